@@ -1,0 +1,383 @@
+"""What the model is compared with: measurements, reference signals, other costs; and known inputs.
+
+Every signal in time (an input, a reference) becomes a `PiecewisePolynomial`: its knots are nodes of the mesh,
+so that the integrator never steps across one and inside a step the signal is one polynomial.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import scipy.interpolate
+import scipy.signal
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+Observe = Callable[..., Any]
+"""``h(t, x, p) -> (q,)``: what a sensor sees of the state."""
+
+
+@dataclass(frozen=True, eq=False)
+class PiecewisePolynomial:
+    """A signal that is a cubic between knots: ``sum_i coefficients[k, i] (t - knots[k])**i`` from knot k on.
+
+    Attributes
+    ----------
+    knots : (K,) array, increasing
+    coefficients : (K - 1, 4, q) array, lowest power first
+    """
+
+    knots: FloatArray
+    coefficients: FloatArray
+
+    @property
+    def channels(self) -> int:
+        """Number of channels, q."""
+        return int(self.coefficients.shape[2])
+
+    def interval(self, times: FloatArray) -> NDArray[np.intp]:
+        """Index of the knot interval that holds each of `times`; beyond the ends the first or the last one."""
+        return np.clip(np.searchsorted(self.knots, times, side="right") - 1, 0, len(self.knots) - 2)
+
+    def __call__(self, times: ArrayLike) -> FloatArray:
+        """Values at `times` (K,): a ``(K, q)`` array."""
+        times = np.asarray(times, dtype=np.float64)
+        k = self.interval(times)
+        s = (times - self.knots[k])[:, None]
+        c = self.coefficients[k]
+        return c[:, 0] + s * (c[:, 1] + s * (c[:, 2] + s * c[:, 3]))
+
+
+@dataclass(frozen=True, eq=False)
+class Input:
+    """A known input ``u(t)``, given by samples; modes are then called as ``f(t, x, p, u)``.
+
+    Parameters
+    ----------
+    times : (K,) array_like
+        Increasing times (s). They must reach over the experiment's ``[t0, tf]``; a held input only has to
+        start by t0, its last value is kept.
+    values : (K,) or (K, q) array_like
+        The modes get a scalar u, or a ``(q,)`` array.
+    kind : {"hold", "linear", "cubic"}
+        Between samples: the last value is held, straight lines, or a cubic spline.
+
+    Raises
+    ------
+    ValueError
+        For times that do not increase, values that are not finite or differ in length from times, too few
+        samples, or an unknown kind.
+    """
+
+    times: Any
+    values: Any
+    kind: Literal["hold", "linear", "cubic"] = "hold"
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("hold", "linear", "cubic"):
+            raise ValueError(f"Input kind must be 'hold', 'linear' or 'cubic'; got {self.kind!r}.")
+        at_least = {"hold": 1, "linear": 2, "cubic": 4}[self.kind]
+        times, values = _samples(self.times, self.values, "Input", at_least=at_least)
+        _require_finite(values, "Input values")
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "values", values)
+
+    def signal(self, t0: float, tf: float) -> PiecewisePolynomial:
+        """The input as a piecewise polynomial over ``[t0, tf]``."""
+        times, values = self.times, self.values.reshape(len(self.times), -1)
+        if times[0] > t0 or (self.kind != "hold" and times[-1] < tf):
+            raise ValueError(
+                f"Input must be known over (t0, tf) = ({t0}, {tf}); its samples reach from {times[0]} to {times[-1]}."
+            )
+        if self.kind == "cubic":
+            return _spline(times, values)
+        if self.kind == "linear":
+            return _from_powers(times, [values[:-1], np.diff(values, axis=0) / np.diff(times)[:, None]])
+        end = max(tf, times[-1] + 1.0)
+        return _from_powers(np.append(times, end), [values])
+
+
+@dataclass(frozen=True, eq=False)
+class RunningCost:
+    """Incremental cost: adds ``integral of ell(t, x, p) dt`` over ``[t0, tf]`` to J, equation (2).
+
+    Parameters
+    ----------
+    ell : callable ``ell(t, x, p) -> scalar``, twice differentiable in x and p.
+    """
+
+    ell: Callable[..., Any]
+
+    def __post_init__(self) -> None:
+        if not callable(self.ell):
+            raise TypeError(f"RunningCost needs a function ell(t, x, p); got {type(self.ell).__name__}.")
+
+
+@dataclass(frozen=True, eq=False)
+class TerminalCost:
+    """Cost of the final state: adds ``phi(x(tf), p)`` to J.
+
+    Parameters
+    ----------
+    phi : callable ``phi(x, p) -> scalar``, twice differentiable.
+    """
+
+    phi: Callable[..., Any]
+
+    def __post_init__(self) -> None:
+        if not callable(self.phi):
+            raise TypeError(f"TerminalCost needs a function phi(x, p); got {type(self.phi).__name__}.")
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceSignal:
+    """A continuous measured signal y_m(t): adds ``integral of 1/2 (y - y_m)' W (y - y_m) dt`` to J.
+
+    The paper's cost (Section V) with ``y = observe(t, x, p)``. Build it with `from_samples`.
+
+    Parameters
+    ----------
+    signal : PiecewisePolynomial
+        y_m, with q channels.
+    observe : callable ``h(t, x, p) -> (q,)``, optional
+        Left out, the whole state is compared.
+    weights : (q,) or (q, q) array_like, optional
+        W, symmetric and positive semi-definite, or its diagonal; the identity if left out.
+    names : sequence of str, optional
+        One for each channel, for reports and plots.
+    samples : (times, values), optional
+        What the signal was made from, for plots.
+    """
+
+    signal: PiecewisePolynomial
+    observe: Observe | None = None
+    weights: Any = None
+    names: tuple[str, ...] | None = None
+    samples: tuple[FloatArray, FloatArray] | None = None
+
+    def __post_init__(self) -> None:
+        if self.observe is not None and not callable(self.observe):
+            raise TypeError(f"observe must be a function h(t, x, p); got {type(self.observe).__name__}.")
+        object.__setattr__(self, "weights", _weight_matrix(self.weights, self.signal.channels))
+        object.__setattr__(self, "names", _channel_names(self.names, self.signal.channels))
+
+    @classmethod
+    def from_samples(
+        cls,
+        times: ArrayLike,
+        values: ArrayLike,
+        *,
+        observe: Observe | None = None,
+        lowpass_hz: float | None = None,
+        weights: ArrayLike | None = None,
+        names: Sequence[str] | None = None,
+    ) -> ReferenceSignal:
+        """Interpolate samples by cubic splines and, if asked, low-pass filter them without phase shift.
+
+        Parameters
+        ----------
+        times : (K,) array_like
+            Increasing sample times (s), four or more.
+        values : (K,) or (K, q) array_like
+            NaN marks a missing value; it is bridged by the interpolation.
+        observe : callable ``h(t, x, p) -> (q,)``, optional
+        lowpass_hz : float, optional
+            Cut-off (Hz) of a second-order Butterworth filter run forward and backward over the interpolated
+            signal, so that no phase shift remains (the gain at the cut-off is then 1/2).
+        weights : (q,) or (q, q) array_like, optional
+        names : sequence of str, optional
+
+        Raises
+        ------
+        ValueError
+            For bad times or values, fewer than four samples in a channel, or a cut-off that is not positive.
+        """
+        times, values = _samples(times, values, "ReferenceSignal", at_least=4)
+        table = values.reshape(len(times), -1)
+        signal = _bridged_spline(times, table)
+        if lowpass_hz is not None:
+            signal = _lowpass(signal, lowpass_hz)
+        label = None if names is None else tuple(names)
+        return cls(signal, observe, weights, label, (times, table))
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """Discrete noisy samples: adds ``1/2 sum ((y_k - h(t_k, x(t_k), p)) / sigma)**2`` to J.
+
+    Parameters
+    ----------
+    times : (K,) array_like
+        Increasing sample times (s); they may be irregular.
+    values : (K,) or (K, q) array_like
+        Samples; NaN marks a missing one.
+    observe : callable ``h(t, x, p) -> (q,)``, optional
+        Left out, the whole state is measured. At a transition with a reset map the sample is of the state
+        just before the jump.
+    sigma : float, (q,) or (K, q) array_like, optional
+        Standard deviation of the noise, for all, for each channel or for each sample. Left out it is
+        unknown: all samples weigh 1 and the covariance is scaled by the residual variance.
+    names : sequence of str, optional
+        One for each channel.
+
+    Raises
+    ------
+    ValueError
+        For times that do not increase, shapes that do not match, no sample at all, infinite values, or a
+        sigma that is not positive.
+    """
+
+    times: Any
+    values: Any
+    observe: Observe | None = None
+    sigma: Any = None
+    names: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        times, values = _samples(self.times, self.values, "Measurements", at_least=1)
+        values = values.reshape(len(times), -1)
+        if np.isinf(values).any():
+            raise ValueError("Measurements values must be finite, or NaN where a sample is missing; got infinity.")
+        if np.isnan(values).all():
+            raise ValueError("Measurements values are all NaN: there is nothing to fit.")
+        if self.observe is not None and not callable(self.observe):
+            raise TypeError(f"observe must be a function h(t, x, p); got {type(self.observe).__name__}.")
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "sigma", _checked_sigma(self.sigma, values.shape))
+        object.__setattr__(self, "names", _channel_names(self.names, values.shape[1]))
+
+    @property
+    def weights(self) -> FloatArray:
+        """``1 / sigma**2`` (1 where sigma is unknown), 0 where a sample is missing: a ``(K, q)`` array."""
+        inverse = np.ones(self.values.shape) if self.sigma is None else np.broadcast_to(
+            self.sigma ** -2.0, self.values.shape
+        )
+        return np.where(np.isnan(self.values), 0.0, inverse)
+
+    @property
+    def count(self) -> int:
+        """Number of values that are not missing."""
+        return int(np.count_nonzero(~np.isnan(self.values)))
+
+
+Data = RunningCost | TerminalCost | ReferenceSignal | Measurements
+
+
+def _samples(times: ArrayLike, values: ArrayLike, what: str, *, at_least: int) -> tuple[FloatArray, FloatArray]:
+    """Times (K,) and values (K, ...) as float64, checked against each other."""
+    try:
+        times = np.array(times, dtype=np.float64)
+        values = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{what} times and values must be arrays of numbers; {error}.") from error
+    if times.ndim != 1 or values.ndim not in (1, 2):
+        raise ValueError(
+            f"{what} needs times of shape (K,) and values of shape (K,) or (K, q); "
+            f"got {times.shape} and {values.shape}."
+        )
+    if len(times) != len(values):
+        raise ValueError(f"{what} needs one row of values for each time; got {len(times)} times, {len(values)} rows.")
+    if len(times) < at_least or values.size == 0:
+        raise ValueError(f"{what} needs {at_least} sample(s) or more; got {len(times)}.")
+    _require_finite(times, f"{what} times")
+    if np.any(np.diff(times) <= 0):
+        k = int(np.argmax(np.diff(times) <= 0))
+        raise ValueError(
+            f"{what} times must increase strictly; got {times[k]} followed by {times[k + 1]} at index {k + 1}."
+        )
+    times.flags.writeable = False
+    values.flags.writeable = False
+    return times, values
+
+
+def _require_finite(values: FloatArray, what: str) -> None:
+    bad = ~np.isfinite(values)
+    if bad.any():
+        where = np.argwhere(bad)[0].tolist()
+        raise ValueError(f"{what} must be finite; got {values[tuple(where)]} at index {where}.")
+
+
+def _checked_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | None:
+    if sigma is None:
+        return None
+    sigma = np.array(sigma, dtype=np.float64)
+    if sigma.shape not in ((), (shape[1],), shape):
+        raise ValueError(
+            f"sigma must be a number, of shape ({shape[1]},) (one a channel) or {shape} (one a sample); "
+            f"got shape {sigma.shape}."
+        )
+    if not np.all(sigma > 0) or not np.all(np.isfinite(sigma)):
+        raise ValueError(f"sigma must be positive and finite; got a smallest value of {sigma.min()}.")
+    return sigma
+
+
+def _channel_names(names: Sequence[str] | None, channels: int) -> tuple[str, ...] | None:
+    if names is None:
+        return None
+    names = (names,) if isinstance(names, str) else tuple(names)
+    if len(names) != channels:
+        raise ValueError(f"names must have one entry for each of the {channels} channels; got {list(names)}.")
+    return names
+
+
+def _weight_matrix(weights: ArrayLike | None, channels: int) -> FloatArray:
+    """W as a symmetric positive semi-definite ``(q, q)`` matrix."""
+    if weights is None:
+        return np.eye(channels)
+    matrix = np.array(weights, dtype=np.float64)
+    if matrix.ndim == 1:
+        matrix = np.diag(matrix)
+    if matrix.shape != (channels, channels):
+        raise ValueError(
+            f"weights must have shape ({channels},) or ({channels}, {channels}); got {np.shape(weights)}."
+        )
+    if not np.all(np.isfinite(matrix)) or not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
+        raise ValueError("weights must be finite and symmetric.")
+    smallest = np.linalg.eigvalsh(matrix)[0]
+    if smallest < -1e-12 * np.abs(matrix).max():
+        raise ValueError(f"weights must be positive semi-definite; its smallest eigenvalue is {smallest:.3g}.")
+    return matrix
+
+
+def _from_powers(knots: FloatArray, powers: list[FloatArray]) -> PiecewisePolynomial:
+    """Polynomial with the given coefficient arrays ``(K - 1, q)``, lowest power first, the rest zero."""
+    coefficients = np.zeros((len(knots) - 1, 4, powers[0].shape[1]))
+    for i, power in enumerate(powers):
+        coefficients[:, i] = power
+    return PiecewisePolynomial(np.asarray(knots, dtype=np.float64), coefficients)
+
+
+def _spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
+    """Not-a-knot cubic spline through ``values`` (K, q)."""
+    spline = scipy.interpolate.CubicSpline(times, values, axis=0)
+    return PiecewisePolynomial(times, np.moveaxis(spline.c[::-1], 0, 1))
+
+
+def _bridged_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
+    """Spline through the samples that are there, each channel's gaps bridged by its own spline first."""
+    filled = values.copy()
+    for channel in filled.T:
+        known = np.isfinite(channel)
+        if known.sum() < 4:
+            raise ValueError(f"ReferenceSignal needs four samples or more in each channel; got {known.sum()}.")
+        if not known.all():
+            channel[~known] = scipy.interpolate.CubicSpline(times[known], channel[known])(times[~known])
+    return _spline(times, filled)
+
+
+def _lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePolynomial:
+    """Butterworth filter of second order forward and backward, on a grid of ten points a period of the cut-off."""
+    if not (np.isfinite(cutoff_hz) and cutoff_hz > 0):
+        raise ValueError(f"lowpass_hz must be positive; got {cutoff_hz}.")
+    start, end = signal.knots[[0, -1]]
+    step = min(0.1 / cutoff_hz, float(np.median(np.diff(signal.knots))))
+    grid = np.linspace(start, end, max(int(np.ceil((end - start) / step)) + 1, 8))
+    rate = (len(grid) - 1) / (end - start)
+    sos = scipy.signal.butter(2, cutoff_hz, fs=rate, output="sos")
+    padding = min(len(grid) - 1, int(np.ceil(3 * rate / cutoff_hz)))
+    filtered = scipy.signal.sosfiltfilt(sos, signal(grid), axis=0, padtype="odd", padlen=padding)
+    return _spline(grid, filtered)

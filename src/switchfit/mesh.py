@@ -1,0 +1,141 @@
+"""The mesh: fixed nodes, cut by the transition times.
+
+The *nodes* of an experiment are t0, tf, all sample times, the knots of inputs and reference signals and a refinement
+grid. They stay where they are while the optimiser works. The transition times cut the *cells* between them into
+*rows*: one row is one Runge-Kutta step, in one mode, inside one cell. Every moment that matters is thus the end of a
+row, and only the rows beside a transition move with it.
+
+Rows are laid out in chunks of `CHUNK` rows of one segment (the time a mode is active), each segment padded to whole
+chunks with rows of length zero, so that a chunk has one mode and all shapes are fixed whatever the transition times.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.data import FloatArray
+
+CHUNK = 8
+"""Rows in a chunk: long enough to fill vector registers (rows times stages), short enough to waste few in padding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Fixed nodes of one experiment.
+
+    Attributes
+    ----------
+    nodes : (G + 1,) array
+        Increasing, from t0 to tf; padded at the end with tf to a length out of `padded_length`, so that
+        experiments of similar size share one compiled program.
+    cells : int
+        Cells before the padding.
+    """
+
+    nodes: FloatArray
+    cells: int
+
+    @classmethod
+    def from_times(cls, times: FloatArray) -> Mesh:
+        """The mesh whose nodes are `times`, in any order and with repetitions."""
+        nodes = np.unique(times)
+        cells = len(nodes) - 1
+        padding = np.full(padded_length(cells) - cells, nodes[-1])
+        return cls(np.concatenate([nodes, padding]), cells)
+
+    @property
+    def times(self) -> FloatArray:
+        """The nodes without the padding."""
+        return self.nodes[: self.cells + 1]
+
+    def halved(self) -> Mesh:
+        """The mesh with every cell cut in two."""
+        nodes = self.times
+        return Mesh.from_times(np.concatenate([nodes, 0.5 * (nodes[1:] + nodes[:-1])]))
+
+    def cell_ending_at(self, times: FloatArray) -> NDArray[np.intp]:
+        """Index of the cell that ends at each of `times`, which must be nodes; -1 for t0."""
+        return np.searchsorted(self.times, times) - 1
+
+
+def padded_length(length: int) -> int:
+    """`length` rounded up to four significant bits: at most an eighth too long, few distinct values."""
+    unit = 1 << max(int(length).bit_length() - 4, 3)
+    return -(-length // unit) * unit
+
+
+class Rows(NamedTuple):
+    """The rows of a mesh at given transition times: Q chunks of C rows.
+
+    Attributes
+    ----------
+    segment : (Q,) int, which entry of the mode sequence
+    opens : (Q,) bool, whether the chunk opens a segment other than the first (a transition precedes it)
+    cell : (Q, C) int
+    start, end : (Q, C) times
+    starts_at, ends_at : (Q, C) int, index i of the transition time tau_i (from 0) at which a row starts or ends, else -1
+    first_chunk : (N + 1,) int, the chunk that opens each segment
+    first_cell : (N + 1,) int, the cell in which each segment begins
+    """
+
+    segment: jax.Array
+    opens: jax.Array
+    cell: jax.Array
+    start: jax.Array
+    end: jax.Array
+    starts_at: jax.Array
+    ends_at: jax.Array
+    first_chunk: jax.Array
+    first_cell: jax.Array
+
+
+def chunk_count(cells: int, transitions: int) -> int:
+    """Chunks that hold all rows wherever the transition times lie: the padding wastes at most C - 1 rows a segment."""
+    return (cells + transitions + (transitions + 1) * (CHUNK - 1)) // CHUNK
+
+
+def rows(nodes: jax.Array, tau: jax.Array, side: jax.Array) -> Rows:
+    """Cut the cells between `nodes` (G + 1,) at `tau` (N,).
+
+    Where tau_i equals a node, `side` = +1 lets segment i begin in the cell after it, so that derivatives are those
+    for tau_i increasing, and -1 in the cell before it.
+    """
+    cells, N = nodes.shape[0] - 1, tau.shape[0]
+    passed = jnp.where(side > 0, nodes[None] <= tau[:, None], nodes[None] < tau[:, None]).sum(1)
+    first_cell = jnp.clip(passed - 1, 0, cells - 1)
+    first_cell = jnp.concatenate([jnp.zeros(1, first_cell.dtype), first_cell])
+    last_cell = jnp.concatenate([first_cell[1:], jnp.full(1, cells - 1, first_cell.dtype)])
+    count = last_cell - first_cell + 1
+    chunks = -(-count // CHUNK)
+    first_chunk = jnp.concatenate([jnp.zeros(1, chunks.dtype), jnp.cumsum(chunks)[:-1]])
+
+    q = jnp.arange(chunk_count(cells, N))
+    segment = (q[:, None] >= first_chunk[None, 1:]).sum(1)
+    offset = (q - first_chunk[segment])[:, None] * CHUNK + jnp.arange(CHUNK)
+    rows_here = count[segment][:, None]
+    padding = offset >= rows_here
+    cell = first_cell[segment][:, None] + jnp.minimum(offset, rows_here - 1)
+
+    begins = jnp.concatenate([nodes[:1], tau])[segment][:, None]
+    finishes = jnp.concatenate([tau, nodes[-1:]])[segment][:, None]
+    opening = (offset == 0) & (segment > 0)[:, None]
+    closing = (offset == rows_here - 1) & (segment < N)[:, None]
+    start = jnp.where(padding, finishes, jnp.where(opening, begins, nodes[cell]))
+    end = jnp.where(padding | closing, finishes, nodes[cell + 1])
+    starts_at = jnp.where(opening, segment[:, None] - 1, -1)
+    ends_at = jnp.where(closing, segment[:, None], -1)
+    opens = opening[:, 0]
+    return Rows(segment, opens, cell, start, end, starts_at, ends_at, first_chunk, first_cell)
+
+
+def row_ending_cell(layout: Rows, cell: jax.Array) -> jax.Array:
+    """Flat index of the last row inside each of the given cells (K,); -1 for cell -1."""
+    segment = (cell[:, None] >= layout.first_cell[None, 1:]).sum(1)
+    row = layout.first_chunk[segment] * CHUNK + cell - layout.first_cell[segment]
+    return jnp.where(cell < 0, -1, row)

@@ -1,0 +1,332 @@
+"""From a problem to functions that JAX can compile: the structure (static) and the arguments (arrays) of a run.
+
+`Structure` holds everything that shapes the compiled program: which functions, in which order, with which shapes.
+`Arguments` holds the numbers. Experiments with equal structure and equal (padded) lengths share one program, and
+nothing is compiled anew when transition times, parameters or data change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from switchfit.data import FloatArray, Measurements, Observe, ReferenceSignal, RunningCost, TerminalCost
+from switchfit.mesh import Mesh, padded_length
+from switchfit.problem import Problem, initial_state_of, reset_maps_of, signals_of
+from switchfit.rungekutta import Density, Field, Tableau, tableau_of
+
+Array = jax.Array
+
+
+def float64() -> Any:
+    """Context in which JAX computes in float64; the user's setting is back in force afterwards."""
+    return jax.enable_x64(True)
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What a compiled program depends on beside the shapes of its arguments. Hashable; functions by identity."""
+
+    mode_names: tuple[str, ...]
+    modes: tuple[Callable[..., Any], ...]
+    mode_of_segment: tuple[int, ...]
+    reset_maps: tuple[Callable[..., Any] | None, ...]
+    initial_state: Callable[..., Any] | None
+    n: int
+    parameters: tuple[tuple[str, tuple[int, ...], bool], ...]  # name, shape, free
+    running: tuple[Callable[..., Any], ...]
+    references: tuple[tuple[Observe | None, int], ...]  # observe, channels
+    measurements: tuple[Observe | None, ...]
+    terminal: tuple[Callable[..., Any], ...]
+    input_shape: tuple[int, ...] | None
+    solver: str
+
+    @property
+    def tableau(self) -> Tableau:
+        """The Runge-Kutta method."""
+        return tableau_of(self.solver)
+
+    @property
+    def N(self) -> int:
+        """Number of transitions."""
+        return len(self.reset_maps)
+
+    @property
+    def M(self) -> int:
+        """Number of free scalar parameters."""
+        return sum(int(np.prod(shape)) for _, shape, free in self.parameters if free)
+
+    @property
+    def resets(self) -> tuple[int, ...]:
+        """The transitions (from 0) at which a reset map acts."""
+        return tuple(i for i, reset in enumerate(self.reset_maps) if reset is not None)
+
+
+class Samples(NamedTuple):
+    """Discrete samples: cell that ends at each (K,), time (K,), value (K, q), weight (K, q), 0 where missing."""
+
+    cell: Array
+    time: Array
+    value: Array
+    weight: Array
+
+
+class Arguments(NamedTuple):
+    """Numbers of a run, none of them estimated.
+
+    Attributes
+    ----------
+    nodes : (G + 1,)
+    signals : (G, 4, S)
+        Polynomial of each signal channel in each cell, in powers of time since the cell's first node: the
+        references in the order of the data, then the input.
+    fixed : values of the fixed parameters, in order
+    initial_state : (n,), zeros where it is a function of the parameters
+    samples : one `Samples` for each `Measurements`
+    weights : one (q, q) matrix for each `ReferenceSignal`
+    """
+
+    nodes: Array
+    signals: Array
+    fixed: tuple[Array, ...]
+    initial_state: Array
+    samples: tuple[Samples, ...]
+    weights: tuple[Array, ...]
+
+
+class Piece(NamedTuple):
+    """The signals in one cell: first node (), coefficients (4, S)."""
+
+    origin: Array
+    coefficients: Array
+
+    def __call__(self, t: Array) -> Array:
+        """All channels at time t: (S,)."""
+        s, c = t - self.origin, self.coefficients
+        return c[0] + s * (c[1] + s * (c[2] + s * c[3]))
+
+
+class Model:
+    """The functions of one experiment, bound to its arguments while a program is traced.
+
+    All functions take the flat vector p (M,) of the free parameters.
+    """
+
+    def __init__(self, structure: Structure, arguments: Arguments) -> None:
+        self.structure = structure
+        self.arguments = arguments
+        self.tableau = structure.tableau
+
+    def parameters(self, p: Array) -> dict[str, Array]:
+        """The dict the user's functions get."""
+        named: dict[str, Array] = {}
+        fixed = iter(self.arguments.fixed)
+        position = 0
+        for name, shape, free in self.structure.parameters:
+            if free:
+                size = int(np.prod(shape))
+                named[name] = p[position : position + size].reshape(shape)
+                position += size
+            else:
+                named[name] = next(fixed)
+        return named
+
+    def field(self, mode: int, piece: Piece) -> Field:
+        """Vector field of a mode inside one cell."""
+        structure = self.structure
+        function, name = structure.modes[mode], structure.mode_names[mode]
+
+        def f(t: Array, x: Array, p: Array) -> Array:
+            given: tuple[Any, ...] = (t, x, self.parameters(p))
+            if structure.input_shape is not None:
+                size = int(np.prod(structure.input_shape))
+                given += (piece(t)[piece.coefficients.shape[-1] - size :].reshape(structure.input_shape),)
+            what = f"mode {name!r}"
+            return checked_vector(function(*given), (structure.n,), what, f"f({'t, x, p, u'[: 3 * len(given) - 2]})")
+
+        return f
+
+    def density(self, piece: Piece) -> Density | None:
+        """Sum of all running costs inside one cell, reference signals included; None if there is none."""
+        if not self.structure.running and not self.structure.references:
+            return None
+
+        def ell(t: Array, x: Array, p: Array) -> Array:
+            total = jnp.zeros(())
+            for function in self.structure.running:
+                total = total + checked_vector(function(t, x, self.parameters(p)), (), "RunningCost", "ell(t, x, p)")
+            for residual, W in zip(self.reference_residuals(piece), self.arguments.weights, strict=True):
+                r = residual(t, x, p)
+                total = total + 0.5 * r @ W @ r
+            return total
+
+        return ell
+
+    def reference_residuals(self, piece: Piece) -> list[Callable[[Array, Array, Array], Array]]:
+        """``y(t, x, p) - y_m(t)`` of each reference signal, (q,)."""
+        residuals = []
+        first = 0
+        for observe, channels in self.structure.references:
+
+            def residual(
+                t: Array, x: Array, p: Array, observe: Observe | None = observe, first: int = first,
+                channels: int = channels,
+            ) -> Array:
+                return self.observed(observe, t, x, p, channels) - piece(t)[first : first + channels]
+
+            residuals.append(residual)
+            first += channels
+        return residuals
+
+    def observed(self, observe: Observe | None, t: Array, x: Array, p: Array, channels: int) -> Array:
+        """What a sensor sees: (q,)."""
+        y = x if observe is None else observe(t, x, self.parameters(p))
+        return checked_vector(y, (channels,), "observe", "h(t, x, p)")
+
+    def sample_residual(self, k: int, sample: Samples, x: Array, p: Array) -> Array:
+        """``h - y`` of one sample of the k-th Measurements, 0 where it is missing: (q,)."""
+        h = self.observed(self.structure.measurements[k], sample.time, x, p, sample.value.shape[-1])
+        return jnp.where(sample.weight > 0, h - sample.value, 0.0)
+
+    def sample_cost(self, k: int, sample: Samples, x: Array, p: Array) -> Array:
+        """``1/2 sum ((h - y) / sigma)**2`` of one sample."""
+        r = self.sample_residual(k, sample, x, p)
+        return 0.5 * jnp.sum(sample.weight * r * r)
+
+    def terminal(self, x: Array, p: Array) -> Array:
+        """Sum of the terminal costs."""
+        total = jnp.zeros(())
+        for phi in self.structure.terminal:
+            total = total + checked_vector(phi(x, self.parameters(p)), (), "TerminalCost", "phi(x, p)")
+        return total
+
+    def reset(self, i: int) -> Callable[[Array, Array, Array], Array]:
+        """Reset map R_i(t, x, p) of transition i, which must have one."""
+        function = self.structure.reset_maps[i]
+        sequence = [self.structure.mode_names[m] for m in self.structure.mode_of_segment[i : i + 2]]
+        if function is None:
+            raise ValueError(f"transition {i + 1} has no reset map.")
+        apply = function
+
+        def R(t: Array, x: Array, p: Array) -> Array:
+            value = apply(t, x, self.parameters(p))
+            return checked_vector(value, (self.structure.n,), f"reset map {tuple(sequence)}", "R(t, x, p)")
+
+        return R
+
+    def initial_state(self, p: Array) -> Array:
+        """x(t0), (n,)."""
+        if self.structure.initial_state is None:
+            return self.arguments.initial_state
+        value = self.structure.initial_state(self.parameters(p))
+        return checked_vector(value, (self.structure.n,), "initial_state", "initial_state(p)")
+
+
+def checked_vector(value: Any, shape: tuple[int, ...], what: str, signature: str) -> Array:
+    """`value` as an array, checked (while tracing) to be float64 of the given shape."""
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{what}: {signature} must return an array of shape {shape}; got {value!r}.") from error
+    if array.shape != shape and array.size == int(np.prod(shape)) == 1:
+        array = array.reshape(shape)
+    if array.shape != shape:
+        raise ValueError(f"{what}: {signature} must return an array of shape {shape}; got shape {array.shape}.")
+    if jnp.issubdtype(array.dtype, jnp.integer) or array.dtype == jnp.bool_:
+        return array.astype(jnp.float64)
+    if array.dtype != jnp.float64:
+        raise ValueError(
+            f"{what}: {signature} must return float64; got {array.dtype}. Its arguments are float64: do not cast them."
+        )
+    return array
+
+
+def structure_of(problem: Problem, e: int) -> Structure:
+    """The structure of experiment e, with every user function called once to check what it returns."""
+    system, experiment = problem.system, problem.experiments[e]
+    names = tuple(dict.fromkeys(experiment.mode_sequence))
+    initial = initial_state_of(system, experiment)
+    of_kind = partial(_of_kind, experiment.data)
+    return Structure(
+        mode_names=names,
+        modes=tuple(system.modes[name] for name in names),
+        mode_of_segment=tuple(names.index(mode) for mode in experiment.mode_sequence),
+        reset_maps=reset_maps_of(system, experiment.mode_sequence),
+        initial_state=initial if callable(initial) else None,
+        n=_state_size(problem, initial),
+        parameters=tuple((name, q.shape, not q.fixed) for name, q in problem.parameters.items()),
+        running=tuple(item.ell for item in of_kind(RunningCost)),
+        references=tuple((item.observe, item.signal.channels) for item in of_kind(ReferenceSignal)),
+        measurements=tuple(item.observe for item in of_kind(Measurements)),
+        terminal=tuple(item.phi for item in of_kind(TerminalCost)),
+        input_shape=None if experiment.inputs is None else tuple(experiment.inputs.values.shape[1:]),
+        solver=problem.solver,
+    )
+
+
+def arguments_of(problem: Problem, e: int, mesh: Mesh) -> Arguments:
+    """The arrays of experiment e on a mesh that holds all its sample times and knots as nodes."""
+    experiment = problem.experiments[e]
+    initial = initial_state_of(problem.system, experiment)
+    fixed = tuple(np.asarray(q.value) for q in problem.parameters.values() if q.fixed)
+    samples = tuple(_padded_samples(item, mesh) for item in _of_kind(experiment.data, Measurements))
+    weights = tuple(item.weights for item in _of_kind(experiment.data, ReferenceSignal))
+    x0 = np.zeros(structure_size(problem, e)) if callable(initial) else initial
+    arrays = Arguments(mesh.nodes, _signals_by_cell(problem, e, mesh), fixed, x0, samples, weights)
+    with float64():
+        return jax.tree.map(jnp.asarray, arrays)
+
+
+def structure_size(problem: Problem, e: int) -> int:
+    """Number of states n of experiment e."""
+    return _state_size(problem, initial_state_of(problem.system, problem.experiments[e]))
+
+
+def _of_kind(data: tuple[Any, ...], kind: type) -> list[Any]:
+    return [item for item in data if isinstance(item, kind)]
+
+
+def _state_size(problem: Problem, initial: Any) -> int:
+    if not callable(initial):
+        return int(initial.size)
+    with float64():
+        p = {name: jax.ShapeDtypeStruct(q.shape, jnp.float64) for name, q in problem.parameters.items()}
+        try:
+            shape = jax.eval_shape(lambda p: jnp.asarray(initial(p)), p).shape
+        except KeyError as error:
+            raise ValueError(f"initial_state asks for the parameter {error}, which the problem lacks.") from error
+    if len(shape) != 1:
+        raise ValueError(f"initial_state(p) must return an array of shape (n,); got shape {shape}.")
+    return int(shape[0])
+
+
+def _padded_samples(item: Measurements, mesh: Mesh) -> Samples:
+    """Samples of one Measurements, padded with missing ones to a length out of `padded_length`."""
+    extra = padded_length(len(item.times)) - len(item.times)
+    rows = ((0, extra), (0, 0))
+    return Samples(
+        np.pad(mesh.cell_ending_at(item.times), (0, extra), mode="edge"),  # type: ignore[arg-type]  # made jax arrays
+        np.pad(item.times, (0, extra), mode="edge"),  # type: ignore[arg-type]
+        np.pad(np.nan_to_num(item.values), rows),  # type: ignore[arg-type]
+        np.pad(item.weights, rows),  # type: ignore[arg-type]
+    )
+
+
+def _signals_by_cell(problem: Problem, e: int, mesh: Mesh) -> FloatArray:
+    """Every signal as a cubic in each cell, in powers of the time since the cell's first node: (G, 4, S)."""
+    starts = mesh.nodes[:-1]
+    middles = 0.5 * (mesh.nodes[:-1] + mesh.nodes[1:])
+    tables = [np.zeros((len(starts), 4, 0))]
+    for signal in signals_of(problem.experiments[e]):
+        k = signal.interval(middles)
+        s = (starts - signal.knots[k])[:, None]
+        c0, c1, c2, c3 = np.moveaxis(signal.coefficients[k], 1, 0)
+        shifted = [c0 + s * (c1 + s * (c2 + s * c3)), c1 + s * (2 * c2 + 3 * s * c3), c2 + 3 * s * c3, c3]
+        tables.append(np.stack(shifted, axis=1))
+    return np.concatenate(tables, axis=2)

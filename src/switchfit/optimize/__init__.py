@@ -1,0 +1,15 @@
+"""Minimisation of a piecewise smooth cost under linear constraints; knows nothing of differential equations."""
+
+from switchfit.optimize.qp import LinearConstraints, QPSolution, solve_qp
+from switchfit.optimize.sqp import Evaluation, IterationRecord, Result, Status, minimize
+
+__all__ = [
+    "Evaluation",
+    "IterationRecord",
+    "LinearConstraints",
+    "QPSolution",
+    "Result",
+    "Status",
+    "minimize",
+    "solve_qp",
+]

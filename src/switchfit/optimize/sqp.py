@@ -1,0 +1,981 @@
+"""Sequential quadratic programming for a piecewise smooth cost under linear constraints.
+
+The problem is to minimise J(theta) subject to A theta >= b and lower <= theta <= upper, where J is continuous and
+smooth except where a coordinate passes one of its breakpoints: there its derivatives jump. (A transition time that
+passes a sample time is such a coordinate.) All constraints are linear, so every iterate is feasible, and the line
+search looks at J alone.
+
+One iteration, `_step`, maps a state to the next state:
+
+1. *direction*: a convex quadratic programme with the exact Hessian, made positive definite only in the subspace where
+   it has to be (Newton), with its blocks, with Gauss-Newton's matrix, or with a multiple of the identity (steepest
+   descent);
+2. *line search*: the full step first, even across breakpoints; if it fails and crosses any, the programme is solved
+   again inside the present smooth piece, where J is smooth and backtracking must succeed;
+3. *kinks*: a coordinate that sits on a breakpoint has the derivatives g₋ and g₊. To first order J is separable
+   there, so such a coordinate is held (g₋ <= 0 <= g₊), or released to the side that descends. The multipliers of the
+   programme say when a held coordinate is to be released because others move.
+
+A point is optimal when zero is in [g₋, g₊] − cone(active normals) at every coordinate, with g₋ = g₊ off the kinks.
+
+References
+----------
+.. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapters 3, 12, 16 and 18.
+.. [2] W. W. Hager, H. Zhang, A new conjugate gradient method with guaranteed descent and an efficient line search,
+   SIAM J. Optim. 16 (2005) 170-192 (line searches below the rounding error of the cost).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import Literal, Protocol, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from switchfit.optimize.qp import (
+    EIGENVALUE_FLOOR,
+    EPS,
+    FloatArray,
+    LinearConstraints,
+    convexify,
+    diagonal_scaling,
+    kkt_residual,
+    solve_qp,
+    split_space,
+)
+
+HessianKind = Literal["exact", "block-diagonal", "gauss-newton", "none"]
+
+#: Fraction of the predicted linear decrease that a step must achieve (Armijo).
+ARMIJO = 1e-4
+#: The same for a step across a breakpoint, where the prediction may be wrong however short the step.
+ARMIJO_ACROSS = 0.1
+#: Shortened steps across breakpoints are tried while they still cross this many.
+MANY_BREAKPOINTS = 3
+#: Differences of costs below this many units of rounding say nothing.
+NOISE = 32 * EPS
+#: Eigenvalues of the scaled Hessian below this are negative curvature, not rounding.
+NEGATIVE_CURVATURE = -1e-8
+#: Iterations spent on making the last step negligible once the optimality is below the tolerance.
+EXTRA_ITERATIONS = 5
+MAX_BACKTRACKS = 60
+
+
+class Evaluation(Protocol):
+    """What the caller's function returns: cost J, gradient, shape (d,), and Hessian, shape (d, d)."""
+
+    @property
+    def cost(self) -> float: ...
+    @property
+    def gradient(self) -> FloatArray: ...
+    @property
+    def hessian(self) -> FloatArray | None: ...
+
+
+class Status(Enum):
+    """How a minimisation ended: a sentence with the remedy, to be filled in by `Result.message`."""
+
+    CONVERGED = "Converged: the optimality {optimality:.1e} is below the tolerance {tolerance:.1e}."
+    CONVERGED_PRECISION = (
+        "Converged to the limit of double precision: the optimality {optimality:.1e} is above the tolerance "
+        "{tolerance:.1e}, but the decrease still predicted is below the rounding error of the cost {cost:.6e}. "
+        "Ask for a larger tolerance."
+    )
+    CONVERGED_AT_KINK = (
+        "Converged at a kink of the cost: {kinks}. The one-sided derivatives have opposite signs, so this is a "
+        "minimiser although no gradient vanishes there; covariances do not apply to such an unknown."
+    )
+    MAX_ITERATIONS = (
+        "Stopped after {iterations} iterations with optimality {optimality:.1e} above the tolerance {tolerance:.1e}. "
+        "Raise max_iterations, use hessian='exact', or start closer."
+    )
+    LINE_SEARCH_FAILED = (
+        "The line search found no decrease of the cost along a descent direction (optimality {optimality:.1e}). "
+        "The gradient does not belong to the cost: check the derivatives, or missing breakpoints."
+    )
+    INTERRUPTED = "Interrupted after {iterations} iterations with optimality {optimality:.1e}: the best point so far."
+    NONFINITE_START = (
+        "The cost or its derivatives are not finite at the starting point. Start elsewhere, or check the model there."
+    )
+    SADDLE = (
+        "A stationary point but no minimum: the scaled Hessian on the free directions has the eigenvalue "
+        "{smallest_eigenvalue:.1e}, and no step along it decreased the cost. Start elsewhere."
+    )
+    SINGULAR = (
+        "Converged, but the cost is flat to second order along {direction} (scaled eigenvalue "
+        "{smallest_eigenvalue:.1e}): these unknowns are not identified. Fix one of them or add data."
+    )
+
+    @property
+    def successful(self) -> bool:
+        """Whether the point is a local minimiser as far as second-order conditions can tell."""
+        return self in (Status.CONVERGED, Status.CONVERGED_PRECISION, Status.CONVERGED_AT_KINK)
+
+
+@dataclass(frozen=True, eq=False)
+class IterationRecord:
+    """One line of the history: theta has shape (d,), `evaluations` counts all calls up to then."""
+
+    iteration: int
+    cost: float
+    optimality: float
+    step_length: float
+    theta: FloatArray
+    evaluations: int
+
+
+Callback = Callable[[IterationRecord], object]
+Evaluate = Callable[[FloatArray, int], Evaluation]
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """Outcome of `minimize`.
+
+    Attributes
+    ----------
+    theta : array, shape (d,)
+        The best point found; feasible.
+    cost : float
+    gradient : array, shape (d,)
+        Right-hand derivatives at a coordinate that is on a breakpoint (left-hand at an upper bound).
+    hessian : array, shape (d, d)
+        As evaluated there, not modified; NaN if the caller gives none.
+    optimality : float
+        KKT residual, min over multipliers of ‖g − Aᵀ lam‖₂; the norm of the gradient if nothing is active.
+    iterations, evaluations : int
+    status : Status
+    active : tuple of str
+        Names of the constraints that hold with equality.
+    multipliers : array, shape (m + 2 d,)
+        Of rows, lower and upper bounds, in the order of `LinearConstraints.names`.
+    kinks : tuple of (int, float, float)
+        Coordinate, left and right derivative, where the solution sits at a kink.
+    free_basis : array, shape (d, k)
+        Orthonormal basis of the directions left free by active constraints and kinks.
+    free_eigenvalues : array, shape (k,)
+        Eigenvalues, ascending, of the diagonally scaled Hessian on the free directions.
+    smallest_eigenvalue, smallest_unscaled_eigenvalue : float
+        The smallest of these, and that of ``free_basisᵀ H free_basis``; NaN if there are none.
+    flat_direction : array, shape (d,)
+        Eigenvector, in theta and of unit length, that belongs to `smallest_eigenvalue`.
+    tolerance : float
+        The tolerance asked for.
+    history : tuple of IterationRecord
+        The start and every iteration.
+    """
+
+    theta: FloatArray
+    cost: float
+    gradient: FloatArray
+    hessian: FloatArray
+    optimality: float
+    iterations: int
+    evaluations: int
+    status: Status
+    active: tuple[str, ...]
+    multipliers: FloatArray
+    kinks: tuple[tuple[int, float, float], ...]
+    free_basis: FloatArray
+    free_eigenvalues: FloatArray
+    smallest_eigenvalue: float
+    smallest_unscaled_eigenvalue: float
+    flat_direction: FloatArray
+    tolerance: float
+    history: tuple[IterationRecord, ...]
+
+    @property
+    def successful(self) -> bool:
+        """Whether the status is one of the successful ones."""
+        return self.status.successful
+
+    @property
+    def message(self) -> str:
+        """The status as a sentence with this result's numbers and names."""
+        kinks = ", ".join(f"theta[{i}] = {self.theta[i]:.10g} between {lo:.1e} and {hi:.1e}" for i, lo, hi in self.kinks)
+        order = np.argsort(-np.abs(self.flat_direction), kind="stable")
+        largest = [i for i in order if abs(self.flat_direction[i]) > 0.1][:4]
+        direction = " ".join(f"{self.flat_direction[i]:+.2g} theta[{i}]" for i in largest) or "no direction"
+        sentence = self.status.value.format(
+            optimality=self.optimality,
+            tolerance=self.tolerance,
+            cost=self.cost,
+            iterations=self.iterations,
+            smallest_eigenvalue=self.smallest_eigenvalue,
+            kinks=kinks,
+            direction=direction,
+        )
+        return sentence + (f" Active: {'; '.join(self.active)}." if self.active else "")
+
+
+# --- the problem and its points ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    evaluate: Evaluate
+    constraints: LinearConstraints
+    normals: FloatArray
+    breakpoints: tuple[FloatArray, ...]
+    hessian: HessianKind
+    mask: FloatArray | None  # 1 inside a block, 0 between blocks
+    tolerance: float
+    max_iterations: int
+
+    @property
+    def uses_hessian(self) -> bool:
+        return self.hessian != "none"
+
+
+@dataclass(frozen=True, eq=False)
+class _Sample:
+    """One evaluation: cost, gradient and (symmetrised) Hessian as arrays."""
+
+    cost: float
+    gradient: FloatArray
+    hessian: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """A feasible point with its one-sided derivatives and KKT residual."""
+
+    theta: FloatArray
+    plus: _Sample  # derivatives to the right of breakpoints
+    minus: _Sample  # and to the left; the same object away from breakpoints
+    kink: NDArray[np.bool_]  # coordinates on a breakpoint with room on both sides
+    side: NDArray[np.int_]  # the only side there is, for a coordinate on a breakpoint and a bound; otherwise 0
+    active: NDArray[np.intp]
+    optimality: float
+    multipliers: FloatArray  # shape (m + 2 d,)
+
+    @property
+    def cost(self) -> float:
+        return self.plus.cost
+
+    def derivatives(self, sides: NDArray[np.int_]) -> tuple[FloatArray, FloatArray]:
+        """Gradient and Hessian on the given sides (+1, -1; 0 for their mean).
+
+        An entry of the Hessian that joins a left and a right coordinate is known from neither evaluation: the mean.
+        """
+        plus, minus = self.plus, self.minus
+        gradient = np.where(sides > 0, plus.gradient, minus.gradient)
+        gradient = np.where(sides == 0, 0.5 * (plus.gradient + minus.gradient), gradient)
+        pair = sides[:, None] + sides[None, :]
+        mean = 0.5 * (plus.hessian + minus.hessian)
+        return gradient, np.where(pair > 0, plus.hessian, np.where(pair < 0, minus.hessian, mean))
+
+
+def _steepest_sides(point: _Point) -> NDArray[np.int_]:
+    """For each kink 0 if it is a minimiser (g₋ <= 0 <= g₊), otherwise the side that descends more steeply."""
+    left, right = point.minus.gradient, point.plus.gradient
+    sides = np.where(-right >= left, 1, -1)
+    sides = np.where((left <= 0.0) & (right >= 0.0), 0, sides)
+    return np.where(point.kink, sides, point.side)
+
+
+class _Oracle:
+    """The caller's function with a counter; turns unknowns into points and refuses what is not finite."""
+
+    def __init__(self, problem: _Problem) -> None:
+        self.problem = problem
+        self.evaluations = 0
+
+    def sample(self, theta: FloatArray, side: int) -> _Sample | None:
+        """Evaluate once; None if the cost or a derivative that is needed is not finite."""
+        self.evaluations += 1
+        value = self.problem.evaluate(theta.copy(), side)
+        d = theta.size
+        gradient = np.asarray(value.gradient, dtype=float).reshape(d)
+        hessian = np.full((d, d), np.nan)
+        if value.hessian is not None:
+            hessian = np.asarray(value.hessian, dtype=float).reshape(d, d)
+        if not (np.isfinite(value.cost) and np.isfinite(gradient).all()):
+            return None
+        if self.problem.uses_hessian and not np.isfinite(hessian).all():
+            return None
+        return _Sample(float(value.cost), gradient, 0.5 * (hessian + hessian.T))
+
+    def first(self, theta: FloatArray) -> _Sample | None:
+        """The evaluation that suffices to judge the cost."""
+        kink, side = self._sides(theta)
+        return self.sample(theta, -1 if not kink.any() and (side < 0).any() else 1)
+
+    def complete(self, theta: FloatArray, first: _Sample, scale: FloatArray) -> _Point | None:
+        """The point: the other side is evaluated only if some coordinate is on a breakpoint and has room there."""
+        kink, side = self._sides(theta)
+        plus = minus = first
+        if kink.any() or ((side < 0).any() and (side > 0).any()):
+            other = self.sample(theta, -1)
+            if other is None:
+                return None
+            minus = other
+        active = np.flatnonzero(
+            self.problem.constraints.slack(theta) <= self.problem.constraints.rounding(np.maximum(scale, np.abs(theta)))
+        )
+        point = _Point(theta, plus, minus, kink, side, active, np.inf, np.zeros(self.problem.normals.shape[0]))
+        return self._judge(point)
+
+    def point(self, theta: FloatArray, scale: FloatArray) -> _Point | None:
+        first = self.first(theta)
+        return None if first is None else self.complete(theta, first, scale)
+
+    def _sides(self, theta: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.int_]]:
+        constraints = self.problem.constraints
+        on = np.array([np.any(points == x) for points, x in zip(self.problem.breakpoints, theta, strict=True)], bool)
+        left, right = theta > constraints.lower, theta < constraints.upper
+        side = np.where(on & right & ~left, 1, np.where(on & left & ~right, -1, 0))
+        return on & left & right, side
+
+    def _judge(self, point: _Point) -> _Point:
+        """KKT residual and multipliers; the convex kinks contribute an interval of derivatives."""
+        left, right = point.minus.gradient, point.plus.gradient
+        gradient, _ = point.derivatives(_steepest_sides(point))
+        interval = point.kink & (left < right)
+        low, high = np.where(interval, left, gradient), np.where(interval, right, gradient)
+        residual, values = kkt_residual(low, high, self.problem.normals[point.active])
+        multipliers = np.zeros(self.problem.normals.shape[0])
+        multipliers[point.active] = values
+        return replace(point, optimality=residual, multipliers=multipliers)
+
+
+# --- the state and one step -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    point: _Point
+    iteration: int = 0
+    step_length: float = 0.0  # of the last iteration
+    metric: float = 1.0  # steepest descent: B = I / metric
+    settled: int = 0  # iterations since the optimality fell below the tolerance
+    scale: FloatArray = field(default_factory=lambda: np.zeros(0))  # largest |theta_i| seen
+    cost_scale: float = 0.0  # largest |J| seen
+    gradient_scale: float = 0.0  # largest derivative seen
+    lowest_cost: float = np.inf
+    status: Status | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Direction:
+    """Step d of the quadratic programme with its slope gᵀd and its predicted reduction −(gᵀd + ½dᵀBd)."""
+
+    step: FloatArray
+    slope: float
+    reduction: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Accepted:
+    point: _Point
+    step_length: float
+
+
+def _step(oracle: _Oracle, state: _State) -> _State:
+    """One iteration: the next state, or the same point with a status."""
+    problem = oracle.problem
+    direction = _direction(problem, state, problem.constraints.lower, problem.constraints.upper)
+    if _is_settled(problem, state, direction):
+        return _finish(oracle, state, Status.CONVERGED)
+    if state.iteration >= problem.max_iterations:
+        return replace(state, status=Status.MAX_ITERATIONS)
+    accepted = _search(oracle, state, direction)
+    if accepted is None:
+        return _stalled(oracle, state, direction)
+    return _advance(problem, state, accepted)
+
+
+def _advance(problem: _Problem, state: _State, accepted: _Accepted) -> _State:
+    """The state after an accepted step."""
+    point, alpha = accepted.point, accepted.step_length
+    gradient = max(np.max(np.abs(point.plus.gradient)), np.max(np.abs(point.minus.gradient)))
+    return replace(
+        state,
+        point=point,
+        iteration=state.iteration + 1,
+        step_length=alpha,
+        metric=state.metric * (2.0 if alpha >= 1.0 else alpha),
+        settled=state.settled + 1 if point.optimality < problem.tolerance else 0,
+        scale=np.maximum(state.scale, np.abs(point.theta)),
+        cost_scale=max(state.cost_scale, abs(point.cost)),
+        gradient_scale=max(state.gradient_scale, float(gradient)),
+        lowest_cost=min(state.lowest_cost, point.cost),
+    )
+
+
+def _is_settled(problem: _Problem, state: _State, direction: _Direction) -> bool:
+    """Optimality below the tolerance and, since J may be badly scaled, the next step negligible as well."""
+    if not state.point.optimality < problem.tolerance:
+        return False
+    if not problem.uses_hessian or state.settled >= EXTRA_ITERATIONS:
+        return True
+    negligible_step = np.all(np.abs(direction.step) <= 1e-8 * state.scale)
+    return bool(negligible_step or direction.reduction <= 1e-10 * abs(state.point.cost))
+
+
+def _stalled(oracle: _Oracle, state: _State, direction: _Direction) -> _State:
+    """The line search found nothing: tell convergence and the limit of precision from failure."""
+    if state.point.optimality < oracle.problem.tolerance:
+        return _finish(oracle, state, Status.CONVERGED)
+    floor = state.gradient_scale
+    if oracle.problem.uses_hessian:
+        floor = max(floor, float(np.max(np.abs(state.point.plus.hessian) @ state.scale)))
+    below_rounding = direction.reduction <= 10 * NOISE * state.cost_scale
+    if below_rounding and state.point.optimality <= 1e5 * EPS * floor:
+        return _finish(oracle, state, Status.CONVERGED_PRECISION)
+    return replace(state, status=Status.LINE_SEARCH_FAILED)
+
+
+def _finish(oracle: _Oracle, state: _State, status: Status) -> _State:
+    """At a KKT point: leave a saddle if possible, otherwise classify the point by its free curvature."""
+    problem = oracle.problem
+    if problem.uses_hessian or np.isfinite(state.point.plus.hessian).all():
+        accepted = _escape(oracle, state) if state.iteration < problem.max_iterations else None
+        if accepted is not None:
+            return _advance(problem, state, accepted)
+        curvature = _curvature(problem, state, state.point.active)
+        if curvature.smallest < NEGATIVE_CURVATURE:
+            return replace(state, status=Status.SADDLE)
+        if curvature.smallest <= EIGENVALUE_FLOOR:
+            return replace(state, status=Status.SINGULAR)
+    return replace(state, status=Status.CONVERGED_AT_KINK if _genuine_kinks(state).any() else status)
+
+
+# --- direction --------------------------------------------------------------------------------------------------------
+
+
+def _direction(
+    problem: _Problem, state: _State, low: FloatArray, high: FloatArray
+) -> _Direction:
+    """Step of the quadratic programme between low and high, with the best sides for coordinates on a kink.
+
+    A coordinate on a kink is held (0) or confined to one side (+1, -1). Afterwards the force that holds it follows
+    from the programme's multipliers; where it is outside [g₋, g₊] that coordinate, the worst one first, is released
+    to the other side, and the programme is solved again. No combination is tried twice.
+    """
+    sides = _steepest_sides(state.point)
+    tried = set()
+    best: _Direction | None = None
+    for _ in range(2 * int(state.point.kink.sum()) + 4):
+        tried.add(sides.tobytes())
+        direction, force = _solve_on_sides(problem, state, sides, low, high)
+        if best is None or direction.reduction > best.reduction:
+            best = direction
+        sides = _released(state.point, sides, direction.step, force)
+        if sides.tobytes() in tried:
+            break
+    return best
+
+
+def _released(
+    point: _Point, sides: NDArray[np.int_], step: FloatArray, force: FloatArray
+) -> NDArray[np.int_]:
+    """Sides with the coordinate released that is held at its kink by the largest force outside [g₋, g₊]."""
+    left, right = point.minus.gradient, point.plus.gradient
+    tolerance = 1e-13 * (np.abs(left) + np.abs(right))
+    pinned = point.kink & (step == 0.0)
+    to_right = np.where(pinned & (sides <= 0), force - right - tolerance, -np.inf)
+    to_left = np.where(pinned & (sides >= 0), left - force - tolerance, -np.inf)
+    worst = int(np.argmax(np.maximum(to_right, to_left)))
+    if max(to_right[worst], to_left[worst]) <= 0.0:
+        return sides
+    changed = sides.copy()
+    changed[worst] = 1 if to_right[worst] > to_left[worst] else -1
+    return changed
+
+
+def _solve_on_sides(
+    problem: _Problem, state: _State, sides: NDArray[np.int_], low: FloatArray, high: FloatArray
+) -> tuple[_Direction, FloatArray]:
+    """The quadratic programme with kinks held or confined as `sides` say, and the force on each coordinate.
+
+    The force is Aᵀ lam − B d: at a coordinate that does not move, the derivative that would balance the others.
+    """
+    point, constraints = state.point, problem.constraints
+    gradient, hessian = point.derivatives(sides)
+    held = point.kink & (sides == 0)
+    free = ~held & (constraints.lower < constraints.upper)
+    matrix = _model_matrix(problem, state, hessian, free)
+    lower, upper = np.minimum(low - point.theta, 0.0), np.maximum(high - point.theta, 0.0)
+    lower[point.kink & (sides > 0)] = 0.0
+    upper[point.kink & (sides < 0)] = 0.0
+    m, k = constraints.b.size, int(free.sum())
+    rows = np.vstack([constraints.A[:, free], np.eye(k), -np.eye(k)])
+    slack = np.maximum(constraints.A @ point.theta - constraints.b, 0.0)
+    slack[np.isin(np.arange(m), point.active)] = 0.0
+    offsets = -np.concatenate([slack, -lower[free], upper[free]])
+    solution = solve_qp(gradient[free], matrix[np.ix_(free, free)], rows, offsets)
+    step = np.zeros(point.theta.size)
+    step[free] = np.clip(solution.step, lower[free], upper[free])
+    slope, curved = float(gradient @ step), matrix @ step
+    force = constraints.A.T @ solution.multipliers[:m] - curved
+    return _Direction(step, slope, -(slope + 0.5 * float(step @ curved))), force
+
+
+def _model_matrix(
+    problem: _Problem, state: _State, hessian: FloatArray, free: NDArray[np.bool_]
+) -> FloatArray:
+    """The matrix B of the quadratic programme: positive definite on the free coordinates, H elsewhere."""
+    d = free.size
+    if not problem.uses_hessian:
+        return np.eye(d) / state.metric
+    matrix = (hessian if problem.mask is None else hessian * problem.mask).copy()
+    if free.any():
+        block = np.ix_(free, free)
+        pressed = problem.normals[state.point.multipliers > 0.0][:, free]
+        matrix[block] = convexify(matrix[block], pressed, _flatness(state)[free])
+    return matrix
+
+
+def _flatness(state: _State) -> FloatArray:
+    """Diagonal Hessian entries so small that changing the unknown by its own size changes J by rounding only."""
+    square = state.scale**2
+    return np.where(square > 0.0, EPS * state.cost_scale / np.where(square > 0.0, square, 1.0), 0.0)
+
+
+# --- line search ------------------------------------------------------------------------------------------------------
+
+
+def _search(oracle: _Oracle, state: _State, direction: _Direction) -> _Accepted | None:
+    """A step that decreases J: across breakpoints if that works, otherwise inside the present smooth piece."""
+    breakpoints = oracle.problem.breakpoints
+    theta = state.point.theta
+    alpha = 1.0
+    crossed = _crossings(breakpoints, theta, direction.step)
+    while crossed > 0:
+        accepted = _attempt(oracle, state, direction, alpha, ARMIJO_ACROSS)
+        if accepted is not None:
+            return accepted
+        alpha *= 0.5
+        crossed = _crossings(breakpoints, theta, alpha * direction.step)
+        if crossed < MANY_BREAKPOINTS:
+            low, high = _piece(oracle.problem, theta)
+            direction = _direction(oracle.problem, state, low, high)
+            break
+    return _backtrack(oracle, state, direction)
+
+
+def _crossings(breakpoints: tuple[FloatArray, ...], theta: FloatArray, step: FloatArray) -> int:
+    """Largest number of breakpoints that a coordinate passes strictly inside the step."""
+    ends = np.sort(np.stack([theta, theta + step]), axis=0)
+    counts = [
+        int(np.searchsorted(points, b, "left") - np.searchsorted(points, a, "right"))
+        for points, a, b in zip(breakpoints, ends[0], ends[1], strict=True)
+    ]
+    return max(counts, default=0)
+
+
+def _piece(problem: _Problem, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The smooth piece around theta: bounds tightened to the next breakpoint on either side."""
+    low, high = problem.constraints.lower.copy(), problem.constraints.upper.copy()
+    for i, (points, x) in enumerate(zip(problem.breakpoints, theta, strict=True)):
+        below, above = np.searchsorted(points, x, "left"), np.searchsorted(points, x, "right")
+        if below > 0:
+            low[i] = max(low[i], points[below - 1])
+        if above < points.size:
+            high[i] = min(high[i], points[above])
+    return low, high
+
+
+def _backtrack(oracle: _Oracle, state: _State, direction: _Direction) -> _Accepted | None:
+    """Armijo backtracking from the full step ([1]_, algorithm 3.1)."""
+    alpha = 1.0
+    for k in range(MAX_BACKTRACKS):
+        accepted = _attempt(oracle, state, direction, alpha, ARMIJO)
+        if accepted is not None:
+            return accepted
+        alpha *= 0.5 if k < 5 else 0.25
+        if k > 5 and alpha * -direction.slope < 0.01 * NOISE * abs(state.point.cost):
+            break
+    return _blind_step(oracle, state, direction)
+
+
+def _attempt(
+    oracle: _Oracle, state: _State, direction: _Direction, alpha: float, fraction: float
+) -> _Accepted | None:
+    """The point at step length alpha if it is acceptable.
+
+    Where the predicted decrease is below the rounding error of J, comparing costs says nothing ([2]_): then a
+    smaller KKT residual counts, or a cost below every earlier one.
+    """
+    point = state.point
+    theta = _move(oracle.problem, point.theta, alpha * direction.step)
+    if np.array_equal(theta, point.theta):
+        return None
+    first = oracle.first(theta)
+    noise = NOISE * abs(point.cost)
+    decrease = -alpha * direction.slope
+    if first is None or first.cost > state.lowest_cost + noise:
+        return None
+    if decrease > noise and first.cost > point.cost - fraction * decrease:
+        return None
+    trial = oracle.complete(theta, first, state.scale)
+    if trial is None:
+        return None
+    if decrease <= noise and trial.optimality >= point.optimality and trial.cost >= state.lowest_cost:
+        return None
+    return _Accepted(trial, alpha)
+
+
+def _blind_step(oracle: _Oracle, state: _State, direction: _Direction) -> _Accepted | None:
+    """The full step on the word of the derivatives, where J is a small difference of large terms.
+
+    The rounding error of such a J is that of the largest cost seen, not of J; the KKT residual has to halve.
+    """
+    noise = NOISE * state.cost_scale
+    if direction.reduction > noise:
+        return None
+    theta = _move(oracle.problem, state.point.theta, direction.step)
+    trial = oracle.point(theta, state.scale)
+    if trial is None or trial.cost > state.lowest_cost + noise or trial.optimality > 0.5 * state.point.optimality:
+        return None
+    return _Accepted(trial, 1.0)
+
+
+def _move(problem: _Problem, theta: FloatArray, step: FloatArray) -> FloatArray:
+    """theta + step, feasible, and bit for bit on a bound or breakpoint that it reaches up to rounding."""
+    constraints = problem.constraints
+    moved = np.clip(theta + step, constraints.lower, constraints.upper)
+    pinned = np.zeros(theta.size, dtype=bool)
+    for i, points in enumerate(problem.breakpoints):
+        if step[i] == 0.0:
+            pinned[i] = moved[i] == constraints.lower[i] or moved[i] == constraints.upper[i] or moved[i] in points
+            continue
+        near = 8 * EPS * max(abs(theta[i]), abs(step[i]), abs(moved[i]))
+        marks = np.concatenate([[constraints.lower[i], constraints.upper[i]], points])
+        nearest = int(np.argmin(np.abs(marks - moved[i])))
+        if abs(marks[nearest] - moved[i]) <= near:
+            moved[i] = marks[nearest]
+            pinned[i] = True
+    return _repair(constraints, moved, pinned)
+
+
+def _repair(constraints: LinearConstraints, theta: FloatArray, pinned: NDArray[np.bool_]) -> FloatArray:
+    """Remove violations of the rows that are due to rounding, leaving pinned coordinates where they are."""
+    theta = theta.copy()
+    for k in range(6):
+        violation = constraints.b - constraints.A @ theta
+        for row in np.flatnonzero(violation > 0.0):
+            normal = np.where(pinned, 0.0, constraints.A[row])
+            square = float(normal @ normal)
+            if square > 0.0:
+                # Growing a little with each round: half an ulp added to a number leaves it as it was.
+                theta += normal * (violation[row] * 1.5**k / square)
+        if not np.any(violation > 0.0):
+            break
+    return np.clip(theta, constraints.lower, constraints.upper)
+
+
+# --- curvature and classification -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Curvature:
+    """Hessian on the free directions: orthonormal basis, scaled and unscaled eigenvalues, the lowest direction."""
+
+    basis: FloatArray
+    eigenvalues: FloatArray
+    unscaled: FloatArray
+    lowest: FloatArray  # of unit length in theta
+
+    @property
+    def smallest(self) -> float:
+        """Smallest scaled eigenvalue; infinite on no directions, NaN where there is no Hessian."""
+        return float(self.eigenvalues[0]) if self.eigenvalues.size else np.inf
+
+
+def _genuine_kinks(state: _State) -> NDArray[np.bool_]:
+    """Coordinates on a breakpoint whose derivative really jumps upwards there."""
+    jump = state.point.plus.gradient - state.point.minus.gradient
+    return np.asarray(state.point.kink & (jump > 1e-12 * state.gradient_scale))
+
+
+def _curvature(problem: _Problem, state: _State, rows: NDArray[np.intp]) -> _Curvature:
+    """Curvature of J, unmodified, in the null space of the given constraints and off the kinks."""
+    point = state.point
+    d = point.theta.size
+    free = np.flatnonzero(~_genuine_kinks(state) & (problem.constraints.lower < problem.constraints.upper))
+    normals = problem.normals[rows][:, free]
+    basis = np.zeros((d, 0)) if free.size == 0 else np.eye(d)[:, free] @ split_space(normals)[0]
+    _, hessian = point.derivatives(_reported_sides(point))
+    count = basis.shape[1]
+    if count == 0 or not np.isfinite(hessian).all():
+        nothing = np.full(count, np.nan)
+        return _Curvature(basis, nothing, nothing, np.zeros(d))
+    block = hessian[np.ix_(free, free)]
+    scaling = diagonal_scaling(block, _flatness(state)[free])
+    null = split_space(normals / scaling)[0]
+    values, vectors = np.linalg.eigh(null.T @ (block / np.outer(scaling, scaling)) @ null)
+    lowest = np.zeros(d)
+    lowest[free] = null @ vectors[:, 0] / scaling
+    unscaled = np.linalg.eigvalsh(basis.T @ hessian @ basis)
+    return _Curvature(basis, values, unscaled, lowest / np.linalg.norm(lowest))
+
+
+def _reported_sides(point: _Point) -> NDArray[np.int_]:
+    """The right-hand side for every coordinate on a breakpoint that has one."""
+    return np.where(point.kink, 1, point.side)
+
+
+def _escape(oracle: _Oracle, state: _State) -> _Accepted | None:
+    """A step along negative curvature: on the face of the pressing constraints first, then of all active ones."""
+    problem = oracle.problem
+    pressing = np.flatnonzero(state.point.multipliers > max(problem.tolerance, 1e-10 * state.gradient_scale))
+    for rows in (pressing, state.point.active):
+        curvature = _curvature(problem, state, rows)
+        if not curvature.smallest < NEGATIVE_CURVATURE:
+            continue
+        for ray in (curvature.lowest, -curvature.lowest):
+            accepted = _descend_along(oracle, state, ray)
+            if accepted is not None:
+                return accepted
+    return None
+
+
+def _descend_along(oracle: _Oracle, state: _State, ray: FloatArray) -> _Accepted | None:
+    """Backtracking on the quadratic decrease ½ t² rayᵀH ray, starting at a tenth of the size of the unknowns."""
+    problem, point = oracle.problem, state.point
+    _, hessian = point.derivatives(_reported_sides(point))
+    bending = float(ray @ hessian @ ray)
+    sized = state.scale > 0.0
+    relative = float(np.max(np.abs(ray[sized]) / state.scale[sized], initial=0.0))
+    length = 0.1 / relative if relative > 0.0 else 0.1 / float(np.max(np.abs(ray)))
+    slope = problem.normals @ ray
+    slack = np.maximum(problem.constraints.slack(point.theta), 0.0)
+    slack[point.active] = 0.0
+    approaching = slope < -1e-12 * np.linalg.norm(problem.normals, axis=1)
+    length = min(length, float(np.min(slack[approaching] / -slope[approaching], initial=np.inf)))
+    for _ in range(40):
+        decrease = -0.5 * bending * length**2
+        if decrease <= NOISE * abs(point.cost) or length == 0.0:
+            return None
+        theta = _move(problem, point.theta, length * ray)
+        first = oracle.first(theta)
+        if first is not None and first.cost < point.cost - ARMIJO * decrease:
+            trial = oracle.complete(theta, first, state.scale)
+            if trial is not None:
+                return _Accepted(trial, length)
+        length *= 0.5
+    return None
+
+
+# --- the driver -------------------------------------------------------------------------------------------------------
+
+
+def minimize(
+    evaluate: Evaluate,
+    theta0: ArrayLike,
+    *,
+    constraints: LinearConstraints,
+    breakpoints: Sequence[ArrayLike] | None = None,
+    hessian: HessianKind = "exact",
+    blocks: ArrayLike | None = None,
+    tolerance: float = 1e-7,
+    max_iterations: int = 200,
+    callback: Callback | None = None,
+) -> Result:
+    """Minimise a piecewise smooth cost under linear constraints; every iterate is feasible.
+
+    Parameters
+    ----------
+    evaluate : callable
+        ``evaluate(theta, side)`` returns cost, gradient, shape (d,), and Hessian, shape (d, d). `side` is +1 or -1:
+        which one-sided derivatives to return for coordinates that sit exactly on a breakpoint. A cost or derivative
+        that is not finite marks a point as unacceptable.
+    theta0 : array, shape (d,)
+        Start, feasible up to rounding.
+    constraints : LinearConstraints
+        ``A theta >= b`` and bounds.
+    breakpoints : sequence of d arrays, optional
+        Sorted values of each coordinate where the derivatives of J may jump. None: J is smooth.
+    hessian : {"exact", "block-diagonal", "gauss-newton", "none"}
+        What stands in the quadratic programme: the Hessian as evaluated, made positive definite where needed; the
+        same without the entries between different `blocks`; the same again, for a caller whose `evaluate` returns
+        Gauss-Newton's matrix; or nothing (steepest descent in the metric of theta, as in the paper).
+    blocks : array of int, shape (d,), optional
+        Label of each coordinate, for "block-diagonal".
+    tolerance : float
+        Bound on the KKT residual. Unless `hessian` is "none", the next step has to be negligible too: a predicted
+        reduction of at most 1e-10 of the cost, or at most 1e-8 of each unknown.
+    max_iterations : int
+    callback : callable, optional
+        Gets an `IterationRecord` after every iteration; a true return value stops with ``INTERRUPTED``.
+
+    Returns
+    -------
+    Result
+        Also after a KeyboardInterrupt, raised anywhere but in the evaluation of the start: the best point so far.
+
+    Raises
+    ------
+    ValueError
+        If shapes or settings are wrong, or the start is infeasible.
+
+    Notes
+    -----
+    One iteration costs one evaluation and a quadratic programme, and one more evaluation if a coordinate is on a
+    breakpoint. The rate is quadratic with the exact Hessian if the second-order sufficient conditions hold.
+    """
+    start = np.atleast_1d(np.asarray(theta0, dtype=float)).copy()
+    problem = _make_problem(evaluate, start, constraints, breakpoints, hessian, blocks, tolerance, max_iterations)
+    theta = _feasible_start(problem, start)
+    oracle = _Oracle(problem)
+    point = oracle.point(theta, np.abs(theta))
+    if point is None:
+        return _nonfinite_start(oracle, theta)
+    state = _initial_state(point)
+    history = [_record(oracle, state)]
+    try:
+        while state.status is None:
+            before = state.iteration
+            state = _step(oracle, state)
+            if state.iteration > before:
+                history.append(_record(oracle, state))
+                if callback is not None and callback(history[-1]):
+                    state = replace(state, status=Status.INTERRUPTED)
+    except KeyboardInterrupt:
+        state = replace(state, status=Status.INTERRUPTED)
+    return _result(oracle, state, state.status or Status.INTERRUPTED, tuple(history))
+
+
+def _make_problem(
+    evaluate: Evaluate,
+    theta: FloatArray,
+    constraints: LinearConstraints,
+    breakpoints: Sequence[ArrayLike] | None,
+    hessian: HessianKind,
+    blocks: ArrayLike | None,
+    tolerance: float,
+    max_iterations: int,
+) -> _Problem:
+    """The problem with all settings checked."""
+    d = constraints.size
+    if theta.shape != (d,):
+        raise ValueError(f"theta0 has shape {theta.shape}, the constraints expect ({d},)")
+    if d == 0:
+        raise ValueError("there is nothing to minimise over: theta0 is empty")
+    if hessian not in get_args(HessianKind):
+        raise ValueError(f"hessian is {hessian!r}; choose one of {', '.join(get_args(HessianKind))}")
+    if not tolerance >= 0.0 or max_iterations < 0:
+        raise ValueError(f"tolerance {tolerance} and max_iterations {max_iterations} must not be negative")
+    normals = constraints.normals
+    points = _checked_breakpoints(breakpoints, d)
+    return _Problem(evaluate, constraints, normals, points, hessian, _mask(hessian, blocks, d), tolerance, max_iterations)
+
+
+def _checked_breakpoints(breakpoints: Sequence[ArrayLike] | None, d: int) -> tuple[FloatArray, ...]:
+    given: Sequence[ArrayLike] = [()] * d if breakpoints is None else breakpoints
+    if len(given) != d:
+        raise ValueError(f"got breakpoints for {len(given)} coordinates, expected {d}; give an empty array for none")
+    arrays = tuple(np.asarray(points, dtype=float).reshape(-1) for points in given)
+    for i, points in enumerate(arrays):
+        if not (np.isfinite(points).all() and np.all(np.diff(points) > 0.0)):
+            raise ValueError(f"the breakpoints of coordinate {i} must be finite and strictly increasing; use np.unique")
+    return arrays
+
+
+def _mask(hessian: HessianKind, blocks: ArrayLike | None, d: int) -> FloatArray | None:
+    """1 where two coordinates carry the same label, 0 elsewhere; None unless the Hessian is to be cut into blocks."""
+    if hessian != "block-diagonal":
+        return None
+    labels = np.asarray(blocks)
+    if blocks is None or labels.shape != (d,):
+        raise ValueError(f"hessian='block-diagonal' needs blocks, an integer label for each of the {d} coordinates")
+    return (labels[:, None] == labels[None, :]).astype(float)
+
+
+def _feasible_start(problem: _Problem, theta: FloatArray) -> FloatArray:
+    """The start with violations of the size of rounding removed."""
+    constraints = problem.constraints
+    if not np.isfinite(theta).all():
+        raise ValueError(f"theta0 is not finite: {theta}")
+    slack = constraints.slack(theta)
+    bounds = np.concatenate([constraints.lower, constraints.upper])
+    size = np.concatenate(
+        [np.abs(constraints.b) + np.abs(constraints.A) @ np.abs(theta), np.where(np.isfinite(bounds), np.abs(bounds), 0)]
+    )
+    violated = np.flatnonzero(slack < -1e-12 * (size + np.finfo(float).tiny))
+    if violated.size:
+        worst = [f"{constraints.names[i]} (by {-slack[i]:.3g})" for i in violated[:5]]
+        raise ValueError(f"theta0 violates {', '.join(worst)}; start at a feasible point")
+    return _move(problem, theta, np.zeros_like(theta))
+
+
+def _initial_state(point: _Point) -> _State:
+    gradient = max(np.max(np.abs(point.plus.gradient)), np.max(np.abs(point.minus.gradient)))
+    return _State(
+        point=point,
+        metric=1.0 / max(1.0, point.optimality),
+        scale=np.abs(point.theta),
+        cost_scale=abs(point.cost),
+        gradient_scale=float(gradient),
+        lowest_cost=point.cost,
+    )
+
+
+def _record(oracle: _Oracle, state: _State) -> IterationRecord:
+    point = state.point
+    return IterationRecord(
+        iteration=state.iteration,
+        cost=point.cost,
+        optimality=point.optimality,
+        step_length=state.step_length,
+        theta=point.theta.copy(),
+        evaluations=oracle.evaluations,
+    )
+
+
+def _result(oracle: _Oracle, state: _State, status: Status, history: tuple[IterationRecord, ...]) -> Result:
+    """The result at the state's point."""
+    problem, point = oracle.problem, state.point
+    gradient, hessian = point.derivatives(_reported_sides(point))
+    curvature = _curvature(problem, state, point.active)
+    held = np.flatnonzero(_genuine_kinks(state))
+    return Result(
+        theta=point.theta,
+        cost=point.cost,
+        gradient=gradient,
+        hessian=hessian,
+        optimality=point.optimality,
+        iterations=state.iteration,
+        evaluations=oracle.evaluations,
+        status=status,
+        active=tuple(problem.constraints.names[i] for i in point.active),
+        multipliers=point.multipliers,
+        kinks=tuple((int(i), float(point.minus.gradient[i]), float(point.plus.gradient[i])) for i in held),
+        free_basis=curvature.basis,
+        free_eigenvalues=curvature.eigenvalues,
+        smallest_eigenvalue=float(curvature.eigenvalues[0]) if curvature.eigenvalues.size else np.nan,
+        smallest_unscaled_eigenvalue=float(curvature.unscaled[0]) if curvature.unscaled.size else np.nan,
+        flat_direction=curvature.lowest,
+        tolerance=problem.tolerance,
+        history=history,
+    )
+
+
+def _nonfinite_start(oracle: _Oracle, theta: FloatArray) -> Result:
+    """A result without numbers."""
+    d = theta.size
+    return Result(
+        theta=theta,
+        cost=np.nan,
+        gradient=np.full(d, np.nan),
+        hessian=np.full((d, d), np.nan),
+        optimality=np.nan,
+        iterations=0,
+        evaluations=oracle.evaluations,
+        status=Status.NONFINITE_START,
+        active=(),
+        multipliers=np.zeros(oracle.problem.normals.shape[0]),
+        kinks=(),
+        free_basis=np.zeros((d, 0)),
+        free_eigenvalues=np.zeros(0),
+        smallest_eigenvalue=np.nan,
+        smallest_unscaled_eigenvalue=np.nan,
+        flat_direction=np.zeros(d),
+        tolerance=oracle.problem.tolerance,
+        history=(),
+    )

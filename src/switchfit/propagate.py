@@ -1,0 +1,126 @@
+"""The forward pass as JAX functions: states at all rows of the mesh, and the cost of the discretised system."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from switchfit.mesh import CHUNK, Rows, row_ending_cell, rows
+from switchfit.model import Model, Piece
+from switchfit.rungekutta import step
+
+Array = jax.Array
+
+
+class Path(NamedTuple):
+    """One simulation: rows in the layout of `switchfit.mesh.Rows`, Q chunks of C.
+
+    Attributes
+    ----------
+    layout : Rows
+    pieces : Piece with origin (Q, C) and coefficients (Q, C, 4, S)
+    before, after : (Q, C, n), state at the start and at the end of each row
+    """
+
+    layout: Rows
+    pieces: Piece
+    before: Array
+    after: Array
+
+    def before_transition(self, i: Array | int) -> Array:
+        """x(tau_i-), the state before the reset map of transition i (from 0): (n,)."""
+        return self.after[self.layout.first_chunk[jnp.asarray(i) + 1] - 1, -1]
+
+    def at_samples(self, cell: Array) -> Array:
+        """State at the ends of the given cells (K,), the one before a jump: (K, n)."""
+        return at_cells(self.layout, self.before[0, 0], self.after, cell)
+
+
+def at_cells(layout: Rows, first: Array, after: Array, cell: Array) -> Array:
+    """Pick from values (Q, C, ...) at the ends of rows those at the ends of cells (K,); `first` for cell -1."""
+    flat = jnp.concatenate([first[None], after.reshape((-1,) + after.shape[2:])])
+    return flat[row_ending_cell(layout, cell) + 1]
+
+
+def by_mode(model: Model, segment: Array, branch: Callable[[int], Callable[..., Any]], *operands: Any) -> Any:
+    """Call ``branch(mode)(*operands)`` for the mode that is active in a segment, compiling only what is needed."""
+    sequence = jnp.asarray(model.structure.mode_of_segment)
+    count = len(model.structure.modes)
+    if count == 1:
+        return branch(0)(*operands)
+    return lax.switch(sequence[segment], [branch(mode) for mode in range(count)], *operands)
+
+
+def propagate(model: Model, tau: Array, p: Array, side: Array) -> Path:
+    """Integrate from t0 to tf: equation (1), with reset maps at the transitions."""
+    layout = rows(model.arguments.nodes, tau, side)
+    pieces = Piece(model.arguments.nodes[layout.cell], model.arguments.signals[layout.cell])
+
+    def through(mode: int) -> Callable[..., tuple[Array, Array]]:
+        def row(x: Array, given: tuple[Array, Array, Piece]) -> tuple[Array, Array]:
+            start, end, piece = given
+            after, _ = step(model.tableau, model.field(mode, piece), None, start, end, x, p)
+            return after, x
+
+        return lambda x, start, end, piece: lax.scan(row, x, (start, end, piece))
+
+    def chunk(x: Array, given: tuple[Array, Array, Array, Array, Piece]) -> tuple[Array, tuple[Array, Array]]:
+        segment, opens, start, end, piece = given
+        x = apply_reset(model, tau, x, p, segment, opens)
+        x, before = by_mode(model, segment, through, x, start, end, piece)
+        return x, (before, jnp.concatenate([before[1:], x[None]]))
+
+    given = (layout.segment, layout.opens, layout.start, layout.end, pieces)
+    _, (before, after) = lax.scan(chunk, model.initial_state(p), given)
+    return Path(layout, pieces, before, after)
+
+
+def apply_reset(model: Model, tau: Array, x: Array, p: Array, segment: Array, opens: Array) -> Array:
+    """``x(tau+) = R(tau, x(tau-), p)`` where a chunk opens a segment whose transition has a reset map."""
+    resets = model.structure.resets
+    if not resets:
+        return x
+    which = jnp.zeros(model.structure.N + 1, dtype=int).at[jnp.array(resets) + 1].set(jnp.arange(1, len(resets) + 1))
+    branches = [lambda t, x: x] + [lambda t, x, i=i: model.reset(i)(t, x, p) for i in resets]
+    times = jnp.concatenate([tau[:1], tau])
+    return lax.switch(jnp.where(opens, which[segment], 0), branches, times[segment], x)
+
+
+def path_cost(model: Model, path: Path, p: Array) -> Array:
+    """The cost J of the discretised system: running costs, samples and terminal costs."""
+    return running_cost(model, path, p).sum() + sample_costs(model, path, p) + model.terminal(path.after[-1, -1], p)
+
+
+def running_cost(model: Model, path: Path, p: Array) -> Array:
+    """Integral of the running costs over each row: (Q, C)."""
+    layout = path.layout
+    if model.density(Piece(layout.start, path.pieces.coefficients)) is None:
+        return jnp.zeros(layout.start.shape)
+
+    def of_mode(mode: int) -> Callable[..., Array]:
+        def row(start: Array, end: Array, piece: Piece, x: Array) -> Array:
+            return step(model.tableau, model.field(mode, piece), model.density(piece), start, end, x, p)[1]
+
+        return jax.vmap(row)
+
+    def chunk(given: tuple[Array, Array, Array, Piece, Array]) -> Array:
+        segment, start, end, piece, x = given
+        return by_mode(model, segment, of_mode, start, end, piece, x)
+
+    return lax.map(chunk, (layout.segment, layout.start, layout.end, path.pieces, path.before))
+
+
+def sample_costs(model: Model, path: Path, p: Array) -> Array:
+    """Sum of the costs of all discrete samples."""
+    total = jnp.zeros(())
+    for k, samples in enumerate(model.arguments.samples):
+        x = path.at_samples(samples.cell)
+        total = total + jax.vmap(lambda s, x, k=k: model.sample_cost(k, s, x, p))(samples, x).sum()
+    return total
+
+
+__all__ = ["CHUNK", "Path", "apply_reset", "at_cells", "by_mode", "path_cost", "propagate", "running_cost"]

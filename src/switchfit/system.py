@@ -1,0 +1,121 @@
+"""What is fitted: a hybrid system, that is named modes, reset maps between them, and an initial state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+VectorField = Callable[..., Any]
+"""``f(t, x, p) -> (n,)``, or ``f(t, x, p, u) -> (n,)`` in an experiment with inputs."""
+
+ResetMap = Callable[..., Any]
+"""``R(t, x, p) -> (n,)``: the state just after a transition from the state just before it."""
+
+InitialState = NDArray[np.float64] | Callable[[Mapping[str, Any]], Any]
+"""An ``(n,)`` array, or a function of the parameters that returns one."""
+
+
+@dataclass(frozen=True, eq=False)
+class HybridSystem:
+    """A switched system: in mode ``i`` the state obeys ``dx/dt = f_i(t, x, p)``, equation (1).
+
+    Parameters
+    ----------
+    modes : mapping of str to callable
+        Vector field of each mode by name: ``f(t, x, p) -> (n,)`` written with ``jax.numpy``. ``t`` is a
+        scalar (s), ``x`` an ``(n,)`` array and ``p`` a dict of arrays; all are float64. In an experiment
+        with inputs modes are called as ``f(t, x, p, u)``, ``u`` being a dict or an array as the
+        `switchfit.Input` was given.
+    initial_state : (n,) array_like, or callable ``p -> (n,)``
+        State at ``t0``; as a function of the parameters it is differentiated with them.
+    reset_maps : mapping of (str, str) to callable, optional
+        ``reset_maps[a, b]`` is applied at every transition from mode ``a`` to mode ``b``:
+        ``x(tau+) = R(tau, x(tau-), p)``. Transitions without an entry leave the state continuous.
+    state_names, state_units : sequence of str, optional
+        One for each state; they label reports and plots.
+
+    Raises
+    ------
+    ValueError
+        If a reset map names an unknown mode, or names, units and initial state differ in length.
+    TypeError
+        If a mode or a reset map is not callable.
+    """
+
+    modes: Mapping[str, VectorField]
+    initial_state: Any
+    reset_maps: Mapping[tuple[str, str], ResetMap] = field(default_factory=dict)
+    state_names: tuple[str, ...] | None = None
+    state_units: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.modes, Mapping) or not self.modes:
+            raise ValueError(f"modes must be a non-empty dict of name -> vector field; got {self.modes!r}.")
+        for name, mode in self.modes.items():
+            if not isinstance(name, str):
+                raise TypeError(f"mode names must be strings; got {name!r}.")
+            if not callable(mode):
+                raise TypeError(f"mode {name!r} must be a function f(t, x, p); got {type(mode).__name__}.")
+        _set(self, "modes", MappingProxyType(dict(self.modes)))
+        _set(self, "reset_maps", MappingProxyType(_checked_reset_maps(self.reset_maps, self.modes)))
+        if not callable(self.initial_state):
+            _set(self, "initial_state", as_state(self.initial_state, "initial_state"))
+        for label in ("state_names", "state_units"):
+            self._check_labels(label)
+
+    def _check_labels(self, label: str) -> None:
+        given = getattr(self, label)
+        if given is None:
+            return
+        if isinstance(given, str):
+            raise TypeError(f"{label} must be a sequence of strings, one for each state; got the string {given!r}.")
+        labels = tuple(str(g) for g in given)
+        _set(self, label, labels)
+        if not callable(self.initial_state) and len(labels) != self.initial_state.size:
+            raise ValueError(
+                f"{label} must have one entry for each of the {self.initial_state.size} states; "
+                f"got {len(labels)}: {labels}."
+            )
+
+    def reset_map(self, before: str, after: str) -> ResetMap | None:
+        """The map applied at a transition from mode `before` to mode `after`; None where x is continuous."""
+        return self.reset_maps.get((before, after))
+
+
+def as_state(value: ArrayLike, name: str) -> NDArray[np.float64]:
+    """`value` as a finite, read-only ``(n,)`` float64 array; ValueError naming `name` otherwise."""
+    try:
+        state = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be an array of numbers, one for each state; got {value!r}.") from error
+    if state.ndim != 1 or state.size == 0:
+        raise ValueError(f"{name} must have shape (n,), one entry for each state; got shape {state.shape}.")
+    if not np.all(np.isfinite(state)):
+        raise ValueError(f"{name} must be finite; got {state.tolist()}.")
+    state.flags.writeable = False
+    return state
+
+
+def _checked_reset_maps(
+    reset_maps: Mapping[tuple[str, str], ResetMap] | None, modes: Mapping[str, VectorField]
+) -> dict[tuple[str, str], ResetMap]:
+    checked = dict(reset_maps or {})
+    for key, reset in checked.items():
+        if not (isinstance(key, tuple) and len(key) == 2):
+            raise ValueError(f"reset_maps must have keys (mode before, mode after); got {key!r}.")
+        for mode in key:
+            if mode not in modes:
+                raise ValueError(f"reset_maps names the unknown mode {mode!r}; the modes are {', '.join(modes)}.")
+        if not callable(reset):
+            raise TypeError(f"reset map {key} must be a function R(t, x, p); got {type(reset).__name__}.")
+    return checked
+
+
+def _set(instance: object, name: str, value: object) -> None:
+    """Set a field of a frozen dataclass while it is being built."""
+    object.__setattr__(instance, name, value)

@@ -1,0 +1,195 @@
+"""The quadratic programme against its KKT conditions, and the algebra around it."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from switchfit.optimize import qp
+from switchfit.optimize.qp import (
+    LinearConstraints,
+    convexify,
+    diagonal_scaling,
+    kkt_residual,
+    solve_qp,
+    split_space,
+)
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def random_matrix(rng, d, condition):
+    """Positive definite matrix of the given condition number, with rows and columns rescaled over six decades."""
+    Q, _ = np.linalg.qr(rng.normal(size=(d, d)))
+    B = (Q * np.logspace(0.0, -np.log10(condition), d)) @ Q.T
+    scale = 10.0 ** rng.uniform(-3, 3, d)
+    B = scale[:, None] * (0.5 * (B + B.T)) * scale
+    return B, scale
+
+
+def assert_kkt(g, B, C, c, solution, rtol=1e-9):
+    """Stationarity, feasibility, signs and complementarity, in units of the unconstrained step."""
+    d, lam = solution.step, solution.multipliers
+    unit = np.sqrt(np.diag(B))
+    terms = np.max((np.abs(g) + np.abs(B) @ np.abs(d) + np.abs(C).T @ lam) / unit)
+    assert np.all(np.abs(g + B @ d - C.T @ lam) <= rtol * terms * unit)
+    length = np.sqrt(g @ np.linalg.solve(B, g))
+    finite = np.isfinite(c)
+    size = np.abs(C[finite]) @ (np.abs(d) + length / unit) + np.abs(c[finite])
+    gap = C[finite] @ d - c[finite]
+    assert np.all(gap >= -rtol * size)
+    assert np.all(lam >= 0.0)
+    assert np.all(lam[~finite] == 0.0)
+    active = lam[finite] > 0.0
+    assert np.all(np.abs(gap[active]) <= rtol * size[active])
+
+
+@settings(max_examples=150, deadline=None)
+@given(SEEDS, st.integers(1, 12), st.integers(0, 20), st.floats(0, 10))
+def test_kkt_conditions_hold(seed, d, k, log_condition):
+    rng = np.random.default_rng(seed)
+    B, scale = random_matrix(rng, d, 10.0**log_condition)
+    g = scale * rng.normal(size=d) * 10.0 ** rng.uniform(-8, 8)
+    C = rng.normal(size=(k, d)) * scale * 10.0 ** rng.uniform(-4, 4, (k, 1))
+    interior = np.abs(C @ np.linalg.solve(B, g)) * rng.uniform(0, 1, k)
+    c = -np.where(rng.uniform(size=k) < 0.3, 0.0, interior)
+    assert_kkt(g, B, C, c, solve_qp(g, B, C, c))
+
+
+@settings(max_examples=150, deadline=None)
+@given(SEEDS, st.integers(2, 8), st.floats(0, 6))
+def test_kkt_conditions_hold_for_duplicate_and_degenerate_constraints(seed, d, log_condition):
+    rng = np.random.default_rng(seed)
+    B, scale = random_matrix(rng, d, 10.0**log_condition)
+    g = scale * rng.normal(size=d)
+    base = rng.integers(-1, 2, size=(2 * d, d)).astype(float)
+    base = base[np.any(base != 0.0, axis=1)]
+    C = np.vstack([base, base * 3.0, base[:1] + base[-1:], np.zeros((1, d))]) * scale
+    c = np.zeros(C.shape[0])
+    assert_kkt(g, B, C, c, solve_qp(g, B, C, c), rtol=1e-8)
+
+
+@settings(max_examples=60, deadline=None)
+@given(SEEDS, st.integers(1, 8))
+def test_primal_active_set_agrees_with_lawson_hanson(seed, d):
+    rng = np.random.default_rng(seed)
+    q = rng.normal(size=d)
+    q /= np.linalg.norm(q)
+    G = rng.normal(size=(2 * d, d))
+    G /= np.linalg.norm(G, axis=1)[:, None]
+    c = -rng.uniform(0, 0.5, 2 * d) * (rng.uniform(size=2 * d) < 0.6)
+    first, _ = qp._least_distance(q, G, c)
+    second, _ = qp._polish(q, G, c, qp._primal_active_set(q, G, c))
+    np.testing.assert_allclose(first, second, atol=1e-10)
+
+
+def test_fallbacks_take_over_when_nonnegative_least_squares_fails(monkeypatch):
+    def failing(*args, **kwargs):
+        raise RuntimeError("Maximum number of iterations reached.")
+
+    monkeypatch.setattr(qp, "nnls", failing)
+    g, B, C, c = np.array([1.0, 2.0]), np.diag([1.0, 4.0]), np.eye(2), np.array([-0.5, -0.1])
+    np.testing.assert_allclose(solve_qp(g, B, C, c).step, [-0.5, -0.1], rtol=1e-14)
+    assert kkt_residual(g, g, np.eye(2))[0] < 1e-14
+    monkeypatch.setattr(qp, "_primal_active_set", lambda *args: None)
+    d = solve_qp(g, B, C, c).step
+    assert g @ d <= 0.0 and np.all(d >= c)
+
+
+def test_bounded_step_has_the_multipliers_of_the_closed_form():
+    g, B = np.array([-3.0, 5.0]), np.array([[2.0, 0.0], [0.0, 1e-8]])
+    C, c = np.vstack([np.eye(2), -np.eye(2)]), np.array([-np.inf, -7.0, -1.0, -np.inf])
+    solution = solve_qp(g, B, C, c)
+    np.testing.assert_allclose(solution.step, [1.0, -7.0], rtol=1e-15)
+    np.testing.assert_allclose(solution.multipliers, [0.0, 5.0 - 7e-8, 1.0, 0.0], rtol=1e-14)
+
+
+def test_zero_gradient_gives_zero_step():
+    solution = solve_qp(np.zeros(2), np.eye(2), np.eye(2), np.zeros(2))
+    assert not solution.step.any() and not solution.multipliers.any()
+
+
+def test_bad_input_is_named():
+    with pytest.raises(ValueError, match="row 1"):
+        solve_qp(np.ones(2), np.eye(2), np.eye(2), np.array([0.0, 0.1]))
+    with pytest.raises(ValueError, match="not positive definite"):
+        solve_qp(np.ones(2), np.diag([1.0, -1.0]), np.zeros((0, 2)), np.zeros(0))
+    with pytest.raises(ValueError, match="not positive definite"):
+        solve_qp(np.ones(2), np.array([[1.0, 2.0], [2.0, 1.0]]), np.zeros((0, 2)), np.zeros(0))
+
+
+def test_constraints_validate_their_input():
+    with pytest.raises(ValueError, match="shapes of the constraints disagree"):
+        LinearConstraints(np.ones((1, 3)), np.zeros(1), np.zeros(2), np.ones(2), ("a",) * 5)
+    with pytest.raises(ValueError, match="got 1 names"):
+        LinearConstraints(np.ones((1, 2)), np.zeros(1), np.zeros(2), np.ones(2), ("a",))
+    with pytest.raises(ValueError, match="must be finite"):
+        LinearConstraints(np.full((1, 1), np.nan), np.zeros(1), np.zeros(1), np.ones(1), ("a", "b", "c"))
+    with pytest.raises(ValueError, match="mu at lower bound"):
+        LinearConstraints.box([2.0], [1.0], unknowns=["mu"])
+
+
+def test_slack_and_normals_agree():
+    constraints = LinearConstraints([[-1.0, 1.0]], [0.5], [0.0, 0.0], [3.0, 4.0], tuple("abcde"))
+    np.testing.assert_array_equal(constraints.slack(np.array([1.0, 2.0])), [0.5, 1.0, 2.0, 2.0, 2.0])
+    np.testing.assert_array_equal(constraints.normals @ np.array([1.0, 2.0]), [1.0, 1.0, 2.0, -1.0, -2.0])
+
+
+@settings(max_examples=60, deadline=None)
+@given(SEEDS, st.integers(1, 8), st.integers(0, 3))
+def test_convexified_matrix_is_positive_definite_and_exact_where_possible(seed, d, k):
+    rng = np.random.default_rng(seed)
+    H = rng.normal(size=(d, d))
+    H = H + H.T
+    N = rng.normal(size=(min(k, d), d))
+    Z, _ = split_space(N)
+    H = H + Z @ Z.T * (np.abs(np.linalg.eigvalsh(H)).max() + 1.0)  # positive definite on the face only
+    B = convexify(H, N)
+    assert np.linalg.eigvalsh(B)[0] > 0.0
+    np.testing.assert_allclose(Z.T @ B @ Z, Z.T @ H @ Z, rtol=1e-7, atol=1e-9)
+
+
+@settings(max_examples=60, deadline=None)
+@given(SEEDS, st.integers(1, 6))
+def test_convexifying_commutes_with_rescaling_the_unknowns(seed, d):
+    rng = np.random.default_rng(seed)
+    H = rng.normal(size=(d, d))
+    H = H + H.T
+    S = np.diag(10.0 ** rng.uniform(-6, 6, d))
+    B, scaled = convexify(H, np.zeros((0, d))), convexify(S @ H @ S, np.zeros((0, d)))
+    unit = np.sqrt(np.diag(B))
+    np.testing.assert_allclose(scaled / np.outer(np.diag(S), np.diag(S)) / np.outer(unit, unit),
+                               B / np.outer(unit, unit), atol=1e-6)
+
+
+def test_scaling_survives_zero_diagonals():
+    assert np.all(diagonal_scaling(np.zeros((2, 2))) == 1.0)
+    H = np.array([[0.0, 1e6], [1e6, 0.0]])
+    D = diagonal_scaling(H)
+    assert np.abs(H / np.outer(D, D)).max() <= 1.0 + 1e-6
+    assert np.linalg.eigvalsh(convexify(H, np.zeros((0, 2))))[0] > 1e5
+
+
+@settings(max_examples=60, deadline=None)
+@given(SEEDS, st.integers(1, 6), st.integers(0, 6), st.booleans())
+def test_kkt_residual_is_the_distance_to_the_cone(seed, d, k, kink):
+    rng = np.random.default_rng(seed)
+    N = rng.normal(size=(k, d)) * 10.0 ** rng.uniform(-3, 3, (k, 1))
+    low = rng.normal(size=d)
+    high = low.copy()
+    if kink:
+        high[0] += rng.uniform(0.1, 2.0)
+    residual, lam = kkt_residual(low, high, N)
+    assert np.all(lam >= 0.0)
+    value = N.T @ lam
+    assert np.linalg.norm(np.clip(value, low, high) - value) == pytest.approx(residual, abs=1e-12)
+    # Projection: the residual is orthogonal to what carries a multiplier and leaves the cone from every other row.
+    r = np.clip(value, low, high) - value
+    unit = N / np.linalg.norm(N, axis=1)[:, None] if k else N
+    assert np.all(unit @ r <= 1e-10)
+    assert np.all(np.abs((unit @ r)[lam > 1e-8]) <= 1e-10)
+
+
+def test_without_active_constraints_the_residual_is_the_norm_of_the_gradient():
+    g = np.array([3.0, 4.0])
+    assert kkt_residual(g, g, np.zeros((0, 2)))[0] == 5.0
