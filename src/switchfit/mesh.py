@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from switchfit.data import FloatArray
 
-CHUNK = 8
+CHUNK = 16
 """Rows in a chunk: long enough to fill vector registers (rows times stages), short enough to waste few in padding."""
 
 
@@ -81,6 +81,7 @@ class Rows(NamedTuple):
     start, end : (Q, C) times
     starts_at, ends_at : (Q, C) int, index i of the transition time tau_i (from 0) at which a row starts or ends, else -1
     first_chunk : (N + 1,) int, the chunk that opens each segment
+    last_row : (N + 1,) int, flat index of the last row of each segment
     first_cell : (N + 1,) int, the cell in which each segment begins
     """
 
@@ -92,6 +93,7 @@ class Rows(NamedTuple):
     starts_at: jax.Array
     ends_at: jax.Array
     first_chunk: jax.Array
+    last_row: jax.Array
     first_cell: jax.Array
 
 
@@ -131,7 +133,8 @@ def rows(nodes: jax.Array, tau: jax.Array, side: jax.Array) -> Rows:
     starts_at = jnp.where(opening, segment[:, None] - 1, -1)
     ends_at = jnp.where(closing, segment[:, None], -1)
     opens = opening[:, 0]
-    return Rows(segment, opens, cell, start, end, starts_at, ends_at, first_chunk, first_cell)
+    last_row = first_chunk * CHUNK + count - 1
+    return Rows(segment, opens, cell, start, end, starts_at, ends_at, first_chunk, last_row, first_cell)
 
 
 def row_ending_cell(layout: Rows, cell: jax.Array) -> jax.Array:

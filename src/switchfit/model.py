@@ -152,10 +152,13 @@ class Model:
 
         return f
 
-    def density(self, piece: Piece) -> Density | None:
-        """Sum of all running costs inside one cell, reference signals included; None if there is none."""
-        if not self.structure.running and not self.structure.references:
-            return None
+    @property
+    def has_running_cost(self) -> bool:
+        """Whether anything is integrated along the trajectory."""
+        return bool(self.structure.running or self.structure.references)
+
+    def density(self, piece: Piece) -> Density:
+        """Sum of all running costs inside one cell, reference signals included."""
 
         def ell(t: Array, x: Array, p: Array) -> Array:
             total = jnp.zeros(())

@@ -11,7 +11,7 @@ from jax import lax
 
 from switchfit.mesh import CHUNK, Rows, row_ending_cell, rows
 from switchfit.model import Model, Piece
-from switchfit.rungekutta import step
+from switchfit.rungekutta import combine, stages
 
 Array = jax.Array
 
@@ -24,12 +24,15 @@ class Path(NamedTuple):
     layout : Rows
     pieces : Piece with origin (Q, C) and coefficients (Q, C, 4, S)
     before, after : (Q, C, n), state at the start and at the end of each row
+    stages, slopes : (Q, C, s, n), states X_j and slopes K_j at the stages of each row
     """
 
     layout: Rows
     pieces: Piece
     before: Array
     after: Array
+    stages: Array
+    slopes: Array
 
     def before_transition(self, i: Array | int) -> Array:
         """x(tau_i-), the state before the reset map of transition i (from 0): (n,)."""
@@ -60,23 +63,23 @@ def propagate(model: Model, tau: Array, p: Array, side: Array) -> Path:
     layout = rows(model.arguments.nodes, tau, side)
     pieces = Piece(model.arguments.nodes[layout.cell], model.arguments.signals[layout.cell])
 
-    def through(mode: int) -> Callable[..., tuple[Array, Array]]:
-        def row(x: Array, given: tuple[Array, Array, Piece]) -> tuple[Array, Array]:
+    def through(mode: int) -> Callable[..., tuple[Array, tuple[Array, ...]]]:
+        def row(x: Array, given: tuple[Array, Array, Piece]) -> tuple[Array, tuple[Array, ...]]:
             start, end, piece = given
-            after, _ = step(model.tableau, model.field(mode, piece), None, start, end, x, p)
-            return after, x
+            X, K = stages(model.tableau, model.field(mode, piece), start, end, x, p)
+            after = x + (end - start) * combine(model.tableau.b, K)
+            return after, (x, after, jnp.stack(X), jnp.stack(K))
 
         return lambda x, start, end, piece: lax.scan(row, x, (start, end, piece))
 
-    def chunk(x: Array, given: tuple[Array, Array, Array, Array, Piece]) -> tuple[Array, tuple[Array, Array]]:
+    def chunk(x: Array, given: tuple[Array, Array, Array, Array, Piece]) -> tuple[Array, tuple[Array, ...]]:
         segment, opens, start, end, piece = given
         x = apply_reset(model, tau, x, p, segment, opens)
-        x, before = by_mode(model, segment, through, x, start, end, piece)
-        return x, (before, jnp.concatenate([before[1:], x[None]]))
+        return by_mode(model, segment, through, x, start, end, piece)
 
     given = (layout.segment, layout.opens, layout.start, layout.end, pieces)
-    _, (before, after) = lax.scan(chunk, model.initial_state(p), given)
-    return Path(layout, pieces, before, after)
+    _, columns = lax.scan(chunk, model.initial_state(p), given)
+    return Path(layout, pieces, *columns)
 
 
 def apply_reset(model: Model, tau: Array, x: Array, p: Array, segment: Array, opens: Array) -> Array:
@@ -96,22 +99,17 @@ def path_cost(model: Model, path: Path, p: Array) -> Array:
 
 
 def running_cost(model: Model, path: Path, p: Array) -> Array:
-    """Integral of the running costs over each row: (Q, C)."""
+    """Integral of the running costs over each row, ``h sum_j b_j ell(t_j, X_j)``: (Q, C)."""
     layout = path.layout
-    if model.density(Piece(layout.start, path.pieces.coefficients)) is None:
-        return jnp.zeros(layout.start.shape)
+    h = layout.end - layout.start
+    if not model.has_running_cost:
+        return jnp.zeros(h.shape)
 
-    def of_mode(mode: int) -> Callable[..., Array]:
-        def row(start: Array, end: Array, piece: Piece, x: Array) -> Array:
-            return step(model.tableau, model.field(mode, piece), model.density(piece), start, end, x, p)[1]
+    def row(start: Array, h: Array, piece: Piece, X: Array) -> Array:
+        times = start + model.tableau.c * h
+        return h * (model.tableau.b @ jax.vmap(model.density(piece), in_axes=(0, 0, None))(times, X, p))
 
-        return jax.vmap(row)
-
-    def chunk(given: tuple[Array, Array, Array, Piece, Array]) -> Array:
-        segment, start, end, piece, x = given
-        return by_mode(model, segment, of_mode, start, end, piece, x)
-
-    return lax.map(chunk, (layout.segment, layout.start, layout.end, path.pieces, path.before))
+    return jax.vmap(jax.vmap(row))(layout.start, h, path.pieces, path.stages)
 
 
 def sample_costs(model: Model, path: Path, p: Array) -> Array:

@@ -1,8 +1,9 @@
-"""One step of a Runge-Kutta method, and the exact second derivative of that step.
+"""One step of a Runge-Kutta method, and the linear equations that its derivatives obey.
 
 With stages ``X_j = x + h sum_l a_jl K_l``, ``K_j = f(t + c_j h, X_j)`` a step is ``x+ = x + h sum_j b_j K_j`` and
 its running cost ``L = h sum_j b_j ell(t + c_j h, X_j)``. A step is a function of its start and end time, of x and of
-p; everything is exact for the *discretised* system, whatever the step length.
+p. Its derivatives are taken stage by stage: f is differentiated at each stage by itself, and what links the stages
+is linear algebra. All of it is exact for the *discretised* system, whatever the step length.
 """
 
 from __future__ import annotations
@@ -142,132 +143,81 @@ def _implicit_stages(
     return list(X), list(K)
 
 
-class Directions(NamedTuple):
-    """Derivatives of a step's arguments in D directions: start (D,), end (D,), x (n, D), p (M, D)."""
-
-    start: Array
-    end: Array
-    x: Array
-    p: Array
-
-
-def curvature(
-    tableau: Tableau,
-    f: Field,
-    ell: Density | None,
-    start: Array,
-    end: Array,
-    x: Array,
-    p: Array,
-    psi: Array,
-    along: Directions,
-) -> Array:
-    """Second derivative of ``psi . x+ + L`` of one step along D directions: a symmetric ``(D, D)`` array.
-
-    The term ``psi . F_xx + L_xx`` (and its mixed forms) of the general discrete sweep.
-    """
-    if tableau is STIFF:
-        return _curvature_of_whole_step(tableau, f, ell, start, end, x, p, psi, along)
-    return _curvature_by_stages(tableau, f, ell, start, end, x, p, psi, along)
-
-
-def _curvature_of_whole_step(
-    tableau: Tableau, f: Field, ell: Density | None, start: Array, end: Array, x: Array, p: Array, psi: Array,
-    along: Directions,
-) -> Array:
-    """By differentiating the step as a whole, forward over forward (which passes through `custom_root`)."""
-
-    def value(start: Array, end: Array, x: Array, p: Array) -> Array:
-        after, cost = step(tableau, f, ell, start, end, x, p)
-        return psi @ after + cost
-
-    at = (start, end, x, p)
-
-    def pair(u: Directions, v: Directions) -> Array:
-        return jax.jvp(lambda *z: jax.jvp(value, z, tuple(u))[1], at, tuple(v))[1]
-
-    columns = Directions(*(jnp.moveaxis(a, -1, 0) for a in along))
-    return jax.vmap(lambda u: jax.vmap(lambda v: pair(u, v))(columns))(columns)
-
-
-def _curvature_by_stages(
-    tableau: Tableau, f: Field, ell: Density | None, start: Array, end: Array, x: Array, p: Array, psi: Array,
-    along: Directions,
-) -> Array:
-    """By the adjoint of the stages: only second derivatives of f itself are taken, never of a composition.
-
-    With w_j the derivative of ``psi . x+`` with respect to K_j and mu_j that of everything with respect to X_j,
-
-        H = sum_j Z_j' D^2 (w_j . f + h b_j ell) Z_j  +  the products of h with K and ell, whose second
-            derivative is  h' x (mu_j sum_l a_jl K_l' + ...) and its transpose,
-
-    where ``'`` is the derivative along the directions and Z_j that of (t_j, X_j, p).
-    """
-    a, b, c = tableau.a, tableau.b, tableau.c
-    s = len(c)
-    h, h_d = end - start, along.end - along.start
-    X, K, T_d, X_d, K_d, aK_d = [], [], [], [], [], []
-    for j in range(s):
-        T_d.append(along.start + float(c[j]) * h_d)
-        if j == 0:
-            X.append(x)
-            X_d.append(along.x)
-            aK_d.append(jnp.zeros_like(along.x))
-        else:
-            aK, aK_j_d = combine(a[j], K), combine(a[j], K_d)
-            X.append(x + h * aK)
-            X_d.append(along.x + h * aK_j_d + aK[:, None] * h_d)
-            aK_d.append(aK_j_d)
-        k, k_d = _jvp_columns(f, start + float(c[j]) * h, X[j], p, T_d[j], X_d[j], along.p)
-        K.append(k)
-        K_d.append(k_d)
-
-    def weighted(w: Array, hb: Array, t: Array, x: Array, p: Array) -> Array:
-        """``w . f + h b ell``, whose derivatives are those of the adjoint and of the cost at a stage."""
-        value = w @ f(t, x, p)
-        return value if ell is None else value + hb * ell(t, x, p)
-
-    w: list[Array] = [psi] * s
-    mu: list[Array] = [psi] * s
-    for j in reversed(range(s)):
-        w[j] = h * (float(b[j]) * psi + sum(float(a[m, j]) * mu[m] for m in range(j + 1, s) if a[m, j] != 0.0))
-        mu[j] = jax.grad(weighted, argnums=3)(w[j], h * float(b[j]), start + float(c[j]) * h, X[j], p)
-
-    def second(w: Array, hb: Array, t: Array, X: Array, T_d: Array, X_d: Array) -> Array:
-        gradient = jax.grad(weighted, argnums=(2, 3, 4))
-
-        def column(t_d: Array, x_d: Array, p_d: Array) -> tuple[Array, Array, Array]:
-            return jax.jvp(lambda t, x, p: gradient(w, hb, t, x, p), (t, X, p), (t_d, x_d, p_d))[1]
-
-        gt, gx, gp = jax.vmap(column, in_axes=(0, -1, -1), out_axes=-1)(T_d, X_d, along.p)
-        return T_d[:, None] * gt[None] + X_d.T @ gx + along.p.T @ gp
-
-    times = start + c * h
-    stack = jnp.stack
-    H = jax.vmap(second)(stack(w), h * jnp.asarray(b), times, stack(X), stack(T_d), stack(X_d)).sum(0)
-    # products of the step length with slopes: D = derivative of everything they multiply
-    D = psi @ combine(b, K_d) + sum(mu[j] @ aK_d[j] for j in range(1, s))
-    if ell is not None:
-        D = D + combine(b, [_jvp_columns(ell, times[j], X[j], p, T_d[j], X_d[j], along.p)[1] for j in range(s)])
-    return H + h_d[:, None] * D[None] + D[:, None] * h_d[None]
-
-
-def _jvp_columns(
-    function: Callable[..., Array], t: Array, x: Array, p: Array, t_d: Array, x_d: Array, p_d: Array
-) -> tuple[Array, Array]:
-    """Value and derivatives along D directions (last axis) of ``function(t, x, p)``."""
-    value, linear = jax.linearize(function, t, x, p)
-    return value, jax.vmap(linear, in_axes=(0, -1, -1), out_axes=-1)(t_d, x_d, p_d)
-
-
-def stage_directions(
-    tableau: Tableau, f: Field, start: Array, end: Array, x: Array, p: Array, along: Directions
+def stage_tangents(
+    tableau: Tableau, h: Array, h_d: Array, A: Array, S: Array, K: Array, x_d: Array
 ) -> tuple[Array, Array, Array]:
-    """Stage times (s,), states (s, n) and the derivatives (s, n, D) of the states along D directions."""
+    """Derivatives of the stages along D directions: the stage equations, differentiated.
 
-    def stacked(start: Array, end: Array, x: Array, p: Array) -> Array:
-        return jnp.stack(stages(tableau, f, start, end, x, p)[0])
+        X_j' = x' + h sum_l a_jl K_l' + (sum_l a_jl K_l) h',      K_j' = A_j X_j' + S_j
 
-    X, linear = jax.linearize(stacked, start, end, x, p)
-    X_d = jax.vmap(linear, in_axes=-1, out_axes=-1)(*along)
-    return start + tableau.c * (end - start), X, X_d
+    Parameters
+    ----------
+    h, h_d : step length () and its derivative (D,)
+    A : (s, n, n), D_1 f at each stage
+    S : (s, n, D), what else K_j depends on: D_2 f t_j' + D_p f p'
+    K : (s, n), slopes
+    x_d : (n, D), derivative of the state before the step
+
+    Returns
+    -------
+    X_d, K_d : (s, n, D) each
+    after_d : (n, D), derivative of the state after the step
+    """
+    s = len(tableau.c)
+    base = [x_d + combine(tableau.a[j], list(K))[:, None] * h_d if tableau.a[j].any() else x_d for j in range(s)]
+    if tableau is STIFF:
+        right = jnp.stack([_product(A[j], base[j]) + S[j] for j in range(s)])
+        K_d = list((_stage_inverse(tableau, h, A) @ right.reshape(-1, right.shape[-1])).reshape(right.shape))
+        X_d = [base[j] + h * combine(tableau.a[j], K_d) for j in range(s)]
+    else:
+        X_d, K_d = [], []
+        for j in range(s):
+            X_d.append(base[j] + h * combine(tableau.a[j], K_d) if j else x_d)
+            K_d.append(_product(A[j], X_d[j]) + S[j])
+    after_d = x_d + h * combine(tableau.b, K_d) + combine(tableau.b, list(K))[:, None] * h_d
+    return jnp.stack(X_d), jnp.stack(K_d), after_d
+
+
+def stage_adjoints(tableau: Tableau, h: Array, A: Array, l_x: Array, psi: Array) -> tuple[Array, Array, Array]:
+    """Derivatives of ``psi . x+ + L`` in the stages: the transposed stage equations, backward.
+
+        w_j = h b_j psi + h sum_l a_lj mu_l,      mu_j = w_j A_j + h b_j l_x,j,      psi_before = psi + sum_j mu_j
+
+    Parameters
+    ----------
+    h : step length ()
+    A : (s, n, n), D_1 f at each stage
+    l_x : (s, n), D ell at each stage
+    psi : (n,), costate after the step
+
+    Returns
+    -------
+    w, mu : (s, n), derivatives in the slopes K_j and in the stage states X_j
+    before : (n,), costate before the step
+    """
+    s = len(tableau.c)
+    a, b = tableau.a, tableau.b
+    if tableau is STIFF:
+        right = jnp.stack([h * (b[j] * psi + combine(a[:, j], [h * b[m] * l_x[m] for m in range(s)])) for j in range(s)])
+        w = list((right.reshape(-1) @ _stage_inverse(tableau, h, A)).reshape(s, -1))
+        mu = [(w[j][:, None] * A[j]).sum(0) + h * b[j] * l_x[j] for j in range(s)]
+    else:
+        w, mu = [psi] * s, [psi] * s
+        for j in reversed(range(s)):
+            w[j] = h * (b[j] * psi + combine(a[j + 1 :, j], mu[j + 1 :])) if j + 1 < s else h * b[j] * psi
+            mu[j] = (w[j][:, None] * A[j]).sum(0) + h * b[j] * l_x[j]
+    return jnp.stack(w), jnp.stack(mu), psi + sum(mu)
+
+
+def _stage_inverse(tableau: Tableau, h: Array, A: Array) -> Array:
+    """Inverse of the coupled stage equations, ``(I - h a_jl A_j)^-1``: (s n, s n)."""
+    s, n = A.shape[:2]
+    blocks = h * jnp.asarray(tableau.a)[:, None, :, None] * A[:, :, None, :]
+    return jnp.linalg.inv(jnp.eye(s * n) - blocks.reshape(s * n, s * n))
+
+
+def _product(A: Array, B: Array) -> Array:
+    """``A @ B`` of small matrices, (n, n) and (n, D), without the overhead of a call to BLAS where that dominates."""
+    if A.shape[0] * A.shape[1] * B.shape[1] > 1000:
+        return A @ B
+    return (A[:, :, None] * B[None]).sum(1)

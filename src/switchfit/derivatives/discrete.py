@@ -1,4 +1,4 @@
-"""Exact gradient and Hessian of the *discretised* cost, by one forward and one backward sweep.
+"""Exact Hessian of the *discretised* cost by a backward sweep, after the forward sweep of `first_order`.
 
 With z = (x_k, theta) the arguments of node map k, Z_k their derivative in theta and psi_{k+1} the derivative of the
 cost to go,
@@ -7,8 +7,9 @@ cost to go,
 
 where steps, samples, reset maps, the initial state and terminal costs are all such maps. The sum is what the sweep
 over (psi_k, Omega_k, Theta_k, H_k) of the general discrete form adds up to; written like this its terms are
-independent of each other, so that a chunk of rows is evaluated at once. Only psi and x_theta are found one row after
-another.
+independent of each other, so that they are evaluated for a chunk of rows at once. Only psi and x_theta are found one
+row after another. Inside a step the same is done once more, for its stages: only f itself is ever differentiated
+twice, never a composition.
 """
 
 from __future__ import annotations
@@ -20,20 +21,18 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from switchfit.derivatives.rows import (
-    ResetJacobians,
-    RowJacobians,
+from switchfit.derivatives.first_order import (
+    FirstOrder,
     Tangents,
     parameter_directions,
-    reset_jacobians,
-    row_jacobians,
-    tangents,
+    sample_gradients,
+    stage_time_directions,
     time_directions,
 )
 from switchfit.mesh import row_ending_cell
 from switchfit.model import Model, Piece, Samples
-from switchfit.propagate import Path, at_cells, by_mode, propagate
-from switchfit.rungekutta import Directions, curvature, stage_directions
+from switchfit.propagate import Path, by_mode
+from switchfit.rungekutta import combine, stage_adjoints
 
 Array = jax.Array
 
@@ -41,69 +40,40 @@ SAMPLES_AT_ONCE = 1024
 """Samples whose second derivatives are evaluated together: bounds the memory of long logs."""
 
 
-class FirstOrder(NamedTuple):
-    """The forward sweep: path, Jacobians, x_theta, cost and gradient."""
+class Costates(NamedTuple):
+    """Derivatives of the cost to go.
 
-    path: Path
-    jacobians: RowJacobians
-    resets: ResetJacobians | None
-    tangents: Tangents
-    cost: Array
-    gradient: Array
+    Attributes
+    ----------
+    start : (n,), at t0
+    opened : (Q, n), at the start of each chunk, after a reset map that acts there
+    after : (Q, C, n), at the end of each row
+    w, mu : (Q, C, s, n), in the slopes K_j and in the stage states X_j of each row
+    """
 
-
-def first_order(model: Model, tau: Array, p: Array, side: Array) -> FirstOrder:
-    """Cost and gradient (D,) of the discretised system, in forward mode."""
-    path = propagate(model, tau, p, side)
-    jacobians = row_jacobians(model, path, p)
-    resets = reset_jacobians(model, path, tau, p)
-    X = tangents(model, path, jacobians, resets, p)
-    P = parameter_directions(model)
-    cost = jacobians.cost.sum()
-    gradient = jnp.einsum("qcn,qcnd->d", jacobians.cost_x, X.before) + jacobians.cost_theta.sum((0, 1))
-    for k, samples in enumerate(model.arguments.samples):
-        value, g_x, g_p = sample_gradients(model, path, k, samples, p)
-        cost = cost + value.sum()
-        gradient = gradient + jnp.einsum("kn,knd->d", g_x, tangents_at(path, X, samples.cell)) + g_p.sum(0) @ P
-    if model.structure.terminal:
-        end = path.after[-1, -1]
-        value, (phi_x, phi_p) = jax.value_and_grad(model.terminal, argnums=(0, 1))(end, p)
-        cost = cost + value
-        gradient = gradient + phi_x @ X.after[-1, -1] + phi_p @ P
-    return FirstOrder(path, jacobians, resets, X, cost, gradient)
-
-
-def sample_gradients(model: Model, path: Path, k: int, samples: Samples, p: Array) -> tuple[Array, Array, Array]:
-    """Cost (K,) of each sample of the k-th Measurements and its derivatives in x (K, n) and p (K, M)."""
-
-    def one(sample: Samples, x: Array) -> tuple[Array, Array, Array]:
-        value, (g_x, g_p) = jax.value_and_grad(model.sample_cost, argnums=(2, 3))(k, sample, x, p)
-        return value, g_x, g_p
-
-    return jax.vmap(one)(samples, path.at_samples(samples.cell))
-
-
-def tangents_at(path: Path, X: Tangents, cell: Array) -> Array:
-    """x_theta at the ends of the given cells (K,): (K, n, D)."""
-    return at_cells(path.layout, X.before[0, 0], X.after, cell)
+    start: Array
+    opened: Array
+    after: Array
+    w: Array
+    mu: Array
 
 
 def adjoint_hessian(model: Model, first: FirstOrder, tau: Array, p: Array) -> Array:
-    """Hessian (D, D) of the discretised cost by the backward sweep."""
+    """Hessian (D, D) of the discretised cost."""
     path, X = first.path, first.tangents
-    psi_start, psi_after, psi_resets = costates(model, first, p)
-    H = row_curvature(model, path, X, psi_after, p)
+    psi = costates(model, first, p)
+    H = stage_curvature(model, path, X, psi, p) + step_length_curvature(model, first, psi)
     P = parameter_directions(model)
     for i in model.structure.resets:
         along = (jnp.arange(P.shape[1]) == i) * 1.0, X.before_transition(path.layout, i), P
-        value = _weighted(model.reset(i), psi_resets[path.layout.first_chunk[i + 1]])
+        value = _weighted(model.reset(i), psi.opened[path.layout.first_chunk[i + 1]])
         H = H + _second(value, (tau[i], path.before_transition(i), p), along)
     for k, samples in enumerate(model.arguments.samples):
         H = H + sample_curvature(model, path, X, k, samples, p, gauss_newton=False)
     if model.structure.terminal:
         H = H + _second(model.terminal, (path.after[-1, -1], p), (X.after[-1, -1], P))
     if model.structure.initial_state is not None:
-        H = H + _second(lambda p: psi_start @ model.initial_state(p), (p,), (P,))
+        H = H + _second(_weighted(model.initial_state, psi.start), (p,), (P,))
     return H
 
 
@@ -115,7 +85,7 @@ def gauss_newton_hessian(model: Model, first: FirstOrder, p: Array) -> Array:
     """
     path, X = first.path, first.tangents
     P = parameter_directions(model)
-    H = row_gauss_newton(model, path, X, p)
+    H = stage_gauss_newton(model, path, X, p)
     for k, samples in enumerate(model.arguments.samples):
         H = H + sample_curvature(model, path, X, k, samples, p, gauss_newton=True)
     if model.structure.terminal:
@@ -123,8 +93,8 @@ def gauss_newton_hessian(model: Model, first: FirstOrder, p: Array) -> Array:
     return H
 
 
-def costates(model: Model, first: FirstOrder, p: Array) -> tuple[Array, Array, Array]:
-    """The costate psi, backward: at t0 (n,), at the end of each row (Q, C, n), and after each reset map (Q, n).
+def costates(model: Model, first: FirstOrder, p: Array) -> Costates:
+    """The costate psi, backward.
 
     It jumps at the samples, ``psi(t_k-) = psi(t_k+) + D ell_k``, and at reset maps, ``psi(tau-) = psi(tau+) D_x R``.
     """
@@ -135,93 +105,137 @@ def costates(model: Model, first: FirstOrder, p: Array) -> tuple[Array, Array, A
         where = row_ending_cell(path.layout, samples.cell) + 1
         jumps = jumps.at[where].add(sample_gradients(model, path, k, samples, p)[1])
 
-    def row(psi: Array, given: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-        F_x, L_x, jump = given
+    def row(psi: Array, given: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
+        h, f_x, l_x, jump = given
         psi = psi + jump
-        return (psi[:, None] * F_x).sum(0) + L_x, psi
+        w, mu, before = stage_adjoints(model.tableau, h, f_x, l_x, psi)
+        return before, (psi, w, mu)
 
-    def chunk(psi: Array, given: tuple[Array, Array, Array, Array, Array]) -> tuple[Array, tuple[Array, Array]]:
-        segment, opens, F_x, L_x, jump = given
-        opened, after = lax.scan(row, psi, (F_x, L_x, jump), reverse=True)
+    def chunk(psi: Array, given: tuple[Array, Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
+        segment, opens, operands = given
+        opened, columns = lax.scan(row, psi, operands, reverse=True)
         psi = opened if resets is None else jnp.where(opens, opened @ resets.x[segment], opened)
-        return psi, (after, opened)
+        return psi, (opened, *columns)
 
+    layout = path.layout
     final = jax.grad(model.terminal)(path.after[-1, -1], p) if model.structure.terminal else jnp.zeros(n)
-    given = (path.layout.segment, path.layout.opens, jacobians.x, jacobians.cost_x, jumps[1:].reshape(Q, C, n))
-    psi, (after, opened) = lax.scan(chunk, final, given, reverse=True)
-    return psi + jumps[0], after, opened
+    operands = (layout.end - layout.start, jacobians.f_x, jacobians.l_x, jumps[1:].reshape(Q, C, n))
+    psi, columns = lax.scan(chunk, final, (layout.segment, layout.opens, operands), reverse=True)
+    return Costates(psi + jumps[0], *columns)
 
 
-def row_curvature(model: Model, path: Path, X: Tangents, psi_after: Array, p: Array) -> Array:
-    """``sum_k Z_k' D^2 (psi . F_k + L_k) Z_k`` over all rows: (D, D).
+def stage_curvature(model: Model, path: Path, X: Tangents, psi: Costates, p: Array) -> Array:
+    """``sum Z_j' D^2 (w_j . f + h b_j ell) Z_j`` over the stages of all rows, Z_j that of (t_j, X_j, p): (D, D).
 
-    Along theta directly, or along the arguments (x, start, end, p) of a row where these are fewer.
+    Along theta directly, or along (t, x, p) where these are fewer.
     """
     n, M = model.structure.n, model.structure.M
     P = parameter_directions(model)
-    local = n + 2 + M < P.shape[1]
-    basis = jnp.eye(n + 2 + M)
+    local = 1 + n + M < P.shape[1]
+    basis = jnp.eye(1 + n + M)
 
     def of_mode(mode: int) -> Callable[..., Array]:
-        def row(start: Array, end: Array, piece: Piece, x: Array, psi: Array, s_d: Array, e_d: Array, X: Array) -> Array:
+        def at_stage(piece: Piece, t: Array, x: Array, w: Array, hb: Array, t_d: Array, x_d: Array) -> Array:
             f, ell = model.field(mode, piece), model.density(piece)
+
+            def value(t: Array, x: Array, p: Array) -> Array:
+                return w @ f(t, x, p) + (hb * ell(t, x, p) if model.has_running_cost else 0.0)
+
             if not local:
-                return curvature(model.tableau, f, ell, start, end, x, p, psi, Directions(s_d, e_d, X, P))
-            along = Directions(basis[n], basis[n + 1], basis[:n], basis[n + 2 :])
-            Z = jnp.concatenate([X, s_d[None], e_d[None], P])
-            return Z.T @ curvature(model.tableau, f, ell, start, end, x, p, psi, along) @ Z
+                return _second(value, (t, x, p), (t_d, x_d, P))
+            Z = jnp.concatenate([t_d[None], x_d, P])
+            return Z.T @ _second(value, (t, x, p), (basis[0], basis[1 : 1 + n], basis[1 + n :])) @ Z
+
+        def row(start: Array, end: Array, piece: Piece, X: Array, w: Array, s_d: Array, e_d: Array, X_d: Array) -> Array:
+            h = end - start
+            times, times_d = start + model.tableau.c * h, stage_time_directions(model, s_d, e_d)
+            over_stages = jax.vmap(at_stage, in_axes=(None, 0, 0, 0, 0, 0, 0))
+            return over_stages(piece, times, X, w, h * jnp.asarray(model.tableau.b), times_d, X_d).sum(0)
 
         return lambda *operands: jax.vmap(row)(*operands).sum(0)
 
-    def chunk(H: Array, given: Any) -> tuple[Array, None]:
-        segment, *operands = given
-        return H + by_mode(model, segment, of_mode, *operands), None
-
     layout = path.layout
-    given = (layout.segment, layout.start, layout.end, path.pieces, path.before, psi_after)
-    given += (*time_directions(model, layout), X.before)
-    return lax.scan(chunk, jnp.zeros((P.shape[1], P.shape[1])), given)[0]
+    operands = (layout.start, layout.end, path.pieces, path.stages, psi.w, *time_directions(model, layout), X.stages)
+    return _sum_over_chunks(model, of_mode, layout.segment, operands)
 
 
-def row_gauss_newton(model: Model, path: Path, X: Tangents, p: Array) -> Array:
+def step_length_curvature(model: Model, first: FirstOrder, psi: Costates) -> Array:
+    """Second derivative of the products of step lengths with slopes: ``h' x (...)' `` and its transpose, (D, D).
+
+    ``h sum a_jl K_l`` contributes ``h' x mu_j sum a_jl K_l'``, ``h sum b_j K_j`` and ``h sum b_j ell_j`` likewise.
+    Only the first and the last row of a segment have a length that depends on theta.
+    """
+    N = model.structure.N
+    P = parameter_directions(model)
+    if N == 0:
+        return jnp.zeros((P.shape[1], P.shape[1]))
+    tableau = model.tableau
+    layout, X = first.path.layout, first.tangents
+    starts, ends = time_directions(model, layout)
+
+    def of_row(row: Array) -> Array:
+        """Derivative along theta of what the step length of a row multiplies: (D,)."""
+
+        def at(a: Array) -> Array:
+            return a.reshape((-1,) + a.shape[2:])[row]
+
+        K_d, mu, J = list(at(X.slopes)), at(psi.mu), jax.tree.map(at, first.jacobians)
+        total = at(psi.after) @ combine(tableau.b, K_d)
+        for j in range(len(tableau.c)):
+            if tableau.a[j].any():
+                total = total + mu[j] @ combine(tableau.a[j], K_d)
+        if model.has_running_cost:
+            times_d = stage_time_directions(model, at(starts), at(ends))
+            l_d = J.l_t[:, None] * times_d + jnp.einsum("sn,snd->sd", J.l_x, at(X.stages)) + J.l_p @ P
+            total = total + tableau.b @ l_d
+        return total
+
+    D_open = jax.vmap(of_row)(layout.first_chunk[1:] * layout.start.shape[1])
+    D_close = jax.vmap(of_row)(layout.last_row[:-1])
+    half = jnp.zeros((P.shape[1], P.shape[1])).at[:N].set(D_close - D_open)
+    return half + half.T
+
+
+def stage_gauss_newton(model: Model, path: Path, X: Tangents, p: Array) -> Array:
     """Gauss-Newton part of the running costs: (D, D)."""
     P = parameter_directions(model)
-    D = P.shape[1]
-    structure = model.structure
-    if not structure.running and not structure.references:
-        return jnp.zeros((D, D))
+    if not model.has_running_cost:
+        return jnp.zeros((P.shape[1], P.shape[1]))
 
     def at_stage(piece: Piece, t: Array, x: Array, t_d: Array, x_d: Array) -> Array:
-        H = jnp.zeros((D, D))
+        H = jnp.zeros((P.shape[1], P.shape[1]))
         for residual, W in zip(model.reference_residuals(piece), model.arguments.weights, strict=True):
-            linear = jax.linearize(residual, t, x, p)[1]
-            r_d = jax.vmap(linear, in_axes=-1, out_axes=-1)(t_d, x_d, P)
+            r_d = _columns(residual, (t, x, p), (t_d, x_d, P))
             H = H + r_d.T @ W @ r_d
-        for ell in structure.running:
-            value = lambda x, p, ell=ell: jnp.asarray(ell(t, x, model.parameters(p))).reshape(())  # noqa: E731
+        for ell in model.structure.running:
+
+            def value(x: Array, p: Array, ell: Callable[..., Any] = ell) -> Array:
+                return jnp.asarray(ell(t, x, model.parameters(p))).reshape(())
+
             H = H + _second(value, (x, p), (x_d, P))
         return H
 
-    def of_mode(mode: int) -> Callable[..., Array]:
-        def row(start: Array, end: Array, piece: Piece, x: Array, s_d: Array, e_d: Array, X: Array) -> Array:
-            along = Directions(s_d, e_d, X, P)
-            times, states, states_d = stage_directions(
-                model.tableau, model.field(mode, piece), start, end, x, p, along
-            )
-            times_d = s_d + model.tableau.c[:, None] * (e_d - s_d)
-            parts = jax.vmap(lambda t, x, t_d, x_d: at_stage(piece, t, x, t_d, x_d))(times, states, times_d, states_d)
-            return (end - start) * jnp.einsum("s,sde->de", jnp.asarray(model.tableau.b), parts)
-
-        return lambda *operands: jax.vmap(row)(*operands).sum(0)
-
-    def chunk(H: Array, given: Any) -> tuple[Array, None]:
-        segment, *operands = given
-        return H + by_mode(model, segment, of_mode, *operands), None
+    def row(start: Array, end: Array, piece: Piece, X: Array, s_d: Array, e_d: Array, X_d: Array) -> Array:
+        times, times_d = start + model.tableau.c * (end - start), stage_time_directions(model, s_d, e_d)
+        parts = jax.vmap(at_stage, in_axes=(None, 0, 0, 0, 0))(piece, times, X, times_d, X_d)
+        return (end - start) * jnp.tensordot(jnp.asarray(model.tableau.b), parts, axes=1)
 
     layout = path.layout
-    given = (layout.segment, layout.start, layout.end, path.pieces, path.before)
-    given += (*time_directions(model, layout), X.before)
-    return lax.scan(chunk, jnp.zeros((D, D)), given)[0]
+    operands = (layout.start, layout.end, path.pieces, path.stages, *time_directions(model, layout), X.stages)
+    return _sum_over_chunks(model, lambda _: lambda *rows: jax.vmap(row)(*rows).sum(0), layout.segment, operands)
+
+
+def _sum_over_chunks(
+    model: Model, of_mode: Callable[[int], Callable[..., Array]], segment: Array, operands: tuple[Any, ...]
+) -> Array:
+    """Sum of (D, D) matrices over all chunks, each evaluated with the functions of its mode."""
+    D = model.structure.N + model.structure.M
+
+    def chunk(H: Array, given: Any) -> tuple[Array, None]:
+        segment, rows = given
+        return H + by_mode(model, segment, of_mode, *rows), None
+
+    return lax.scan(chunk, jnp.zeros((D, D)), (segment, operands))[0]
 
 
 def sample_curvature(
@@ -234,14 +248,13 @@ def sample_curvature(
         sample, x, x_d = given
         if not gauss_newton:
             return _second(lambda x, p: model.sample_cost(k, sample, x, p), (x, p), (x_d, P))
-        linear = jax.linearize(lambda x, p: model.sample_residual(k, sample, x, p), x, p)[1]
-        r_d = jax.vmap(linear, in_axes=-1, out_axes=-1)(x_d, P)
+        r_d = _columns(lambda x, p: model.sample_residual(k, sample, x, p), (x, p), (x_d, P))
         return r_d.T @ (sample.weight[:, None] * r_d)
 
     def block(H: Array, given: Any) -> tuple[Array, None]:
         return H + jax.vmap(one)(given).sum(0), None
 
-    given = (samples, path.at_samples(samples.cell), tangents_at(path, X, samples.cell))
+    given = (samples, path.at_samples(samples.cell), X.at_samples(path.layout, samples.cell))
     K = samples.cell.shape[0]
     whole = K - K % SAMPLES_AT_ONCE
     H = jnp.zeros((P.shape[1], P.shape[1]))
@@ -265,3 +278,9 @@ def _second(value: Callable[..., Array], at: tuple[Array, ...], along: tuple[Arr
     columns = jax.vmap(column, in_axes=-1, out_axes=-1)(*along)
     flat = [a.reshape(-1, a.shape[-1]) for a in along]
     return sum((a.T @ c.reshape(a.shape[0], -1) for a, c in zip(flat, columns, strict=True)), jnp.zeros(()))
+
+
+def _columns(function: Callable[..., Array], at: tuple[Array, ...], along: tuple[Array, ...]) -> Array:
+    """Derivatives (..., D) of a function along D directions (last axes of `along`)."""
+    linear = jax.linearize(function, *at)[1]
+    return jax.vmap(linear, in_axes=-1, out_axes=-1)(*along)

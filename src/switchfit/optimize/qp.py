@@ -34,6 +34,8 @@ FloatArray = NDArray[np.float64]
 EPS = float(np.finfo(np.float64).eps)
 #: Eigenvalues of the diagonally scaled Hessian below this count as zero.
 EIGENVALUE_FLOOR = 1e-10
+#: What such an eigenvalue is replaced by in the quadratic programme: small, but steps along it stay within reason.
+EIGENVALUE_REPLACEMENT = 1e-4
 #: Feasibility and sign tolerance of the whitened problem, whose quantities are all of order one.
 _WHITE_TOLERANCE = 1e-12
 
@@ -101,9 +103,7 @@ class LinearConstraints:
             )
 
     @classmethod
-    def box(
-        cls, lower: ArrayLike, upper: ArrayLike, *, unknowns: Sequence[str] | None = None
-    ) -> LinearConstraints:
+    def box(cls, lower: ArrayLike, upper: ArrayLike, *, unknowns: Sequence[str] | None = None) -> LinearConstraints:
         """Bounds alone, named after the unknowns (``theta[i]`` if these have no names)."""
         low = np.atleast_1d(np.asarray(lower, dtype=float))
         labels = [f"theta[{i}]" for i in range(low.size)] if unknowns is None else list(unknowns)
@@ -172,8 +172,6 @@ def solve_qp(gradient: FloatArray, matrix: FloatArray, normals: FloatArray, offs
     white = _whiten(gradient, matrix, normals, offsets)
     e, white_multipliers = _least_distance(white.target, white.rows, white.offsets)
     e, white_multipliers = _refine(white, e, white_multipliers, gradient, matrix)
-    if np.linalg.norm(e) < 8 * EPS:  # the length of the unconstrained step is 1: this is a vertex and rounding
-        e = np.zeros_like(e)
     multipliers = np.zeros(offsets.size)
     multipliers[white.kept] = white_multipliers * white.length / white.norms
     return QPSolution(white.unwhiten(e), multipliers)
@@ -201,13 +199,14 @@ class _White:
 
 def _whiten(gradient: FloatArray, matrix: FloatArray, normals: FloatArray, offsets: FloatArray) -> _White:
     variances = np.diag(matrix)
+    message = "the matrix of the quadratic programme is not positive definite; convexify it first"
     if not np.all(variances > 0.0):
-        raise ValueError("the matrix of the quadratic programme is not positive definite; convexify it first")
+        raise ValueError(message)
     diagonal = np.sqrt(variances)
     try:
         factor = np.linalg.cholesky(matrix / np.outer(diagonal, diagonal))
     except np.linalg.LinAlgError as error:
-        raise ValueError("the matrix of the quadratic programme is not positive definite; convexify it first") from error
+        raise ValueError(message) from error
     target = solve_triangular(factor, gradient / diagonal, lower=True)
     length = float(np.linalg.norm(target))
     target = target / length
@@ -429,19 +428,17 @@ def convexify(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None
 
 
 def _absolute(matrix: FloatArray) -> FloatArray:
-    """The matrix with its eigenvalues replaced by absolute values above the floor; itself if they are already."""
+    """The matrix with eigenvalues that are not positive replaced by absolute values; itself if there are none."""
     symmetric = 0.5 * (matrix + matrix.T)
     values, vectors = np.linalg.eigh(symmetric)
     if values.size == 0 or values[0] > EIGENVALUE_FLOOR:
         return symmetric
-    changed = np.maximum(np.abs(values), EIGENVALUE_FLOOR)
+    changed = np.where(values > EIGENVALUE_FLOOR, values, np.maximum(np.abs(values), EIGENVALUE_REPLACEMENT))
     convex = (vectors * changed) @ vectors.T
     return np.asarray(0.5 * (convex + convex.T))
 
 
-def kkt_residual(
-    low: FloatArray, high: FloatArray, normals: FloatArray
-) -> tuple[float, FloatArray]:
+def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tuple[float, FloatArray]:
     """Distance of the gradient from the cone of the active constraints, and the multipliers that attain it.
 
     min over lam >= 0 and low <= g <= high of ‖g − Nᵀ lam‖₂, where low = high except at coordinates held at a kink.

@@ -62,6 +62,8 @@ NEGATIVE_CURVATURE = -1e-8
 #: Iterations spent on making the last step negligible once the optimality is below the tolerance.
 EXTRA_ITERATIONS = 5
 MAX_BACKTRACKS = 60
+#: Newton steps up to this multiple of the unknowns' size are never shortened by changing the Hessian.
+LONGEST_STEP = 1e3
 
 
 class Evaluation(Protocol):
@@ -195,7 +197,10 @@ class Result:
     @property
     def message(self) -> str:
         """The status as a sentence with this result's numbers and names."""
-        kinks = ", ".join(f"theta[{i}] = {self.theta[i]:.10g} between {lo:.1e} and {hi:.1e}" for i, lo, hi in self.kinks)
+        kinks = ", ".join(
+            f"theta[{i}] = {self.theta[i]:.10g}, where the derivative jumps from {left:.1e} to {right:.1e}"
+            for i, left, right in self.kinks
+        )
         order = np.argsort(-np.abs(self.flat_direction), kind="stable")
         largest = [i for i in order if abs(self.flat_direction[i]) > 0.1][:4]
         direction = " ".join(f"{self.flat_direction[i]:+.2g} theta[{i}]" for i in largest) or "no direction"
@@ -398,7 +403,7 @@ def _advance(problem: _Problem, state: _State, accepted: _Accepted) -> _State:
         iteration=state.iteration + 1,
         step_length=alpha,
         metric=state.metric * (2.0 if alpha >= 1.0 else alpha),
-        settled=state.settled + 1 if point.optimality < problem.tolerance else 0,
+        settled=state.settled + 1 if point.optimality <= problem.tolerance else 0,
         scale=np.maximum(state.scale, np.abs(point.theta)),
         cost_scale=max(state.cost_scale, abs(point.cost)),
         gradient_scale=max(state.gradient_scale, float(gradient)),
@@ -408,7 +413,7 @@ def _advance(problem: _Problem, state: _State, accepted: _Accepted) -> _State:
 
 def _is_settled(problem: _Problem, state: _State, direction: _Direction) -> bool:
     """Optimality below the tolerance and, since J may be badly scaled, the next step negligible as well."""
-    if not state.point.optimality < problem.tolerance:
+    if state.point.optimality > problem.tolerance:
         return False
     if not problem.uses_hessian or state.settled >= EXTRA_ITERATIONS:
         return True
@@ -418,7 +423,7 @@ def _is_settled(problem: _Problem, state: _State, direction: _Direction) -> bool
 
 def _stalled(oracle: _Oracle, state: _State, direction: _Direction) -> _State:
     """The line search found nothing: tell convergence and the limit of precision from failure."""
-    if state.point.optimality < oracle.problem.tolerance:
+    if state.point.optimality <= oracle.problem.tolerance:
         return _finish(oracle, state, Status.CONVERGED)
     floor = state.gradient_scale
     if oracle.problem.uses_hessian:
@@ -447,9 +452,7 @@ def _finish(oracle: _Oracle, state: _State, status: Status) -> _State:
 # --- direction --------------------------------------------------------------------------------------------------------
 
 
-def _direction(
-    problem: _Problem, state: _State, low: FloatArray, high: FloatArray
-) -> _Direction:
+def _direction(problem: _Problem, state: _State, low: FloatArray, high: FloatArray) -> _Direction:
     """Step of the quadratic programme between low and high, with the best sides for coordinates on a kink.
 
     A coordinate on a kink is held (0) or confined to one side (+1, -1). Afterwards the force that holds it follows
@@ -457,26 +460,25 @@ def _direction(
     to the other side, and the programme is solved again. No combination is tried twice.
     """
     sides = _steepest_sides(state.point)
-    tried = set()
-    best: _Direction | None = None
+    best, force = _solve_on_sides(problem, state, sides, low, high)
+    direction = best
+    tried = {sides.tobytes()}
     for _ in range(2 * int(state.point.kink.sum()) + 4):
-        tried.add(sides.tobytes())
-        direction, force = _solve_on_sides(problem, state, sides, low, high)
-        if best is None or direction.reduction > best.reduction:
-            best = direction
         sides = _released(state.point, sides, direction.step, force)
         if sides.tobytes() in tried:
             break
+        tried.add(sides.tobytes())
+        direction, force = _solve_on_sides(problem, state, sides, low, high)
+        if direction.reduction > best.reduction:
+            best = direction
     return best
 
 
-def _released(
-    point: _Point, sides: NDArray[np.int_], step: FloatArray, force: FloatArray
-) -> NDArray[np.int_]:
+def _released(point: _Point, sides: NDArray[np.int_], step: FloatArray, force: FloatArray) -> NDArray[np.int_]:
     """Sides with the coordinate released that is held at its kink by the largest force outside [g₋, g₊]."""
     left, right = point.minus.gradient, point.plus.gradient
     tolerance = 1e-13 * (np.abs(left) + np.abs(right))
-    pinned = point.kink & (step == 0.0)
+    pinned = point.kink & (np.abs(step) <= 8 * EPS * np.maximum(np.abs(point.theta), np.max(np.abs(step))))
     to_right = np.where(pinned & (sides <= 0), force - right - tolerance, -np.inf)
     to_left = np.where(pinned & (sides >= 0), left - force - tolerance, -np.inf)
     worst = int(np.argmax(np.maximum(to_right, to_left)))
@@ -509,15 +511,16 @@ def _solve_on_sides(
     offsets = -np.concatenate([slack, -lower[free], upper[free]])
     solution = solve_qp(gradient[free], matrix[np.ix_(free, free)], rows, offsets)
     step = np.zeros(point.theta.size)
-    step[free] = np.clip(solution.step, lower[free], upper[free])
+    # A bound that presses is reached exactly, whatever rounding did to the step: kinks depend on it.
+    at_lower, at_upper = solution.multipliers[m : m + k] > 0.0, solution.multipliers[m + k :] > 0.0
+    reached = np.where(at_lower, lower[free], np.where(at_upper, upper[free], solution.step))
+    step[free] = np.clip(reached, lower[free], upper[free])
     slope, curved = float(gradient @ step), matrix @ step
     force = constraints.A.T @ solution.multipliers[:m] - curved
     return _Direction(step, slope, -(slope + 0.5 * float(step @ curved))), force
 
 
-def _model_matrix(
-    problem: _Problem, state: _State, hessian: FloatArray, free: NDArray[np.bool_]
-) -> FloatArray:
+def _model_matrix(problem: _Problem, state: _State, hessian: FloatArray, free: NDArray[np.bool_]) -> FloatArray:
     """The matrix B of the quadratic programme: positive definite on the free coordinates, H elsewhere."""
     d = free.size
     if not problem.uses_hessian:
@@ -526,7 +529,11 @@ def _model_matrix(
     if free.any():
         block = np.ix_(free, free)
         pressed = problem.normals[state.point.multipliers > 0.0][:, free]
-        matrix[block] = convexify(matrix[block], pressed, _flatness(state)[free])
+        gradient = np.maximum(np.abs(state.point.plus.gradient), np.abs(state.point.minus.gradient))
+        size = np.where(state.scale > 0.0, state.scale, 1.0)
+        # Where J is nearly linear in an unknown, its step is limited to a multiple of its size.
+        floor = np.maximum(_flatness(state), gradient / (LONGEST_STEP * size))
+        matrix[block] = convexify(matrix[block], pressed, floor[free])
     return matrix
 
 
@@ -593,9 +600,7 @@ def _backtrack(oracle: _Oracle, state: _State, direction: _Direction) -> _Accept
     return _blind_step(oracle, state, direction)
 
 
-def _attempt(
-    oracle: _Oracle, state: _State, direction: _Direction, alpha: float, fraction: float
-) -> _Accepted | None:
+def _attempt(oracle: _Oracle, state: _State, direction: _Direction, alpha: float, fraction: float) -> _Accepted | None:
     """The point at step length alpha if it is acceptable.
 
     Where the predicted decrease is below the rounding error of J, comparing costs says nothing ([2]_): then a
@@ -629,6 +634,8 @@ def _blind_step(oracle: _Oracle, state: _State, direction: _Direction) -> _Accep
     if direction.reduction > noise:
         return None
     theta = _move(oracle.problem, state.point.theta, direction.step)
+    if np.array_equal(theta, state.point.theta):
+        return None
     trial = oracle.point(theta, state.scale)
     if trial is None or trial.cost > state.lowest_cost + noise or trial.optimality > 0.5 * state.point.optimality:
         return None
@@ -711,8 +718,8 @@ def _curvature(problem: _Problem, state: _State, rows: NDArray[np.intp]) -> _Cur
     values, vectors = np.linalg.eigh(null.T @ (block / np.outer(scaling, scaling)) @ null)
     lowest = np.zeros(d)
     lowest[free] = null @ vectors[:, 0] / scaling
-    unscaled = np.linalg.eigvalsh(basis.T @ hessian @ basis)
-    return _Curvature(basis, values, unscaled, lowest / np.linalg.norm(lowest))
+    unscaled = np.asarray(np.linalg.eigvalsh(basis.T @ hessian @ basis), dtype=float)
+    return _Curvature(basis, np.asarray(values, dtype=float), unscaled, lowest / np.linalg.norm(lowest))
 
 
 def _reported_sides(point: _Point) -> NDArray[np.int_]:
@@ -861,9 +868,16 @@ def _make_problem(
         raise ValueError(f"hessian is {hessian!r}; choose one of {', '.join(get_args(HessianKind))}")
     if not tolerance >= 0.0 or max_iterations < 0:
         raise ValueError(f"tolerance {tolerance} and max_iterations {max_iterations} must not be negative")
-    normals = constraints.normals
-    points = _checked_breakpoints(breakpoints, d)
-    return _Problem(evaluate, constraints, normals, points, hessian, _mask(hessian, blocks, d), tolerance, max_iterations)
+    return _Problem(
+        evaluate=evaluate,
+        constraints=constraints,
+        normals=constraints.normals,
+        breakpoints=_checked_breakpoints(breakpoints, d),
+        hessian=hessian,
+        mask=_mask(hessian, blocks, d),
+        tolerance=tolerance,
+        max_iterations=max_iterations,
+    )
 
 
 def _checked_breakpoints(breakpoints: Sequence[ArrayLike] | None, d: int) -> tuple[FloatArray, ...]:
@@ -893,10 +907,9 @@ def _feasible_start(problem: _Problem, theta: FloatArray) -> FloatArray:
     if not np.isfinite(theta).all():
         raise ValueError(f"theta0 is not finite: {theta}")
     slack = constraints.slack(theta)
-    bounds = np.concatenate([constraints.lower, constraints.upper])
-    size = np.concatenate(
-        [np.abs(constraints.b) + np.abs(constraints.A) @ np.abs(theta), np.where(np.isfinite(bounds), np.abs(bounds), 0)]
-    )
+    bounds = np.abs(np.concatenate([constraints.lower, constraints.upper]))
+    rows = np.abs(constraints.b) + np.abs(constraints.A) @ np.abs(theta)
+    size = np.concatenate([rows, np.where(np.isfinite(bounds), bounds, 0.0)])
     violated = np.flatnonzero(slack < -1e-12 * (size + np.finfo(float).tiny))
     if violated.size:
         worst = [f"{constraints.names[i]} (by {-slack[i]:.3g})" for i in violated[:5]]

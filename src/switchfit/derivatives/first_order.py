@@ -1,0 +1,218 @@
+"""First derivatives of the discretised system along theta, shared by its forward and its adjoint second order.
+
+theta here is (tau_1 .. tau_N, p_1 .. p_M), D = N + M entries; fixed transition times are among them. f and ell are
+differentiated at all stages of a chunk of rows at once; what remains to be done one row after another is linear.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from switchfit.mesh import Rows
+from switchfit.model import Model, Piece, Samples
+from switchfit.propagate import Path, at_cells, by_mode, propagate
+from switchfit.rungekutta import stage_tangents
+
+Array = jax.Array
+
+
+class StageJacobians(NamedTuple):
+    """Derivatives of f and ell at every stage of every row.
+
+    Attributes
+    ----------
+    f_t, f_x, f_p : (Q, C, s, n), (Q, C, s, n, n), (Q, C, s, n, M)
+    l, l_t, l_x, l_p : (Q, C, s), (Q, C, s), (Q, C, s, n), (Q, C, s, M)
+    """
+
+    f_t: Array
+    f_x: Array
+    f_p: Array
+    l: Array  # noqa: E741  # the paper's ell
+    l_t: Array
+    l_x: Array
+    l_p: Array
+
+
+class ResetJacobians(NamedTuple):
+    """Derivatives of the map at the opening of each segment, identity where there is none: (N + 1, ...) arrays."""
+
+    x: Array  # (N + 1, n, n)
+    theta: Array  # (N + 1, n, D)
+
+
+class Tangents(NamedTuple):
+    """Derivative of the state in theta.
+
+    Attributes
+    ----------
+    before, after : (Q, C, n, D), at the start and the end of each row
+    stages, slopes : (Q, C, s, n, D), of X_j and K_j
+    """
+
+    before: Array
+    after: Array
+    stages: Array
+    slopes: Array
+
+    def before_transition(self, layout: Rows, i: int) -> Array:
+        """At tau_i-: (n, D)."""
+        return self.after[layout.first_chunk[i + 1] - 1, -1]
+
+    def at_samples(self, layout: Rows, cell: Array) -> Array:
+        """At the ends of the given cells (K,): (K, n, D)."""
+        return at_cells(layout, self.before[0, 0], self.after, cell)
+
+
+class FirstOrder(NamedTuple):
+    """The forward sweep: path, Jacobians, x_theta, cost and gradient."""
+
+    path: Path
+    jacobians: StageJacobians
+    resets: ResetJacobians | None
+    tangents: Tangents
+    cost: Array
+    gradient: Array
+
+
+def first_order(model: Model, tau: Array, p: Array, side: Array) -> FirstOrder:
+    """Cost and gradient (D,) of the discretised system, in forward mode."""
+    path = propagate(model, tau, p, side)
+    jacobians = stage_jacobians(model, path, p)
+    resets = reset_jacobians(model, path, tau, p)
+    X = tangents(model, path, jacobians, resets, p)
+    P = parameter_directions(model)
+    cost, gradient = running_cost_gradient(model, path, jacobians, X)
+    for k, samples in enumerate(model.arguments.samples):
+        value, g_x, g_p = sample_gradients(model, path, k, samples, p)
+        cost = cost + value.sum()
+        gradient = gradient + jnp.einsum("kn,knd->d", g_x, X.at_samples(path.layout, samples.cell)) + g_p.sum(0) @ P
+    if model.structure.terminal:
+        value, (phi_x, phi_p) = jax.value_and_grad(model.terminal, argnums=(0, 1))(path.after[-1, -1], p)
+        cost = cost + value
+        gradient = gradient + phi_x @ X.after[-1, -1] + phi_p @ P
+    return FirstOrder(path, jacobians, resets, X, cost, gradient)
+
+
+def parameter_directions(model: Model) -> Array:
+    """Derivative of p in theta, ``[0 | I]``: (M, D)."""
+    N, M = model.structure.N, model.structure.M
+    return jnp.concatenate([jnp.zeros((M, N)), jnp.eye(M)], axis=1)
+
+
+def time_directions(model: Model, layout: Rows) -> tuple[Array, Array]:
+    """Derivatives of the start and the end of each row in theta: two (Q, C, D) arrays of zeros and ones."""
+    index = jnp.arange(model.structure.N + model.structure.M)
+    return (layout.starts_at[..., None] == index) * 1.0, (layout.ends_at[..., None] == index) * 1.0
+
+
+def stage_time_directions(model: Model, start_d: Array, end_d: Array) -> Array:
+    """Derivatives of the times of the stages of one row, ``start' + c_j h'``: (s, D)."""
+    return start_d + model.tableau.c[:, None] * (end_d - start_d)
+
+
+def stage_jacobians(model: Model, path: Path, p: Array) -> StageJacobians:
+    """D_2 f, D_1 f, D_p f and the same of ell at all stages, by forward differentiation along (t, x, p)."""
+    n, M = model.structure.n, model.structure.M
+    basis = jnp.eye(1 + n + M)
+
+    def of_mode(mode: int) -> Callable[..., tuple[Array, Array, Array]]:
+        def at_stage(piece: Piece, t: Array, x: Array) -> tuple[Array, Array, Array]:
+            f, ell = model.field(mode, piece), model.density(piece)
+
+            def function(t: Array, x: Array, p: Array) -> tuple[Array, Array]:
+                return f(t, x, p), ell(t, x, p) if model.has_running_cost else jnp.zeros(())
+
+            def column(direction: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+                along = (direction[0], direction[1 : 1 + n], direction[1 + n :])
+                return jax.jvp(function, (t, x, p), along)
+
+            (_, l), (f_z, l_z) = jax.vmap(column, out_axes=((None, None), (-1, -1)))(basis)  # noqa: E741
+            return f_z, l, l_z
+
+        def row(start: Array, end: Array, piece: Piece, X: Array) -> tuple[Array, Array, Array]:
+            times = start + model.tableau.c * (end - start)
+            return jax.vmap(at_stage, in_axes=(None, 0, 0))(piece, times, X)
+
+        return jax.vmap(row)
+
+    def chunk(given: tuple[Array, Array, Array, Piece, Array]) -> tuple[Array, Array, Array]:
+        segment, *operands = given
+        return by_mode(model, segment, of_mode, *operands)
+
+    layout = path.layout
+    f_z, l, l_z = lax.map(chunk, (layout.segment, layout.start, layout.end, path.pieces, path.stages))  # noqa: E741
+    return StageJacobians(
+        f_z[..., 0], f_z[..., 1 : 1 + n], f_z[..., 1 + n :], l, l_z[..., 0], l_z[..., 1 : 1 + n], l_z[..., 1 + n :]
+    )
+
+
+def reset_jacobians(model: Model, path: Path, tau: Array, p: Array) -> ResetJacobians | None:
+    """Jacobians of the reset maps; None where no transition has one."""
+    structure = model.structure
+    if not structure.resets:
+        return None
+    n, N, M = structure.n, structure.N, structure.M
+    x = jnp.broadcast_to(jnp.eye(n), (N + 1, n, n))
+    theta = jnp.zeros((N + 1, n, N + M))
+    for i in structure.resets:
+        R_t, R_x, R_p = jax.jacfwd(model.reset(i), argnums=(0, 1, 2))(tau[i], path.before_transition(i), p)
+        x = x.at[i + 1].set(R_x)
+        theta = theta.at[i + 1, :, i].set(R_t).at[i + 1, :, N:].set(R_p)
+    return ResetJacobians(x, theta)
+
+
+def tangents(model: Model, path: Path, jacobians: StageJacobians, resets: ResetJacobians | None, p: Array) -> Tangents:
+    """``x_theta`` along the path: forward, linear, one row after another."""
+    layout = path.layout
+    P = parameter_directions(model)
+
+    def row(X: Array, given: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
+        h, s_d, e_d, f_t, f_x, f_p, K = given
+        S = f_t[:, :, None] * stage_time_directions(model, s_d, e_d)[:, None, :] + f_p @ P
+        stages_d, slopes_d, after = stage_tangents(model.tableau, h, e_d - s_d, f_x, S, K, X)
+        return after, (X, after, stages_d, slopes_d)
+
+    def chunk(X: Array, given: tuple[Array, Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
+        segment, opens, operands = given
+        if resets is not None:
+            X = jnp.where(opens, resets.x[segment] @ X + resets.theta[segment], X)
+        return lax.scan(row, X, operands)
+
+    first = jax.jacfwd(model.initial_state)(p) @ P
+    starts, ends = time_directions(model, layout)
+    operands = (layout.end - layout.start, starts, ends, jacobians.f_t, jacobians.f_x, jacobians.f_p, path.slopes)
+    return Tangents(*lax.scan(chunk, first, (layout.segment, layout.opens, operands))[1])
+
+
+def running_cost_gradient(model: Model, path: Path, jacobians: StageJacobians, X: Tangents) -> tuple[Array, Array]:
+    """Integral of the running costs and its derivative in theta (D,)."""
+    P = parameter_directions(model)
+    if not model.has_running_cost:
+        return jnp.zeros(()), jnp.zeros(P.shape[1])
+    layout = path.layout
+    b = jnp.asarray(model.tableau.b)
+    weight = (layout.end - layout.start)[..., None] * b
+    starts, ends = time_directions(model, layout)
+    gradient = jnp.einsum("qcs,qcsn,qcsnd->d", weight, jacobians.l_x, X.stages)
+    gradient = gradient + jnp.einsum("qcs,qcsm->m", weight, jacobians.l_p) @ P
+    times_d = (weight * jacobians.l_t) @ jnp.stack([1 - model.tableau.c, model.tableau.c], axis=1)
+    by_start = times_d[..., 0] - jacobians.l @ b
+    by_end = times_d[..., 1] + jacobians.l @ b
+    gradient = gradient + jnp.einsum("qc,qcd->d", by_start, starts) + jnp.einsum("qc,qcd->d", by_end, ends)
+    return jnp.sum(weight * jacobians.l), gradient
+
+
+def sample_gradients(model: Model, path: Path, k: int, samples: Samples, p: Array) -> tuple[Array, Array, Array]:
+    """Cost (K,) of each sample of the k-th Measurements and its derivatives in x (K, n) and p (K, M)."""
+
+    def one(sample: Samples, x: Array) -> tuple[Array, Array, Array]:
+        value, (g_x, g_p) = jax.value_and_grad(model.sample_cost, argnums=(2, 3))(k, sample, x, p)
+        return value, g_x, g_p
+
+    return jax.vmap(one)(samples, path.at_samples(samples.cell))
