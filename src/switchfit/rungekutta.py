@@ -143,39 +143,60 @@ def _implicit_stages(
     return list(X), list(K)
 
 
-def stage_tangents(
-    tableau: Tableau, h: Array, h_d: Array, A: Array, S: Array, K: Array, x_d: Array
-) -> tuple[Array, Array, Array]:
-    """Derivatives of the stages along D directions: the stage equations, differentiated.
+def stage_tangents(tableau: Tableau, h: Array, A: Array, S: Array, x_d: Array) -> tuple[Array, Array]:
+    """Derivatives of the stages along D directions at fixed step length: the stage equations, differentiated.
 
-        X_j' = x' + h sum_l a_jl K_l' + (sum_l a_jl K_l) h',      K_j' = A_j X_j' + S_j
+        X_j' = x_j' + h sum_l a_jl K_l',      K_j' = A_j X_j' + S_j
 
     Parameters
     ----------
-    h, h_d : step length () and its derivative (D,)
+    h : step length ()
     A : (s, n, n), D_1 f at each stage
-    S : (s, n, D), what else K_j depends on: D_2 f t_j' + D_p f p'
-    K : (s, n), slopes
-    x_d : (n, D), derivative of the state before the step
+    S : (s, n, D), what else K_j depends on
+    x_d : (n, D), derivative of the state before the step; or (s, n, D) where it differs from stage to stage
 
     Returns
     -------
-    X_d, K_d : (s, n, D) each
-    after_d : (n, D), derivative of the state after the step
+    X_d, K_d : (s, n, D) each; the state after the step has derivative ``x' + h sum_j b_j K_j'``
     """
     s = len(tableau.c)
-    base = [x_d + combine(tableau.a[j], list(K))[:, None] * h_d if tableau.a[j].any() else x_d for j in range(s)]
+    base = [x_d] * s if x_d.ndim == 2 else list(x_d)
     if tableau is STIFF:
-        right = jnp.stack([_product(A[j], base[j]) + S[j] for j in range(s)])
+        right = jnp.stack([product(A[j], base[j]) + S[j] for j in range(s)])
         K_d = list((_stage_inverse(tableau, h, A) @ right.reshape(-1, right.shape[-1])).reshape(right.shape))
         X_d = [base[j] + h * combine(tableau.a[j], K_d) for j in range(s)]
     else:
         X_d, K_d = [], []
         for j in range(s):
-            X_d.append(base[j] + h * combine(tableau.a[j], K_d) if j else x_d)
-            K_d.append(_product(A[j], X_d[j]) + S[j])
-    after_d = x_d + h * combine(tableau.b, K_d) + combine(tableau.b, list(K))[:, None] * h_d
-    return jnp.stack(X_d), jnp.stack(K_d), after_d
+            X_d.append(base[j] + h * combine(tableau.a[j], K_d) if j else base[0])
+            K_d.append(product(A[j], X_d[j]) + S[j])
+    return jnp.stack(X_d), jnp.stack(K_d)
+
+
+def end_tangents(
+    tableau: Tableau, h: Array, A: Array, f_t: Array, K: Array, t_d: Array, h_d: float
+) -> tuple[Array, Array, Array]:
+    """Derivatives of a step in its start (``t' = 1 - c, h' = -1``) or in its end (``t' = c, h' = 1``).
+
+        X_j' = h sum_l a_jl K_l' + h' sum_l a_jl K_l,      K_j' = A_j X_j' + D_2 f_j t_j'
+
+    Parameters
+    ----------
+    h : step length ()
+    A, f_t : (s, n, n) and (s, n), D_1 f and D_2 f at each stage
+    K : (s, n), slopes
+    t_d : (s,), derivative of the stage times
+    h_d : derivative of the step length
+
+    Returns
+    -------
+    X_d, K_d : (s, n)
+    after_d : (n,), derivative of the state after the step
+    """
+    base = h_d * (jnp.asarray(tableau.a) @ K)[:, :, None]
+    X_d, K_d = stage_tangents(tableau, h, A, (f_t * t_d[:, None])[:, :, None], base)
+    after_d = h * combine(tableau.b, list(K_d[..., 0])) + h_d * combine(tableau.b, list(K))
+    return X_d[..., 0], K_d[..., 0], after_d
 
 
 def stage_adjoints(tableau: Tableau, h: Array, A: Array, l_x: Array, psi: Array) -> tuple[Array, Array, Array]:
@@ -216,7 +237,7 @@ def _stage_inverse(tableau: Tableau, h: Array, A: Array) -> Array:
     return jnp.linalg.inv(jnp.eye(s * n) - blocks.reshape(s * n, s * n))
 
 
-def _product(A: Array, B: Array) -> Array:
+def product(A: Array, B: Array) -> Array:
     """``A @ B`` of small matrices, (n, n) and (n, D), without the overhead of a call to BLAS where that dominates."""
     if A.shape[0] * A.shape[1] * B.shape[1] > 1000:
         return A @ B

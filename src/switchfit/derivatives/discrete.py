@@ -32,7 +32,7 @@ from switchfit.derivatives.first_order import (
 from switchfit.mesh import row_ending_cell
 from switchfit.model import Model, Piece, Samples
 from switchfit.propagate import Path, by_mode
-from switchfit.rungekutta import combine, stage_adjoints
+from switchfit.rungekutta import combine, product, stage_adjoints
 
 Array = jax.Array
 
@@ -179,14 +179,15 @@ def step_length_curvature(model: Model, first: FirstOrder, psi: Costates) -> Arr
         def at(a: Array) -> Array:
             return a.reshape((-1,) + a.shape[2:])[row]
 
-        K_d, mu, J = list(at(X.slopes)), at(psi.mu), jax.tree.map(at, first.jacobians)
+        J, X_d, mu = jax.tree.map(at, first.jacobians), at(X.stages), at(psi.mu)
+        times_d = stage_time_directions(model, at(starts), at(ends))
+        K_d = [product(A, x_d) + S for A, x_d, S in zip(J.f_x, X_d, J.f_t[:, :, None] * times_d[:, None] + J.f_p @ P)]
         total = at(psi.after) @ combine(tableau.b, K_d)
         for j in range(len(tableau.c)):
             if tableau.a[j].any():
                 total = total + mu[j] @ combine(tableau.a[j], K_d)
         if model.has_running_cost:
-            times_d = stage_time_directions(model, at(starts), at(ends))
-            l_d = J.l_t[:, None] * times_d + jnp.einsum("sn,snd->sd", J.l_x, at(X.stages)) + J.l_p @ P
+            l_d = J.l_t[:, None] * times_d + jnp.einsum("sn,snd->sd", J.l_x, X_d) + J.l_p @ P
             total = total + tableau.b @ l_d
         return total
 

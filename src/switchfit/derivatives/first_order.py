@@ -7,6 +7,7 @@ differentiated at all stages of a chunk of rows at once; what remains to be done
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -16,7 +17,7 @@ from jax import lax
 from switchfit.mesh import Rows
 from switchfit.model import Model, Piece, Samples
 from switchfit.propagate import Path, at_cells, by_mode, propagate
-from switchfit.rungekutta import stage_tangents
+from switchfit.rungekutta import combine, end_tangents, stage_tangents
 
 Array = jax.Array
 
@@ -52,13 +53,12 @@ class Tangents(NamedTuple):
     Attributes
     ----------
     before, after : (Q, C, n, D), at the start and the end of each row
-    stages, slopes : (Q, C, s, n, D), of X_j and K_j
+    stages : (Q, C, s, n, D), at the stages of each row
     """
 
     before: Array
     after: Array
     stages: Array
-    slopes: Array
 
     def before_transition(self, layout: Rows, i: int) -> Array:
         """At tau_i-: (n, D)."""
@@ -168,15 +168,26 @@ def reset_jacobians(model: Model, path: Path, tau: Array, p: Array) -> ResetJaco
 
 
 def tangents(model: Model, path: Path, jacobians: StageJacobians, resets: ResetJacobians | None, p: Array) -> Tangents:
-    """``x_theta`` along the path: forward, linear, one row after another."""
-    layout = path.layout
-    P = parameter_directions(model)
+    """``x_theta`` along the path: forward, linear, one row after another.
+
+    Only the first and the last row of a segment depend on a transition time directly: what that adds is found
+    before (to the state after the row) and put in afterwards (at its stages).
+    """
+    layout, tableau = path.layout, model.tableau
+    b = tableau.b
+    N, M = model.structure.N, model.structure.M
+    ends = row_end_tangents(model, path, jacobians)
+    Q, C, s, n = path.stages.shape
+    extra = jnp.zeros((Q * C, n, N + M))
+    index = jnp.arange(N)
+    extra = extra.at[ends.rows, :, index].add(ends.after).reshape(Q, C, n, N + M)
 
     def row(X: Array, given: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
-        h, s_d, e_d, f_t, f_x, f_p, K = given
-        S = f_t[:, :, None] * stage_time_directions(model, s_d, e_d)[:, None, :] + f_p @ P
-        stages_d, slopes_d, after = stage_tangents(model.tableau, h, e_d - s_d, f_x, S, K, X)
-        return after, (X, after, stages_d, slopes_d)
+        h, f_x, f_p, extra = given
+        S = jnp.pad(f_p, ((0, 0), (0, 0), (N, 0)))
+        stages_d, slopes_d = stage_tangents(tableau, h, f_x, S, X)
+        after = X + h * combine(b, list(slopes_d)) + extra
+        return after, (X, after, stages_d)
 
     def chunk(X: Array, given: tuple[Array, Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
         segment, opens, operands = given
@@ -184,10 +195,42 @@ def tangents(model: Model, path: Path, jacobians: StageJacobians, resets: ResetJ
             X = jnp.where(opens, resets.x[segment] @ X + resets.theta[segment], X)
         return lax.scan(row, X, operands)
 
-    first = jax.jacfwd(model.initial_state)(p) @ P
-    starts, ends = time_directions(model, layout)
-    operands = (layout.end - layout.start, starts, ends, jacobians.f_t, jacobians.f_x, jacobians.f_p, path.slopes)
-    return Tangents(*lax.scan(chunk, first, (layout.segment, layout.opens, operands))[1])
+    first = jax.jacfwd(model.initial_state)(p) @ parameter_directions(model)
+    operands = (layout.end - layout.start, jacobians.f_x, jacobians.f_p, extra)
+    _, (before, after, stages) = lax.scan(chunk, first, (layout.segment, layout.opens, operands))
+    stages = stages.reshape(Q * C, s, n, N + M).at[ends.rows, :, :, index].add(ends.stages)
+    return Tangents(before, after, stages.reshape(Q, C, s, n, N + M))
+
+
+class RowEnds(NamedTuple):
+    """The 2 x N rows that open or close a segment at a transition, and their derivatives in that time.
+
+    Attributes
+    ----------
+    rows : (2, N) int, flat index of the rows that start (first line) and that end (second line) at tau_i
+    stages : (2, N, s, n), derivative of the stage states at fixed state before the row
+    after : (2, N, n), derivative of the state after the row
+    """
+
+    rows: Array
+    stages: Array
+    after: Array
+
+
+def row_end_tangents(model: Model, path: Path, jacobians: StageJacobians) -> RowEnds:
+    """Direct derivatives of the rows beside a transition in its time."""
+    layout, tableau = path.layout, model.tableau
+    rows = jnp.stack([layout.first_chunk[1:] * layout.start.shape[1], layout.last_row[:-1]])
+    h, f_x, f_t, K = (
+        a.reshape((-1,) + a.shape[2:])[rows]
+        for a in (layout.end - layout.start, jacobians.f_x, jacobians.f_t, path.slopes)
+    )
+    parts = []
+    for line, (t_d, h_d) in enumerate(((1 - tableau.c, -1.0), (tableau.c, 1.0))):
+        derivative = partial(end_tangents, tableau, t_d=t_d, h_d=h_d)
+        parts.append(jax.vmap(derivative)(h[line], f_x[line], f_t[line], K[line]))
+    stages, _, after = (jnp.stack(pair) for pair in zip(*parts, strict=True))
+    return RowEnds(rows, stages, after)
 
 
 def running_cost_gradient(model: Model, path: Path, jacobians: StageJacobians, X: Tangents) -> tuple[Array, Array]:

@@ -476,6 +476,8 @@ def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tupl
 
 def _cone_projection(unit: FloatArray, gradient: FloatArray) -> FloatArray:
     """Argument of min over lam >= 0 of ‖g − Nᵀ lam‖."""
+    if gradient.size == 0:
+        return np.zeros(unit.shape[0])
     try:
         return np.asarray(nnls(unit.T, gradient, maxiter=10 * unit.shape[0] + 30)[0])
     except RuntimeError:
@@ -485,7 +487,44 @@ def _cone_projection(unit: FloatArray, gradient: FloatArray) -> FloatArray:
 def _box_projection(
     unit: FloatArray, low: FloatArray, width: FloatArray, wide: NDArray[np.intp]
 ) -> tuple[FloatArray, FloatArray]:
-    """Arguments of min over lam >= 0, 0 <= s <= width of ‖low + s − Nᵀ lam‖: lam and s."""
+    """Arguments of min over lam >= 0, 0 <= s <= width of ‖low + s − Nᵀ lam‖: lam and s.
+
+    With s inside its interval a coordinate puts no condition on lam, at an end of it an ordinary one: nonnegative
+    least squares with the coordinates so labelled, until the labels agree with the solution. Should they cycle, a
+    general (less accurate) solver has its say too.
+    """
+    label = np.zeros(wide.size)  # −1 and +1: at the lower and upper end
+    candidates = []
+    for _ in range(3 * wide.size + 5):
+        target = low.copy()
+        target[wide] += np.where(label > 0, width, 0.0)
+        fitted = np.ones(low.size, dtype=bool)
+        fitted[wide] = label != 0.0
+        multipliers = _cone_projection(unit[:, fitted], target[fitted])
+        above = (unit.T @ multipliers - low)[wide]
+        shifts = np.clip(above, 0.0, width)
+        candidates.append((multipliers, shifts))
+        relabelled = np.where(above > width, 1.0, np.where(above < 0.0, -1.0, 0.0))
+        if np.array_equal(relabelled, label):
+            return multipliers, shifts
+        label = relabelled
+    candidates.append(_bounded_least_squares(unit, low, width, wide))
+    return min(candidates, key=lambda pair: _distance(unit, low, wide, *pair))
+
+
+def _distance(
+    unit: FloatArray, low: FloatArray, wide: NDArray[np.intp], multipliers: FloatArray, shifts: FloatArray
+) -> float:
+    """‖low + s − Nᵀ lam‖."""
+    difference = low - unit.T @ multipliers
+    difference[wide] += shifts
+    return float(np.linalg.norm(difference))
+
+
+def _bounded_least_squares(
+    unit: FloatArray, low: FloatArray, width: FloatArray, wide: NDArray[np.intp]
+) -> tuple[FloatArray, FloatArray]:
+    """The problem of `_box_projection` by a general solver."""
     k, d = unit.shape
     columns = np.zeros((d, wide.size))
     columns[wide, np.arange(wide.size)] = -1.0

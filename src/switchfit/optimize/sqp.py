@@ -27,7 +27,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Literal, Protocol, get_args
@@ -463,10 +463,12 @@ def _direction(problem: _Problem, state: _State, low: FloatArray, high: FloatArr
     best, force = _solve_on_sides(problem, state, sides, low, high)
     direction = best
     tried = {sides.tobytes()}
-    for _ in range(2 * int(state.point.kink.sum()) + 4):
-        sides = _released(state.point, sides, direction.step, force)
-        if sides.tobytes() in tried:
+    for _ in range(3 * int(state.point.kink.sum()) + 4):
+        released = (s for s in _releases(state, sides, direction.step, force) if s.tobytes() not in tried)
+        following = next(released, None)
+        if following is None:
             break
+        sides = following
         tried.add(sides.tobytes())
         direction, force = _solve_on_sides(problem, state, sides, low, high)
         if direction.reduction > best.reduction:
@@ -474,19 +476,24 @@ def _direction(problem: _Problem, state: _State, low: FloatArray, high: FloatArr
     return best
 
 
-def _released(point: _Point, sides: NDArray[np.int_], step: FloatArray, force: FloatArray) -> NDArray[np.int_]:
-    """Sides with the coordinate released that is held at its kink by the largest force outside [g₋, g₊]."""
+def _releases(
+    state: _State, sides: NDArray[np.int_], step: FloatArray, force: FloatArray
+) -> Iterator[NDArray[np.int_]]:
+    """Sides with one coordinate released that a force outside [g₋, g₊] holds at its kink, the worst one first."""
+    point = state.point
     left, right = point.minus.gradient, point.plus.gradient
     tolerance = 1e-13 * (np.abs(left) + np.abs(right))
     pinned = point.kink & (np.abs(step) <= 8 * EPS * np.maximum(np.abs(point.theta), np.max(np.abs(step))))
-    to_right = np.where(pinned & (sides <= 0), force - right - tolerance, -np.inf)
-    to_left = np.where(pinned & (sides >= 0), left - force - tolerance, -np.inf)
-    worst = int(np.argmax(np.maximum(to_right, to_left)))
-    if max(to_right[worst], to_left[worst]) <= 0.0:
-        return sides
-    changed = sides.copy()
-    changed[worst] = 1 if to_right[worst] > to_left[worst] else -1
-    return changed
+    to_right = np.where(pinned & (sides <= 0), force - right - tolerance, 0.0)
+    to_left = np.where(pinned & (sides >= 0), left - force - tolerance, 0.0)
+    # In units of J, or unknowns of different units could not be compared.
+    worth = np.maximum(to_right, to_left) * np.where(state.scale > 0.0, state.scale, 1.0)
+    for i in np.argsort(-worth, kind="stable"):
+        if worth[i] <= 0.0:
+            return
+        changed = sides.copy()
+        changed[i] = 1 if to_right[i] > to_left[i] else -1
+        yield changed
 
 
 def _solve_on_sides(
@@ -661,19 +668,33 @@ def _move(problem: _Problem, theta: FloatArray, step: FloatArray) -> FloatArray:
 
 
 def _repair(constraints: LinearConstraints, theta: FloatArray, pinned: NDArray[np.bool_]) -> FloatArray:
-    """Remove violations of the rows that are due to rounding, leaving pinned coordinates where they are."""
-    theta = theta.copy()
-    for k in range(6):
-        violation = constraints.b - constraints.A @ theta
-        for row in np.flatnonzero(violation > 0.0):
-            normal = np.where(pinned, 0.0, constraints.A[row])
-            square = float(normal @ normal)
-            if square > 0.0:
-                # Growing a little with each round: half an ulp added to a number leaves it as it was.
-                theta += normal * (violation[row] * 1.5**k / square)
-        if not np.any(violation > 0.0):
+    """Remove violations of the rows that are due to rounding, leaving pinned coordinates where they are.
+
+    Projections onto one violated row after the other, an ulp to its inside. What they cannot remove where many rows
+    meet at a vertex is left: it is of the size of rounding too.
+    """
+    best, least = theta, _violation(constraints, theta)
+    repaired = theta.copy()
+    for _ in range(6):
+        if least <= 0.0:
             break
-    return np.clip(theta, constraints.lower, constraints.upper)
+        for normal, bound in zip(constraints.A, constraints.b, strict=True):
+            violation = float(bound - normal @ repaired)
+            inside = np.where(pinned, 0.0, normal)
+            square = float(inside @ inside)
+            if violation > 0.0 and square > 0.0:
+                margin = EPS * float(np.abs(normal) @ np.abs(repaired))
+                repaired += inside * ((violation + margin) / square)
+        repaired = np.clip(repaired, constraints.lower, constraints.upper)
+        remaining = _violation(constraints, repaired)
+        if remaining < least:
+            best, least = repaired.copy(), remaining
+    return best
+
+
+def _violation(constraints: LinearConstraints, theta: FloatArray) -> float:
+    """Largest violation of a row."""
+    return float(np.max(constraints.b - constraints.A @ theta, initial=0.0))
 
 
 # --- curvature and classification -------------------------------------------------------------------------------------
