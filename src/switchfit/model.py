@@ -7,7 +7,7 @@ nothing is compiled anew when transition times, parameters or data change.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -18,8 +18,9 @@ import numpy as np
 
 from switchfit.data import FloatArray, Measurements, Observe, ReferenceSignal, RunningCost, TerminalCost
 from switchfit.mesh import Mesh, padded_length
-from switchfit.problem import Problem, initial_state_of, reset_maps_of, signals_of
+from switchfit.experiment import Experiment, Parameter, initial_state_of, reset_maps_of, signals_of
 from switchfit.rungekutta import Density, Field, Tableau, tableau_of
+from switchfit.system import HybridSystem
 
 Array = jax.Array
 
@@ -42,7 +43,7 @@ class Structure:
     parameters: tuple[tuple[str, tuple[int, ...], bool], ...]  # name, shape, free
     running: tuple[Callable[..., Any], ...]
     references: tuple[tuple[Observe | None, int], ...]  # observe, channels
-    measurements: tuple[Observe | None, ...]
+    measurements: tuple[tuple[Observe | None, int], ...]  # observe, channels
     terminal: tuple[Callable[..., Any], ...]
     input_shape: tuple[int, ...] | None
     solver: str
@@ -194,7 +195,8 @@ class Model:
 
     def sample_residual(self, k: int, sample: Samples, x: Array, p: Array) -> Array:
         """``h - y`` of one sample of the k-th Measurements, 0 where it is missing: (q,)."""
-        h = self.observed(self.structure.measurements[k], sample.time, x, p, sample.value.shape[-1])
+        observe, channels = self.structure.measurements[k]
+        h = self.observed(observe, sample.time, x, p, channels)
         return jnp.where(sample.weight > 0, h - sample.value, 0.0)
 
     def sample_cost(self, k: int, sample: Samples, x: Array, p: Array) -> Array:
@@ -250,9 +252,10 @@ def checked_vector(value: Any, shape: tuple[int, ...], what: str, signature: str
     return array
 
 
-def structure_of(problem: Problem, e: int) -> Structure:
-    """The structure of experiment e, with every user function called once to check what it returns."""
-    system, experiment = problem.system, problem.experiments[e]
+def structure_of(
+    system: HybridSystem, experiment: Experiment, parameters: Mapping[str, Parameter], solver: str
+) -> Structure:
+    """The structure of one experiment."""
     names = tuple(dict.fromkeys(experiment.mode_sequence))
     initial = initial_state_of(system, experiment)
     of_kind = partial(_of_kind, experiment.data)
@@ -262,44 +265,93 @@ def structure_of(problem: Problem, e: int) -> Structure:
         mode_of_segment=tuple(names.index(mode) for mode in experiment.mode_sequence),
         reset_maps=reset_maps_of(system, experiment.mode_sequence),
         initial_state=initial if callable(initial) else None,
-        n=_state_size(problem, initial),
-        parameters=tuple((name, q.shape, not q.fixed) for name, q in problem.parameters.items()),
+        n=_state_size(initial, parameters),
+        parameters=tuple((name, q.shape, not q.fixed) for name, q in parameters.items()),
         running=tuple(item.ell for item in of_kind(RunningCost)),
         references=tuple((item.observe, item.signal.channels) for item in of_kind(ReferenceSignal)),
-        measurements=tuple(item.observe for item in of_kind(Measurements)),
+        measurements=tuple((item.observe, item.values.shape[1]) for item in of_kind(Measurements)),
         terminal=tuple(item.phi for item in of_kind(TerminalCost)),
         input_shape=None if experiment.inputs is None else tuple(experiment.inputs.values.shape[1:]),
-        solver=problem.solver,
+        solver=solver,
     )
 
 
-def arguments_of(problem: Problem, e: int, mesh: Mesh) -> Arguments:
-    """The arrays of experiment e on a mesh that holds all its sample times and knots as nodes."""
-    experiment = problem.experiments[e]
-    initial = initial_state_of(problem.system, experiment)
-    fixed = tuple(np.asarray(q.value) for q in problem.parameters.values() if q.fixed)
+def arguments_of(
+    structure: Structure,
+    system: HybridSystem,
+    experiment: Experiment,
+    parameters: Mapping[str, Parameter],
+    mesh: Mesh,
+) -> Arguments:
+    """The arrays of one experiment on a mesh that holds all its sample times and knots as nodes."""
+    initial = initial_state_of(system, experiment)
+    fixed = tuple(np.asarray(q.value) for q in parameters.values() if q.fixed)
     samples = tuple(_padded_samples(item, mesh) for item in _of_kind(experiment.data, Measurements))
     weights = tuple(item.weights for item in _of_kind(experiment.data, ReferenceSignal))
-    x0 = np.zeros(structure_size(problem, e)) if callable(initial) else initial
-    arrays = Arguments(mesh.nodes, _signals_by_cell(problem, e, mesh), fixed, x0, samples, weights)
+    x0 = np.zeros(structure.n) if callable(initial) else initial
+    arrays = Arguments(mesh.nodes, _signals_by_cell(experiment, mesh), fixed, x0, samples, weights)
     with float64():
         return jax.tree.map(jnp.asarray, arrays)
 
 
-def structure_size(problem: Problem, e: int) -> int:
-    """Number of states n of experiment e."""
-    return _state_size(problem, initial_state_of(problem.system, problem.experiments[e]))
+def check_functions(structure: Structure) -> None:
+    """Call every function of the user's once, abstractly: that shapes, dtypes and parameter names are right.
+
+    Raises
+    ------
+    ValueError
+        Naming the mode or function, what it should return and what it returned.
+    """
+    channels = sum(q for _, q in structure.references) + int(np.prod(structure.input_shape or ()))
+    with float64():
+        arguments = Arguments(
+            nodes=jnp.zeros(2),
+            signals=jnp.zeros((1, 4, channels)),
+            fixed=tuple(jnp.zeros(shape) for _, shape, free in structure.parameters if not free),
+            initial_state=jnp.zeros(structure.n),
+            samples=(),
+            weights=tuple(jnp.eye(q) for _, q in structure.references),
+        )
+        model = Model(structure, arguments)
+        piece = Piece(jnp.zeros(()), arguments.signals[0])
+        t, x, p = (jax.ShapeDtypeStruct(shape, jnp.float64) for shape in ((), (structure.n,), (structure.M,)))
+        for mode, name in enumerate(structure.mode_names):
+            _trace(f"mode {name!r}", model.field(mode, piece), t, x, p)
+        for i in structure.resets:
+            names = tuple(structure.mode_names[m] for m in structure.mode_of_segment[i : i + 2])
+            _trace(f"reset map {names}", model.reset(i), t, x, p)
+        _trace("a RunningCost or an observe function", model.density(piece), t, x, p)
+        for observe, q in structure.measurements:
+            _trace("observe", partial(model.observed, observe, channels=q), t, x, p)
+        _trace("a TerminalCost", model.terminal, x, p)
+        _trace("initial_state", model.initial_state, p)
+
+
+def _trace(what: str, function: Callable[..., Any], *arguments: Any) -> None:
+    """Call a function of the user's on abstract arguments; whatever it raises becomes one clear sentence."""
+    try:
+        jax.eval_shape(function, *arguments)
+    except KeyError as error:
+        raise ValueError(f"{what} asks for the parameter {error}, which the problem lacks.") from error
+    except jax.errors.ConcretizationTypeError as error:
+        raise ValueError(
+            f"{what} decides by the value of t, x or p (an `if`, a `while`, float() or numpy function), which JAX cannot "
+            "differentiate. Write it with jax.numpy; if the dynamics change there, make it a mode with a transition time."
+        ) from error
+    except (TypeError, IndexError, AttributeError) as error:
+        raise ValueError(f"{what} raised {type(error).__name__}: {error}") from error
 
 
 def _of_kind(data: tuple[Any, ...], kind: type) -> list[Any]:
     return [item for item in data if isinstance(item, kind)]
 
 
-def _state_size(problem: Problem, initial: Any) -> int:
+def _state_size(initial: Any, parameters: Mapping[str, Parameter]) -> int:
+    """Number of states, from the initial state or what its function returns."""
     if not callable(initial):
         return int(initial.size)
     with float64():
-        p = {name: jax.ShapeDtypeStruct(q.shape, jnp.float64) for name, q in problem.parameters.items()}
+        p = {name: jax.ShapeDtypeStruct(q.shape, jnp.float64) for name, q in parameters.items()}
         try:
             shape = jax.eval_shape(lambda p: jnp.asarray(initial(p)), p).shape
         except KeyError as error:
@@ -321,12 +373,12 @@ def _padded_samples(item: Measurements, mesh: Mesh) -> Samples:
     )
 
 
-def _signals_by_cell(problem: Problem, e: int, mesh: Mesh) -> FloatArray:
+def _signals_by_cell(experiment: Experiment, mesh: Mesh) -> FloatArray:
     """Every signal as a cubic in each cell, in powers of the time since the cell's first node: (G, 4, S)."""
     starts = mesh.nodes[:-1]
     middles = 0.5 * (mesh.nodes[:-1] + mesh.nodes[1:])
     tables = [np.zeros((len(starts), 4, 0))]
-    for signal in signals_of(problem.experiments[e]):
+    for signal in signals_of(experiment):
         k = signal.interval(middles)
         s = (starts - signal.knots[k])[:, None]
         c0, c1, c2, c3 = np.moveaxis(signal.coefficients[k], 1, 0)

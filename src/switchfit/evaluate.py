@@ -1,0 +1,202 @@
+"""The cost of a problem and its exact derivatives at any theta, on a mesh that stays the same."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+from weakref import WeakKeyDictionary
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from switchfit.data import FloatArray
+from switchfit.derivatives.adjoint import paper_derivatives
+from switchfit.derivatives.discrete import adjoint_hessian, gauss_newton_hessian
+from switchfit.derivatives.first_order import first_order
+from switchfit.derivatives.forward import forward_hessian
+from switchfit.mesh import Mesh
+from switchfit.model import Arguments, Model, Structure, float64
+from switchfit.problem import Problem
+from switchfit.propagate import path_cost, propagate
+from switchfit.refine import refined_mesh
+
+Method = Literal["auto", "forward", "discrete-adjoint", "adjoint", "autodiff"]
+METHODS = ("auto", "forward", "discrete-adjoint", "adjoint", "autodiff")
+
+FORWARD_UP_TO = 1
+"""Unknowns of one experiment up to which second order forward is cheaper than the backward sweep (benchmarks)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Cost and derivatives at one theta.
+
+    Attributes
+    ----------
+    cost : J
+    gradient : (d,), J's derivative in theta
+    hessian : (d, d)
+    """
+
+    cost: float
+    gradient: FloatArray
+    hessian: FloatArray
+
+
+class Evaluator:
+    """A problem on fixed meshes, one an experiment: cost, gradient and Hessian as functions of theta alone.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : (d,) array, optional
+        Where the meshes are refined; the problem's initial guess if left out.
+    meshes : sequence of Mesh, optional
+        Meshes to use instead of refined ones.
+    """
+
+    def __init__(
+        self, problem: Problem, theta: FloatArray | None = None, meshes: Sequence[Mesh] | None = None
+    ) -> None:
+        self.problem = problem
+        indices = range(len(problem.experiments))
+        at = problem.initial_theta if theta is None else theta
+        self.meshes = list(meshes) if meshes is not None else [refined_mesh(problem, e, at) for e in indices]
+        self.arguments = [problem.arguments(e, mesh) for e, mesh in enumerate(self.meshes)]
+        self._places = [_places(problem, e) for e in indices]
+
+    def halved(self) -> Evaluator:
+        """The same problem with every cell of its meshes cut in two."""
+        return Evaluator(self.problem, meshes=[mesh.halved() for mesh in self.meshes])
+
+    def cost(self, theta: FloatArray) -> float:
+        """J alone."""
+        with float64():
+            return float(sum(_cost(a, tau, p, structure=s) for s, a, tau, p in self._each(theta)))
+
+    def __call__(
+        self, theta: FloatArray, side: int = 1, method: Method = "auto", gauss_newton: bool = False
+    ) -> Evaluation:
+        """Cost, gradient and Hessian; where a transition time sits on a node, the derivatives to its `side`."""
+        d = len(theta)
+        total, gradient, hessian = 0.0, np.zeros(d), np.zeros((d, d))
+        with float64():
+            results = [
+                _derivatives(a, tau, p, float(side), structure=s, method=_resolve(method, s), gauss_newton=gauss_newton)
+                for s, a, tau, p in self._each(theta)
+            ]
+        for (J, g, H), places in zip(results, self._places, strict=True):
+            free = places >= 0
+            here = places[free]
+            total += float(J)
+            gradient[here] += np.asarray(g)[free]
+            hessian[np.ix_(here, here)] += np.asarray(H)[np.ix_(free, free)]
+        return Evaluation(total, gradient, hessian)
+
+    def breakpoints(self) -> list[FloatArray]:
+        """For each entry of theta the nodes at which derivatives may jump: none for parameters."""
+        points = [np.zeros(0)] * len(self.problem.theta_names)
+        for mesh, where in zip(self.meshes, self.problem.unknowns.times, strict=True):
+            for place in where[where >= 0]:
+                points[place] = mesh.times
+        return points
+
+    def _each(self, theta: FloatArray) -> list[tuple[Structure, Arguments, FloatArray, FloatArray]]:
+        times, parameters = self.problem.split(np.asarray(theta, dtype=np.float64))
+        free = [np.ravel(parameters[name]) for name, q in self.problem.parameters.items() if not q.fixed]
+        p = np.concatenate([np.zeros(0), *free])
+        return [(s, a, tau, p) for s, a, tau in zip(self.problem.structures, self.arguments, times, strict=True)]
+
+
+_evaluators: WeakKeyDictionary[Problem, Evaluator] = WeakKeyDictionary()
+
+
+def evaluator_of(problem: Problem) -> Evaluator:
+    """The problem's own evaluator, its meshes refined at the initial guess; made once."""
+    if problem not in _evaluators:
+        _evaluators[problem] = Evaluator(problem)
+    return _evaluators[problem]
+
+
+def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method = "auto") -> Evaluation:
+    """Cost, exact gradient and exact Hessian of a problem.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : (d,) array_like, optional
+        In the order of ``problem.theta_names``; the initial guess if left out.
+    method : {"auto", "forward", "discrete-adjoint", "adjoint", "autodiff"}
+        "forward" and "discrete-adjoint" are exact for the discretised cost, second order forward and backward;
+        "auto" takes the cheaper one. "adjoint" evaluates the paper's equations (6)-(17), which agree with
+        them to the integration error. "autodiff" leaves everything to JAX; slow, an independent check.
+
+    Returns
+    -------
+    Evaluation
+        cost, gradient (d,), hessian (d, d).
+
+    Raises
+    ------
+    ValueError
+        For a theta of the wrong shape or with transition times out of order, or an unknown method.
+
+    Notes
+    -----
+    The mesh is refined once, at the initial guess, so that J is one smooth function of theta. Where a transition
+    time sits exactly on a sample time the derivatives are those for increasing it.
+    """
+    if method not in METHODS:
+        raise ValueError(f"method must be one of {', '.join(METHODS)}; got {method!r}.")
+    return evaluator_of(problem)(problem.checked_theta(theta), method=method)
+
+
+def _places(problem: Problem, e: int) -> Any:
+    """Position in theta of each of the experiment's N transition times and M parameters, -1 where fixed: (N + M,)."""
+    spans = [np.arange(span.start, span.stop) for span in problem.unknowns.parameters.values()]
+    return np.concatenate([problem.unknowns.times[e], *spans]).astype(int)
+
+
+def _resolve(method: Method, structure: Structure) -> Method:
+    if method != "auto":
+        return method
+    return "forward" if structure.N + structure.M <= FORWARD_UP_TO else "discrete-adjoint"
+
+
+@partial(jax.jit, static_argnames=("structure", "method", "gauss_newton"))
+def _derivatives(
+    arguments: Arguments, tau: jax.Array, p: jax.Array, side: jax.Array, *, structure: Structure, method: Method,
+    gauss_newton: bool,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    model = Model(structure, arguments)
+    if method == "adjoint":
+        return paper_derivatives(model, tau, p, side)
+    if method == "autodiff":
+        return _autodiff(model, tau, p, side)
+    first = first_order(model, tau, p, side)
+    if gauss_newton:
+        return first.cost, first.gradient, gauss_newton_hessian(model, first, p)
+    second = forward_hessian if method == "forward" else adjoint_hessian
+    return first.cost, first.gradient, second(model, first, tau, p)
+
+
+def _autodiff(model: Model, tau: jax.Array, p: jax.Array, side: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """J and its derivatives by JAX alone, forward over forward."""
+    N = model.structure.N
+
+    def J(theta: jax.Array) -> jax.Array:
+        path = propagate(model, theta[:N], theta[N:], side)
+        return path_cost(model, path, theta[N:])
+
+    theta = jnp.concatenate([tau, p])
+    return J(theta), jax.jacfwd(J)(theta), jax.jacfwd(jax.jacfwd(J))(theta)
+
+
+@partial(jax.jit, static_argnames=("structure",))
+def _cost(arguments: Arguments, tau: jax.Array, p: jax.Array, *, structure: Structure) -> jax.Array:
+    model = Model(structure, arguments)
+    return path_cost(model, propagate(model, tau, p, jnp.ones(())), p)

@@ -1,0 +1,214 @@
+"""One run of the system: its data, its sequence of modes, its guesses; and `Parameter`, an unknown of any kind."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from switchfit.data import (
+    Data,
+    FloatArray,
+    Input,
+    Measurements,
+    PiecewisePolynomial,
+    ReferenceSignal,
+    RunningCost,
+    TerminalCost,
+)
+from switchfit.system import HybridSystem, ResetMap, as_state
+
+
+@dataclass(frozen=True, eq=False)
+class Parameter:
+    """One unknown, scalar or array: its initial guess and what is known about it.
+
+    Parameters
+    ----------
+    value : float or array_like
+        Initial guess, or the value itself where `fixed`.
+    lower, upper : float or array_like, optional
+        Bounds; broadcast to the shape of `value`.
+    unit : str, optional
+        For the report.
+    fixed : bool, optional
+        A fixed parameter is not estimated.
+
+    Raises
+    ------
+    ValueError
+        If a value is not finite, bounds cross, or the guess lies outside them.
+    """
+
+    value: Any
+    lower: Any = -np.inf
+    upper: Any = np.inf
+    unit: str = ""
+    fixed: bool = False
+
+    def __post_init__(self) -> None:
+        try:
+            value = np.array(self.value, dtype=np.float64)
+            lower = np.broadcast_to(np.asarray(self.lower, dtype=np.float64), value.shape).copy()
+            upper = np.broadcast_to(np.asarray(self.upper, dtype=np.float64), value.shape).copy()
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"Parameter needs numbers: value {self.value!r}, lower {self.lower!r}, upper {self.upper!r}; {error}."
+            ) from error
+        if not np.all(np.isfinite(value)):
+            raise ValueError(f"Parameter value must be finite; got {self.value!r}.")
+        if not np.all(lower <= upper):
+            raise ValueError(f"Parameter bounds must satisfy lower <= upper; got [{self.lower}, {self.upper}].")
+        if not (np.all(lower <= value) and np.all(value <= upper)):
+            raise ValueError(f"Parameter value {self.value} lies outside its bounds [{self.lower}, {self.upper}].")
+        for name, array in (("value", value), ("lower", lower), ("upper", upper)):
+            object.__setattr__(self, name, array)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the parameter, () for a scalar."""
+        return tuple(self.value.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """One run: its data, its sequence of modes, and the first guess of when they switch.
+
+    Parameters
+    ----------
+    data : cost or list of costs
+        `Measurements`, `ReferenceSignal`, `RunningCost`, `TerminalCost`; several add up.
+    mode_sequence : sequence of str
+        Names of the modes in the order in which they are active; a mode may return.
+    transition_times : sequence of float or Parameter
+        First guess (s) of each transition, one fewer than modes, strictly increasing inside ``(t0, tf)``;
+        an entry may be a `Parameter` with bounds, or fixed.
+    t0, tf : float
+        Horizon (s).
+    inputs : Input, optional
+        Known input; modes are then called as ``f(t, x, p, u)``.
+    initial_state : (n,) array_like or callable ``p -> (n,)``, optional
+        Overrides the system's.
+    name : str, optional
+        Used in the names of transition times when there are several experiments.
+
+    Raises
+    ------
+    ValueError
+        If lengths do not match, times are unordered or outside the horizon, or data lies outside it.
+    """
+
+    data: Any
+    mode_sequence: tuple[str, ...]
+    transition_times: tuple[Any, ...]
+    t0: float
+    tf: float
+    inputs: Input | None = None
+    initial_state: Any = None
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        t0, tf = float(self.t0), float(self.tf)
+        if not (np.isfinite(t0) and np.isfinite(tf) and t0 < tf):
+            raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got ({self.t0}, {self.tf}).")
+        if isinstance(self.mode_sequence, str):
+            raise TypeError(f"mode_sequence must be a sequence of mode names; got the string {self.mode_sequence!r}.")
+        sequence = tuple(self.mode_sequence)
+        if not sequence:
+            raise ValueError("mode_sequence is empty; name at least one mode.")
+        times = tuple(as_parameter(tau, "a transition time") for tau in np.atleast_1d(self.transition_times).tolist())
+        if self.inputs is not None and not isinstance(self.inputs, Input):
+            raise TypeError(f"inputs must be an sf.Input; got {type(self.inputs).__name__}.")
+        if self.initial_state is not None and not callable(self.initial_state):
+            object.__setattr__(self, "initial_state", as_state(self.initial_state, "initial_state"))
+        for field, value in (("t0", t0), ("tf", tf), ("mode_sequence", sequence), ("transition_times", times)):
+            object.__setattr__(self, field, value)
+        object.__setattr__(self, "data", _checked_data(self.data))
+        self._check_times()
+        self._check_data_inside()
+        if self.inputs is not None:
+            self.inputs.signal(t0, tf)
+
+    @property
+    def initial_times(self) -> FloatArray:
+        """Guess of all transition times, fixed ones included: an ``(N,)`` array."""
+        return np.array([tau.value for tau in self.transition_times], dtype=np.float64)
+
+    def _check_times(self) -> None:
+        needed = len(self.mode_sequence) - 1
+        if len(self.transition_times) != needed:
+            raise ValueError(
+                f"{len(self.mode_sequence)} modes need {needed} transition times; got {len(self.transition_times)}."
+            )
+        if any(tau.shape != () for tau in self.transition_times):
+            raise ValueError("Each transition time must be a single number or a Parameter with a single value.")
+        knots = np.concatenate([[self.t0], self.initial_times, [self.tf]])
+        if np.any(np.diff(knots) <= 0):
+            raise ValueError(
+                f"transition_times must increase strictly inside (t0, tf) = ({self.t0}, {self.tf}); "
+                f"got {self.initial_times.tolist()}."
+            )
+
+    def _check_data_inside(self) -> None:
+        for item in self.data:
+            if isinstance(item, Measurements):
+                _require_inside(item.times, self.t0, self.tf, "Measurements")
+            elif isinstance(item, ReferenceSignal):
+                first, last = item.signal.knots[[0, -1]]
+                if first > self.t0 or last < self.tf:
+                    raise ValueError(
+                        f"A ReferenceSignal must reach over (t0, tf) = ({self.t0}, {self.tf}); "
+                        f"this one is known from {first} to {last}."
+                    )
+
+
+def initial_state_of(system: HybridSystem, experiment: Experiment) -> Any:
+    """The experiment's initial state, or the system's where it has none of its own."""
+    return system.initial_state if experiment.initial_state is None else experiment.initial_state
+
+
+def reset_maps_of(system: HybridSystem, mode_sequence: Sequence[str]) -> tuple[ResetMap | None, ...]:
+    """The reset map of each of the N transitions of a mode sequence, None where the state is continuous."""
+    return tuple(system.reset_map(a, b) for a, b in zip(mode_sequence[:-1], mode_sequence[1:], strict=True))
+
+
+def signals_of(experiment: Experiment) -> tuple[PiecewisePolynomial, ...]:
+    """Reference signals in the order of the data, then the input: all that varies in time beside the modes."""
+    signals = [item.signal for item in experiment.data if isinstance(item, ReferenceSignal)]
+    if experiment.inputs is not None:
+        signals.append(experiment.inputs.signal(experiment.t0, experiment.tf))
+    return tuple(signals)
+
+
+def as_parameter(value: Any, what: str) -> Parameter:
+    if isinstance(value, Parameter):
+        return value
+    try:
+        return Parameter(value)
+    except ValueError as error:
+        raise ValueError(f"{what} must be a number, an array or an sf.Parameter: {error}") from error
+
+
+def _checked_data(data: Any) -> tuple[Data, ...]:
+    kinds = (Measurements, ReferenceSignal, RunningCost, TerminalCost)
+    items = (data,) if isinstance(data, kinds) else tuple(data) if isinstance(data, (list, tuple)) else (data,)
+    for item in items:
+        if not isinstance(item, kinds):
+            raise TypeError(
+                "data must be sf.Measurements, sf.ReferenceSignal, sf.RunningCost, sf.TerminalCost or a list of them; "
+                f"got {type(item).__name__}."
+            )
+    if not items:
+        raise ValueError("data is empty: an experiment needs at least one cost.")
+    return items
+
+
+def _require_inside(times: FloatArray, t0: float, tf: float, what: str) -> None:
+    outside = (times < t0) | (times > tf)
+    if outside.any():
+        raise ValueError(
+            f"{what} times must lie inside [t0, tf] = [{t0}, {tf}]; {outside.sum()} of {len(times)} do not, "
+            f"the first is {times[outside][0]}."
+        )

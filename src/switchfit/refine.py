@@ -1,0 +1,138 @@
+"""Choosing the mesh: how short the steps have to be, from one adaptive solve at a given theta.
+
+The adaptive solve is SciPy's, with the same order as the fixed steps that follow. It also integrates the running
+costs, so that they are resolved as well. Its steps are turned into a refinement of the intervals between the nodes
+that have to be there anyway; the mesh then stays as it is while theta moves.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.integrate
+
+from switchfit.data import FloatArray, Measurements
+from switchfit.mesh import Mesh
+from switchfit.experiment import Experiment, signals_of
+from switchfit.model import Arguments, Model, Piece, Structure, float64
+from switchfit.problem import Problem
+
+MAX_STEPS = 200_000
+"""Adaptive steps in one mode before it is called stiff."""
+
+
+def fixed_nodes(experiment: Experiment) -> FloatArray:
+    """Moments that must be nodes: t0, tf, sample times, knots of inputs and reference signals inside the horizon."""
+    t0, tf = experiment.t0, experiment.tf
+    times = [np.array([t0, tf])]
+    times += [item.times for item in experiment.data if isinstance(item, Measurements)]
+    times += [signal.knots for signal in signals_of(experiment)]
+    nodes = np.unique(np.concatenate(times))
+    return nodes[(nodes >= t0) & (nodes <= tf)]
+
+
+def refined_mesh(problem: Problem, e: int, theta: FloatArray) -> Mesh:
+    """Mesh of experiment e on which its trajectory at theta meets the problem's tolerances.
+
+    Raises
+    ------
+    ValueError
+        If a mode returns a value that is not finite, or the trajectory cannot be integrated to its end.
+    """
+    experiment = problem.experiments[e]
+    nodes = fixed_nodes(experiment)
+    steps = _adaptive_steps(problem, e, theta, Mesh.from_times(nodes))
+    index = np.interp(nodes, steps, np.arange(len(steps)))
+    pieces = np.maximum(np.ceil(np.diff(index) - 0.05).astype(int), 1)
+    grid = [np.linspace(a, b, k, endpoint=False) for a, b, k in zip(nodes[:-1], nodes[1:], pieces, strict=True)]
+    return Mesh.from_times(np.concatenate([*grid, nodes[-1:]]))
+
+
+def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -> FloatArray:
+    """All times at which the adaptive solver stopped, from t0 to tf, strictly increasing."""
+    experiment, structure = problem.experiments[e], problem.structures[e]
+    arguments = jax.tree.map(np.asarray, problem.arguments(e, coarse))
+    times, parameters = problem.split(theta)
+    free = [np.ravel(parameters[name]) for name, _, is_free in structure.parameters if is_free]
+    p = np.concatenate([np.zeros(0), *free])
+    ends = np.concatenate([[experiment.t0], times[e], [experiment.tf]])
+    inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
+    steps = [np.array([experiment.t0])]
+    with float64():
+        x = np.asarray(_initial_state(arguments, p, structure=structure))
+        for i, mode in enumerate(structure.mode_of_segment):
+            if i > 0 and structure.reset_maps[i - 1] is not None:
+                x = np.asarray(_reset(arguments, ends[i], x, p, structure=structure, i=i - 1))
+            knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
+            stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
+            for start, end in zip(stops[:-1], stops[1:], strict=True):
+                if end > start:
+                    accepted, x = _solve(problem, structure, arguments, coarse, mode, start, end, x, p)
+                    steps.append(accepted)
+    return np.concatenate(steps)
+
+
+def _solve(
+    problem: Problem,
+    structure: Structure,
+    arguments: Arguments,
+    coarse: Mesh,
+    mode: int,
+    start: float,
+    end: float,
+    x: FloatArray,
+    p: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Adaptive solve of one mode from start to end: accepted times (start left out) and the final state."""
+    name = structure.mode_names[mode]
+    function = partial(_field_and_density, structure=structure, mode=mode)
+    last = len(coarse.times) - 2
+
+    def right_hand_side(t: float, y: FloatArray) -> FloatArray:
+        inside = min(max(t, np.nextafter(start, end)), np.nextafter(end, start))
+        cell = min(int(np.searchsorted(coarse.times, inside, side="right")) - 1, last)
+        value = np.asarray(function(arguments, arguments.nodes[cell], arguments.signals[cell], t, y[:-1], p))
+        if not np.isfinite(value).all():
+            what = f"mode {name!r}" if not np.isfinite(value[:-1]).all() else "a running cost"
+            raise ValueError(f"{what} returned {value.tolist()} at t = {t:.6g}, x = {y[:-1].tolist()}.")
+        return value
+
+    method = scipy.integrate.RK45 if problem.solver == "explicit" else scipy.integrate.Radau
+    solver = method(right_hand_side, start, np.append(x, 0.0), end, rtol=problem.rtol, atol=problem.atol)
+    accepted: list[float] = []
+    while solver.status == "running":
+        message = solver.step()
+        if solver.status == "failed" or len(accepted) > MAX_STEPS:
+            remedy = "use solver='stiff', or a better guess" if problem.solver == "explicit" else "use a better guess"
+            raise ValueError(
+                f"mode {name!r} cannot be integrated at the guess beyond t = {solver.t:.6g}, where x = "
+                f"{solver.y[:-1].tolist()} ({message or 'too many steps'}): {remedy}."
+            )
+        accepted.append(float(solver.t))
+    return np.array(accepted), np.asarray(solver.y[:-1])
+
+
+@partial(jax.jit, static_argnames=("structure", "mode"))
+def _field_and_density(
+    arguments: Arguments, origin: jax.Array, coefficients: jax.Array, t: jax.Array, x: jax.Array, p: jax.Array, *,
+    structure: Structure, mode: int,
+) -> jax.Array:
+    model = Model(structure, arguments)
+    piece = Piece(origin, coefficients)
+    cost = model.density(piece)(t, x, p) if model.has_running_cost else jnp.zeros(())
+    return jnp.append(model.field(mode, piece)(t, x, p), cost)
+
+
+@partial(jax.jit, static_argnames=("structure",))
+def _initial_state(arguments: Arguments, p: jax.Array, *, structure: Structure) -> jax.Array:
+    return Model(structure, arguments).initial_state(p)
+
+
+@partial(jax.jit, static_argnames=("structure", "i"))
+def _reset(
+    arguments: Arguments, t: jax.Array, x: jax.Array, p: jax.Array, *, structure: Structure, i: int
+) -> jax.Array:
+    return Model(structure, arguments).reset(i)(t, x, p)
