@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from switchfit.optimize import qp
@@ -69,6 +69,24 @@ def test_kkt_conditions_hold_for_duplicate_and_degenerate_constraints(seed, d, l
     assert_kkt(g, B, C, c, solve_qp(g, B, C, c), rtol=1e-8)
 
 
+@settings(max_examples=100, deadline=None)
+@given(SEEDS, st.integers(1, 8))
+def test_solutions_in_integers_are_found_to_rounding(seed, d):
+    rng = np.random.default_rng(seed)
+    R = rng.integers(-2, 3, size=(d, d))
+    B = R @ R.T + np.eye(d)
+    d_true = rng.integers(-5, 6, size=d)
+    active = int(rng.integers(0, d + 1))
+    C = rng.integers(-4, 5, size=(active + 6, d))
+    C = np.where(C @ d_true > 0, -1, 1)[:, None] * C
+    assume(active == 0 or np.linalg.cond(C[:active].astype(float)) < 100.0)
+    lam = np.concatenate([rng.integers(1, 9, size=active), np.zeros(6)])
+    c = C @ d_true - np.concatenate([np.zeros(active), rng.integers(1, 9, size=6)])
+    solution = solve_qp(C.T @ lam - B @ d_true, B, C.astype(float), np.minimum(c, 0.0))
+    np.testing.assert_allclose(solution.step, d_true, atol=2e-12)
+    np.testing.assert_allclose(solution.multipliers, lam, atol=2e-11)
+
+
 @settings(max_examples=60, deadline=None)
 @given(SEEDS, st.integers(1, 8))
 def test_primal_active_set_agrees_with_lawson_hanson(seed, d):
@@ -93,7 +111,8 @@ def test_fallbacks_take_over_when_nonnegative_least_squares_fails(monkeypatch):
     assert kkt_residual(g, g, np.eye(2))[0] < 1e-14
     monkeypatch.setattr(qp, "_primal_active_set", lambda *args: None)
     d = solve_qp(g, B, C, c).step
-    assert g @ d <= 0.0 and np.all(d >= c)
+    assert g @ d <= 0.0
+    assert np.all(d >= c)
 
 
 def test_bounded_step_has_the_multipliers_of_the_closed_form():
@@ -106,7 +125,8 @@ def test_bounded_step_has_the_multipliers_of_the_closed_form():
 
 def test_zero_gradient_gives_zero_step():
     solution = solve_qp(np.zeros(2), np.eye(2), np.eye(2), np.zeros(2))
-    assert not solution.step.any() and not solution.multipliers.any()
+    assert not solution.step.any()
+    assert not solution.multipliers.any()
 
 
 def test_bad_input_is_named():
@@ -158,8 +178,9 @@ def test_convexifying_commutes_with_rescaling_the_unknowns(seed, d):
     S = np.diag(10.0 ** rng.uniform(-6, 6, d))
     B, scaled = convexify(H, np.zeros((0, d))), convexify(S @ H @ S, np.zeros((0, d)))
     unit = np.sqrt(np.diag(B))
-    np.testing.assert_allclose(scaled / np.outer(np.diag(S), np.diag(S)) / np.outer(unit, unit),
-                               B / np.outer(unit, unit), atol=1e-6)
+    np.testing.assert_allclose(
+        scaled / np.outer(np.diag(S), np.diag(S)) / np.outer(unit, unit), B / np.outer(unit, unit), atol=1e-6
+    )
 
 
 def test_scaling_survives_zero_diagonals():

@@ -483,11 +483,13 @@ def _releases(
     point = state.point
     left, right = point.minus.gradient, point.plus.gradient
     tolerance = 1e-13 * (np.abs(left) + np.abs(right))
-    pinned = point.kink & (np.abs(step) <= 8 * EPS * np.maximum(np.abs(point.theta), np.max(np.abs(step))))
+    size = np.where(state.scale > 0.0, state.scale, 1.0)
+    relative = np.abs(step) / size
+    pinned = point.kink & (relative <= 8 * EPS * max(1.0, float(np.max(relative))))
     to_right = np.where(pinned & (sides <= 0), force - right - tolerance, 0.0)
     to_left = np.where(pinned & (sides >= 0), left - force - tolerance, 0.0)
     # In units of J, or unknowns of different units could not be compared.
-    worth = np.maximum(to_right, to_left) * np.where(state.scale > 0.0, state.scale, 1.0)
+    worth = np.maximum(to_right, to_left) * size
     for i in np.argsort(-worth, kind="stable"):
         if worth[i] <= 0.0:
             return

@@ -1,0 +1,682 @@
+"""The SQP on functions with known minimisers: rates, constraints, kinks, saddles, and every status."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from switchfit.optimize import LinearConstraints, Status, minimize
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+@dataclass
+class Value:
+    cost: float
+    gradient: np.ndarray
+    hessian: np.ndarray | None
+
+
+def free(d):
+    return LinearConstraints.box(np.full(d, -np.inf), np.full(d, np.inf))
+
+
+def rows(A, b, lower=None, upper=None):
+    A = np.atleast_2d(np.asarray(A, float))
+    m, d = A.shape
+    lower = np.full(d, -np.inf) if lower is None else lower
+    upper = np.full(d, np.inf) if upper is None else upper
+    names = [f"row {i}" for i in range(m)] + [f"low {i}" for i in range(d)] + [f"up {i}" for i in range(d)]
+    return LinearConstraints(A, b, lower, upper, tuple(names))
+
+
+def smooth(function):
+    """An evaluate callable from theta -> (cost, gradient, hessian)."""
+
+    def evaluate(theta, side):
+        return Value(*function(theta))
+
+    return evaluate
+
+
+def quadratic(H, centre, offset=0.0):
+    """½ (theta − centre)ᵀ H (theta − centre) + offset."""
+
+    def function(theta):
+        e = theta - centre
+        return 0.5 * e @ H @ e + offset, H @ e, H
+
+    return smooth(function)
+
+
+def with_kinks(function, breakpoints, weights):
+    """Add sum of weights |theta_i − b| to a smooth function; derivatives at b from the side asked for."""
+
+    def evaluate(theta, side):
+        J, g, H = function(theta)
+        g = np.array(g, float)
+        for i, (points, w) in enumerate(zip(breakpoints, weights, strict=True)):
+            if len(points):
+                e = theta[i] - np.asarray(points)
+                J = J + np.sum(w * np.abs(e))
+                g[i] += np.sum(w * np.where(e == 0.0, side, np.sign(e)))
+        return Value(float(J), g, H)
+
+    return evaluate
+
+
+def rosenbrock(theta):
+    x, y = theta
+    J = 100.0 * (y - x**2) ** 2 + (1.0 - x) ** 2
+    g = np.array([-400.0 * x * (y - x**2) - 2.0 * (1.0 - x), 200.0 * (y - x**2)])
+    return J, g, np.array([[1200.0 * x**2 - 400.0 * y + 2.0, -400.0 * x], [-400.0 * x, 200.0]])
+
+
+def double_well(theta):
+    x, y = theta
+    return x**4 / 4 - x**2 / 2 + y**2, np.array([x**3 - x, 2 * y]), np.diag([3 * x**2 - 1, 2.0])
+
+
+def assert_feasible(result, constraints):
+    for record in result.history:
+        size = 1.0 + np.abs(constraints.A) @ np.abs(record.theta) + np.abs(constraints.b)
+        assert np.all(constraints.A @ record.theta - constraints.b >= -1e-14 * size)
+        assert np.all(record.theta >= constraints.lower)
+        assert np.all(record.theta <= constraints.upper)
+
+
+# --- smooth problems --------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=60, deadline=None)
+@given(SEEDS, st.integers(1, 10))
+def test_convex_quadratics_over_twelve_decades_take_one_newton_step(seed, d):
+    rng = np.random.default_rng(seed)
+    Q = np.linalg.qr(rng.normal(size=(d, d)))[0]
+    scale = 10.0 ** rng.uniform(-6, 6, d)
+    H = scale[:, None] * ((Q * np.logspace(0, 3, d)) @ Q.T) * scale
+    centre = rng.normal(size=d) / scale
+    result = minimize(quadratic(H, centre), centre + rng.normal(size=d) / scale, constraints=free(d), tolerance=1e-6)
+    assert result.status is Status.CONVERGED
+    assert result.iterations <= 4
+    np.testing.assert_allclose((result.theta - centre) * scale, 0.0, atol=1e-9)
+
+
+@settings(max_examples=40, deadline=None)
+@given(SEEDS, st.integers(2, 6))
+def test_constrained_quadratics_satisfy_kkt(seed, d):
+    rng = np.random.default_rng(seed)
+    R = rng.normal(size=(d, d))
+    H = R @ R.T + 0.1 * np.eye(d)
+    start = rng.normal(size=d)
+    A = rng.normal(size=(2 * d, d))
+    constraints = rows(A, A @ start - rng.uniform(0, 1, 2 * d), start - 1.0, start + rng.uniform(0, 1, d))
+    result = minimize(quadratic(H, rng.normal(size=d) * 3), start, constraints=constraints, tolerance=1e-9)
+    assert result.successful, result.message
+    assert_feasible(result, constraints)
+    lam = result.multipliers
+    assert np.all(lam >= 0.0)
+    np.testing.assert_allclose(constraints.normals.T @ lam, result.gradient, atol=1e-8)
+    assert np.all(np.abs(constraints.slack(result.theta)[lam > 1e-7]) <= 1e-12)
+
+
+@settings(max_examples=25, deadline=None)
+@given(SEEDS)
+def test_newton_does_not_see_the_units_of_the_unknowns(seed):
+    rng = np.random.default_rng(seed)
+    unit = 2.0 ** rng.integers(-20, 21, 2)  # powers of two: rescaling is then exact
+
+    def scaled(theta):
+        J, g, H = rosenbrock(theta * unit)
+        return J, g * unit, H * np.outer(unit, unit)
+
+    start = rng.uniform(-2, 2, 2)
+    plain = minimize(smooth(rosenbrock), start, constraints=free(2), tolerance=0.0, max_iterations=6)
+    other = minimize(smooth(scaled), start / unit, constraints=free(2), tolerance=0.0, max_iterations=6)
+    for a, b in zip(plain.history, other.history, strict=False):
+        np.testing.assert_allclose(b.theta * unit, a.theta, rtol=1e-6, atol=1e-8)
+
+
+def test_local_rate_is_quadratic():
+    result = minimize(smooth(rosenbrock), [-1.2, 1.0], constraints=free(2), tolerance=1e-12)
+    errors = np.array([np.linalg.norm(record.theta - 1.0) for record in result.history])
+    errors = errors[errors > 1e-15]
+    assert result.status is Status.CONVERGED
+    assert result.optimality < 1e-12
+    assert result.iterations < 30
+    local = errors[errors < 0.1]
+    assert local.size >= 3
+    assert np.all(local[1:] <= 30.0 * local[:-1] ** 2 + 1e-14)
+
+
+def test_rate_is_quadratic_on_a_face_although_the_full_hessian_is_indefinite():
+    # Minimise exp(x) − x − 5 y² + x y over y <= 1: the Hessian has a negative eigenvalue for every y, not on the face.
+    def function(theta):
+        x, y = theta
+        J = np.exp(x) - x - 5 * y**2 + x * y
+        return J, np.array([np.exp(x) - 1 + y, -10 * y + x]), np.array([[np.exp(x), 1.0], [1.0, -10.0]])
+
+    constraints = LinearConstraints.box([-3.0, 0.2], [3.0, 0.9], unknowns=["x", "y"])
+    result = minimize(smooth(function), [0.5, 0.5], constraints=constraints, tolerance=1e-13)
+    assert result.successful
+    errors = np.array([abs(record.theta[0] - np.log(0.1)) for record in result.history])
+    local = errors[(errors < 0.3) & (errors > 1e-15)]
+    assert local.size >= 3
+    assert np.all(local[1:] <= 1.0 * local[:-1] ** 2 + 1e-14)
+    assert result.active == ("y at upper bound",)
+    assert result.multipliers[3] == pytest.approx(9.0 - np.log(0.1), rel=1e-12)
+    np.testing.assert_allclose(np.abs(result.free_basis[:, 0]), [1.0, 0.0], atol=1e-15)
+    assert result.smallest_unscaled_eigenvalue == pytest.approx(0.1, rel=1e-9)
+    assert result.smallest_eigenvalue == pytest.approx(1.0, rel=1e-9)
+
+
+@pytest.mark.parametrize("start", [[-1.2, 1.0], [0.0, -1.0], [-1.9, 0.4]])
+def test_rosenbrock_with_constraints(start):
+    constraints = rows([[-1.0, -1.0], [1.0, 0.0]], [-1.5, -2.0], [-2.0, -2.0], [2.0, 1.5])  # x + y <= 1.5
+    result = minimize(smooth(rosenbrock), start, constraints=constraints, tolerance=1e-9)
+    assert result.status is Status.CONVERGED
+    assert_feasible(result, constraints)
+    assert result.active == ("row 0",)
+    assert result.theta.sum() == pytest.approx(1.5, abs=1e-14)
+    grid = np.linspace(-0.5, 2.0, 20001)
+    line = 100 * (1.5 - grid - grid**2) ** 2 + (1 - grid) ** 2
+    assert result.cost <= line.min() + 1e-9
+
+
+def test_a_large_constant_in_the_cost_does_not_stall_newton():
+    def function(theta):
+        J, g, H = rosenbrock(theta)
+        return J + 1e6, g, H
+
+    result = minimize(smooth(function), [-1.2, 1.0], constraints=free(2), tolerance=1e-12)
+    assert result.successful
+    assert result.optimality < 1e-12
+
+
+def test_a_small_cost_is_not_stopped_early():
+    H = 1e-9 * np.array([[2.0, 1.0], [1.0, 3.0]])
+    result = minimize(quadratic(H, np.array([1.0, 2.0]), 1e-7), [1.5, 1.5], constraints=free(2))
+    np.testing.assert_allclose(result.theta, [1.0, 2.0], rtol=1e-9)
+
+
+def test_block_diagonal_and_gauss_newton():
+    H = np.array([[2.0, 0.9, 0.1], [0.9, 2.0, 0.2], [0.1, 0.2, 1.0]])
+    evaluate = quadratic(H, np.array([1.0, -1.0, 0.5]))
+    exact = minimize(evaluate, np.zeros(3), constraints=free(3), hessian="gauss-newton")
+    blocks = minimize(evaluate, np.zeros(3), constraints=free(3), hessian="block-diagonal", blocks=[0, 0, 1])
+    assert exact.iterations == 1
+    assert 1 < blocks.iterations < 20
+    np.testing.assert_allclose(blocks.theta, exact.theta, atol=1e-7)
+    np.testing.assert_array_equal(blocks.hessian, H)
+
+
+def test_steepest_descent_reaches_the_tolerance_at_condition_1000():
+    rng = np.random.default_rng(0)
+    Q = np.linalg.qr(rng.normal(size=(4, 4)))[0]
+    H = (Q * np.logspace(-1, 2, 4)) @ Q.T
+    function = quadratic(H, np.ones(4), offset=3.0)
+
+    def without_hessian(theta, side):
+        value = function(theta, side)
+        return Value(value.cost, value.gradient, None)
+
+    result = minimize(without_hessian, np.zeros(4), constraints=free(4), hessian="none", max_iterations=20000)
+    assert result.status is Status.CONVERGED, result.message
+    assert result.optimality < 1e-7
+    assert np.isnan(result.hessian).all()
+    assert 50 < result.iterations < 10000
+
+
+def test_steepest_descent_respects_constraints():
+    constraints = rows([[-1.0, 1.0]], [0.0], [-1.0, -1.0], [1.0, 1.0])
+    result = minimize(
+        quadratic(np.diag([1.0, 9.0]), np.array([2.0, -0.5])),
+        [-0.5, 0.5],
+        constraints=constraints,
+        hessian="none",
+        max_iterations=2000,
+    )
+    assert result.successful
+    assert_feasible(result, constraints)
+    np.testing.assert_allclose(result.theta, -0.25, atol=1e-7)
+
+
+# --- constraints ------------------------------------------------------------------------------------------------------
+
+
+def test_collapsed_ordering_is_exact_and_named():
+    constraints = LinearConstraints(
+        [[-1.0, 1.0, 0.0], [0.0, -1.0, 1.0]], [0.0, 0.0], np.zeros(3), np.full(3, 10.0),
+        ("tau_1 <= tau_2 (mode 'slip' collapsed)", "tau_2 <= tau_3", *("low",) * 3, *("up",) * 3),
+    )  # fmt: skip
+    H = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, 0.2], [0.1, 0.2, 1.7]])
+    result = minimize(quadratic(H, np.array([5.1, 4.3, 7.7])), [1.1, 2.3, 3.7], constraints=constraints)
+    assert result.status is Status.CONVERGED
+    assert result.active == ("tau_1 <= tau_2 (mode 'slip' collapsed)",)
+    assert "collapsed" in result.message
+    assert result.theta[1] - result.theta[0] == pytest.approx(0.0, abs=1e-15)
+    assert result.theta[1] >= result.theta[0]
+    assert result.multipliers[0] > 0.1
+    assert_feasible(result, constraints)
+    assert result.free_basis.shape == (3, 2)
+
+
+def test_degenerate_coincident_constraints():
+    # The solution is at the origin, where five constraints meet in two dimensions, one of them twice.
+    A = [[1.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [2.0, 1.0]]
+    constraints = rows(A, np.zeros(5), np.zeros(2), np.full(2, 5.0))
+    result = minimize(
+        quadratic(np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([-1.0, -2.0])),
+        [1.0, 3.0],
+        constraints=constraints,
+        tolerance=1e-12,
+    )
+    assert result.status is Status.CONVERGED
+    np.testing.assert_array_equal(result.theta, 0.0)
+    assert len(result.active) == 7
+    assert result.free_basis.shape == (2, 0)
+    assert np.isnan(result.smallest_eigenvalue)
+    np.testing.assert_allclose(constraints.normals.T @ result.multipliers, result.gradient, atol=1e-12)
+
+
+def test_fixed_unknowns_stay():
+    constraints = LinearConstraints.box([1.0, -np.inf], [1.0, np.inf])
+    result = minimize(quadratic(np.array([[2.0, 1.0], [1.0, 2.0]]), np.zeros(2)), [1.0, 3.0], constraints=constraints)
+    np.testing.assert_allclose(result.theta, [1.0, -0.5], rtol=1e-12)
+    assert result.status is Status.CONVERGED
+
+
+@settings(max_examples=40, deadline=None)
+@given(SEEDS, st.integers(1, 6))
+def test_nonconvex_polynomials_end_feasible_at_second_order_points(seed, d):
+    rng = np.random.default_rng(seed)
+    S = rng.normal(size=(d, d))
+    S = S + S.T
+    c = rng.normal(size=d)
+
+    def function(theta):
+        return (np.sum(theta**4) + 0.5 * theta @ S @ theta + c @ theta, 4 * theta**3 + S @ theta + c,
+                np.diag(12 * theta**2) + S)  # fmt: skip
+
+    start = np.sort(rng.uniform(-1, 1, d))
+    order = np.diff(np.eye(d), axis=0)
+    constraints = rows(order, np.zeros(d - 1), np.full(d, -1.0), np.full(d, 1.0)) if d > 1 else rows([[1.0]], [-1.0])
+    result = minimize(smooth(function), start, constraints=constraints, tolerance=1e-9)
+    assert result.successful, result.message
+    assert_feasible(result, constraints)
+    costs = [record.cost for record in result.history]
+    assert np.all(np.diff(costs) <= 1e-13 * np.abs(costs[0]) + 1e-13)
+    if result.free_eigenvalues.size:
+        assert result.smallest_eigenvalue > 0.0
+
+
+# --- kinks ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("start", [-3.0, 0.3, 0.7, 0.70001, 40.0])
+@pytest.mark.parametrize("curvature", [0.0, 1e-3, 1.0])
+@pytest.mark.parametrize("hessian", ["exact", "none"])
+def test_absolute_value_ends_exactly_on_its_kink(start, curvature, hessian):
+    def function(theta):
+        return 0.5 * curvature * theta[0] ** 2, curvature * theta, np.array([[curvature]])
+
+    evaluate = with_kinks(function, [[0.7]], [1.0])
+    result = minimize(evaluate, [start], constraints=free(1), breakpoints=[[0.7]], hessian=hessian)
+    assert result.status is Status.CONVERGED_AT_KINK, result.message
+    assert result.theta[0] == 0.7
+    assert result.optimality == 0.0
+    assert result.iterations <= 60
+    ((index, left, right),) = result.kinks
+    assert index == 0
+    assert left == pytest.approx(-1.0 + 0.7 * curvature)
+    assert right == pytest.approx(1.0 + 0.7 * curvature)
+    assert "0.7" in result.message
+    assert result.free_basis.shape == (1, 0)
+
+
+def test_concave_kink_is_left_on_the_steeper_side():
+    def function(theta):
+        return 0.5 * theta[0] ** 2 + 0.1 * theta[0], theta + 0.1, np.eye(1)
+
+    result = minimize(with_kinks(function, [[0.0]], [-1.0]), [0.0], constraints=free(1), breakpoints=[[0.0]])
+    assert result.status is Status.CONVERGED
+    np.testing.assert_allclose(result.theta, [-1.1], rtol=1e-12)
+
+
+def test_coupled_kink_and_smooth_coordinate():
+    H = np.array([[2.0, 1.5], [1.5, 2.0]])
+    breakpoints = [[0.0, 1.0], []]
+    evaluate = with_kinks(
+        lambda t: (0.5 * (t - [1.3, 2.0]) @ H @ (t - [1.3, 2.0]), H @ (t - [1.3, 2.0]), H),
+        breakpoints,
+        [np.array([0.2, 0.4]), 0.0],
+    )
+    for start in ([-4.0, 3.0], [1.0, -2.0], [0.0, 0.0], [5.0, 5.0]):
+        result = minimize(evaluate, start, constraints=free(2), breakpoints=breakpoints, tolerance=1e-11)
+        assert result.status is Status.CONVERGED_AT_KINK, result.message
+        assert result.theta[0] == 1.0
+        # With x = 1 held, y solves 1.5 (1 − 1.3) + 2 (y − 2) = 0.
+        assert result.theta[1] == pytest.approx(2.225, rel=1e-11)
+        np.testing.assert_allclose(np.abs(result.free_basis), [[0.0], [1.0]], atol=1e-15)
+
+
+def assert_no_descent(evaluate, result, constraints, breakpoints):
+    """First-order optimality by directions: none of many feasible ones decreases J before the next breakpoint."""
+    rng = np.random.default_rng(1)
+    J = evaluate(result.theta, 1).cost
+    slack = constraints.slack(result.theta)
+    gaps = [np.abs(np.asarray(p) - x) for p, x in zip(breakpoints, result.theta, strict=True)]
+    gap = min(np.min(g[g > 0.0], initial=np.inf) for g in gaps)
+    for v in rng.normal(size=(300, result.theta.size)):
+        for t in (1e-4, 1e-6):
+            t = min(t, 0.5 * gap / np.max(np.abs(v)))
+            if np.all(slack + t * (constraints.normals @ v) >= 0.0):
+                assert evaluate(result.theta + t * v, 1).cost >= J - 1e-7 * t - 1e-15
+
+
+@settings(max_examples=40, deadline=None)
+@given(SEEDS, st.integers(1, 5))
+def test_many_small_kinks_under_constraints(seed, d):
+    rng = np.random.default_rng(seed)
+    R = rng.normal(size=(d, d))
+    H = R @ R.T + 0.2 * np.eye(d)
+    centre = np.sort(rng.uniform(0.2, 0.8, d)) * 10
+    breakpoints = [np.arange(0.0, 10.01, 0.1)] * d
+    weights = [rng.uniform(-1, 1.0, 101) * 10.0 ** rng.uniform(-4, -1) for _ in range(d)]
+    evaluate = with_kinks(lambda t: (0.5 * (t - centre) @ H @ (t - centre), H @ (t - centre), H), breakpoints, weights)
+    order = np.diff(np.eye(d), axis=0)
+    constraints = (
+        rows(order, np.zeros(d - 1), np.zeros(d), np.full(d, 10.0)) if d > 1 else rows([[1.0]], [0.0], [0.0], [10.0])
+    )
+    start = np.sort(np.round(rng.uniform(0, 10, d), 1))
+    result = minimize(evaluate, start, constraints=constraints, breakpoints=breakpoints)
+    assert result.successful, result.message
+    assert result.iterations <= 60
+    assert_feasible(result, constraints)
+    assert_no_descent(evaluate, result, constraints, breakpoints)
+    for i, left, right in result.kinks:
+        assert result.theta[i] in breakpoints[i]
+        assert left <= right
+
+
+@settings(max_examples=40, deadline=None)
+@given(SEEDS)
+def test_collapsed_pair_on_a_common_kink(seed):
+    # tau_1 <= tau_2 active, both at the breakpoint: each kink alone would move, only the pair is held.
+    rng = np.random.default_rng(seed)
+    pull = rng.uniform(0.5, 2.0)
+    H = np.eye(2)
+    centre = np.array([1.0 + pull, 1.0 - pull]) + rng.uniform(-0.2, 0.2)
+    breakpoints = [[1.0], [1.0]]
+    evaluate = with_kinks(lambda t: (0.5 * (t - centre) @ (t - centre), t - centre, H), breakpoints, [0.3, 0.3])
+    constraints = rows([[-1.0, 1.0]], [0.0])
+    result = minimize(evaluate, np.sort(rng.uniform(-2, 4, 2)), constraints=constraints, breakpoints=breakpoints)
+    assert result.successful, result.message
+    np.testing.assert_array_equal(result.theta, [1.0, 1.0])
+    assert_no_descent(evaluate, result, constraints, breakpoints)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-6, 1e6])
+def test_collapsed_group_leaves_its_concave_kinks_together(unit):
+    # Alone, x would go right and y left, and x <= y blocks both; together they descend to the right.
+    def evaluate(theta, side):
+        x, y = theta / unit
+        a = np.where(theta == 0.0, side, np.sign(theta))
+        J = -1.95 * x + 1.45 * y - 0.05 * (abs(x) + abs(y)) + 0.5 * (x**2 + y**2)
+        g = np.array([-1.95 + x, 1.45 + y]) - 0.05 * a
+        return Value(J, g / unit, np.eye(2) / unit**2)
+
+    constraints = rows([[-1.0, 1.0]], [0.0])
+    result = minimize(evaluate, np.zeros(2), constraints=constraints, breakpoints=[[0.0], [0.0]], tolerance=1e-9 / unit)
+    assert result.status is Status.CONVERGED, result.message
+    np.testing.assert_allclose(result.theta / unit, 0.3, rtol=1e-12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(SEEDS, st.integers(2, 6), st.sampled_from(["exact", "block-diagonal", "none"]))
+def test_nonconvex_costs_with_kinks_of_all_sizes(seed, d, hessian):
+    rng = np.random.default_rng(seed)
+    S = rng.normal(size=(d, d))
+    S = S + S.T
+    c = rng.normal(size=d)
+    breakpoints = [np.unique(np.round(rng.uniform(-1, 1, rng.integers(0, 40)), 2)) for _ in range(d)]
+    weights = [rng.uniform(-0.5, 1, p.size) * 10.0 ** rng.uniform(-5, 0.3) for p in breakpoints]
+
+    def function(t):
+        return np.sum(t**4) + 0.5 * t @ S @ t + c @ t, 4 * t**3 + S @ t + c, np.diag(12 * t**2) + S
+
+    evaluate = with_kinks(function, breakpoints, weights)
+    constraints = rows(np.diff(np.eye(d), axis=0), np.full(d - 1, 0.01 * (seed % 2)), np.full(d, -1.0), np.full(d, 1.0))
+    start = np.sort(rng.uniform(-0.9, 0.8, d)) + 0.011 * np.arange(d)
+    result = minimize(
+        evaluate,
+        start,
+        constraints=constraints,
+        breakpoints=breakpoints,
+        hessian=hessian,
+        blocks=np.arange(d) // 2,
+        max_iterations=5000,
+        tolerance=1e-6,
+    )
+    assert result.successful, result.message
+    assert_feasible(result, constraints)
+    if hessian == "exact":
+        assert result.iterations < 50
+
+
+def test_held_kink_is_released_when_a_constraint_pushes():
+    # x is at its kink with 0 in the interval, but y has to rise, and x >= y takes x along.
+    H = np.eye(2)
+    centre = np.array([0.0, 3.0])
+    evaluate = with_kinks(lambda t: (0.5 * (t - centre) @ (t - centre), t - centre, H), [[0.0], []], [0.5, 0.0])
+    constraints = rows([[1.0, -1.0]], [0.0])
+    result = minimize(evaluate, [0.0, 0.0], constraints=constraints, breakpoints=[[0.0], []], tolerance=1e-10)
+    assert result.status is Status.CONVERGED
+    np.testing.assert_allclose(result.theta, 1.25, rtol=1e-12)  # x + 0.5 + x − 3 = 0
+
+
+def test_breakpoints_on_bounds_use_the_inner_side_only():
+    asked = []
+
+    def evaluate(theta, side):
+        asked.append((theta.copy(), side))
+        g = np.array([1.0 if side > 0 else np.nan]) if theta[0] == 0.0 else np.array([1.0])
+        return Value(float(theta[0]), g, np.eye(1))
+
+    result = minimize(evaluate, [0.6], constraints=LinearConstraints.box([0.0], [1.0]), breakpoints=[[0.0, 1.0]])
+    assert result.status is Status.CONVERGED
+    assert result.theta[0] == 0.0
+    assert result.kinks == ()
+    assert result.active == ("theta[0] at lower bound",)
+    flipped = minimize(
+        lambda t, s: Value(-t[0], np.array([-1.0 if s < 0 or t[0] < 1.0 else np.nan]), np.eye(1)),
+        [0.4],
+        constraints=LinearConstraints.box([0.0], [1.0]),
+        breakpoints=[[0.0, 1.0]],
+    )
+    assert flipped.status is Status.CONVERGED
+    assert flipped.theta[0] == 1.0
+
+
+def test_piecewise_smooth_nonquadratic_chain():
+    # |sin|-like slopes: smooth pieces exp(±), kinks at integers, coupled with a second unknown.
+    def function(t):
+        x, y = t
+        J = np.cosh(x - 2.3) + 0.5 * (y - x) ** 2
+        return J, np.array([np.sinh(x - 2.3) + x - y, y - x]), np.array([[np.cosh(x - 2.3) + 1, -1.0], [-1.0, 1.0]])
+
+    breakpoints = [np.arange(-10.0, 11.0), np.arange(-10.0, 11.0) / 2]
+    evaluate = with_kinks(function, breakpoints, [np.full(21, 0.02), np.full(21, 0.05)])
+    for start in ([-6.0, 9.0], [9.5, -9.5], [2.0, 2.0], [0.0, 0.1]):
+        result = minimize(evaluate, start, constraints=free(2), breakpoints=breakpoints)
+        assert result.successful, result.message
+        assert_no_descent(evaluate, result, free(2), breakpoints)
+        assert result.iterations < 40
+
+
+# --- statuses ---------------------------------------------------------------------------------------------------------
+
+
+def test_saddle_start_is_left():
+    result = minimize(smooth(double_well), [0.0, 0.0], constraints=free(2))
+    assert result.status is Status.CONVERGED
+    assert abs(result.theta[0]) == pytest.approx(1.0, abs=1e-8)
+
+
+def test_saddle_start_is_left_towards_the_feasible_side():
+    result = minimize(smooth(double_well), [0.0, 0.0], constraints=LinearConstraints.box([0.0, -1.0], [5.0, 1.0]))
+    assert result.status is Status.CONVERGED
+    assert result.theta[0] == pytest.approx(1.0, abs=1e-8)
+
+
+def test_a_saddle_that_cannot_be_left_is_reported():
+    # The Hessian claims negative curvature that J does not have.
+    def function(theta):
+        return 1.0 + theta @ theta, 2 * theta, np.diag([-2.0, 2.0])
+
+    result = minimize(smooth(function), [0.0, 0.0], constraints=free(2))
+    assert result.status is Status.SADDLE
+    assert not result.successful
+    assert result.smallest_eigenvalue == pytest.approx(-1.0)
+    assert "-1.0e+00" in result.message
+
+
+def test_flat_direction_is_singular_and_named():
+    def function(theta):
+        e = 1e3 * theta[0] + 1e-3 * theta[1] - 1.0
+        a = np.array([1e3, 1e-3, 0.0])
+        z = np.array([0.0, 0.0, theta[2]])
+        return 1.0 + e**2 + theta[2] ** 2, 2 * e * a + 2 * z, 2 * np.outer(a, a) + 2 * np.diag([0.0, 0.0, 1.0])
+
+    result = minimize(smooth(function), [1e-3, 1e3, 1.0], constraints=free(3))
+    assert result.status is Status.SINGULAR
+    assert abs(result.smallest_eigenvalue) < 1e-12
+    assert "theta[1]" in result.message
+    assert "theta[2]" not in result.message
+
+
+def test_unknown_without_effect_is_singular():
+    result = minimize(quadratic(np.diag([1.0, 0.0]), np.array([1.0, 0.0]), 1.0), [0.0, 5.0], constraints=free(2))
+    assert result.status is Status.SINGULAR
+    assert result.theta[1] == 5.0
+    np.testing.assert_allclose(np.abs(result.flat_direction), [0.0, 1.0], atol=1e-12)
+
+
+def test_infinite_and_undefined_regions_are_backed_away_from():
+    def function(theta):
+        x = theta[0]
+        if x >= 1.0:
+            return (np.inf if x < 2.0 else np.nan), np.array([np.nan]), np.full((1, 1), np.nan)
+        return -np.log(1 - x) - 3 * x, np.array([1 / (1 - x) - 3]), np.array([[1 / (1 - x) ** 2]])
+
+    result = minimize(smooth(function), [-5.0], constraints=free(1))
+    assert result.status is Status.CONVERGED
+    assert result.theta[0] == pytest.approx(2 / 3, rel=1e-8)
+    start = minimize(smooth(function), [1.5], constraints=free(1))
+    assert start.status is Status.NONFINITE_START
+    assert "not finite" in start.message
+    assert np.isnan(start.cost)
+
+
+def test_max_iterations():
+    result = minimize(smooth(rosenbrock), [-1.2, 1.0], constraints=free(2), max_iterations=3)
+    assert result.status is Status.MAX_ITERATIONS
+    assert result.iterations == 3
+    assert len(result.history) == 4
+    assert "after 3 iterations" in result.message
+    assert minimize(smooth(rosenbrock), [1.0, 1.0], constraints=free(2), max_iterations=0).status is Status.CONVERGED
+
+
+def test_line_search_fails_on_a_wrong_gradient():
+    result = minimize(smooth(lambda t: (t @ t, -2 * t, 2 * np.eye(2))), [1.0, 1.0], constraints=free(2))
+    assert result.status is Status.LINE_SEARCH_FAILED
+    assert not result.successful
+    np.testing.assert_array_equal(result.theta, [1.0, 1.0])
+    assert result.evaluations < 100
+
+
+def test_the_limit_of_precision_is_a_success():
+    result = minimize(smooth(rosenbrock), [-1.2, 1.1], constraints=free(2), tolerance=0.0)
+    assert result.status in (Status.CONVERGED_PRECISION, Status.CONVERGED)
+    rng = np.random.default_rng(3)
+
+    def noisy(theta):  # gradient with an error of 1e-13, as from a long simulation
+        J, g, H = rosenbrock(theta)
+        return 1.0 + J, g + 1e-13 * rng.normal(size=2), H
+
+    result = minimize(smooth(noisy), [-1.2, 1.0], constraints=free(2), tolerance=1e-17)
+    assert result.status is Status.CONVERGED_PRECISION, result.message
+    assert result.successful
+    assert result.optimality < 1e-10
+    assert result.iterations < 100
+
+
+def test_interrupt_in_evaluate_and_in_callback():
+    calls = []
+
+    def interrupting(theta, side):
+        calls.append(theta)
+        if len(calls) == 5:
+            raise KeyboardInterrupt
+        return Value(*rosenbrock(theta))
+
+    def interrupt(record):
+        if record.iteration == 2:
+            raise KeyboardInterrupt
+
+    first = minimize(interrupting, [-1.2, 1.0], constraints=free(2))
+    second = minimize(smooth(rosenbrock), [-1.2, 1.0], constraints=free(2), callback=interrupt)
+    third = minimize(
+        smooth(rosenbrock), [-1.2, 1.0], constraints=free(2), callback=lambda record: record.iteration == 2
+    )
+    for result in (first, second, third):
+        assert result.status is Status.INTERRUPTED
+        assert result.cost == min(record.cost for record in result.history)
+        assert result.cost < rosenbrock([-1.2, 1.0])[0]
+        assert "Interrupted after" in result.message
+    assert second.iterations == third.iterations == 2
+
+
+def test_history_and_callback_agree():
+    seen = []
+    result = minimize(smooth(rosenbrock), [-1.2, 1.0], constraints=free(2), callback=seen.append)
+    assert [r.iteration for r in result.history] == list(range(result.iterations + 1))
+    assert seen == list(result.history[1:])
+    assert result.history[-1].evaluations <= result.evaluations
+    assert result.history[0].step_length == 0.0
+    np.testing.assert_array_equal(result.history[-1].theta, result.theta)
+
+
+# --- contracts --------------------------------------------------------------------------------------------------------
+
+
+def test_bad_input_is_named():
+    evaluate = smooth(rosenbrock)
+    with pytest.raises(ValueError, match=r"theta0 has shape \(3,\)"):
+        minimize(evaluate, np.zeros(3), constraints=free(2))
+    with pytest.raises(ValueError, match="theta0 is empty"):
+        minimize(evaluate, np.zeros(0), constraints=free(0))
+    with pytest.raises(ValueError, match="theta0 is not finite"):
+        minimize(evaluate, [np.nan, 0.0], constraints=free(2))
+    with pytest.raises(ValueError, match=r"row 0 \(by 1\); start at a feasible"):
+        minimize(evaluate, [1.0, 0.0], constraints=rows([[-1.0, 1.0]], [0.0]))
+    with pytest.raises(ValueError, match="choose one of exact"):
+        minimize(evaluate, [1.0, 0.0], constraints=free(2), hessian="bfgs")
+    with pytest.raises(ValueError, match="must not be negative"):
+        minimize(evaluate, [1.0, 0.0], constraints=free(2), tolerance=-1.0)
+    with pytest.raises(ValueError, match="needs blocks"):
+        minimize(evaluate, [1.0, 0.0], constraints=free(2), hessian="block-diagonal")
+    with pytest.raises(ValueError, match="breakpoints for 1 coordinates"):
+        minimize(evaluate, [1.0, 0.0], constraints=free(2), breakpoints=[[1.0]])
+    with pytest.raises(ValueError, match="strictly increasing"):
+        minimize(evaluate, [1.0, 0.0], constraints=free(2), breakpoints=[[1.0, 1.0], []])
+
+
+def test_start_infeasible_by_rounding_is_repaired():
+    constraints = rows([[-1.0, 1.0]], [0.0])
+    start = np.array([0.3, np.nextafter(0.3, 0.0)])
+    result = minimize(quadratic(np.eye(2), np.ones(2)), start, constraints=constraints)
+    assert result.status is Status.CONVERGED
+    assert_feasible(result, constraints)
