@@ -645,7 +645,7 @@ def test_history_and_callback_agree():
     assert [r.iteration for r in result.history] == list(range(result.iterations + 1))
     assert seen == list(result.history[1:])
     assert result.history[-1].evaluations <= result.evaluations
-    assert result.history[0].step_length == 0.0
+    assert result.history[0].step == 0.0
     np.testing.assert_array_equal(result.history[-1].theta, result.theta)
 
 

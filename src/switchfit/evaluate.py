@@ -23,6 +23,7 @@ from switchfit.model import Arguments, Model, Structure, float64
 from switchfit.problem import Problem
 from switchfit.propagate import path_cost, propagate
 from switchfit.refine import refined_mesh
+from switchfit.simulate import flat_parameters
 
 Method = Literal["auto", "forward", "discrete-adjoint", "adjoint", "autodiff"]
 METHODS = ("auto", "forward", "discrete-adjoint", "adjoint", "autodiff")
@@ -73,11 +74,6 @@ class Evaluator:
         """The same problem with every cell of its meshes cut in two."""
         return Evaluator(self.problem, meshes=[mesh.halved() for mesh in self.meshes])
 
-    def cost(self, theta: FloatArray) -> float:
-        """J alone."""
-        with float64():
-            return float(sum(_cost(a, tau, p, structure=s) for s, a, tau, p in self._each(theta)))
-
     def __call__(
         self, theta: FloatArray, side: int = 1, method: Method = "auto", gauss_newton: bool = False
     ) -> Evaluation:
@@ -107,8 +103,7 @@ class Evaluator:
 
     def _each(self, theta: FloatArray) -> list[tuple[Structure, Arguments, FloatArray, FloatArray]]:
         times, parameters = self.problem.split(np.asarray(theta, dtype=np.float64))
-        free = [np.ravel(parameters[name]) for name, q in self.problem.parameters.items() if not q.fixed]
-        p = np.concatenate([np.zeros(0), *free])
+        p = flat_parameters(self.problem, parameters)
         return [(s, a, tau, p) for s, a, tau in zip(self.problem.structures, self.arguments, times, strict=True)]
 
 
@@ -194,9 +189,3 @@ def _autodiff(model: Model, tau: jax.Array, p: jax.Array, side: jax.Array) -> tu
 
     theta = jnp.concatenate([tau, p])
     return J(theta), jax.jacfwd(J)(theta), jax.jacfwd(jax.jacfwd(J))(theta)
-
-
-@partial(jax.jit, static_argnames=("structure",))
-def _cost(arguments: Arguments, tau: jax.Array, p: jax.Array, *, structure: Structure) -> jax.Array:
-    model = Model(structure, arguments)
-    return path_cost(model, propagate(model, tau, p, jnp.ones(())), p)

@@ -76,8 +76,8 @@ class Problem:
     parameters: Mapping[str, Any] | None = None
     min_duration: float = 0.0
     solver: Literal["explicit", "stiff"] = "explicit"
-    rtol: float = 1e-9
-    atol: float = 1e-11
+    rtol: float = 1e-8
+    atol: float = 1e-10
     unknowns: Unknowns = field(init=False)
     structures: tuple[Structure, ...] = field(init=False)
 

@@ -277,8 +277,9 @@ def _second(value: Callable[..., Array], at: tuple[Array, ...], along: tuple[Arr
         return jax.jvp(gradient, at, direction)[1]
 
     columns = jax.vmap(column, in_axes=-1, out_axes=-1)(*along)
-    flat = [a.reshape(-1, a.shape[-1]) for a in along]
-    return sum((a.T @ c.reshape(a.shape[0], -1) for a, c in zip(flat, columns, strict=True)), jnp.zeros(()))
+    D = along[0].shape[-1]
+    pairs = [(a.reshape(a.size // D, D), c.reshape(a.size // D, D)) for a, c in zip(along, columns, strict=True)]
+    return sum((a.T @ c for a, c in pairs), jnp.zeros((D, D)))
 
 
 def _columns(function: Callable[..., Array], at: tuple[Array, ...], along: tuple[Array, ...]) -> Array:

@@ -119,12 +119,22 @@ class Status(Enum):
 
 @dataclass(frozen=True, eq=False)
 class IterationRecord:
-    """One line of the history: theta has shape (d,), `evaluations` counts all calls up to then."""
+    """One line of the history.
+
+    Attributes
+    ----------
+    iteration : int, 0 for the start
+    cost, optimality : float
+    step : float
+        The fraction of the proposed step that was taken.
+    theta : array, shape (d,)
+    evaluations : int, all calls up to then
+    """
 
     iteration: int
     cost: float
     optimality: float
-    step_length: float
+    step: float
     theta: FloatArray
     evaluations: int
 
@@ -958,7 +968,7 @@ def _record(oracle: _Oracle, state: _State) -> IterationRecord:
         iteration=state.iteration,
         cost=point.cost,
         optimality=point.optimality,
-        step_length=state.step_length,
+        step=state.step_length,
         theta=point.theta.copy(),
         evaluations=oracle.evaluations,
     )
