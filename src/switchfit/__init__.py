@@ -1,8 +1,37 @@
 """switchfit: when did the system switch mode, and what were its parameters?"""
 
+from switchfit.check import DerivativeCheck, check_derivatives
 from switchfit.data import Input, Measurements, ReferenceSignal, RunningCost, TerminalCost
+from switchfit.estimate import Estimate, estimate
 from switchfit.evaluate import Evaluation, evaluate
 from switchfit.experiment import Experiment, Parameter
+from switchfit.optimize import Status
 from switchfit.problem import Problem
-from switchfit.simulate import Trajectory, simulate
+from switchfit.result import Certificate
+from switchfit.simulate import Comparison, Trajectory, simulate
 from switchfit.system import HybridSystem
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Certificate",
+    "Comparison",
+    "DerivativeCheck",
+    "Estimate",
+    "Evaluation",
+    "Experiment",
+    "HybridSystem",
+    "Input",
+    "Measurements",
+    "Parameter",
+    "Problem",
+    "ReferenceSignal",
+    "RunningCost",
+    "Status",
+    "TerminalCost",
+    "Trajectory",
+    "check_derivatives",
+    "estimate",
+    "evaluate",
+    "simulate",
+]

@@ -180,7 +180,8 @@ class ReferenceSignal:
         Parameters
         ----------
         times : (K,) array_like
-            Increasing sample times (s), four or more.
+            Increasing sample times (s), four or more. A time given twice breaks the spline there, as at the
+            transitions of a simulated trajectory; each part then needs four samples.
         values : (K,) or (K, q) array_like
             NaN marks a missing value; it is bridged by the interpolation.
         observe : callable ``h(t, x, p) -> (q,)``, optional
@@ -195,9 +196,11 @@ class ReferenceSignal:
         ValueError
             For bad times or values, fewer than four samples in a channel, or a cut-off that is not positive.
         """
-        times, values = _samples(times, values, "ReferenceSignal", at_least=4)
+        times, values = _samples(times, values, "ReferenceSignal", at_least=4, breaks=True)
         table = values.reshape(len(times), -1)
-        signal = _bridged_spline(times, table)
+        cuts = np.flatnonzero(np.diff(times) == 0) + 1
+        parts = zip(np.split(times, cuts), np.split(table, cuts), strict=True)
+        signal = _joined([_bridged_spline(part_times, part) for part_times, part in parts])
         if lowpass_hz is not None:
             signal = _lowpass(signal, lowpass_hz)
         label = None if names is None else tuple(names)
@@ -267,8 +270,10 @@ class Measurements:
 Data = RunningCost | TerminalCost | ReferenceSignal | Measurements
 
 
-def _samples(times: ArrayLike, values: ArrayLike, what: str, *, at_least: int) -> tuple[FloatArray, FloatArray]:
-    """Times (K,) and values (K, ...) as float64, checked against each other."""
+def _samples(
+    times: ArrayLike, values: ArrayLike, what: str, *, at_least: int, breaks: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """Times (K,) and values (K, ...) as float64, checked against each other; with `breaks` a time may stand twice."""
     try:
         times = np.array(times, dtype=np.float64)
         values = np.array(values, dtype=np.float64)
@@ -284,8 +289,11 @@ def _samples(times: ArrayLike, values: ArrayLike, what: str, *, at_least: int) -
     if len(times) < at_least or values.size == 0:
         raise ValueError(f"{what} needs {at_least} sample(s) or more; got {len(times)}.")
     _require_finite(times, f"{what} times")
-    if np.any(np.diff(times) <= 0):
-        k = int(np.argmax(np.diff(times) <= 0))
+    wrong = np.diff(times) <= 0
+    if breaks:
+        wrong = (np.diff(times) < 0) | np.append(times[2:] == times[:-2], False)
+    if wrong.any():
+        k = int(np.argmax(wrong))
         raise ValueError(
             f"{what} times must increase strictly; got {times[k]} followed by {times[k + 1]} at index {k + 1}."
         )
@@ -357,13 +365,19 @@ def _spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
     return PiecewisePolynomial(times, np.moveaxis(spline.c[::-1], 0, 1))
 
 
+def _joined(parts: list[PiecewisePolynomial]) -> PiecewisePolynomial:
+    """One signal out of several that follow each other."""
+    knots = np.concatenate([part.knots[:-1] for part in parts[:-1]] + [parts[-1].knots])
+    return PiecewisePolynomial(knots, np.concatenate([part.coefficients for part in parts]))
+
+
 def _bridged_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
     """Spline through the samples that are there, each channel's gaps bridged by its own spline first."""
     filled = values.copy()
     for channel in filled.T:
         known = np.isfinite(channel)
         if known.sum() < 4:
-            raise ValueError(f"ReferenceSignal needs four samples or more in each channel; got {known.sum()}.")
+            raise ValueError(f"ReferenceSignal needs four samples or more in each channel and part; got {known.sum()}.")
         if not known.all():
             channel[~known] = scipy.interpolate.CubicSpline(times[known], channel[known])(times[~known])
     return _spline(times, filled)

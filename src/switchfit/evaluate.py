@@ -70,9 +70,9 @@ class Evaluator:
         self.arguments = [problem.arguments(e, mesh) for e, mesh in enumerate(self.meshes)]
         self._places = [_places(problem, e) for e in indices]
 
-    def halved(self) -> Evaluator:
-        """The same problem with every cell of its meshes cut in two."""
-        return Evaluator(self.problem, meshes=[mesh.halved() for mesh in self.meshes])
+    def divided(self, parts: int = 2) -> Evaluator:
+        """The same problem with every cell of its meshes cut into equal parts."""
+        return Evaluator(self.problem, meshes=[mesh.divided(parts) for mesh in self.meshes])
 
     def __call__(
         self, theta: FloatArray, side: int = 1, method: Method = "auto", gauss_newton: bool = False

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from switchfit.data import FloatArray, Measurements, Observe, ReferenceSignal, RunningCost, TerminalCost
-from switchfit.mesh import Mesh, padded_length
 from switchfit.experiment import Experiment, Parameter, initial_state_of, reset_maps_of, signals_of
+from switchfit.mesh import Mesh, padded_length
 from switchfit.rungekutta import Density, Field, Tableau, tableau_of
 from switchfit.system import HybridSystem
 

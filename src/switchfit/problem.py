@@ -60,7 +60,7 @@ class Problem:
     min_duration : float, optional
         Shortest time (s) a mode may last; 0 lets it vanish, which the result then reports.
     solver : {"explicit", "stiff"}, optional
-        Dormand-Prince of order 5, or Radau IIA of order 5 for stiff modes.
+        Butcher's explicit Runge-Kutta method of order 5, or Radau IIA of order 5 for stiff modes.
     rtol, atol : float, optional
         Tolerances of the local error by which the mesh is refined.
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from switchfit.mesh import CHUNK, Rows, row_ending_cell, rows
+from switchfit.mesh import Rows, row_ending_cell, rows
 from switchfit.model import Model, Piece
 from switchfit.rungekutta import combine, stages
 
@@ -43,9 +43,14 @@ class Path(NamedTuple):
         return at_cells(self.layout, self.before[0, 0], self.after, cell)
 
 
+def by_row(values: Array) -> Array:
+    """Values (Q, C, ...) as (Q C, ...): one entry a row."""
+    return values.reshape((values.shape[0] * values.shape[1], *values.shape[2:]))
+
+
 def at_cells(layout: Rows, first: Array, after: Array, cell: Array) -> Array:
     """Pick from values (Q, C, ...) at the ends of rows those at the ends of cells (K,); `first` for cell -1."""
-    flat = jnp.concatenate([first[None], after.reshape((-1,) + after.shape[2:])])
+    flat = jnp.concatenate([first[None], by_row(after)])
     return flat[row_ending_cell(layout, cell) + 1]
 
 
@@ -120,5 +125,3 @@ def sample_costs(model: Model, path: Path, p: Array) -> Array:
         total = total + jax.vmap(lambda s, x, k=k: model.sample_cost(k, s, x, p))(samples, x).sum()
     return total
 
-
-__all__ = ["CHUNK", "Path", "apply_reset", "at_cells", "by_mode", "path_cost", "propagate", "running_cost"]

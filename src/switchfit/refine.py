@@ -15,8 +15,8 @@ import numpy as np
 import scipy.integrate
 
 from switchfit.data import FloatArray, Measurements
-from switchfit.mesh import Mesh
 from switchfit.experiment import Experiment, signals_of
+from switchfit.mesh import Mesh
 from switchfit.model import Arguments, Model, Piece, Structure, float64
 from switchfit.problem import Problem
 

@@ -9,7 +9,7 @@ is linear algebra. All of it is exact for the *discretised* system, whatever the
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,16 +35,19 @@ class Tableau(NamedTuple):
     order: int
 
 
-def dormand_prince() -> Tableau:
-    """Dormand and Prince (1980), order 5 with six stages (the seventh only serves their error estimate)."""
+def butcher() -> Tableau:
+    """Butcher (1964), order 5 with six stages.
+
+    All weights are positive or zero, so that the integral of a positive running cost is positive whatever the step;
+    those of Dormand and Prince are not.
+    """
     a = np.zeros((6, 6))
-    a[1, :1] = [1 / 5]
-    a[2, :2] = [3 / 40, 9 / 40]
-    a[3, :3] = [44 / 45, -56 / 15, 32 / 9]
-    a[4, :4] = [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729]
-    a[5, :5] = [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656]
-    b = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
-    return Tableau(a, b, a.sum(1), 5)
+    a[1, :1] = [1 / 4]
+    a[2, :2] = [1 / 8, 1 / 8]
+    a[3, :3] = [0, -1 / 2, 1]
+    a[4, :4] = [3 / 16, 0, 0, 9 / 16]
+    a[5, :5] = [-3 / 7, 2 / 7, 12 / 7, -12 / 7, 8 / 7]
+    return Tableau(a, np.array([7, 0, 32, 12, 32, 7]) / 90, a.sum(1), 5)
 
 
 def radau_iia() -> Tableau:
@@ -60,7 +63,7 @@ def radau_iia() -> Tableau:
     return Tableau(a, a[2].copy(), np.array([(4 - r) / 10, (4 + r) / 10, 1.0]), 5)
 
 
-EXPLICIT, STIFF = dormand_prince(), radau_iia()
+EXPLICIT, STIFF = butcher(), radau_iia()
 
 
 def tableau_of(solver: str) -> Tableau:

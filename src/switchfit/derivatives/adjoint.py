@@ -33,8 +33,8 @@ psi_dot being (7) (the paper's step from (6) to (11)), with tau_j, j < i, by Ome
              X^{tau,p} = D_1 F_{i-1} D_p x- - D_1 f_i D_p x+ + D_p F_{i-1} - D_p f_i
     p, p  :  D_p R' Omega_p + psi . [D_p^2 R + D_1 D_p R D_p x-]  at each transition, added to (14).
 
-All of f_i, D ell, psi, Omega, Omega_p are at (tau_i, x(tau_i+)). Thus (11), (13), (16) and (17) hold as they are printed
-once f_{i-1} is read as F_{i-1}. Through the map itself
+All of f_i, D ell, psi, Omega, Omega_p are at (tau_i, x(tau_i+)). Thus (11), (13), (16) and (17) hold as they are
+printed once f_{i-1} is read as F_{i-1}. Through the map itself
 
     D_p x+ = D_x R D_p x- + D_p R,      psi- = psi+ D_x R,      Omega- = D_x R' Omega+ D_x R + psi+ . D_x^2 R,
     Omega_p- = D_x R' Omega_p+ + psi+ . [D_x^2 R D_p x- + D_p D_x R],      and (9) gains psi+ D_p R.
@@ -353,9 +353,7 @@ def integrands(d: Along, adjoints: Adjoints) -> Quadratures:
 
 def along_trajectory(f: Field, ell: Density, t: Array, x: Array, Dp_x: Array, p: Array) -> Along:
     """All that the adjoint equations need to know about the trajectory at time t."""
-    D1f, Dpf, *of_f = first_and_second(f, t, x, p)
-    D1ell, Dpell, *of_ell = first_and_second(ell, t, x, p)
-    return Along(Dp_x, D1f, Dpf, *of_f, D1ell, Dpell, *of_ell)
+    return Along(Dp_x, *first_and_second(f, t, x, p), *first_and_second(ell, t, x, p))
 
 
 def backward_sweep(
@@ -389,8 +387,8 @@ def backward_sweep(
     layout = path.layout
     minus = [Dp_x_after[layout.first_chunk[i + 1] - 1, -1] for i in range(len(transitions))]
     Dp_minus = jnp.stack([jnp.zeros_like(Dp_x_before[0, 0]), *minus])
-    given = (layout.segment, layout.opens, jumps, layout.start, layout.end, path.pieces)
-    given += (path.before, path.after, Dp_x_before, Dp_x_after)
+    rows = (layout.start, layout.end, path.pieces, path.before, path.after, Dp_x_before, Dp_x_after)
+    given = (layout.segment, layout.opens, jumps, *rows)
     (start, total), opened = lax.scan(chunk, (final, total), given, reverse=True)
     return add(start, at_t0), opened, total
 
@@ -465,7 +463,7 @@ def sample_jumps(
         ends = row_ending_cell(path.layout, samples.cell) + 1  # 0 is t0
         jumps = jax.tree.map(lambda a, b, ends=ends: a.at[ends].add(b), jumps, jump)
         total = add(total, jax.tree.map(lambda a: a.sum(0), added))
-    at_rows = jax.tree.map(lambda a: a[1:].reshape((Q, C) + a.shape[1:]), jumps)
+    at_rows = jax.tree.map(lambda a: a[1:].reshape((Q, C, *a.shape[1:])), jumps)
     return pick(jumps, 0), at_rows, total
 
 

@@ -31,7 +31,7 @@ from switchfit.derivatives.first_order import (
 )
 from switchfit.mesh import row_ending_cell
 from switchfit.model import Model, Piece, Samples
-from switchfit.propagate import Path, by_mode
+from switchfit.propagate import Path, by_mode, by_row
 from switchfit.rungekutta import combine, product, stage_adjoints
 
 Array = jax.Array
@@ -177,7 +177,7 @@ def step_length_curvature(model: Model, first: FirstOrder, psi: Costates) -> Arr
         """Derivative along theta of what the step length of a row multiplies: (D,)."""
 
         def at(a: Array) -> Array:
-            return a.reshape((-1,) + a.shape[2:])[row]
+            return by_row(a)[row]
 
         J, X_d, mu = jax.tree.map(at, first.jacobians), at(X.stages), at(psi.mu)
         times_d = stage_time_directions(model, at(starts), at(ends))

@@ -16,7 +16,7 @@ from jax import lax
 
 from switchfit.mesh import Rows
 from switchfit.model import Model, Piece, Samples
-from switchfit.propagate import Path, at_cells, by_mode, propagate
+from switchfit.propagate import Path, at_cells, by_mode, by_row, propagate
 from switchfit.rungekutta import combine, end_tangents, stage_tangents
 
 Array = jax.Array
@@ -222,7 +222,7 @@ def row_end_tangents(model: Model, path: Path, jacobians: StageJacobians) -> Row
     layout, tableau = path.layout, model.tableau
     rows = jnp.stack([layout.first_chunk[1:] * layout.start.shape[1], layout.last_row[:-1]])
     h, f_x, f_t, K = (
-        a.reshape((-1,) + a.shape[2:])[rows]
+        by_row(a)[rows]
         for a in (layout.end - layout.start, jacobians.f_x, jacobians.f_t, path.slopes)
     )
     parts = []

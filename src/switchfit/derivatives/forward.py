@@ -100,8 +100,8 @@ def second_tangents(model: Model, first: FirstOrder, tau: Array, p: Array) -> tu
     resets = reset_sources(model, first, tau, p)
     path, layout = first.path, first.path.layout
     start = along_pairs(model.initial_state, (p,), (P,))
-    given = (layout.segment, layout.opens, layout.start, layout.end, path.pieces, path.before)
-    given += (*time_directions(model, layout), first.tangents.before)
+    directions = (*time_directions(model, layout), first.tangents.before)
+    given = (layout.segment, layout.opens, layout.start, layout.end, path.pieces, path.before, *directions)
     (H, _), second = lax.scan(chunk, (jnp.zeros(start.shape[-1]), start), given)
     return H, Second(*second)
 

@@ -1,0 +1,156 @@
+"""Checking derivatives at any theta: Taylor remainders, and the paper's equations against the discretised cost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from switchfit.data import FloatArray
+from switchfit.evaluate import Evaluation, Evaluator, evaluator_of
+from switchfit.problem import Problem
+
+
+@dataclass(frozen=True, eq=False)
+class DerivativeCheck:
+    """Taylor table and gaps between the methods; print it.
+
+    Attributes
+    ----------
+    steps : (S,) array
+        Step lengths h.
+    remainders : (S, 3) array
+        ``|J(theta + h v) - J|``, the same less ``h g.v``, and the same less ``h^2/2 v'Hv``.
+    orders : (S - 1, 3) array
+        Observed orders in h, which are 1, 2 and 3 if J, g and H are right; NaN where a remainder is rounding.
+    gradient_gap, hessian_gap : float
+        Relative gap between the paper's equations (6)-(17) and the discretised cost's exact derivatives.
+    gradient_gap_halved, hessian_gap_halved : float
+        The same with every step halved: smaller by ``2**order`` of the integrator, down to rounding.
+    theta : (d,) array
+    """
+
+    steps: FloatArray
+    remainders: FloatArray
+    orders: FloatArray
+    gradient_gap: float
+    hessian_gap: float
+    gradient_gap_halved: float
+    hessian_gap_halved: float
+    theta: FloatArray
+
+    @property
+    def observed_orders(self) -> tuple[float, ...]:
+        """Median order of each remainder over the steps at which it is not yet rounding; NaN if it always is."""
+        return tuple(_median(self.orders[:, k]) for k in range(3))
+
+    @property
+    def passed(self) -> bool:
+        """Whether the orders are 1, 2, 3 within 0.25, or beyond what can be seen, and the methods agree to 1e-4."""
+        right = all(order > k - 0.25 or np.isnan(order) for k, order in enumerate(self.observed_orders, start=1))
+        return right and self.gradient_gap < 1e-4 and self.hessian_gap < 1e-4
+
+    def __str__(self) -> str:
+        lines = ["Taylor remainders of J along a random direction", ""]
+        lines.append(f"{'h':>10}  {'J':>10} order  {'+ gradient':>10} order  {'+ Hessian':>10} order")
+        for k, (h, r) in enumerate(zip(self.steps, self.remainders, strict=True)):
+            cells = [f"{r[j]:10.2e} {'' if k == 0 else _order(self.orders[k - 1, j]):>5}" for j in range(3)]
+            lines.append(f"{h:10.1e}  " + "  ".join(cells))
+        lines.append("")
+        lines.append("Paper's equations (6)-(17) against the derivatives of the discretised cost, relative:")
+        lines.append(f"  gradient {self.gradient_gap:.1e}, with half the steps {self.gradient_gap_halved:.1e}")
+        lines.append(f"  Hessian  {self.hessian_gap:.1e}, with half the steps {self.hessian_gap_halved:.1e}")
+        verdict = "passed" if self.passed else "FAILED: the derivatives do not belong to the cost"
+        lines.append(f"Observed orders {', '.join(f'{o:.2f}' for o in self.observed_orders)} (1, 2, 3 expected): {verdict}.")
+        return "\n".join(lines)
+
+
+def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, seed: int = 0) -> DerivativeCheck:
+    """Check the gradient and the Hessian of a problem against its cost, and the two ways to find them.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : (d,) array_like, optional
+        The initial guess if left out. Transition times that lie on a node of the mesh are moved off it, since
+        derivatives jump there.
+    seed : int, optional
+        Of the random direction.
+
+    Returns
+    -------
+    DerivativeCheck
+        Print it, or look at ``.passed``.
+    """
+    evaluator = evaluator_of(problem)
+    at = _off_nodes(evaluator, problem.checked_theta(theta))
+    base = evaluator(at)
+    direction = np.random.default_rng(seed).choice([-1.0, 1.0], size=len(at)) * _scales(base, at)
+    largest = _room(evaluator, at, direction)
+    steps = largest * 0.5 ** np.arange(8)
+    remainders = np.array([_remainders(evaluator, base, at, h, direction) for h in steps])
+    rounding = remainders < 1e3 * np.finfo(float).eps * max(abs(base.cost), float(remainders.max()))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        orders = np.where(rounding[1:], np.nan, np.log2(remainders[:-1] / remainders[1:]))
+    gaps = derivative_gap(evaluator, at)
+    halved = derivative_gap(evaluator.divided(), at)
+    return DerivativeCheck(steps, remainders, orders, *gaps, *halved, at)
+
+
+def derivative_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[float, float]:
+    """Relative gap of gradient and Hessian between the paper's equations and the discretised cost."""
+    paper, discrete = evaluator(theta, method="adjoint"), evaluator(theta)
+    scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(discrete.hessian)), 1e-300))
+    return (
+        _gap(paper.gradient * scale, discrete.gradient * scale, 1e-6 * np.sqrt(max(abs(discrete.cost), 1e-300))),
+        _gap(paper.hessian * np.outer(scale, scale), discrete.hessian * np.outer(scale, scale), 0.0),
+    )
+
+
+def _gap(a: FloatArray, b: FloatArray, floor: float) -> float:
+    return float(np.linalg.norm(a - b) / max(np.linalg.norm(b), floor, 1e-300))
+
+
+def _scales(base: Evaluation, theta: FloatArray) -> FloatArray:
+    """Changes of the unknowns that each change J by about as much as the others."""
+    curvature = np.abs(np.diag(base.hessian))
+    typical = np.where(theta != 0, np.abs(theta), 1.0)
+    return np.where(curvature > 0, 1.0 / np.sqrt(np.where(curvature > 0, curvature, 1.0)), typical)
+
+
+def _off_nodes(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
+    """theta with each transition time in the middle of the cell it is in, where J is smooth for longest."""
+    moved = theta.copy()
+    for i, nodes in enumerate(evaluator.breakpoints()):
+        if len(nodes):
+            k = int(np.clip(np.searchsorted(nodes, theta[i], side="right") - 1, 0, len(nodes) - 2))
+            moved[i] = 0.5 * (nodes[k] + nodes[k + 1])
+    return moved
+
+
+def _room(evaluator: Evaluator, theta: FloatArray, direction: FloatArray) -> float:
+    """Largest step that leaves every transition time in its cell, and every unknown near its size."""
+    room = 1e-2 * np.min(np.where(theta != 0, np.abs(theta), 1.0) / np.abs(direction))
+    for i, nodes in enumerate(evaluator.breakpoints()):
+        if len(nodes):
+            room = min(room, 0.9 * np.min(np.abs(nodes - theta[i])) / abs(direction[i]))
+    return float(room)
+
+
+def _remainders(
+    evaluator: Evaluator, base: Evaluation, theta: FloatArray, h: float, direction: FloatArray
+) -> tuple[float, float, float]:
+    zeroth = evaluator(theta + h * direction).cost - base.cost
+    first = zeroth - h * base.gradient @ direction
+    second = first - 0.5 * h**2 * direction @ base.hessian @ direction
+    return abs(zeroth), abs(first), abs(second)
+
+
+def _median(orders: FloatArray) -> float:
+    finite = orders[np.isfinite(orders)]
+    return float(np.median(finite)) if len(finite) else np.nan
+
+
+def _order(order: float) -> str:
+    return "-" if np.isnan(order) else f"{order:.2f}"

@@ -1,0 +1,299 @@
+"""The command line: ``switchfit fit | check | simulate``.
+
+Exit codes: 0 converged, 1 not converged (what was found is still written), 2 a problem with what was given,
+3 an error of switchfit itself. Only typer is imported here; the numerical parts load when a command needs them, so
+that ``--help`` is quick.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import os
+import signal
+import sys
+import tempfile
+import threading
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.live import Live
+
+    from switchfit.io.problem_file import ProblemFile
+
+CONVERGED, NOT_CONVERGED, BAD_INPUT, INTERNAL_ERROR = 0, 1, 2, 3
+
+app = typer.Typer(
+    name="switchfit",
+    help="When did it switch, and what were the parameters? Fits switched models to measurements.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+ProblemPath = Annotated[Path, typer.Argument(metavar="PROBLEM.toml", help="Problem file.", show_default=False)]
+Debug = Annotated[bool, typer.Option("--debug", help="Show the full traceback of an error.")]
+
+
+def main() -> None:
+    """Entry point of the ``switchfit`` command."""
+    app()
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        typer.echo(f"switchfit {version('switchfit')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def fit(
+    problem: ProblemPath,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for report.txt, estimate.json and fit.png.", show_default=False)
+    ] = None,
+    hessian: Annotated[
+        Literal["exact", "block-diagonal", "gauss-newton", "none"] | None,
+        typer.Option(help="Quadratic term of the optimiser.", show_default="exact"),
+    ] = None,
+    tolerance: Annotated[
+        float | None, typer.Option(min=0.0, help="Optimality at which to stop.", show_default="the library's")
+    ] = None,
+    max_iterations: Annotated[
+        int | None, typer.Option(min=0, help="Most iterations.", show_default="the library's")
+    ] = None,
+    no_figures: Annotated[bool, typer.Option("--no-figures", help="Write no figure.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Estimate transition times and parameters; report on the terminal, report and figure in --out.
+
+    Options given here win over those in the problem file. Ctrl-C stops after the iteration that is under way and
+    reports what was found. Exit code 0: converged; 1: not converged, what was found is still written; 2: something
+    is wrong with what was given.
+    """
+    given = {"hessian": hessian, "tolerance": tolerance, "max_iterations": max_iterations}
+    with _reported(debug):
+        loaded = _load(problem)
+        options = loaded.options | {key: value for key, value in given.items() if value is not None}
+        figures = out is not None and not no_figures
+        if out is not None:
+            _make_folder(out)
+        estimate = _estimate(loaded, options, prepare_figures=figures)
+        report = str(estimate)
+        typer.echo(report)
+        if out is not None:
+            _write(out / "report.txt", lambda path: path.write_text(report + "\n", encoding="utf-8"))
+            _write(out / "estimate.json", estimate.save)
+            if figures:
+                _write(out / "fit.png", lambda path: estimate.plot().savefig(path, dpi=150))
+            typer.echo(f"written to {out}", err=True)
+    if not estimate.success:
+        typer.echo(f"switchfit: not converged. {estimate.message}", err=True)
+        raise typer.Exit(NOT_CONVERGED)
+
+
+@app.command()
+def check(problem: ProblemPath, debug: Debug = False) -> None:
+    """Check a problem without fitting it: data, derivatives, what the data can tell at the first guess.
+
+    Exit code 0: the derivatives are right; 1: they are not; 2: something is wrong with what was given.
+    """
+    with _reported(debug):
+        loaded = _load(problem)
+        import switchfit as sf
+        from switchfit.io.summary import describe, identifiability
+
+        typer.echo(f"{describe(loaded.problem)}\n")
+        derivatives = sf.check_derivatives(loaded.problem)
+        typer.echo(f"{derivatives}\n")
+        typer.echo(identifiability(loaded.problem))
+    if not derivatives.passed:
+        raise typer.Exit(NOT_CONVERGED)
+
+
+@app.command()
+def simulate(
+    problem: ProblemPath,
+    out: Annotated[Path, typer.Option(metavar="FILE.csv", help="CSV file to write.", show_default=False)],
+    debug: Debug = False,
+) -> None:
+    """Integrate the model at the first guess and write time, mode and states as CSV."""
+    with _reported(debug):
+        loaded = _load(problem)
+        import switchfit as sf
+
+        runs = [sf.simulate(loaded.problem, experiment=e) for e in range(len(loaded.problem.experiments))]
+        _make_folder(out.parent)
+
+        def save(path: Path) -> None:
+            with path.open("w", newline="", encoding="utf-8") as file:
+                table = csv.writer(file)
+                table.writerow(["experiment", "t", "mode", *runs[0].state_names])
+                for k, run in enumerate(runs):
+                    name = loaded.problem.experiments[k].name or f"run{k + 1}"
+                    for t, mode, x in zip(run.times.tolist(), run.modes, run.states.tolist(), strict=True):
+                        table.writerow([name, t, mode, *x])
+
+        _write(out, save)
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _reported(debug: bool) -> Iterator[None]:
+    """Turn exceptions into a sentence on stderr and an exit code."""
+    try:
+        yield
+    except typer.Exit:
+        raise
+    except KeyboardInterrupt:
+        _fail("interrupted before there was anything to write.", NOT_CONVERGED)
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        from switchfit.io.errors import InputError
+        from switchfit.io.python_file import located, user_place
+
+        if user_place(error) is not None and not isinstance(error, InputError):
+            _fail(f"{located(error)}. (--debug shows the full traceback.)", BAD_INPUT)
+        if isinstance(error, (InputError, ValueError)):
+            _fail(str(error), BAD_INPUT)
+        if not debug:
+            traceback.print_exc()
+        _fail("this is an error in switchfit itself; please report it with the lines above.", INTERNAL_ERROR)
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    typer.echo(f"switchfit: {message}", err=True)
+    raise typer.Exit(code)
+
+
+# --- a fit on the terminal --------------------------------------------------------------------------------------------
+
+
+def _load(problem: Path) -> ProblemFile:
+    from switchfit.io.problem_file import load_problem
+
+    return load_problem(problem)
+
+
+def _estimate(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: bool) -> Any:
+    """`switchfit.estimate` with a live line on stderr; Ctrl-C ends it after the iteration under way."""
+    import switchfit as sf
+
+    if prepare_figures:  # matplotlib loads while XLA compiles
+        threading.Thread(target=_import_figures, daemon=True).start()
+    with _stop_on_interrupt() as stopped, _progress() as show:
+
+        def callback(record: Any) -> bool:
+            show(record)
+            return stopped()
+
+        return sf.estimate(loaded.problem, callback=callback, **options)
+
+
+def _import_figures() -> None:
+    with contextlib.suppress(ImportError):
+        import matplotlib.backends.backend_agg
+        import matplotlib.figure  # noqa: F401
+
+
+@contextlib.contextmanager
+def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
+    """The first Ctrl-C only asks to stop, the second is a KeyboardInterrupt."""
+    asked = threading.Event()
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        if asked.is_set():
+            raise KeyboardInterrupt
+        asked.set()
+        typer.echo("stopping after this iteration; Ctrl-C again to stop at once", err=True)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield asked.is_set
+        return
+    before = signal.signal(signal.SIGINT, ask)
+    try:
+        yield asked.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[Callable[[Any], None]]:
+    """A live line on stderr where that is a terminal, nothing otherwise."""
+    if not sys.stderr.isatty():
+        yield lambda record: None
+        return
+    from rich.console import Console
+    from rich.live import Live
+    from rich.spinner import Spinner
+
+    waiting = Spinner("dots", "compiling (only the first time)")
+    with Live(waiting, console=Console(stderr=True), transient=True, refresh_per_second=12) as live:
+        yield lambda record: _show(live, record)
+
+
+def _show(live: Live, record: Any) -> None:
+    live.update(
+        f"iteration {record.iteration:3d}   cost {record.cost:.8g}   optimality {record.optimality:.2e}   "
+        f"step {record.step:.2g}"
+    )
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def _make_folder(folder: Path) -> None:
+    from switchfit.io.errors import InputError
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"the folder {folder} cannot be made: {error.strerror}; name another with --out.") from error
+
+
+def _write(path: Path, save: Callable[[Path], object]) -> None:
+    """Write a file whole or not at all: into a file beside it, which then takes its name."""
+    from switchfit.io.errors import InputError
+
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}; name another with --out.") from error
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        save(temporary)
+        temporary.chmod(0o666 & ~_umask())
+        temporary.replace(path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}; name another with --out.") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _umask() -> int:
+    """The process's umask, which can only be read by setting it."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

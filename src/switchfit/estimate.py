@@ -1,0 +1,232 @@
+"""estimate(): a problem in, an `Estimate` out. Puts mesh, derivatives and optimiser together."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from switchfit.certificate import certify
+from switchfit.data import Measurements
+from switchfit.evaluate import Evaluation, Evaluator, evaluator_of
+from switchfit.io.json import load_fit, save_fit
+from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
+from switchfit.problem import Problem
+from switchfit.report.plot import plot_fit
+from switchfit.report.text import report
+from switchfit.result import Certificate, Fit
+from switchfit.simulate import compare
+
+HessianKind = Literal["exact", "block-diagonal", "gauss-newton", "none"]
+HESSIANS = ("exact", "block-diagonal", "gauss-newton", "none")
+
+REFINEMENTS = 2
+"""Times the mesh may be refined at the solution and the fit resumed, if the integration error asks for it."""
+
+LARGEST_INTEGRATION_ERROR = 1e-8
+"""Relative error of J (by halving all steps) above which the mesh is refined again, unless rtol allows more."""
+
+PERFECT_FIT = 1e-3
+"""Where J has fallen to less than this part of its first value, the integration error is measured against that part:
+the relative error of a cost that vanishes says nothing."""
+
+ORDER = 5
+"""Order of both integrators: what dividing the steps gains."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate(Fit):
+    """Result of `estimate`: everything in `Fit`, and what can be done with it. Print it for the report."""
+
+    certificate_data: Certificate | None = None
+    problem: Problem | None = None
+
+    @cached_property
+    def certificate(self) -> Certificate:
+        """How the numbers were checked. The paper's equations are evaluated here, at the first access."""
+        if self.certificate_data is not None:
+            return self.certificate_data
+        if self.problem is None:
+            raise ValueError("This estimate was loaded without a certificate and has no problem to check it with.")
+        return certify(self, Evaluator(self.problem, theta=self.theta))
+
+    def __str__(self) -> str:
+        return report(self)
+
+    def plot(self) -> Any:
+        """Measured against fitted over time with the modes shaded, as a matplotlib Figure."""
+        return plot_fit(self)
+
+    def save(self, path: str | Path) -> None:
+        """Write everything (but the model) to a JSON file, atomically; `load` reads it."""
+        save_fit(self, self.certificate, Path(path))
+
+    @classmethod
+    def load(cls, path: str | Path) -> Estimate:
+        """Read what `save` wrote.
+
+        Raises
+        ------
+        ValueError
+            If the file is not one of switchfit's.
+        """
+        fit, certificate = load_fit(Path(path))
+        return cls(**{f.name: getattr(fit, f.name) for f in fields(Fit)}, certificate_data=certificate)
+
+
+def estimate(
+    problem: Problem,
+    *,
+    hessian: HessianKind = "exact",
+    tolerance: float = 1e-7,
+    max_iterations: int = 200,
+    callback: Callable[[IterationRecord], object] | None = None,
+) -> Estimate:
+    """Estimate all transition times and parameters of a problem together.
+
+    Parameters
+    ----------
+    problem : Problem
+    hessian : {"exact", "block-diagonal", "gauss-newton", "none"}
+        Quadratic term of the sequential quadratic programme: equation (3), equation (4), the Gauss-Newton
+        matrix, or none (steepest descent).
+    tolerance : float
+        On the KKT residual, the norm of the gradient where no constraint is active.
+    max_iterations : int
+    callback : callable, optional
+        Called with each `IterationRecord`; a true return value stops the fit. Ctrl-C does as well; both
+        return the best point so far.
+
+    Returns
+    -------
+    Estimate
+        Also when it did not converge: see ``.success`` and ``.message``.
+
+    Raises
+    ------
+    ValueError
+        For a bad setting, or a guess at which the model cannot be integrated.
+    """
+    if hessian not in HESSIANS:
+        raise ValueError(f"hessian must be one of {', '.join(HESSIANS)}; got {hessian!r}.")
+    if not tolerance > 0:
+        raise ValueError(f"tolerance must be positive; got {tolerance}.")
+    if max_iterations < 0:
+        raise ValueError(f"max_iterations must not be negative; got {max_iterations}.")
+    began = time.perf_counter()
+    evaluator = evaluator_of(problem)
+    theta = problem.initial_theta
+    history: list[IterationRecord] = []
+    evaluations = 0
+    for attempt in range(REFINEMENTS + 1):
+        result = _minimized(evaluator, theta, hessian, tolerance, max_iterations, callback, len(history))
+        history += result.history if not history else result.history[1:]
+        evaluations += result.evaluations
+        theta = result.theta
+        fine_cost, trajectories, comparisons = compare(problem, theta, [mesh.divided() for mesh in evaluator.meshes])
+        error = abs(fine_cost - result.cost) / max(abs(fine_cost), PERFECT_FIT * abs(history[0].cost), 1e-300)
+        excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
+        if excess <= 1 or attempt == REFINEMENTS or result.status in (Status.INTERRUPTED, Status.NONFINITE_START):
+            break
+        evaluator = evaluator.divided(2 ** max(int(np.ceil(np.log2(excess) / ORDER)), 1))
+    return _estimate(
+        problem, evaluator, result, history, hessian, tolerance,
+        evaluations=evaluations, trajectories=trajectories, comparisons=comparisons,
+        integration_error=float(error), seconds=time.perf_counter() - began,
+    )
+
+
+def constraints_of(problem: Problem) -> LinearConstraints:
+    """Ordering, minimum durations and bounds of a problem as the optimiser takes them."""
+    unknowns = problem.unknowns
+    names = [
+        *unknowns.constraint_names,
+        *(f"{name} at its lower bound {value:g}" for name, value in zip(unknowns.names, unknowns.lower, strict=True)),
+        *(f"{name} at its upper bound {value:g}" for name, value in zip(unknowns.names, unknowns.upper, strict=True)),
+    ]
+    return LinearConstraints(unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, tuple(names))
+
+
+def _minimized(
+    evaluator: Evaluator, theta: Any, hessian: HessianKind, tolerance: float, max_iterations: int,
+    callback: Callable[[IterationRecord], object] | None, before: int,
+) -> Result:
+    """One run of the optimiser on the evaluator's meshes."""
+    problem = evaluator.problem
+
+    def evaluate(theta: Any, side: int) -> Evaluation:
+        return evaluator(theta, side, gauss_newton=hessian == "gauss-newton")
+
+    is_time = np.zeros(len(theta), dtype=int)
+    for where in problem.unknowns.times:
+        is_time[where[where >= 0]] = 1
+    return minimize(
+        evaluate,
+        theta,
+        constraints=constraints_of(problem),
+        breakpoints=evaluator.breakpoints(),
+        hessian=hessian,
+        blocks=is_time,
+        tolerance=tolerance,
+        max_iterations=max(max_iterations - max(before - 1, 0), 0),
+        callback=callback,
+    )
+
+
+def _estimate(
+    problem: Problem, evaluator: Evaluator, result: Result, history: list[IterationRecord], hessian: HessianKind,
+    tolerance: float, **rest: Any,
+) -> Estimate:
+    """Collect what the optimiser found into an Estimate, with the exact Hessian whatever it worked with."""
+    unknowns = problem.unknowns
+    times, parameters = problem.split(result.theta)
+    exact = result.hessian
+    if hessian == "gauss-newton" and np.isfinite(result.cost):
+        exact = evaluator(result.theta).hessian
+    return Estimate(
+        theta_names=unknowns.names,
+        theta_units=unknowns.units,
+        initial_theta=unknowns.initial.copy(),
+        theta=result.theta,
+        lower=unknowns.lower,
+        upper=unknowns.upper,
+        transition_times=tuple(times),
+        parameters={name: np.array(value) for name, value in parameters.items()},
+        cost=result.cost,
+        gradient=result.gradient,
+        hessian=exact,
+        optimality=result.optimality,
+        iterations=len(history) - 1,
+        status=result.status,
+        message=_named(result.message, unknowns.names),
+        history=tuple(history),
+        active=result.active,
+        kinks=tuple((unknowns.names[i], left, right) for i, left, right in result.kinks),
+        free_basis=result.free_basis,
+        sigma_known=_sigma_known(problem),
+        hessian_kind=hessian,
+        tolerance=tolerance,
+        problem=problem,
+        **rest,
+    )
+
+
+def _named(message: str, names: tuple[str, ...]) -> str:
+    """The optimiser's message with the unknowns called by their names."""
+    return re.sub(r"theta\[(\d+)\]", lambda match: names[int(match.group(1))], message)
+
+
+def _sigma_known(problem: Problem) -> bool | None:
+    """Whether sigma is known for all measurements; None where the cost is not made of measurements alone."""
+    items = [item for experiment in problem.experiments for item in experiment.data]
+    if not all(isinstance(item, Measurements) for item in items):
+        return None
+    return all(item.sigma is not None for item in items)
+
+

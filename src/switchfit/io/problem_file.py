@@ -1,0 +1,505 @@
+"""Problem files: a model, its data, guesses and bounds, in TOML.
+
+The `pydantic` models below are the format: their fields are the keys, a field's description says what the key is
+for, in the reference page and in error messages. ``docs/problem-file.md`` shows it by example.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import inspect
+import re
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import numpy as np
+import pydantic
+from pydantic import Field
+
+from switchfit.data import FloatArray, Input, Measurements, ReferenceSignal
+from switchfit.experiment import Experiment, Parameter
+from switchfit.io.csv import read_columns
+from switchfit.io.errors import InputError
+from switchfit.io.python_file import call, load_object, located, user_place
+from switchfit.models import BUILT_IN
+from switchfit.problem import Problem
+from switchfit.system import HybridSystem
+
+HessianKind = Literal["exact", "block-diagonal", "gauss-newton", "none"]
+
+
+@dataclass(frozen=True)
+class ProblemFile:
+    """What a problem file says.
+
+    Attributes
+    ----------
+    path : Path
+    problem : Problem
+    options : dict
+        Keyword arguments for `switchfit.estimate`, as far as the file gives them.
+    """
+
+    path: Path
+    problem: Problem
+    options: dict[str, Any]
+
+
+def load_problem(path: str | Path) -> ProblemFile:
+    """Read a problem file, the data files it names, and the Python file of its model.
+
+    Parameters
+    ----------
+    path : str or Path
+        A TOML file. Files it names are looked for in its folder.
+
+    Returns
+    -------
+    ProblemFile
+
+    Raises
+    ------
+    InputError
+        For anything wrong with the file or with what it names: one sentence with the file, the key, what was given
+        and what to do.
+    """
+    path = Path(path)
+    contents = _validated(path, _parsed(path))
+    options = contents.options.model_dump(include={"hessian", "tolerance", "max_iterations"}, exclude_none=True)
+    build = _from_tables if contents.problem is None else _from_python
+    return ProblemFile(path, build(path, contents), options)
+
+
+# --- the format -------------------------------------------------------------------------------------------------------
+
+
+class _Table(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+def _number_as_table(given: Any) -> Any:
+    """``mu = 0.8`` means ``mu = { value = 0.8 }``."""
+    return {"value": given} if isinstance(given, (int, float, list)) and not isinstance(given, bool) else given
+
+
+def _name_as_table(given: Any) -> Any:
+    """``model = "skid_steer"`` means ``model = { name = "skid_steer" }``."""
+    return {"name": given} if isinstance(given, str) else given
+
+
+def _table_as_list(given: Any) -> Any:
+    """One table where several may stand."""
+    return [given] if isinstance(given, dict) else given
+
+
+class ParameterTable(_Table):
+    """A guess and what is known about it; a bare number is a guess without bounds."""
+
+    value: float | list[float] = Field(description="first guess, or the value itself where fixed")
+    lower: float = Field(default=-np.inf, description="lower bound")
+    upper: float = Field(default=np.inf, description="upper bound")
+    unit: str = Field(default="", description="unit, for the report")
+    fixed: bool = Field(default=False, description="true if it is known and not to be estimated")
+
+
+class TransitionTable(_Table):
+    """First guess of a transition time, with bounds of its own."""
+
+    value: float = Field(description="first guess of the transition time (s)")
+    lower: float = Field(default=-np.inf, description="earliest time (s)")
+    upper: float = Field(default=np.inf, description="latest time (s)")
+    fixed: bool = Field(default=False, description="true if the time is known and not to be estimated")
+
+
+class LogTable(_Table):
+    """Columns of a CSV file over time."""
+
+    file: str = Field(description="CSV file, relative to the problem file")
+    time: str = Field(description="name of the column with the time")
+    columns: list[str] = Field(min_length=1, description="names of the columns with the values")
+    window: Annotated[list[float], Field(min_length=2, max_length=2)] | None = Field(
+        default=None, description="[from, to]: only rows with the time column in between are used"
+    )
+    time_offset: float = Field(default=0.0, description="subtracted from the time column")
+    time_scale: float = Field(default=1.0, gt=0, description="then multiplied: 1e-3 if the column is in milliseconds")
+
+
+class DataTable(LogTable):
+    """What the model is compared with."""
+
+    kind: Literal["measurements", "reference"] = Field(
+        default="measurements", description="discrete noisy samples, or a continuous reference signal"
+    )
+    observe: str | list[str] | None = Field(
+        default=None,
+        description="the state that each column measures, by name, or 'file.py:function' with h(t, x, p); left out, "
+        "the columns are the whole state",
+    )
+    sigma: float | list[float] | list[str] | None = Field(
+        default=None,
+        description="standard deviation of the noise: a number, one a column, or the names of columns that hold it; "
+        "left out, it is unknown (measurements only)",
+    )
+    lowpass_hz: float | None = Field(
+        default=None, gt=0, description="cut-off of a low-pass filter (Hz; reference only)"
+    )
+    weights: list[float] | None = Field(default=None, description="weight of each column (reference only)")
+
+
+class InputTable(LogTable):
+    """A known input u(t); modes are then called as f(t, x, p, u)."""
+
+    kind: Literal["hold", "linear", "cubic"] = Field(default="hold", description="what happens between samples")
+
+
+class ExperimentTable(_Table):
+    """One run."""
+
+    mode_sequence: list[str] = Field(min_length=1, description="names of the modes in the order of their activity")
+    transition_times: list[Annotated[TransitionTable, pydantic.BeforeValidator(_number_as_table)]] = Field(
+        description="first guess of each transition time (s), one fewer than modes"
+    )
+    data: Annotated[list[DataTable], pydantic.BeforeValidator(_table_as_list)] = Field(
+        min_length=1, description="what the model is compared with; several tables add up"
+    )
+    t0: float | None = Field(default=None, description="start of the horizon (s); left out, the first sample")
+    tf: float | None = Field(default=None, description="end of the horizon (s); left out, the last sample")
+    initial_state: list[float] | None = Field(default=None, description="state at t0, instead of the model's")
+    inputs: InputTable | None = Field(default=None, description="a known input")
+    name: str | None = Field(default=None, description="used in the report where there are several experiments")
+
+
+class ModelTable(_Table):
+    """The model: built in, or in a Python file."""
+
+    name: str = Field(description="a built-in model, or 'file.py:object' with a HybridSystem or a function making one")
+    arguments: dict[str, Any] = Field(default_factory=dict, description="arguments of the function")
+
+
+class OptionsTable(_Table):
+    """How to solve; what is left out has the library's default."""
+
+    min_duration: float | None = Field(default=None, ge=0, description="shortest time a mode may last (s)")
+    solver: Literal["explicit", "stiff"] | None = Field(default=None, description="integrator")
+    rtol: float | None = Field(default=None, gt=0, description="relative tolerance of the integrator")
+    atol: float | None = Field(default=None, gt=0, description="absolute tolerance of the integrator")
+    hessian: HessianKind | None = Field(default=None, description="quadratic term of the optimiser")
+    tolerance: float | None = Field(default=None, gt=0, description="optimality at which to stop")
+    max_iterations: int | None = Field(default=None, ge=0, description="most iterations")
+
+
+class Contents(_Table):
+    """The whole file: a model with parameters and experiments, or a problem built in Python."""
+
+    model: Annotated[ModelTable, pydantic.BeforeValidator(_name_as_table)] | None = Field(
+        default=None, description="a built-in model, or 'file.py:object', or a table with name and arguments"
+    )
+    problem: str | None = Field(
+        default=None,
+        description="'file.py:object' with an sf.Problem or a function making one, instead of all the rest",
+    )
+    parameters: dict[str, Annotated[ParameterTable, pydantic.BeforeValidator(_number_as_table)]] = Field(
+        default_factory=dict, description="the model's parameters"
+    )
+    experiments: Annotated[list[ExperimentTable], pydantic.BeforeValidator(_table_as_list)] = Field(
+        default_factory=list, description="the runs"
+    )
+    options: OptionsTable = Field(default_factory=OptionsTable, description="how to solve")
+
+
+# --- from text to checked tables --------------------------------------------------------------------------------------
+
+
+def _parsed(path: Path) -> dict[str, Any]:
+    try:
+        with path.open("rb") as file:
+            return tomllib.load(file)
+    except FileNotFoundError:
+        raise InputError(f"There is no problem file {path}; check the name and the folder.") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is not valid TOML: {error}.") from error
+
+
+def _validated(path: Path, given: dict[str, Any]) -> Contents:
+    try:
+        contents = Contents.model_validate(given)
+    except pydantic.ValidationError as error:
+        raise InputError(f"{path}: {_sentence(error)}") from error
+    if contents.problem is not None:
+        others = [key for key in ("model", "parameters", "experiments") if key in given]
+        if others:
+            raise InputError(f"{path}: 'problem' stands for everything but options; leave out {' and '.join(others)}.")
+    elif contents.model is None:
+        raise InputError(f"{path}: the key 'model' is missing; name one of {', '.join(BUILT_IN)} or 'file.py:object'.")
+    elif not contents.experiments:
+        raise InputError(f"{path}: [[experiments]] is missing; give at least one.")
+    return contents
+
+
+def _sentence(error: pydantic.ValidationError) -> str:
+    """The first thing that is wrong, in words."""
+    errors = sorted(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
+    first = errors[0]
+    table, steps = _followed(first["loc"])
+    key = _key(steps)
+    if first["type"] == "extra_forbidden":
+        known = list(table.model_fields) if table else []
+        close = difflib.get_close_matches(str(steps[-1]), known, n=1)
+        remedy = f"did you mean {close[0]!r}?" if close else f"known here are {', '.join(known)}."
+        sentence = f"unknown key {key}; {remedy}"
+    elif first["type"] == "missing":
+        sentence = f"the key {key} is missing: {_description(table, steps)}."
+    else:
+        sentence = f"{key} {_complaint(first)}; got {_short(first['input'])} ({_description(table, steps)})."
+    different = {_key(_followed(e["loc"])[1]) for e in errors} - {key}
+    return sentence + (f" Also wrong: {', '.join(sorted(different))}." if different else "")
+
+
+def _followed(location: Sequence[str | int]) -> tuple[type[_Table] | None, list[str | int]]:
+    """The table that holds the key at a location, and the location without pydantic's names for unions."""
+    table: type[_Table] | None = Contents
+    holder = table
+    steps: list[str | int] = []
+    for step in location:
+        if table is not None and isinstance(step, str) and (step in table.model_fields or step == location[-1]):
+            holder = table
+            steps.append(step)
+            annotation = table.model_fields[step].annotation if step in table.model_fields else None
+            table = _table_in(annotation)
+            if table is ParameterTable:  # a dict of tables: the next step is a name the user chose
+                table = _ParameterNames
+        elif table is _ParameterNames:
+            steps.append(step)
+            holder = table = ParameterTable
+        elif isinstance(step, int):
+            steps.append(step)
+    return holder, steps
+
+
+class _ParameterNames(_Table):
+    """Stands for [parameters], whose keys are free."""
+
+
+def _table_in(annotation: Any) -> type[_Table] | None:
+    if inspect.isclass(annotation) and issubclass(annotation, _Table):
+        return annotation
+    return next((found for part in get_args(annotation) if (found := _table_in(part)) is not None), None)
+
+
+def _key(steps: Sequence[str | int]) -> str:
+    """``'experiments[1].data[2].file'``, counted from 1."""
+    text = ""
+    for step in steps:
+        text += f"[{step + 1}]" if isinstance(step, int) else f".{step}" if text else step
+    return repr(text)
+
+
+def _description(table: type[_Table] | None, steps: Sequence[str | int]) -> str:
+    names = [step for step in steps if isinstance(step, str)]
+    known = table.model_fields.get(names[-1]) if table and names else None
+    return (known.description if known else None) or "a parameter is a number, a list of numbers or a table"
+
+
+def _complaint(error: Any) -> str:
+    """pydantic's message as the end of a sentence: 'Input should be a valid number' -> 'must be a number'."""
+    if error["type"] in ("too_short", "too_long"):
+        bound, size = next((k, v) for k, v in error["ctx"].items() if k in ("min_length", "max_length"))
+        return f"must have at {'least' if bound == 'min_length' else 'most'} {size} entries"
+    message = error["msg"][:1].lower() + error["msg"][1:]
+    for old, new in (("input should be", "must be"), ("a valid ", "a "), ("dictionary", "table"), (" or instance", "")):
+        message = message.replace(old, new)
+    return re.sub(r" of \w+Table$", "", message)
+
+
+def _short(given: Any) -> str:
+    text = repr(given)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+# --- from tables to a problem -----------------------------------------------------------------------------------------
+
+
+def _from_python(path: Path, contents: Contents) -> Problem:
+    given = contents.options.model_dump(include={"min_duration", "solver", "rtol", "atol"}, exclude_none=True)
+    if given:
+        raise InputError(f"{path}: with 'problem', {', '.join(given)} is set where the sf.Problem is built, not here.")
+    reference = contents.problem or ""
+    found = load_object(reference, path.parent, f"{path}: problem")
+    if callable(found):
+        found = call(found, f"{path}: problem {reference!r}")
+    if not isinstance(found, Problem):
+        raise InputError(
+            f"{path}: problem {reference!r} must be an sf.Problem or a function that returns one; "
+            f"got {type(found).__name__}."
+        )
+    return found
+
+
+def _from_tables(path: Path, contents: Contents) -> Problem:
+    system = _system(path, contents.model or ModelTable(name=""))
+    experiments = []
+    for k, table in enumerate(contents.experiments, start=1):
+        where = f"{path}: experiments[{k}]"
+        experiments.append(_explained(where, _experiment, path.parent, table, system, where))
+    parameters = {
+        name: _explained(f"{path}: parameters.{name}", Parameter, **table.model_dump())
+        for name, table in contents.parameters.items()
+    }
+    options = contents.options.model_dump(include={"min_duration", "solver", "rtol", "atol"}, exclude_none=True)
+    return _explained(f"{path}", Problem, system, experiments, parameters, **options)
+
+
+def _explained(where: str, build: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    """Build something; what it says is wrong is said with the place in the problem file."""
+    try:
+        return build(*arguments, **named)
+    except InputError:
+        raise
+    except Exception as error:
+        if user_place(error) is not None:
+            raise InputError(f"{where}: {located(error)}.") from error
+        if isinstance(error, (ValueError, TypeError)):
+            raise InputError(f"{where}: {error}") from error
+        raise
+
+
+def _system(path: Path, table: ModelTable) -> HybridSystem:
+    what = f"{path}: model"
+    if ".py" in table.name:
+        found = load_object(table.name, path.parent, what)
+    elif table.name in BUILT_IN:
+        found = BUILT_IN[table.name]
+    else:
+        raise InputError(
+            f"{what} {table.name!r} is not known; the built-in models are {', '.join(BUILT_IN)}, your own is given as "
+            "'file.py:object'."
+        )
+    if callable(found):
+        found = call(found, f"{what} {table.name!r}", **_accepted(found, table, what))
+    elif table.arguments:
+        raise InputError(f"{what} {table.name!r} is not a function; leave out its arguments.")
+    if not isinstance(found, HybridSystem):
+        raise InputError(
+            f"{what} {table.name!r} must be an sf.HybridSystem or a function that returns one; "
+            f"got {type(found).__name__}."
+        )
+    return found
+
+
+def _accepted(factory: Callable[..., Any], table: ModelTable, what: str) -> dict[str, Any]:
+    """The arguments, if the factory takes them."""
+    try:
+        inspect.signature(factory).bind(**table.arguments)
+    except TypeError as error:
+        takes = ", ".join(inspect.signature(factory).parameters) or "no arguments"
+        raise InputError(f"{what} {table.name!r}: {error}; it takes {takes}.") from error
+    return table.arguments
+
+
+def _experiment(folder: Path, table: ExperimentTable, system: HybridSystem, where: str) -> Experiment:
+    places = [f"{where}.data[{k}]" for k in range(1, len(table.data) + 1)]
+    data = [
+        _explained(place, _data, folder, item, system, place) for place, item in zip(places, table.data, strict=True)
+    ]
+    spans = [item.times if isinstance(item, Measurements) else item.signal.knots for item in data]
+    return Experiment(
+        data=data,
+        mode_sequence=tuple(table.mode_sequence),
+        transition_times=tuple(Parameter(unit="s", **tau.model_dump()) for tau in table.transition_times),
+        t0=min(span[0] for span in spans) if table.t0 is None else table.t0,
+        tf=max(span[-1] for span in spans) if table.tf is None else table.tf,
+        inputs=None if table.inputs is None else _explained(f"{where}.inputs", _input, folder, table.inputs),
+        initial_state=table.initial_state,
+        name=table.name,
+    )
+
+
+def _data(folder: Path, table: DataTable, system: HybridSystem, where: str) -> Measurements | ReferenceSignal:
+    observe = _observe(folder, table, system, where)
+    names = tuple(table.observe) if isinstance(table.observe, list) else tuple(table.columns)
+    if table.kind == "reference":
+        if table.sigma is not None:
+            raise ValueError("sigma belongs to kind = 'measurements'; a reference has weights.")
+        times, values = _log(folder, table)
+        return ReferenceSignal.from_samples(
+            times, values, observe=observe, lowpass_hz=table.lowpass_hz, weights=table.weights, names=names
+        )
+    for key in ("lowpass_hz", "weights"):
+        if getattr(table, key) is not None:
+            raise ValueError(f"{key} belongs to kind = 'reference'; measurements have sigma.")
+    sigma_columns = [name for name in (table.sigma if isinstance(table.sigma, list) else []) if isinstance(name, str)]
+    times, values = _log(folder, table, sigma_columns)
+    q = len(table.columns)
+    sigma = values[:, q:] if sigma_columns else table.sigma
+    return Measurements(times, values[:, :q], observe=observe, sigma=sigma, names=names)
+
+
+def _input(folder: Path, table: InputTable) -> Input:
+    times, values = _log(folder, table)
+    return Input(times, values[:, 0] if len(table.columns) == 1 else values, kind=table.kind)
+
+
+def _log(folder: Path, table: LogTable, more: Sequence[str] = ()) -> tuple[FloatArray, FloatArray]:
+    """Times (K,) and values (K, q) of the rows inside the window."""
+    path = folder / table.file
+    rows = read_columns(path, [table.time, *table.columns, *more])
+    if np.isnan(rows[:, 0]).any():
+        raise InputError(
+            f"{path}, column {table.time!r}: a time is missing in sample {np.isnan(rows[:, 0]).argmax() + 1}."
+        )
+    if table.window is not None:
+        first, last = table.window
+        inside = (rows[:, 0] >= first) & (rows[:, 0] <= last)
+        if not inside.any():
+            raise InputError(
+                f"{path}: no time in column {table.time!r} lies in the window [{first}, {last}]; they reach from "
+                f"{rows[:, 0].min()} to {rows[:, 0].max()}."
+            )
+        rows = rows[inside]
+    return (rows[:, 0] - table.time_offset) * table.time_scale, rows[:, 1:]
+
+
+def _observe(folder: Path, table: DataTable, system: HybridSystem, where: str) -> Callable[..., Any] | None:
+    """The observation h(t, x, p), or None for the whole state."""
+    if table.observe is None:
+        return None
+    if isinstance(table.observe, str):
+        observe = load_object(table.observe, folder, f"{where}.observe")
+        if not callable(observe):
+            raise ValueError(f"observe {table.observe!r} must be a function h(t, x, p); got {type(observe).__name__}.")
+        return observe
+    if len(table.observe) != len(table.columns):
+        raise ValueError(
+            f"observe must name one state for each of the {len(table.columns)} columns; got {table.observe}."
+        )
+    if system.state_names is None:
+        raise ValueError("observe names states, but the model has no state_names; give it some.")
+    unknown = [name for name in table.observe if name not in system.state_names]
+    if unknown:
+        raise ValueError(
+            f"observe names the unknown state {unknown[0]!r}; the states are {', '.join(system.state_names)}."
+        )
+    return select_states(tuple(system.state_names.index(name) for name in table.observe))
+
+
+@functools.cache
+def select_states(indices: tuple[int, ...]) -> Callable[..., Any]:
+    """The observation ``h(t, x, p) = x[indices]``; the same function for the same indices, so it compiles once.
+
+    Parameters
+    ----------
+    indices : tuple of int
+        Positions in the state.
+    """
+    picked = np.array(indices)
+
+    def observe(t: Any, x: Any, p: Any) -> Any:
+        return x[picked]
+
+    return observe

@@ -1,0 +1,97 @@
+"""Objects out of Python files that users write, and where in them an error came from."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import traceback
+from pathlib import Path
+from typing import Any
+
+from switchfit.io.errors import InputError, first_line
+
+
+def load_object(reference: str, folder: Path, what: str) -> Any:
+    """The object that ``"file.py:object"`` names.
+
+    Parameters
+    ----------
+    reference : str
+        Path of a Python file, relative to `folder`, and the name of an object in it.
+    folder : Path
+        While the file runs it can also import its neighbours in its own folder.
+    what : str
+        What the object is for, used in messages.
+
+    Raises
+    ------
+    InputError
+        If the file or the object is missing, or running the file raises.
+    """
+    file, colon, name = reference.rpartition(":")
+    if not colon or not file.endswith(".py") or not name.isidentifier():
+        raise InputError(f"{what} must be given as 'file.py:object'; got {reference!r}.")
+    path = folder / file
+    if not path.is_file():
+        raise InputError(f"{what} {reference!r}: there is no file {path}.")
+    module = _run(path)
+    if not hasattr(module, name):
+        public = [key for key in vars(module) if not key.startswith("_")]
+        raise InputError(f"{what} {reference!r}: {path} defines no {name!r}; it has {', '.join(public) or 'nothing'}.")
+    return getattr(module, name)
+
+
+def call(function: Any, what: str, **arguments: Any) -> Any:
+    """Call a user's factory; InputError says where it failed."""
+    try:
+        return function(**arguments)
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{what} failed: {located(error)}.") from error
+
+
+def located(error: BaseException) -> str:
+    """An exception with the place in a user's file it came from, as far as it has one."""
+    place = user_place(error)
+    return f"{place}: {first_line(error)}" if place else first_line(error)
+
+
+def user_place(error: BaseException) -> str | None:
+    """``"file.py, line 3, in slip"`` for the innermost frame that is in a file loaded by `load_object`."""
+    if isinstance(error, SyntaxError) and error.filename and error.filename in _files:
+        return f"{error.filename}, line {error.lineno}"
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename in _files]
+    if not frames:
+        return None
+    frame = frames[-1]
+    inside = "" if frame.name == "<module>" else f", in {frame.name}"
+    return f"{frame.filename}, line {frame.lineno}{inside}"
+
+
+#: Every file that was run, and the modules of those that ran through, with the time of their last change (ns).
+_files: set[str] = set()
+_modules: dict[str, tuple[int, Any]] = {}
+
+
+def _run(path: Path) -> Any:
+    """The module that a file makes; a file that several keys name runs once while it does not change."""
+    key = str(path)
+    stamp = path.stat().st_mtime_ns
+    if key in _modules and _modules[key][0] == stamp:
+        return _modules[key][1]
+    specification = importlib.util.spec_from_file_location(f"switchfit_user_{path.stem}", path)
+    if specification is None or specification.loader is None:
+        raise InputError(f"{path} cannot be loaded as a Python file.")
+    module = importlib.util.module_from_spec(specification)
+    _files.add(key)
+    sys.modules[module.__name__] = module
+    sys.path.insert(0, str(path.parent))
+    try:
+        specification.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        raise InputError(f"Running {path} failed: {located(error)}.") from error
+    finally:
+        sys.path.remove(str(path.parent))
+    _modules[key] = (stamp, module)
+    return module

@@ -1,0 +1,57 @@
+"""A body that slides on a plane with Coulomb friction until it sticks."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from switchfit.system import HybridSystem
+
+
+def sliding_block(*, g: float = 9.81) -> HybridSystem:
+    r"""A body sliding on a level plane, modes ``"slide"`` and ``"stick"``, state ``(x, y, vx, vy)``.
+
+    Friction acts against the velocity and so along it: the body stays on a straight line. With ``e`` the unit
+    vector along the initial velocity ``(vx0, vy0)``,
+
+    slide: ``d(vx, vy)/dt = -mu g e``; stick: ``d(x, y, vx, vy)/dt = 0``.
+
+    Written with the constant ``e`` instead of ``v/|v|`` the field is smooth where the velocity passes zero, so that
+    a transition time that is tried too late gives a body that has turned back, not a division by zero.
+
+    Parameters
+    ----------
+    g : float, optional
+        Acceleration of gravity (m/s²).
+
+    Returns
+    -------
+    HybridSystem
+        Its parameters are ``mu`` (friction coefficient, 1), ``x0``, ``y0`` (position at t0, m) and ``vx0``,
+        ``vy0`` (velocity at t0, m/s; not both zero).
+
+    Notes
+    -----
+    In ``"stick"`` the velocity is held, not set to zero: a body sticks when it has come to rest, and a velocity left
+    over at the transition is a misfit that measured velocities see. Positions alone determine the moment of sticking
+    badly: the rest position is stationary in it exactly where the body comes to rest by itself.
+    """
+
+    def slide(t: Any, x: Any, p: Any) -> Any:
+        speed = jnp.sqrt(p["vx0"] ** 2 + p["vy0"] ** 2)
+        deceleration = p["mu"] * g / speed
+        return jnp.stack([x[2], x[3], -deceleration * p["vx0"], -deceleration * p["vy0"]])
+
+    def stick(t: Any, x: Any, p: Any) -> Any:
+        return jnp.zeros_like(x)
+
+    def initial_state(p: Any) -> Any:
+        return jnp.stack([p["x0"], p["y0"], p["vx0"], p["vy0"]])
+
+    return HybridSystem(
+        modes={"slide": slide, "stick": stick},
+        initial_state=initial_state,
+        state_names=("x", "y", "vx", "vy"),
+        state_units=("m", "m", "m/s", "m/s"),
+    )

@@ -1,0 +1,206 @@
+"""The numbers of a fit: plain data that can be saved, loaded, printed and plotted without the model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.special
+
+from switchfit.data import FloatArray
+from switchfit.optimize import IterationRecord, Status
+from switchfit.simulate import Comparison, Trajectory
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """How the numbers of a fit were checked.
+
+    Attributes
+    ----------
+    optimality : float
+        KKT residual at the solution.
+    smallest_eigenvalue : float
+        Of the Hessian on the free directions; positive: the second-order sufficient condition holds. NaN if
+        nothing is free.
+    smallest_scaled_eigenvalue : float
+        The same with the unknowns scaled to unit curvature each: 1 is perfectly, 0 not at all determined.
+    condition_number : float
+        Of that scaled Hessian.
+    worst_direction : str
+        The worst-determined direction in words.
+    integration_error : float
+        ``|J(half the steps) - J|`` relative to J, or to 1e-3 of the first J where that is more.
+    gradient_gap, hessian_gap : float
+        Relative gap between the paper's equations (6)-(17) and the exact derivatives of the discretised cost.
+    active : tuple of str
+        Constraints that hold with equality, collapsed modes and bounds among them, and kinks.
+    """
+
+    optimality: float
+    smallest_eigenvalue: float
+    smallest_scaled_eigenvalue: float
+    condition_number: float
+    worst_direction: str
+    integration_error: float
+    gradient_gap: float
+    hessian_gap: float
+    active: tuple[str, ...]
+
+    def __str__(self) -> str:
+        rows = [
+            ("KKT residual", f"{self.optimality:.2e}"),
+            ("smallest Hessian eigenvalue, free directions", f"{self.smallest_eigenvalue:.4g}"),
+            ("  with unknowns scaled to unit curvature", f"{self.smallest_scaled_eigenvalue:.4g}"),
+            ("  condition number of that", f"{self.condition_number:.3g}"),
+            ("  worst-determined direction", self.worst_direction),
+            ("integration error of J, relative", f"{self.integration_error:.1e}"),
+            ("paper's gradient against discretised, relative", f"{self.gradient_gap:.1e}"),
+            ("paper's Hessian against discretised, relative", f"{self.hessian_gap:.1e}"),
+            ("active constraints", "; ".join(self.active) or "none"),
+        ]
+        return "\n".join(f"{label:<48} {value}" for label, value in rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What an estimation found; d unknowns in the order of `theta_names`.
+
+    Attributes
+    ----------
+    theta_names, theta_units : tuple of str
+    initial_theta, theta, lower, upper : (d,)
+    transition_times : tuple of (N,) arrays, one an experiment, fixed ones included
+    parameters : dict of name -> array, fixed ones included
+    cost : float
+    gradient, hessian : (d,), (d, d), exact at theta
+    optimality : float
+        KKT residual; the norm of the gradient where no constraint is active.
+    iterations, evaluations : int
+    status : Status
+    message : str
+        The status as a sentence with what to do.
+    history : tuple of IterationRecord
+    active : tuple of str
+        Constraints that hold with equality.
+    kinks : tuple of (name, left derivative, right derivative)
+        Unknowns that ended where the derivative jumps through zero.
+    free_basis : (d, k)
+        Orthonormal basis of the directions that constraints and kinks leave free.
+    trajectories : tuple of Trajectory, one an experiment
+    comparisons : tuple of tuples of Comparison, one tuple an experiment
+    sigma_known : bool or None
+        Whether the noise of the measurements is known; None where the cost has no noise model.
+    integration_error : float
+        ``|J(half the steps) - J|`` relative to J, or to 1e-3 of the first J where that is more.
+    hessian_kind : str
+    tolerance : float
+    seconds : float
+        Wall time of the estimation.
+    """
+
+    theta_names: tuple[str, ...]
+    theta_units: tuple[str, ...]
+    initial_theta: FloatArray
+    theta: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    transition_times: tuple[FloatArray, ...]
+    parameters: Mapping[str, FloatArray]
+    cost: float
+    gradient: FloatArray
+    hessian: FloatArray
+    optimality: float
+    iterations: int
+    evaluations: int
+    status: Status
+    message: str
+    history: tuple[IterationRecord, ...]
+    active: tuple[str, ...]
+    kinks: tuple[tuple[str, float, float], ...]
+    free_basis: FloatArray
+    trajectories: tuple[Trajectory, ...]
+    comparisons: tuple[tuple[Comparison, ...], ...]
+    sigma_known: bool | None
+    integration_error: float
+    hessian_kind: str
+    tolerance: float
+    seconds: float
+
+    @property
+    def success(self) -> bool:
+        """Whether a local minimum was found."""
+        return self.status.successful
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The fitted trajectory of the only experiment; with several use `trajectories`."""
+        if len(self.trajectories) > 1:
+            raise ValueError(f"There are {len(self.trajectories)} experiments: use .trajectories[e].")
+        return self.trajectories[0]
+
+    @property
+    def samples(self) -> int:
+        """Number of measured values that are not missing."""
+        return sum(int(np.isfinite(c.measured).sum()) for run in self.comparisons for c in run if _discrete(c))
+
+    @property
+    def residual_variance(self) -> float:
+        """``2 J / (samples - free unknowns)``: near 1 where sigma is right; NaN without measurements."""
+        freedom = self.samples - self.free_basis.shape[1]
+        return 2 * self.cost / freedom if self.sigma_known is not None and freedom > 0 else np.nan
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance of theta from the exact Hessian on the free directions: (d, d).
+
+        ``Z (Z' H Z)^-1 Z'``, times the residual variance where sigma is unknown. An unknown held by a bound, a
+        collapsed mode or a kink has variance 0 here. NaN where the cost has no noise model (anything but
+        `Measurements`), the Hessian is not positive definite, or there are too few samples.
+        """
+        d = len(self.theta)
+        Z = self.free_basis
+        scale = self.residual_variance if self.sigma_known is False else 1.0
+        if self.sigma_known is None or np.isnan(scale):
+            return np.full((d, d), np.nan)
+        reduced = Z.T @ self.hessian @ Z
+        size = 1 / np.sqrt(np.maximum(np.abs(np.diag(reduced)), np.finfo(float).tiny))
+        values, vectors = np.linalg.eigh(reduced * np.outer(size, size))
+        if len(values) and values[0] <= 1e-14:
+            return np.full((d, d), np.nan)
+        root = Z @ (size[:, None] * vectors / np.sqrt(values))
+        return scale * root @ root.T
+
+    @property
+    def standard_errors(self) -> FloatArray:
+        """Square roots of the variances: (d,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def correlation(self) -> FloatArray:
+        """Correlation matrix of theta: (d, d); NaN for unknowns that are held."""
+        errors = self.standard_errors
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return self.covariance / np.outer(errors, errors)
+
+    def confidence_intervals(self, level: float = 0.95) -> FloatArray:
+        """Symmetric intervals theta +- quantile x standard error: (d, 2).
+
+        Parameters
+        ----------
+        level : float, between 0 and 1
+            The quantile is of Student's t where sigma is unknown, of the normal distribution where it is known.
+        """
+        if not 0 < level < 1:
+            raise ValueError(f"level must lie between 0 and 1; got {level}.")
+        freedom = max(self.samples - self.free_basis.shape[1], 1)
+        tail = 0.5 + level / 2
+        quantile = scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail)
+        half = quantile * self.standard_errors
+        return np.stack([self.theta - half, self.theta + half], axis=1)
+
+
+def _discrete(comparison: Comparison) -> bool:
+    return comparison.kind == "measurements"
