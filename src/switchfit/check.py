@@ -62,7 +62,9 @@ class DerivativeCheck:
         lines.append(f"  gradient {self.gradient_gap:.1e}, with half the steps {self.gradient_gap_halved:.1e}")
         lines.append(f"  Hessian  {self.hessian_gap:.1e}, with half the steps {self.hessian_gap_halved:.1e}")
         verdict = "passed" if self.passed else "FAILED: the derivatives do not belong to the cost"
-        lines.append(f"Observed orders {', '.join(f'{o:.2f}' for o in self.observed_orders)} (1, 2, 3 expected): {verdict}.")
+        lines.append(
+            f"Observed orders {', '.join(f'{o:.2f}' for o in self.observed_orders)} (1, 2, 3 expected): {verdict}."
+        )
         return "\n".join(lines)
 
 

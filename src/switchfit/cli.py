@@ -23,8 +23,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 import typer
 
 if TYPE_CHECKING:
-    from rich.live import Live
-
     from switchfit.io.problem_file import ProblemFile
 
 CONVERGED, NOT_CONVERGED, BAD_INPUT, INTERNAL_ERROR = 0, 1, 2, 3
@@ -191,16 +189,28 @@ def _fail(message: str, code: int) -> NoReturn:
 
 
 def _load(problem: Path) -> ProblemFile:
+    _keep_compiled()
     from switchfit.io.problem_file import load_problem
 
     return load_problem(problem)
+
+
+def _keep_compiled() -> None:
+    """Let JAX keep compiled programs between runs; what the user's environment says about it wins."""
+    import jax
+
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
+        jax.config.update("jax_compilation_cache_dir", str(Path(home) / "switchfit" / "jax"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def _estimate(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: bool) -> Any:
     """`switchfit.estimate` with a live line on stderr; Ctrl-C ends it after the iteration under way."""
     import switchfit as sf
 
-    if prepare_figures:  # matplotlib loads while XLA compiles
+    if prepare_figures:  # matplotlib, which must not look for a display, loads while XLA compiles
+        os.environ.setdefault("MPLBACKEND", "Agg")
         threading.Thread(target=_import_figures, daemon=True).start()
     with _stop_on_interrupt() as stopped, _progress() as show:
 
@@ -247,14 +257,15 @@ def _progress() -> Iterator[Callable[[Any], None]]:
     from rich.console import Console
     from rich.live import Live
     from rich.spinner import Spinner
+    from rich.text import Text
 
     waiting = Spinner("dots", "compiling (only the first time)")
     with Live(waiting, console=Console(stderr=True), transient=True, refresh_per_second=12) as live:
-        yield lambda record: _show(live, record)
+        yield lambda record: live.update(Text(_line(record)))
 
 
-def _show(live: Live, record: Any) -> None:
-    live.update(
+def _line(record: Any) -> str:
+    return (
         f"iteration {record.iteration:3d}   cost {record.cost:.8g}   optimality {record.optimality:.2e}   "
         f"step {record.step:.2g}"
     )

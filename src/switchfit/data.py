@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import scipy.interpolate
-import scipy.signal
 from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
@@ -256,8 +254,8 @@ class Measurements:
     @property
     def weights(self) -> FloatArray:
         """``1 / sigma**2`` (1 where sigma is unknown), 0 where a sample is missing: a ``(K, q)`` array."""
-        inverse = np.ones(self.values.shape) if self.sigma is None else np.broadcast_to(
-            self.sigma ** -2.0, self.values.shape
+        inverse = (
+            np.ones(self.values.shape) if self.sigma is None else np.broadcast_to(self.sigma**-2.0, self.values.shape)
         )
         return np.where(np.isnan(self.values), 0.0, inverse)
 
@@ -340,9 +338,7 @@ def _weight_matrix(weights: ArrayLike | None, channels: int) -> FloatArray:
     if matrix.ndim == 1:
         matrix = np.diag(matrix)
     if matrix.shape != (channels, channels):
-        raise ValueError(
-            f"weights must have shape ({channels},) or ({channels}, {channels}); got {np.shape(weights)}."
-        )
+        raise ValueError(f"weights must have shape ({channels},) or ({channels}, {channels}); got {np.shape(weights)}.")
     if not np.all(np.isfinite(matrix)) or not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
         raise ValueError("weights must be finite and symmetric.")
     smallest = np.linalg.eigvalsh(matrix)[0]
@@ -361,7 +357,9 @@ def _from_powers(knots: FloatArray, powers: list[FloatArray]) -> PiecewisePolyno
 
 def _spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
     """Not-a-knot cubic spline through ``values`` (K, q)."""
-    spline = scipy.interpolate.CubicSpline(times, values, axis=0)
+    from scipy.interpolate import CubicSpline  # here, since importing it takes longer than most fits
+
+    spline = CubicSpline(times, values, axis=0)
     return PiecewisePolynomial(times, np.moveaxis(spline.c[::-1], 0, 1))
 
 
@@ -379,12 +377,14 @@ def _bridged_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomia
         if known.sum() < 4:
             raise ValueError(f"ReferenceSignal needs four samples or more in each channel and part; got {known.sum()}.")
         if not known.all():
-            channel[~known] = scipy.interpolate.CubicSpline(times[known], channel[known])(times[~known])
+            channel[~known] = _spline(times[known], channel[known][:, None])(times[~known])[:, 0]
     return _spline(times, filled)
 
 
 def _lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePolynomial:
     """Butterworth filter of second order forward and backward, on a grid of ten points a period of the cut-off."""
+    import scipy.signal  # here, since importing it takes longer than most fits
+
     if not (np.isfinite(cutoff_hz) and cutoff_hz > 0):
         raise ValueError(f"lowpass_hz must be positive; got {cutoff_hz}.")
     start, end = signal.knots[[0, -1]]

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from switchfit.certificate import certify
-from switchfit.data import Measurements
+from switchfit.data import FloatArray, Measurements
 from switchfit.evaluate import Evaluation, Evaluator, evaluator_of
 from switchfit.io.json import load_fit, save_fit
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
@@ -80,6 +80,15 @@ class Estimate(Fit):
         return cls(**{f.name: getattr(fit, f.name) for f in fields(Fit)}, certificate_data=certificate)
 
 
+@dataclass(frozen=True, eq=False)
+class CostAndGradient:
+    """All that steepest descent is given."""
+
+    cost: float
+    gradient: FloatArray
+    hessian: None = None
+
+
 def estimate(
     problem: Problem,
     *,
@@ -136,9 +145,17 @@ def estimate(
             break
         evaluator = evaluator.divided(2 ** max(int(np.ceil(np.log2(excess) / ORDER)), 1))
     return _estimate(
-        problem, evaluator, result, history, hessian, tolerance,
-        evaluations=evaluations, trajectories=trajectories, comparisons=comparisons,
-        integration_error=float(error), seconds=time.perf_counter() - began,
+        problem,
+        evaluator,
+        result,
+        history,
+        hessian,
+        tolerance,
+        evaluations=evaluations,
+        trajectories=trajectories,
+        comparisons=comparisons,
+        integration_error=float(error),
+        seconds=time.perf_counter() - began,
     )
 
 
@@ -154,14 +171,22 @@ def constraints_of(problem: Problem) -> LinearConstraints:
 
 
 def _minimized(
-    evaluator: Evaluator, theta: Any, hessian: HessianKind, tolerance: float, max_iterations: int,
-    callback: Callable[[IterationRecord], object] | None, before: int,
+    evaluator: Evaluator,
+    theta: Any,
+    hessian: HessianKind,
+    tolerance: float,
+    max_iterations: int,
+    callback: Callable[[IterationRecord], object] | None,
+    before: int,
 ) -> Result:
     """One run of the optimiser on the evaluator's meshes."""
     problem = evaluator.problem
 
-    def evaluate(theta: Any, side: int) -> Evaluation:
-        return evaluator(theta, side, gauss_newton=hessian == "gauss-newton")
+    matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
+
+    def evaluate(theta: Any, side: int) -> Evaluation | CostAndGradient:
+        here = evaluator(theta, side, matrix=matrix)
+        return CostAndGradient(here.cost, here.gradient) if hessian == "none" else here
 
     is_time = np.zeros(len(theta), dtype=int)
     for where in problem.unknowns.times:
@@ -180,14 +205,19 @@ def _minimized(
 
 
 def _estimate(
-    problem: Problem, evaluator: Evaluator, result: Result, history: list[IterationRecord], hessian: HessianKind,
-    tolerance: float, **rest: Any,
+    problem: Problem,
+    evaluator: Evaluator,
+    result: Result,
+    history: list[IterationRecord],
+    hessian: HessianKind,
+    tolerance: float,
+    **rest: Any,
 ) -> Estimate:
     """Collect what the optimiser found into an Estimate, with the exact Hessian whatever it worked with."""
     unknowns = problem.unknowns
     times, parameters = problem.split(result.theta)
     exact = result.hessian
-    if hessian == "gauss-newton" and np.isfinite(result.cost):
+    if hessian in ("gauss-newton", "none") and np.isfinite(result.cost):
         exact = evaluator(result.theta).hessian
     return Estimate(
         theta_names=unknowns.names,
@@ -228,5 +258,3 @@ def _sigma_known(problem: Problem) -> bool | None:
     if not all(isinstance(item, Measurements) for item in items):
         return None
     return all(item.sigma is not None for item in items)
-
-

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.cache import compilation_cache
 from switchfit.data import FloatArray
 from switchfit.derivatives.adjoint import paper_derivatives
 from switchfit.derivatives.discrete import adjoint_hessian, gauss_newton_hessian
@@ -26,6 +28,7 @@ from switchfit.refine import refined_mesh
 from switchfit.simulate import flat_parameters
 
 Method = Literal["auto", "forward", "discrete-adjoint", "adjoint", "autodiff"]
+Matrix = Literal["exact", "gauss-newton", "none"]
 METHODS = ("auto", "forward", "discrete-adjoint", "adjoint", "autodiff")
 
 FORWARD_UP_TO = 1
@@ -60,14 +63,13 @@ class Evaluator:
         Meshes to use instead of refined ones.
     """
 
-    def __init__(
-        self, problem: Problem, theta: FloatArray | None = None, meshes: Sequence[Mesh] | None = None
-    ) -> None:
+    def __init__(self, problem: Problem, theta: FloatArray | None = None, meshes: Sequence[Mesh] | None = None) -> None:
         self.problem = problem
         indices = range(len(problem.experiments))
         at = problem.initial_theta if theta is None else theta
         self.meshes = list(meshes) if meshes is not None else [refined_mesh(problem, e, at) for e in indices]
         self.arguments = [problem.arguments(e, mesh) for e, mesh in enumerate(self.meshes)]
+        self._compiled: set[tuple[Method, Matrix]] = set()
         self._places = [_places(problem, e) for e in indices]
 
     def divided(self, parts: int = 2) -> Evaluator:
@@ -75,16 +77,21 @@ class Evaluator:
         return Evaluator(self.problem, meshes=[mesh.divided(parts) for mesh in self.meshes])
 
     def __call__(
-        self, theta: FloatArray, side: int = 1, method: Method = "auto", gauss_newton: bool = False
+        self, theta: FloatArray, side: int = 1, method: Method = "auto", matrix: Matrix = "exact"
     ) -> Evaluation:
-        """Cost, gradient and Hessian; where a transition time sits on a node, the derivatives to its `side`."""
+        """Cost, gradient and Hessian; where a transition time sits on a node, the derivatives to its `side`.
+
+        `matrix` asks for the Gauss-Newton matrix in place of the Hessian, or for none (it is NaN then).
+        """
         d = len(theta)
         total, gradient, hessian = 0.0, np.zeros(d), np.zeros((d, d))
-        with float64():
+        compiled = (method, matrix) in self._compiled
+        with float64(), nullcontext() if compiled else compilation_cache():
             results = [
-                _derivatives(a, tau, p, float(side), structure=s, method=_resolve(method, s), gauss_newton=gauss_newton)
+                _derivatives(a, tau, p, float(side), structure=s, method=_resolve(method, s), matrix=matrix)
                 for s, a, tau, p in self._each(theta)
             ]
+        self._compiled.add((method, matrix))
         for (J, g, H), places in zip(results, self._places, strict=True):
             free = places >= 0
             here = places[free]
@@ -162,10 +169,16 @@ def _resolve(method: Method, structure: Structure) -> Method:
     return "forward" if structure.N + structure.M <= FORWARD_UP_TO else "discrete-adjoint"
 
 
-@partial(jax.jit, static_argnames=("structure", "method", "gauss_newton"))
+@partial(jax.jit, static_argnames=("structure", "method", "matrix"))
 def _derivatives(
-    arguments: Arguments, tau: jax.Array, p: jax.Array, side: jax.Array, *, structure: Structure, method: Method,
-    gauss_newton: bool,
+    arguments: Arguments,
+    tau: jax.Array,
+    p: jax.Array,
+    side: jax.Array,
+    *,
+    structure: Structure,
+    method: Method,
+    matrix: Matrix,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     model = Model(structure, arguments)
     if method == "adjoint":
@@ -173,7 +186,9 @@ def _derivatives(
     if method == "autodiff":
         return _autodiff(model, tau, p, side)
     first = first_order(model, tau, p, side)
-    if gauss_newton:
+    if matrix == "none":
+        return first.cost, first.gradient, jnp.full((first.gradient.size, first.gradient.size), jnp.nan)
+    if matrix == "gauss-newton":
         return first.cost, first.gradient, gauss_newton_hessian(model, first, p)
     second = forward_hessian if method == "forward" else adjoint_hessian
     return first.cost, first.gradient, second(model, first, tau, p)

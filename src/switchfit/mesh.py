@@ -57,7 +57,9 @@ class Mesh:
     def divided(self, parts: int = 2) -> Mesh:
         """The mesh with every cell cut into equal parts."""
         nodes = self.times
-        return Mesh.from_times(np.concatenate([nodes[:-1] + np.diff(nodes) * k / parts for k in range(parts)] + [nodes]))
+        return Mesh.from_times(
+            np.concatenate([nodes[:-1] + np.diff(nodes) * k / parts for k in range(parts)] + [nodes])
+        )
 
     def cell_ending_at(self, times: FloatArray) -> NDArray[np.intp]:
         """Index of the cell that ends at each of `times`, which must be nodes; -1 for t0."""

@@ -179,7 +179,11 @@ class Model:
         for observe, channels in self.structure.references:
 
             def residual(
-                t: Array, x: Array, p: Array, observe: Observe | None = observe, first: int = first,
+                t: Array,
+                x: Array,
+                p: Array,
+                observe: Observe | None = observe,
+                first: int = first,
                 channels: int = channels,
             ) -> Array:
                 return self.observed(observe, t, x, p, channels) - piece(t)[first : first + channels]

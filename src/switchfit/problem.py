@@ -109,7 +109,6 @@ class Problem:
             check_functions(structure)
         object.__setattr__(self, "structures", structures)
 
-
     @property
     def initial_theta(self) -> FloatArray:
         """The first guess of everything estimated: a ``(d,)`` array."""

@@ -124,4 +124,3 @@ def sample_costs(model: Model, path: Path, p: Array) -> Array:
         x = path.at_samples(samples.cell)
         total = total + jax.vmap(lambda s, x, k=k: model.sample_cost(k, s, x, p))(samples, x).sum()
     return total
-

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.integrate
 
+from switchfit.cache import compilation_cache
 from switchfit.data import FloatArray, Measurements
 from switchfit.experiment import Experiment, signals_of
 from switchfit.mesh import Mesh
@@ -61,7 +62,7 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
     ends = np.concatenate([[experiment.t0], times[e], [experiment.tf]])
     inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
     steps = [np.array([experiment.t0])]
-    with float64():
+    with float64(), compilation_cache():
         x = np.asarray(_initial_state(arguments, p, structure=structure))
         for i, mode in enumerate(structure.mode_of_segment):
             if i > 0 and structure.reset_maps[i - 1] is not None:
@@ -117,8 +118,15 @@ def _solve(
 
 @partial(jax.jit, static_argnames=("structure", "mode"))
 def _field_and_density(
-    arguments: Arguments, origin: jax.Array, coefficients: jax.Array, t: jax.Array, x: jax.Array, p: jax.Array, *,
-    structure: Structure, mode: int,
+    arguments: Arguments,
+    origin: jax.Array,
+    coefficients: jax.Array,
+    t: jax.Array,
+    x: jax.Array,
+    p: jax.Array,
+    *,
+    structure: Structure,
+    mode: int,
 ) -> jax.Array:
     model = Model(structure, arguments)
     piece = Piece(origin, coefficients)

@@ -131,8 +131,8 @@ class Fit:
 
     @property
     def success(self) -> bool:
-        """Whether a local minimum was found."""
-        return self.status.successful
+        """Whether the fit converged; with `Status.SINGULAR` to a point from which J is flat in some direction."""
+        return self.status.successful or self.status is Status.SINGULAR
 
     @property
     def trajectory(self) -> Trajectory:

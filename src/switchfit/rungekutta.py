@@ -73,8 +73,10 @@ def tableau_of(solver: str) -> Tableau:
 
 def stages(tableau: Tableau, f: Field, start: Array, end: Array, x: Array, p: Array) -> tuple[list[Array], list[Array]]:
     """Stage states X_j and slopes K_j of one step, s arrays ``(n,)`` each."""
-    return _implicit_stages(tableau, f, start, end, x, p) if tableau is STIFF else _explicit_stages(
-        tableau, f, start, end, x, p
+    return (
+        _implicit_stages(tableau, f, start, end, x, p)
+        if tableau is STIFF
+        else _explicit_stages(tableau, f, start, end, x, p)
     )
 
 
@@ -222,7 +224,9 @@ def stage_adjoints(tableau: Tableau, h: Array, A: Array, l_x: Array, psi: Array)
     s = len(tableau.c)
     a, b = tableau.a, tableau.b
     if tableau is STIFF:
-        right = jnp.stack([h * (b[j] * psi + combine(a[:, j], [h * b[m] * l_x[m] for m in range(s)])) for j in range(s)])
+        right = jnp.stack(
+            [h * (b[j] * psi + combine(a[:, j], [h * b[m] * l_x[m] for m in range(s)])) for j in range(s)]
+        )
         w = list((right.reshape(-1) @ _stage_inverse(tableau, h, A)).reshape(s, -1))
         mu = [(w[j][:, None] * A[j]).sum(0) + h * b[j] * l_x[j] for j in range(s)]
     else:

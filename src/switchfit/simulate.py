@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.cache import compilation_cache
 from switchfit.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.mesh import Mesh
 from switchfit.model import Arguments, Model, Structure, float64
@@ -132,7 +133,7 @@ def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> tuple
     """Cost, path and outputs of experiment e on a given mesh, as NumPy arrays."""
     times, parameters = problem.split(theta)
     p = flat_parameters(problem, parameters)
-    with float64():
+    with float64(), compilation_cache():
         results = _simulation(problem.arguments(e, mesh), times[e], p, structure=problem.structures[e])
     cost, path, outputs = jax.tree.map(np.asarray, results)
     return float(cost), path, outputs

@@ -260,8 +260,24 @@ def transition_at(model: Model, path: Path, i: int, tau_i: Array, p: Array) -> T
     X = f_im1 - f_i  # (8)
     D1R, DpR, *second = first_and_second(R, *minus)
     return Transition(
-        X, f_before(*minus), f_im1, D1f_im1, D2f_im1, Dpf_im1, f_i, D1f_i, D2f_i, Dpf_i,
-        Lambda(*minus), D1Lambda, D2Lambda, DpLambda, jax.grad(ell, argnums=1)(*plus), D1R, DpR, *second,
+        X,
+        f_before(*minus),
+        f_im1,
+        D1f_im1,
+        D2f_im1,
+        Dpf_im1,
+        f_i,
+        D1f_i,
+        D2f_i,
+        Dpf_i,
+        Lambda(*minus),
+        D1Lambda,
+        D2Lambda,
+        DpLambda,
+        jax.grad(ell, argnums=1)(*plus),
+        D1R,
+        DpR,
+        *second,
     )
 
 
@@ -303,9 +319,7 @@ def sensitivities(
     def chunk(now: Sensitivities, given: Any) -> tuple[Sensitivities, tuple[Sensitivities, Sensitivities]]:
         segment, opens, start, end, piece, states = given
         # The columns X^i begin at tau_i. Misprint in the display before (10): segment k integrates from tau_k, not t0.
-        jumped = Sensitivities(
-            D1R[segment] @ now.Phi_X + X_columns[segment], D1R[segment] @ now.Dp_x + DpR[segment]
-        )
+        jumped = Sensitivities(D1R[segment] @ now.Phi_X + X_columns[segment], D1R[segment] @ now.Dp_x + DpR[segment])
         now = where(opens, jumped, now)
         return lax.scan(row, now, (end - start, *by_mode(model, segment, of_mode, start, end, piece, states)))
 
@@ -322,17 +336,9 @@ def adjoint_rate(d: Along, adjoints: Adjoints) -> Adjoints:
     """Right-hand sides of the adjoint equations at one time; affine in the adjoints."""
     psi, Omega, Omega_p = adjoints
     psi_dot = -d.D1ell - psi @ d.D1f  # (7)
-    Omega_dot = (
-        -d.D1D1ell
-        - contract(psi, d.D1D1f)
-        - d.D1f.T @ Omega
-        - Omega @ d.D1f
-    )  # (12)
+    Omega_dot = -d.D1D1ell - contract(psi, d.D1D1f) - d.D1f.T @ Omega - Omega @ d.D1f  # (12)
     Omega_p_dot = (
-        -d.D1D1ell @ d.Dp_x
-        - d.DpD1ell
-        - d.D1f.T @ Omega_p
-        - contract(psi, d.D1D1f @ d.Dp_x + d.DpD1f)
+        -d.D1D1ell @ d.Dp_x - d.DpD1ell - d.D1f.T @ Omega_p - contract(psi, d.D1D1f @ d.Dp_x + d.DpD1f)
     )  # (15); D_pD_1 ell is ours
     return Adjoints(psi_dot, Omega_dot, Omega_p_dot)
 
@@ -342,11 +348,7 @@ def integrands(d: Along, adjoints: Adjoints) -> Quadratures:
     psi, _, Omega_p = adjoints
     first = psi @ d.Dpf + d.Dpell  # (9)
     second = (
-        d.Dpf.T @ Omega_p
-        + contract(psi, d.DpDpf)
-        + contract(psi, d.D1Dpf @ d.Dp_x)
-        + d.DpDpell
-        + d.D1Dpell @ d.Dp_x
+        d.Dpf.T @ Omega_p + contract(psi, d.DpDpf) + contract(psi, d.D1Dpf @ d.Dp_x) + d.DpDpell + d.D1Dpell @ d.Dp_x
     )  # (14)
     return Quadratures(first, second)
 
@@ -435,9 +437,7 @@ def interpolated(f: Field, s: Array, start: Array, end: Array, x_k: Array, x_k1:
 # Jumps: samples, the terminal cost, reset maps, the initial state
 
 
-def point_cost(
-    cost: Callable[[Array, Array], Array], x: Array, Dp_x: Array, p: Array
-) -> tuple[Adjoints, Quadratures]:
+def point_cost(cost: Callable[[Array, Array], Array], x: Array, Dp_x: Array, p: Array) -> tuple[Adjoints, Quadratures]:
     """What a cost of x at one time, a sample or the terminal cost, adds to the adjoints there and to (9), (14)."""
     (Dell, Dpell) = jax.grad(cost, argnums=(0, 1))(x, p)
     (D2ell, DpD1ell), (D1Dpell, DpDpell) = jax.hessian(cost, argnums=(0, 1))(x, p)
@@ -506,9 +506,7 @@ def at_initial_state(model: Model, adjoints: Adjoints, p: Array) -> Quadratures:
 # Tools
 
 
-def linear_step(
-    tableau: Tableau, rate: Callable[[Any, Any], Any], h: Array, given: Any, y: Any
-) -> tuple[Any, Any]:
+def linear_step(tableau: Tableau, rate: Callable[[Any, Any], Any], h: Array, given: Any, y: Any) -> tuple[Any, Any]:
     """One Runge-Kutta step of ``dy/dt = rate(given, y)``, affine in y: its stage states (s, ...) and y at its end.
 
     `given` holds what varies in time, at the s stages; h < 0 steps backward.

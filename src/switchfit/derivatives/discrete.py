@@ -146,7 +146,9 @@ def stage_curvature(model: Model, path: Path, X: Tangents, psi: Costates, p: Arr
             Z = jnp.concatenate([t_d[None], x_d, P])
             return Z.T @ _second(value, (t, x, p), (basis[0], basis[1 : 1 + n], basis[1 + n :])) @ Z
 
-        def row(start: Array, end: Array, piece: Piece, X: Array, w: Array, s_d: Array, e_d: Array, X_d: Array) -> Array:
+        def row(
+            start: Array, end: Array, piece: Piece, X: Array, w: Array, s_d: Array, e_d: Array, X_d: Array
+        ) -> Array:
             h = end - start
             times, times_d = start + model.tableau.c * h, stage_time_directions(model, s_d, e_d)
             over_stages = jax.vmap(at_stage, in_axes=(None, 0, 0, 0, 0, 0, 0))

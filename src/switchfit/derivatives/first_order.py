@@ -221,10 +221,7 @@ def row_end_tangents(model: Model, path: Path, jacobians: StageJacobians) -> Row
     """Direct derivatives of the rows beside a transition in its time."""
     layout, tableau = path.layout, model.tableau
     rows = jnp.stack([layout.first_chunk[1:] * layout.start.shape[1], layout.last_row[:-1]])
-    h, f_x, f_t, K = (
-        by_row(a)[rows]
-        for a in (layout.end - layout.start, jacobians.f_x, jacobians.f_t, path.slopes)
-    )
+    h, f_x, f_t, K = (by_row(a)[rows] for a in (layout.end - layout.start, jacobians.f_x, jacobians.f_t, path.slopes))
     parts = []
     for line, (t_d, h_d) in enumerate(((1 - tableau.c, -1.0), (tableau.c, 1.0))):
         derivative = partial(end_tangents, tableau, t_d=t_d, h_d=h_d)

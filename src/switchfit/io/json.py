@@ -1,17 +1,254 @@
-"""Fits as JSON files."""
+"""Fits as JSON files that can be read without switchfit, and back again without losing a bit.
+
+A file holds ``{"format": "switchfit fit", "version": 1, "fit": {...}, "certificate": {...}}`` with the fields of
+`Fit` and `Certificate` under their own names:
+
+- numbers are written with as many digits as it takes to read the same float64; JSON has no NaN and no infinities, so
+  they are the strings ``"nan"``, ``"inf"`` and ``"-inf"``;
+- an array of float64 is a list, or a list of rows; any other, and an empty one, is
+  ``{"dtype": ..., "shape": ..., "values": [...]}``;
+- a status is its name.
+
+What is read is checked against the types that the fields of the dataclasses declare.
+"""
 
 from __future__ import annotations
 
+import json
+import os
+import secrets
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum
 from pathlib import Path
+from types import UnionType
+from typing import Any, NoReturn, get_args, get_origin, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.result import Certificate, Fit
 
+FORMAT = "switchfit fit"
+VERSION = 1
+
 
 def save_fit(fit: Fit, certificate: Certificate, path: Path) -> None:
-    """Write a fit."""
-    raise NotImplementedError
+    """Write a fit to a file, whole or not at all.
+
+    Parameters
+    ----------
+    fit : Fit
+        Of a subclass only what belongs to `Fit` is written.
+    certificate : Certificate
+    path : Path
+        An existing file is replaced.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written; an existing one is then left as it was.
+    """
+    content = {
+        "format": FORMAT,
+        "version": VERSION,
+        "fit": _encoded(fit, Fit),
+        "certificate": _encoded(certificate, Certificate),
+    }
+    _write_atomically(_dumped(content) + "\n", Path(path))
 
 
 def load_fit(path: Path) -> tuple[Fit, Certificate]:
-    """Read a fit."""
-    raise NotImplementedError
+    """Read what `save_fit` wrote; every field is equal, and arrays have the same bits, dtype and shape.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    fit : Fit
+    certificate : Certificate
+
+    Raises
+    ------
+    OSError
+        If there is no such file (FileNotFoundError) or it cannot be read.
+    ValueError
+        If it is no JSON, not written by switchfit, of another version, or a field is missing or of a wrong type.
+    """
+    try:
+        content = json.loads(Path(path).read_bytes().decode(), parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not a saved estimate: it is no valid JSON ({error}).") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise ValueError(f'{path} is not a saved estimate: it has no entry "format": "{FORMAT}" at its top.')
+    if content.get("version") != VERSION:
+        raise ValueError(
+            f"{path} is a saved estimate of version {content.get('version')!r}; this switchfit reads version "
+            f"{VERSION}. Read it with the switchfit that wrote it."
+        )
+    try:
+        fit = _decoded(Fit, content.get("fit"), "fit")
+        return fit, _decoded(Certificate, content.get("certificate"), "certificate")
+    except (ValueError, OverflowError) as error:
+        raise ValueError(f"{path} is damaged: {error}.") from error
+
+
+# --- to JSON ----------------------------------------------------------------------------------------------------------
+
+
+def _encoded(value: Any, kind: type | None = None) -> Any:
+    """`value` in terms of dict, list, str, int, finite float, bool and None; a dataclass by the fields of `kind`."""
+    if is_dataclass(value):
+        return {f.name: _encoded(getattr(value, f.name)) for f in fields(kind or type(value))}
+    if isinstance(value, Enum):
+        return value.name
+    if isinstance(value, np.ndarray):
+        if value.dtype == np.float64 and value.size > 0:
+            return _encoded(value.tolist())
+        return {"dtype": value.dtype.str, "shape": list(value.shape), "values": _encoded(value.ravel().tolist())}
+    if isinstance(value, Mapping):
+        return {str(name): _encoded(entry) for name, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_encoded(entry) for entry in value]
+    if isinstance(value, np.generic):
+        return _encoded(value.item())
+    if isinstance(value, float) and not np.isfinite(value):
+        return str(value)
+    return value
+
+
+def _dumped(value: Any, indent: str = "") -> str:
+    """JSON with one entry of an object or one row of an array on a line."""
+    deeper = indent + "  "
+    if isinstance(value, dict) and value:
+        entries = [f"{json.dumps(name)}: {_dumped(entry, deeper)}" for name, entry in value.items()]
+    elif isinstance(value, list) and any(isinstance(entry, (dict, list)) for entry in value):
+        entries = [_dumped(entry, deeper) for entry in value]
+    else:
+        return json.dumps(value, allow_nan=False, ensure_ascii=False)
+    opening, closing = "{}" if isinstance(value, dict) else "[]"
+    return f"{opening}\n{deeper}" + f",\n{deeper}".join(entries) + f"\n{indent}{closing}"
+
+
+def _write_atomically(text: str, path: Path) -> None:
+    """Write a new file beside `path`, which then takes its name."""
+    path = path.resolve()  # a link stays one
+    temporary = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
+    try:
+        with temporary.open("x", encoding="utf-8", newline="\n") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+# --- from JSON --------------------------------------------------------------------------------------------------------
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"it contains {name}")
+
+
+def _decoded(hint: Any, value: Any, where: str) -> Any:
+    """`value` as what the type hint of the field `where` says; ValueError otherwise."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if is_dataclass(hint) and isinstance(hint, type):
+        return _dataclass(hint, value, where)
+    if origin is UnionType:
+        optional = [kind for kind in inner if kind is not type(None)]
+        return None if value is None else _decoded(optional[0], value, where)
+    if origin is np.ndarray:
+        return _array(value, where)
+    if origin is tuple:
+        return _tuple(inner, value, where)
+    if origin is Mapping:
+        entries = _checked(value, dict, where).items()
+        return {name: _decoded(inner[1], entry, f"{where}[{name!r}]") for name, entry in entries}
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        names = hint.__members__
+        if not isinstance(value, str) or value not in names:
+            raise ValueError(f"{where} must be one of {', '.join(names)}; got {_shown(value)}")
+        return names[value]
+    return _number(value, where) if hint is float else _checked(value, hint, where)
+
+
+def _dataclass(kind: type, value: Any, where: str) -> Any:
+    """An instance of a dataclass from a dict with exactly its fields."""
+    hints = get_type_hints(kind)
+    names = [f.name for f in fields(kind)]
+    given = _checked(value, dict, where)
+    for name in names:
+        if name not in given:
+            raise ValueError(f"{where}.{name} is missing")
+    if unknown := [name for name in given if name not in names]:
+        raise ValueError(f"{where} has the unknown entry {unknown[0]!r}")
+    return kind(**{name: _decoded(hints[name], given[name], f"{where}.{name}") for name in names})
+
+
+def _tuple(kinds: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+    """A tuple of the given types, or of any number of the first one where the second is an ellipsis."""
+    entries = _checked(value, list, where)
+    if kinds[1:] == (Ellipsis,):
+        kinds = kinds[:1] * len(entries)
+    if len(entries) != len(kinds):
+        raise ValueError(f"{where} must have {len(kinds)} entries; got {len(entries)}")
+    parts = zip(kinds, entries, strict=True)
+    return tuple(_decoded(kind, entry, f"{where}[{k}]") for k, (kind, entry) in enumerate(parts))
+
+
+def _array(value: Any, where: str) -> NDArray[Any]:
+    """An array from a list of numbers, or from its dtype, shape and values."""
+    if not isinstance(value, dict):
+        return _assembled(_numbers(value, where), np.dtype(np.float64), where)
+    if set(value) != {"dtype", "shape", "values"}:
+        raise ValueError(f"{where} must be an array; got {_shown(value)}")
+    try:
+        dtype = np.dtype(_checked(value["dtype"], str, where))
+    except TypeError as error:
+        raise ValueError(f"{where} has the unknown dtype {value['dtype']!r}") from error
+    if dtype.kind not in "bifuU":
+        raise ValueError(f"{where} has the dtype {value['dtype']!r}, which is none of numbers or text")
+    values = _checked(value["values"], list, where)
+    flat = _assembled(_numbers(values, where) if dtype.kind == "f" else values, dtype, where)
+    shape = _tuple((int, ...), value["shape"], f"{where} shape")
+    if flat.size != np.prod(shape) or min(shape, default=0) < 0:
+        raise ValueError(f"{where} has the shape {shape} but {flat.size} values")
+    return flat.reshape(shape)
+
+
+def _assembled(values: Any, dtype: np.dtype[Any], where: str) -> NDArray[Any]:
+    try:
+        return np.array(values, dtype=dtype)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{where} is no array of {dtype}: {error}") from error
+
+
+def _numbers(value: Any, where: str) -> Any:
+    """Nested lists of floats."""
+    if isinstance(value, list):
+        return [_numbers(entry, where) for entry in value]
+    return _number(value, where)
+
+
+def _number(value: Any, where: str) -> float:
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not number and (not isinstance(value, str) or value not in ("nan", "inf", "-inf")):
+        raise ValueError(f'{where} must be a number, or one of "nan", "inf", "-inf"; got {_shown(value)}')
+    return float(value)
+
+
+def _checked(value: Any, kind: type, where: str) -> Any:
+    """`value`, which has to be exactly of a JSON type."""
+    if type(value) is not kind:
+        words = {dict: "an object", list: "a list", str: "a string", int: "an integer", bool: "true or false"}
+        raise ValueError(f"{where} must be {words.get(kind, kind)}; got {_shown(value)}")
+    return value
+
+
+def _shown(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 40 else f"{text[:40]}..."

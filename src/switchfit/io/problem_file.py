@@ -449,10 +449,9 @@ def _log(folder: Path, table: LogTable, more: Sequence[str] = ()) -> tuple[Float
     """Times (K,) and values (K, q) of the rows inside the window."""
     path = folder / table.file
     rows = read_columns(path, [table.time, *table.columns, *more])
-    if np.isnan(rows[:, 0]).any():
-        raise InputError(
-            f"{path}, column {table.time!r}: a time is missing in sample {np.isnan(rows[:, 0]).argmax() + 1}."
-        )
+    missing = np.isnan(rows[:, 0])
+    if missing.any():
+        raise InputError(f"{path}, column {table.time!r}: the time of sample {missing.argmax() + 1} is missing.")
     if table.window is not None:
         first, last = table.window
         inside = (rows[:, 0] >= first) & (rows[:, 0] <= last)

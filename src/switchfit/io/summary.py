@@ -67,7 +67,7 @@ def identifiability(problem: Problem) -> str:
     ----------
     problem : Problem
     """
-    H = evaluator_of(problem)(problem.initial_theta, gauss_newton=True).hessian
+    H = evaluator_of(problem)(problem.initial_theta, matrix="gauss-newton").hessian
     scale = np.sqrt(np.diag(H))
     names = np.array(problem.theta_names)
     without = names[~(scale > 0)]

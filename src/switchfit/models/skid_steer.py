@@ -72,8 +72,8 @@ def skid_steer(
 
     References
     ----------
-    .. [1] L. M. Miller, T. D. Murphey, Simultaneous optimal estimation of mode transition times and parameters
-       applied to simple traction models, equation (18).
+    L. M. Miller, T. D. Murphey, Simultaneous optimal estimation of mode transition times and parameters applied to
+    simple traction models, equation (18).
     """
     for name, forces in (("stick_forces", stick_forces), ("slip_forces", slip_forces)):
         if len(forces) != 4:

@@ -59,6 +59,8 @@ MANY_BREAKPOINTS = 3
 NOISE = 32 * EPS
 #: Eigenvalues of the scaled Hessian below this are negative curvature, not rounding.
 NEGATIVE_CURVATURE = -1e-8
+#: A step below this part of the unknowns' size is negligible.
+NEGLIGIBLE_STEP = 1e-10
 #: Iterations spent on making the last step negligible once the optimality is below the tolerance.
 EXTRA_ITERATIONS = 5
 MAX_BACKTRACKS = 60
@@ -427,8 +429,7 @@ def _is_settled(problem: _Problem, state: _State, direction: _Direction) -> bool
         return False
     if not problem.uses_hessian or state.settled >= EXTRA_ITERATIONS:
         return True
-    negligible_step = np.all(np.abs(direction.step) <= 1e-8 * state.scale)
-    return bool(negligible_step or direction.reduction <= 1e-10 * abs(state.point.cost))
+    return bool(np.all(np.abs(direction.step) <= NEGLIGIBLE_STEP * state.scale))
 
 
 def _stalled(oracle: _Oracle, state: _State, direction: _Direction) -> _State:
