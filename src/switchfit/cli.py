@@ -189,20 +189,9 @@ def _fail(message: str, code: int) -> NoReturn:
 
 
 def _load(problem: Path) -> ProblemFile:
-    _keep_compiled()
     from switchfit.io.problem_file import load_problem
 
     return load_problem(problem)
-
-
-def _keep_compiled() -> None:
-    """Let JAX keep compiled programs between runs; what the user's environment says about it wins."""
-    import jax
-
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
-        jax.config.update("jax_compilation_cache_dir", str(Path(home) / "switchfit" / "jax"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def _estimate(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: bool) -> Any:

@@ -6,7 +6,7 @@ so that the integrator never steps across one and inside a step the signal is on
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -157,6 +157,11 @@ class ReferenceSignal:
     samples: tuple[FloatArray, FloatArray] | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.signal, PiecewisePolynomial):
+            raise TypeError(
+                "ReferenceSignal is made from samples by sf.ReferenceSignal.from_samples(times, values, ...); "
+                f"got {type(self.signal).__name__}."
+            )
         if self.observe is not None and not callable(self.observe):
             raise TypeError(f"observe must be a function h(t, x, p); got {type(self.observe).__name__}.")
         object.__setattr__(self, "weights", _weight_matrix(self.weights, self.signal.channels))
@@ -196,13 +201,14 @@ class ReferenceSignal:
         """
         times, values = _samples(times, values, "ReferenceSignal", at_least=4, breaks=True)
         table = values.reshape(len(times), -1)
+        if np.isinf(table).any():
+            raise ValueError("ReferenceSignal values must be finite, or NaN where one is missing; got infinity.")
         cuts = np.flatnonzero(np.diff(times) == 0) + 1
         parts = zip(np.split(times, cuts), np.split(table, cuts), strict=True)
         signal = _joined([_bridged_spline(part_times, part) for part_times, part in parts])
         if lowpass_hz is not None:
             signal = _lowpass(signal, lowpass_hz)
-        label = None if names is None else tuple(names)
-        return cls(signal, observe, weights, label, (times, table))
+        return cls(signal, observe, weights, names, (times, table))  # type: ignore[arg-type]  # made a tuple there
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,6 +306,22 @@ def _samples(
     return times, values
 
 
+def as_numbers(value: Any, what: str) -> FloatArray:
+    """`value` as a float64 array; ValueError naming it otherwise."""
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{what} must be a number or an array of numbers; got {value!r}.") from error
+
+
+def as_number(value: Any, what: str) -> float:
+    """`value` as a float; ValueError naming it otherwise."""
+    number = as_numbers(value, what)
+    if number.size != 1:
+        raise ValueError(f"{what} must be a single number; got {value!r}.")
+    return float(number.reshape(()))
+
+
 def _require_finite(values: FloatArray, what: str) -> None:
     bad = ~np.isfinite(values)
     if bad.any():
@@ -310,7 +332,7 @@ def _require_finite(values: FloatArray, what: str) -> None:
 def _checked_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | None:
     if sigma is None:
         return None
-    sigma = np.array(sigma, dtype=np.float64)
+    sigma = as_numbers(sigma, "sigma")
     if sigma.shape not in ((), (shape[1],), shape):
         raise ValueError(
             f"sigma must be a number, of shape ({shape[1]},) (one a channel) or {shape} (one a sample); "
@@ -324,6 +346,8 @@ def _checked_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | None:
 def _channel_names(names: Sequence[str] | None, channels: int) -> tuple[str, ...] | None:
     if names is None:
         return None
+    if not isinstance(names, Iterable):
+        raise TypeError(f"names must be a sequence of strings, one for each channel; got {names!r}.")
     names = (names,) if isinstance(names, str) else tuple(names)
     if len(names) != channels:
         raise ValueError(f"names must have one entry for each of the {channels} channels; got {list(names)}.")
@@ -334,13 +358,13 @@ def _weight_matrix(weights: ArrayLike | None, channels: int) -> FloatArray:
     """W as a symmetric positive semi-definite ``(q, q)`` matrix."""
     if weights is None:
         return np.eye(channels)
-    matrix = np.array(weights, dtype=np.float64)
+    matrix = as_numbers(weights, "weights")
     if matrix.ndim == 1:
         matrix = np.diag(matrix)
     if matrix.shape != (channels, channels):
         raise ValueError(f"weights must have shape ({channels},) or ({channels}, {channels}); got {np.shape(weights)}.")
     if not np.all(np.isfinite(matrix)) or not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
-        raise ValueError("weights must be finite and symmetric.")
+        raise ValueError(f"weights must be finite and symmetric; got {matrix.tolist()}.")
     smallest = np.linalg.eigvalsh(matrix)[0]
     if smallest < -1e-12 * np.abs(matrix).max():
         raise ValueError(f"weights must be positive semi-definite; its smallest eigenvalue is {smallest:.3g}.")
@@ -385,6 +409,7 @@ def _lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePolynomi
     """Butterworth filter of second order forward and backward, on a grid of ten points a period of the cut-off."""
     import scipy.signal  # here, since importing it takes longer than most fits
 
+    cutoff_hz = as_number(cutoff_hz, "lowpass_hz")
     if not (np.isfinite(cutoff_hz) and cutoff_hz > 0):
         raise ValueError(f"lowpass_hz must be positive; got {cutoff_hz}.")
     start, end = signal.knots[[0, -1]]

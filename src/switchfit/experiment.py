@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ from switchfit.data import (
     ReferenceSignal,
     RunningCost,
     TerminalCost,
+    as_number,
 )
 from switchfit.system import HybridSystem, ResetMap, as_state
 
@@ -57,6 +58,8 @@ class Parameter:
             raise ValueError(
                 f"Parameter needs numbers: value {self.value!r}, lower {self.lower!r}, upper {self.upper!r}; {error}."
             ) from error
+        if value.size == 0:
+            raise ValueError("Parameter value must have one entry or more; got none.")
         if not np.all(np.isfinite(value)):
             raise ValueError(f"Parameter value must be finite; got {self.value!r}.")
         if not np.all(lower <= upper):
@@ -110,15 +113,18 @@ class Experiment:
     name: str | None = None
 
     def __post_init__(self) -> None:
-        t0, tf = float(self.t0), float(self.tf)
+        t0, tf = as_number(self.t0, "t0"), as_number(self.tf, "tf")
         if not (np.isfinite(t0) and np.isfinite(tf) and t0 < tf):
             raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got ({self.t0}, {self.tf}).")
         if isinstance(self.mode_sequence, str):
             raise TypeError(f"mode_sequence must be a sequence of mode names; got the string {self.mode_sequence!r}.")
+        if not isinstance(self.mode_sequence, Iterable):
+            raise TypeError(f"mode_sequence must be a sequence of mode names; got {self.mode_sequence!r}.")
         sequence = tuple(self.mode_sequence)
         if not sequence:
             raise ValueError("mode_sequence is empty; name at least one mode.")
-        times = tuple(as_parameter(tau, "a transition time") for tau in np.atleast_1d(self.transition_times).tolist())
+        given = self.transition_times if isinstance(self.transition_times, Iterable) else (self.transition_times,)
+        times = tuple(as_parameter(tau, "a transition time") for tau in given)
         if self.inputs is not None and not isinstance(self.inputs, Input):
             raise TypeError(f"inputs must be an sf.Input; got {type(self.inputs).__name__}.")
         if self.initial_state is not None and not callable(self.initial_state):
@@ -140,10 +146,12 @@ class Experiment:
         needed = len(self.mode_sequence) - 1
         if len(self.transition_times) != needed:
             raise ValueError(
-                f"{len(self.mode_sequence)} modes need {needed} transition times; got {len(self.transition_times)}."
+                f"transition_times must be one fewer than the {len(self.mode_sequence)} modes of mode_sequence; "
+                f"got {len(self.transition_times)}, needed {needed}."
             )
         if any(tau.shape != () for tau in self.transition_times):
-            raise ValueError("Each transition time must be a single number or a Parameter with a single value.")
+            shapes = [tau.shape for tau in self.transition_times]
+            raise ValueError(f"transition_times must be single numbers or Parameters of one; got the shapes {shapes}.")
         knots = np.concatenate([[self.t0], self.initial_times, [self.tf]])
         if np.any(np.diff(knots) <= 0):
             raise ValueError(

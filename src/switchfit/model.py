@@ -149,7 +149,7 @@ class Model:
                 size = int(np.prod(structure.input_shape))
                 given += (piece(t)[piece.coefficients.shape[-1] - size :].reshape(structure.input_shape),)
             what = f"mode {name!r}"
-            return checked_vector(function(*given), (structure.n,), what, f"f({'t, x, p, u'[: 3 * len(given) - 2]})")
+            return checked_vector(function, given, (structure.n,), what, f"f({'t, x, p, u'[: 3 * len(given) - 2]})")
 
         return f
 
@@ -164,7 +164,7 @@ class Model:
         def ell(t: Array, x: Array, p: Array) -> Array:
             total = jnp.zeros(())
             for function in self.structure.running:
-                total = total + checked_vector(function(t, x, self.parameters(p)), (), "RunningCost", "ell(t, x, p)")
+                total = total + checked_vector(function, (t, x, self.parameters(p)), (), "RunningCost", "ell(t, x, p)")
             for residual, W in zip(self.reference_residuals(piece), self.arguments.weights, strict=True):
                 r = residual(t, x, p)
                 total = total + 0.5 * r @ W @ r
@@ -194,8 +194,14 @@ class Model:
 
     def observed(self, observe: Observe | None, t: Array, x: Array, p: Array, channels: int) -> Array:
         """What a sensor sees: (q,)."""
-        y = x if observe is None else observe(t, x, self.parameters(p))
-        return checked_vector(y, (channels,), "observe", "h(t, x, p)")
+        if observe is None:
+            if x.shape != (channels,):
+                raise ValueError(
+                    f"Without observe the whole state is compared: its {x.shape[0]} entries need as many channels of "
+                    f"data; got {channels}. Give observe=h(t, x, p) -> ({channels},)."
+                )
+            return x
+        return checked_vector(observe, (t, x, self.parameters(p)), (channels,), "observe", "h(t, x, p)")
 
     def sample_residual(self, k: int, sample: Samples, x: Array, p: Array) -> Array:
         """``h - y`` of one sample of the k-th Measurements, 0 where it is missing: (q,)."""
@@ -212,7 +218,7 @@ class Model:
         """Sum of the terminal costs."""
         total = jnp.zeros(())
         for phi in self.structure.terminal:
-            total = total + checked_vector(phi(x, self.parameters(p)), (), "TerminalCost", "phi(x, p)")
+            total = total + checked_vector(phi, (x, self.parameters(p)), (), "TerminalCost", "phi(x, p)")
         return total
 
     def reset(self, i: int) -> Callable[[Array, Array, Array], Array]:
@@ -224,8 +230,8 @@ class Model:
         apply = function
 
         def R(t: Array, x: Array, p: Array) -> Array:
-            value = apply(t, x, self.parameters(p))
-            return checked_vector(value, (self.structure.n,), f"reset map {tuple(sequence)}", "R(t, x, p)")
+            given = (t, x, self.parameters(p))
+            return checked_vector(apply, given, (self.structure.n,), f"reset map {tuple(sequence)}", "R(t, x, p)")
 
         return R
 
@@ -233,16 +239,48 @@ class Model:
         """x(t0), (n,)."""
         if self.structure.initial_state is None:
             return self.arguments.initial_state
-        value = self.structure.initial_state(self.parameters(p))
-        return checked_vector(value, (self.structure.n,), "initial_state", "initial_state(p)")
+        given = (self.parameters(p),)
+        return checked_vector(
+            self.structure.initial_state, given, (self.structure.n,), "initial_state", "initial_state(p)"
+        )
 
 
-def checked_vector(value: Any, shape: tuple[int, ...], what: str, signature: str) -> Array:
-    """`value` as an array, checked (while tracing) to be float64 of the given shape."""
+UNTRACEABLE = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+"""What JAX raises where Python code wants to know a number that is not known yet."""
+
+
+def called(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, signature: str) -> Array:
+    """Call a function of the user's while tracing; whatever it raises becomes one sentence that names it."""
     try:
-        array = jnp.asarray(value)
+        value = function(*arguments)
+    except KeyError as error:
+        parameters = next(given for given in arguments if isinstance(given, dict))
+        raise ValueError(
+            f"{what} asks for the parameter {error}, which the problem lacks; it has {', '.join(parameters) or 'none'}."
+        ) from error
+    except UNTRACEABLE as error:
+        raise ValueError(
+            f"{what} decides by the value of t, x or p (an `if`, a `while`, float() or numpy function), which JAX "
+            "cannot differentiate. Write it with jax.numpy; if the dynamics change there, make it a mode with a "
+            "transition time."
+        ) from error
+    except Exception as error:
+        raise ValueError(f"{what}: {signature} raised {type(error).__name__}: {error}") from error
+    try:
+        return jnp.asarray(value)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{what}: {signature} must return an array of shape {shape}; got {value!r}.") from error
+        raise ValueError(f"{what}: {signature} must return an array of numbers; got {value!r}.") from error
+
+
+def checked_vector(
+    function: Callable[..., Any], arguments: tuple[Any, ...], shape: tuple[int, ...], what: str, signature: str
+) -> Array:
+    """What a function of the user's returns, checked (while tracing) to be a float64 array of the given shape."""
+    array = called(function, arguments, what, signature)
     if array.shape != shape and array.size == int(np.prod(shape)) == 1:
         array = array.reshape(shape)
     if array.shape != shape:
@@ -319,31 +357,15 @@ def check_functions(structure: Structure) -> None:
         model = Model(structure, arguments)
         piece = Piece(jnp.zeros(()), arguments.signals[0])
         t, x, p = (jax.ShapeDtypeStruct(shape, jnp.float64) for shape in ((), (structure.n,), (structure.M,)))
-        for mode, name in enumerate(structure.mode_names):
-            _trace(f"mode {name!r}", model.field(mode, piece), t, x, p)
+        for mode in range(len(structure.modes)):
+            jax.eval_shape(model.field(mode, piece), t, x, p)
         for i in structure.resets:
-            names = tuple(structure.mode_names[m] for m in structure.mode_of_segment[i : i + 2])
-            _trace(f"reset map {names}", model.reset(i), t, x, p)
-        _trace("a RunningCost or an observe function", model.density(piece), t, x, p)
+            jax.eval_shape(model.reset(i), t, x, p)
+        jax.eval_shape(model.density(piece), t, x, p)
         for observe, q in structure.measurements:
-            _trace("observe", partial(model.observed, observe, channels=q), t, x, p)
-        _trace("a TerminalCost", model.terminal, x, p)
-        _trace("initial_state", model.initial_state, p)
-
-
-def _trace(what: str, function: Callable[..., Any], *arguments: Any) -> None:
-    """Call a function of the user's on abstract arguments; whatever it raises becomes one clear sentence."""
-    try:
-        jax.eval_shape(function, *arguments)
-    except KeyError as error:
-        raise ValueError(f"{what} asks for the parameter {error}, which the problem lacks.") from error
-    except jax.errors.ConcretizationTypeError as error:
-        raise ValueError(
-            f"{what} decides by the value of t, x or p (an `if`, a `while`, float() or numpy function), which JAX cannot "
-            "differentiate. Write it with jax.numpy; if the dynamics change there, make it a mode with a transition time."
-        ) from error
-    except (TypeError, IndexError, AttributeError) as error:
-        raise ValueError(f"{what} raised {type(error).__name__}: {error}") from error
+            jax.eval_shape(partial(model.observed, observe, channels=q), t, x, p)
+        jax.eval_shape(model.terminal, x, p)
+        jax.eval_shape(model.initial_state, p)
 
 
 def _of_kind(data: tuple[Any, ...], kind: type) -> list[Any]:
@@ -356,11 +378,8 @@ def _state_size(initial: Any, parameters: Mapping[str, Parameter]) -> int:
         return int(initial.size)
     with float64():
         p = {name: jax.ShapeDtypeStruct(q.shape, jnp.float64) for name, q in parameters.items()}
-        try:
-            shape = jax.eval_shape(lambda p: jnp.asarray(initial(p)), p).shape
-        except KeyError as error:
-            raise ValueError(f"initial_state asks for the parameter {error}, which the problem lacks.") from error
-    if len(shape) != 1:
+        shape = jax.eval_shape(lambda p: called(initial, (p,), "initial_state", "initial_state(p)"), p).shape
+    if len(shape) != 1 or shape[0] == 0:
         raise ValueError(f"initial_state(p) must return an array of shape (n,); got shape {shape}.")
     return int(shape[0])
 

@@ -13,11 +13,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.data import FloatArray
+from switchfit.data import FloatArray, as_number, as_numbers
 from switchfit.experiment import Experiment, Parameter, as_parameter
 from switchfit.mesh import Mesh
 from switchfit.model import Arguments, Structure, arguments_of, check_functions, structure_of
 from switchfit.system import HybridSystem
+
+SMALLEST_RTOL = 1e-13
+"""Local errors below this part of the state are rounding."""
 
 
 @dataclass(frozen=True)
@@ -84,9 +87,10 @@ class Problem:
     def __post_init__(self) -> None:
         if not isinstance(self.system, HybridSystem):
             raise TypeError(f"system must be an sf.HybridSystem; got {type(self.system).__name__}.")
-        experiments = (self.experiments,) if isinstance(self.experiments, Experiment) else tuple(self.experiments)
+        given = self.experiments
+        experiments = tuple(given) if isinstance(given, (list, tuple)) else (given,)
         if not experiments or not all(isinstance(e, Experiment) for e in experiments):
-            raise TypeError("experiments must be an sf.Experiment or a non-empty list of them.")
+            raise TypeError(f"experiments must be an sf.Experiment or a non-empty list of them; got {given!r}.")
         for experiment in experiments:
             for mode in experiment.mode_sequence:
                 if mode not in self.system.modes:
@@ -96,18 +100,31 @@ class Problem:
         if self.solver not in ("explicit", "stiff"):
             raise ValueError(f"solver must be 'explicit' or 'stiff'; got {self.solver!r}.")
         for name in ("rtol", "atol"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ValueError(f"{name} must be positive; got {getattr(self, name)!r}.")
-        parameters = {
-            str(name): as_parameter(value, f"parameter {name!r}") for name, value in (self.parameters or {}).items()
-        }
+            value = as_number(getattr(self, name), name)
+            if not (np.isfinite(value) and value > 0):
+                raise ValueError(f"{name} must be positive; got {value}.")
+            object.__setattr__(self, name, value)
+        if not SMALLEST_RTOL <= self.rtol < 1:
+            raise ValueError(f"rtol must lie between {SMALLEST_RTOL} (rounding) and 1; got {self.rtol}.")
+        parameters = _checked_parameters(self.parameters)
         object.__setattr__(self, "experiments", experiments)
         object.__setattr__(self, "parameters", parameters)
-        object.__setattr__(self, "unknowns", _unknowns(experiments, parameters, float(self.min_duration)))
+        dwell = as_number(self.min_duration, "min_duration")
+        object.__setattr__(self, "unknowns", _unknowns(experiments, parameters, dwell))
         structures = tuple(structure_of(self.system, e, parameters, self.solver) for e in experiments)
-        for structure in structures:
+        for structure, experiment in zip(structures, experiments, strict=True):
+            self._check_states(structure.n, experiment)
             check_functions(structure)
         object.__setattr__(self, "structures", structures)
+
+    def _check_states(self, n: int, experiment: Experiment) -> None:
+        own = self.system.initial_state
+        if not callable(own) and n != own.size:
+            raise ValueError(
+                f"initial_state of experiment {experiment.name or self.experiments.index(experiment) + 1} must have "
+                f"{own.size} entries, as the system's has; got {n}."
+            )
+        self.system.check_labels_of(n)
 
     @property
     def initial_theta(self) -> FloatArray:
@@ -127,7 +144,7 @@ class Problem:
         """`theta`, or the initial guess for None, as a ``(d,)`` array; ValueError where shape or order is wrong."""
         if theta is None:
             return self.initial_theta
-        checked = np.array(theta, dtype=np.float64)
+        checked = as_numbers(theta, "theta")
         if checked.shape != self.unknowns.initial.shape:
             raise ValueError(
                 f"theta must have shape ({len(self.theta_names)},): {', '.join(self.theta_names)}; "
@@ -156,6 +173,15 @@ class Problem:
             span = self.unknowns.parameters.get(name)
             parameters[name] = parameter.value if span is None else theta[span].reshape(parameter.shape)
         return times, parameters
+
+
+def _checked_parameters(parameters: Any) -> dict[str, Parameter]:
+    if not isinstance(parameters or {}, Mapping):
+        raise TypeError(f"parameters must be a dict of name -> value or sf.Parameter; got {parameters!r}.")
+    for name in parameters or {}:
+        if not isinstance(name, str):
+            raise TypeError(f"parameter names must be strings; got {name!r}.")
+    return {name: as_parameter(value, f"parameter {name!r}") for name, value in (parameters or {}).items()}
 
 
 def _unknowns(experiments: tuple[Experiment, ...], parameters: dict[str, Parameter], dwell: float) -> Unknowns:

@@ -7,7 +7,9 @@ that have to be there anyway; the mesh then stays as it is while theta moves.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +25,9 @@ from switchfit.problem import Problem
 
 MAX_STEPS = 200_000
 """Adaptive steps in one mode before it is called stiff."""
+
+PACE = 1000
+"""Steps over which the pace of a mode is measured; a stiff one is thus refused before it has cost much."""
 
 
 def fixed_nodes(experiment: Experiment) -> FloatArray:
@@ -63,10 +68,12 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
     inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
     steps = [np.array([experiment.t0])]
     with float64(), compilation_cache():
-        x = np.asarray(_initial_state(arguments, p, structure=structure))
+        x = _finite(_initial_state(arguments, p, structure=structure), f"initial_state at p = {_rounded(parameters)}")
         for i, mode in enumerate(structure.mode_of_segment):
             if i > 0 and structure.reset_maps[i - 1] is not None:
-                x = np.asarray(_reset(arguments, ends[i], x, p, structure=structure, i=i - 1))
+                names = tuple(experiment.mode_sequence[i - 1 : i + 1])
+                value = _reset(arguments, ends[i], x, p, structure=structure, i=i - 1)
+                x = _finite(value, f"reset map {names} at t = {ends[i]:.6g}, x = {x.tolist()}")
             knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
             stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
             for start, end in zip(stops[:-1], stops[1:], strict=True):
@@ -97,23 +104,51 @@ def _solve(
         cell = min(int(np.searchsorted(coarse.times, inside, side="right")) - 1, last)
         value = np.asarray(function(arguments, arguments.nodes[cell], arguments.signals[cell], t, y[:-1], p))
         if not np.isfinite(value).all():
-            what = f"mode {name!r}" if not np.isfinite(value[:-1]).all() else "a running cost"
-            raise ValueError(f"{what} returned {value.tolist()} at t = {t:.6g}, x = {y[:-1].tolist()}.")
+            slope, density = value[:-1].tolist(), value[-1]
+            finite = np.isfinite(slope).all()
+            what = (
+                f"a running cost in mode {name!r} returned {density}" if finite else f"mode {name!r} returned {slope}"
+            )
+            raise ValueError(
+                f"{what} at t = {t:.6g}, x = {y[:-1].tolist()}: the guess leads to where the model is not defined or "
+                "grows without bound; use a better guess, or change the model there."
+            )
         return value
 
     method = scipy.integrate.RK45 if problem.solver == "explicit" else scipy.integrate.Radau
     solver = method(right_hand_side, start, np.append(x, 0.0), end, rtol=problem.rtol, atol=problem.atol)
-    accepted: list[float] = []
+    accepted = [start]
     while solver.status == "running":
-        message = solver.step()
-        if solver.status == "failed" or len(accepted) > MAX_STEPS:
+        with np.errstate(over="ignore", invalid="ignore"):  # a state that overflows is refused in words
+            message = solver.step()
+        if solver.status == "failed" or _too_many(accepted, end):
             remedy = "use solver='stiff', or a better guess" if problem.solver == "explicit" else "use a better guess"
+            reason = message or f"it needs more than {MAX_STEPS} steps"
             raise ValueError(
                 f"mode {name!r} cannot be integrated at the guess beyond t = {solver.t:.6g}, where x = "
-                f"{solver.y[:-1].tolist()} ({message or 'too many steps'}): {remedy}."
+                f"{solver.y[:-1].tolist()} ({reason}): {remedy}."
             )
         accepted.append(float(solver.t))
-    return np.array(accepted), np.asarray(solver.y[:-1])
+    return np.array(accepted[1:]), np.asarray(solver.y[:-1])
+
+
+def _too_many(accepted: list[float], end: float) -> bool:
+    """Whether more than `MAX_STEPS` have been taken, or will be at the pace of the last `PACE` steps."""
+    if len(accepted) < 5 * PACE:
+        return False
+    return len(accepted) + PACE * (end - accepted[-1]) / (accepted[-1] - accepted[-PACE - 1]) > MAX_STEPS
+
+
+def _finite(value: jax.Array, what: str) -> FloatArray:
+    state = np.asarray(value)
+    if not np.isfinite(state).all():
+        raise ValueError(f"{what} returned {state.tolist()}, which is not finite: use a better guess.")
+    return state
+
+
+def _rounded(parameters: Mapping[str, FloatArray]) -> dict[str, Any]:
+    """Parameters for a message."""
+    return {name: np.round(value, 6).tolist() for name, value in parameters.items()}
 
 
 @partial(jax.jit, static_argnames=("structure", "mode"))

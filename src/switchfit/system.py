@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
@@ -74,13 +74,20 @@ class HybridSystem:
             return
         if isinstance(given, str):
             raise TypeError(f"{label} must be a sequence of strings, one for each state; got the string {given!r}.")
-        labels = tuple(str(g) for g in given)
-        _set(self, label, labels)
-        if not callable(self.initial_state) and len(labels) != self.initial_state.size:
-            raise ValueError(
-                f"{label} must have one entry for each of the {self.initial_state.size} states; "
-                f"got {len(labels)}: {labels}."
-            )
+        if not isinstance(given, Iterable):
+            raise TypeError(f"{label} must be a sequence of strings, one for each state; got {given!r}.")
+        _set(self, label, tuple(str(g) for g in given))
+        if not callable(self.initial_state):
+            self.check_labels_of(self.initial_state.size)
+
+    def check_labels_of(self, n: int) -> None:
+        """ValueError unless names and units, where given, have one entry for each of n states."""
+        for label in ("state_names", "state_units"):
+            labels = getattr(self, label)
+            if labels is not None and len(labels) != n:
+                raise ValueError(
+                    f"{label} must have one entry for each of the {n} states; got {len(labels)}: {labels}."
+                )
 
     def reset_map(self, before: str, after: str) -> ResetMap | None:
         """The map applied at a transition from mode `before` to mode `after`; None where x is continuous."""
@@ -104,6 +111,8 @@ def as_state(value: ArrayLike, name: str) -> NDArray[np.float64]:
 def _checked_reset_maps(
     reset_maps: Mapping[tuple[str, str], ResetMap] | None, modes: Mapping[str, VectorField]
 ) -> dict[tuple[str, str], ResetMap]:
+    if not isinstance(reset_maps or {}, Mapping):
+        raise TypeError(f"reset_maps must be a dict of (mode before, mode after) -> function; got {reset_maps!r}.")
     checked = dict(reset_maps or {})
     for key, reset in checked.items():
         if not (isinstance(key, tuple) and len(key) == 2):

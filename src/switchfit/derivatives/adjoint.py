@@ -58,7 +58,7 @@ from jax.flatten_util import ravel_pytree
 from switchfit.mesh import row_ending_cell
 from switchfit.model import Model, Piece
 from switchfit.propagate import Path, at_cells, by_mode, path_cost, propagate
-from switchfit.rungekutta import STIFF, Density, Field, Tableau, combine
+from switchfit.rungekutta import STIFF, Field, Tableau, combine
 
 Array = jax.Array
 
@@ -353,11 +353,6 @@ def integrands(d: Along, adjoints: Adjoints) -> Quadratures:
     return Quadratures(first, second)
 
 
-def along_trajectory(f: Field, ell: Density, t: Array, x: Array, Dp_x: Array, p: Array) -> Along:
-    """All that the adjoint equations need to know about the trajectory at time t."""
-    return Along(Dp_x, *first_and_second(f, t, x, p), *first_and_second(ell, t, x, p))
-
-
 def backward_sweep(
     model: Model, path: Path, transitions: list[Transition], Dp_x: Sensitivities, p: Array
 ) -> tuple[Adjoints, Adjoints, Quadratures]:
@@ -369,7 +364,6 @@ def backward_sweep(
     final, total = point_cost(model.terminal, path.after[-1, -1], Dp_x_after[-1, -1], p)
     at_t0, jumps, sampled = sample_jumps(model, path, Dp_x_before, Dp_x_after, p)
     total = add(total, sampled)
-    of_mode = trajectory_of_mode(model, p)
 
     def row(now: tuple[Adjoints, Quadratures], given: Any) -> tuple[tuple[Adjoints, Quadratures], None]:
         adjoints, total = now
@@ -382,7 +376,7 @@ def backward_sweep(
 
     def chunk(now: tuple[Adjoints, Quadratures], given: Any) -> tuple[tuple[Adjoints, Quadratures], Adjoints]:
         segment, opens, jump, start, end, *trajectory = given
-        d = by_mode(model, segment, of_mode, start, end, *trajectory)
+        d = along_rows(model, segment, p, start, end, *trajectory)
         (opened, total), _ = lax.scan(row, now, (start, end, d, jump), reverse=True)
         return (before_reset(transitions, segment, opens, opened, pick(Dp_minus, segment)), total), opened
 
@@ -395,24 +389,35 @@ def backward_sweep(
     return add(start, at_t0), opened, total
 
 
-def trajectory_of_mode(model: Model, p: Array) -> Callable[[int], Callable[..., Along]]:
-    """For each mode: `Along` at the stages of the backward sweep of a chunk of rows, (C, s, ...)."""
+def along_rows(
+    model: Model, segment: Array, p: Array, start: Array, end: Array, pieces: Piece, *values: Array
+) -> Along:
+    """`Along` at the stages of the backward sweep through a chunk of rows of one segment, (C, s, ...).
+
+    `values` are x and D_p x at the start and at the end of each row: x_k, x_{k+1}, D_p x_k, D_p x_{k+1}.
+    """
     fractions = 1.0 - jnp.asarray(model.tableau.c)  # stage j of a row that is traversed from its end to its start
+    directions = jnp.eye(p.shape[0])
 
-    def of_mode(mode: int) -> Callable[..., Along]:
-        def row(start: Array, end: Array, piece: Piece, x_k: Array, x_k1: Array, Dx_k: Array, Dx_k1: Array) -> Along:
-            f, ell = model.field(mode, piece), model.density(piece)
+    def of_mode(mode: int) -> Callable[..., tuple[Array, ...]]:
+        def row(start: Array, end: Array, piece: Piece, x_k: Array, x_k1: Array, *Dp_x: Array) -> tuple[Array, ...]:
+            f = model.field(mode, piece)
 
-            def stage(s: Array) -> Along:
+            def stage(s: Array) -> tuple[Array, ...]:
                 x, linear = jax.linearize(lambda *ends: interpolated(f, s, start, end, *ends), x_k, x_k1, p)
-                Dp_x = jax.vmap(linear, in_axes=-1, out_axes=-1)(Dx_k, Dx_k1, jnp.eye(p.shape[0]))
-                return along_trajectory(f, ell, start + s * (end - start), x, Dp_x, p)
+                columns = jax.vmap(linear, in_axes=-1, out_axes=-1)(*Dp_x, directions)
+                return x, columns, *first_and_second(f, start + s * (end - start), x, p)
 
             return jax.vmap(stage)(fractions)
 
         return jax.vmap(row)
 
-    return of_mode
+    def of_ell(start: Array, end: Array, piece: Piece, x: Array) -> tuple[Array, ...]:
+        times = start + fractions * (end - start)
+        return jax.vmap(lambda t, x: first_and_second(model.density(piece), t, x, p))(times, x)
+
+    x, Dp_x, *of_f = by_mode(model, segment, of_mode, start, end, pieces, *values)
+    return Along(Dp_x, *of_f, *jax.vmap(of_ell)(start, end, pieces, x))
 
 
 def interpolated(f: Field, s: Array, start: Array, end: Array, x_k: Array, x_k1: Array, p: Array) -> Array:
@@ -537,8 +542,13 @@ def first_and_second(
     function: Callable[[Array, Array, Array], Array], t: Array, x: Array, p: Array
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     """``D1, Dp, D1D1, DpD1, D1Dp, DpDp`` of a function of (t, x, p); the outermost derivative is the last axis."""
-    D1, Dp = jax.jacfwd(function, argnums=(1, 2))(t, x, p)
-    (D1D1, DpD1), (D1Dp, DpDp) = jax.jacfwd(jax.jacfwd(function, argnums=(1, 2)), argnums=(1, 2))(t, x, p)
+
+    def first(t: Array, x: Array, p: Array) -> tuple[Any, Any]:
+        derivatives = jax.jacfwd(function, argnums=(1, 2))(t, x, p)
+        return derivatives, derivatives
+
+    second, (D1, Dp) = jax.jacfwd(first, argnums=(1, 2), has_aux=True)(t, x, p)
+    (D1D1, DpD1), (D1Dp, DpDp) = second
     return D1, Dp, D1D1, DpD1, D1Dp, DpDp
 
 

@@ -162,7 +162,10 @@ def _decoded(hint: Any, value: Any, where: str) -> Any:
         optional = [kind for kind in inner if kind is not type(None)]
         return None if value is None else _decoded(optional[0], value, where)
     if origin is np.ndarray:
-        return _array(value, where)
+        array, declared = _array(value, where), np.dtype(get_args(inner[1])[0])
+        if array.dtype.kind != declared.kind:
+            raise ValueError(f"{where} must be an array of {declared.type.__name__}; got one of {array.dtype}")
+        return array
     if origin is tuple:
         return _tuple(inner, value, where)
     if origin is Mapping:

@@ -13,10 +13,12 @@ One iteration, `_step`, maps a state to the next state:
 2. *line search*: the full step first, even across breakpoints; if it fails and crosses any, the programme is solved
    again inside the present smooth piece, where J is smooth and backtracking must succeed;
 3. *kinks*: a coordinate that sits on a breakpoint has the derivatives g₋ and g₊. To first order J is separable
-   there, so such a coordinate is held (g₋ <= 0 <= g₊), or released to the side that descends. The multipliers of the
-   programme say when a held coordinate is to be released because others move.
+   there, so such a coordinate is held, or released to the side to which the steepest feasible direction moves it. The
+   multipliers of the programme say when a held coordinate is to be released because others move.
 
-A point is optimal when zero is in [g₋, g₊] − cone(active normals) at every coordinate, with g₋ = g₊ off the kinks.
+Along v, J changes at the rate J'(v) = Σ (g₊ max(v, 0) + g₋ min(v, 0)), with g₋ = g₊ off the kinks. A point is optimal
+when no feasible v has J'(v) < 0, and the steepest descent −J'(v) over ‖v‖₂ <= 1, `_first_order`, measures how far it is
+from that. The programme starts from the sides of this v, so that its step descends wherever the measure is positive.
 
 References
 ----------
@@ -30,6 +32,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from itertools import product
 from typing import Literal, Protocol, get_args
 
 import numpy as np
@@ -64,6 +67,8 @@ NEGLIGIBLE_STEP = 1e-10
 #: Iterations spent on making the last step negligible once the optimality is below the tolerance.
 EXTRA_ITERATIONS = 5
 MAX_BACKTRACKS = 60
+#: All combinations of sides are compared for up to this many concave kinks that constraints couple.
+MANY_CONCAVE_KINKS = 6
 #: Newton steps up to this multiple of the unknowns' size are never shortened by changing the Hessian.
 LONGEST_STEP = 1e3
 
@@ -159,7 +164,8 @@ class Result:
     hessian : array, shape (d, d)
         As evaluated there, not modified; NaN if the caller gives none.
     optimality : float
-        KKT residual, min over multipliers of ‖g − Aᵀ lam‖₂; the norm of the gradient if nothing is active.
+        KKT residual, min over multipliers of ‖g − Aᵀ lam‖₂: the steepest descent along feasible directions of length
+        one, the norm of the gradient if nothing is active.
     iterations, evaluations : int
     status : Status
     active : tuple of str
@@ -236,7 +242,7 @@ class _Problem:
     evaluate: Evaluate
     constraints: LinearConstraints
     normals: FloatArray
-    breakpoints: tuple[FloatArray, ...]
+    breakpoints: tuple[tuple[int, FloatArray], ...]  # of the coordinates that have any
     hessian: HessianKind
     mask: FloatArray | None  # 1 inside a block, 0 between blocks
     tolerance: float
@@ -258,7 +264,7 @@ class _Sample:
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """A feasible point with its one-sided derivatives and KKT residual."""
+    """A feasible point with its one-sided derivatives and first-order conditions."""
 
     theta: FloatArray
     plus: _Sample  # derivatives to the right of breakpoints
@@ -268,6 +274,7 @@ class _Point:
     active: NDArray[np.intp]
     optimality: float
     multipliers: FloatArray  # shape (m + 2 d,)
+    downhill: NDArray[np.int_]  # like side, and for each kink the side to descend to, 0 to hold it
 
     @property
     def cost(self) -> float:
@@ -279,6 +286,8 @@ class _Point:
         An entry of the Hessian that joins a left and a right coordinate is known from neither evaluation: the mean.
         """
         plus, minus = self.plus, self.minus
+        if plus is minus:
+            return plus.gradient, plus.hessian
         gradient = np.where(sides > 0, plus.gradient, minus.gradient)
         gradient = np.where(sides == 0, 0.5 * (plus.gradient + minus.gradient), gradient)
         pair = sides[:, None] + sides[None, :]
@@ -286,12 +295,49 @@ class _Point:
         return gradient, np.where(pair > 0, plus.hessian, np.where(pair < 0, minus.hessian, mean))
 
 
-def _steepest_sides(point: _Point) -> NDArray[np.int_]:
-    """For each kink 0 if it is a minimiser (g₋ <= 0 <= g₊), otherwise the side that descends more steeply."""
-    left, right = point.minus.gradient, point.plus.gradient
-    sides = np.where(-right >= left, 1, -1)
-    sides = np.where((left <= 0.0) & (right >= 0.0), 0, sides)
-    return np.where(point.kink, sides, point.side)
+def _first_order(
+    plus: _Sample, minus: _Sample, kink: NDArray[np.bool_], side: NDArray[np.int_], normals: FloatArray
+) -> tuple[float, FloatArray, NDArray[np.int_]]:
+    """The steepest descent over feasible directions of length one, its multipliers, and the side of each coordinate.
+
+    At a convex kink, g₋ <= g₊, the rate of change is the maximum of g v over [g₋, g₊], at a concave one the minimum of
+    g₋ v and g₊ v. With one of the two chosen for every concave kink J' is thus convex and its steepest descent is the
+    KKT residual; that of J' itself is the largest over the choices.
+    """
+    left, right = minus.gradient, plus.gradient
+    if plus is minus:
+        return *kkt_residual(right, right, normals), side
+    alone = np.where((left <= 0.0) & (right >= 0.0), 0, np.where(-right >= left, 1, -1))
+    convex = kink & (left < right)
+    best = -1.0
+    for sides in _choices(np.where(kink, alone, side), kink & (left > right), normals):
+        gradient = np.where(sides > 0, right, left)
+        low, high = np.where(convex, left, gradient), np.where(convex, right, gradient)
+        residual, values = kkt_residual(low, high, normals)
+        if residual > best:
+            best, multipliers = residual, values
+            pull = normals.T @ values
+            steepest = pull - np.clip(pull, low, high)
+            moving = kink & (np.abs(steepest) > 1e-12 * (np.abs(left) + np.abs(right)))
+            downhill = np.where(moving, np.where(steepest > 0.0, 1, -1), sides)
+    return best, multipliers, downhill
+
+
+def _choices(sides: NDArray[np.int_], concave: NDArray[np.bool_], normals: FloatArray) -> Iterator[NDArray[np.int_]]:
+    """The given sides, then others for the concave kinks: alone each takes its steeper side, a constraint may differ.
+
+    All to the right and all to the left suffice to find a descent where constraints keep coordinates in order: the
+    extreme directions move a group of them, all to one side.
+    """
+    yield sides
+    coupled = np.flatnonzero(concave & np.any(normals != 0.0, axis=0))
+    every = product((1, -1), repeat=coupled.size)
+    same: list[tuple[int, ...]] = [(1,) * coupled.size, (-1,) * coupled.size]
+    for choice in every if coupled.size <= MANY_CONCAVE_KINKS else same:
+        changed = sides.copy()
+        changed[coupled] = choice
+        if not np.array_equal(changed, sides):
+            yield changed
 
 
 class _Oracle:
@@ -330,33 +376,35 @@ class _Oracle:
             if other is None:
                 return None
             minus = other
-        active = np.flatnonzero(
-            self.problem.constraints.slack(theta) <= self.problem.constraints.rounding(np.maximum(scale, np.abs(theta)))
-        )
-        point = _Point(theta, plus, minus, kink, side, active, np.inf, np.zeros(self.problem.normals.shape[0]))
-        return self._judge(point)
+        constraints, normals = self.problem.constraints, self.problem.normals
+        rounding = constraints.rounding(np.maximum(scale, np.abs(theta)))
+        active = np.flatnonzero(constraints.slack(theta) <= rounding)
+        optimality, values, downhill = _first_order(plus, minus, kink, side, normals[active])
+        multipliers = np.zeros(normals.shape[0])
+        multipliers[active] = values
+        return _Point(theta, plus, minus, kink, side, active, optimality, multipliers, downhill)
 
     def point(self, theta: FloatArray, scale: FloatArray) -> _Point | None:
         first = self.first(theta)
         return None if first is None else self.complete(theta, first, scale)
 
     def _sides(self, theta: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.int_]]:
-        constraints = self.problem.constraints
-        on = np.array([np.any(points == x) for points, x in zip(self.problem.breakpoints, theta, strict=True)], bool)
-        left, right = theta > constraints.lower, theta < constraints.upper
-        side = np.where(on & right & ~left, 1, np.where(on & left & ~right, -1, 0))
-        return on & left & right, side
+        kink, side = np.zeros(theta.size, dtype=bool), np.zeros(theta.size, dtype=int)
+        lower, upper = self.problem.constraints.lower, self.problem.constraints.upper
+        for i, points in self.problem.breakpoints:
+            x = theta[i]
+            if _nearest(points, x) == x:
+                room = int(x < upper[i]) - int(x > lower[i])
+                kink[i], side[i] = room == 0 and lower[i] < upper[i], room
+        return kink, side
 
-    def _judge(self, point: _Point) -> _Point:
-        """KKT residual and multipliers; the convex kinks contribute an interval of derivatives."""
-        left, right = point.minus.gradient, point.plus.gradient
-        gradient, _ = point.derivatives(_steepest_sides(point))
-        interval = point.kink & (left < right)
-        low, high = np.where(interval, left, gradient), np.where(interval, right, gradient)
-        residual, values = kkt_residual(low, high, self.problem.normals[point.active])
-        multipliers = np.zeros(self.problem.normals.shape[0])
-        multipliers[point.active] = values
-        return replace(point, optimality=residual, multipliers=multipliers)
+
+def _nearest(points: FloatArray, x: float) -> float:
+    """The breakpoint nearest to x."""
+    above = int(points.searchsorted(x))
+    if above == points.size or (above > 0 and x - points[above - 1] <= points[above] - x):
+        above -= 1
+    return float(points[above])
 
 
 # --- the state and one step -------------------------------------------------------------------------------------------
@@ -470,8 +518,10 @@ def _direction(problem: _Problem, state: _State, low: FloatArray, high: FloatArr
     from the programme's multipliers; where it is outside [g₋, g₊] that coordinate, the worst one first, is released
     to the other side, and the programme is solved again. No combination is tried twice.
     """
-    sides = _steepest_sides(state.point)
+    sides = state.point.downhill
     best, force = _solve_on_sides(problem, state, sides, low, high)
+    if not state.point.kink.any():
+        return best
     direction = best
     tried = {sides.tobytes()}
     for _ in range(3 * int(state.point.kink.sum()) + 4):
@@ -568,38 +618,35 @@ def _flatness(state: _State) -> FloatArray:
 
 def _search(oracle: _Oracle, state: _State, direction: _Direction) -> _Accepted | None:
     """A step that decreases J: across breakpoints if that works, otherwise inside the present smooth piece."""
-    breakpoints = oracle.problem.breakpoints
-    theta = state.point.theta
+    problem, theta = oracle.problem, state.point.theta
     alpha = 1.0
-    crossed = _crossings(breakpoints, theta, direction.step)
+    crossed = _crossings(problem, theta, direction.step)
     while crossed > 0:
         accepted = _attempt(oracle, state, direction, alpha, ARMIJO_ACROSS)
         if accepted is not None:
             return accepted
         alpha *= 0.5
-        crossed = _crossings(breakpoints, theta, alpha * direction.step)
+        crossed = _crossings(problem, theta, alpha * direction.step)
         if crossed < MANY_BREAKPOINTS:
-            low, high = _piece(oracle.problem, theta)
-            direction = _direction(oracle.problem, state, low, high)
+            direction = _direction(problem, state, *_piece(problem, theta))
             break
     return _backtrack(oracle, state, direction)
 
 
-def _crossings(breakpoints: tuple[FloatArray, ...], theta: FloatArray, step: FloatArray) -> int:
+def _crossings(problem: _Problem, theta: FloatArray, step: FloatArray) -> int:
     """Largest number of breakpoints that a coordinate passes strictly inside the step."""
-    ends = np.sort(np.stack([theta, theta + step]), axis=0)
-    counts = [
-        int(np.searchsorted(points, b, "left") - np.searchsorted(points, a, "right"))
-        for points, a, b in zip(breakpoints, ends[0], ends[1], strict=True)
-    ]
-    return max(counts, default=0)
+    largest = 0
+    for i, points in problem.breakpoints:
+        a, b = sorted((theta[i], theta[i] + step[i]))
+        largest = max(largest, int(points.searchsorted(b, "left") - points.searchsorted(a, "right")))
+    return largest
 
 
 def _piece(problem: _Problem, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The smooth piece around theta: bounds tightened to the next breakpoint on either side."""
     low, high = problem.constraints.lower.copy(), problem.constraints.upper.copy()
-    for i, (points, x) in enumerate(zip(problem.breakpoints, theta, strict=True)):
-        below, above = np.searchsorted(points, x, "left"), np.searchsorted(points, x, "right")
+    for i, points in problem.breakpoints:
+        below, above = points.searchsorted(theta[i], "left"), points.searchsorted(theta[i], "right")
         if below > 0:
             low[i] = max(low[i], points[below - 1])
         if above < points.size:
@@ -664,20 +711,18 @@ def _blind_step(oracle: _Oracle, state: _State, direction: _Direction) -> _Accep
 
 def _move(problem: _Problem, theta: FloatArray, step: FloatArray) -> FloatArray:
     """theta + step, feasible, and bit for bit on a bound or breakpoint that it reaches up to rounding."""
-    constraints = problem.constraints
-    moved = np.clip(theta + step, constraints.lower, constraints.upper)
+    lower, upper = problem.constraints.lower, problem.constraints.upper
+    moved = theta + step
+    near = np.where(step != 0.0, 8 * EPS * np.maximum(np.maximum(np.abs(theta), np.abs(step)), np.abs(moved)), 0.0)
     pinned = np.zeros(theta.size, dtype=bool)
-    for i, points in enumerate(problem.breakpoints):
-        if step[i] == 0.0:
-            pinned[i] = moved[i] == constraints.lower[i] or moved[i] == constraints.upper[i] or moved[i] in points
-            continue
-        near = 8 * EPS * max(abs(theta[i]), abs(step[i]), abs(moved[i]))
-        marks = np.concatenate([[constraints.lower[i], constraints.upper[i]], points])
-        nearest = int(np.argmin(np.abs(marks - moved[i])))
-        if abs(marks[nearest] - moved[i]) <= near:
-            moved[i] = marks[nearest]
-            pinned[i] = True
-    return _repair(constraints, moved, pinned)
+    for i, points in problem.breakpoints:
+        mark = _nearest(points, moved[i])
+        if abs(mark - moved[i]) <= near[i]:
+            moved[i], pinned[i] = mark, True
+    moved = np.where(moved - near <= lower, lower, np.where(moved + near >= upper, upper, moved))
+    if problem.constraints.b.size == 0:
+        return moved
+    return _repair(problem.constraints, moved, pinned | (moved == lower) | (moved == upper))
 
 
 def _repair(constraints: LinearConstraints, theta: FloatArray, pinned: NDArray[np.bool_]) -> FloatArray:
@@ -914,7 +959,7 @@ def _make_problem(
     )
 
 
-def _checked_breakpoints(breakpoints: Sequence[ArrayLike] | None, d: int) -> tuple[FloatArray, ...]:
+def _checked_breakpoints(breakpoints: Sequence[ArrayLike] | None, d: int) -> tuple[tuple[int, FloatArray], ...]:
     given: Sequence[ArrayLike] = [()] * d if breakpoints is None else breakpoints
     if len(given) != d:
         raise ValueError(f"got breakpoints for {len(given)} coordinates, expected {d}; give an empty array for none")
@@ -922,7 +967,7 @@ def _checked_breakpoints(breakpoints: Sequence[ArrayLike] | None, d: int) -> tup
     for i, points in enumerate(arrays):
         if not (np.isfinite(points).all() and np.all(np.diff(points) > 0.0)):
             raise ValueError(f"the breakpoints of coordinate {i} must be finite and strictly increasing; use np.unique")
-    return arrays
+    return tuple((i, points) for i, points in enumerate(arrays) if points.size)
 
 
 def _mask(hessian: HessianKind, blocks: ArrayLike | None, d: int) -> FloatArray | None:

@@ -1,12 +1,367 @@
-"""Figures of a fit."""
+"""Figures of a fit: measured against fitted over time with the modes shaded, residuals, convergence.
+
+Functions that draw one thing take an ``ax`` and return it, so that they fit into any figure; `plot_fit` puts them
+together. Figures are built as objects: nothing here touches pyplot or any other global state.
+
+matplotlib is imported where a figure is made, not at the top: it takes longer to load than half of switchfit.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from switchfit.data import FloatArray
+from switchfit.optimize import IterationRecord
+from switchfit.report.text import run_names, standard_errors_of, transitions_of, unit_of
 from switchfit.result import Fit
+from switchfit.simulate import Comparison, Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+LARGEST_FIGURE = 10
+"""Experiments that one figure shows."""
+COLUMNS = 4
+"""Experiments side by side."""
+
+MODE_COLOURS = ("#eef4fb", "#f9dfbf", "#e2f2df", "#e9d0e2", "#faf7d4", "#c9dfe1", "#ececec", "#dcc9b6")
+"""Light, and of different lightness one after the other, so that they differ in grey too."""
+FIT, DATA, REFERENCE, TRANSITION = "#b2182b", "#222222", "#777777", "#333333"
 
 
-def plot_fit(fit: Fit) -> Any:
-    """Measured against fitted over time."""
-    raise NotImplementedError
+def plot_fit(fit: Fit) -> Figure:
+    """Every channel of every experiment, measured and fitted, with its residuals below; states where there is no data.
+
+    Parameters
+    ----------
+    fit : Fit
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Save it with ``figure.savefig("fit.png")``. Of more than 10 experiments the first 10 are shown.
+    """
+    from matplotlib.figure import Figure
+
+    shown = min(len(fit.trajectories), LARGEST_FIGURE)
+    columns = min(shown, COLUMNS) if shown > 3 else max(shown, 1)
+    blocks = -(-shown // columns)
+    panels = [
+        max(len(_panels(fit, e)) for e in range(b * columns, min((b + 1) * columns, shown))) for b in range(blocks)
+    ]
+    width = {1: 8.0, 2: 5.5, 3: 4.5}.get(columns, 4.0) * columns
+    heights = [0.6 + 2.5 * count for count in panels]
+    figure = Figure(figsize=(width, 0.7 + sum(heights)), layout="constrained")
+    grid = figure.add_gridspec(blocks, columns, height_ratios=heights)
+    colours = mode_colours(fit.trajectories)
+    for e in range(shown):
+        block = figure.add_subfigure(grid[divmod(e, columns)])
+        _draw_experiment(fit, e, block, panels[e // columns], colours)
+    _head(fit, figure, shown, colours)
+    return figure
+
+
+def plot_comparison(comparison: Comparison, trajectory: Trajectory, channel: int, ax: Axes) -> Axes:
+    """One channel over time: samples as dots (a reference signal dashed) and the fitted output as a line.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    trajectory : Trajectory
+        Of the same experiment; its states lend their units to channels of the same name.
+    channel : int
+        Which channel, from 0.
+    ax : matplotlib.axes.Axes
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    measured = comparison.measured[:, channel]
+    if comparison.kind == "measurements":
+        ax.plot(comparison.times, measured, label="measured", zorder=3, **_dots(len(measured)))
+    else:
+        ax.plot(comparison.times, measured, "--", color=REFERENCE, linewidth=1.5, label="reference signal", zorder=3)
+    times, curve = _broken(comparison.curve_times, comparison.curve[:, channel], trajectory)
+    ax.plot(times, curve, "-", color=FIT, linewidth=1.5, label="fitted", zorder=4)
+    ax.set_ylabel(_labelled(comparison.names[channel], trajectory))
+    return _time_axis(ax, trajectory)
+
+
+def plot_residuals(comparison: Comparison, trajectory: Trajectory, channel: int, ax: Axes) -> Axes:
+    """Measured less fitted of one channel over time, with a band of one sigma to either side where it is known.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    trajectory : Trajectory
+    channel : int
+        Which channel, from 0.
+    ax : matplotlib.axes.Axes
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    residual = comparison.residuals[:, channel]
+    ax.axhline(0.0, color=FIT, linewidth=1.0, zorder=2)
+    if comparison.kind == "measurements":
+        ax.plot(comparison.times, residual, zorder=3, **_dots(len(residual)))
+    else:
+        times, line = _broken(comparison.times, residual, trajectory)
+        ax.plot(times, line, "-", color=REFERENCE, linewidth=1.0, zorder=3)
+    if comparison.sigma is not None:
+        sigma = comparison.sigma[:, channel]
+        ax.plot(comparison.times, sigma, ":", color=TRANSITION, linewidth=1.0, zorder=2, label="± sigma")
+        ax.plot(comparison.times, -sigma, ":", color=TRANSITION, linewidth=1.0, zorder=2)
+    unit = unit_of(comparison.names[channel], trajectory)
+    ax.set_ylabel(f"residual\n({unit})" if unit else "residual")
+    ax.margins(y=0.12)
+    return _time_axis(ax, trajectory)
+
+
+def plot_state(trajectory: Trajectory, state: int, ax: Axes) -> Axes:
+    """One state over time.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+    state : int
+        Which state, from 0.
+    ax : matplotlib.axes.Axes
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    times, curve = _broken(trajectory.times, trajectory.states[:, state], trajectory)
+    ax.plot(times, curve, "-", color=FIT, linewidth=1.5, label="fitted", zorder=4)
+    ax.set_ylabel(_labelled(trajectory.state_names[state], trajectory))
+    return _time_axis(ax, trajectory)
+
+
+def plot_modes(
+    trajectory: Trajectory, ax: Axes, *, colours: Mapping[str, str] | None = None, labels: bool = True
+) -> Axes:
+    """Shade the time in which each mode is active, and name the modes above.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+    ax : matplotlib.axes.Axes
+    colours : mapping of mode to colour, optional
+        As from `mode_colours`, so that several axes agree; left out, the modes of this trajectory in their order.
+    labels : bool, optional
+        False leaves the names out. A name that is wider than its mode's time is turned by 90 degrees.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    colours = mode_colours([trajectory]) if colours is None else colours
+    spans = trajectory.mode_spans
+    inches = ax.bbox.width / ax.figure.dpi
+    for mode, begin, end in spans:
+        if not end > begin:
+            continue
+        ax.axvspan(begin, end, color=colours[mode], linewidth=0, zorder=0)
+        room = inches * (end - begin) / (spans[-1][2] - spans[0][1])
+        if labels and room > 0.1:
+            turned = room < 0.085 * len(mode)
+            ax.text(
+                (begin + end) / 2,
+                1.02,
+                mode,
+                transform=ax.get_xaxis_transform(),
+                ha="center",
+                va="bottom",
+                fontsize=9,
+                rotation=90 if turned else 0,
+            )
+    return _time_axis(ax, trajectory)
+
+
+def plot_transitions(times: Sequence[float], errors: Sequence[float], ax: Axes) -> Axes:
+    """Transition times as vertical lines, each in a band of one standard error to either side.
+
+    Parameters
+    ----------
+    times, errors : sequence of float, of the same length
+        No band is drawn for an error that is 0 or NaN.
+    ax : matplotlib.axes.Axes
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    for time, error in zip(times, errors, strict=True):
+        ax.axvline(time, color=TRANSITION, linewidth=0.9, zorder=2)
+        if np.isfinite(error) and error > 0:
+            ax.axvspan(time - error, time + error, color=TRANSITION, alpha=0.22, linewidth=0, zorder=1)
+    return ax
+
+
+def plot_convergence(history: Sequence[IterationRecord], ax: Axes, *, tolerance: float | None = None) -> Axes:
+    """Optimality against iteration on a logarithmic scale.
+
+    Parameters
+    ----------
+    history : sequence of IterationRecord
+        As in `Fit.history`. An optimality of 0 is left out.
+    ax : matplotlib.axes.Axes
+    tolerance : float, optional
+        Drawn as a line.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    optimality = np.array([record.optimality for record in history], dtype=np.float64)
+    shown = np.where(optimality > 0, optimality, np.nan)
+    ax.set_yscale("log")
+    ax.plot([record.iteration for record in history], shown, "o-", color=FIT, markersize=4, linewidth=1.2)
+    if tolerance is not None:
+        ax.axhline(tolerance, color=REFERENCE, linestyle="--", linewidth=1.0)
+        ax.annotate(
+            "tolerance",
+            (0.99, tolerance),
+            xycoords=("axes fraction", "data"),
+            ha="right",
+            va="bottom",
+            color=REFERENCE,
+            fontsize=9,
+        )
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set_xlabel("iteration")
+    ax.set_ylabel("optimality (KKT residual)")
+    return ax
+
+
+def mode_colours(trajectories: Sequence[Trajectory]) -> dict[str, str]:
+    """A colour for each mode that occurs, in the order of first occurrence.
+
+    Parameters
+    ----------
+    trajectories : sequence of Trajectory
+    """
+    names = dict.fromkeys(mode for trajectory in trajectories for mode, _, _ in trajectory.mode_spans)
+    return {name: MODE_COLOURS[k % len(MODE_COLOURS)] for k, name in enumerate(names)}
+
+
+# --- the figure of a fit ----------------------------------------------------------------------------------------------
+
+
+def _panels(fit: Fit, e: int) -> list[tuple[Comparison | None, int]]:
+    """What the panels of an experiment show: (comparison, channel), or (None, state) where there is no data."""
+    channels: list[tuple[Comparison | None, int]] = [(c, k) for c in fit.comparisons[e] for k in range(len(c.names))]
+    return channels or [(None, k) for k in range(len(fit.trajectories[e].state_names))]
+
+
+def _draw_experiment(fit: Fit, e: int, block: Any, rows: int, colours: Mapping[str, str]) -> None:
+    """Draw one experiment into its subfigure, leaving rows free at the bottom that only others need."""
+    trajectory, panels = fit.trajectories[e], _panels(fit, e)
+    with_data = panels[0][0] is not None
+    ratios = [3.0, 1.2] * rows if with_data else [1.0] * rows
+    grid = block.add_gridspec(len(ratios), 1, height_ratios=ratios)
+    errors = standard_errors_of(fit)
+    here = [t for t in transitions_of(fit) if t.experiment == e]
+    times = [t.time for t in here]
+    spread = [np.nan if t.index is None else float(errors[t.index]) for t in here]
+    axes: list[Axes] = []
+    for comparison, k in panels:
+        share = axes[0] if axes else None
+        axes.append(block.add_subplot(grid[len(axes)], sharex=share))
+        if comparison is None:
+            plot_state(trajectory, k, axes[-1])
+        else:
+            plot_comparison(comparison, trajectory, k, axes[-1])
+            axes.append(block.add_subplot(grid[len(axes)], sharex=axes[0]))
+            plot_residuals(comparison, trajectory, k, axes[-1])
+    for number, ax in enumerate(axes):
+        plot_modes(trajectory, ax, colours=colours, labels=number == 0)
+        plot_transitions(times, spread, ax)
+        if ax is not axes[-1]:
+            ax.tick_params(labelbottom=False)
+            ax.set_xlabel("")
+    block.align_ylabels(axes)
+    if len(fit.trajectories) > 1:
+        block.suptitle(run_names(fit)[e], fontsize="medium", fontweight="bold")
+
+
+def _head(fit: Fit, figure: Figure, shown: int, colours: Mapping[str, str]) -> None:
+    """Legend, a warning where the fit did not succeed, and a note where not everything is shown."""
+    from matplotlib.patches import Patch
+
+    handles: dict[str, Any] = {}
+    for ax in figure.axes:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    handles |= _transition_handles(fit)
+    named = {text.get_text() for ax in figure.axes for text in ax.texts}
+    drawn = {mode for trajectory in fit.trajectories[:shown] for mode, a, b in trajectory.mode_spans if b > a}
+    for mode in (mode for mode in colours if mode in drawn - named):  # too short for a name
+        handles[mode] = Patch(facecolor=colours[mode], edgecolor=TRANSITION, linewidth=0.5)
+    figure.legend(handles.values(), handles.keys(), loc="outside upper right", ncols=len(handles), frameon=False)
+    notes = [] if fit.success else [f"Not a minimum: {fit.status.name.lower().replace('_', ' ')}"]
+    if shown < len(fit.trajectories):
+        notes.append(f"{shown} of {len(fit.trajectories)} experiments")
+    if notes:
+        colour = "black" if fit.success else FIT
+        figure.suptitle("; ".join(notes), x=0.01, ha="left", fontweight="bold", fontsize="medium", color=colour)
+
+
+def _transition_handles(fit: Fit) -> dict[str, Any]:
+    """Entries of the legend for the transitions and their standard errors."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    if not any(len(times) for times in fit.transition_times):
+        return {}
+    handles: dict[str, Any] = {"transition": Line2D([], [], color=TRANSITION, linewidth=0.9)}
+    errors = standard_errors_of(fit)
+    if any(t.index is not None and errors[t.index] > 0 for t in transitions_of(fit)):
+        handles["± standard error"] = Patch(color=TRANSITION, alpha=0.22, linewidth=0)
+    return handles
+
+
+# --- parts ------------------------------------------------------------------------------------------------------------
+
+
+def _dots(count: int) -> dict[str, Any]:
+    """Dots that become smaller the more there are; thousands are one picture in a vector file."""
+    size = 4.5 if count <= 100 else 3.0 if count <= 400 else 1.5
+    return {
+        "linestyle": "none",
+        "marker": "o",
+        "markersize": size,
+        "markeredgewidth": 0,
+        "color": DATA,
+        "alpha": 0.8 if count <= 400 else 0.5,
+        "rasterized": count > 5000,
+    }
+
+
+def _broken(times: FloatArray, values: FloatArray, trajectory: Trajectory) -> tuple[FloatArray, FloatArray]:
+    """A curve over the trajectory's nodes with a gap at each transition, where a reset map may make it jump."""
+    if len(times) != len(trajectory.times):
+        return times, values
+    inner = trajectory.segments[1:-1]
+    return np.insert(times, inner, times[inner]), np.insert(values, inner, np.nan)
+
+
+def _labelled(name: str, trajectory: Trajectory) -> str:
+    unit = unit_of(name, trajectory)
+    return f"{name} ({unit})" if unit else name
+
+
+def _time_axis(ax: Axes, trajectory: Trajectory) -> Axes:
+    """The experiment's horizon, labelled."""
+    ax.set_xlim(float(trajectory.times[0]), float(trajectory.times[-1]))
+    ax.set_xlabel("time (s)")
+    return ax

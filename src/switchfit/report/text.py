@@ -163,8 +163,8 @@ def standard_errors_of(fit: Fit) -> FloatArray:
 
 
 def _failure(fit: Fit) -> list[str]:
-    """A line in capitals, unless a minimum was found."""
-    if fit.success:
+    """A line in capitals, unless a minimum was found and it is the only one nearby."""
+    if fit.status.successful:
         return []
     return [f"*** {_FAILURES.get(fit.status.name, 'NOT CONVERGED: the numbers below are not a minimum')}. ***"]
 
@@ -221,8 +221,8 @@ def _quality(fit: Fit) -> Iterator[str]:
         if fit.sigma_known:
             yield from _row("reduced chi-square", f"{variance:.4g}   ({origin}; near 1 where sigma is right)")
         else:
-            noise = f"sigma is unknown, {np.sqrt(variance):.4g} by the residuals"
-            yield from _row("residual variance", f"{variance:.4g}   ({origin}; {noise})")
+            noise = f"so sigma is about {np.sqrt(variance):.4g}"
+            yield from _row("residual variance", f"{variance:.4g}   ({origin}, {noise})")
     yield from _row("integration error", f"{fit.integration_error:.1e}   (of J, relative, by halving all steps)")
 
 
@@ -233,12 +233,13 @@ def _channels(fit: Fit) -> list[str]:
     for name, trajectory, run in zip(run_names(fit), fit.trajectories, fit.comparisons, strict=True):
         for comparison in run:
             for k, channel in enumerate(comparison.names):
+                count, rmse, scaled = _residuals(comparison, k)
                 label = channel if single else f"{name} {channel}"
-                rows.append([label, *_residuals(comparison, k), unit_of(channel, trajectory)])
+                rows.append([label, count, rmse, unit_of(channel, trajectory), scaled])
     if not rows:
         return []
     most = 4 * LISTED_EXPERIMENTS
-    table = _table([["channel", "values", "rmse", "rmse/sigma", ""], *rows[:most]], "<>>><")
+    table = _table([["channel", "values", "rmse", "", "rmse/sigma"], *rows[:most]], "<>><>")
     return ["", *table] + ([f"  and {len(rows) - most} more channels"] if len(rows) > most else [])
 
 
@@ -422,7 +423,8 @@ def _noise(fit: Fit) -> Iterator[str]:
     else:
         yield (
             f"The reduced chi-square is {variance:.3g} where 1 is expected: sigma is too large, or the samples were "
-            f"smoothed before. Standard errors are too large, by a factor of {1 / np.sqrt(variance):.2g} if it is sigma."
+            f"smoothed before. Standard errors are too large, by a factor of {1 / np.sqrt(variance):.2g} if it is "
+            "sigma."
         )
 
 
@@ -451,14 +453,7 @@ def _row(label: str, text: str) -> list[str]:
 
 def _wrapped(text: str, first: str, others: str) -> list[str]:
     return textwrap.wrap(
-        text,
-        WIDTH,
-        initial_indent=first,
-        subsequent_indent=others,
-        break_long_words=False,
-        break_on_hyphens=False,
-        replace_whitespace=False,
-        drop_whitespace=True,
+        text, WIDTH, initial_indent=first, subsequent_indent=others, break_long_words=False, break_on_hyphens=False
     )
 
 

@@ -1,0 +1,1 @@
+"""Benchmarks of switchfit: ``python -m benchmarks``. What is compared with what: README.md beside this file."""

@@ -1,0 +1,112 @@
+"""The benchmark problem: the paper's simulated vehicle, from (tau_1, tau_2, mu) = (5, 9, 0.8) to (6, 10, 0.7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+import switchfit as sf
+from switchfit.evaluate import Evaluator
+from switchfit.mesh import Mesh, rows
+from switchfit.model import float64
+from switchfit.models import skid_steer
+
+SEQUENCE = ("stick", "slip", "stick")
+START, TRUTH, HORIZON = (5.0, 9.0), (6.0, 10.0), (0.0, 15.0)
+MU_START, MU_TRUTH = 0.8, 0.7
+MINIMUM_DURATION = 1e-3
+
+
+def with_reference(knot_step: float | None = None) -> sf.Problem:
+    """Cost 1/2 |x - x_m|^2, x_m a spline through the true trajectory, all six states.
+
+    The knots of the spline are the steps of the true trajectory, or `knot_step` apart. Knots are nodes of the mesh.
+    """
+    nothing = sf.RunningCost(lambda t, x, p: 0.0)
+    data: list = [nothing]
+    if knot_step is not None:
+        times = np.linspace(*HORIZON, round((HORIZON[1] - HORIZON[0]) / knot_step) + 1)
+        data.append(sf.Measurements(times, np.zeros((len(times), 6))))
+    run = sf.Experiment(data, SEQUENCE, TRUTH, *HORIZON)
+    path = sf.simulate(sf.Problem(skid_steer(), run, {"mu": MU_TRUTH}))
+    keep = np.append(True, np.diff(path.times) > 0)
+    if knot_step is not None:
+        keep &= np.isin(path.times, times)
+    reference = sf.ReferenceSignal.from_samples(path.times[keep], path.states[keep])
+    return _problem(reference)
+
+
+def without_reference() -> sf.Problem:
+    """Cost 1/2 |x|^2: nothing but the dynamics costs time."""
+    return _problem(sf.RunningCost(lambda t, x, p: 0.5 * (x @ x)))
+
+
+def _problem(data: object) -> sf.Problem:
+    run = sf.Experiment(data, SEQUENCE, START, *HORIZON)
+    return sf.Problem(
+        skid_steer(), run, {"mu": sf.Parameter(MU_START, lower=0.05, upper=2.0)}, min_duration=MINIMUM_DURATION
+    )
+
+
+@dataclass(frozen=True)
+class Row:
+    """One Runge-Kutta step as CasADi gets it.
+
+    Attributes
+    ----------
+    mode : "stick" or "slip"
+    start, end : times; `starts_at` and `ends_at` say which transition (from 0) they are, -1 for none
+    origin : time from which the reference counts
+    coefficients : (4, 6) of the reference in this row, lowest power first; zeros without a reference
+    """
+
+    mode: str
+    start: float
+    end: float
+    starts_at: int
+    ends_at: int
+    origin: float
+    coefficients: np.ndarray
+
+
+def table_of_rows(evaluator: Evaluator, theta: np.ndarray) -> list[Row]:
+    """The rows that switchfit steps through at theta, without its padding.
+
+    A row of length zero beside a transition stays: its derivative does not vanish.
+    """
+    arguments = evaluator.arguments[0]
+    with float64():
+        layout = rows(arguments.nodes, np.asarray(theta[:2]), np.float64(1.0))
+        layout = jax.tree.map(np.asarray, layout)
+    signals = np.asarray(arguments.signals)
+    nodes = np.asarray(arguments.nodes)
+    table = []
+    moves = (layout.starts_at >= 0) | (layout.ends_at >= 0)
+    for q, k in np.argwhere((layout.end > layout.start) | moves):
+        cell = layout.cell[q, k]
+        coefficients = signals[cell] if signals.shape[2] else np.zeros((4, 6))
+        table.append(
+            Row(
+                SEQUENCE[layout.segment[q]],
+                float(layout.start[q, k]),
+                float(layout.end[q, k]),
+                int(layout.starts_at[q, k]),
+                int(layout.ends_at[q, k]),
+                float(nodes[cell]),
+                coefficients,
+            )
+        )
+    return table
+
+
+def evaluator_with(problem: sf.Problem, cells: int | None) -> Evaluator:
+    """The problem on the mesh it chooses itself, or on one of `cells` equal cells.
+
+    With a reference the coarse mesh ignores the knots: the reference then is, in each cell, the cubic of the knot
+    interval that holds the cell's middle. Both sides of the comparison get the same cubics.
+    """
+    if cells is None:
+        return Evaluator(problem)
+    return Evaluator(problem, meshes=[Mesh.from_times(np.linspace(*HORIZON, cells + 1))])

@@ -1,0 +1,20 @@
+"""Sphinx configuration; `make docs` builds to out/docs."""
+
+from importlib.metadata import version as installed_version
+
+project = "switchfit"
+author = "switchfit developers"
+version = release = installed_version("switchfit")
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.napoleon"]
+source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
+exclude_patterns = ["_build"]
+html_theme = "alabaster"
+html_theme_options = {"description": "When did it switch, and what were the parameters?", "page_width": "1100px"}
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"
+autodoc_default_options = {"members": True}
+napoleon_google_docstring = False
+napoleon_use_ivar = True
+myst_enable_extensions = ["dollarmath"]

@@ -1,0 +1,296 @@
+"""Test systems: nonlinear, time-dependent, with parameters in several modes and every kind of cost at once.
+
+The weight of each kind of cost, the time at which everything happens and whether two modes are equal are fixed
+parameters, that is arguments: one compiled program serves all of these variations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from switchfit.data import Input, Measurements, ReferenceSignal, RunningCost, TerminalCost
+from switchfit.derivatives.adjoint import paper_derivatives
+from switchfit.derivatives.discrete import adjoint_hessian, gauss_newton_hessian
+from switchfit.derivatives.first_order import first_order
+from switchfit.derivatives.forward import forward_hessian
+from switchfit.experiment import Experiment, Parameter
+from switchfit.mesh import Mesh
+from switchfit.model import Arguments, Model, float64
+from switchfit.problem import Problem
+from switchfit.propagate import path_cost, propagate
+from switchfit.system import HybridSystem
+
+KINDS = ("running", "reference", "samples", "terminal", "all")
+CELLS = 176
+"""Cells of every mesh, padded: one compiled program for coarse and fine ones."""
+
+
+def mode_a(t, x, p):
+    s = t - p["shift"]
+    return jnp.array([x[1] * jnp.cos(s) + 0.2 * x[0] * x[1], -p["a"] * x[0] + 0.3 * x[1] ** 2 * jnp.sin(s)])
+
+
+def mode_b(t, x, p):
+    s = t - p["shift"]
+    own = jnp.array([p["b"] * x[1] ** 2 - x[0] + 0.2 * jnp.cos(2 * s) * x[1], -x[0] * jnp.exp(-p["a"] * s)])
+    return (1 - p["equal"]) * own + p["equal"] * mode_a(t, x, p)
+
+
+def mode_c(t, x, p):
+    s = t - p["shift"]
+    return jnp.array([p["a"] * s - x[0] * x[1], p["b"] * jnp.sin(x[0] * s)])
+
+
+def driven_a(t, x, p, u):
+    return mode_a(t, x, p) + u * jnp.array([x[1], 0.3 * p["b"]])
+
+
+def driven_b(t, x, p, u):
+    return mode_b(t, x, p) + u**2 * jnp.array([p["a"], x[0]])
+
+
+def stiff_b(t, x, p):
+    """The second state follows the first one within a thousandth of the horizon."""
+    s = t - p["shift"]
+    return jnp.array([p["b"] * jnp.cos(s) - x[0] * x[1], -1000.0 * p["a"] * (x[1] - jnp.cos(p["b"] * x[0] + s))])
+
+
+def reset(t, x, p):
+    s = t - p["shift"]
+    return jnp.array([1.1 * x[0] + p["a"] * s * x[1] ** 2, 0.2 * p["b"] ** 2 * jnp.sin(x[0]) - 0.7 * x[1]])
+
+
+def initial_state(p):
+    return jnp.array([p["a"], 1.0 - 0.2 * p["b"] ** 2])
+
+
+def running(t, x, p):
+    s = t - p["shift"]
+    return p["w_running"] * (jnp.sin(x[0]) * x[1] ** 2 * p["a"] * jnp.cos(s) + jnp.exp(0.3 * x[0]) * p["b"] * x[1] * s)
+
+
+def terminal(x, p):
+    return p["w_terminal"] * (x[0] * x[1] ** 2 * p["b"] + p["a"] * x[0] ** 3)
+
+
+def observed_continuously(t, x, p):
+    return jnp.array([x[0] * x[1] + p["b"] * (t - p["shift"])])
+
+
+def observed_at_samples(t, x, p):
+    return jnp.array([p["a"] * x[1] ** 2 + (t - p["shift"]) * x[0], x[0] + p["b"] * x[1]])
+
+
+NODES = np.linspace(0.0, 2.0, 21)
+KNOTS = NODES[[0, 5, 10, 15, 20]]
+# Geometric towards the ends of the stiff mode, where x and the adjoints have layers.
+LAYERED = np.concatenate([NODES, NODES[6] + 0.1 * 0.5 ** np.arange(1, 12), NODES[13] - 0.1 * 0.5 ** np.arange(1, 12)])
+SAMPLE_TIMES = NODES[[0, 2, 5, 9, 10, 14, 17, 20]]
+P0 = np.array([0.8, 1.2])
+
+SYSTEMS = {
+    "plain": (HybridSystem({"A": mode_a, "B": mode_b, "C": mode_c}, [0.7, 0.9]), ("A", "B", "C"), NODES[[6, 13]]),
+    "resets": (
+        HybridSystem({"A": driven_a, "B": driven_b}, initial_state, {("A", "B"): reset}),
+        ("A", "B", "A", "B"),
+        NODES[[4, 8, 13]],
+    ),
+    "stiff": (
+        HybridSystem({"A": mode_a, "S": stiff_b}, initial_state, {("S", "A"): reset}),
+        ("A", "S", "A"),
+        NODES[[6, 13]],
+    ),
+}
+
+
+def problem_of(name: str, shift: float = 0.0, parts: tuple[str, ...] = KINDS[:4]) -> Problem:
+    """One of `SYSTEMS` with the given kinds of cost."""
+    system, sequence, tau = SYSTEMS[name]
+    values = np.stack([np.cos(3 * SAMPLE_TIMES), 1.0 + SAMPLE_TIMES], axis=1)
+    values[3, 0] = np.nan
+    data = {
+        "running": RunningCost(running),
+        "reference": ReferenceSignal.from_samples(
+            KNOTS + shift, np.sin(2 * KNOTS), observe=observed_continuously, weights=[1.3]
+        ),
+        "samples": Measurements(SAMPLE_TIMES + shift, values, observe=observed_at_samples, sigma=[0.9, 1.2]),
+        "terminal": TerminalCost(terminal),
+    }
+    inputs = Input(KNOTS + shift, np.cos(KNOTS), kind="linear") if name == "resets" else None
+    experiment = Experiment([data[part] for part in parts], sequence, tau + shift, shift, shift + 2.0, inputs=inputs)
+    weights = {q: Parameter(1.0, fixed=True) for q in ("w_running", "w_terminal")}
+    parameters = {"a": P0[0], "b": P0[1], "shift": Parameter(shift, fixed=True), "equal": Parameter(0.0, fixed=True)}
+    solver = "stiff" if name == "stiff" else "explicit"
+    return Problem(system, experiment, parameters | weights, solver=solver)
+
+
+def padded_mesh(times: np.ndarray, cells: int = CELLS) -> Mesh:
+    """A mesh of given nodes, padded to a given number of cells."""
+    return Mesh(np.concatenate([times, np.full(cells + 1 - len(times), times[-1])]), len(times) - 1)
+
+
+def weighted(arguments: Arguments, kind: str, equal: float = 0.0) -> Arguments:
+    """Arguments of `problem_of` that leave one kind of cost, or all; `equal` = 1 makes mode B equal to mode A."""
+    on = {name: float(kind in (name, "all")) for name in KINDS}
+    with float64():
+        return arguments._replace(
+            fixed=(arguments.fixed[0], *(jnp.asarray(q) for q in (equal, on["running"], on["terminal"]))),
+            weights=tuple(W * on["reference"] for W in arguments.weights),
+            samples=tuple(s._replace(weight=s.weight * on["samples"]) for s in arguments.samples),
+        )
+
+
+@dataclass(frozen=True)
+class Derivatives:
+    """Cost, gradient (D,) and Hessian (D, D), and what else there is."""
+
+    cost: float
+    gradient: np.ndarray
+    hessian: np.ndarray
+    gauss_newton: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, values: Any) -> Derivatives:
+        cost, *rest = values
+        return cls(float(cost), *(np.asarray(value) for value in rest))
+
+
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`jax.jit` in float64, compiled quickly: these programs run for milliseconds."""
+    program = jax.jit(function, compiler_options={"xla_backend_optimization_level": 0})
+
+    def call(arguments: Arguments, tau: Any, p: Any, side: int = 1) -> Any:
+        with float64():
+            return jax.block_until_ready(program(arguments, jnp.asarray(tau), jnp.asarray(p), jnp.asarray(side)))
+
+    return call
+
+
+class Case:
+    """A problem, and all ways to differentiate its cost, each compiled once."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.structure = problem.structures[0]
+        self.tau = problem.experiments[0].initial_times
+        self.N = len(self.tau)
+
+    def arguments(self, kind: str = "all", *, halvings: int = 0, equal: float = 0.0) -> Arguments:
+        """Arguments of one of `SYSTEMS`, on the mesh of `NODES` with each cell halved some times."""
+        times = np.unique(LAYERED) if self.structure.solver == "stiff" else NODES
+        for _ in range(halvings):
+            times = np.sort(np.concatenate([times, 0.5 * (times[1:] + times[:-1])]))
+        return weighted(self.problem.arguments(0, padded_mesh(times)), kind, equal)
+
+    @cached_property
+    def _paper(self) -> Callable[..., Any]:
+        return compiled(lambda arguments, *at: paper_derivatives(Model(self.structure, arguments), *at))
+
+    @cached_property
+    def _discrete(self) -> Callable[..., Any]:
+        def evaluate(arguments, tau, p, side):
+            model = Model(self.structure, arguments)
+            first = first_order(model, tau, p, side)
+            gauss_newton = gauss_newton_hessian(model, first, p)
+            return first.cost, first.gradient, adjoint_hessian(model, first, tau, p), gauss_newton
+
+        return compiled(evaluate)
+
+    @cached_property
+    def _forward(self) -> Callable[..., Any]:
+        def evaluate(arguments, tau, p, side):
+            model = Model(self.structure, arguments)
+            first = first_order(model, tau, p, side)
+            return first.cost, first.gradient, forward_hessian(model, first, tau, p)
+
+        return compiled(evaluate)
+
+    @cached_property
+    def _autodiff(self) -> Callable[..., Any]:
+        # Forward over forward: it compiles fastest, and passes through the iteration of an implicit method.
+        def evaluate(arguments, tau, p, side):
+            def cost(theta):
+                J = self._simulate(arguments, theta, side)
+                return J, J
+
+            def gradient(theta):
+                g, J = jax.jacfwd(cost, has_aux=True)(theta)
+                return g, (J, g)
+
+            hessian, (J, g) = jax.jacfwd(gradient, has_aux=True)(jnp.concatenate([tau, p]))
+            return J, g, hessian
+
+        return compiled(evaluate)
+
+    @cached_property
+    def _cost(self) -> Callable[..., Any]:
+        return compiled(lambda arguments, tau, p, side: self._simulate(arguments, jnp.concatenate([tau, p]), side))
+
+    def _simulate(self, arguments, theta, side):
+        model, tau, p = Model(self.structure, arguments), theta[: self.N], theta[self.N :]
+        return path_cost(model, propagate(model, tau, p, side), p)
+
+    def cost(self, *given: Any) -> float:
+        """The simulated cost."""
+        return float(self._cost(*given))
+
+    def paper(self, *given: Any) -> Derivatives:
+        """By the paper's adjoint equations."""
+        return Derivatives.of(self._paper(*given))
+
+    def discrete(self, *given: Any) -> Derivatives:
+        """Of the discretised cost by the adjoint."""
+        return Derivatives.of(self._discrete(*given))
+
+    def forward(self, *given: Any) -> Derivatives:
+        """Of the discretised cost in forward mode."""
+        return Derivatives.of(self._forward(*given))
+
+    def autodiff(self, *given: Any) -> Derivatives:
+        """Of the discretised cost by JAX alone: simulate, then differentiate twice."""
+        return Derivatives.of(self._autodiff(*given))
+
+
+@cache
+def case(name: str) -> Case:
+    """The case of one of `SYSTEMS`, shared by all tests of a run."""
+    return Case(problem_of(name))
+
+
+# A system whose cost has a closed form
+
+
+def constant_velocity(t, x, p):
+    return p["q"] * jnp.ones(1)
+
+
+def decay(t, x, p):
+    return -x
+
+
+def quadratic_reset(t, x, p):
+    return p["q"] * x**2 + t
+
+
+def half_square(t, x, p):
+    return 0.5 * x[0] ** 2
+
+
+def closed_form_case(*, transitions: int, q: Parameter) -> Case:
+    """x' = q from 0; then, at tau, x becomes ``q x^2 + tau`` and x' = -x, to T = 2; ell = x^2 / 2."""
+    system = HybridSystem({"A": constant_velocity, "B": decay}, [0.0], {("A", "B"): quadratic_reset})
+    sequence, tau = (("A", "B"), [0.9]) if transitions else (("A",), [])
+    return Case(Problem(system, Experiment(RunningCost(half_square), sequence, tau, 0.0, 2.0), {"q": q}))
+
+
+def closed_form(tau, q):
+    """The cost of `closed_form_case` with one transition."""
+    opened = q * (q * tau) ** 2 + tau
+    return q**2 * tau**3 / 6 + opened**2 * (1 - jnp.exp(-2 * (2.0 - tau))) / 4

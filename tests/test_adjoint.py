@@ -1,0 +1,159 @@
+"""The paper's adjoint equations against the derivatives of the discretised cost, block by block.
+
+Both converge to the derivatives of the cost, so the gap between them closes at the order of the integrator (5).
+On the diagonal of the tau block it is one less: the local error of the row that ends at tau_i goes with the sixth power
+of its length, and tau_i differentiates it twice. A mistake in a formula leaves a gap that does not close at all.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from systems import KINDS, NODES, P0, Case, Parameter, case, closed_form, closed_form_case, compiled, padded_mesh
+
+from switchfit.model import Model, float64
+from switchfit.propagate import propagate
+
+# A sample inside a stiff mode starts a layer of the adjoints, which this mesh does not resolve.
+SMOOTH_KINDS = ("running", "reference", "terminal")
+VARIATIONS = [("plain", kind) for kind in reversed(KINDS)]
+VARIATIONS += [("resets", kind) for kind in reversed(KINDS)]
+VARIATIONS += [("stiff", kind) for kind in SMOOTH_KINDS]
+
+
+def blocks(N: int, gradient: np.ndarray, hessian: np.ndarray) -> dict[str, float]:
+    """Largest entry of each block of a gradient and a Hessian."""
+    parts = {
+        "D_tau J": gradient[:N],
+        "D_p J": gradient[N:],
+        "tau-tau, i = j": np.diag(hessian)[:N],
+        "tau-tau, i > j": hessian[:N, :N][np.tril_indices(N, -1)],
+        "tau-p": hessian[:N, N:],
+        "p-p": hessian[N:, N:],
+    }
+    return {name: float(np.abs(part).max()) for name, part in parts.items()}
+
+
+ORDER = {"tau-tau, i = j": 4.0}
+ROUNDING = {"stiff": 1e-10}
+"""Relative gaps that need not close any further; the Jacobian of the stiff mode amplifies rounding."""
+BLOCKS = ("D_tau J", "D_p J", "tau-tau, i = j", "tau-tau, i > j", "tau-p", "p-p")
+
+
+@cache
+def gaps(name: str, kind: str) -> list[dict[str, float]]:
+    """Gap of each block, relative to the largest entry, on meshes that are halved again and again."""
+    this = case(name)
+    found = []
+    for halvings in (1, 2) if name == "stiff" else (2, 3):
+        given = this.arguments(kind, halvings=halvings), this.tau, P0
+        paper, discrete = this.paper(*given), this.discrete(*given)
+        assert paper.cost == pytest.approx(discrete.cost, rel=1e-12)
+        gradient, hessian = np.abs(discrete.gradient).max(), np.abs(discrete.hessian).max()
+        found.append(
+            blocks(
+                this.N,
+                (paper.gradient - discrete.gradient) / gradient,
+                (paper.hessian - discrete.hessian) / hessian,
+            )
+        )
+    return found
+
+
+@pytest.mark.parametrize("block", BLOCKS)
+@pytest.mark.parametrize(("name", "kind"), VARIATIONS)
+def test_gap_closes_at_the_order_of_the_integrator(name: str, kind: str, block: str) -> None:
+    coarse, fine = (gap[block] for gap in gaps(name, kind))
+    at_least = ORDER.get(block, 5.0) - 0.8
+    assert fine < ROUNDING.get(name, 0.0) or np.log2(coarse / fine) > at_least, f"{block}: {coarse:.1e} to {fine:.1e}"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ["plain", "resets"])
+def test_p_block_is_symmetric_without_symmetrising(name: str, kind: str) -> None:
+    this = case(name)
+    asymmetry = []
+    for halvings in (1, 3):
+        H = this.paper(this.arguments(kind, halvings=halvings), this.tau, P0).hessian[this.N :, this.N :]
+        asymmetry.append(np.abs(H - H.T).max() / np.abs(H).max())
+    assert asymmetry[1] < 1e-10
+    assert asymmetry[1] < asymmetry[0] / 2**8
+
+
+def test_equal_neighbouring_modes_give_zero_rows() -> None:
+    this = case("plain")
+    found = this.paper(this.arguments(equal=1.0), this.tau, P0)
+    assert np.abs(found.hessian[1:, 1:]).max() > 1.0
+    np.testing.assert_allclose(found.gradient[0], 0.0, atol=1e-13)
+    np.testing.assert_allclose(found.hessian[0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(found.hessian[:, 0], 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", ["paper", "discrete"])
+def test_one_sided_derivatives_at_a_sample_differ_by_dell_x(method: str) -> None:
+    this = case("plain")
+    tau = NODES[[5, 13]]  # the first one at a sample
+    arguments = this.arguments("samples", halvings=2)
+    left, right = (getattr(this, method)(arguments, tau, P0, side).gradient for side in (-1, 1))
+
+    def Dell_X(arguments, tau, p, side):  # noqa: N802
+        model = Model(this.structure, arguments)
+        x = propagate(model, tau, p, side).before_transition(0)
+        sample = jax.tree.map(lambda a: a[2], arguments.samples[0])
+        Dell = jax.grad(lambda x: model.sample_cost(0, sample, x, p))(x)
+        mode_a, mode_b = (model.structure.modes[i](tau[0], x, model.parameters(p)) for i in (0, 1))
+        return Dell @ (mode_a - mode_b)
+
+    expected = float(compiled(Dell_X)(arguments, tau, P0))
+    assert abs(expected) > 0.1
+    np.testing.assert_allclose((left - right)[0], expected, rtol=1e-6)
+
+
+def test_derivatives_at_a_sample_converge_from_both_sides() -> None:
+    this = case("resets")
+    tau = np.array([NODES[4], NODES[9], NODES[14]])
+    for side in (-1, 1):
+        given = this.arguments(halvings=3), tau, P0, side
+        paper, discrete = this.paper(*given), this.discrete(*given)
+        np.testing.assert_allclose(paper.gradient, discrete.gradient, atol=1e-7)
+        np.testing.assert_allclose(paper.hessian, discrete.hessian, atol=1e-6)
+
+
+def test_coinciding_transitions() -> None:
+    this = case("resets")
+    given = this.arguments(halvings=3), NODES[[4, 4, 13]], P0
+    np.testing.assert_allclose(this.paper(*given).hessian, this.discrete(*given).hessian, atol=1e-6)
+
+
+def closed_form_arguments(this: Case):
+    return this.problem.arguments(0, padded_mesh(np.linspace(0.0, 2.0, 41), 40))
+
+
+@pytest.mark.parametrize("method", ["paper", "discrete"])
+def test_closed_form_with_reset_map(method: str) -> None:
+    this = closed_form_case(transitions=1, q=Parameter(0.7))
+    found = getattr(this, method)(closed_form_arguments(this), [0.9], [0.7])
+    with float64():
+        at = jnp.array([0.9, 0.7])
+        gradient, hessian = (d(lambda z: closed_form(z[0], z[1]))(at) for d in (jax.grad, jax.hessian))
+    np.testing.assert_allclose(found.gradient, gradient, rtol=1e-8)
+    np.testing.assert_allclose(found.hessian, hessian, rtol=1e-6)
+
+
+def test_without_parameters() -> None:
+    this = closed_form_case(transitions=1, q=Parameter(0.7, fixed=True))
+    found = this.paper(closed_form_arguments(this), [0.9], np.zeros(0))
+    with float64():
+        expected = jax.hessian(closed_form)(0.9, 0.7)
+    assert found.hessian.shape == (1, 1)
+    np.testing.assert_allclose(found.hessian[0, 0], expected, rtol=1e-6)
+
+
+def test_without_transitions() -> None:
+    this = closed_form_case(transitions=0, q=Parameter(0.7))
+    found = this.paper(closed_form_arguments(this), np.zeros(0), [0.7])
+    np.testing.assert_allclose([found.gradient[0], found.hessian[0, 0]], [0.7 * 8 / 3, 8 / 3], rtol=1e-12)

@@ -1,0 +1,310 @@
+"""The command line: what it writes, what it prints where, and its exit codes."""
+
+import csv
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import switchfit as sf
+from switchfit import cli
+from switchfit.io.problem_file import load_problem
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+PROBLEM = """
+model = "room.py:room"
+
+[parameters]
+heating = 0.4
+
+[[experiments]]
+mode_sequence = ["on", "off"]
+transition_times = [2.0]
+t0 = 0.0
+tf = 6.0
+
+[[experiments.data]]
+file = "log.csv"
+time = "t"
+columns = ["T"]
+sigma = 0.1
+"""
+
+ROOM = """
+import switchfit as sf
+
+def on(t, x, p):
+    return p["heating"] - 0.05 * x
+
+def off(t, x, p):
+    return -0.05 * x
+
+room = sf.HybridSystem(modes={"on": on, "off": off}, initial_state=[0.0], state_names=("T",))
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A problem with an exact answer: heating 0.5 until t = 3.2."""
+    folder = tmp_path_factory.mktemp("room")
+    (folder / "problem.toml").write_text(PROBLEM)
+    (folder / "room.py").write_text(ROOM)
+    times = np.arange(0.25, 6.0, 0.5)
+    heated = 10 * (1 - np.exp(-0.05 * np.minimum(times, 3.2)))
+    values = heated * np.exp(-0.05 * np.maximum(times - 3.2, 0))
+    rows = "".join(f"{t},{v!r}\n" for t, v in zip(times, values.tolist(), strict=True))
+    (folder / "log.csv").write_text("t,T\n" + rows)
+    return folder
+
+
+def run(*arguments):
+    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+
+
+def test_fit_converged(folder, tmp_path):
+    out = tmp_path / "a" / "b"
+    result = run("fit", folder / "problem.toml", "--out", out)
+    assert result.exit_code == 0, result.stderr
+    assert sorted(path.name for path in out.iterdir()) == ["estimate.json", "fit.png", "report.txt"]
+    assert (out / "report.txt").read_text().strip() == result.stdout.strip()
+    assert "heating" in result.stdout
+    assert "tau_1" in result.stdout
+    assert result.stderr == f"written to {out}\n"
+    estimate = sf.Estimate.load(out / "estimate.json")
+    np.testing.assert_allclose(estimate.theta, [3.2, 0.5], rtol=1e-5)
+    assert (out / "fit.png").read_bytes().startswith(b"\x89PNG")
+    umask = os.umask(0)
+    os.umask(umask)
+    assert (out / "report.txt").stat().st_mode & 0o777 == 0o666 & ~umask
+
+
+def test_fit_not_converged_writes_what_was_found(folder, tmp_path):
+    result = run("fit", folder / "problem.toml", "--out", tmp_path, "--max-iterations", 1, "--no-figures")
+    assert result.exit_code == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["estimate.json", "report.txt"]
+    assert "not converged. Stopped after 1 iterations" in result.stderr
+    assert json.loads((tmp_path / "estimate.json").read_text())
+
+
+def test_fit_without_out_writes_nothing(folder):
+    before = sorted(folder.iterdir())
+    result = run("fit", folder / "problem.toml", "--max-iterations", 0)
+    assert result.exit_code == 1
+    assert "heating" in result.stdout
+    assert [p for p in sorted(folder.iterdir()) if p.name != "__pycache__"] == [
+        p for p in before if p.name != "__pycache__"
+    ]
+
+
+def test_options_win_over_the_file(folder, tmp_path, monkeypatch):
+    (folder / "options.toml").write_text(PROBLEM + '\n[options]\nhessian = "none"\ntolerance = 1e-3\n')
+    got = {}
+
+    def estimate(problem, **options):
+        got.update(options)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(sf, "estimate", estimate)
+    result = run("fit", folder / "options.toml", "--hessian", "gauss-newton", "--max-iterations", 7)
+    assert result.exit_code == 2
+    assert result.stderr == "switchfit: enough\n"
+    del got["callback"]
+    assert got == {"hessian": "gauss-newton", "tolerance": 1e-3, "max_iterations": 7}
+
+
+def test_interrupt_ends_the_fit_and_writes(folder, tmp_path, monkeypatch):
+    real = sf.estimate
+
+    def estimate(problem, callback, **options):
+        def interrupted(record):
+            signal.raise_signal(signal.SIGINT)
+            return callback(record)
+
+        return real(problem, callback=interrupted, **options)
+
+    monkeypatch.setattr(sf, "estimate", estimate)
+    before = signal.getsignal(signal.SIGINT)
+    result = run("fit", folder / "problem.toml", "--out", tmp_path, "--no-figures")
+    assert result.exit_code == 1
+    assert "stopping after this iteration" in result.stderr
+    assert "Interrupted after 1 iterations" in result.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["estimate.json", "report.txt"]
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_second_interrupt_stops_at_once(folder, monkeypatch):
+    def estimate(problem, callback, **options):
+        signal.raise_signal(signal.SIGINT)
+        assert callback(None)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(sf, "estimate", estimate)
+    result = run("fit", folder / "problem.toml")
+    assert result.exit_code == 1
+    assert "interrupted before there was anything to write" in result.stderr
+
+
+def test_check(folder):
+    result = run("check", folder / "problem.toml")
+    assert result.exit_code == 0, result.stderr
+    assert "12 samples of T" in result.stdout
+    assert "1, 2, 3 expected): passed" in result.stdout
+    assert "the data determine all 2 unknowns" in result.stdout
+
+
+def test_check_fails_where_derivatives_are_wrong(folder, monkeypatch):
+    class Wrong:
+        passed = False
+
+    monkeypatch.setattr(sf, "check_derivatives", lambda problem: Wrong())
+    assert run("check", folder / "problem.toml").exit_code == 1
+
+
+def test_simulate(folder, tmp_path):
+    result = run("simulate", folder / "problem.toml", "--out", tmp_path / "new" / "x.csv")
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout == ""
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "new" / "x.csv").read_text())))
+    assert list(rows[0]) == ["experiment", "t", "mode", "T"]
+    times = np.array([float(row["t"]) for row in rows])
+    states = np.array([float(row["T"]) for row in rows])
+    on = np.array([row["mode"] == "on" for row in rows])
+    assert {row["mode"] for row in rows} == {"on", "off"}
+    assert {row["experiment"] for row in rows} == {"run1"}
+    assert times[on].max() == times[~on].min() == 2.0
+    np.testing.assert_allclose(states[on], 8 * (1 - np.exp(-0.05 * times[on])), atol=1e-8)
+
+
+def test_version_and_help():
+    result = run("--version")
+    assert result.exit_code == 0
+    assert result.stdout == f"switchfit {sf.__version__}\n"
+    for arguments in (["--help"], ["fit", "--help"], ["check", "--help"], ["simulate", "--help"]):
+        result = run(*arguments)
+        assert result.exit_code == 0
+        assert "Usage" in result.stdout
+
+
+# --- what is wrong is said on stderr, exit code 2, no traceback -------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", [["fit"], ["check"], ["simulate", "--out", "x.csv"]])
+def test_missing_problem_file(command, tmp_path):
+    result = run(command[0], tmp_path / "none.toml", *command[1:])
+    assert result.exit_code == 2
+    assert (
+        result.stderr
+        == f"switchfit: There is no problem file {tmp_path / 'none.toml'}; check the name and the folder.\n"
+    )
+    assert result.stdout == ""
+
+
+def test_unknown_option_is_exit_code_2(folder):
+    assert run("fit", folder / "problem.toml", "--hessian", "newton").exit_code == 2
+    assert run("fit", folder / "problem.toml", "--max-iterations", -1).exit_code == 2
+    assert run("fit").exit_code == 2
+
+
+def test_bad_setting_is_exit_code_2(folder):
+    result = run("fit", folder / "problem.toml", "--tolerance", 0)
+    assert result.exit_code == 2
+    assert result.stderr == "switchfit: tolerance must be positive; got 0.0.\n"
+
+
+def test_model_that_raises(folder):
+    (folder / "bad.py").write_text("import switchfit as sf\n\n1 / 0\n")
+    (folder / "bad.toml").write_text(PROBLEM.replace("room.py", "bad.py"))
+    result = run("check", folder / "bad.toml")
+    assert result.exit_code == 2
+    assert f"{folder / 'bad.py'}, line 3: ZeroDivisionError: division by zero." in result.stderr
+    assert "Traceback" not in result.stderr
+    result = run("check", folder / "bad.toml", "--debug")
+    assert result.exit_code == 2
+    assert "Traceback" in result.stderr
+
+
+def test_model_that_raises_later(folder, monkeypatch):
+    (folder / "late.py").write_text(ROOM + "\ndef late():\n    raise LookupError('not today')\n")
+    (folder / "late.toml").write_text(PROBLEM.replace("room.py", "late.py"))
+    late = load_problem(folder / "late.toml").problem.system.modes["on"].__globals__["late"]
+    monkeypatch.setattr(sf, "check_derivatives", lambda problem: late())
+    result = run("check", folder / "late.toml")
+    assert result.exit_code == 2
+    assert "late.py, line 13, in late: LookupError: not today. (--debug shows the full traceback.)" in result.stderr
+
+
+def test_error_of_our_own_is_not_hidden(folder, monkeypatch):
+    def broken(problem):
+        raise ZeroDivisionError("ours")
+
+    monkeypatch.setattr(sf, "check_derivatives", broken)
+    result = run("check", folder / "problem.toml")
+    assert result.exit_code == 3
+    assert "ZeroDivisionError: ours" in result.stderr
+    assert "please report it" in result.stderr
+
+
+def test_folder_that_cannot_be_made(folder, tmp_path):
+    (tmp_path / "file").write_text("")
+    result = run("fit", folder / "problem.toml", "--out", tmp_path / "file")
+    assert result.exit_code == 2
+    assert f"the folder {tmp_path / 'file'} cannot be made" in result.stderr
+
+
+def test_file_that_cannot_be_written(folder, tmp_path):
+    (tmp_path / "x.csv").mkdir()
+    result = run("simulate", folder / "problem.toml", "--out", tmp_path / "x.csv")
+    assert result.exit_code == 2
+    assert "x.csv cannot be written" in result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["x.csv"]
+
+
+def test_writing_is_all_or_nothing(tmp_path):
+    path = tmp_path / "report.txt"
+    path.write_text("before")
+
+    def half(target):
+        target.write_text("half")
+        raise RuntimeError("stopped")
+
+    with pytest.raises(RuntimeError, match="stopped"):
+        cli._write(path, half)
+    assert path.read_text() == "before"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+# --- progress, and all of it ------------------------------------------------------------------------------------------
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_progress_only_on_a_terminal(monkeypatch):
+    record = sf.optimize.IterationRecord(3, 1.5, 2e-4, 0.5, np.zeros(1), 4)
+    for stream, shown in ((Terminal(), True), (io.StringIO(), False)):
+        monkeypatch.setattr(sys, "stderr", stream)
+        with cli._progress() as show:
+            show(record)
+        assert ("iteration   3   cost 1.5   optimality 2.00e-04   step 0.5" in stream.getvalue()) == shown
+
+
+@pytest.mark.parametrize("name", ["toss"])
+def test_examples_from_a_shell(name, tmp_path):
+    """The command as installed, in a process of its own, output piped."""
+    command = [sys.executable, "-c", "from switchfit.cli import main; main()", "fit", "problem.toml", "--out", tmp_path]
+    done = subprocess.run(command, cwd=EXAMPLES / name, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == f"written to {tmp_path}\n"
+    tau, mu = sf.Estimate.load(tmp_path / "estimate.json").theta[:2]
+    assert mu == pytest.approx(0.2162, abs=5e-4)  # a plain least-squares fit gave 0.2162 and 0.351 s
+    assert tau == pytest.approx(0.351, abs=2e-3)

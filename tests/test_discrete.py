@@ -1,0 +1,184 @@
+"""Derivatives of the discretised cost: adjoint, forward mode and JAX alone must agree to rounding."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from systems import KINDS, NODES, P0, Case, Derivatives, case, compiled, padded_mesh, problem_of, weighted
+
+from switchfit.model import Model
+from switchfit.propagate import propagate
+
+INSIDE = {"plain": [0.613, 1.287], "resets": [0.413, 0.791, 1.336], "stiff": [0.6187, 1.2812]}
+"""Transition times that are not nodes."""
+
+
+def assert_same(found: Derivatives, expected: Derivatives, relative: float) -> None:
+    """Equal gradients and Hessians, relative to their largest entries."""
+    assert found.cost == pytest.approx(expected.cost, rel=relative)
+    for a, b in ((found.gradient, expected.gradient), (found.hessian, expected.hessian)):
+        np.testing.assert_allclose(a, b, rtol=0.0, atol=relative * np.abs(b).max())
+
+
+def assert_all_same(this: Case, *at: object) -> None:
+    relative = 1e-9 if this.structure.solver == "stiff" else 2e-12
+    expected = this.autodiff(*at)
+    assert np.abs(expected.hessian).min() > 1e-6, "an entry is not tested"
+    assert_same(this.discrete(*at), expected, relative)
+    assert_same(this.forward(*at), expected, relative)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ["resets", "stiff"])
+def test_adjoint_forward_and_autodiff_agree(name: str, kind: str) -> None:
+    this = case(name)
+    assert_all_same(this, this.arguments(kind), INSIDE[name], P0)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("name", ["resets", "stiff"])
+def test_agree_where_transitions_are_nodes_and_samples(name: str, side: int) -> None:
+    this = case(name)
+    tau = NODES[[5, 9, 14][-this.N :]]
+    assert_all_same(this, this.arguments(), tau, P0, side)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_side_is_the_limit_from_that_side(side: int) -> None:
+    this = case("resets")
+    tau = NODES[[5, 9, 14]]
+    at = this.discrete(this.arguments(halvings=2), tau, P0, side)
+    beside = this.discrete(this.arguments(halvings=2), tau + side * 1e-9, P0, side)
+    other = this.discrete(this.arguments(halvings=2), tau, P0, -side)
+    np.testing.assert_allclose(at.gradient, beside.gradient, atol=1e-6)
+    np.testing.assert_allclose(at.hessian, beside.hessian, atol=1e-4)
+    assert np.abs(at.gradient - other.gradient).max() > 0.1
+
+
+@pytest.mark.parametrize("tau", [NODES[[4, 4, 13]], NODES[[4, 4, 4]], np.array([0.413, 0.413, 1.287])])
+def test_agree_where_transitions_coincide(tau: np.ndarray) -> None:
+    this = case("resets")
+    assert_all_same(this, this.arguments(), tau, P0)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    times=st.lists(st.floats(0.0, 2.0), min_size=3, max_size=3),
+    p=st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
+    side=st.sampled_from([-1, 1]),
+)
+def test_adjoint_and_forward_agree_anywhere(times: list[float], p: tuple[float, float], side: int) -> None:
+    this = case("resets")
+    at = this.arguments(), np.sort(times), np.array(p), side
+    found, expected = this.discrete(*at), this.forward(*at)
+    scale = max(1.0, np.abs(expected.hessian).max())
+    np.testing.assert_allclose(found.hessian, expected.hessian, rtol=0.0, atol=1e-11 * scale)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ["plain", "resets", "stiff"])
+def test_taylor_remainders_have_orders_1_2_3(name: str, kind: str) -> None:
+    this = case(name)
+    arguments = this.arguments(kind)
+    tau = np.array(INSIDE[name])
+    direction = np.array([*[1.0, -0.7, 0.8][: this.N], 0.9, -1.1])
+    direction *= (0.0002 if name == "stiff" else 0.01) / np.abs(direction).max()
+    at = this.discrete(arguments, tau, P0)
+
+    def remainders(step: float) -> list[float]:
+        d = step * direction
+        change = this.cost(arguments, tau + d[: this.N], P0 + d[this.N :]) - at.cost
+        return [change, change - at.gradient @ d, change - at.gradient @ d - 0.5 * d @ at.hessian @ d]
+
+    coarse, fine = np.abs(remainders(0.5)), np.abs(remainders(0.25))
+    np.testing.assert_allclose(np.log2(coarse / fine), [1.0, 2.0, 3.0], atol=0.2)
+
+
+def test_gauss_newton_from_the_residual_jacobian() -> None:
+    this = case("plain")
+    N = this.N
+
+    def explicit(arguments, tau, p, side):
+        model = Model(this.structure, arguments)
+
+        def residuals(theta):
+            path = propagate(model, theta[:N], theta[N:], side)
+            samples = arguments.samples[0]
+            at_samples = jax.vmap(lambda s, x: model.sample_residual(0, s, x, theta[N:]))(
+                samples, path.at_samples(samples.cell)
+            )
+
+            def of_row(start, end, piece, X):
+                (residual,) = model.reference_residuals(piece)
+                return jax.vmap(lambda t, x: residual(t, x, theta[N:]))(start + model.tableau.c * (end - start), X)
+
+            continuous = jax.vmap(jax.vmap(of_row))(path.layout.start, path.layout.end, path.pieces, path.stages)
+            return at_samples, continuous[..., 0], path.layout.end - path.layout.start
+
+        theta = jnp.concatenate([tau, p])
+        h = residuals(theta)[2]
+        at_samples, continuous, _ = jax.jacfwd(residuals)(theta)
+        weight = h[..., None] * model.tableau.b * arguments.weights[0][0, 0]
+        return jnp.einsum("kqd,kq,kqe->de", at_samples, arguments.samples[0].weight, at_samples) + jnp.einsum(
+            "qcsd,qcs,qcse->de", continuous, weight, continuous
+        )
+
+    arguments = this.arguments("all")
+    with_data_only = weighted_data(this)
+    expected = np.asarray(compiled(explicit)(with_data_only, INSIDE["plain"], P0))
+    found = this.discrete(with_data_only, INSIDE["plain"], P0)
+    np.testing.assert_allclose(found.gauss_newton, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
+    assert np.abs(found.gauss_newton - found.hessian).max() > 0.1
+    assert np.linalg.eigvalsh(found.gauss_newton).min() > 0.0
+    running = this.discrete(arguments, INSIDE["plain"], P0).gauss_newton - found.gauss_newton
+    assert np.abs(running).max() > 0.1
+
+
+def weighted_data(this: Case):
+    """Arguments with samples and the reference signal, without the other costs."""
+    arguments, samples, reference = (this.arguments(kind) for kind in ("all", "samples", "reference"))
+    return arguments._replace(fixed=samples.fixed, samples=arguments.samples, weights=reference.weights)
+
+
+def test_samples_alone() -> None:
+    """Without a running cost nothing is integrated; it is not the same program as a running cost of weight 0."""
+    this, alone = case("plain"), Case(problem_of("plain", parts=("samples",)))
+    arguments = weighted(alone.problem.arguments(0, padded_mesh(NODES)), "all")
+    assert not alone.structure.running
+    found = alone.discrete(arguments, INSIDE["plain"], P0)
+    expected = this.discrete(this.arguments("samples"), INSIDE["plain"], P0)
+    assert_same(found, expected, 1e-13)
+    np.testing.assert_allclose(found.gauss_newton, expected.gauss_newton, atol=1e-12)
+
+
+def test_equal_neighbouring_modes_give_zero_rows() -> None:
+    """... up to the integrator's error, since where tau_1 stands moves a step of the integrator."""
+    this = case("plain")
+    found = this.discrete(this.arguments(equal=1.0, halvings=3), INSIDE["plain"], P0)
+    assert np.abs(found.hessian[1:, 1:]).max() > 1.0
+    np.testing.assert_allclose(found.gradient[0], 0.0, atol=1e-7)
+    np.testing.assert_allclose(found.hessian[0], 0.0, atol=1e-4)
+
+
+@pytest.mark.parametrize("split", [0.0, 0.35, 0.6, 1.287])
+def test_splitting_a_mode_changes_nothing(split: float) -> None:
+    """Modes A, A, C with the first transition anywhere, at t0 too, where nothing is left of the first A."""
+    this = case("plain")
+    arguments = this.arguments(equal=1.0, halvings=3)
+    expected = this.discrete(arguments, [0.0, 1.287], P0)
+    found = this.discrete(arguments, [split, 1.287], P0)
+    assert found.cost == pytest.approx(expected.cost, rel=1e-9)
+    np.testing.assert_allclose(found.gradient[1:], expected.gradient[1:], atol=1e-6)
+    np.testing.assert_allclose(found.hessian[1:, 1:], expected.hessian[1:, 1:], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["plain", "resets"])
+def test_shift_of_time_changes_nothing(name: str) -> None:
+    this, shift = case(name), 4.0
+    moved = problem_of(name, shift).arguments(0, padded_mesh(NODES + shift))
+    found = this.discrete(weighted(moved, "all"), np.array(INSIDE[name]) + shift, P0)
+    assert_same(found, this.discrete(this.arguments(), INSIDE[name], P0), 1e-11)

@@ -1,0 +1,27 @@
+"""The examples, run."""
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+
+import switchfit as sf
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def test_own_model_finds_what_made_its_log(capsys):
+    problem = runpy.run_path(str(EXAMPLES / "own_model.py"))["problem"]
+    estimate = sf.estimate(problem)
+    assert estimate.success
+    error = estimate.theta - [43.0, 0.5, 0.02]
+    assert np.all(np.abs(error) < 3 * estimate.standard_errors)
+    assert capsys.readouterr().out == ""
+
+
+def test_vehicle_finds_the_truth():
+    module = runpy.run_path(str(EXAMPLES / "vehicle" / "vehicle.py"))
+    estimate = sf.estimate(module["make_problem"]())
+    assert estimate.success
+    assert estimate.iterations < 12  # the paper's
+    np.testing.assert_allclose(estimate.theta, [6.0, 10.0, 0.7], atol=2e-4)

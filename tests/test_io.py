@@ -1,0 +1,438 @@
+"""Tables, Python files and problem files: what they give, and what they say when something is wrong."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import switchfit as sf
+from switchfit.io.csv import read_columns
+from switchfit.io.errors import InputError
+from switchfit.io.problem_file import load_problem
+from switchfit.io.python_file import load_object
+from switchfit.io.summary import describe, identifiability
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+PROBLEM = """
+model = "room.py:room"
+
+[parameters]
+heating = { value = 0.3, lower = 0.0, upper = 2.0, unit = "K/min" }
+cooling = 0.05
+
+[[experiments]]
+name = "monday"
+mode_sequence = ["on", "off"]
+transition_times = [{ value = 3.0, lower = 1.0, upper = 5.0 }]
+t0 = 0.0
+tf = 6.0
+
+[[experiments.data]]
+file = "log.csv"
+time = "t"
+columns = ["T"]
+observe = ["T"]
+sigma = 0.1
+
+[options]
+min_duration = 0.5
+rtol = 1e-7
+max_iterations = 50
+"""
+
+ROOM = """
+import jax.numpy as jnp
+import switchfit as sf
+
+def on(t, x, p):
+    return p["heating"] - p["cooling"] * (x - 15.0)
+
+def off(t, x, p):
+    return -p["cooling"] * (x - 15.0)
+
+room = sf.HybridSystem(modes={"on": on, "off": off}, initial_state=[15.0], state_names=("T",))
+
+def make(start=15.0):
+    return sf.HybridSystem(modes={"on": on, "off": off}, initial_state=[start], state_names=("T",))
+
+def fahrenheit(t, x, p):
+    return 32.0 + 1.8 * x
+
+def broken_factory():
+    raise RuntimeError("no data today")
+
+def broken_mode(t, x, p):
+    return x * undefined_name
+
+broken = sf.HybridSystem(modes={"on": broken_mode, "off": off}, initial_state=[15.0], state_names=("T",))
+nameless = sf.HybridSystem(modes={"on": on, "off": off}, initial_state=[15.0])
+seven = 7
+"""
+
+LOG = """t,T,sd,u
+0,15.0,0.1,1
+1,15.4,0.1,1
+2,,0.2,1
+3,16.3,0.1,1
+4,16.2,0.1,0
+5,16.1,0.1,0
+6,16.0,0.1,0
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "problem.toml").write_text(PROBLEM)
+    (tmp_path / "room.py").write_text(ROOM)
+    (tmp_path / "log.csv").write_text(LOG)
+    return tmp_path
+
+
+def changed(folder, *changes):
+    """The problem file with (old, new) replaced, loaded."""
+    text = PROBLEM
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    (folder / "problem.toml").write_text(text)
+    return load_problem(folder / "problem.toml")
+
+
+def refused(folder, message, *changes):
+    with pytest.raises(InputError, match=message) as caught:
+        changed(folder, *changes)
+    return str(caught.value)
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "t,x,y\n0,1,2\n1,3,4\n",
+        "t;x;y\n0;1;2\n1;3;4",
+        "t\tx\ty\n0\t1\t2\n1\t3\t4\n",
+        "\ufeff t , x , y\r\n 0 , 1 , 2 \r\n1, 3, 4\r\n",
+        '# a comment\n\n"t","x","y"\n0,1,2\n\n# another\n1,3e0,4.0\n',
+    ],
+)
+def test_read_columns(tmp_path, text):
+    (tmp_path / "a.csv").write_text(text, encoding="utf-8")
+    np.testing.assert_array_equal(read_columns(tmp_path / "a.csv", ["y", "t"]), [[2, 0], [4, 1]])
+
+
+def test_read_columns_missing_values_and_names_with_commas(tmp_path):
+    (tmp_path / "a.csv").write_text('t,"x, in m"\n0,\n1,NA\n2,nan\n3,4\n')
+    values = read_columns(tmp_path / "a.csv", ["x, in m"])
+    np.testing.assert_array_equal(values, [[np.nan], [np.nan], [np.nan], [4]])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", r"a\.csv is empty; it needs a line with the names"),
+        ("\n# only this\n", r"a\.csv is empty"),
+        ("t,x\n", r"a\.csv has a header but no rows"),
+        ("t,y\n0,1\n", r"a\.csv has no column 'x'; its columns are t, y\."),
+        ("t,x,x\n0,1,2\n", r"a\.csv has 2 columns 'x'; rename all but one"),
+        ("t,x\n0,1\n\n1,two\n", r"a\.csv, line 4, column 'x': 'two' is not a number; leave the cell empty"),
+        ("t,x\n0,1\n1\n", r"a\.csv, line 3: 1 fields where the header has 2"),
+        ("t,x\n0,1\n1,2,3\n", r"a\.csv, line 3: 3 fields where the header has 2"),
+    ],
+)
+def test_read_columns_refuses(tmp_path, text, message):
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_columns(tmp_path / "a.csv", ["t", "x"])
+
+
+def test_read_columns_refuses_what_is_no_text_file(tmp_path):
+    with pytest.raises(InputError, match=r"There is no file .*missing\.csv; check the name"):
+        read_columns(tmp_path / "missing.csv", ["t"])
+    with pytest.raises(InputError, match="is a folder; name a CSV file in it"):
+        read_columns(tmp_path, ["t"])
+    (tmp_path / "a.bin").write_bytes(b"t,x\n\xff\xfe\x00")
+    with pytest.raises(InputError, match=r"a\.bin is not a text file in UTF-8 \(byte 4\)"):
+        read_columns(tmp_path / "a.bin", ["t"])
+
+
+# --- a problem file that is right -------------------------------------------------------------------------------------
+
+
+def test_everything_in_the_file_arrives(folder):
+    loaded = changed(folder)
+    problem = loaded.problem
+    experiment = problem.experiments[0]
+    assert loaded.options == {"max_iterations": 50}
+    assert problem.theta_names == ("tau_1", "heating", "cooling")
+    np.testing.assert_array_equal(problem.initial_theta, [3.0, 0.3, 0.05])
+    np.testing.assert_array_equal(problem.unknowns.lower, [1.0, 0.0, -np.inf])
+    np.testing.assert_array_equal(problem.unknowns.upper, [5.0, 2.0, np.inf])
+    assert problem.unknowns.units == ("s", "K/min", "")
+    assert (problem.rtol, problem.atol) == (1e-7, sf.Problem.atol)
+    np.testing.assert_array_equal(problem.unknowns.b, [0.5, -5.5])
+    assert (experiment.name, experiment.t0, experiment.tf) == ("monday", 0.0, 6.0)
+    (data,) = experiment.data
+    np.testing.assert_array_equal(data.times, np.arange(7.0))
+    np.testing.assert_array_equal(data.values[:, 0], [15.0, 15.4, np.nan, 16.3, 16.2, 16.1, 16.0])
+    assert data.names == ("T",)
+    assert data.sigma == 0.1
+    np.testing.assert_array_equal(data.observe(0.0, np.array([21.0]), {}), [21.0])
+
+
+def test_short_forms_and_defaults(folder):
+    loaded = changed(
+        folder,
+        ("transition_times = [{ value = 3.0, lower = 1.0, upper = 5.0 }]", "transition_times = [3]"),
+        ("t0 = 0.0\ntf = 6.0\n", ""),
+        ('observe = ["T"]\nsigma = 0.1\n', ""),
+        ("\n[options]\nmin_duration = 0.5\nrtol = 1e-7\nmax_iterations = 50\n", ""),
+    )
+    experiment = loaded.problem.experiments[0]
+    assert (experiment.t0, experiment.tf) == (0.0, 6.0)
+    assert experiment.data[0].sigma is None
+    assert experiment.data[0].observe is None
+    assert loaded.options == {}
+    assert loaded.problem.rtol == sf.Problem.rtol
+
+
+def test_fixed_values_stay_out_of_theta(folder):
+    loaded = changed(
+        folder, ("cooling = 0.05", "cooling = { value = 0.05, fixed = true }"), ("upper = 5.0 }", "fixed = true }")
+    )
+    assert loaded.problem.theta_names == ("heating",)
+
+
+def test_window_offset_and_scale(folder):
+    (folder / "log.csv").write_text("t,T\n" + "".join(f"{k},{k}.5\n" for k in range(1000, 9001, 1000)))
+    change = ('time = "t"', 'time = "t"\nwindow = [3000, 8000]\ntime_offset = 2000\ntime_scale = 1e-3')
+    data = changed(folder, change).problem.experiments[0].data[0]
+    np.testing.assert_array_equal(data.times, [1, 2, 3, 4, 5, 6])
+    np.testing.assert_array_equal(data.values[:, 0], [3000.5, 4000.5, 5000.5, 6000.5, 7000.5, 8000.5])
+
+
+def test_sigma_from_a_column(folder):
+    data = changed(folder, ("sigma = 0.1", 'sigma = ["sd"]')).problem.experiments[0].data[0]
+    np.testing.assert_array_equal(data.sigma[:, 0], [0.1, 0.1, 0.2, 0.1, 0.1, 0.1, 0.1])
+
+
+def test_observe_by_a_function(folder):
+    data = changed(folder, ('observe = ["T"]', 'observe = "room.py:fahrenheit"')).problem.experiments[0].data[0]
+    assert data.observe(0.0, np.array([10.0]), {}) == 50.0
+
+
+def test_equal_observations_are_one_function(folder):
+    toss = load_problem(EXAMPLES / "toss" / "problem.toml").problem.experiments[0]
+    again = load_problem(EXAMPLES / "toss" / "problem.toml").problem.experiments[0]
+    assert toss.data[0].observe is again.data[0].observe
+    assert toss.data[0].observe is not toss.data[1].observe
+
+
+def test_reference_signal(folder):
+    change = ("sigma = 0.1", 'kind = "reference"\nlowpass_hz = 0.2\nweights = [2.0]')
+    data = changed(folder, change).problem.experiments[0].data[0]
+    assert isinstance(data, sf.ReferenceSignal)
+    np.testing.assert_array_equal(data.weights, [[2.0]])
+
+
+def test_inputs(folder):
+    (folder / "room.py").write_text(
+        "import switchfit as sf\n"
+        "room = sf.HybridSystem({'on': lambda t, x, p, u: p['heating'] * u - p['cooling'] * x,"
+        " 'off': lambda t, x, p, u: -p['cooling'] * x}, [15.0], state_names=('T',))\n"
+    )
+    table = '[experiments.inputs]\nfile = "log.csv"\ntime = "t"\ncolumns = ["u"]\n'
+    inputs = changed(folder, ("[[experiments.data]]", table + "\n[[experiments.data]]")).problem.experiments[0].inputs
+    assert inputs.kind == "hold"
+    np.testing.assert_array_equal(inputs.values, [1, 1, 1, 1, 0, 0, 0])
+    refused(
+        folder, r"experiments\[1\]\.inputs: Input kind|'experiments\[1\]\.inputs\.kind' must be 'hold', 'linear' or",
+        ("[[experiments.data]]", table + 'kind = "step"\n[[experiments.data]]'),
+    )  # fmt: skip
+
+
+def test_model_arguments_and_factories(folder):
+    changed_model = ('model = "room.py:room"', 'model = { name = "room.py:make", arguments = { start = 18.0 } }')
+    assert changed(folder, changed_model).problem.system.initial_state == [18.0]
+    system = changed(folder, ('"room.py:room"', '"room.py:make"')).problem.system
+    assert system.initial_state == [15.0]
+
+
+def test_initial_state_of_an_experiment(folder):
+    problem = changed(folder, ("t0 = 0.0", "t0 = 0.0\ninitial_state = [17.0]")).problem
+    assert problem.experiments[0].initial_state == [17.0]
+
+
+def test_problem_built_in_python(folder):
+    (folder / "built.py").write_text(
+        "import switchfit as sf\nfrom room import room\n"  # a neighbour in the same folder
+        "def make():\n"
+        "    run = sf.Experiment(sf.Measurements([1.0, 3.0], [15.0, 16.0]), ('on', 'off'), (2.5,), 0.0, 4.0)\n"
+        "    return sf.Problem(room, run, {'heating': 0.3, 'cooling': 0.05})\n"
+        "problem = make()\n"
+    )
+    path = folder / "p.toml"
+    for name in ("make", "problem"):
+        path.write_text(f'problem = "built.py:{name}"\n[options]\nhessian = "gauss-newton"\n')
+        loaded = load_problem(path)
+        assert isinstance(loaded.problem, sf.Problem)
+        assert loaded.options == {"hessian": "gauss-newton"}
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*/*.toml")), ids=lambda path: path.parent.name)
+def test_examples_load(path):
+    assert load_problem(path).problem.theta_names
+
+
+# --- a problem file that is wrong -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("tf = 6.0", "t_f = 6.0", r"unknown key 'experiments\[1\]\.t_f'; did you mean 'tf'\?"),
+        ("tf = 6.0", "qqq = 6.0", r"unknown key 'experiments\[1\]\.qqq'; known here are mode_sequence, "),
+        ("tf = 6.0", 'tf = "six"', r"'experiments\[1\]\.tf' must be a number; got 'six' \(end of the horizon"),
+        ("tf = 6.0", "tf = true", r"'experiments\[1\]\.tf' must be a number; got True"),
+        ("upper = 5.0 }", "uper = 5.0 }", r"'experiments\[1\]\.transition_times\[1\]\.uper'; did you mean 'upper'\?"),
+        ("{ value = 3.0, lower = 1.0, upper = 5.0 }", '"three"', r"times\[1\]' must be a table; got 'three'"),
+        ("{ value = 3.0, lower = 1.0, upper = 5.0 }", "7.0", r"experiments\[1\]: transition_times must increase .*\[7"),
+        ("{ value = 3.0, lower = 1.0, upper = 5.0 }", "", r"experiments\[1\]: 2 modes need 1 transition times; got 0"),
+        ('mode_sequence = ["on", "off"]', "", r"the key 'experiments\[1\]\.mode_sequence' is missing: names of the"),
+        ('["on", "off"]', "[]", r"mode_sequence' must have at least 1 entries; got \[\]"),
+        ('["on", "off"]', '["on", "of"]', r"mode_sequence names the unknown mode 'of'; the modes are on, off"),
+        ("value = 0.3, lower = 0.0", "value = 0.3, lower = 0.4", r"parameters\.heating: .* lies outside its bounds"),
+        ("cooling = 0.05", 'cooling = "little"', r"'parameters\.cooling' must be a table; got 'little' \(a parameter"),
+        ("cooling = 0.05", "cooling = { val = 1 }", r"unknown key 'parameters\.cooling\.val'; did you mean 'value'\?"),
+        ("cooling = 0.05", "", r"asks for the parameter 'cooling', which the problem lacks"),
+        ('columns = ["T"]', 'columns = ["temp"]', r"log\.csv has no column 'temp'; its columns are t, T, sd, u"),
+        ('"log.csv"', '"lgo.csv"', r"There is no file .*lgo\.csv"),
+        ('time = "t"', 'time = "T"', r"log\.csv, column 'T': the time of sample 3 is missing"),
+        ('time = "t"', 'time = "u"', r"experiments\[1\]\.data\[1\]: Measurements times must increase strictly"),
+        ('time = "t"', 'time = "t"\nwindow = [10, 20]', r"no time in column 't' lies in the window \[10\.0, 20\.0\]; "),
+        ('time = "t"', 'time = "t"\nwindow = [10]', r"\.window' must have at least 2 entries; got \[10\]"),
+        ('time = "t"', 'time = "t"\ntime_offset = 3', r"Measurements times must lie inside \[t0, tf\] = \[0\.0"),
+        ('observe = ["T"]', 'observe = ["x"]', r"data\[1\]: observe names the unknown state 'x'; the states are T"),
+        ('observe = ["T"]', 'observe = ["T", "T"]', r"observe must name one state for each of the 1 columns; got"),
+        ('observe = ["T"]', 'observe = "room.py:seven"', r"observe 'room.py:seven' must be a function h\(t, x, p\);"),
+        ('observe = ["T"]', 'observe = "T"', r"data\[1\]\.observe must be given as 'file\.py:object'; got 'T'"),
+        ("sigma = 0.1", "sigma = -0.1", r"experiments\[1\]\.data\[1\]: sigma must be positive and finite; got .*-0\.1"),
+        ("sigma = 0.1", "lowpass_hz = 1.0", r"lowpass_hz belongs to kind = 'reference'; measurements have sigma"),
+        ("sigma = 0.1", 'sigma = 0.1\nkind = "reference"', r"sigma belongs to kind = 'measurements'; a reference has"),
+        ("sigma = 0.1", 'kind = "samples"', r"kind' must be 'measurements' or 'reference'; got 'samples'"),
+        ("[options]", "[option]", r"unknown key 'option'; did you mean 'options'\?"),
+        ("rtol = 1e-7", "rtol = -1.0", r"'options\.rtol' must be greater than 0; got -1\.0"),
+        ("rtol = 1e-7", 'hessian = "newton"', r"'options\.hessian' must be 'exact', 'block-diagonal', 'gauss-newton'"),
+        ("min_duration = 0.5", "min_duration = 4.0", r"min_duration is 4\.0 s, but the guess gives mode 1"),
+        ("[parameters]", "[parameters", r"is not valid TOML: .*line 4"),
+        ('model = "room.py:room"', "", r"the key 'model' is missing; name one of skid_steer, sliding_block or"),
+        ('model = "room.py:room"', "model = 3", r"'model' must be a table; got 3 \(a built-in model"),
+        ("room.py:room", "room", r"model 'room' is not known; the built-in models are skid_steer, sliding_block"),
+        ("room.py:room", "rom.py:room", r"model 'rom\.py:room': there is no file .*rom\.py"),
+        ("room.py:room", "room.py", r"model must be given as 'file\.py:object'; got 'room\.py'"),
+        ("room.py:room", "room.py:rom", r"room\.py defines no 'rom'; it has .*room, make"),
+        ("room.py:room", "room.py:seven", r"model 'room\.py:seven' must be an sf\.HybridSystem or a .*got int"),
+        ("room.py:room", "room.py:broken_factory", r"failed: .*room\.py, line 20, in broken_factory: RuntimeError: no"),
+        ("room.py:room", "room.py:broken", r"room\.py, line 23, in broken_mode: NameError: name 'undefined_name'"),
+        ("room.py:room", "room.py:nameless", r"observe names states, but the model has no state_names; give it some"),
+        ('"room.py:room"', '{ name = "room.py:room", arguments = { a = 1 } }', "is not a function; leave out its arg"),
+        ('"room.py:room"', '{ name = "room.py:make", arguments = { a = 1 } }', "argument 'a'; it takes start"),
+        ('"room.py:room"', '{ name = "skid_steer", arguments = { restick = "x" } }', "failed: ValueError: restick"),
+        ('model = "room.py:room"', 'problem = "room.py:seven"', r"leave out parameters and experiments"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_said(folder, old, new, message):
+    said = refused(folder, message, (old, new))
+    assert str(folder) in said  # the file is named
+    assert "\n" not in said  # in one sentence
+
+
+def test_no_experiments(folder):
+    (folder / "problem.toml").write_text('model = "skid_steer"\n')
+    with pytest.raises(InputError, match=r"\[\[experiments\]\] is missing; give at least one"):
+        load_problem(folder / "problem.toml")
+
+
+def test_several_mistakes_are_listed(folder):
+    said = refused(
+        folder, r"unknown key 'experiments\[1\]\.t_f'", ("tf = 6.0", "t_f = 6.0"), ("sigma = 0.1", "sigma = true")
+    )
+    assert "Also wrong: 'experiments[1].data[1].sigma'" in said
+
+
+def test_problem_file_that_is_not_there(tmp_path):
+    with pytest.raises(InputError, match=r"There is no problem file .*none\.toml"):
+        load_problem(tmp_path / "none.toml")
+    with pytest.raises(InputError, match=r"cannot be read: Is a directory"):
+        load_problem(tmp_path)
+    (tmp_path / "a.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(InputError, match=r"a\.toml is not valid TOML"):
+        load_problem(tmp_path / "a.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('problem = "room.py:seven"', r"must be an sf\.Problem or a function that returns one; got int"),
+        (
+            'problem = "room.py:seven"\n[options]\nrtol = 1e-6',
+            r"with 'problem', rtol is set where the sf\.Problem is b",
+        ),
+        ('problem = "seven"', r"problem must be given as 'file\.py:object'; got 'seven'"),
+    ],
+)
+def test_problem_built_in_python_refuses(folder, text, message):
+    (folder / "problem.toml").write_text(text)
+    with pytest.raises(InputError, match=message):
+        load_problem(folder / "problem.toml")
+
+
+# --- Python files -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x = 1\ny = x +\n", r"Running .*m\.py failed: .*m\.py, line 2: SyntaxError: invalid syntax"),
+        ("def f():\n    return 1 / 0\n\nx = f()\n", r"m\.py, line 2, in f: ZeroDivisionError: division by zero"),
+        ("import nowhere_to_be_found\n", r"m\.py, line 1: ModuleNotFoundError: No module named 'nowhere_to_be_found'"),
+        ("raise SystemExit('bye')\n", r"m\.py, line 1: SystemExit: bye"),
+    ],
+)
+def test_python_file_that_fails(tmp_path, text, message):
+    (tmp_path / "m.py").write_text(text)
+    with pytest.raises(InputError, match=message):
+        load_object("m.py:x", tmp_path, "model")
+
+
+def test_python_file_is_read_again_when_it_changes(tmp_path):
+    path = tmp_path / "m.py"
+    path.write_text("x = object()\n")
+    first = load_object("m.py:x", tmp_path, "model")
+    assert load_object("m.py:x", tmp_path, "model") is first
+    path.write_text("x = 5\n")
+    assert load_object("m.py:x", tmp_path, "model") == 5
+
+
+# --- what check says --------------------------------------------------------------------------------------------------
+
+
+def test_describe_and_identifiability(folder):
+    problem = changed(folder).problem
+    text = describe(problem)
+    assert "Experiment 1 (monday)" in text
+    assert "on -> off on [0, 6] s, at 3 s" in text
+    assert "7 samples of T, 0 to 6 s, typically 1 s apart, 1 values missing" in text
+    assert re.search(r"heating\s+0\.3 K/min\s+in \[0, 2\]", text)
+    assert re.search(r"condition number of the scaled problem \d", identifiability(problem))
+
+
+def test_identifiability_names_what_the_data_do_not_tell(folder):
+    (folder / "log.csv").write_text("t,T,sd,u\n0,15,1,1\n1,15.4,1,1\n2,15.7,1,1\n")  # nothing after the transition
+    message = identifiability(changed(folder).problem)
+    assert "does not depend on tau_1" in message
+    (folder / "log.csv").write_text("t,T,sd,u\n0,15,1,1\n6,15.4,1,1\n")  # one value that says something, three unknowns
+    assert "do not determine this combination" in identifiability(changed(folder).problem)

@@ -1,0 +1,184 @@
+"""The repository itself: documented, small, free of what does not belong in it."""
+
+import ast
+import importlib
+import inspect
+import pkgutil
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import switchfit as sf
+from switchfit.io import problem_file
+
+ROOT = Path(__file__).parent.parent
+SOURCES = sorted((ROOT / "src").rglob("*.py"))
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+def tracked():
+    """Every file git knows or would add; skips where this is no clone."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
+    try:
+        listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("not a git clone")
+    return [path for name in listed.split("\0") if name and (path := ROOT / name).is_file()]
+
+
+def modules():
+    names = ["switchfit", *(m.name for m in pkgutil.walk_packages(sf.__path__, "switchfit."))]
+    return [importlib.import_module(name) for name in names]
+
+
+def public_callables():
+    """Public functions, classes and methods, by qualified name, each once."""
+    found = {}
+    for module in modules():
+        for name, item in vars(module).items():
+            if name.startswith("_") or getattr(item, "__module__", "") != module.__name__:
+                continue
+            if inspect.isfunction(item) or inspect.isclass(item):
+                found[f"{module.__name__}.{name}"] = item
+    return found
+
+
+def test_everything_public_has_a_docstring():
+    bare = [name for name, item in public_callables().items() if not inspect.getdoc(item)]
+    bare += [str(path) for path in SOURCES if path.read_text() and not ast.get_docstring(ast.parse(path.read_text()))]
+    for name, item in public_callables().items():
+        if inspect.isclass(item):
+            methods = {k: v for k, v in vars(item).items() if not k.startswith("_") and inspect.isfunction(v)}
+            bare += [f"{name}.{k}" for k, method in methods.items() if not inspect.getdoc(method)]
+    assert not bare
+
+
+def documented(text):
+    """Names that stand at the start of a line as ``name : type`` or ``a, b : type``."""
+    names = set()
+    for line in text.splitlines():
+        match = re.match(r"\s*([A-Za-z_][\w, ]*?)\s*(:|$)", line)
+        if match:
+            names |= {name.strip() for name in match.group(1).split(",")}
+    return names
+
+
+def front_door():
+    """What `import switchfit as sf`, the models and the files offer to users."""
+    doors = {f"sf.{name}": getattr(sf, name) for name in sf.__all__}
+    for module in ("switchfit.models", "switchfit.io.problem_file", "switchfit.io.csv", "switchfit.io.summary"):
+        for name, item in vars(importlib.import_module(module)).items():
+            if inspect.isfunction(item) and item.__module__.startswith(module) and not name.startswith("_"):
+                doors[f"{module}.{name}"] = item
+    return doors
+
+
+#: Only `estimate` makes these.
+NOT_FOR_USERS = {"sf.Estimate": {"certificate_data", "problem"}}
+
+
+@pytest.mark.parametrize("name", sorted(front_door()))
+def test_every_parameter_is_documented(name):
+    item = front_door()[name]
+    if isinstance(item, type) and issubclass(item, sf.Status):
+        pytest.skip("an enumeration")
+    signature = inspect.signature(item)
+    parameters = [p for p in signature.parameters.values() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    inherited = {f for base in getattr(item, "__mro__", [])[1:-1] for f in getattr(base, "__annotations__", {})}
+    missing = {p.name for p in parameters if p.name != "self"} - documented(inspect.getdoc(item)) - inherited
+    assert not missing - NOT_FOR_USERS.get(name, set()), f"{name} does not document {sorted(missing)}"
+
+
+def test_every_key_of_problem_files_is_described_and_in_the_reference():
+    reference = (ROOT / "docs" / "problem-file.md").read_text()
+    tables = [t for t in vars(problem_file).values() if isinstance(t, type) and issubclass(t, problem_file._Table)]
+    for table in tables:
+        for key, field in table.model_fields.items():
+            assert field.description, f"{table.__name__}.{key}"
+            assert re.search(rf"\b{key}\b", reference), key
+
+
+def test_defaults_in_the_reference_are_those_of_the_library():
+    reference = (ROOT / "docs" / "problem-file.md").read_text()
+    estimate = {name: p.default for name, p in inspect.signature(sf.estimate).parameters.items()}
+    for key, default in (
+        ("`rtol`, `atol`", f"{sf.Problem.rtol:g}, {sf.Problem.atol:g}"),
+        ("`tolerance`", f"{estimate['tolerance']:g}"),
+        ("`max_iterations`", str(estimate["max_iterations"])),
+        ("`hessian`", f'`"{estimate["hessian"]}"`'),
+        ("`solver`", f'`"{sf.Problem.solver}"`'),
+    ):
+        assert any(
+            line.startswith(f"| {key}") and line.endswith(f"| {default} |") for line in reference.splitlines()
+        ), key
+
+
+def test_versions_agree():
+    assert sf.__version__ == PROJECT["project"]["version"]
+    assert f"version: {sf.__version__}\n" in (ROOT / "CITATION.cff").read_text()
+
+
+def test_links_in_the_pages_lead_somewhere():
+    for page in [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]:
+        for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
+            assert "://" in target or (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_the_table_of_equations_names_what_exists():
+    page = (ROOT / "docs" / "equations.md").read_text()
+    named = re.findall(r"`([\w/]+\.py): (\w+)`", page)
+    assert len(named) > 20
+    for file, function in named:
+        path = ROOT / ("tests" if file.startswith("test_") else "src/switchfit") / file
+        assert re.search(rf"^def {function}\b", path.read_text(), re.M), f"{file}: {function}"
+
+
+def test_no_large_files():
+    large = [
+        f"{path.relative_to(ROOT)}: {path.stat().st_size}" for path in tracked() if path.stat().st_size > 1_000_000
+    ]
+    assert not large
+
+
+def test_nothing_generated_is_kept():
+    endings = {".png", ".pdf", ".pyc", ".so", ".pt", ".pkl", ".npz", ".ipynb"}
+    assert not [path for path in tracked() if path.suffix in endings]
+
+
+FORBIDDEN = {
+    "an absolute path of one machine": r"(?<![\w.<])/(work|home|root|Users|tmp)/\w",
+    "the number of an issue": r"(?i)\b(issue|pull request|PR) ?#?\d+",
+    "a package registry": r"pypi\.org|pythonhosted|anaconda\.org",
+    "a merge conflict": r"^(<{7}|>{7}) ",
+    "something left to do": r"\b(TO" + r"DO|FIX" + r"ME|X" + r"XX)\b",
+}
+
+
+@pytest.mark.parametrize("what", FORBIDDEN)
+def test_nothing_in_the_tree_that_does_not_belong(what):
+    pattern = re.compile(FORBIDDEN[what], re.M)
+    found = []
+    for path in tracked():
+        if path.name == Path(__file__).name or path.suffix in {".csv", ".svg"}:
+            continue
+        match = pattern.search(path.read_text(encoding="utf-8"))
+        if match:
+            found.append(f"{path.relative_to(ROOT)}: {match.group()}")
+    assert not found
+
+
+def test_no_print_no_assert_in_the_library():
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            printing = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
+            assert not printing, f"{path.name}, line {node.lineno}: print"
+            assert not isinstance(node, ast.Assert), f"{path.name}, line {node.lineno}: assert"
+
+
+def test_optimiser_knows_no_differential_equation():
+    for path in (ROOT / "src" / "switchfit" / "optimize").glob("*.py"):
+        imports = re.findall(r"^\s*from (switchfit\S*) import|^\s*import (switchfit\S*)", path.read_text(), re.M)
+        assert all((a or b).startswith("switchfit.optimize") for a, b in imports), path.name

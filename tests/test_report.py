@@ -1,0 +1,617 @@
+"""The report as text and as figures, of fits made by hand and of one real one."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+import switchfit as sf
+from switchfit.optimize import IterationRecord, Status
+from switchfit.report.plot import (
+    MODE_COLOURS,
+    mode_colours,
+    plot_comparison,
+    plot_convergence,
+    plot_fit,
+    plot_modes,
+    plot_residuals,
+    plot_transitions,
+)
+from switchfit.report.text import report, rounded, transitions_of, warnings_of
+from switchfit.result import Fit
+from switchfit.simulate import Comparison, Trajectory
+
+
+def trajectory_of(modes=("stick", "slip", "stick"), times=(0.0, 4.0, 7.0, 10.0), nodes=9) -> Trajectory:
+    """States X (m) and dX (m/s) that jump at each transition."""
+    t = [np.linspace(a, b, nodes) for a, b in itertools.pairwise(times)]
+    states = np.concatenate([np.stack([np.sin(part) + i, np.cos(part)], axis=1) for i, part in enumerate(t)])
+    labels = np.repeat(np.array(modes), nodes)
+    segments = nodes * np.arange(len(modes) + 1)
+    return Trajectory(np.concatenate(t), states, labels, segments, ("X", "dX"), ("m", "m/s"))
+
+
+def comparison_of(trajectory: Trajectory, samples=30, kind="measurements", sigma=0.1, names=("X", "h")) -> Comparison:
+    """Samples of both states, scattered by one sigma in turn up and down; the third sample of X is missing."""
+    first, last = trajectory.times[0], trajectory.times[-1]
+    times = np.linspace(first, last, samples) if kind == "measurements" else trajectory.times
+    fitted = np.stack([np.interp(times, trajectory.times, x) for x in trajectory.states.T], axis=1)
+    measured = fitted + 0.1 * (-1.0) ** np.arange(len(times))[:, None]
+    if kind == "measurements":
+        measured[2, 0] = np.nan
+    spread = None if sigma is None else np.full(measured.shape, sigma)
+    return Comparison(kind, names, times, measured, fitted, spread, trajectory.times, trajectory.states)
+
+
+def made(**changes) -> Fit:
+    """A fit of one experiment with two free transition times and one parameter; reduced chi-square 1."""
+    trajectory = trajectory_of()
+    theta = np.array([4.0, 7.0, 0.8])
+    hessian = np.array([[400.0, 20.0, 0.0], [20.0, 100.0, 300.0], [0.0, 300.0, 2500.0]])
+    fit = Fit(
+        theta_names=("tau_1", "tau_2", "mu"),
+        theta_units=("s", "s", "1"),
+        initial_theta=np.array([3.0, 8.0, 0.5]),
+        theta=theta,
+        lower=np.array([-np.inf, -np.inf, 0.05]),
+        upper=np.array([np.inf, np.inf, 2.0]),
+        transition_times=(theta[:2].copy(),),
+        parameters={"mu": np.array(0.8), "g": np.array(9.81)},
+        cost=28.0,
+        gradient=np.array([1e-9, -2e-9, 0.0]),
+        hessian=hessian,
+        optimality=2e-9,
+        iterations=2,
+        evaluations=4,
+        status=Status.CONVERGED,
+        message="Converged: the optimality 2.0e-09 is below the tolerance 1.0e-07.",
+        history=tuple(
+            IterationRecord(k, cost, optimality, 1.0, theta - k, k + 1)
+            for k, (cost, optimality) in enumerate([(900.0, 50.0), (30.0, 1e-2), (28.0, 2e-9)])
+        ),
+        active=(),
+        kinks=(),
+        free_basis=np.eye(3),
+        trajectories=(trajectory,),
+        comparisons=((comparison_of(trajectory),),),
+        sigma_known=True,
+        integration_error=3e-11,
+        hessian_kind="exact",
+        tolerance=1e-7,
+        seconds=1.25,
+    )
+    return replace(fit, **changes)
+
+
+def several(count: int, names=None) -> Fit:
+    """A fit of many experiments with two transitions each, the second one fixed, and one shared parameter."""
+    names = names or [f"run{e + 1}" for e in range(count)]
+    trajectories = tuple(trajectory_of(times=(0.0, 3.0 + 0.1 * e, 7.0, 10.0)) for e in range(count))
+    theta = np.array([3.0 + 0.1 * e for e in range(count)] + [0.8])
+    return made(
+        theta_names=(*(f"{name}.tau_1" for name in names), "mu"),
+        theta_units=("s",) * count + ("1",),
+        initial_theta=theta - 0.5,
+        theta=theta,
+        lower=np.full(count + 1, -np.inf),
+        upper=np.full(count + 1, np.inf),
+        transition_times=tuple(np.array([3.0 + 0.1 * e, 7.0]) for e in range(count)),
+        hessian=np.diag(np.linspace(100.0, 400.0, count + 1)),
+        free_basis=np.eye(count + 1),
+        trajectories=trajectories,
+        comparisons=tuple((comparison_of(t, names=("X", "dX")),) for t in trajectories),
+        cost=29.0 * count,
+    )
+
+
+def line_with(text: str, start: str) -> str:
+    """The only line that begins with `start`, spaces aside, with single spaces."""
+    found = [line for line in text.splitlines() if line.strip().startswith(start)]
+    assert len(found) == 1, f"{start!r} begins {len(found)} lines of\n{text}"
+    return " ".join(found[0].split())
+
+
+# --- text -------------------------------------------------------------------------------------------------------------
+
+
+def test_report_of_a_good_fit():
+    text = report(made())
+    assert line_with(text, "experiment") == "experiment stick -> slip -> stick, 0 to 10 s"
+    assert line_with(text, "X, h") == "X, h: 30 samples, 1 of 60 values missing"
+    assert line_with(text, "method") == "method SQP with the exact Hessian"
+    assert line_with(text, "effort") == "effort 2 iterations, 4 evaluations, 1.25 s"
+    assert line_with(text, "status") == "status Converged: the optimality 2.0e-09 is below the tolerance 1.0e-07."
+    assert line_with(text, "cost J") == "cost J 28 (first guess: 900)"
+    assert line_with(text, "reduced chi-square").startswith("reduced chi-square 1 (2 J / (59 values - 3 free unknowns)")
+    assert line_with(text, "X  ") == "X 29 0.1 m 1"
+    assert line_with(text, "h  ") == "h 30 0.1 1"  # no state is called h: no unit
+    assert text.splitlines()[0] == "Fit"
+    assert "Warnings" not in text
+    assert all(len(line) <= 100 and line == line.rstrip() for line in text.splitlines())
+
+
+def test_unknowns_have_errors_units_guesses_and_modes():
+    fit = made()
+    text = report(fit)
+    # (H^-1)_ii by hand: det = 400 (250000 - 90000) - 20 (20 * 2500) = 63e6
+    by_hand = np.sqrt([160000 / 63e6, 1e6 / 63e6, (40000 - 400) / 63e6])
+    assert fit.standard_errors == pytest.approx(by_hand)
+    assert line_with(text, "tau_1  ") == "tau_1 4.000 ± 0.050 (1.3 %) s 3 stick -> slip"
+    assert line_with(text, "tau_2  ") == "tau_2 7.00 ± 0.13 (1.8 %) s 8 slip -> stick"
+    assert line_with(text, "mu  ") == "mu 0.800 ± 0.025 (3.1 %) 0.5"
+    assert line_with(text, "g  ") == "g 9.81"
+    # correlation of tau_2 and mu: -cofactor / root of the product of the others
+    assert line_with(text, "tau_2, mu") == f"tau_2, mu {-400 * 300 / np.sqrt(1e6 * 39600):+.3f}"
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "expected"),
+    [
+        (43.0162288, 0.1215, ("43.02", "± 0.12", "(0.28 %)")),
+        (0.02003193, 0.000110893, ("0.02003", "± 0.00011", "(0.55 %)")),
+        (-123456.7, 2345.6, ("-123457", "± 2346", "(1.9 %)")),
+        (1.23456789e-7, 2.34e-11, ("1.23457e-07", "± 2.3e-11", "(0.019 %)")),
+        (5.4321e9, 1.2e6, ("5.4321e+09", "± 1.2e+06", "(0.022 %)")),
+        (0.0, 0.5, ("0.00", "± 0.50", "")),
+        (3.14159265358979, np.nan, ("3.1415927", "", "")),
+        (2.0, 0.0, ("2", "held", "")),
+    ],
+)
+def test_values_are_rounded_to_their_errors(value, error, expected):
+    assert rounded(value, error) == expected
+
+
+@pytest.mark.parametrize("value", [3.0, -0.02, 4.4e-9, 1.7e12, 0.0])
+@pytest.mark.parametrize("error", [1e-13, 3e-6, 0.0996, 7.0, 1e5])
+def test_rounding_loses_less_than_a_tenth_of_the_error(value, error):
+    text, spread, _ = rounded(value, error)
+    assert abs(float(text) - value) <= 0.1 * error
+    assert float(spread.removeprefix("± ")) == pytest.approx(error, rel=0.06)
+
+
+def test_what_failed_is_said_first():
+    statuses = {
+        Status.MAX_ITERATIONS: "NOT CONVERGED",
+        Status.LINE_SEARCH_FAILED: "NOT CONVERGED",
+        Status.INTERRUPTED: "NOT CONVERGED: interrupted",
+        Status.NONFINITE_START: "NOT STARTED",
+        Status.SADDLE: "NOT A MINIMUM",
+        Status.SINGULAR: "NOT UNIQUE",
+    }
+    for status in Status:
+        first = report(made(status=status)).splitlines()[0]
+        assert first.startswith(f"*** {statuses[status]}") if status in statuses else first == "Fit"
+
+
+def test_long_messages_are_wrapped():
+    text = report(made(message="word " * 60))
+    assert max(len(line) for line in text.splitlines()) <= 100
+    assert text.count("word") == 60
+
+
+def test_sigma_unknown_is_estimated_from_the_residuals():
+    text = report(made(sigma_known=False, cost=0.28))
+    assert line_with(text, "residual variance") == (
+        "residual variance 0.01 (2 J / (59 values - 3 free unknowns), so sigma is about 0.1)"
+    )
+    assert "± 0.0050" in line_with(text, "tau_1  ")
+    assert "Warnings" not in text
+
+
+def test_reference_signals_have_no_errors_and_say_why():
+    trajectory = trajectory_of()
+    fit = made(sigma_known=None, comparisons=((comparison_of(trajectory, kind="reference", sigma=None),),))
+    text = report(fit)
+    assert line_with(text, "X, h") == "X, h: reference signal"
+    assert line_with(text, "X  ") == "X signal 0.1 m"
+    assert line_with(text, "tau_1  ") == "tau_1 4 s 3 stick -> slip"
+    assert "std. error" not in text
+    assert "Correlations" not in text
+    assert "chi-square" not in text
+    assert [w for w in warnings_of(fit) if w.startswith("No standard errors: the cost has no noise model")]
+
+
+def test_a_cost_without_data():
+    text = report(made(sigma_known=None, comparisons=((),)))
+    assert line_with(text, "no data") == "no data: a cost of the trajectory"
+    assert "rmse" not in text
+
+
+def test_a_channel_without_a_single_value():
+    trajectory = trajectory_of()
+    comparison = comparison_of(trajectory)
+    comparison.measured[:, 0] = np.nan
+    assert line_with(report(made(comparisons=((comparison,),))), "X  ") == "X 0 m"
+
+
+def only_warning(fit: Fit) -> str:
+    warnings = warnings_of(fit)
+    assert len(warnings) == 1, warnings
+    first = report(fit).split("Warnings\n  - ")[1].split()[0]
+    assert warnings[0].startswith(first)
+    return warnings[0]
+
+
+def test_warning_of_a_bound():
+    fit = made(active=("mu at its upper bound 0.8",), free_basis=np.eye(3)[:, :2], cost=28.5)
+    assert only_warning(fit).startswith("mu is at its upper bound 0.8: it has no standard error")
+    assert line_with(report(fit), "mu  ") == "mu 0.8 held 0.5 AT UPPER BOUND"
+    lower = made(active=("mu at its lower bound 0.8",), free_basis=np.eye(3)[:, :2], cost=28.5)
+    assert "AT LOWER BOUND" in line_with(report(lower), "mu  ")
+
+
+def test_warning_of_a_collapsed_mode():
+    fit = made(active=("mode 2 ('slip') has collapsed to nothing",))
+    assert only_warning(fit).startswith("Mode 2 ('slip') has collapsed to nothing: the data want no such mode there.")
+
+
+def test_warning_of_a_shortest_duration():
+    fit = made(active=("mode 2 ('slip') of run1 is at its minimum duration",))
+    assert only_warning(fit).startswith("Mode 2 ('slip') of run1 is at its minimum duration: the data would have it")
+
+
+def test_warning_of_another_constraint():
+    assert only_warning(made(active=("something else",))) == "Active constraint: something else."
+
+
+def test_warning_of_a_kink():
+    fit = made(kinks=(("tau_1", -3.0, 5.0),), free_basis=np.eye(3)[:, 1:], cost=28.5)
+    assert only_warning(fit).startswith("tau_1 is at a kink of the cost, where its derivative jumps from -3.0e+00 to")
+    assert line_with(report(fit), "tau_1  ") == "tau_1 4 held s 3 stick -> slip, AT A KINK"
+
+
+def test_warning_of_a_hessian_that_is_not_positive_definite():
+    fit = made(hessian=np.diag([1.0, -4.0, 1.0]), status=Status.SADDLE)
+    expected = "No standard errors: the Hessian is not positive definite (smallest eigenvalue -1.0e+00"
+    assert only_warning(fit).startswith(expected)
+
+
+def test_warning_of_unknowns_that_are_not_told_apart():
+    a, b = np.array([0.0, 3.0, 500.0]), np.array([1.0, 0.0, 0.0])
+    fit = made(hessian=np.outer(a, a) + np.outer(b, b), status=Status.SINGULAR)
+    undetermined, without = warnings_of(fit)
+    assert undetermined.startswith("The data hardly determine tau_2 and mu apart from one another")
+    assert without.startswith("No standard errors: the Hessian is not positive definite")
+    nearly = made(hessian=np.outer(a, a) + np.outer(b, b) + np.diag([0.0, 1e-7, 0.0]))
+    assert only_warning(nearly).startswith("The data hardly determine tau_2 and mu apart from one another")
+
+
+def test_warning_of_an_unknown_without_influence():
+    fit = made(hessian=np.diag([1.0, 0.0, 1.0]), status=Status.SINGULAR)
+    assert warnings_of(fit)[0].startswith("The data hardly determine tau_2 (smallest eigenvalue 0.0e+00")
+
+
+def test_warning_of_too_few_samples():
+    trajectory = trajectory_of()
+    comparison = comparison_of(trajectory, samples=3, sigma=None)
+    comparison = replace(comparison, measured=comparison.fitted * [np.nan, 1.0])
+    fit = made(sigma_known=False, comparisons=((comparison,),))
+    expected = "No standard errors: sigma is unknown and 3 values are too few to estimate it beside 3 unknowns."
+    assert only_warning(fit) == expected
+
+
+def test_warning_of_numbers_that_are_not_finite():
+    fit = made(
+        status=Status.NONFINITE_START, cost=np.nan, gradient=np.full(3, np.nan), hessian=np.full((3, 3), np.nan),
+        optimality=np.nan, history=(), free_basis=np.zeros((3, 0)),
+    )  # fmt: skip
+    assert only_warning(fit) == "No standard errors: the cost or its derivatives are not finite."
+    assert line_with(report(fit), "tau_1  ") == "tau_1 4 s 3 stick -> slip"
+
+
+@pytest.mark.parametrize(
+    ("cost", "words"),
+    [
+        (4 * 28.0, ("is 4 where 1 is expected: sigma is too small", "too small, by a factor of 2 ")),
+        (28.0 / 4, ("is 0.25 where 1 is expected: sigma is too large", "too large, by a factor of 2 ")),
+    ],
+)
+def test_warning_of_a_wrong_sigma(cost, words):
+    warning = only_warning(made(cost=cost))
+    assert all(part in warning for part in words)
+    assert not warnings_of(made(cost=cost, sigma_known=False))
+    assert not warnings_of(made(cost=cost, status=Status.MAX_ITERATIONS))
+
+
+def test_no_warning_of_what_chance_explains():
+    assert not warnings_of(made(cost=28.0 * 1.3))
+
+
+def test_warning_of_a_large_integration_error():
+    assert only_warning(made(integration_error=3e-5)).startswith("The integration error of the cost is 3.0e-05")
+    assert only_warning(made(integration_error=np.nan)).startswith("The integration error of the cost is nan")
+
+
+# --- several experiments ----------------------------------------------------------------------------------------------
+
+
+def test_transitions_are_found_in_theta_by_name():
+    fit = several(2, names=["dry", "wet"])
+    assert [(t.run, t.name, t.index, t.before, t.after) for t in transitions_of(fit)] == [
+        ("dry", "dry.tau_1", 0, "stick", "slip"),
+        ("dry", "dry.tau_2", None, "slip", "stick"),
+        ("wet", "wet.tau_1", 1, "stick", "slip"),
+        ("wet", "wet.tau_2", None, "slip", "stick"),
+    ]
+    text = report(fit)
+    assert line_with(text, "dry  ") == "dry stick -> slip -> stick, 0 to 10 s"
+    assert line_with(text, "wet.tau_2") == "wet.tau_2 7 s slip -> stick"
+    assert line_with(text, "wet dX") == "wet dX 30 0.1 m/s 1"
+
+
+def test_transitions_of_one_experiment_with_the_first_fixed():
+    fit = made(
+        theta_names=("tau_2", "tau_1"), theta_units=("s", ""), theta=np.array([7.0, 4.0]),
+        initial_theta=np.ones(2), hessian=np.eye(2), free_basis=np.eye(2),
+    )  # fmt: skip
+    assert [(t.name, t.index) for t in transitions_of(fit)] == [("tau_1", None), ("tau_2", 0)]
+
+
+def test_many_experiments_are_cut_short():
+    text = report(several(14))
+    assert "and 4 more experiments" in text
+    assert "run10 " in text
+    assert "run11  " not in text
+    assert "run14.tau_1" in text
+
+
+def test_correlations_are_the_largest_first_and_at_most_ten():
+    d = 8
+    rng = np.random.default_rng(0)
+    factor = rng.standard_normal((d, d))
+    names = tuple(f"p{k}" for k in range(d))
+    fit = made(
+        theta_names=names, theta_units=("",) * d, theta=np.arange(d) + 1.0, initial_theta=np.ones(d),
+        lower=np.full(d, -np.inf), upper=np.full(d, np.inf), hessian=factor @ factor.T, free_basis=np.eye(d),
+        parameters={name: np.array(1.0) for name in names},
+    )  # fmt: skip
+    section = report(fit).split("Correlations above 0.1\n")[1].split("\n\n")[0].splitlines()
+    sizes = [abs(float(line.split()[-1])) for line in section[:10]]
+    expected = np.sort(np.abs(fit.correlation[np.tril_indices(d, -1)]))[::-1]
+    assert sizes == pytest.approx(expected[:10], abs=6e-4)
+    assert section[10].strip() == f"and {np.sum(expected > 0.1) - 10} more"
+
+
+def test_array_parameters_that_are_fixed_are_abbreviated():
+    text = report(made(parameters={"mu": np.array(0.8), "table": np.arange(100.0)}))
+    assert line_with(text, "table") == "table [ 0., 1., ..., 98., 99.]"
+
+
+# --- figures ----------------------------------------------------------------------------------------------------------
+
+
+def axes() -> tuple[Figure, object]:
+    figure = Figure(figsize=(8, 3))
+    return figure, figure.add_subplot()
+
+
+def test_figure_of_a_fit():
+    fit = made()
+    figure = plot_fit(fit)
+    assert [ax.get_ylabel() for ax in figure.axes] == ["X (m)", "residual\n(m)", "h", "residual"]
+    assert [ax.get_xlabel() for ax in figure.axes] == ["", "", "", "time (s)"]
+    assert all(ax.get_xlim() == (0.0, 10.0) for ax in figure.axes)
+    assert [text.get_text() for text in figure.axes[0].texts] == ["stick", "slip", "stick"]
+    assert not figure.axes[1].texts
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert legend == ["measured", "fitted", "± sigma", "transition", "± standard error"]
+    figure.draw_without_rendering()
+
+
+def test_comparison_draws_samples_and_curve():
+    trajectory = trajectory_of()
+    comparison = comparison_of(trajectory)
+    _, ax = axes()
+    assert plot_comparison(comparison, trajectory, 0, ax) is ax
+    samples, curve = ax.lines
+    np.testing.assert_array_equal(samples.get_ydata(), comparison.measured[:, 0])
+    assert (samples.get_linestyle(), samples.get_marker()) == ("None", "o")
+    assert curve.get_linestyle() == "-"
+    x, y = curve.get_data()
+    assert x[np.isnan(y)].tolist() == [4.0, 7.0]  # states jump there
+    np.testing.assert_array_equal(y[~np.isnan(y)], comparison.curve[:, 0])
+
+
+def test_reference_signals_are_dashed_and_grey():
+    trajectory = trajectory_of()
+    _, ax = axes()
+    plot_comparison(comparison_of(trajectory, kind="reference", sigma=None), trajectory, 0, ax)
+    signal, _ = ax.lines
+    assert signal.get_linestyle() == "--"
+    assert len(set(to_rgb(signal.get_color()))) == 1
+
+
+def test_dots_become_smaller_the_more_there_are():
+    trajectory = trajectory_of()
+    sizes = []
+    for samples in (20, 300, 20000):
+        _, ax = axes()
+        plot_comparison(comparison_of(trajectory, samples=samples), trajectory, 0, ax)
+        sizes.append(ax.lines[0].get_markersize())
+    assert sizes[0] > sizes[1] > sizes[2]
+    assert ax.lines[0].get_rasterized()
+
+
+def test_residuals_lie_between_sigmas():
+    trajectory = trajectory_of()
+    comparison = comparison_of(trajectory)
+    _, ax = axes()
+    assert plot_residuals(comparison, trajectory, 0, ax) is ax
+    _, residuals, upper, lower = ax.lines
+    np.testing.assert_array_equal(residuals.get_ydata(), comparison.residuals[:, 0])
+    assert set(upper.get_ydata()) == {0.1}
+    assert set(lower.get_ydata()) == {-0.1}
+    _, ax = axes()
+    plot_residuals(replace(comparison, sigma=None), trajectory, 0, ax)
+    assert len(ax.lines) == 2
+
+
+def spans(ax) -> list[tuple[float, float]]:
+    return [(patch.get_x(), patch.get_x() + patch.get_width()) for patch in ax.patches]
+
+
+def test_modes_are_shaded_and_named():
+    _, ax = axes()
+    assert plot_modes(trajectory_of(), ax) is ax
+    assert spans(ax) == [(0.0, 4.0), (4.0, 7.0), (7.0, 10.0)]
+    stick, slip, again = (patch.get_facecolor() for patch in ax.patches)
+    assert stick == again != slip
+    assert [text.get_text() for text in ax.texts] == ["stick", "slip", "stick"]
+    assert [text.get_rotation() for text in ax.texts] == [0, 0, 0]
+
+
+def test_names_of_short_modes_are_turned_or_left_out():
+    _, ax = axes()
+    modes = ("before", "impact", "gone", "collapsed", "after")
+    plot_modes(trajectory_of(modes, (0.0, 4.0, 4.4, 4.41, 4.41, 10.0)), ax)
+    assert [(text.get_text(), text.get_rotation()) for text in ax.texts] == [
+        ("before", 0),
+        ("impact", 90),
+        ("after", 0),
+    ]
+    assert len(ax.patches) == 4
+
+
+def test_modes_too_short_for_a_name_are_in_the_legend():
+    trajectory = trajectory_of(("a", "b", "collapsed", "c"), (0.0, 4.0, 4.01, 4.01, 10.0))
+    times = np.array([4.0, 4.01, 4.01])
+    fit = made(trajectories=(trajectory,), comparisons=((),), transition_times=(times,), sigma_known=None)
+    assert [text.get_text() for text in plot_fit(fit).legends[0].get_texts()] == ["fitted", "transition", "b"]
+
+
+def test_mode_colours_are_light_and_differ_in_grey():
+    grey = np.array([np.dot([0.2126, 0.7152, 0.0722], to_rgb(colour)) for colour in MODE_COLOURS])
+    assert grey.min() > 0.75
+    assert np.abs(np.diff(grey)).min() > 0.02
+    colours = mode_colours([trajectory_of(("a", "b"), (0.0, 1.0, 2.0)), trajectory_of(("c", "b"), (0.0, 1.0, 2.0))])
+    assert list(colours) == ["a", "b", "c"]
+    assert len(set(colours.values())) == 3
+
+
+def test_transitions_have_bands_of_their_errors():
+    _, ax = axes()
+    assert plot_transitions([4.0, 7.0, 9.0], [0.5, np.nan, 0.0], ax) is ax
+    assert [line.get_xdata()[0] for line in ax.lines] == [4.0, 7.0, 9.0]
+    assert spans(ax) == [(3.5, 4.5)]
+
+
+def test_bands_in_a_figure_are_the_standard_errors():
+    fit = made()
+    bands = spans(plot_fit(fit).axes[0])[3:]
+    expected = [(t - s, t + s) for t, s in zip(fit.theta[:2], fit.standard_errors[:2], strict=True)]
+    np.testing.assert_allclose(bands, expected, rtol=1e-12)
+    without = plot_fit(made(sigma_known=None))
+    assert len(spans(without.axes[0])) == 3
+    assert "± standard error" not in [text.get_text() for text in without.legends[0].get_texts()]
+
+
+def test_convergence_is_logarithmic():
+    figure, ax = axes()
+    history = [IterationRecord(k, 1.0, value, 1.0, np.zeros(1), k) for k, value in enumerate([50.0, 1e-2, 0.0])]
+    assert plot_convergence(history, ax, tolerance=1e-7) is ax
+    assert ax.get_yscale() == "log"
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("iteration", "optimality (KKT residual)")
+    np.testing.assert_array_equal(ax.lines[0].get_ydata(), [50.0, 1e-2, np.nan])
+    assert ax.lines[1].get_ydata()[0] == 1e-7
+    figure.draw_without_rendering()
+
+
+@pytest.mark.parametrize("values", [[], [0.0], [np.nan]])
+def test_convergence_of_nothing(values):
+    figure, ax = axes()
+    plot_convergence([IterationRecord(k, 1.0, v, 1.0, np.zeros(1), k) for k, v in enumerate(values)], ax)
+    figure.draw_without_rendering()
+
+
+def test_states_are_drawn_where_there_is_no_data():
+    figure = plot_fit(made(sigma_known=None, comparisons=((),)))
+    assert [ax.get_ylabel() for ax in figure.axes] == ["X (m)", "dX (m/s)"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["fitted", "transition"]
+    figure.draw_without_rendering()
+
+
+def titles(figure) -> list[str]:
+    return [block.get_suptitle() for block in figure.subfigs]
+
+
+def test_each_experiment_has_its_own_column():
+    figure = plot_fit(several(2, names=["dry", "wet"]))
+    assert titles(figure) == ["dry", "wet"]
+    assert len(figure.axes) == 2 * 4
+    assert figure.get_suptitle() == ""
+
+
+def test_of_many_experiments_ten_are_drawn():
+    figure = plot_fit(several(12))
+    assert titles(figure) == [f"run{e + 1}" for e in range(10)]
+    assert figure.get_suptitle() == "10 of 12 experiments"
+    assert figure.get_figwidth() <= 20
+
+
+def test_a_fit_that_failed_says_so_in_its_figure():
+    assert plot_fit(made(status=Status.MAX_ITERATIONS)).get_suptitle() == "Not a minimum: max iterations"
+
+
+def test_a_system_without_transitions():
+    trajectory = trajectory_of(("only",), (0.0, 10.0))
+    fit = made(
+        theta_names=("mu",), theta_units=("",), theta=np.array([0.8]), initial_theta=np.ones(1), hessian=np.eye(1),
+        transition_times=(np.zeros(0),), free_basis=np.eye(1), trajectories=(trajectory,),
+        comparisons=((comparison_of(trajectory),),),
+    )  # fmt: skip
+    assert line_with(report(fit), "experiment") == "experiment only, 0 to 10 s"
+    legend = [text.get_text() for text in plot_fit(fit).legends[0].get_texts()]
+    assert legend == ["measured", "fitted", "± sigma"]
+
+
+def test_importing_switchfit_does_not_import_matplotlib():
+    code = "import switchfit, sys; print('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "False\n"
+
+
+# --- a real fit -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="session")
+def heater() -> sf.Estimate:
+    """A heater goes off at 4 s; sigma is 0.05."""
+    system = sf.HybridSystem(
+        {"on": lambda t, x, p: p["power"] - 0.3 * x, "off": lambda t, x, p: -0.3 * x}, [0.0], state_names=("T",),
+        state_units=("K",),
+    )  # fmt: skip
+    times = np.linspace(0.1, 9.9, 41)
+    on = 2.0 / 0.3 * (1 - np.exp(-0.3 * np.minimum(times, 4.0)))
+    values = on * np.exp(-0.3 * np.maximum(times - 4.0, 0.0)) + 0.05 * np.random.default_rng(3).standard_normal(41)
+    run = sf.Experiment(
+        sf.Measurements(times, values, observe=lambda t, x, p: jnp.array([x[0]]), sigma=0.05, names=("T",)),
+        ("on", "off"), (5.0,), 0.0, 10.0,
+    )  # fmt: skip
+    return sf.estimate(sf.Problem(system, run, {"power": sf.Parameter(1.5, lower=0.0, unit="K/s")}))
+
+
+def test_report_of_a_real_fit(heater):
+    text = str(heater)
+    assert "Warnings" not in text
+    assert line_with(text, "T  ").startswith("T 41 0.0")
+    tau, power = heater.theta
+    assert line_with(text, "tau_1  ").startswith(f"tau_1 {tau:.3f} ± ")
+    assert line_with(text, "tau_1  ").endswith("s 5 on -> off")
+    assert line_with(text, "power  ").startswith(f"power {power:.4f} ± ")
+    assert " K/s 1.5" in line_with(text, "power  ")
+
+
+def test_figure_of_a_real_fit(heater):
+    figure = heater.plot()
+    assert [ax.get_ylabel() for ax in figure.axes] == ["T (K)", "residual\n(K)"]
+    x, y = figure.axes[0].lines[1].get_data()
+    assert np.nanmax(y) == pytest.approx(heater.trajectory.states.max())
+    assert heater.theta[0] in x
+    figure.draw_without_rendering()

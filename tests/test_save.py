@@ -1,0 +1,291 @@
+"""Saving a fit and loading it gives the same fit, to the bit; what is no saved fit is refused with the reason."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from test_report import comparison_of, made, several, trajectory_of
+
+import switchfit as sf
+from switchfit.io.json import FORMAT, VERSION, load_fit, save_fit
+from switchfit.optimize import Status
+from switchfit.result import Certificate, Fit
+
+CERTIFICATE = Certificate(
+    optimality=2e-9,
+    smallest_eigenvalue=np.nan,
+    smallest_scaled_eigenvalue=0.1,
+    condition_number=np.inf,
+    worst_direction="tau_1 and mu trade off",
+    integration_error=1e-12,
+    gradient_gap=5e-324,
+    hessian_gap=1.7976931348623157e308,
+    active=("mu at its lower bound 0.05", "mode 1 ('ü\"\\') has collapsed to nothing"),
+)
+
+
+def assert_same(a, b, where=""):
+    """Equal in type and value throughout; arrays in dtype, shape and bits."""
+    if isinstance(a, np.ndarray):
+        assert (a.dtype, a.shape) == (b.dtype, b.shape), where
+        assert a.tobytes() == b.tobytes(), where
+    elif is_dataclass(a):
+        assert type(a) is type(b), where
+        for field in fields(a):
+            assert_same(getattr(a, field.name), getattr(b, field.name), f"{where}.{field.name}")
+    elif isinstance(a, (tuple, list)):
+        assert (type(a), len(a)) == (type(b), len(b)), where
+        for k, (x, y) in enumerate(zip(a, b, strict=True)):
+            assert_same(x, y, f"{where}[{k}]")
+    elif isinstance(a, dict):
+        assert list(a) == list(b), where
+        for key in a:
+            assert_same(a[key], b[key], f"{where}[{key!r}]")
+    elif isinstance(a, float) and np.isnan(a):
+        assert np.isnan(b), where
+    else:
+        assert type(a) is type(b), where
+        assert a == b, where
+
+
+def round_trip(fit: Fit, folder: Path, certificate: Certificate = CERTIFICATE) -> tuple[Fit, Certificate]:
+    save_fit(fit, certificate, folder / "fit.json")
+    return load_fit(folder / "fit.json")
+
+
+def without_numbers() -> Fit:
+    """What a start that is not finite leaves."""
+    nothing = np.full(3, np.nan)
+    return made(
+        status=Status.NONFINITE_START, cost=np.nan, gradient=nothing, hessian=np.outer(nothing, nothing),
+        optimality=np.nan, history=(), free_basis=np.zeros((3, 0)), integration_error=np.inf,
+    )  # fmt: skip
+
+
+def with_everything_odd() -> Fit:
+    """Empty and scalar arrays, negative zeros, the smallest numbers, missing samples, unknown sigma, kinks."""
+    trajectory = trajectory_of(("plain", "ünïcode", "a longer name"))
+    comparison = comparison_of(trajectory, sigma=None)
+    empty = replace(comparison, times=np.zeros(0), measured=np.zeros((0, 2)), fitted=np.zeros((0, 2)))
+    return made(
+        parameters={"scalar": np.array(-0.0), "matrix": np.array([[5e-324, 1 / 3], [-np.inf, 1e308]]),
+                    "none": np.zeros((2, 0, 3)), "one": np.array([0.1 + 0.2])},
+        trajectories=(trajectory,), comparisons=((comparison, empty),), transition_times=(np.zeros(0),),
+        kinks=(("tau_1", -1.5, 2.5),), active=("a", "b"), sigma_known=None, theta_units=("", "°C", "m/s²"),
+        free_basis=np.zeros((3, 0)),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "fit",
+    [made(), made(sigma_known=False), several(3), without_numbers(), with_everything_odd(), made(comparisons=((),))],
+    ids=["plain", "sigma unknown", "several", "no numbers", "odd", "no data"],
+)
+def test_loading_gives_the_same_fit(fit, tmp_path):
+    loaded, certificate = round_trip(fit, tmp_path)
+    assert_same(fit, loaded)
+    assert_same(CERTIFICATE, certificate)
+
+
+@pytest.mark.parametrize("status", Status)
+def test_every_status_is_kept(status, tmp_path):
+    assert round_trip(made(status=status), tmp_path)[0].status is status
+
+
+FLOATS = st.floats(allow_nan=False) | st.just(np.nan)
+
+
+@given(
+    theta=hnp.arrays(np.float64, hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4), elements=FLOATS),
+    labels=hnp.arrays("<U4", st.integers(0, 5), elements=st.text(alphabet='aé"\\\n', max_size=4)),
+    counts=hnp.arrays(np.intp, st.integers(0, 5)),
+    cost=FLOATS,
+)
+def test_any_array_comes_back_to_the_bit(tmp_path_factory, theta, labels, counts, cost):
+    trajectory = replace(trajectory_of(), modes=labels, segments=counts)
+    fit = made(theta=theta, cost=cost, trajectories=(trajectory,))
+    assert_same(fit, round_trip(fit, tmp_path_factory.getbasetemp())[0])
+
+
+def test_the_file_is_strict_and_readable(tmp_path):
+    save_fit(made(), CERTIFICATE, tmp_path / "fit.json")
+    text = (tmp_path / "fit.json").read_text(encoding="utf-8")
+
+    def refuse(name):
+        raise AssertionError(f"{name} is not JSON")
+
+    content = json.loads(text, parse_constant=refuse)
+    assert (content["format"], content["version"]) == (FORMAT, VERSION)
+    assert content["fit"]["theta"] == [4.0, 7.0, 0.8]
+    assert content["fit"]["hessian"][1] == [20.0, 100.0, 300.0]
+    assert content["fit"]["lower"] == ["-inf", "-inf", 0.05]
+    assert content["fit"]["status"] == "CONVERGED"
+    assert content["certificate"]["smallest_eigenvalue"] == "nan"
+    assert '    "theta": [4.0, 7.0, 0.8],\n' in text
+
+
+def test_a_subclass_is_saved_as_a_fit(tmp_path):
+    fit = made()
+    given = {field.name: getattr(fit, field.name) for field in fields(Fit)}
+    estimate = sf.Estimate(**given, certificate_data=CERTIFICATE)
+    estimate.save(str(tmp_path / "fit.json"))
+    loaded = sf.Estimate.load(str(tmp_path / "fit.json"))
+    assert_same(fit, Fit(**{field.name: getattr(loaded, field.name) for field in fields(Fit)}))
+    assert_same(CERTIFICATE, loaded.certificate)
+    assert str(loaded) == str(estimate)
+
+
+def test_a_real_fit_comes_back(tmp_path):
+    system = sf.HybridSystem({"up": lambda t, x, p: p["v"] + 0 * x, "rest": lambda t, x, p: 0 * x}, [0.0])
+    times = np.linspace(0.05, 1.95, 20)
+    data = sf.Measurements(times, 3.0 * np.minimum(times, 1.23) + 0.01 * np.cos(40 * times))
+    problem = sf.Problem(system, sf.Experiment(data, ("up", "rest"), (1.0,), 0.0, 2.0), {"v": 2.0})
+    estimate = sf.estimate(problem)
+    estimate.save(tmp_path / "fit.json")
+    loaded = sf.Estimate.load(tmp_path / "fit.json")
+    for field in fields(Fit):
+        assert_same(getattr(estimate, field.name), getattr(loaded, field.name), field.name)
+    assert_same(estimate.certificate, loaded.certificate)
+    assert str(loaded) == str(estimate)
+    np.testing.assert_array_equal(loaded.standard_errors, estimate.standard_errors)
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_file_is_replaced_whole_and_nothing_is_left_beside_it(tmp_path):
+    path = tmp_path / "fit.json"
+    path.write_text("x" * 10_000_000)
+    save_fit(made(), CERTIFICATE, path)
+    assert load_fit(path)[0].cost == 28.0
+    assert os.listdir(tmp_path) == ["fit.json"]
+
+
+def test_a_failure_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "fit.json"
+    save_fit(made(), CERTIFICATE, path)
+    before = path.read_bytes()
+
+    def full(handle):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        save_fit(made(cost=1.0), CERTIFICATE, path)
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["fit.json"]
+
+
+def test_a_link_stays_one(tmp_path):
+    (tmp_path / "link.json").symlink_to(tmp_path / "fit.json")
+    save_fit(made(), CERTIFICATE, tmp_path / "link.json")
+    assert (tmp_path / "link.json").is_symlink()
+    assert load_fit(tmp_path / "fit.json")[0].cost == 28.0
+
+
+def test_a_new_file_has_the_usual_permissions(tmp_path):
+    save_fit(made(), CERTIFICATE, tmp_path / "fit.json")
+    (tmp_path / "usual").touch()
+    assert (tmp_path / "fit.json").stat().st_mode == (tmp_path / "usual").stat().st_mode
+
+
+def test_a_folder_that_is_not_there(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        save_fit(made(), CERTIFICATE, tmp_path / "nowhere" / "fit.json")
+
+
+# --- what cannot be read ----------------------------------------------------------------------------------------------
+
+
+def test_a_missing_file(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        load_fit(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (b"", "no valid JSON"),
+        (b"PK\x03\x04\xff\xfe", "no valid JSON"),
+        (b'{"format": "switchfit fit", "version": 1, "fit"', "no valid JSON"),
+        (b'{"format": "switchfit fit", "version": NaN}', "no valid JSON \\(it contains NaN\\)"),
+        (b"[" * 100_000, "no valid JSON"),
+        (b"[1, 2]", 'no entry "format": "switchfit fit"'),
+        (b'{"theta": [1.0]}', 'no entry "format": "switchfit fit"'),
+        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads version 1"),
+        (b'{"format": "switchfit fit", "version": 2}', "of version 2; this switchfit reads version 1"),
+        (b'{"format": "switchfit fit", "version": 1}', "is damaged: fit must be an object; got null"),
+    ],
+)
+def test_what_is_no_saved_fit(text, message, tmp_path):
+    path = tmp_path / "fit.json"
+    path.write_bytes(text)
+    with pytest.raises(ValueError, match=f"{re.escape(str(path))}.*{message}"):
+        load_fit(path)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        (("fit", "cost"), None, "fit.cost must be a number, or one of"),
+        (("fit", "cost"), True, "fit.cost must be a number"),
+        (("fit", "cost"), "12.5", 'fit.cost must be a number, or one of "nan", "inf", "-inf"; got "12.5"'),
+        (("fit", "cost"), 10**400, "int too large to convert to float"),
+        (("fit", "theta"), [1.0, None], "fit.theta must be a number"),
+        (("fit", "theta"), "abc", "fit.theta must be a number"),
+        (("fit", "hessian"), [[1.0], [2.0, 3.0]], "fit.hessian is no array of float64"),
+        (("fit", "theta"), {"values": []}, "fit.theta must be an array"),
+        (("fit", "theta"), {"dtype": "f9", "shape": [0], "values": []}, "fit.theta has the unknown dtype 'f9'"),
+        (("fit", "theta"), {"dtype": "O", "shape": [0], "values": []}, "fit.theta has the dtype 'O', which is none"),
+        (("fit", "theta"), {"dtype": "<f8", "shape": [2], "values": []}, "has the shape (2,) but 0 values"),
+        (
+            ("fit", "theta"),
+            {"dtype": "<f8", "shape": [-1, -1], "values": [1]},
+            "has the shape (-1, -1) but 1 values",
+        ),
+        (
+            ("fit", "theta"),
+            {"dtype": "<i8", "shape": [1], "values": [1]},
+            "must be an array of float64; got one of int64",
+        ),
+        (
+            ("fit", "trajectories", 0, "segments"),
+            {"dtype": "<i8", "shape": [1], "values": ["a"]},
+            "is no array of int64",
+        ),
+        (("fit", "status"), "FINE", "fit.status must be one of CONVERGED, "),
+        (("fit", "status"), None, "fit.status must be one of CONVERGED, "),
+        (("fit", "iterations"), 2.5, "fit.iterations must be an integer; got 2.5"),
+        (("fit", "sigma_known"), 1, "fit.sigma_known must be true or false; got 1"),
+        (("fit", "message"), ["a"], 'fit.message must be a string; got ["a"]'),
+        (("fit", "active"), "abc", "fit.active must be a list"),
+        (("fit", "kinks"), [["tau_1", 1.0]], "fit.kinks[0] must have 3 entries; got 2"),
+        (("fit", "parameters"), [], "fit.parameters must be an object; got []"),
+        (("fit", "history", 1), {"iteration": 0}, "fit.history[1].cost is missing"),
+        (("fit", "trajectories", 0, "modes"), 3, "fit.trajectories[0].modes must be an array of str_; got"),
+        (("fit", "comparisons", 0, 0, "kind"), None, "fit.comparisons[0][0].kind must be a string; got null"),
+        (("fit", "colour"), "red", "fit has the unknown entry 'colour'"),
+        (("certificate",), {}, "certificate.optimality is missing"),
+    ],
+)
+def test_what_is_damaged(place, value, message, tmp_path):
+    path = tmp_path / "fit.json"
+    save_fit(made(), CERTIFICATE, path)
+    content = json.loads(path.read_text(encoding="utf-8"))
+    inner = content
+    for key in place[:-1]:
+        inner = inner[key]
+    inner[place[-1]] = value
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+        load_fit(path)
+    assert str(caught.value).startswith(f"{path} is damaged: ")
