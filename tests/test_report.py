@@ -325,6 +325,24 @@ def test_no_warning_of_what_chance_explains():
     assert not warnings_of(made(cost=28.0 * 1.3))
 
 
+def test_warning_of_residuals_with_a_trend():
+    trajectory = trajectory_of()
+    comparison = comparison_of(trajectory, samples=60)
+    comparison.measured[:, 0] = comparison.fitted[:, 0] + 0.1 * np.sqrt(2) * np.sin(0.2 * np.arange(60))
+    fit = made(comparisons=((comparison,),), cost=58.0)
+    assert only_warning(fit).startswith("Neighbouring residuals are correlated in X (0.9")
+    assert not warnings_of(replace(fit, sigma_known=None))[1:]  # only that there are no standard errors
+    short = comparison_of(trajectory, samples=12)
+    short.measured[:] = short.fitted + 0.1
+    assert not warnings_of(made(comparisons=((short,),), cost=10.0))  # 12 of one sign: too few to tell
+
+
+def test_no_trend_where_the_data_is_met_exactly():
+    comparison = comparison_of(trajectory_of(), sigma=None)
+    exact = replace(comparison, measured=comparison.fitted)
+    assert not warnings_of(made(comparisons=((exact,),), cost=0.0, sigma_known=False))
+
+
 def test_warning_of_a_large_integration_error():
     assert only_warning(made(integration_error=3e-5)).startswith("The integration error of the cost is 3.0e-05")
     assert only_warning(made(integration_error=np.nan)).startswith("The integration error of the cost is nan")

@@ -26,6 +26,8 @@ LARGE_INTEGRATION_ERROR = 1e-6
 """Relative error of the cost by halving the steps above which the report warns."""
 UNLIKELY = 1e-3
 """Probability of the residual variance below which the report warns, if it is 10 % off as well."""
+TREND = 0.5
+"""Correlation of neighbouring residuals above which the report warns, if it is 4 standard errors from 0 as well."""
 
 METHODS = {
     "exact": "SQP with the exact Hessian",
@@ -66,7 +68,7 @@ def warnings_of(fit: Fit) -> list[str]:
     ----------
     fit : Fit
     """
-    sources = (_held, _at_kinks, _undetermined, _without_errors, _noise, _integration)
+    sources = (_held, _at_kinks, _undetermined, _without_errors, _noise, _trends, _integration)
     return [warning for source in sources for warning in source(fit)]
 
 
@@ -426,6 +428,33 @@ def _noise(fit: Fit) -> Iterator[str]:
             f"smoothed before. Standard errors are too large, by a factor of {1 / np.sqrt(variance):.2g} if it is "
             "sigma."
         )
+
+
+def _trends(fit: Fit) -> Iterator[str]:
+    """Residuals that are alike from one sample to the next: the errors of the model, not of the sensor."""
+    if not fit.success or fit.sigma_known is None:
+        return
+    single = len(fit.trajectories) == 1
+    found = []
+    for name, run in zip(run_names(fit), fit.comparisons, strict=True):
+        for comparison in run:
+            for channel, residual in zip(comparison.names, comparison.residuals.T, strict=True):
+                correlation = _lag_correlation(residual[np.isfinite(residual)])
+                if correlation > TREND:
+                    found.append(f"{'' if single else f'{name} '}{channel} ({correlation:.2f})")
+    if found:
+        more = f" and {len(found) - 6} more" if len(found) > 6 else ""
+        yield (
+            f"Neighbouring residuals are correlated in {', '.join(found[:6])}{more}: the model misses something there, "
+            "or the samples were smoothed before. The standard errors take them as independent and are too small."
+        )
+
+
+def _lag_correlation(residual: FloatArray) -> float:
+    """Correlation of each residual with the next, about zero; 0 where chance may explain it."""
+    square = float(residual @ residual)
+    correlation = float(residual[1:] @ residual[:-1]) / square if square > 0 else 0.0
+    return correlation if abs(correlation) * np.sqrt(len(residual)) > 4 else 0.0
 
 
 def _integration(fit: Fit) -> Iterator[str]:
