@@ -34,11 +34,11 @@ def folder() -> Path | None:
 def compilation_cache() -> Iterator[None]:
     """Context in which JAX reads and writes compiled programs in `folder`; everything is as before afterwards."""
     path = folder()
-    if path is None or jax.config.jax_compilation_cache_dir or not _writable(path):
+    if path is None or jax.config.read("jax_compilation_cache_dir") or not _writable(path):
         yield
         return
     settings = {**SETTINGS, "jax_compilation_cache_dir": str(path)}
-    before = {name: getattr(jax.config, name) for name in settings}
+    before = {name: jax.config.read(name) for name in settings}
     try:
         for name, value in settings.items():
             jax.config.update(name, value)

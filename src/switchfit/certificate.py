@@ -5,33 +5,34 @@ from __future__ import annotations
 import numpy as np
 
 from switchfit.check import derivative_gap
-from switchfit.data import FloatArray
 from switchfit.evaluate import Evaluator
-from switchfit.result import Certificate, Fit
+from switchfit.result import Certificate, Fit, free_curvature
 
 
-def certify(fit: Fit, evaluator: Evaluator) -> Certificate:
+def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
     """Check a fit.
 
     Parameters
     ----------
     fit : Fit
-    evaluator : Evaluator
-        Of its problem; its meshes refined at the solution.
+    evaluator : Evaluator or None
+        Of its problem, its meshes refined at the solution. Without it the paper's equations are not evaluated and
+        the gaps are NaN.
 
     Returns
     -------
     Certificate
     """
-    values, scaled, direction = curvature_on_free_directions(fit)
-    gaps = derivative_gap(evaluator, fit.theta)
+    curvature = free_curvature(fit)
+    scaled = curvature.scaled
+    gaps = (np.nan, np.nan) if evaluator is None else derivative_gap(evaluator, fit.theta)
     kinks = tuple(f"{name} at a kink ({left:.1e}, {right:.1e})" for name, left, right in fit.kinks)
     return Certificate(
         optimality=fit.optimality,
-        smallest_eigenvalue=float(values[0]) if len(values) else np.nan,
+        smallest_eigenvalue=curvature.smallest,
         smallest_scaled_eigenvalue=float(scaled[0]) if len(scaled) else np.nan,
         condition_number=float(scaled[-1] / scaled[0]) if len(scaled) and scaled[0] > 0 else np.inf,
-        worst_direction=in_words(fit, direction),
+        worst_direction=_in_words(curvature.weakest),
         integration_error=fit.integration_error,
         gradient_gap=gaps[0],
         hessian_gap=gaps[1],
@@ -39,23 +40,8 @@ def certify(fit: Fit, evaluator: Evaluator) -> Certificate:
     )
 
 
-def curvature_on_free_directions(fit: Fit) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Eigenvalues (k,) of the Hessian on the free directions, those with scaled unknowns, and the weakest (d,)."""
-    Z = fit.free_basis
-    if Z.shape[1] == 0 or not np.isfinite(fit.hessian).all():
-        return np.zeros(0), np.zeros(0), np.zeros(len(fit.theta))
-    size = 1 / np.sqrt(np.maximum(np.abs(np.diag(fit.hessian)), np.finfo(float).tiny))
-    basis = np.linalg.qr(Z / size[:, None])[0]
-    scaled, vectors = np.linalg.eigh(basis.T @ (fit.hessian * np.outer(size, size)) @ basis)
-    return np.linalg.eigvalsh(Z.T @ fit.hessian @ Z), scaled, size * (basis @ vectors[:, 0])
-
-
-def in_words(fit: Fit, direction: FloatArray) -> str:
-    """The unknowns that a direction mostly consists of, in units of their curvature."""
-    weight = np.abs(direction) * np.sqrt(np.abs(np.diag(fit.hessian)))
-    if not weight.any() or not np.isfinite(weight).all():
-        return "none"
-    strong = [i for i in np.argsort(-weight) if weight[i] > 0.3 * weight.max()][:4]
-    if len(strong) == 1:
-        return f"{fit.theta_names[strong[0]]} alone"
-    return " and ".join(fit.theta_names[i] for i in strong) + " trade off"
+def _in_words(names: tuple[str, ...]) -> str:
+    """The unknowns that a direction mostly consists of."""
+    if len(names) < 2:
+        return f"{names[0]} alone" if names else "none"
+    return " and ".join(names) + " trade off"

@@ -90,7 +90,7 @@ def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, seed:
     base = evaluator(at)
     direction = np.random.default_rng(seed).choice([-1.0, 1.0], size=len(at)) * _scales(base, at)
     largest = _room(evaluator, at, direction)
-    steps = largest * 0.5 ** np.arange(8)
+    steps: FloatArray = largest * 0.5 ** np.arange(8.0)
     remainders = np.array([_remainders(evaluator, base, at, h, direction) for h in steps])
     rounding = remainders < 1e3 * np.finfo(float).eps * max(abs(base.cost), float(remainders.max()))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -111,7 +111,7 @@ def derivative_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[float, floa
 
 
 def _gap(a: FloatArray, b: FloatArray, floor: float) -> float:
-    return float(np.linalg.norm(a - b) / max(np.linalg.norm(b), floor, 1e-300))
+    return float(np.linalg.norm(a - b)) / max(float(np.linalg.norm(b)), floor, 1e-300)
 
 
 def _scales(base: Evaluation, theta: FloatArray) -> FloatArray:
@@ -146,7 +146,7 @@ def _remainders(
     zeroth = evaluator(theta + h * direction).cost - base.cost
     first = zeroth - h * base.gradient @ direction
     second = first - 0.5 * h**2 * direction @ base.hessian @ direction
-    return abs(zeroth), abs(first), abs(second)
+    return abs(zeroth), abs(float(first)), abs(float(second))
 
 
 def _median(orders: FloatArray) -> float:

@@ -44,17 +44,18 @@ ORDER = 5
 class Estimate(Fit):
     """Result of `estimate`: everything in `Fit`, and what can be done with it. Print it for the report."""
 
-    certificate_data: Certificate | None = None
+    saved_certificate: Certificate | None = None
     problem: Problem | None = None
 
     @cached_property
     def certificate(self) -> Certificate:
-        """How the numbers were checked. The paper's equations are evaluated here, at the first access."""
-        if self.certificate_data is not None:
-            return self.certificate_data
-        if self.problem is None:
-            raise ValueError("This estimate was loaded without a certificate and has no problem to check it with.")
-        return certify(self, Evaluator(self.problem, theta=self.theta))
+        """How the numbers were checked. The paper's equations are evaluated here, at the first access.
+
+        An estimate that was loaded has no model: its certificate is the one that was saved.
+        """
+        if self.saved_certificate is not None:
+            return self.saved_certificate
+        return certify(self, None if self.problem is None else Evaluator(self.problem, theta=self.theta))
 
     def __str__(self) -> str:
         return report(self)
@@ -64,7 +65,7 @@ class Estimate(Fit):
         return plot_fit(self)
 
     def save(self, path: str | Path) -> None:
-        """Write everything (but the model) to a JSON file, atomically; `load` reads it."""
+        """Write everything but the model to a JSON file, atomically; `load` reads it."""
         save_fit(self, self.certificate, Path(path))
 
     @classmethod
@@ -77,7 +78,7 @@ class Estimate(Fit):
             If the file is not one of switchfit's.
         """
         fit, certificate = load_fit(Path(path))
-        return cls(**{f.name: getattr(fit, f.name) for f in fields(Fit)}, certificate_data=certificate)
+        return cls(**{f.name: getattr(fit, f.name) for f in fields(Fit)}, saved_certificate=certificate)
 
 
 @dataclass(frozen=True, eq=False)

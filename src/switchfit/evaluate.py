@@ -198,9 +198,9 @@ def _autodiff(model: Model, tau: jax.Array, p: jax.Array, side: jax.Array) -> tu
     """J and its derivatives by JAX alone, forward over forward."""
     N = model.structure.N
 
-    def J(theta: jax.Array) -> jax.Array:
+    def cost(theta: jax.Array) -> jax.Array:
         path = propagate(model, theta[:N], theta[N:], side)
         return path_cost(model, path, theta[N:])
 
     theta = jnp.concatenate([tau, p])
-    return J(theta), jax.jacfwd(J)(theta), jax.jacfwd(jax.jacfwd(J))(theta)
+    return cost(theta), jax.jacfwd(cost)(theta), jax.jacfwd(jax.jacfwd(cost))(theta)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -179,7 +180,7 @@ def initial_state_of(system: HybridSystem, experiment: Experiment) -> Any:
 
 def reset_maps_of(system: HybridSystem, mode_sequence: Sequence[str]) -> tuple[ResetMap | None, ...]:
     """The reset map of each of the N transitions of a mode sequence, None where the state is continuous."""
-    return tuple(system.reset_map(a, b) for a, b in zip(mode_sequence[:-1], mode_sequence[1:], strict=True))
+    return tuple(system.reset_map(a, b) for a, b in pairwise(mode_sequence))
 
 
 def signals_of(experiment: Experiment) -> tuple[PiecewisePolynomial, ...]:

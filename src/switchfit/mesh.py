@@ -81,7 +81,7 @@ class Rows(NamedTuple):
     opens : (Q,) bool, whether the chunk opens a segment other than the first (a transition precedes it)
     cell : (Q, C) int
     start, end : (Q, C) times
-    starts_at, ends_at : (Q, C) int, index i of the transition time tau_i (from 0) at which a row starts or ends, else -1
+    starts_at, ends_at : (Q, C) int, index (from 0) of the transition time at which a row starts or ends, else -1
     first_chunk : (N + 1,) int, the chunk that opens each segment
     last_row : (N + 1,) int, flat index of the last row of each segment
     first_cell : (N + 1,) int, the cell in which each segment begins

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -174,23 +175,15 @@ class Model:
 
     def reference_residuals(self, piece: Piece) -> list[Callable[[Array, Array, Array], Array]]:
         """``y(t, x, p) - y_m(t)`` of each reference signal, (q,)."""
-        residuals = []
-        first = 0
-        for observe, channels in self.structure.references:
+        ends = np.cumsum([0, *(channels for _, channels in self.structure.references)]).tolist()
+        return [
+            partial(self._reference_residual, k, slice(first, last), piece)
+            for k, (first, last) in enumerate(pairwise(ends))
+        ]
 
-            def residual(
-                t: Array,
-                x: Array,
-                p: Array,
-                observe: Observe | None = observe,
-                first: int = first,
-                channels: int = channels,
-            ) -> Array:
-                return self.observed(observe, t, x, p, channels) - piece(t)[first : first + channels]
-
-            residuals.append(residual)
-            first += channels
-        return residuals
+    def _reference_residual(self, k: int, channels: slice, piece: Piece, t: Array, x: Array, p: Array) -> Array:
+        observe, q = self.structure.references[k]
+        return self.observed(observe, t, x, p, q) - piece(t)[channels]
 
     def observed(self, observe: Observe | None, t: Array, x: Array, p: Array, channels: int) -> Array:
         """What a sensor sees: (q,)."""
@@ -269,7 +262,8 @@ def called(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, 
             "transition time."
         ) from error
     except Exception as error:
-        raise ValueError(f"{what}: {signature} raised {type(error).__name__}: {error}") from error
+        said = str(error).rstrip(".")
+        raise ValueError(f"{what}: {signature} raised {type(error).__name__}: {said}.") from error
     try:
         return jnp.asarray(value)
     except (TypeError, ValueError) as error:
@@ -331,9 +325,9 @@ def arguments_of(
     samples = tuple(_padded_samples(item, mesh) for item in _of_kind(experiment.data, Measurements))
     weights = tuple(item.weights for item in _of_kind(experiment.data, ReferenceSignal))
     x0 = np.zeros(structure.n) if callable(initial) else initial
-    arrays = Arguments(mesh.nodes, _signals_by_cell(experiment, mesh), fixed, x0, samples, weights)
+    arrays = (mesh.nodes, _signals_by_cell(experiment, mesh), fixed, x0, samples, weights)
     with float64():
-        return jax.tree.map(jnp.asarray, arrays)
+        return Arguments(*jax.tree.map(jnp.asarray, arrays))
 
 
 def check_functions(structure: Structure) -> None:

@@ -76,7 +76,7 @@ class Problem:
 
     system: HybridSystem
     experiments: Any
-    parameters: Mapping[str, Any] | None = None
+    parameters: Mapping[str, Any] = field(default_factory=dict)
     min_duration: float = 0.0
     solver: Literal["explicit", "stiff"] = "explicit"
     rtol: float = 1e-8

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import jax
@@ -76,7 +77,7 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
                 x = _finite(value, f"reset map {names} at t = {ends[i]:.6g}, x = {x.tolist()}")
             knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
             stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
-            for start, end in zip(stops[:-1], stops[1:], strict=True):
+            for start, end in pairwise(stops.tolist()):
                 if end > start:
                     accepted, x = _solve(problem, structure, arguments, coarse, mode, start, end, x, p)
                     steps.append(accepted)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import scipy.special
@@ -34,7 +35,8 @@ class Certificate:
     integration_error : float
         ``|J(half the steps) - J|`` relative to J, or to 1e-3 of the first J where that is more.
     gradient_gap, hessian_gap : float
-        Relative gap between the paper's equations (6)-(17) and the exact derivatives of the discretised cost.
+        Relative gap between the paper's equations (6)-(17) and the exact derivatives of the discretised cost; NaN
+        where that was not checked.
     active : tuple of str
         Constraints that hold with equality, collapsed modes and bounds among them, and kinks.
     """
@@ -57,11 +59,15 @@ class Certificate:
             ("  condition number of that", f"{self.condition_number:.3g}"),
             ("  worst-determined direction", self.worst_direction),
             ("integration error of J, relative", f"{self.integration_error:.1e}"),
-            ("paper's gradient against discretised, relative", f"{self.gradient_gap:.1e}"),
-            ("paper's Hessian against discretised, relative", f"{self.hessian_gap:.1e}"),
+            ("paper's gradient against discretised, relative", _gap(self.gradient_gap)),
+            ("paper's Hessian against discretised, relative", _gap(self.hessian_gap)),
             ("active constraints", "; ".join(self.active) or "none"),
         ]
         return "\n".join(f"{label:<48} {value}" for label, value in rows)
+
+
+def _gap(gap: float) -> str:
+    return "not checked" if np.isnan(gap) else f"{gap:.1e}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +169,7 @@ class Fit:
         d = len(self.theta)
         Z = self.free_basis
         scale = self.residual_variance if self.sigma_known is False else 1.0
-        if self.sigma_known is None or np.isnan(scale):
+        if self.sigma_known is None or np.isnan(scale) or not np.isfinite(self.hessian).all():
             return np.full((d, d), np.nan)
         reduced = Z.T @ self.hessian @ Z
         size = 1 / np.sqrt(np.maximum(np.abs(np.diag(reduced)), np.finfo(float).tiny))
@@ -200,6 +206,38 @@ class Fit:
         quantile = scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail)
         half = quantile * self.standard_errors
         return np.stack([self.theta - half, self.theta + half], axis=1)
+
+
+class FreeCurvature(NamedTuple):
+    """The Hessian on the directions that constraints and kinks leave free.
+
+    Attributes
+    ----------
+    smallest : float
+        Its smallest eigenvalue; NaN if nothing is free.
+    scaled : (k,)
+        Eigenvalues, ascending, with the unknowns scaled to unit curvature each.
+    weakest : tuple of str
+        The unknowns that the direction of the smallest of them mostly consists of.
+    """
+
+    smallest: float
+    scaled: FloatArray
+    weakest: tuple[str, ...]
+
+
+def free_curvature(fit: Fit) -> FreeCurvature:
+    """How well a fit's unknowns are determined, from its exact Hessian."""
+    Z = fit.free_basis
+    if Z.shape[1] == 0 or not np.isfinite(fit.hessian).all():
+        return FreeCurvature(np.nan, np.zeros(0), ())
+    size = 1 / np.sqrt(np.maximum(np.abs(np.diag(fit.hessian)), np.finfo(float).tiny))
+    basis = np.linalg.qr(Z / size[:, None])[0]
+    scaled, vectors = np.linalg.eigh(basis.T @ (fit.hessian * np.outer(size, size)) @ basis)
+    weight = np.abs(basis @ vectors[:, 0])
+    strong = [i for i in np.argsort(-weight, kind="stable") if weight[i] > 0.3 * weight.max()][:4]
+    smallest = float(np.linalg.eigvalsh(Z.T @ fit.hessian @ Z)[0])
+    return FreeCurvature(smallest, scaled, tuple(fit.theta_names[i] for i in strong))
 
 
 def _discrete(comparison: Comparison) -> bool:

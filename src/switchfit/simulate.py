@@ -84,8 +84,10 @@ class Comparison:
 
     @property
     def rmse(self) -> FloatArray:
-        """Root mean square of the residuals of each channel: (q,)."""
-        return np.sqrt(np.nanmean(self.residuals**2, axis=0))
+        """Root mean square of the residuals of each channel: (q,); NaN where there is no sample."""
+        known = np.isfinite(self.measured)
+        squares = np.where(known, self.residuals, 0.0) ** 2
+        return np.sqrt(squares.sum(0) / np.where(known.any(0), known.sum(0), np.nan))
 
 
 def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: int = 0) -> Trajectory:
@@ -160,7 +162,7 @@ def _simulation(
     model = Model(structure, arguments)
     path = propagate(model, tau, p, jnp.ones(()))
     layout = path.layout
-    outputs = []
+    outputs: list[Outputs] = []
     for observe, channels in (*structure.references, *structure.measurements):
 
         def y(t: jax.Array, x: jax.Array, observe: Any = observe, channels: int = channels) -> jax.Array:
@@ -175,7 +177,7 @@ def _simulation(
     return path_cost(model, path, p), path, outputs
 
 
-def _pick(structure: Structure, path: Path, before: FloatArray, after: FloatArray) -> list[FloatArray]:
+def _pick(structure: Structure, path: Path, before: Any, after: Any) -> list[FloatArray]:
     """Of values at the starts and ends of rows (Q, C, ...) those that a trajectory shows, a list by segment."""
     layout = path.layout
     real = (layout.end > layout.start).reshape(-1)
@@ -216,7 +218,7 @@ def _comparisons(problem: Problem, e: int, path: Path, outputs: list[Outputs]) -
         if isinstance(item, ReferenceSignal):
             here = Comparison("reference", label, times, item.signal(times), curve, None, times, curve)
         else:
-            fitted = output.at_samples[: len(item.times)]
+            fitted = np.asarray(output.at_samples)[: len(item.times)]
             sigma = None if item.sigma is None else np.broadcast_to(item.sigma, item.values.shape).copy()
             here = Comparison("measurements", label, item.times, item.values, fitted, sigma, times, curve)
         comparisons.append(here)

@@ -183,7 +183,7 @@ def step_length_curvature(model: Model, first: FirstOrder, psi: Costates) -> Arr
 
         J, X_d, mu = jax.tree.map(at, first.jacobians), at(X.stages), at(psi.mu)
         times_d = stage_time_directions(model, at(starts), at(ends))
-        K_d = [product(A, x_d) + S for A, x_d, S in zip(J.f_x, X_d, J.f_t[:, :, None] * times_d[:, None] + J.f_p @ P)]
+        K_d = list(jax.vmap(product)(J.f_x, X_d) + J.f_t[:, :, None] * times_d[:, None] + J.f_p @ P)
         total = at(psi.after) @ combine(tableau.b, K_d)
         for j in range(len(tableau.c)):
             if tableau.a[j].any():
@@ -262,7 +262,7 @@ def sample_curvature(
     whole = K - K % SAMPLES_AT_ONCE
     H = jnp.zeros((P.shape[1], P.shape[1]))
     if whole:
-        split = jax.tree.map(lambda a: a[:whole].reshape((-1, SAMPLES_AT_ONCE) + a.shape[1:]), given)
+        split = jax.tree.map(lambda a: a[:whole].reshape((-1, SAMPLES_AT_ONCE, *a.shape[1:])), given)
         H = lax.scan(block, H, split)[0]
     return block(H, jax.tree.map(lambda a: a[whole:], given))[0] if whole < K else H
 

@@ -224,7 +224,7 @@ def row_end_tangents(model: Model, path: Path, jacobians: StageJacobians) -> Row
     h, f_x, f_t, K = (by_row(a)[rows] for a in (layout.end - layout.start, jacobians.f_x, jacobians.f_t, path.slopes))
     parts = []
     for line, (t_d, h_d) in enumerate(((1 - tableau.c, -1.0), (tableau.c, 1.0))):
-        derivative = partial(end_tangents, tableau, t_d=t_d, h_d=h_d)
+        derivative = partial(end_tangents, tableau, t_d=jnp.asarray(t_d), h_d=h_d)
         parts.append(jax.vmap(derivative)(h[line], f_x[line], f_t[line], K[line]))
     stages, _, after = (jnp.stack(pair) for pair in zip(*parts, strict=True))
     return RowEnds(rows, stages, after)

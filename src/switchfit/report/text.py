@@ -10,7 +10,7 @@ import numpy as np
 import scipy.special
 
 from switchfit.data import FloatArray
-from switchfit.result import Fit
+from switchfit.result import Fit, free_curvature
 from switchfit.simulate import Comparison, Trajectory
 
 WIDTH = 100
@@ -364,28 +364,14 @@ def _at_kinks(fit: Fit) -> Iterator[str]:
 
 def _undetermined(fit: Fit) -> Iterator[str]:
     """A direction along which the cost hardly changes."""
-    smallest, direction = _weakest_direction(fit)
-    if abs(smallest) < BARELY_DETERMINED:
+    curvature = free_curvature(fit)
+    if len(curvature.scaled) and abs(smallest := curvature.scaled[0]) < BARELY_DETERMINED:
+        *others, last = curvature.weakest
+        what = f"{', '.join(others)} and {last} apart from one another" if others else last
         yield (
-            f"The data hardly determine {direction} (smallest eigenvalue {smallest:.1e} of the Hessian scaled to unit "
+            f"The data hardly determine {what} (smallest eigenvalue {smallest:.1e} of the Hessian scaled to unit "
             "curvature). Fix one of the unknowns, or add data that tell them apart."
         )
-
-
-def _weakest_direction(fit: Fit) -> tuple[float, str]:
-    """Smallest eigenvalue of the free part of the Hessian with unit diagonal, and its direction in words."""
-    Z = fit.free_basis
-    if Z.shape[1] == 0 or not np.isfinite(fit.hessian).all():
-        return np.nan, ""
-    size = 1 / np.sqrt(np.maximum(np.abs(np.diag(fit.hessian)), np.finfo(float).tiny))
-    basis = np.linalg.qr(Z / size[:, None])[0]
-    values, vectors = np.linalg.eigh(basis.T @ (fit.hessian * np.outer(size, size)) @ basis)
-    weight = basis @ vectors[:, 0]
-    strong = [i for i in np.argsort(-np.abs(weight), kind="stable") if abs(weight[i]) > 0.3 * np.abs(weight).max()][:4]
-    names = [fit.theta_names[i] for i in strong]
-    if len(names) == 1:
-        return float(values[0]), names[0]
-    return float(values[0]), f"{', '.join(names[:-1])} and {names[-1]} apart from one another"
 
 
 def _without_errors(fit: Fit) -> Iterator[str]:
@@ -402,7 +388,7 @@ def _without_errors(fit: Fit) -> Iterator[str]:
     elif fit.sigma_known is False and fit.samples <= k:
         reason = f"sigma is unknown and {fit.samples} values are too few to estimate it beside {k} unknowns"
     else:
-        smallest, _ = _weakest_direction(fit)
+        smallest = float(np.min(free_curvature(fit).scaled, initial=np.inf))
         reason = f"the Hessian is not positive definite (smallest eigenvalue {smallest:.1e}, scaled to unit curvature)"
     yield f"No standard errors: {reason}."
 
