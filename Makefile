@@ -8,13 +8,14 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 .PHONY: help demo test test-slow check format bench docs clean
 
 help:
-	@echo "make demo       fit a measured toss: report on the terminal, figure in out/demo"
+	@echo "make demo       fit a measured toss and the paper's simulated vehicle: reports, figures in out/"
 	@echo "make test       the tests;  make test-slow: statistics and long runs too"
 	@echo "make check      ruff and mypy;  make format: put the code into form"
 	@echo "make bench      measure speed;  make docs: build the documentation;  make clean: remove what was built"
 
 demo: $(VENV)/.installed
 	$(BIN)/switchfit fit examples/toss/problem.toml --out out/demo
+	$(BIN)/switchfit fit examples/vehicle/problem.toml --out out/demo-vehicle
 
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -n $(JOBS)

@@ -557,13 +557,6 @@ def test_the_trajectory_of_several_experiments(fit):
     refused(lambda: fit.trajectory, ValueError, "There are 2 experiments: use .trajectories[e]")
 
 
-def test_a_certificate_needs_a_problem(fit):
-    import dataclasses
-
-    bare = dataclasses.replace(fit, problem=None)
-    refused(lambda: bare.certificate, ValueError, "loaded without a certificate and has no problem")
-
-
 def test_a_reset_map_that_is_not_there():
     structure = GOOD.structures[0]
     refused(lambda: Model(structure, None).reset(0), ValueError, "transition 1 has no reset map")

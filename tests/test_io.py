@@ -300,7 +300,7 @@ def test_examples_load(path):
         ("upper = 5.0 }", "uper = 5.0 }", r"'experiments\[1\]\.transition_times\[1\]\.uper'; did you mean 'upper'\?"),
         ("{ value = 3.0, lower = 1.0, upper = 5.0 }", '"three"', r"times\[1\]' must be a table; got 'three'"),
         ("{ value = 3.0, lower = 1.0, upper = 5.0 }", "7.0", r"experiments\[1\]: transition_times must increase .*\[7"),
-        ("{ value = 3.0, lower = 1.0, upper = 5.0 }", "", r"experiments\[1\]: 2 modes need 1 transition times; got 0"),
+        ("{ value = 3.0, lower = 1.0, upper = 5.0 }", "", r"experiments\[1\]: transition_times must be one fewer"),
         ('mode_sequence = ["on", "off"]', "", r"the key 'experiments\[1\]\.mode_sequence' is missing: names of the"),
         ('["on", "off"]', "[]", r"mode_sequence' must have at least 1 entries; got \[\]"),
         ('["on", "off"]', '["on", "of"]', r"mode_sequence names the unknown mode 'of'; the modes are on, off"),
@@ -336,7 +336,7 @@ def test_examples_load(path):
         ("room.py:room", "room.py:rom", r"room\.py defines no 'rom'; it has .*room, make"),
         ("room.py:room", "room.py:seven", r"model 'room\.py:seven' must be an sf\.HybridSystem or a .*got int"),
         ("room.py:room", "room.py:broken_factory", r"failed: .*room\.py, line 20, in broken_factory: RuntimeError: no"),
-        ("room.py:room", "room.py:broken", r"room\.py, line 23, in broken_mode: NameError: name 'undefined_name'"),
+        ("room.py:room", "room.py:broken", r"room\.py, line 23, in broken_mode: mode 'on': .* NameError: name 'undef"),
         ("room.py:room", "room.py:nameless", r"observe names states, but the model has no state_names; give it some"),
         ('"room.py:room"', '{ name = "room.py:room", arguments = { a = 1 } }', "is not a function; leave out its arg"),
         ('"room.py:room"', '{ name = "room.py:make", arguments = { a = 1 } }', "argument 'a'; it takes start"),
@@ -406,6 +406,13 @@ def test_python_file_that_fails(tmp_path, text, message):
     (tmp_path / "m.py").write_text(text)
     with pytest.raises(InputError, match=message):
         load_object("m.py:x", tmp_path, "model")
+
+
+def test_python_file_is_named_as_the_user_named_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "m.py").write_text("raise ValueError('no.')\n")
+    with pytest.raises(InputError, match=r"^Running m\.py failed: m\.py, line 1: ValueError: no\.$"):
+        load_object("m.py:x", Path(), "model")
 
 
 def test_python_file_is_read_again_when_it_changes(tmp_path):

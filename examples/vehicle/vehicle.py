@@ -10,17 +10,17 @@ SEQUENCE = ("stick", "slip", "stick")
 
 
 def truth() -> sf.Trajectory:
-    """The vehicle with the true values, from rest."""
-    nothing = sf.RunningCost(lambda t, x, p: 0.0)
-    run = sf.Experiment(nothing, SEQUENCE, TRUTH["tau"], t0=0.0, tf=15.0)
+    """The vehicle with the true values, from rest, with a node every 0.1 s."""
+    times = np.linspace(0.0, 15.0, 151)
+    nodes = sf.Measurements(times, np.zeros((len(times), 6)))
+    run = sf.Experiment(nodes, SEQUENCE, TRUTH["tau"], t0=0.0, tf=15.0)
     return sf.simulate(sf.Problem(skid_steer(), run, {"mu": TRUTH["mu"]}))
 
 
 def make_problem() -> sf.Problem:
     """Cost 1/2 |x - x_m|² with x_m the truth, started from (mu, tau_1, tau_2) = (0.8, 5, 9)."""
     measured = truth()
-    once = np.append(True, np.diff(measured.times) > 0)  # at a transition a trajectory has two entries
-    reference = sf.ReferenceSignal.from_samples(measured.times[once], measured.states[once])
+    reference = sf.ReferenceSignal.from_samples(measured.times, measured.states)
     run = sf.Experiment(reference, SEQUENCE, (5.0, 9.0), t0=0.0, tf=15.0)
     return sf.Problem(skid_steer(), run, {"mu": sf.Parameter(0.8, lower=0.05, upper=2.0)})
 

@@ -11,12 +11,14 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import jax
 import platformdirs
 from jax.experimental.compilation_cache import compilation_cache as jax_cache
 
-SETTINGS = {
+SETTINGS: dict[str, Any] = {
+    "jax_compilation_cache_dir": None,  # the folder, when it is known
     "jax_persistent_cache_min_compile_time_secs": 0.0,
     "jax_persistent_cache_min_entry_size_bytes": -1,
 }
@@ -34,11 +36,11 @@ def folder() -> Path | None:
 def compilation_cache() -> Iterator[None]:
     """Context in which JAX reads and writes compiled programs in `folder`; everything is as before afterwards."""
     path = folder()
-    if path is None or jax.config.read("jax_compilation_cache_dir") or not _writable(path):
+    before = {name: getattr(jax.config, name) for name in SETTINGS}
+    if path is None or before["jax_compilation_cache_dir"] or not _writable(path):
         yield
         return
     settings = {**SETTINGS, "jax_compilation_cache_dir": str(path)}
-    before = {name: jax.config.read(name) for name in settings}
     try:
         for name, value in settings.items():
             jax.config.update(name, value)

@@ -79,6 +79,9 @@ def fit(
         int | None, typer.Option(min=0, help="Most iterations.", show_default="the library's")
     ] = None,
     no_figures: Annotated[bool, typer.Option("--no-figures", help="Write no figure.")] = False,
+    certificate: Annotated[
+        bool, typer.Option("--certificate", help="Check with the paper's equations too, and print how.")
+    ] = False,
     debug: Debug = False,
 ) -> None:
     """Estimate transition times and parameters; report on the terminal, report and figure in --out.
@@ -96,10 +99,12 @@ def fit(
             _make_folder(out)
         estimate = _estimate(loaded, options, prepare_figures=figures)
         report = str(estimate)
+        if certificate:
+            report += f"\n\nCertificate\n{estimate.certificate}"
         typer.echo(report)
         if out is not None:
             _write(out / "report.txt", lambda path: path.write_text(report + "\n", encoding="utf-8"))
-            _write(out / "estimate.json", estimate.save)
+            _write(out / "estimate.json", lambda path: _save(estimate, path, complete=certificate))
             if figures:
                 _write(out / "fit.png", lambda path: estimate.plot().savefig(path, dpi=150))
             typer.echo(f"written to {out}", err=True)
@@ -214,6 +219,14 @@ def _import_figures() -> None:
     with contextlib.suppress(ImportError):
         import matplotlib.backends.backend_agg
         import matplotlib.figure  # noqa: F401
+
+
+def _save(estimate: Any, path: Path, *, complete: bool) -> None:
+    """Save an estimate; not `complete` leaves the paper's equations out of its certificate, which take seconds."""
+    from switchfit.certificate import certify
+    from switchfit.io.json import save_fit
+
+    save_fit(estimate, estimate.certificate if complete else certify(estimate, None), path)
 
 
 @contextlib.contextmanager

@@ -192,6 +192,7 @@ def signals_of(experiment: Experiment) -> tuple[PiecewisePolynomial, ...]:
 
 
 def as_parameter(value: Any, what: str) -> Parameter:
+    """`value` itself if it is a `Parameter`, otherwise a free one without bounds; errors call it `what`."""
     if isinstance(value, Parameter):
         return value
     try:

@@ -54,8 +54,21 @@ def refined_mesh(problem: Problem, e: int, theta: FloatArray) -> Mesh:
     steps = _adaptive_steps(problem, e, theta, Mesh.from_times(nodes))
     index = np.interp(nodes, steps, np.arange(len(steps)))
     pieces = np.maximum(np.ceil(np.diff(index) - 0.05).astype(int), 1)
-    grid = [np.linspace(a, b, k, endpoint=False) for a, b, k in zip(nodes[:-1], nodes[1:], pieces, strict=True)]
-    return Mesh.from_times(np.concatenate([*grid, nodes[-1:]]))
+    inside = [_graded(nodes[k : k + 2], steps, int(pieces[k])) for k in np.flatnonzero(pieces > 1)]
+    return Mesh.from_times(np.concatenate([nodes, *inside]))
+
+
+def _graded(ends: FloatArray, steps: FloatArray, pieces: int) -> FloatArray:
+    """Nodes between two ends: half of them as dense as the solver's steps are, half of them evenly.
+
+    The steps are short in the layers of a stiff mode, which evenly spaced nodes would miss; but layers move with the
+    transition times, and the mesh does not.
+    """
+    inner = steps[(steps > ends[0]) & (steps < ends[1])]
+    times = np.concatenate([ends[:1], inner, ends[1:]])
+    index = np.interp(times, steps, np.arange(len(steps)))
+    density = 0.5 * (index - index[0]) / (index[-1] - index[0]) + 0.5 * (times - ends[0]) / (ends[1] - ends[0])
+    return np.interp(np.linspace(0.0, 1.0, pieces + 1)[1:-1], density, times)
 
 
 def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -> FloatArray:

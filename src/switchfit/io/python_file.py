@@ -53,38 +53,49 @@ def call(function: Any, what: str, **arguments: Any) -> Any:
 
 def located(error: BaseException) -> str:
     """An exception with the place in a user's file it came from, as far as it has one."""
-    place = user_place(error)
-    return f"{place}: {first_line(error)}" if place else first_line(error)
+    explained = error.__cause__ is not None and isinstance(error, ValueError)
+    place, what = user_place(error), (str(error) if explained else first_line(error)).rstrip(".")
+    return f"{place}: {what}" if place else what
 
 
-def user_place(error: BaseException) -> str | None:
-    """``"file.py, line 3, in slip"`` for the innermost frame that is in a file loaded by `load_object`."""
-    if isinstance(error, SyntaxError) and error.filename and error.filename in _files:
-        return f"{error.filename}, line {error.lineno}"
+def user_place(error: BaseException | None) -> str | None:
+    """``"file.py, line 3, in slip"`` for the innermost frame that is in a file loaded by `load_object`.
+
+    The exception that caused this one goes first: it was raised further inside.
+    """
+    if error is None:
+        return None
+    cause = user_place(error.__cause__)
+    if cause is not None:
+        return cause
+    if isinstance(error, SyntaxError) and error.filename in _files:
+        return f"{_files[error.filename]}, line {error.lineno}"
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename in _files]
     if not frames:
         return None
     frame = frames[-1]
     inside = "" if frame.name == "<module>" else f", in {frame.name}"
-    return f"{frame.filename}, line {frame.lineno}{inside}"
+    return f"{_files[frame.filename]}, line {frame.lineno}{inside}"
 
 
-#: Every file that was run, and the modules of those that ran through, with the time of their last change (ns).
-_files: set[str] = set()
+#: Every file that was run, absolute -> as the user named it.
+_files: dict[str | None, Path] = {}
+
+#: The modules of those that ran through, with the time of their last change (ns).
 _modules: dict[str, tuple[int, Any]] = {}
 
 
 def _run(path: Path) -> Any:
     """The module that a file makes; a file that several keys name runs once while it does not change."""
-    key = str(path)
+    key = str(path.resolve())
     stamp = path.stat().st_mtime_ns
     if key in _modules and _modules[key][0] == stamp:
         return _modules[key][1]
-    specification = importlib.util.spec_from_file_location(f"switchfit_user_{path.stem}", path)
+    specification = importlib.util.spec_from_file_location(f"switchfit_user_{path.stem}", key)
     if specification is None or specification.loader is None:
         raise InputError(f"{path} cannot be loaded as a Python file.")
     module = importlib.util.module_from_spec(specification)
-    _files.add(key)
+    _files[key] = path
     sys.modules[module.__name__] = module
     sys.path.insert(0, str(path.parent))
     try:

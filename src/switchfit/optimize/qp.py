@@ -4,7 +4,7 @@ Every quadratic programme here is strictly convex with a feasible zero step,
 
     minimise  gᵀd + ½ dᵀBd   subject to   C d >= c,   c <= 0,
 
-and is solved in three stages:
+and is solved in stages. Newton's step −B⁻¹g, if it is feasible, is the solution. Otherwise:
 
 1. *whitening*: with B = D L Lᵀ D (D the root of the diagonal) and e = Lᵀ D d it becomes a least-distance problem,
    minimise ½‖e + q‖² subject to G e >= c, with unit rows of G and ‖q‖ = 1, so that nothing has a scale any more;
@@ -26,7 +26,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import qr, solve_triangular
+from scipy.linalg import qr
+from scipy.linalg.lapack import dgeqp3, dpotrf, dpotrs, dtrtrs
 from scipy.optimize import lsq_linear, nnls
 
 FloatArray = NDArray[np.float64]
@@ -166,23 +167,62 @@ def solve_qp(gradient: FloatArray, matrix: FloatArray, normals: FloatArray, offs
     offsets = np.asarray(offsets, dtype=float)
     if np.any(offsets > 0.0):
         raise ValueError(f"the zero step violates row {int(np.argmax(offsets))} by {offsets.max()}; c must be <= 0")
-    zero = QPSolution(np.zeros(gradient.size), np.zeros(offsets.size))
+    multipliers = np.zeros(offsets.size)
     if gradient.size == 0 or not np.any(gradient):
-        return zero
-    white = _whiten(gradient, matrix, normals, offsets)
+        return QPSolution(np.zeros(gradient.size), multipliers)
+    factor = _Factor.of(matrix)
+    step = -factor.solve(gradient)
+    step -= factor.solve(gradient + matrix @ step)
+    if np.all(normals @ step >= offsets):
+        return QPSolution(step, multipliers)
+    white = _whiten(gradient, factor, normals, offsets)
     e, white_multipliers = _least_distance(white.target, white.rows, white.offsets)
     e, white_multipliers = _refine(white, e, white_multipliers, gradient, matrix)
-    multipliers = np.zeros(offsets.size)
     multipliers[white.kept] = white_multipliers * white.length / white.norms
     return QPSolution(white.unwhiten(e), multipliers)
+
+
+@dataclass(frozen=True, eq=False)
+class _Factor:
+    """The factorisation B = D L Lᵀ D, with the root of B's diagonal for D."""
+
+    diagonal: FloatArray
+    lower: FloatArray
+
+    @classmethod
+    def of(cls, matrix: FloatArray) -> _Factor:
+        variances = matrix.diagonal()
+        if np.all(variances > 0.0):
+            diagonal = np.sqrt(variances)
+            lower, failed = dpotrf(matrix / (diagonal[:, None] * diagonal), lower=1)
+            if not failed:
+                return cls(diagonal, lower)
+        raise ValueError("the matrix of the quadratic programme is not positive definite; convexify it first")
+
+    def solve(self, vector: FloatArray) -> FloatArray:
+        """B⁻¹ v."""
+        return np.asarray(dpotrs(self.lower, vector / self.diagonal, lower=1)[0] / self.diagonal)
+
+    def whiten(self, vectors: FloatArray) -> FloatArray:
+        """L⁻¹ D⁻¹ v for each of the rows v."""
+        return _solve_triangular(self.lower, (vectors / self.diagonal).T, lower=1).T
+
+    def unwhiten(self, vector: FloatArray) -> FloatArray:
+        """D⁻¹ L⁻ᵀ v."""
+        return _solve_triangular(self.lower, vector, lower=1, trans=1) / self.diagonal
+
+
+def _solve_triangular(matrix: FloatArray, right: FloatArray, lower: int = 0, trans: int = 0) -> FloatArray:
+    """LAPACK's solution; `scipy.linalg.solve_triangular` takes ten times longer on a small system."""
+    solution, singular = dtrtrs(matrix, right, lower=lower, trans=trans)
+    return np.full_like(right, np.nan) if singular else np.asarray(solution)
 
 
 @dataclass(frozen=True, eq=False)
 class _White:
     """The whitened problem: minimise ½‖e + target‖² subject to rows e >= offsets; d = length D⁻¹ L⁻ᵀ e."""
 
-    diagonal: FloatArray  # D
-    factor: FloatArray  # L
+    factor: _Factor
     length: float  # norm of L⁻¹ D⁻¹ g
     target: FloatArray  # q, of norm 1
     kept: NDArray[np.intp]  # which constraints can be active at all
@@ -191,26 +231,14 @@ class _White:
     offsets: FloatArray
 
     def unwhiten(self, e: FloatArray) -> FloatArray:
-        return self.length * solve_triangular(self.factor, e, lower=True, trans="T") / self.diagonal
-
-    def whiten_gradient(self, vector: FloatArray) -> FloatArray:
-        return np.asarray(solve_triangular(self.factor, vector / self.diagonal, lower=True)) / self.length
+        return self.length * self.factor.unwhiten(e)
 
 
-def _whiten(gradient: FloatArray, matrix: FloatArray, normals: FloatArray, offsets: FloatArray) -> _White:
-    variances = np.diag(matrix)
-    message = "the matrix of the quadratic programme is not positive definite; convexify it first"
-    if not np.all(variances > 0.0):
-        raise ValueError(message)
-    diagonal = np.sqrt(variances)
-    try:
-        factor = np.linalg.cholesky(matrix / np.outer(diagonal, diagonal))
-    except np.linalg.LinAlgError as error:
-        raise ValueError(message) from error
-    target = solve_triangular(factor, gradient / diagonal, lower=True)
+def _whiten(gradient: FloatArray, factor: _Factor, normals: FloatArray, offsets: FloatArray) -> _White:
+    target = factor.whiten(gradient)
     length = float(np.linalg.norm(target))
     target = target / length
-    rows = solve_triangular(factor, (normals / diagonal).T, lower=True).T
+    rows = factor.whiten(normals)
     norms = np.linalg.norm(rows, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         unit = rows / norms[:, None]
@@ -218,7 +246,7 @@ def _whiten(gradient: FloatArray, matrix: FloatArray, normals: FloatArray, offse
         # d = 0 is feasible, so ‖e + q‖ <= ‖q‖ = 1: a row that this ball does not reach can be forgotten.
         reached = (norms > 0.0) & (scaled + unit @ target >= -1.0 - 1e-9)
     kept = np.flatnonzero(reached)
-    return _White(diagonal, factor, length, target, kept, norms[kept], unit[kept], scaled[kept])
+    return _White(factor, length, target, kept, norms[kept], unit[kept], scaled[kept])
 
 
 def _least_distance(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -255,9 +283,9 @@ def _equality_solution(target: FloatArray, rows: FloatArray, offsets: FloatArray
     if offsets.size == 0:
         return -target, np.zeros(0)
     Q, R = np.linalg.qr(rows.T)
-    inside = solve_triangular(R, offsets, trans="T")
+    inside = _solve_triangular(R, offsets, trans=1)
     along = Q.T @ target
-    multipliers = solve_triangular(R, inside + along)
+    multipliers = _solve_triangular(R, inside + along)
     return Q @ (inside + along) - target, multipliers
 
 
@@ -265,9 +293,9 @@ def _independent(rows: FloatArray, working: NDArray[np.intp]) -> NDArray[np.intp
     """A maximal linearly independent part of the working set (unit rows)."""
     if working.size <= 1:
         return working
-    _, R, order = qr(rows[working].T, mode="economic", pivoting=True)
-    rank = int(np.sum(np.abs(np.diag(R)) > 1e-11))
-    return np.sort(working[order[:rank]])
+    R, order, *_ = dgeqp3(rows[working].T)
+    rank = int(np.sum(np.abs(R.diagonal()) > 1e-11))
+    return np.sort(working[order[:rank] - 1])
 
 
 def _polish(
@@ -330,13 +358,14 @@ def _refine(
 ) -> tuple[FloatArray, FloatArray]:
     """One step of iterative refinement: the residual is computed with B itself, not with its factor."""
     working = np.flatnonzero(multipliers > 0.0)
+    if working.size > e.size:
+        return e, multipliers
     rows = white.rows[working]
     # C_iᵀ mu_i = length D L G_iᵀ lam_i, so the constraints' part of the residual is exact in white variables.
-    residual = white.whiten_gradient(gradient + matrix @ white.unwhiten(e)) - rows.T @ multipliers[working]
+    residual = white.factor.whiten(gradient + matrix @ white.unwhiten(e)) / white.length - rows.T @ multipliers[working]
     gap = white.offsets[working] - rows @ e
-    if _independent(white.rows, working).size < working.size:
-        return e, multipliers
     correction, change = _equality_solution(residual, rows, gap)
+    # Not so if the rows are dependent, as after the last resort.
     small = np.linalg.norm(correction) <= 1e-4 * np.linalg.norm(e) + 1e-12
     if not small or np.any(multipliers[working] + change < 0.0):
         return e, multipliers
@@ -411,7 +440,7 @@ def convexify(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None
     scaling = diagonal_scaling(hessian, floor)
     weight = np.outer(scaling, scaling)
     scaled = hessian / weight
-    if np.linalg.eigvalsh(scaled)[0] > EIGENVALUE_FLOOR:
+    if not dpotrf(scaled - EIGENVALUE_FLOOR * np.eye(scaled.shape[0]))[1]:
         return hessian
     free, blocked = split_space(normals / scaling)
     if blocked.shape[1] == 0 or free.shape[1] == 0:
@@ -455,12 +484,11 @@ def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tupl
     residual : float
     multipliers : array, shape (k,)
     """
-    wide = np.flatnonzero(high > low)
-    base = np.clip(0.0, low, high)
-    lengths = np.linalg.norm(normals, axis=1)
     size = float(max(np.max(np.abs(low), initial=0.0), np.max(np.abs(high), initial=0.0)))
     if normals.shape[0] == 0 or size == 0.0:
-        return float(np.linalg.norm(base)), np.zeros(normals.shape[0])
+        return float(np.linalg.norm(np.clip(0.0, low, high))), np.zeros(normals.shape[0])
+    wide = np.flatnonzero(high > low)
+    lengths = np.linalg.norm(normals, axis=1)
     lengths = np.where(lengths > 0.0, lengths, 1.0)
     unit = normals / lengths[:, None]
     if wide.size == 0:

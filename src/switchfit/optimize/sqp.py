@@ -148,6 +148,7 @@ class IterationRecord:
 
 Callback = Callable[[IterationRecord], object]
 Evaluate = Callable[[FloatArray, int], Evaluation]
+Index = NDArray[np.intp] | slice
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,6 +280,10 @@ class _Point:
     @property
     def cost(self) -> float:
         return self.plus.cost
+
+    @property
+    def largest_derivative(self) -> float:
+        return float(max(np.max(np.abs(self.plus.gradient)), np.max(np.abs(self.minus.gradient))))
 
     def derivatives(self, sides: NDArray[np.int_]) -> tuple[FloatArray, FloatArray]:
         """Gradient and Hessian on the given sides (+1, -1; 0 for their mean).
@@ -456,7 +461,6 @@ def _step(oracle: _Oracle, state: _State) -> _State:
 def _advance(problem: _Problem, state: _State, accepted: _Accepted) -> _State:
     """The state after an accepted step."""
     point, alpha = accepted.point, accepted.step_length
-    gradient = max(np.max(np.abs(point.plus.gradient)), np.max(np.abs(point.minus.gradient)))
     return replace(
         state,
         point=point,
@@ -466,7 +470,7 @@ def _advance(problem: _Problem, state: _State, accepted: _Accepted) -> _State:
         settled=state.settled + 1 if point.optimality <= problem.tolerance else 0,
         scale=np.maximum(state.scale, np.abs(point.theta)),
         cost_scale=max(state.cost_scale, abs(point.cost)),
-        gradient_scale=max(state.gradient_scale, float(gradient)),
+        gradient_scale=max(state.gradient_scale, point.largest_derivative),
         lowest_cost=min(state.lowest_cost, point.cost),
     )
 
@@ -516,31 +520,24 @@ def _direction(problem: _Problem, state: _State, low: FloatArray, high: FloatArr
 
     A coordinate on a kink is held (0) or confined to one side (+1, -1). Afterwards the force that holds it follows
     from the programme's multipliers; where it is outside [g₋, g₊] that coordinate, the worst one first, is released
-    to the other side, and the programme is solved again. No combination is tried twice.
+    to the other side, and the programme is solved again, as long as that helps.
     """
     sides = state.point.downhill
     best, force = _solve_on_sides(problem, state, sides, low, high)
-    if not state.point.kink.any():
-        return best
-    direction = best
-    tried = {sides.tobytes()}
-    for _ in range(3 * int(state.point.kink.sum()) + 4):
-        released = (s for s in _releases(state, sides, direction.step, force) if s.tobytes() not in tried)
-        following = next(released, None)
-        if following is None:
+    for _ in range(2 * int(state.point.kink.sum())):
+        released = _release(state, sides, best.step, force)
+        if released is None:
             break
-        sides = following
-        tried.add(sides.tobytes())
+        sides = released
         direction, force = _solve_on_sides(problem, state, sides, low, high)
-        if direction.reduction > best.reduction:
-            best = direction
+        if direction.reduction <= best.reduction:
+            break
+        best = direction
     return best
 
 
-def _releases(
-    state: _State, sides: NDArray[np.int_], step: FloatArray, force: FloatArray
-) -> Iterator[NDArray[np.int_]]:
-    """Sides with one coordinate released that a force outside [g₋, g₊] holds at its kink, the worst one first."""
+def _release(state: _State, sides: NDArray[np.int_], step: FloatArray, force: FloatArray) -> NDArray[np.int_] | None:
+    """Sides with the coordinate released that a force farthest outside [g₋, g₊] holds at its kink; None if none is."""
     point = state.point
     left, right = point.minus.gradient, point.plus.gradient
     tolerance = 1e-13 * (np.abs(left) + np.abs(right))
@@ -551,12 +548,12 @@ def _releases(
     to_left = np.where(pinned & (sides >= 0), left - force - tolerance, 0.0)
     # In units of J, or unknowns of different units could not be compared.
     worth = np.maximum(to_right, to_left) * size
-    for i in np.argsort(-worth, kind="stable"):
-        if worth[i] <= 0.0:
-            return
-        changed = sides.copy()
-        changed[i] = 1 if to_right[i] > to_left[i] else -1
-        yield changed
+    worst = int(np.argmax(worth))
+    if worth[worst] <= 0.0:
+        return None
+    changed = sides.copy()
+    changed[worst] = 1 if to_right[worst] > to_left[worst] else -1
+    return changed
 
 
 def _solve_on_sides(
@@ -568,42 +565,42 @@ def _solve_on_sides(
     """
     point, constraints = state.point, problem.constraints
     gradient, hessian = point.derivatives(sides)
-    held = point.kink & (sides == 0)
-    free = ~held & (constraints.lower < constraints.upper)
-    matrix = _model_matrix(problem, state, hessian, free)
     lower, upper = np.minimum(low - point.theta, 0.0), np.maximum(high - point.theta, 0.0)
     lower[point.kink & (sides > 0)] = 0.0
     upper[point.kink & (sides < 0)] = 0.0
-    m, k = constraints.b.size, int(free.sum())
-    rows = np.vstack([constraints.A[:, free], np.eye(k), -np.eye(k)])
+    free = ~(point.kink & (sides == 0)) & (constraints.lower < constraints.upper)
+    m, k = constraints.b.size, int(np.count_nonzero(free))
+    # What is held is left out of the programme; the slices of everything are views.
+    part = slice(None) if k == free.size else np.flatnonzero(free)
+    rows = slice(None) if k == free.size else np.concatenate([np.ones(m, dtype=bool), free, free])
+    matrix = _model_matrix(problem, state, hessian, part)
     slack = np.maximum(constraints.A @ point.theta - constraints.b, 0.0)
-    slack[np.isin(np.arange(m), point.active)] = 0.0
-    offsets = -np.concatenate([slack, -lower[free], upper[free]])
-    solution = solve_qp(gradient[free], matrix[np.ix_(free, free)], rows, offsets)
-    step = np.zeros(point.theta.size)
+    slack[point.active[point.active < m]] = 0.0
+    lower, upper = lower[part], upper[part]
+    offsets = np.concatenate([-slack, lower, -upper])
+    solution = solve_qp(gradient[part], matrix[part][:, part], problem.normals[rows][:, part], offsets)
     # A bound that presses is reached exactly, whatever rounding did to the step: kinks depend on it.
     at_lower, at_upper = solution.multipliers[m : m + k] > 0.0, solution.multipliers[m + k :] > 0.0
-    reached = np.where(at_lower, lower[free], np.where(at_upper, upper[free], solution.step))
-    step[free] = np.clip(reached, lower[free], upper[free])
+    step = np.zeros(free.size)
+    step[part] = np.clip(np.where(at_lower, lower, np.where(at_upper, upper, solution.step)), lower, upper)
     slope, curved = float(gradient @ step), matrix @ step
     force = constraints.A.T @ solution.multipliers[:m] - curved
     return _Direction(step, slope, -(slope + 0.5 * float(step @ curved))), force
 
 
-def _model_matrix(problem: _Problem, state: _State, hessian: FloatArray, free: NDArray[np.bool_]) -> FloatArray:
+def _model_matrix(problem: _Problem, state: _State, hessian: FloatArray, free: Index) -> FloatArray:
     """The matrix B of the quadratic programme: positive definite on the free coordinates, H elsewhere."""
-    d = free.size
+    point = state.point
     if not problem.uses_hessian:
-        return np.eye(d) / state.metric
-    matrix = (hessian if problem.mask is None else hessian * problem.mask).copy()
-    if free.any():
-        block = np.ix_(free, free)
-        pressed = problem.normals[state.point.multipliers > 0.0][:, free]
-        gradient = np.maximum(np.abs(state.point.plus.gradient), np.abs(state.point.minus.gradient))
-        size = np.where(state.scale > 0.0, state.scale, 1.0)
-        # Where J is nearly linear in an unknown, its step is limited to a multiple of its size.
-        floor = np.maximum(_flatness(state), gradient / (LONGEST_STEP * size))
-        matrix[block] = convexify(matrix[block], pressed, floor[free])
+        return np.eye(point.theta.size) / state.metric
+    matrix = hessian.copy() if problem.mask is None else hessian * problem.mask
+    pressed = problem.normals[point.multipliers > 0.0][:, free]
+    gradient = np.maximum(np.abs(point.plus.gradient), np.abs(point.minus.gradient))
+    size = np.where(state.scale > 0.0, state.scale, 1.0)
+    # Where J is nearly linear in an unknown, its step is limited to a multiple of its size.
+    floor = np.maximum(_flatness(state), gradient / (LONGEST_STEP * size))
+    block = free if isinstance(free, slice) else np.ix_(free, free)
+    matrix[block] = convexify(matrix[block], pressed, floor[free])
     return matrix
 
 
@@ -997,13 +994,12 @@ def _feasible_start(problem: _Problem, theta: FloatArray) -> FloatArray:
 
 
 def _initial_state(point: _Point) -> _State:
-    gradient = max(np.max(np.abs(point.plus.gradient)), np.max(np.abs(point.minus.gradient)))
     return _State(
         point=point,
         metric=1.0 / max(1.0, point.optimality),
         scale=np.abs(point.theta),
         cost_scale=abs(point.cost),
-        gradient_scale=float(gradient),
+        gradient_scale=point.largest_derivative,
         lowest_cost=point.cost,
     )
 

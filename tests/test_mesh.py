@@ -1,0 +1,309 @@
+"""Rows against a construction in plain Python; the cost as transition times pass nodes; the default tolerances."""
+
+from functools import cache
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+import switchfit as sf
+from switchfit.evaluate import Evaluator
+from switchfit.mesh import CHUNK, Mesh, chunk_count, padded_length, row_ending_cell, rows
+from switchfit.model import Model, float64
+from switchfit.propagate import path_cost, propagate
+from switchfit.refine import fixed_nodes, refined_mesh
+
+# Rows
+
+
+def walk(nodes, tau, side):
+    """The rows as (segment, cell, start, end): nodes and transition times in order, and what lies between them.
+
+    A transition time that equals a node comes after it (side 1) or before it (side -1), but never outside the nodes.
+    """
+    last = len(nodes) - 1
+    marks = [(-np.inf if k == 0 else np.inf if k == last else t, 0, 1, 0) for k, t in enumerate(nodes)]
+    marks += [(t, side, 0, 1) for t in tau]
+    times = [*nodes, *tau]
+    order = sorted(range(len(marks)), key=lambda m: (marks[m][:2], m))
+    found, cell, segment = [], -1, 0
+    for here, following in pairwise(order):
+        cell, segment = cell + marks[here][2], segment + marks[here][3]
+        found.append((segment, cell, times[here], times[following]))
+    return found
+
+
+@cache
+def program(cells, transitions):
+    return jax.jit(lambda nodes, tau, side: (r := rows(nodes, tau, side), row_ending_cell(r, jnp.arange(-1, cells))))
+
+
+def layout_of(nodes, tau, side):
+    with float64():
+        found = program(len(nodes) - 1, len(tau))(jnp.asarray(nodes), jnp.asarray(tau, float), side)
+    return jax.tree.map(np.asarray, found)
+
+
+def flat(values):
+    return values.reshape(-1, *values.shape[2:])
+
+
+@st.composite
+def cuts(draw):
+    """Nodes, some of them repeated at the end as padding, transition times in all kinds of places, and a side."""
+    cells, transitions = draw(st.sampled_from([(1, 1), (1, 2), (7, 0), (7, 1), (7, 4), (40, 2), (40, 5)]))
+    lengths = draw(st.lists(st.floats(1e-9, 10.0), min_size=cells, max_size=cells))
+    nodes = draw(st.floats(-100.0, 100.0)) + np.concatenate([[0.0], np.cumsum(lengths)])
+    used = draw(st.integers(1, cells))
+    nodes[used:] = nodes[used]
+    places = []
+    for _ in range(transitions):
+        node = nodes[draw(st.integers(0, used))]
+        kind = draw(st.sampled_from(["node", "before", "after", "between", "again"]))
+        place = {
+            "node": node,
+            "before": np.nextafter(node, -np.inf),
+            "after": np.nextafter(node, np.inf),
+            "between": nodes[0] + draw(st.floats(0.0, 1.0)) * (nodes[-1] - nodes[0]),
+            "again": places[-1] if places else node,
+        }[kind]
+        places.append(np.clip(place, nodes[0], nodes[-1]))
+    return nodes, np.sort(places), draw(st.sampled_from([1, -1]))
+
+
+SEVEN = np.arange(8.0)
+
+
+@given(cuts())
+@example((SEVEN, np.array([2.0]), 1))
+@example((SEVEN, np.array([2.0]), -1))
+@example((SEVEN, np.array([0.0, 0.0, 7.0, 7.0]), 1))
+@example((SEVEN, np.array([0.0, 0.0, 7.0, 7.0]), -1))
+@example((SEVEN, np.array([3.0, 3.0, 3.5, 3.5]), 1))
+@example((SEVEN, np.array([3.0, 3.0, 3.5, 3.5]), -1))
+def test_rows_against_a_walk_along_the_time_axis(cut):
+    nodes, tau, side = cut
+    layout, ending = layout_of(nodes, tau, side)
+    expected = walk(nodes, tau, side)
+    N, cells = len(tau), len(nodes) - 1
+    assert len(layout.segment) == chunk_count(cells, N)
+    assert np.all(layout.first_chunk[1:] * CHUNK > layout.last_row[:-1])
+
+    real = np.concatenate(
+        [np.arange(a * CHUNK, b + 1) for a, b in zip(layout.first_chunk, layout.last_row, strict=True)]
+    )
+    segment = np.repeat(layout.segment, CHUNK)
+    found = list(
+        zip(segment[real], flat(layout.cell)[real], flat(layout.start)[real], flat(layout.end)[real], strict=True)
+    )
+    assert found == expected
+
+    # All other rows are padding: of no length, at the end of their segment, in its last cell.
+    padding = np.setdiff1d(np.arange(len(segment)), real)
+    finishes = np.append(tau, nodes[-1])
+    last_cell = flat(layout.cell)[layout.last_row]
+    np.testing.assert_array_equal(flat(layout.start)[padding], finishes[segment[padding]])
+    np.testing.assert_array_equal(flat(layout.end)[padding], finishes[segment[padding]])
+    np.testing.assert_array_equal(flat(layout.cell)[padding], last_cell[segment[padding]])
+
+    # Which rows move with which transition time, and where reset maps act.
+    first_row = layout.first_chunk * CHUNK
+    np.testing.assert_array_equal(np.flatnonzero(flat(layout.starts_at) >= 0), first_row[1:])
+    np.testing.assert_array_equal(flat(layout.starts_at)[first_row[1:]], np.arange(N))
+    np.testing.assert_array_equal(np.flatnonzero(flat(layout.ends_at) >= 0), layout.last_row[:-1])
+    np.testing.assert_array_equal(flat(layout.ends_at)[layout.last_row[:-1]], np.arange(N))
+    np.testing.assert_array_equal(np.flatnonzero(layout.opens), layout.first_chunk[1:])
+
+    # Time runs on from row to row without gaps, padding included.
+    assert flat(layout.start)[0] == nodes[0]
+    assert flat(layout.end)[-1] == nodes[-1]
+    np.testing.assert_array_equal(flat(layout.start)[1:], flat(layout.end)[:-1])
+    assert np.all(flat(layout.end) >= flat(layout.start))
+
+    last_in_cell = {cell: row for row, (_, cell, *_) in zip(real, expected, strict=True)}
+    np.testing.assert_array_equal(ending, [-1, *(last_in_cell[c] for c in range(cells))])
+
+
+@given(st.lists(st.integers(0, 60), min_size=2).filter(lambda times: min(times) < max(times)))
+def test_mesh_of_times_in_any_order(times):
+    mesh = Mesh.from_times(np.array(times) / 7.0)
+    assert mesh.times.tolist() == sorted({t / 7.0 for t in times})
+    assert len(mesh.nodes) == padded_length(mesh.cells) + 1
+    assert np.all(mesh.nodes[mesh.cells :] == mesh.times[-1])
+    np.testing.assert_array_equal(mesh.cell_ending_at(mesh.times), np.arange(-1, mesh.cells))
+    third = mesh.divided(3)
+    assert third.cells == 3 * mesh.cells
+    np.testing.assert_array_equal(third.times[::3], mesh.times)
+    np.testing.assert_allclose(np.diff(third.times), np.repeat(np.diff(mesh.times) / 3, 3), rtol=1e-10)
+
+
+@given(st.integers(1, 10**6))
+def test_padded_lengths_are_few_and_not_much_longer(length):
+    padded = padded_length(length)
+    assert length <= padded <= max(1.125 * length, length + 7)
+    assert padded_length(padded) == padded
+    assert padded_length(length + 1) >= padded
+
+
+def test_few_padded_lengths():
+    assert len({padded_length(length) for length in range(1, 4097)}) < 70
+
+
+# The cost as a transition time passes a node
+
+
+A, B, X0 = 0.7, 1.9, 1.3
+SAMPLE, VALUE, SIGMA = 0.5, 0.4, 0.2
+
+
+@cache
+def decays():
+    """x' = -a x, then -b x; samples at 0.5, where the mesh has a node in any case, and at the end."""
+    system = sf.HybridSystem({"a": lambda t, x, p: -A * x, "b": lambda t, x, p: -B * x}, [X0])
+    data = sf.Measurements([SAMPLE, 1.0], [VALUE, 0.3], sigma=SIGMA)
+    run = sf.Experiment(data, ("a", "b"), (0.4,), 0.0, 1.0)
+    problem = sf.Problem(system, run, rtol=1e-12, atol=1e-14)
+    evaluator = Evaluator(problem)
+    assert SAMPLE in evaluator.breakpoints()[0]
+    return evaluator
+
+
+def cost_of_decays(tau):
+    """J and its left and right derivatives in closed form."""
+    x_sample = X0 * np.exp(-A * min(tau, SAMPLE) - B * max(SAMPLE - tau, 0.0))
+    x_end = X0 * np.exp(-A * tau - B * (1.0 - tau))
+    r_sample, r_end = (x_sample - VALUE) / SIGMA, (x_end - 0.3) / SIGMA
+    moves = [tau <= SAMPLE, tau < SAMPLE]
+    slopes = [r_end * x_end * (B - A) / SIGMA + (r_sample * x_sample * (B - A) / SIGMA if on else 0.0) for on in moves]
+    return 0.5 * r_sample**2 + 0.5 * r_end**2, *slopes
+
+
+ULPS = [-(2**30), -1000, -3, -1, 0, 1, 3, 1000, 2**30]
+
+
+@pytest.mark.parametrize("ulps", ULPS)
+def test_cost_and_gradient_within_rounding_of_a_sample(ulps):
+    """A transition an ulp before a sample has the derivative of one before it, and one an ulp later that of later."""
+    tau = SAMPLE + ulps * np.spacing(SAMPLE)
+    J, left, right = cost_of_decays(tau)
+    assert abs(left - right) > 0.1 or ulps != 0
+    for side, slope in ((1, right), (-1, left)):
+        found = decays()(np.array([tau]), side)
+        assert found.cost == pytest.approx(J, rel=1e-11)
+        assert found.gradient[0] == pytest.approx(slope, rel=1e-9)
+
+
+def test_cost_is_continuous_at_every_node():
+    """Also where no sample is, J and its gradient are those of the other side up to the integration error."""
+    evaluator = decays()
+    nodes = evaluator.breakpoints()[0]
+    for node in nodes[1:-1:3]:
+        below, above = np.nextafter(node, 0.0), np.nextafter(node, 1.0)
+        places = ((below, 1), (node, -1), (node, 1), (above, 1), (above, -1))
+        values = [evaluator(np.array([tau]), side) for tau, side in places]
+        costs = np.array([value.cost for value in values])
+        np.testing.assert_allclose(costs, costs[0], rtol=1e-14)
+        slopes = np.array([value.gradient[0] for value in values])
+        np.testing.assert_allclose(slopes[:2], slopes[0], rtol=1e-9)
+        np.testing.assert_allclose(slopes[2:], slopes[2], rtol=1e-9)
+        if node != SAMPLE:
+            np.testing.assert_allclose(slopes, slopes[0], rtol=1e-9)
+
+
+def test_transitions_at_both_ends_of_the_horizon():
+    """tau = t0 leaves only the second mode, tau = tf only the first one, whatever the side."""
+    for tau in (0.0, 1.0):
+        J, _, right = cost_of_decays(tau)
+        for side in (1, -1):
+            found = decays()(np.array([tau]), side)
+            assert found.cost == pytest.approx(J, rel=1e-10)
+            assert found.gradient[0] == pytest.approx(right, rel=1e-9)
+
+
+# The nodes of a problem
+
+
+def test_nodes_that_have_to_be_there():
+    """t0, tf, samples, knots of references and inputs; nothing outside the horizon."""
+    samples = sf.Measurements([0.15, 0.35], [1.0, 1.0])
+    signal = sf.ReferenceSignal.from_samples([-1.0, 0.25, 0.5, 1.0, 2.0], np.zeros(5))
+    inputs = sf.Input([-3.0, 0.7, 5.0], [1.0, 2.0, 3.0])
+    run = sf.Experiment([samples, signal], ("a",), (), 0.0, 1.0, inputs=inputs)
+    assert fixed_nodes(run).tolist() == [0.0, 0.15, 0.25, 0.35, 0.5, 0.7, 1.0]
+
+
+# The tolerances
+
+
+def oscillator(t, x, p):
+    return jnp.array([x[1], -jnp.sin(x[0]) - 0.1 * x[1]])
+
+
+def driven(t, x, p, u):
+    return oscillator(t, x, p) + jnp.array([0.0, 3.0]) * u
+
+
+def steps_and_springs():
+    """A nonlinear pendulum driven by a held input with jumps, and sparse samples."""
+    system = sf.HybridSystem({"swing": driven, "damped": lambda t, x, p, u: driven(t, x, p, u) - x}, [1.0, 0.0])
+    inputs = sf.Input([0.0, 1.1, 3.3, 6.0], [0.0, 1.0, -1.0, 0.5])
+    data = sf.Measurements([4.0, 10.0], np.ones((2, 2)), sigma=0.1)
+    return system, sf.Experiment(data, ("swing", "damped"), (7.3,), 0.0, 10.0, inputs=inputs)
+
+
+def fishing():
+    def mode(u):
+        return lambda t, x, p: jnp.array([x[0] - x[0] * x[1] - 0.4 * x[0] * u, -x[1] + x[0] * x[1] - 0.2 * x[1] * u])
+
+    system = sf.HybridSystem({"idle": mode(0.0), "fishing": mode(1.0)}, [0.5, 0.7])
+    cost = sf.RunningCost(lambda t, x, p: (x[0] - 1.0) ** 2 + (x[1] - 1.0) ** 2)
+    return system, sf.Experiment(cost, ("idle", "fishing", "idle"), (2.4, 4.3), 0.0, 12.0)
+
+
+def fast_cost():
+    """A state that hardly moves under a cost that oscillates: the cost has to be resolved as well."""
+    system = sf.HybridSystem({"slow": lambda t, x, p: -0.01 * x, "slower": lambda t, x, p: -0.005 * x}, [1.0])
+    cost = sf.RunningCost(lambda t, x, p: x[0] * (1.0 + jnp.cos(40.0 * t)))
+    return system, sf.Experiment(cost, ("slow", "slower"), (1.7,), 0.0, 5.0)
+
+
+def relaxation():
+    """A boundary layer and a slow motion behind it."""
+    system = sf.HybridSystem(
+        {"a": lambda t, x, p: -1000.0 * (x - jnp.cos(t)), "b": lambda t, x, p: -500.0 * (x**3 - jnp.sin(t))}, [0.0]
+    )
+    cost = sf.RunningCost(lambda t, x, p: x[0] ** 2)
+    return system, sf.Experiment(cost, ("a", "b"), (0.8,), 0.0, 2.0)
+
+
+def cost_of(made, **settings):
+    system, run = made
+    problem = sf.Problem(system, run, **settings)
+    mesh = refined_mesh(problem, 0, problem.initial_theta)
+
+    @jax.jit
+    def cost(arguments, tau):
+        model = Model(problem.structures[0], arguments)
+        return path_cost(model, propagate(model, tau, jnp.zeros(0), jnp.ones(())), jnp.zeros(0))
+
+    with float64():
+        return float(cost(problem.arguments(0, mesh), run.initial_times))
+
+
+@pytest.mark.parametrize(
+    ("make", "solver", "gap"),
+    [
+        (steps_and_springs, "explicit", 5e-8),  # rtol is that of a step, and here errors add up
+        (fishing, "explicit", 1e-8),
+        (fast_cost, "explicit", 1e-8),
+        (relaxation, "stiff", 1e-8),  # evenly spaced nodes miss the layers: 3e-5
+    ],
+)
+def test_default_tolerances_give_the_cost_to_about_1e_8(make, solver, gap):
+    found, exact = cost_of(make(), solver=solver), cost_of(make(), solver=solver, rtol=1e-12, atol=1e-14)
+    assert found == pytest.approx(exact, rel=gap)
+    assert found != exact
