@@ -118,8 +118,6 @@ def _jacobian(y: Symbol, x: Symbol, mode: str) -> Symbol:
 def _row_function(row: Row, reference: bool, cse: bool) -> ca.Function:
     x, theta, data = ca.SX.sym("x", 6), ca.SX.sym("theta", D), ca.SX.sym("data", N_DATA)
     after, cost = step(row, x, theta, data, reference)
-    z, J = ca.SX.sym("J"), None
-    del z, J
     return ca.Function("row", [x, theta, data], [after, cost], {"cse": cse})
 
 
@@ -228,10 +226,8 @@ def adjoint(expand: bool) -> Form:
         for row, data, states in reversed(kept):
             K = data.shape[1]
             _, backward = _adjoint_rows(row, reference)
-            last = ca.MX(ca.DM(np.arange(K)[::-1].copy())) if False else list(range(K))[::-1]
-            costates, parts = backward.mapaccum("backward", K)(
-                psi, states[:, last], ca.repmat(theta, 1, K), data[:, ::-1].copy()
-            )
+            given = (states[:, list(range(K))[::-1]], ca.repmat(theta, 1, K), data[:, ::-1].copy())
+            costates, parts = backward.mapaccum("backward", K)(psi, *given)
             psi = costates[:, -1]
             H = H + ca.reshape(ca.sum2(parts), D, D)
         function = ca.Function("adjoint", [theta], [J, g, H])
@@ -295,3 +291,7 @@ class Timed:
         self.theta[:] = theta
         self._call()
         return float(self.J[0]), self.g, self.H.reshape(D, D)
+
+
+QUICK = ["SX, hessian()", "SX, hessian(), cse", "adjoint SX rows, mapaccum, expand(), cse"]
+"""Forms for a quick run: on the machine they were chosen on, the fastest."""

@@ -16,26 +16,25 @@ from switchfit.models import skid_steer
 SEQUENCE = ("stick", "slip", "stick")
 START, TRUTH, HORIZON = (5.0, 9.0), (6.0, 10.0), (0.0, 15.0)
 MU_START, MU_TRUTH = 0.8, 0.7
-MINIMUM_DURATION = 1e-3
 
 
-def with_reference(knot_step: float | None = None) -> sf.Problem:
+def with_reference(cells: int | None = None) -> sf.Problem:
     """Cost 1/2 |x - x_m|^2, x_m a spline through the true trajectory, all six states.
 
-    The knots of the spline are the steps of the true trajectory, or `knot_step` apart. Knots are nodes of the mesh.
+    The knots of the spline, which are nodes of the mesh, are the steps in which the true trajectory was found, or
+    divide the horizon into equal `cells`.
     """
-    nothing = sf.RunningCost(lambda t, x, p: 0.0)
-    data: list = [nothing]
-    if knot_step is not None:
-        times = np.linspace(*HORIZON, round((HORIZON[1] - HORIZON[0]) / knot_step) + 1)
-        data.append(sf.Measurements(times, np.zeros((len(times), 6))))
-    run = sf.Experiment(data, SEQUENCE, TRUTH, *HORIZON)
+    seen = sf.RunningCost(lambda t, x, p: 0.0)
+    knots = None
+    if cells is not None:
+        knots = np.linspace(*HORIZON, cells + 1)
+        seen = sf.Measurements(knots, np.zeros((len(knots), 6)))
+    run = sf.Experiment(seen, SEQUENCE, TRUTH, *HORIZON)
     path = sf.simulate(sf.Problem(skid_steer(), run, {"mu": MU_TRUTH}))
-    keep = np.append(True, np.diff(path.times) > 0)
-    if knot_step is not None:
-        keep &= np.isin(path.times, times)
-    reference = sf.ReferenceSignal.from_samples(path.times[keep], path.states[keep])
-    return _problem(reference)
+    keep = np.append(True, np.diff(path.times) > 0)  # at a transition a trajectory has two entries
+    if knots is not None:
+        keep &= np.isin(path.times, knots)
+    return _problem(sf.ReferenceSignal.from_samples(path.times[keep], path.states[keep]))
 
 
 def without_reference() -> sf.Problem:
@@ -45,9 +44,7 @@ def without_reference() -> sf.Problem:
 
 def _problem(data: object) -> sf.Problem:
     run = sf.Experiment(data, SEQUENCE, START, *HORIZON)
-    return sf.Problem(
-        skid_steer(), run, {"mu": sf.Parameter(MU_START, lower=0.05, upper=2.0)}, min_duration=MINIMUM_DURATION
-    )
+    return sf.Problem(skid_steer(), run, {"mu": sf.Parameter(MU_START, lower=0.05, upper=2.0)})
 
 
 @dataclass(frozen=True)
@@ -102,11 +99,7 @@ def table_of_rows(evaluator: Evaluator, theta: np.ndarray) -> list[Row]:
 
 
 def evaluator_with(problem: sf.Problem, cells: int | None) -> Evaluator:
-    """The problem on the mesh it chooses itself, or on one of `cells` equal cells.
-
-    With a reference the coarse mesh ignores the knots: the reference then is, in each cell, the cubic of the knot
-    interval that holds the cell's middle. Both sides of the comparison get the same cubics.
-    """
+    """The problem on the mesh it chooses itself, or on one of equal `cells` (which must be those of a reference)."""
     if cells is None:
         return Evaluator(problem)
     return Evaluator(problem, meshes=[Mesh.from_times(np.linspace(*HORIZON, cells + 1))])

@@ -211,6 +211,19 @@ def test_kkt_residual_is_the_distance_to_the_cone(seed, d, k, kink):
     assert np.all(np.abs((unit @ r)[lam > 1e-8]) <= 1e-10)
 
 
+@pytest.mark.parametrize(("g", "signs"), [([1, -2, 2, 1], [-1, 1, -1, 1]), ([3, 0, -1, 0], [-1, 1, 1, -1])])
+def test_wrong_answers_of_nonnegative_least_squares_are_noticed(g, signs):
+    # SciPy 1.17's nnls leaves these with residuals several times larger than that of the solution.
+    N = np.vstack([np.diff(np.eye(4), axis=0), np.diag(signs)]).astype(float)
+    g = np.array(g, dtype=float)
+    residual, lam = kkt_residual(g, g, N)
+    r = g - N.T @ lam
+    assert np.all(lam >= 0.0)
+    assert np.all(N @ r <= 1e-12)
+    assert np.all(np.abs(N @ r)[lam > 1e-12] <= 1e-12)
+    assert residual == pytest.approx(np.linalg.norm(r))
+
+
 def test_without_active_constraints_the_residual_is_the_norm_of_the_gradient():
     g = np.array([3.0, 4.0])
     assert kkt_residual(g, g, np.zeros((0, 2)))[0] == 5.0

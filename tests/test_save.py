@@ -136,7 +136,7 @@ def test_the_file_is_strict_and_readable(tmp_path):
 def test_a_subclass_is_saved_as_a_fit(tmp_path):
     fit = made()
     given = {field.name: getattr(fit, field.name) for field in fields(Fit)}
-    estimate = sf.Estimate(**given, certificate_data=CERTIFICATE)
+    estimate = sf.Estimate(**given, saved_certificate=CERTIFICATE)
     estimate.save(str(tmp_path / "fit.json"))
     loaded = sf.Estimate.load(str(tmp_path / "fit.json"))
     assert_same(fit, Fit(**{field.name: getattr(loaded, field.name) for field in fields(Fit)}))

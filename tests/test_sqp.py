@@ -1,13 +1,15 @@
 """The SQP on functions with known minimisers: rates, constraints, kinks, saddles, and every status."""
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from switchfit.optimize import LinearConstraints, Status, minimize
+from switchfit.optimize.qp import kkt_residual
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -378,6 +380,9 @@ def assert_no_descent(evaluate, result, constraints, breakpoints):
 
 @settings(max_examples=40, deadline=None)
 @given(SEEDS, st.integers(1, 5))
+@example(8678464, 4)  # a pair on a convex and a concave kink descends on the less steep side of the concave one
+@example(4137468320, 5)
+@example(3692735272, 3)
 def test_many_small_kinks_under_constraints(seed, d):
     rng = np.random.default_rng(seed)
     R = rng.normal(size=(d, d))
@@ -416,6 +421,49 @@ def test_collapsed_pair_on_a_common_kink(seed):
     assert result.successful, result.message
     np.testing.assert_array_equal(result.theta, [1.0, 1.0])
     assert_no_descent(evaluate, result, constraints, breakpoints)
+
+
+def corner(left, right):
+    """J = sum of right max(theta, 0) + left min(theta, 0), with all unknowns on their breakpoints at the origin."""
+
+    def evaluate(theta, side):
+        chosen = np.where(theta > 0.0, right, np.where(theta < 0.0, left, right if side > 0 else left))
+        return Value(float(chosen @ theta), chosen, None)
+
+    d = len(left)
+    constraints = rows(np.diff(np.eye(d), axis=0), np.zeros(d - 1))
+    return minimize(
+        evaluate, np.zeros(d), constraints=constraints, breakpoints=[[0.0]] * d, hessian="none", max_iterations=0
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(SEEDS, st.integers(2, 4))
+def test_optimality_at_a_corner_is_the_steepest_descent_over_all_orthants(seed, d):
+    rng = np.random.default_rng(seed)
+    left, right = rng.integers(-3, 4, (2, d)).astype(float)
+    order = np.diff(np.eye(d), axis=0)
+    steepest = 0.0
+    for signs in product((-1.0, 1.0), repeat=d):
+        gradient = np.where(np.array(signs) > 0.0, right, left)
+        steepest = max(steepest, kkt_residual(gradient, gradient, np.vstack([order, np.diag(signs)]))[0])
+    result = corner(left, right)
+    assert result.optimality == pytest.approx(steepest, abs=1e-12)
+    assert result.successful == (steepest <= 1e-12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(SEEDS, st.integers(8, 12))
+def test_descent_of_a_long_collapsed_chain_with_concave_kinks_is_seen(seed, d):
+    rng = np.random.default_rng(seed)
+    middle = np.sort(rng.integers(-3, 4, d)).astype(float)
+    jump = rng.integers(-2, 1, d).astype(float)
+    jump[int(rng.integers(d))] = 30.0
+    left, right = middle - 0.5 * jump - middle.mean(), middle + 0.5 * jump - middle.mean()
+    ends = np.tri(d)
+    # Feasible directions are sums of these: the last ones to the right, the first ones to the left.
+    descends = min((ends.T @ right).min(), (-ends @ left).min()) < -1e-12
+    assert (corner(left, right).optimality > 1e-12) == descends
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-6, 1e6])

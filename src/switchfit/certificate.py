@@ -34,8 +34,8 @@ def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
         condition_number=float(scaled[-1] / scaled[0]) if len(scaled) and scaled[0] > 0 else np.inf,
         worst_direction=_in_words(curvature.weakest),
         integration_error=fit.integration_error,
-        gradient_gap=gaps[0],
-        hessian_gap=gaps[1],
+        gradient_gap=float(gaps[0]),
+        hessian_gap=float(gaps[1]),
         active=fit.active + kinks,
     )
 

@@ -365,7 +365,7 @@ def _refine(
     residual = white.factor.whiten(gradient + matrix @ white.unwhiten(e)) / white.length - rows.T @ multipliers[working]
     gap = white.offsets[working] - rows @ e
     correction, change = _equality_solution(residual, rows, gap)
-    # Not so if the rows are dependent, as after the last resort.
+    # Rows that depend on one another, as the last resort may leave them, give no small one.
     small = np.linalg.norm(correction) <= 1e-4 * np.linalg.norm(e) + 1e-12
     if not small or np.any(multipliers[working] + change < 0.0):
         return e, multipliers
@@ -437,6 +437,8 @@ def convexify(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None
     ----------
     .. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, sections 3.4 and 16.7.
     """
+    if hessian.size == 0:
+        return hessian
     scaling = diagonal_scaling(hessian, floor)
     weight = np.outer(scaling, scaling)
     scaled = hessian / weight
@@ -503,13 +505,22 @@ def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tupl
 
 
 def _cone_projection(unit: FloatArray, gradient: FloatArray) -> FloatArray:
-    """Argument of min over lam >= 0 of ‖g − Nᵀ lam‖."""
+    """Argument of min over lam >= 0 of ‖g − Nᵀ lam‖.
+
+    SciPy's nnls is fast, but from version 1.15 on its answer may be wrong for dependent rows, and its residual with it
+    (https://github.com/scipy/scipy/issues/25389), so that the answer is checked.
+    """
     if gradient.size == 0:
         return np.zeros(unit.shape[0])
     try:
-        return np.asarray(nnls(unit.T, gradient, maxiter=10 * unit.shape[0] + 30)[0])
+        multipliers = np.asarray(nnls(unit.T, gradient, maxiter=10 * unit.shape[0] + 30)[0])
     except RuntimeError:
-        return np.asarray(lsq_linear(unit.T, gradient, bounds=(0.0, np.inf), method="bvls").x)
+        multipliers = np.full(unit.shape[0], np.nan)
+    pull = unit @ (gradient - unit.T @ multipliers)
+    wrong = np.where(multipliers > 0.0, np.abs(pull), pull)
+    if np.all(wrong <= 1e-12 * (1.0 + np.max(multipliers))):
+        return multipliers
+    return np.asarray(lsq_linear(unit.T, gradient, bounds=(0.0, np.inf), method="bvls").x)
 
 
 def _box_projection(

@@ -336,9 +336,8 @@ def _choices(sides: NDArray[np.int_], concave: NDArray[np.bool_], normals: Float
     """
     yield sides
     coupled = np.flatnonzero(concave & np.any(normals != 0.0, axis=0))
-    every = product((1, -1), repeat=coupled.size)
-    same: list[tuple[int, ...]] = [(1,) * coupled.size, (-1,) * coupled.size]
-    for choice in every if coupled.size <= MANY_CONCAVE_KINKS else same:
+    few = coupled.size <= MANY_CONCAVE_KINKS
+    for choice in product((1, -1), repeat=coupled.size) if few else [(1,), (-1,)]:
         changed = sides.copy()
         changed[coupled] = choice
         if not np.array_equal(changed, sides):
@@ -570,7 +569,7 @@ def _solve_on_sides(
     upper[point.kink & (sides < 0)] = 0.0
     free = ~(point.kink & (sides == 0)) & (constraints.lower < constraints.upper)
     m, k = constraints.b.size, int(np.count_nonzero(free))
-    # What is held is left out of the programme; the slices of everything are views.
+    # What is held is left out of the programme.
     part = slice(None) if k == free.size else np.flatnonzero(free)
     rows = slice(None) if k == free.size else np.concatenate([np.ones(m, dtype=bool), free, free])
     matrix = _model_matrix(problem, state, hessian, part)

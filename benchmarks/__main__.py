@@ -1,0 +1,42 @@
+"""Run all benchmarks, print Markdown tables and write them to benchmarks/results: ``python -m benchmarks``."""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+from benchmarks import machine
+
+PARTS = ("derivatives", "fit", "cold", "scaling")
+
+
+def main() -> None:
+    """Parse the command line and run the parts asked for."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="fewer cases and repetitions; below a minute when idle")
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"only these of: {', '.join(PARTS)}")
+    options = parser.parse_args()
+    unknown = set(options.parts) - set(PARTS)
+    if unknown:
+        parser.error(f"no such part: {', '.join(sorted(unknown))}")
+    cores = machine.use_one_core()  # before JAX starts its threads
+
+    from benchmarks import cold, derivatives, fit, scaling
+    from benchmarks.report import Report
+
+    report = Report(machine.describe(cores))
+    run = {
+        "derivatives": lambda: derivatives.run(report, options.quick),
+        "fit": lambda: fit.run(report, options.quick),
+        "cold": lambda: cold.run(report, options.quick, cores),
+        "scaling": lambda: scaling.run(report, options.quick),
+    }
+    began = time.perf_counter()
+    for part in options.parts or PARTS:
+        run[part]()
+    report.note(f"Measured in {time.perf_counter() - began:.0f} s.")
+    report.close("quick" if options.quick else "full")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""How the cost of the Hessian grows: with the nodes of the mesh, and with the unknowns by method."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+import switchfit as sf
+from benchmarks.report import Report
+from benchmarks.timing import ms, take_turns
+from switchfit.evaluate import FORWARD_UP_TO, Evaluator
+from switchfit.mesh import Mesh
+
+NODES = (500, 1000, 2000, 4000, 8000)
+HORIZON = 10.0
+METHODS = ("forward", "discrete-adjoint")
+MIX = {1: (1, 0), 2: (1, 1), 3: (2, 1), 4: (2, 2), 5: (3, 2), 6: (3, 3), 7: (4, 3), 8: (4, 4)}
+"""Unknowns d: (transitions, parameters)."""
+
+
+def run(report: Report, quick: bool) -> None:
+    """Both studies."""
+    with_nodes(report, quick)
+    with_unknowns(report, quick)
+
+
+def oscillators(transitions: int, parameters: int, states: int = 4) -> sf.Problem:
+    """A chain of nonlinear oscillators whose two modes take turns, `parameters` stiffnesses and dampings in them."""
+
+    def mode(sign: float) -> Any:
+        def f(t: Any, x: Any, p: Any) -> Any:
+            q, v = x[: states // 2], x[states // 2 :]
+            k = p["k"] if parameters else jnp.zeros(0)
+            force = -jnp.sin(q) - 0.1 * v + 0.2 * sign * jnp.cos(t)
+            for i in range(parameters):
+                force = force + sign**i * k[i] * (q * v if i % 2 else jnp.tanh(jnp.roll(q, i) - q)) / (1 + i)
+            return jnp.concatenate([v, force])
+
+        return f
+
+    system = sf.HybridSystem({"a": mode(1.0), "b": mode(-1.0)}, 0.5 * np.ones(states))
+    times = HORIZON * (np.arange(transitions) + 1.0) / (transitions + 1) + 1e-3
+    sequence = tuple("ab"[i % 2] for i in range(transitions + 1))
+    run = sf.Experiment(sf.RunningCost(lambda t, x, p: 0.5 * (x @ x)), sequence, tuple(times), 0.0, HORIZON)
+    free = {"k": sf.Parameter(np.linspace(0.1, 0.3, parameters))} if parameters else {}
+    return sf.Problem(system, run, free)
+
+
+def _call(problem: sf.Problem, cells: int, method: Any) -> partial[Any]:
+    evaluator = Evaluator(problem, meshes=[Mesh.from_times(np.linspace(0.0, HORIZON, cells + 1))])
+    return partial(evaluator, problem.initial_theta, method=method)
+
+
+def with_nodes(report: Report, quick: bool) -> None:
+    """20 unknown transitions, 10 parameters, meshes of more and more nodes."""
+    problem = oscillators(20, 10)
+    sizes = NODES[::2] if quick else NODES
+    calls = {str(size): _call(problem, size - 1, "discrete-adjoint") for size in sizes}
+    timings = take_turns(calls, 5 if quick else 30, block=3)
+    least = np.array([timings[str(size)].minimum for size in sizes])
+    exponent, _ = np.polyfit(np.log(sizes), np.log(least), 1)
+    report.section("Hessian against nodes: 20 transitions, 10 parameters, 4 states, discrete-adjoint")
+    report.table(
+        ("nodes", "median", "minimum", "a node"),
+        [
+            (size, ms(timings[str(size)].median), ms(t), f"{t / size * 1e6:.2f} us")
+            for size, t in zip(sizes, least, strict=True)
+        ],
+    )
+    last = float(np.log(least[-1] / least[-2]) / np.log(sizes[-1] / sizes[-2]))
+    report.note(f"Fitted exponent of the minimum: {exponent:.2f} (1 is linear); between the last two sizes {last:.2f}.")
+    report.data["nodes"] = {"exponent": float(exponent), **{name: vars(t) for name, t in timings.items()}}
+    report.target("exponent of the Hessian's cost in nodes", 1.1, float(exponent), "")
+
+
+def with_unknowns(report: Report, quick: bool) -> None:
+    """Second order forward against the backward sweep, 200 cells, for d = 1 to 8 unknowns."""
+    rows = []
+    forward_wins = []
+    for d, (transitions, parameters) in MIX.items():
+        if quick and d > 3:
+            break
+        problem = oscillators(transitions, parameters)
+        calls = {method: _call(problem, 200, method) for method in METHODS}
+        timings = take_turns(calls, 20 if quick else 100)
+        forward, adjoint = (timings[method].minimum for method in METHODS)
+        forward_wins.append(forward < adjoint)
+        rows.append((d, transitions, parameters, ms(forward), ms(adjoint), f"{forward / adjoint:.2f}"))
+        report.data[f"unknowns {d}"] = {method: vars(t) for method, t in timings.items()}
+    justified = len(forward_wins) if all(forward_wins) else forward_wins.index(False)
+    report.section("Forward against discrete-adjoint, 200 cells, 4 states (minima)")
+    report.table(("unknowns", "transitions", "parameters", "forward", "discrete-adjoint", "forward / adjoint"), rows)
+    report.note(f"FORWARD_UP_TO is {FORWARD_UP_TO}; these figures justify {justified}.")
+    report.data["forward up to"] = justified

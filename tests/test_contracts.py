@@ -1,0 +1,365 @@
+"""What holds whatever the problem: what compiles when, float64 throughout, no traces in JAX's configuration, docs."""
+
+import inspect
+import re
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import switchfit as sf
+from switchfit.evaluate import evaluator_of
+from switchfit.mesh import padded_length
+
+# Nothing is compiled anew
+
+TRACES = {"count": 0}
+
+
+def counted(t, x, p):
+    """A vector field that counts how often JAX traces it."""
+    TRACES["count"] += 1
+    return jnp.array([x[1], -p["k"] * x[0]])
+
+
+def damped(t, x, p):
+    return counted(t, x, p) - p["damping"] * x
+
+
+def position(t, x, p):
+    return x[:1]
+
+
+OSCILLATOR = sf.HybridSystem({"free": counted, "damped": damped}, [1.0, 0.0])
+
+
+def oscillator(tau=1.1, k=2.0, damping=0.3, samples=9, seed=0, start=None):
+    """Samples at which the truth is (1.2, 2.1, 0.35), with a little noise of a given seed."""
+    times = np.linspace(0.0, 3.0, samples)
+    values = np.cos(np.sqrt(2.1) * times) * np.exp(-0.3 * np.maximum(times - 1.2, 0.0))
+    values += 0.01 * np.random.default_rng(seed).normal(size=samples)
+    data = sf.Measurements(times, values, observe=position, sigma=0.01)
+    run = sf.Experiment(data, ("free", "damped"), (tau,), 0.0, 3.0, initial_state=start)
+    return sf.Problem(OSCILLATOR, run, {"k": k, "damping": damping})
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    """Evaluated and fitted once: everything below has to get by with the programs of this."""
+    problem = oscillator()
+    for method in ("auto", "adjoint"):
+        sf.evaluate(problem, method=method)
+    sf.simulate(problem)
+    assert sf.estimate(problem).success
+    assert TRACES["count"] > 0
+    return problem
+
+
+def cells_of(problem):
+    """Length of the mesh with its padding: experiments share programs where it is the same."""
+    return len(evaluator_of(problem).meshes[0].nodes)
+
+
+def traces_of(call):
+    before = TRACES["count"]
+    call()
+    return TRACES["count"] - before
+
+
+@pytest.mark.parametrize("method", ["auto", "adjoint"])
+def test_nothing_is_traced_as_tau_and_p_move(compiled, method):
+    thetas = [[0.7, 2.0, 0.3], [2.9, 1.0, 0.0], [0.0, 2.0, -1.0], [3.0, 0.1, 0.3], [1.5, 2.0, 0.3]]
+    costs = []
+    assert traces_of(lambda: costs.extend(sf.evaluate(compiled, theta, method=method).cost for theta in thetas)) == 0
+    assert len(set(costs)) == len(thetas)
+
+
+def test_nothing_is_traced_for_other_data_of_the_same_shape(compiled):
+    other = oscillator(tau=1.0, seed=1, start=[0.9, 0.1])
+    assert other.structures == compiled.structures
+    assert cells_of(other) == cells_of(compiled)
+    assert traces_of(lambda: sf.evaluate(other)) == 0
+    assert sf.evaluate(other).cost != sf.evaluate(compiled).cost
+
+
+def test_nothing_is_traced_for_another_number_of_samples_of_the_same_padded_length(compiled):
+    other = oscillator(samples=11)
+    assert padded_length(11) == padded_length(9)
+    assert cells_of(other) == cells_of(compiled)
+    assert traces_of(lambda: sf.evaluate(other)) == 0
+    assert sf.evaluate(other).cost == pytest.approx(11 / 9 * sf.evaluate(compiled).cost, rel=0.5)
+
+
+def test_nothing_is_traced_in_a_second_fit(compiled):
+    other = oscillator(tau=1.2, seed=2)
+    assert cells_of(other) == cells_of(compiled)
+    assert traces_of(lambda: sf.estimate(other)) == 0
+
+
+def test_building_a_problem_calls_every_function_once():
+    """Twice here, since one mode calls the other: abstractly, without compiling anything."""
+    assert traces_of(oscillator) == 2
+
+
+def test_the_mesh_is_made_once(compiled):
+    assert evaluator_of(compiled) is evaluator_of(compiled)
+
+
+# float64 whatever the user has set
+
+
+@pytest.fixture(params=[False, True], ids=["x64 off", "x64 on"])
+def x64(request):
+    before = jax.config.jax_enable_x64
+    jax.config.update("jax_enable_x64", request.param)
+    yield request.param
+    assert jax.config.jax_enable_x64 is request.param
+    assert jnp.zeros(1).dtype == (jnp.float64 if request.param else jnp.float32)
+    jax.config.update("jax_enable_x64", before)
+
+
+SEEN = []
+
+
+def recorded(t, x, p):
+    SEEN.extend([t.dtype, x.dtype, *(value.dtype for value in p.values())])
+    return -p["k"] * x + p["offset"]
+
+
+def decay(start=(1.0,)):
+    """x' = -k x: x(1) = exp(-k)."""
+    system = sf.HybridSystem({"decay": recorded}, start)
+    run = sf.Experiment(sf.TerminalCost(lambda x, p: x[0]), ("decay",), (), 0.0, 1.0)
+    offset = sf.Parameter(0.0, fixed=True)
+    return sf.Problem(system, run, {"k": np.float32(1.5), "offset": offset}, rtol=1e-12, atol=1e-14)
+
+
+def test_everything_is_float64_and_the_setting_as_before(x64):
+    SEEN.clear()
+    found = sf.evaluate(decay())
+    assert found.cost == pytest.approx(np.exp(-1.5), rel=1e-13)
+    np.testing.assert_allclose(found.gradient, [-np.exp(-1.5)], rtol=1e-12)
+    np.testing.assert_allclose(found.hessian, [[np.exp(-1.5)]], rtol=1e-11)
+    path = sf.simulate(decay())
+    assert {found.gradient.dtype, found.hessian.dtype, path.states.dtype, path.times.dtype} == {np.dtype("float64")}
+    assert set(SEEN) == {np.dtype("float64")}
+
+
+def test_the_setting_is_as_before_after_exceptions(x64):
+    """Raised while a problem is built, and while its mesh is refined."""
+
+    def casting(t, x, p):
+        return x.astype(jnp.float32)
+
+    with pytest.raises(ValueError, match="must return float64; got float32"):
+        sf.Problem(sf.HybridSystem({"decay": casting}, [1.0]), decay().experiments[0], {"k": 1.0})
+    assert jax.config.jax_enable_x64 is x64
+    blowing_up = sf.HybridSystem({"decay": lambda t, x, p: 9.0 * x**2}, [1.0])
+    with pytest.raises(ValueError, match="mode 'decay' cannot be integrated"):
+        sf.evaluate(sf.Problem(blowing_up, decay().experiments[0], {"k": 1.0}))
+
+
+class StopError(Exception):
+    """Raised by a callback."""
+
+
+def test_an_exception_of_the_callback_is_passed_on(compiled, x64):
+    def callback(record):
+        raise StopError
+
+    with pytest.raises(StopError):
+        sf.estimate(compiled, callback=callback)
+
+
+def test_arrays_of_single_precision_are_accepted(x64):
+    """As ``jnp.ones(1)`` is where the user has not enabled float64."""
+    single = sf.evaluate(decay(start=jnp.ones(1, jnp.float32)))
+    assert single.cost == pytest.approx(np.exp(-1.5), rel=1e-13)
+    f32 = np.float32
+    data = sf.Measurements(f32([0.0, 0.5]), f32([1.0, 0.5]), sigma=f32(0.25))
+    run = sf.Experiment(data, ("decay",), (), f32(0.0), f32(1.0), initial_state=jnp.ones(1, jnp.float32))
+    assert {data.values.dtype, run.initial_state.dtype, data.weights.dtype} == {np.dtype("float64")}
+    assert isinstance(run.tf, float)
+
+
+# JAX's configuration
+
+CACHE_SETTINGS = (
+    "jax_compilation_cache_dir",
+    "jax_enable_compilation_cache",
+    "jax_persistent_cache_min_compile_time_secs",
+    "jax_persistent_cache_min_entry_size_bytes",
+)
+
+
+def cache_settings():
+    return {name: getattr(jax.config, name) for name in CACHE_SETTINGS}
+
+
+def small_fit(factor):
+    """A fit of one parameter; a factor not yet used makes it compile."""
+    system = sf.HybridSystem({"m": lambda t, x, p: -p["k"] * x * factor}, [1.0])
+    data = sf.Measurements([0.5, 1.0], [0.6, 0.4])
+    return sf.estimate(sf.Problem(system, sf.Experiment(data, ("m",), (), 0.0, 1.0), {"k": 1.0}))
+
+
+def test_the_compilation_cache_is_used_and_its_configuration_as_before(tmp_path, monkeypatch):
+    before = cache_settings()
+    monkeypatch.setenv("SWITCHFIT_CACHE", str(tmp_path / "programs"))
+    assert small_fit(1.1).success
+    assert cache_settings() == before
+    assert any((tmp_path / "programs").iterdir())
+
+
+def test_the_compilation_cache_can_be_turned_off(tmp_path, monkeypatch):
+    before = cache_settings()
+    monkeypatch.setenv("SWITCHFIT_CACHE", "off")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    assert sf.simulate(small_fit(1.2).problem).times[-1] == 1.0
+    assert cache_settings() == before
+    assert not list(tmp_path.iterdir())
+
+
+def test_import_has_no_side_effects():
+    """Neither on JAX's configuration, nor by loading what only some calls need."""
+    program = """
+import sys, jax
+before = dict(jax.config.values)
+import switchfit
+changed = {k for k, v in jax.config.values.items() if before.get(k, v) != v}
+heavy = {"matplotlib", "pydantic", "typer", "rich"} & set(sys.modules)
+print(changed or "", heavy or "", end="")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == ""
+
+
+# Names, and sums over experiments
+
+
+def test_theta_in_its_order():
+    """Free transition times of the first experiment, of the second, then the parameters as given, entry by entry."""
+    system = sf.HybridSystem({"a": lambda t, x, p: x, "b": lambda t, x, p: -x}, [1.0])
+    cost = sf.TerminalCost(lambda x, p: x[0])
+
+    def run(times, **name):
+        return sf.Experiment(cost, ("a", "b", "a"), times, 0.0, 1.0, **name)
+
+    fixed, bounded = sf.Parameter(0.3, fixed=True), sf.Parameter(0.6, lower=0.5, upper=0.7, unit="ms")
+    problem = sf.Problem(
+        system,
+        [run((fixed, bounded), name="city"), run((0.2, 0.8))],
+        {
+            "z": 7.0,
+            "held": sf.Parameter([1.0, 2.0], fixed=True),
+            "A": sf.Parameter([[1.0, 2.0], [3.0, 4.0]], lower=[[0.0], [3.0]], unit="N"),
+            "b": [5.0, 6.0],
+        },
+    )
+    assert problem.theta_names == (
+        "city.tau_2", "run2.tau_1", "run2.tau_2", "z", "A[0,0]", "A[0,1]", "A[1,0]", "A[1,1]", "b[0]", "b[1]",
+    )  # fmt: skip
+    np.testing.assert_array_equal(problem.initial_theta, [0.6, 0.2, 0.8, 7.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    assert problem.unknowns.units == ("ms", "s", "s", "", "N", "N", "N", "N", "", "")
+    inf = np.inf
+    np.testing.assert_array_equal(problem.unknowns.lower, [0.5, -inf, -inf, -inf, 0.0, 0.0, 3.0, 3.0, -inf, -inf])
+    np.testing.assert_array_equal(problem.unknowns.upper, [0.7, *[inf] * 9])
+    theta = np.array([0.65, 0.1, 0.9, *range(7)])
+    times, parameters = problem.split(theta)
+    assert [tau.tolist() for tau in times] == [[0.3, 0.65], [0.1, 0.9]]
+    assert {name: value.tolist() for name, value in parameters.items()} == {
+        "z": 0.0, "held": [1.0, 2.0], "A": [[1.0, 2.0], [3.0, 4.0]], "b": [5.0, 6.0],
+    }  # fmt: skip
+    # Writing into what is handed out changes nothing.
+    problem.initial_theta[0] = -1.0
+    assert problem.initial_theta[0] == 0.6
+
+
+def test_one_experiment_needs_no_prefix():
+    assert oscillator().theta_names == ("tau_1", "k", "damping")
+
+
+def test_experiments_with_shared_parameters_add_up(compiled):
+    """J and the derivatives in the parameters are sums, those in transition times each run's own."""
+    singles = [oscillator(tau=1.1), oscillator(tau=0.8, samples=11, seed=3)]
+    both = sf.Problem(OSCILLATOR, [single.experiments[0] for single in singles], {"k": 2.0, "damping": 0.3})
+    assert both.theta_names == ("run1.tau_1", "run2.tau_1", "k", "damping")
+    together, parts = sf.evaluate(both), [sf.evaluate(single) for single in singles]
+    g, H = np.zeros(4), np.zeros((4, 4))
+    for e, part in enumerate(parts):
+        place = [e, 2, 3]
+        g[place] += part.gradient
+        H[np.ix_(place, place)] += part.hessian
+    assert together.cost == pytest.approx(parts[0].cost + parts[1].cost, rel=1e-14)
+    np.testing.assert_allclose(together.gradient, g, rtol=1e-13)
+    np.testing.assert_allclose(together.hessian, H, rtol=1e-13)
+    assert H[0, 1] == 0.0
+
+
+# Documentation
+
+PUBLIC = [getattr(sf, name) for name in sf.__all__]
+
+
+def sections(thing):
+    """Names under "Parameters" and "Attributes" of a docstring in numpydoc's form, in their order."""
+    found = {"Parameters": [], "Attributes": []}
+    lines = (inspect.getdoc(thing) or "").splitlines()
+    section = None
+    for line, following in zip(lines, [*lines[1:], ""], strict=True):
+        if re.fullmatch(r"-{3,}", following):
+            section = line
+        elif section in found and (match := re.match(r"(\w+(?:, \w+)*)(?: :|$)", line)):
+            found[section] += match[1].split(", ")
+    return found
+
+
+@pytest.mark.parametrize("thing", PUBLIC, ids=sf.__all__)
+def test_everything_public_says_what_it_is(thing):
+    own = thing.__doc__
+    assert own
+    assert not own.startswith(f"{thing.__name__}("), "a docstring made by dataclass"
+    assert own.strip().splitlines()[0].rstrip(".") != ""
+
+
+@pytest.mark.parametrize(
+    "thing", [thing for thing in PUBLIC if thing is not sf.Status], ids=lambda thing: thing.__name__
+)
+def test_docstrings_name_the_parameters_of_the_signature(thing):
+    documented = sections(thing)
+    given = [
+        name for name in inspect.signature(thing).parameters if name not in ("unknowns", "structures", "cls", "self")
+    ]
+    if inspect.isclass(thing) and documented["Attributes"]:
+        assert documented["Attributes"] == given
+        return
+    if thing is sf.Estimate:  # its attributes are those of Fit, and what it adds is not for users to give
+        assert sections(sf.Estimate.__base__)["Attributes"] == given[: -len(("certificate", "problem"))]
+        return
+    assert documented["Parameters"] == given
+
+
+METHODS = [
+    (kind, name, method)
+    for kind in PUBLIC
+    if inspect.isclass(kind) and kind is not sf.Status
+    for name, method in inspect.getmembers(kind)
+    if not name.startswith("_")
+    and (inspect.isfunction(method) or inspect.ismethod(method))
+    and method.__module__.startswith("switchfit")
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "method"), METHODS, ids=lambda m: m if isinstance(m, str) else "")
+def test_methods_are_documented(kind, name, method):
+    assert method.__doc__, f"{kind.__name__}.{name} has no docstring"
+    documented = sections(method)["Parameters"]
+    given = [parameter for parameter in inspect.signature(method).parameters if parameter not in ("self", "cls")]
+    if documented:
+        assert documented == given
+    else:
+        assert len(given) <= 3, f"{kind.__name__}.{name} takes {given}: name them in the docstring"

@@ -1,0 +1,345 @@
+"""Inputs, reference signals and measurements: what they add to the cost, in closed form."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.polynomial import Polynomial
+
+import switchfit as sf
+from switchfit.evaluate import Evaluator
+from switchfit.refine import refined_mesh
+
+# Inputs
+
+
+def integrator(t, x, p, u):
+    """The first state integrates the input times p, the second one integrates the first."""
+    return jnp.array([p["gain"] * u, x[0]])
+
+
+def final_state(x, p):
+    return x[0] + 2.0 * x[1]
+
+
+INTEGRATOR = sf.HybridSystem({"on": integrator}, [0.0, 0.0])
+KNOTS = np.array([-0.5, 0.3711, 0.9, 1.7071, 2.0])
+LEVELS = np.array([2.0, -1.0, 4.0, 0.5, 7.0])
+CUBIC = Polynomial([1.0, -2.0, 0.7, 0.4])
+
+
+def integrated(inputs, gain=1.5):
+    run = sf.Experiment(sf.TerminalCost(final_state), ("on",), (), 0.0, 2.0, inputs=inputs)
+    return sf.evaluate(sf.Problem(INTEGRATOR, run, {"gain": gain}))
+
+
+def integral_of(pieces, gain=1.5):
+    """gain (int u + 2 int int u) over [0, 2] = gain int u (1 + 2 (2 - t)); pieces: (from, to, polynomial)."""
+    weighted = [(a, b, (u * Polynomial([5.0, -2.0])).integ()) for a, b, u in pieces]
+    return gain * sum(U(b) - U(a) for a, b, U in weighted)
+
+
+def line(a, b, at_a, at_b):
+    return Polynomial([at_a, (at_b - at_a) / (b - a)])(Polynomial([-a, 1.0]))
+
+
+CLIPPED = np.clip(KNOTS, 0.0, 2.0)
+PIECES = {
+    "hold": [(CLIPPED[k], CLIPPED[k + 1], Polynomial([LEVELS[k]])) for k in range(4)],
+    "linear": [(CLIPPED[k], CLIPPED[k + 1], line(KNOTS[k], KNOTS[k + 1], LEVELS[k], LEVELS[k + 1])) for k in range(4)],
+    "cubic": [(0.0, 2.0, CUBIC)],
+}
+
+
+@pytest.mark.parametrize("kind", ["hold", "linear", "cubic"])
+def test_inputs_are_integrated_exactly_since_no_step_crosses_a_knot(kind):
+    """Any step across the jump at 0.3711 would leave an error of the step length or of its square."""
+    values = CUBIC(KNOTS) if kind == "cubic" else LEVELS
+    found = integrated(sf.Input(KNOTS, values, kind=kind))
+    expected = integral_of(PIECES[kind])
+    assert found.cost == pytest.approx(expected, rel=1e-13)
+    assert found.gradient[0] == pytest.approx(expected / 1.5, rel=1e-13)
+
+
+def test_a_held_input_starts_by_t0_and_keeps_its_last_value():
+    found = integrated(sf.Input([0.0, 0.5], [1.0, 3.0]))
+    expected = integral_of([(0.0, 0.5, Polynomial([1.0])), (0.5, 2.0, Polynomial([3.0]))])
+    assert found.cost == pytest.approx(expected, rel=1e-13)
+
+
+def pull(t, x, p, u):
+    return jnp.array([x[1], u[0] - p["k"] * jnp.sin(x[0]) - u[1] * x[1]])
+
+
+def distance(t, x, p):
+    return (x[0] - 0.5) ** 2 + p["k"] * x[1] ** 2
+
+
+def test_a_held_input_is_the_same_as_modes_that_switch_at_fixed_times():
+    """Two channels, three levels, on one mesh: cost, gradient and Hessian agree to rounding."""
+    jumps, levels = (0.37, 1.41), np.array([[1.0, 0.2], [-2.0, 0.5], [0.7, 0.1]])
+    cost, k = sf.RunningCost(distance), {"k": 1.2}
+    driven = sf.HybridSystem({"all": pull}, [0.3, 0.0])
+    inputs = sf.Input([0.0, *jumps], levels)
+    first = sf.Problem(driven, sf.Experiment(cost, ("all",), (), 0.0, 2.0, inputs=inputs), k)
+
+    def mode(level):
+        return lambda t, x, p: pull(t, x, p, level)
+
+    switched = sf.HybridSystem({f"level {i}": mode(level) for i, level in enumerate(levels)}, [0.3, 0.0])
+    times = [sf.Parameter(jump, fixed=True) for jump in jumps]
+    second = sf.Problem(switched, sf.Experiment(cost, switched.modes, times, 0.0, 2.0), k)
+    meshes = [refined_mesh(first, 0, first.initial_theta)]
+    theta = np.array([1.3])
+    a, b = Evaluator(first, meshes=meshes)(theta), Evaluator(second, meshes=meshes)(theta)
+    assert a.cost == pytest.approx(b.cost, rel=1e-12)
+    np.testing.assert_allclose(a.gradient, b.gradient, rtol=1e-12)
+    np.testing.assert_allclose(a.hessian, b.hessian, rtol=1e-12)
+    # Each on its own mesh: to the tolerances.
+    assert sf.evaluate(second, theta).cost == pytest.approx(a.cost, rel=1e-8)
+
+
+# Reference signals
+
+
+IRREGULAR = np.array([0.0, 0.1, 0.35, 0.4, 0.9, 1.2, 1.25, 1.8, 2.0])
+DENSE = np.linspace(0.0, 2.0, 301)
+OTHER = Polynomial([0.3, 0.5, -1.0, 0.25])
+
+
+def two_cubics(times):
+    return np.stack([CUBIC(times), OTHER(times)], axis=1)
+
+
+def test_interpolation_reproduces_cubics():
+    signal = sf.ReferenceSignal.from_samples(IRREGULAR, two_cubics(IRREGULAR)).signal
+    np.testing.assert_allclose(signal(DENSE), two_cubics(DENSE), rtol=0, atol=1e-13)
+
+
+def test_missing_values_are_bridged_by_their_own_channel():
+    """Gaps at different times, inside and at both ends; a cubic comes back whole."""
+    values = two_cubics(IRREGULAR)
+    values[[0, 3, 4], 0] = np.nan
+    values[[2, 4, 8], 1] = np.nan
+    signal = sf.ReferenceSignal.from_samples(IRREGULAR, values).signal
+    np.testing.assert_allclose(signal(DENSE), two_cubics(DENSE), rtol=0, atol=1e-12)
+
+
+def test_a_time_given_twice_breaks_the_signal():
+    """A cubic up to t = 0.9 and another one from there, with neither of them bent near the break."""
+    before, after = IRREGULAR[:5], IRREGULAR[4:]
+    values = np.concatenate([CUBIC(before), OTHER(after)])
+    signal = sf.ReferenceSignal.from_samples(np.concatenate([before, after]), values).signal
+    expected = np.where(DENSE < 0.9, CUBIC(DENSE), OTHER(DENSE))
+    np.testing.assert_allclose(signal(DENSE)[:, 0], expected, rtol=0, atol=1e-13)
+    assert signal([0.9])[0, 0] == pytest.approx(OTHER(0.9), abs=1e-13)
+    assert signal([np.nextafter(0.9, 0.0)])[0, 0] == pytest.approx(CUBIC(0.9), abs=1e-13)
+
+
+def filtered(frequency, cutoff):
+    """Amplitudes of the sine and of the cosine that remain of a sine, far from the ends."""
+    times = np.linspace(0.0, 40.0, 2001)
+    signal = sf.ReferenceSignal.from_samples(times, np.sin(2 * np.pi * frequency * times), lowpass_hz=cutoff).signal
+    middle = np.arange(15.0, 25.0, 0.005)
+    y = signal(middle)[:, 0]
+    return [2 * np.mean(y * wave(2 * np.pi * frequency * middle)) for wave in (np.sin, np.cos)]
+
+
+def test_the_lowpass_filter_passes_slow_signals_without_shifting_their_phase():
+    sine, cosine = filtered(0.2, cutoff=2.0)
+    assert sine == pytest.approx(1.0, abs=1e-3)
+    assert cosine == pytest.approx(0.0, abs=1e-5)
+
+
+def test_the_lowpass_filter_halves_the_amplitude_at_its_cut_off():
+    sine, cosine = filtered(1.0, cutoff=1.0)
+    assert sine == pytest.approx(0.5, abs=5e-3)
+    assert cosine == pytest.approx(0.0, abs=5e-3)
+
+
+def test_the_lowpass_filter_stops_fast_signals():
+    sine, cosine = filtered(10.0, cutoff=1.0)
+    assert np.hypot(sine, cosine) < 2e-4
+
+
+def test_the_peak_of_a_slow_wave_stays_where_it_is():
+    times = np.linspace(0.0, 20.0, 401)
+    signal = sf.ReferenceSignal.from_samples(times, np.sin(0.5 * times), lowpass_hz=1.0).signal
+    around = np.linspace(2.0, 4.5, 25001)
+    assert around[np.argmax(signal(around)[:, 0])] == pytest.approx(np.pi, abs=2e-4)
+
+
+def at_rest(t, x, p):
+    return jnp.zeros(2)
+
+
+def resting_state(p):
+    return jnp.array([0.4, p["level"]])
+
+
+REST = sf.HybridSystem({"rest": at_rest}, resting_state)
+
+
+def reference_cost(values=None, times=IRREGULAR, **settings):
+    """J of a state that stays at (0.4, p) for a reference on [0, 2]."""
+    values = two_cubics(times) if values is None else values
+    signal = sf.ReferenceSignal.from_samples(times, values, **settings)
+    return sf.evaluate(sf.Problem(REST, sf.Experiment(signal, ("rest",), (), 0.0, 2.0), {"level": -0.2}))
+
+
+@pytest.mark.parametrize(
+    ("weights", "W"),
+    [(None, np.eye(2)), ([2.0, 0.5], np.diag([2.0, 0.5])), ([[2.0, -0.6], [-0.6, 0.5]],) * 2],
+    ids=["none", "diagonal", "matrix"],
+)
+def test_weights_of_a_reference_signal(weights, W):
+    """J = 1/2 int (y - y_m)' W (y - y_m), a polynomial; dJ/dlevel = int W[1] (y - y_m)."""
+    W = np.array(W)
+    r = [0.4 - CUBIC, -0.2 - OTHER]
+    density = sum(0.5 * W[i, j] * r[i] * r[j] for i in range(2) for j in range(2)).integ()
+    slope = (W[1, 0] * r[0] + W[1, 1] * r[1]).integ()
+    found = reference_cost(weights=weights)
+    assert found.cost == pytest.approx(density(2.0) - density(0.0), rel=1e-7)
+    assert found.gradient[0] == pytest.approx(slope(2.0) - slope(0.0), rel=1e-7)
+    assert found.hessian[0, 0] == pytest.approx(2.0 * W[1, 1], rel=1e-12)
+
+
+def test_a_broken_reference_signal_is_integrated_up_to_the_break_and_from_it():
+    """0 before t = 0.7 and 1 after it: evenly spaced nodes or a smooth signal would miss that."""
+    times = np.array([0.0, 0.2, 0.5, 0.7, 0.7, 0.9, 1.5, 2.0])
+    values = np.repeat(np.array([[0.0, 0.0], [1.0, 1.0]]), 4, axis=0)
+    before, after = 0.5 * (0.4**2 + 0.2**2), 0.5 * (0.6**2 + 1.2**2)
+    assert reference_cost(values, times).cost == pytest.approx(0.7 * before + 1.3 * after, rel=1e-13)
+
+
+# Measurements
+
+
+def first_mode(t, x, p):
+    return -p["k"] * x
+
+
+def second_mode(t, x, p):
+    return jnp.array([-p["k"] * x[0], p["k"] * x[0] - x[1]])
+
+
+def seen(t, x, p):
+    return jnp.array([x[0] + x[1], p["k"] * x[1]])
+
+
+DECAYS = sf.HybridSystem({"first": first_mode, "second": second_mode}, [1.5, 0.8])
+THETA = np.array([0.83, 1.4])
+SAMPLED = np.array([0.0, 0.011, 0.4, 0.41, 0.8, 1.25, 2.0])
+RNG = np.random.default_rng(5)
+VALUES = RNG.normal(size=(7, 2))
+
+
+def states(theta, t):
+    """x(t) in closed form: x' = -k x up to tau, then x1' = -k x1, x2' = k x1 - x2."""
+    tau, k = theta
+    early = jnp.array([1.5, 0.8]) * jnp.exp(-k * t)
+    a, b = jnp.array([1.5, 0.8]) * jnp.exp(-k * tau)
+    s = t - tau
+    forced = k * a * (jnp.exp(-k * s) - jnp.exp(-s)) / (1.0 - k)
+    return jnp.where(t <= tau, early, jnp.array([a * jnp.exp(-k * s), b * jnp.exp(-s) + forced]))
+
+
+@cache
+def closed_form_program(K):
+    def cost(theta, times, values, sigma):
+        x = jax.vmap(states, in_axes=(None, 0))(theta, times)
+        h = jnp.stack([x[:, 0] + x[:, 1], theta[1] * x[:, 1]], axis=1)
+        known = jnp.isfinite(values)
+        return 0.5 * jnp.sum((jnp.where(known, h - jnp.where(known, values, 0.0), 0.0) / sigma) ** 2)
+
+    return jax.jit(lambda *given: (cost(*given), jax.grad(cost)(*given), jax.hessian(cost)(*given)))
+
+
+def closed_form(times, values, sigma):
+    with jax.enable_x64(True):
+        given = [jnp.asarray(a, float) for a in (THETA, times, values, np.broadcast_to(sigma, values.shape))]
+        return [np.asarray(value) for value in closed_form_program(len(times))(*given)]
+
+
+def evaluated(times, values, sigma):
+    data = sf.Measurements(times, values, observe=seen, sigma=sigma)
+    run = sf.Experiment(data, ("first", "second"), THETA[:1], 0.0, 2.0)
+    return sf.evaluate(sf.Problem(DECAYS, run, {"k": THETA[1]}, rtol=1e-11, atol=1e-13))
+
+
+def with_gaps(*places):
+    values = VALUES.copy()
+    for place in places:
+        values[place] = np.nan
+    return values
+
+
+@pytest.mark.parametrize(
+    ("values", "sigma"),
+    [
+        (VALUES, 0.3),
+        (VALUES, [0.3, 0.7]),
+        (VALUES, RNG.uniform(0.1, 1.0, size=(7, 2))),
+        (with_gaps((0, 1), (3, 0), (6, 1)), [0.3, 0.7]),
+        (with_gaps((0,), (2,), (4,), (6,)), RNG.uniform(0.1, 1.0, size=(7, 2))),
+        (VALUES, None),
+    ],
+    ids=["sigma", "sigma a channel", "sigma a sample", "single gaps", "whole samples missing", "sigma unknown"],
+)
+def test_measurements_in_closed_form(values, sigma):
+    """Irregular times with one at t0 and one at tf; missing values leave no trace in any derivative."""
+    J, g, H = closed_form(SAMPLED, values, 1.0 if sigma is None else sigma)
+    found = evaluated(SAMPLED, values, sigma)
+    assert found.cost == pytest.approx(float(J), rel=1e-9)
+    np.testing.assert_allclose(found.gradient, g, rtol=1e-8)
+    np.testing.assert_allclose(found.hessian, H, rtol=1e-8)
+
+
+def test_a_missing_sample_is_the_same_as_one_left_out():
+    values = with_gaps((1,), (4,))
+    there = np.isfinite(values).all(axis=1)
+    missing, left_out = evaluated(SAMPLED, values, 0.3), evaluated(SAMPLED[there], values[there], 0.3)
+    assert missing.cost == pytest.approx(left_out.cost, rel=1e-10)
+    np.testing.assert_allclose(missing.gradient, left_out.gradient, rtol=1e-10)
+    np.testing.assert_allclose(missing.hessian, left_out.hessian, rtol=1e-10)
+
+
+def test_weights_and_count():
+    values = np.array([[1.0, np.nan], [2.0, 3.0]])
+    measured = sf.Measurements([0.0, 1.0], values, sigma=[0.5, 2.0])
+    np.testing.assert_array_equal(measured.weights, [[4.0, 0.0], [4.0, 0.25]])
+    assert measured.count == 3
+    assert sf.Measurements([0.0, 1.0], values).weights.tolist() == [[1.0, 0.0], [1.0, 1.0]]
+    column = sf.Measurements([0.0, 1.0], [1.0, 2.0], sigma=[[0.1], [1.0]])
+    np.testing.assert_allclose(column.weights, [[100.0], [1.0]])
+
+
+def test_a_sample_at_a_transition_with_a_reset_map_is_of_the_state_before_the_jump():
+    """x = 1, halved at tau = 0.5, where a sample is: the cost is that of the 1, whatever the side of tau."""
+    system = sf.HybridSystem({"a": lambda t, x, p: 0.0 * x}, [1.0], {("a", "a"): lambda t, x, p: p["e"] * x})
+    run = sf.Experiment(sf.Measurements([0.5, 1.0], [0.0, 0.0]), ("a", "a"), (0.5,), 0.0, 1.0)
+    problem = sf.Problem(system, run, {"e": 0.5})
+    found = sf.evaluate(problem)
+    assert found.cost == pytest.approx(0.5 * (1.0 + 0.25), rel=1e-14)
+    assert found.gradient[1] == pytest.approx(0.5, rel=1e-14)
+
+
+def test_costs_of_several_data_add_up():
+    """Two Measurements, a reference and running and terminal costs at once, each with a cost of its own size."""
+    system = sf.HybridSystem({"a": lambda t, x, p: 0.0 * x}, lambda p: jnp.array([p["c"]]))
+    data = [
+        sf.Measurements([0.5], [0.0], sigma=0.1),
+        sf.RunningCost(lambda t, x, p: 3.0 * x[0]),
+        sf.Measurements([0.2, 0.4], [0.0, 1.0], observe=lambda t, x, p: 10.0 * x),
+        sf.TerminalCost(lambda x, p: 7.0 * x[0]),
+        sf.ReferenceSignal.from_samples([0.0, 1.0, 2.0, 3.0], [1.0, 1.0, 1.0, 1.0], weights=[11.0]),
+        sf.ReferenceSignal.from_samples([0.0, 1.0, 2.0, 3.0], [2.0, 2.0, 2.0, 2.0], observe=lambda t, x, p: -x),
+    ]
+    found = sf.evaluate(sf.Problem(system, sf.Experiment(data, ("a",), (), 0.0, 2.0), {"c": 0.3}))
+    c = 0.3
+    parts = [50 * c**2, 6 * c, 50 * c**2 + 0.5 * (10 * c - 1) ** 2, 7 * c, 11 * (c - 1) ** 2, (c + 2) ** 2]
+    slopes = [100 * c, 6, 100 * c + 10 * (10 * c - 1), 7, 22 * (c - 1), 2 * (c + 2)]
+    assert found.cost == pytest.approx(sum(parts), rel=1e-13)
+    assert found.gradient[0] == pytest.approx(sum(slopes), rel=1e-13)
