@@ -112,7 +112,7 @@ def _jacobian(y: Symbol, x: Symbol, mode: str) -> Symbol:
     return ca.horzcat(*[ca.jtimes(y, x, ca.DM.eye(y.numel())[:, i], True) for i in range(y.numel())]).T
 
 
-# --- MX: the SX function of a row, accumulated over the rows ------------------------------------------------------------
+# --- MX: the SX function of a row, accumulated over the rows ----------------------------------------------------------
 
 
 def _row_function(row: Row, reference: bool, cse: bool) -> ca.Function:

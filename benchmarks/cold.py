@@ -7,7 +7,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
 
@@ -17,47 +18,53 @@ ROOT = Path(__file__).parent.parent
 FIT = [sys.executable, "-c", "from switchfit.cli import main; main()", "fit", "examples/toss/problem.toml"]
 IMPORT = [sys.executable, "-c", "import switchfit"]
 NOTHING = [sys.executable, "-c", "pass"]
-EMPTY_TARGET, FILLED_TARGET, IMPORT_TARGET = 6.0, 2.5, 1.2
+EMPTY, FILLED = "switchfit fit toss, empty cache", "switchfit fit toss, filled cache"
+TARGETS = {EMPTY: 6.0, FILLED: 2.5, "import switchfit": 1.2}
 
 
 def run(report: Report, quick: bool, cores: set[int] | None) -> None:
     """Wall-clock medians of whole processes, on all cores."""
     with tempfile.TemporaryDirectory() as folder:
-        caches = (str(Path(folder) / f"empty{k}") for k in range(100))
-        filled = str(Path(folder) / "filled")
-        seconds_of(FIT, filled, cores)
+        first = Path(folder) / "0"
         few, many = (1, 2) if quick else (5, 11)
-        commands: dict[str, tuple[int, Callable[[], float]]] = {
-            "switchfit fit toss, empty cache": (few, lambda: seconds_of(FIT, next(caches), cores)),
-            "switchfit fit toss, filled cache": (many, lambda: seconds_of(FIT, filled, cores)),
-            "import switchfit": (many, lambda: seconds_of(IMPORT, filled, cores)),
-            "python, nothing": (many, lambda: seconds_of(NOTHING, filled, cores)),
+        taken = {
+            EMPTY: [seconds_of(FIT, first.with_name(str(k)), cores) for k in range(few)],
+            FILLED: [seconds_of(FIT, first, cores) for _ in range(many)],
+            "import switchfit": [seconds_of(IMPORT, first, cores) for _ in range(many)],
+            "python, nothing": [seconds_of(NOTHING, first, cores) for _ in range(many)],
         }
-        taken = {name: [call() for _ in range(count)] for name, (count, call) in commands.items()}
     report.section("Cold processes", "Wall clock of whole processes, on all cores; the interpreter's start included.")
     report.table(
         ("", "median", "minimum", "processes"),
         [(name, f"{median(s):.2f} s", f"{min(s):.2f} s", len(s)) for name, s in taken.items()],
     )
     report.data["cold"] = taken
-    names = list(taken)
-    for name, wanted in zip(names, (EMPTY_TARGET, FILLED_TARGET, IMPORT_TARGET), strict=False):
+    for name, wanted in TARGETS.items():
         report.target(name, wanted, median(taken[name]), "s")
 
 
-def seconds_of(command: list[str], cache: str, cores: set[int] | None) -> float:
-    """Wall clock of one process with a compilation cache of its own."""
+def seconds_of(command: list[str], cache: Path, cores: set[int] | None) -> float:
+    """Wall clock of one process with a compilation cache of its own, on `cores`."""
     environment = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
-    environment |= {"SWITCHFIT_CACHE": cache, "XDG_CACHE_HOME": cache}
-
-    def use_all_cores() -> None:
-        if cores is not None:
-            os.sched_setaffinity(0, cores)
-
-    began = time.perf_counter()
-    done = subprocess.run(
-        command, cwd=ROOT, env=environment, preexec_fn=use_all_cores, capture_output=True, text=True, check=False
-    )
+    environment |= {"SWITCHFIT_CACHE": str(cache), "XDG_CACHE_HOME": str(cache)}
+    with _on(cores):
+        began = time.perf_counter()
+        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+        seconds = time.perf_counter() - began
     if done.returncode != 0:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr}")
-    return time.perf_counter() - began
+    return seconds
+
+
+@contextmanager
+def _on(cores: set[int] | None) -> Iterator[None]:
+    """Let this thread, and the processes it starts, use `cores`."""
+    if cores is None:
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, cores)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,7 @@ def run(report: Report, quick: bool) -> None:
             "SLSQP, switchfit's gradient", lambda: slsqp(problem, *_cost_and_gradient(evaluator))
         ),
     }
-    timings = take_turns(calls, 10 if quick else 30)
+    timings = take_turns(calls, 5 if quick else 30)
     timings |= take_turns({"SLSQP, differences of solve_ivp": integrated}, 1 if quick else 5, block=1)
     best = min(evaluator(found_theta(result)).cost for result in results.values())
     fastest = timings["estimate(), new problem"].median
@@ -72,8 +73,8 @@ def run(report: Report, quick: bool) -> None:
         report.data[f"fit: {name}"] = {**vars(timing), "iterations": iterations, "excess": excess, "error": error}
     report.section(
         "Whole fit of the vehicle, warm",
-        f"From (5, 9, 0.8) to (6, 10, 0.7), stopping at 1e-7 (switchfit) or ftol 1e-14 (SLSQP). J of all is evaluated on "
-        f"switchfit's mesh; the same optimum: J within {SAME_OPTIMUM:.0e} of the best. *New problem*: its mesh is "
+        f"From (5, 9, 0.8) to (6, 10, 0.7), stopping at 1e-7 (switchfit) or ftol 1e-14 (SLSQP). J of all is evaluated "
+        f"on switchfit's mesh; the same optimum: J within {SAME_OPTIMUM:.0e} of the best. *New problem*: its mesh is "
         "refined again by an adaptive solve, nothing is compiled; the ratio is to this.",
     )
     report.table(("", "median", "ratio", "iterations", "evaluations", "same optimum", "largest error in theta"), rows)
@@ -99,7 +100,7 @@ def _cost_and_gradient(evaluator: Evaluator) -> tuple[Callable[[np.ndarray], Any
 
 
 def slsqp(problem: sf.Problem, cost: Callable[[np.ndarray], Any], jac: str | bool) -> Any:
-    """SciPy's SLSQP with the bounds and the ordering of the problem; `jac` True: `cost` returns the gradient as well."""
+    """SciPy's SLSQP with the problem's bounds and ordering; with `jac` True `cost` returns the gradient as well."""
     unknowns = problem.unknowns
     calls = 0
 
@@ -138,7 +139,7 @@ class CostBySciPy:
     def __call__(self, theta: np.ndarray) -> float:
         """J at theta; infinite where the transition times are out of order."""
         times = [vehicle.HORIZON[0], theta[0], theta[1], vehicle.HORIZON[1]]
-        if any(b < a for a, b in zip(times[:-1], times[1:], strict=True)):
+        if any(b < a for a, b in pairwise(times)):
             return math.inf
         y = np.zeros(7)
         for mode, start, end in zip(vehicle.SEQUENCE, times[:-1], times[1:], strict=True):

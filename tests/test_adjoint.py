@@ -100,7 +100,7 @@ def test_one_sided_derivatives_at_a_sample_differ_by_dell_x(method: str) -> None
     arguments = this.arguments("samples", halvings=2)
     left, right = (getattr(this, method)(arguments, tau, P0, side).gradient for side in (-1, 1))
 
-    def Dell_X(arguments, tau, p, side):  # noqa: N802
+    def Dell_X(arguments, tau, p, side):
         model = Model(this.structure, arguments)
         x = propagate(model, tau, p, side).before_transition(0)
         sample = jax.tree.map(lambda a: a[2], arguments.samples[0])

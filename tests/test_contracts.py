@@ -38,11 +38,11 @@ OSCILLATOR = sf.HybridSystem({"free": counted, "damped": damped}, [1.0, 0.0])
 
 def oscillator(tau=1.1, k=2.0, damping=0.3, samples=9, seed=0, start=None):
     """Samples at which the truth is (1.2, 2.1, 0.35), with a little noise of a given seed."""
-    times = np.linspace(0.0, 3.0, samples)
+    times = np.linspace(0.0, 3.4, samples)
     values = np.cos(np.sqrt(2.1) * times) * np.exp(-0.3 * np.maximum(times - 1.2, 0.0))
     values += 0.01 * np.random.default_rng(seed).normal(size=samples)
     data = sf.Measurements(times, values, observe=position, sigma=0.01)
-    run = sf.Experiment(data, ("free", "damped"), (tau,), 0.0, 3.0, initial_state=start)
+    run = sf.Experiment(data, ("free", "damped"), (tau,), 0.0, 3.4, initial_state=start)
     return sf.Problem(OSCILLATOR, run, {"k": k, "damping": damping})
 
 

@@ -179,8 +179,8 @@ def stage_tangents(tableau: Tableau, h: Array, A: Array, S: Array, x_d: Array) -
 
 
 def end_tangents(
-    tableau: Tableau, h: Array, A: Array, f_t: Array, K: Array, t_d: Array, h_d: float
-) -> tuple[Array, Array, Array]:
+    tableau: Tableau, h: Array, A: Array, f_t: Array, K: Array, t_d: Array, h_d: Array
+) -> tuple[Array, Array]:
     """Derivatives of a step in its start (``t' = 1 - c, h' = -1``) or in its end (``t' = c, h' = 1``).
 
         X_j' = h sum_l a_jl K_l' + h' sum_l a_jl K_l,      K_j' = A_j X_j' + D_2 f_j t_j'
@@ -191,17 +191,17 @@ def end_tangents(
     A, f_t : (s, n, n) and (s, n), D_1 f and D_2 f at each stage
     K : (s, n), slopes
     t_d : (s,), derivative of the stage times
-    h_d : derivative of the step length
+    h_d : (), derivative of the step length
 
     Returns
     -------
-    X_d, K_d : (s, n)
+    X_d : (s, n)
     after_d : (n,), derivative of the state after the step
     """
+    b = jnp.asarray(tableau.b)
     base = h_d * (jnp.asarray(tableau.a) @ K)[:, :, None]
     X_d, K_d = stage_tangents(tableau, h, A, (f_t * t_d[:, None])[:, :, None], base)
-    after_d = h * combine(tableau.b, list(K_d[..., 0])) + h_d * combine(tableau.b, list(K))
-    return X_d[..., 0], K_d[..., 0], after_d
+    return X_d[..., 0], h * b @ K_d[..., 0] + h_d * b @ K
 
 
 def stage_adjoints(tableau: Tableau, h: Array, A: Array, l_x: Array, psi: Array) -> tuple[Array, Array, Array]:

@@ -248,7 +248,7 @@ def transition_at(model: Model, path: Path, i: int, tau_i: Array, p: Array) -> T
         direction = (jnp.ones(()), f_before(t, x, p), jnp.zeros_like(p))
         return jax.jvp(R, (t, x, p), direction)[1]
 
-    def Lambda(t: Array, x: Array, p: Array) -> Array:  # noqa: N802
+    def Lambda(t: Array, x: Array, p: Array) -> Array:
         return ell(t, x, p) - ell(t, R(t, x, p), p)
 
     x_minus, x_plus = path.before_transition(i), path.before[opening, 0]

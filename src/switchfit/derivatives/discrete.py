@@ -32,7 +32,7 @@ from switchfit.derivatives.first_order import (
 from switchfit.mesh import row_ending_cell
 from switchfit.model import Model, Piece, Samples
 from switchfit.propagate import Path, by_mode, by_row
-from switchfit.rungekutta import combine, product, stage_adjoints
+from switchfit.rungekutta import stage_adjoints
 
 Array = jax.Array
 
@@ -171,31 +171,27 @@ def step_length_curvature(model: Model, first: FirstOrder, psi: Costates) -> Arr
     P = parameter_directions(model)
     if N == 0:
         return jnp.zeros((P.shape[1], P.shape[1]))
-    tableau = model.tableau
+    a, b = jnp.asarray(model.tableau.a), jnp.asarray(model.tableau.b)
     layout, X = first.path.layout, first.tangents
     starts, ends = time_directions(model, layout)
 
     def of_row(row: Array) -> Array:
         """Derivative along theta of what the step length of a row multiplies: (D,)."""
 
-        def at(a: Array) -> Array:
-            return by_row(a)[row]
+        def at(values: Array) -> Array:
+            return by_row(values)[row]
 
-        J, X_d, mu = jax.tree.map(at, first.jacobians), at(X.stages), at(psi.mu)
+        J, X_d = jax.tree.map(at, first.jacobians), at(X.stages)
         times_d = stage_time_directions(model, at(starts), at(ends))
-        K_d = list(jax.vmap(product)(J.f_x, X_d) + J.f_t[:, :, None] * times_d[:, None] + J.f_p @ P)
-        total = at(psi.after) @ combine(tableau.b, K_d)
-        for j in range(len(tableau.c)):
-            if tableau.a[j].any():
-                total = total + mu[j] @ combine(tableau.a[j], K_d)
+        K_d = J.f_x @ X_d + J.f_t[:, :, None] * times_d[:, None] + J.f_p @ P
+        total = jnp.einsum("n,s,snd->d", at(psi.after), b, K_d) + jnp.einsum("jn,js,snd->d", at(psi.mu), a, K_d)
         if model.has_running_cost:
-            l_d = J.l_t[:, None] * times_d + jnp.einsum("sn,snd->sd", J.l_x, X_d) + J.l_p @ P
-            total = total + tableau.b @ l_d
+            total = total + b @ (J.l_t[:, None] * times_d + jnp.einsum("sn,snd->sd", J.l_x, X_d) + J.l_p @ P)
         return total
 
-    D_open = jax.vmap(of_row)(layout.first_chunk[1:] * layout.start.shape[1])
-    D_close = jax.vmap(of_row)(layout.last_row[:-1])
-    half = jnp.zeros((P.shape[1], P.shape[1])).at[:N].set(D_close - D_open)
+    opening, closing = layout.first_chunk[1:] * layout.start.shape[1], layout.last_row[:-1]
+    by_opening, by_closing = jax.vmap(jax.vmap(of_row))(jnp.stack([opening, closing]))
+    half = jnp.zeros((P.shape[1], P.shape[1])).at[:N].set(by_closing - by_opening)
     return half + half.T
 
 

@@ -222,11 +222,9 @@ def row_end_tangents(model: Model, path: Path, jacobians: StageJacobians) -> Row
     layout, tableau = path.layout, model.tableau
     rows = jnp.stack([layout.first_chunk[1:] * layout.start.shape[1], layout.last_row[:-1]])
     h, f_x, f_t, K = (by_row(a)[rows] for a in (layout.end - layout.start, jacobians.f_x, jacobians.f_t, path.slopes))
-    parts = []
-    for line, (t_d, h_d) in enumerate(((1 - tableau.c, -1.0), (tableau.c, 1.0))):
-        derivative = partial(end_tangents, tableau, t_d=jnp.asarray(t_d), h_d=h_d)
-        parts.append(jax.vmap(derivative)(h[line], f_x[line], f_t[line], K[line]))
-    stages, _, after = (jnp.stack(pair) for pair in zip(*parts, strict=True))
+    t_d, h_d = jnp.stack([1 - tableau.c, jnp.asarray(tableau.c)]), jnp.array([-1.0, 1.0])  # in the start, in the end
+    of_line = jax.vmap(partial(end_tangents, tableau), in_axes=(0, 0, 0, 0, None, None))
+    stages, after = jax.vmap(of_line)(h, f_x, f_t, K, t_d, h_d)
     return RowEnds(rows, stages, after)
 
 
