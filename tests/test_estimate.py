@@ -463,7 +463,6 @@ def test_the_mesh_is_refined_where_the_solution_needs_it():
     assert found.theta[0] == pytest.approx(exact.x[0], rel=1e-5)
 
 
-@pytest.mark.xfail(reason="records count from 0 again after the mesh was refined", strict=True)
 def test_iterations_are_numbered_on_after_the_mesh_was_refined():
     history = refined_fit().history
     assert [record.iteration for record in history] == list(range(len(history)))

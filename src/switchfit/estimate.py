@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields
-from functools import cached_property
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -135,14 +135,20 @@ def estimate(
     history: list[IterationRecord] = []
     evaluations = 0
     for attempt in range(REFINEMENTS + 1):
-        result = _minimized(evaluator, theta, hessian, tolerance, max_iterations, callback, len(history))
-        history += result.history if not history else result.history[1:]
+        numbered = partial(_numbered_on, after=history[-1] if history else None)
+        told = None if callback is None else lambda record, on=numbered: callback(on(record))
+        left = max_iterations - max(len(history) - 1, 0)
+        result = _minimized(evaluator, theta, hessian, tolerance, max(left, 0), told)
+        records = [numbered(record) for record in result.history]
+        history += records[1:] if history else records
         evaluations += result.evaluations
         theta = result.theta
         fine_cost, trajectories, comparisons = compare(problem, theta, [mesh.divided() for mesh in evaluator.meshes])
-        error = abs(fine_cost - result.cost) / max(abs(fine_cost), PERFECT_FIT * abs(history[0].cost), 1e-300)
+        first_cost = abs(history[0].cost) if history else 0.0
+        error = abs(fine_cost - result.cost) / max(abs(fine_cost), PERFECT_FIT * first_cost, 1e-300)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
-        if excess <= 1 or attempt == REFINEMENTS or result.status in (Status.INTERRUPTED, Status.NONFINITE_START):
+        done = result.status in (Status.INTERRUPTED, Status.NONFINITE_START) or attempt == REFINEMENTS
+        if done or not excess > 1:
             break
         evaluator = evaluator.divided(2 ** max(int(np.ceil(np.log2(excess) / ORDER)), 1))
     return _estimate(
@@ -157,6 +163,15 @@ def estimate(
         comparisons=comparisons,
         integration_error=float(error),
         seconds=time.perf_counter() - began,
+    )
+
+
+def _numbered_on(record: IterationRecord, after: IterationRecord | None) -> IterationRecord:
+    """`record` of a fit that was resumed, counted on from the last record before."""
+    if after is None:
+        return record
+    return replace(
+        record, iteration=record.iteration + after.iteration, evaluations=record.evaluations + after.evaluations
     )
 
 
@@ -178,7 +193,6 @@ def _minimized(
     tolerance: float,
     max_iterations: int,
     callback: Callable[[IterationRecord], object] | None,
-    before: int,
 ) -> Result:
     """One run of the optimiser on the evaluator's meshes."""
     problem = evaluator.problem
@@ -200,7 +214,7 @@ def _minimized(
         hessian=hessian,
         blocks=is_time,
         tolerance=tolerance,
-        max_iterations=max(max_iterations - max(before - 1, 0), 0),
+        max_iterations=max_iterations,
         callback=callback,
     )
 
@@ -233,7 +247,7 @@ def _estimate(
         gradient=result.gradient,
         hessian=exact,
         optimality=result.optimality,
-        iterations=len(history) - 1,
+        iterations=max(len(history) - 1, 0),
         status=result.status,
         message=_named(result.message, unknowns.names),
         history=tuple(history),

@@ -112,7 +112,8 @@ def rows(nodes: jax.Array, tau: jax.Array, side: jax.Array) -> Rows:
     """
     cells, N = nodes.shape[0] - 1, tau.shape[0]
     passed = jnp.where(side > 0, nodes[None] <= tau[:, None], nodes[None] < tau[:, None]).sum(1)
-    first_cell = jnp.clip(passed - 1, 0, cells - 1)
+    real_cells = (nodes[1:] > nodes[:-1]).sum()  # without the padding, so that tau = tf stays before what is at tf
+    first_cell = jnp.clip(passed - 1, 0, real_cells - 1)
     first_cell = jnp.concatenate([jnp.zeros(1, first_cell.dtype), first_cell])
     last_cell = jnp.concatenate([first_cell[1:], jnp.full(1, cells - 1, first_cell.dtype)])
     count = last_cell - first_cell + 1
