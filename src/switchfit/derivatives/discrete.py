@@ -30,7 +30,7 @@ from switchfit.derivatives.first_order import (
     time_directions,
 )
 from switchfit.mesh import row_ending_cell
-from switchfit.model import Model, Piece, Samples
+from switchfit.model import Model, Piece, Samples, weighted
 from switchfit.propagate import Path, by_mode, by_row
 from switchfit.rungekutta import stage_adjoints
 
@@ -205,7 +205,7 @@ def stage_gauss_newton(model: Model, path: Path, X: Tangents, p: Array) -> Array
         H = jnp.zeros((P.shape[1], P.shape[1]))
         for residual, W in zip(model.reference_residuals(piece), model.arguments.weights, strict=True):
             r_d = _columns(residual, (t, x, p), (t_d, x_d, P))
-            H = H + r_d.T @ W @ r_d
+            H = H + r_d.T @ weighted(W, r_d)
         for ell in model.structure.running:
 
             def value(x: Array, p: Array, ell: Callable[..., Any] = ell) -> Array:

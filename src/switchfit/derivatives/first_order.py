@@ -117,39 +117,36 @@ def stage_time_directions(model: Model, start_d: Array, end_d: Array) -> Array:
 
 
 def stage_jacobians(model: Model, path: Path, p: Array) -> StageJacobians:
-    """D_2 f, D_1 f, D_p f and the same of ell at all stages, by forward differentiation along (t, x, p)."""
+    """D_2 f, D_1 f, D_p f at all stages, by forward differentiation along (t, x, p), and the gradient of ell."""
     n, M = model.structure.n, model.structure.M
     basis = jnp.eye(1 + n + M)
 
-    def of_mode(mode: int) -> Callable[..., tuple[Array, Array, Array]]:
-        def at_stage(piece: Piece, t: Array, x: Array) -> tuple[Array, Array, Array]:
-            f, ell = model.field(mode, piece), model.density(piece)
+    def of_mode(mode: int) -> Callable[..., StageJacobians]:
+        def at_stage(piece: Piece, t: Array, x: Array) -> StageJacobians:
+            f = model.field(mode, piece)
 
-            def function(t: Array, x: Array, p: Array) -> tuple[Array, Array]:
-                return f(t, x, p), ell(t, x, p) if model.has_running_cost else jnp.zeros(())
+            def column(direction: Array) -> Array:
+                return jax.jvp(f, (t, x, p), (direction[0], direction[1 : 1 + n], direction[1 + n :]))[1]
 
-            def column(direction: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-                along = (direction[0], direction[1 : 1 + n], direction[1 + n :])
-                return jax.jvp(function, (t, x, p), along)
+            f_z = jax.vmap(column, out_axes=-1)(basis)
+            if model.has_running_cost:  # a scalar: backward is cheaper
+                l, gradient = jax.value_and_grad(model.density(piece), argnums=(0, 1, 2))(t, x, p)  # noqa: E741
+            else:
+                l, gradient = jnp.zeros(()), (jnp.zeros(()), jnp.zeros(n), jnp.zeros(M))  # noqa: E741
+            return StageJacobians(f_z[..., 0], f_z[..., 1 : 1 + n], f_z[..., 1 + n :], l, *gradient)
 
-            (_, l), (f_z, l_z) = jax.vmap(column, out_axes=((None, None), (-1, -1)))(basis)  # noqa: E741
-            return f_z, l, l_z
-
-        def row(start: Array, end: Array, piece: Piece, X: Array) -> tuple[Array, Array, Array]:
+        def row(start: Array, end: Array, piece: Piece, X: Array) -> StageJacobians:
             times = start + model.tableau.c * (end - start)
             return jax.vmap(at_stage, in_axes=(None, 0, 0))(piece, times, X)
 
         return jax.vmap(row)
 
-    def chunk(given: tuple[Array, Array, Array, Piece, Array]) -> tuple[Array, Array, Array]:
+    def chunk(given: tuple[Array, Array, Array, Piece, Array]) -> StageJacobians:
         segment, *operands = given
         return by_mode(model, segment, of_mode, *operands)
 
     layout = path.layout
-    f_z, l, l_z = lax.map(chunk, (layout.segment, layout.start, layout.end, path.pieces, path.stages))  # noqa: E741
-    return StageJacobians(
-        f_z[..., 0], f_z[..., 1 : 1 + n], f_z[..., 1 + n :], l, l_z[..., 0], l_z[..., 1 : 1 + n], l_z[..., 1 + n :]
-    )
+    return lax.map(chunk, (layout.segment, layout.start, layout.end, path.pieces, path.stages))
 
 
 def reset_jacobians(model: Model, path: Path, tau: Array, p: Array) -> ResetJacobians | None:
