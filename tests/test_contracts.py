@@ -1,9 +1,11 @@
 """What holds whatever the problem: what compiles when, float64 throughout, no traces in JAX's configuration, docs."""
 
+import gc
 import inspect
 import re
 import subprocess
 import sys
+import weakref
 
 import jax
 import jax.numpy as jnp
@@ -365,3 +367,13 @@ def test_methods_are_documented(kind, name, method):
         assert documented == given
     else:
         assert len(given) <= 3, f"{kind.__name__}.{name} takes {given}: name them in the docstring"
+
+
+def test_a_problem_that_is_no_longer_used_is_freed(compiled):
+    """Its meshes and arrays are kept with the problem, not in a table of the library's."""
+    problem = oscillator(tau=1.05)
+    sf.evaluate(problem)
+    gone = weakref.ref(problem)
+    del problem
+    gc.collect()
+    assert gone() is None

@@ -7,7 +7,6 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
-from weakref import WeakKeyDictionary
 
 import jax
 import jax.numpy as jnp
@@ -115,14 +114,12 @@ class Evaluator:
         return [(s, a, tau, p) for s, a, tau in zip(self.problem.structures, self.arguments, times, strict=True)]
 
 
-_evaluators: WeakKeyDictionary[Problem, Evaluator] = WeakKeyDictionary()
-
-
 def evaluator_of(problem: Problem) -> Evaluator:
-    """The problem's own evaluator, its meshes refined at the initial guess; made once."""
-    if problem not in _evaluators:
-        _evaluators[problem] = Evaluator(problem)
-    return _evaluators[problem]
+    """The problem's own evaluator, its meshes refined at the initial guess; made once and kept with the problem."""
+    if "evaluator" not in problem.__dict__:
+        object.__setattr__(problem, "evaluator", Evaluator(problem))
+    own: Evaluator = problem.__dict__["evaluator"]
+    return own
 
 
 def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method = "auto") -> Evaluation:
