@@ -2,6 +2,7 @@
 
 import gc
 import inspect
+import os
 import re
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import pytest
 import switchfit as sf
 from switchfit.evaluate import evaluator_of
 from switchfit.mesh import padded_length
+from switchfit.xla import SMALL_LOOPS
 
 # Nothing is compiled anew
 
@@ -239,6 +241,22 @@ print(changed or "", heavy or "", end="")
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.strip() == ""
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ("", SMALL_LOOPS),
+        ("--xla_cpu_enable_fast_math=false", f"--xla_cpu_enable_fast_math=false {SMALL_LOOPS}"),
+        ("--xla_backend_extra_options=mine=1", "--xla_backend_extra_options=mine=1"),
+    ],
+)
+def test_the_flags_for_xla_are_added_to_those_of_the_user(given, expected):
+    program = "import os, switchfit; print(os.environ['XLA_FLAGS'])"
+    command = [sys.executable, "-c", program]
+    env = {**os.environ, "XLA_FLAGS": given}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True, env=env)
+    assert done.stdout.strip() == expected
 
 
 # Names, and sums over experiments

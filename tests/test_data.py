@@ -10,6 +10,7 @@ from numpy.polynomial import Polynomial
 
 import switchfit as sf
 from switchfit.evaluate import Evaluator
+from switchfit.model import Piece, float64
 from switchfit.refine import refined_mesh
 
 # Inputs
@@ -105,6 +106,17 @@ def test_a_held_input_is_the_same_as_modes_that_switch_at_fixed_times():
 IRREGULAR = np.array([0.0, 0.1, 0.35, 0.4, 0.9, 1.2, 1.25, 1.8, 2.0])
 DENSE = np.linspace(0.0, 2.0, 301)
 OTHER = Polynomial([0.3, 0.5, -1.0, 0.25])
+
+
+def test_the_derivatives_of_a_signal_in_a_cell_are_those_of_its_cubic():
+    """The rule for them is switchfit's own: value and three derivatives against NumPy's polynomials, along a curve."""
+    coefficients, at = np.array([[0.3, -1.0], [2.0, 0.7], [-0.4, 0.2], [1.1, -0.6]]), 0.37
+    with float64():
+        function = Piece(jnp.asarray(0.2), jnp.asarray(coefficients))
+        for order in range(5):
+            exact = [Polynomial(c).deriv(order)(at - 0.2) for c in coefficients.T]
+            np.testing.assert_allclose(function(at), exact, rtol=1e-13, atol=1e-13)
+            function = jax.jacfwd(function)
 
 
 def two_cubics(times):

@@ -10,6 +10,9 @@ from switchfit.problem import Problem
 from switchfit.result import Certificate
 from switchfit.simulate import Comparison, Trajectory, simulate
 from switchfit.system import HybridSystem
+from switchfit.xla import compile_small_loops_whole
+
+compile_small_loops_whole()
 
 __version__ = "0.1.0"
 

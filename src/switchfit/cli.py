@@ -40,15 +40,8 @@ ProblemPath = Annotated[Path, typer.Argument(metavar="PROBLEM.toml", help="Probl
 Debug = Annotated[bool, typer.Option("--debug", help="Show the full traceback of an error.")]
 
 
-FAST_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000000"
-"""Makes XLA compile the loop over the rows of the mesh into one kernel: an evaluation takes about half the time."""
-
-
 def main() -> None:
     """Entry point of the ``switchfit`` command."""
-    flags = os.environ.get("XLA_FLAGS", "")
-    if "xla_backend_extra_options" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} {FAST_LOOPS}".strip()
     app()
 
 

@@ -234,12 +234,13 @@ def running_cost_gradient(model: Model, path: Path, jacobians: StageJacobians, X
     b = jnp.asarray(model.tableau.b)
     weight = (layout.end - layout.start)[..., None] * b
     starts, ends = time_directions(model, layout)
-    gradient = jnp.einsum("qcs,qcsn,qcsnd->d", weight, jacobians.l_x, X.stages)
-    gradient = gradient + jnp.einsum("qcs,qcsm->m", weight, jacobians.l_p) @ P
+    D = P.shape[1]  # products of flat arrays: XLA makes slow loops of the contractions they stand for
+    gradient = (weight[..., None] * jacobians.l_x).reshape(-1) @ X.stages.reshape(-1, D)
+    gradient = gradient + weight.reshape(-1) @ jacobians.l_p.reshape(weight.size, P.shape[0]) @ P
     times_d = (weight * jacobians.l_t) @ jnp.stack([1 - model.tableau.c, model.tableau.c], axis=1)
     by_start = times_d[..., 0] - jacobians.l @ b
     by_end = times_d[..., 1] + jacobians.l @ b
-    gradient = gradient + jnp.einsum("qc,qcd->d", by_start, starts) + jnp.einsum("qc,qcd->d", by_end, ends)
+    gradient = gradient + by_start.reshape(-1) @ starts.reshape(-1, D) + by_end.reshape(-1) @ ends.reshape(-1, D)
     return jnp.sum(weight * jacobians.l), gradient
 
 
