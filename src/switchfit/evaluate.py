@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from switchfit.cache import compilation_cache
 from switchfit.data import FloatArray
@@ -92,12 +92,11 @@ class Evaluator:
                 for s, a, tau, p in self._each(theta)
             ]
         self._compiled.add((method, matrix))
-        for (J, g, H), places in zip(results, self._places, strict=True):
-            free = places >= 0
-            here = places[free]
+        for result, (own, mine) in zip(results, self._places, strict=True):
+            J, g, H = map(np.asarray, result)
             total += float(J)
-            gradient[here] += np.asarray(g)[free]
-            hessian[np.ix_(here, here)] += np.asarray(H)[np.ix_(free, free)]
+            gradient[mine] += g[own]
+            hessian[mine[:, None], mine] += H[own[:, None], own]
         return Evaluation(total, gradient, hessian)
 
     def breakpoints(self) -> list[FloatArray]:
@@ -155,10 +154,12 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     return evaluator_of(problem)(problem.checked_theta(theta), method=method)
 
 
-def _places(problem: Problem, e: int) -> Any:
-    """Position in theta of each of the experiment's N transition times and M parameters, -1 where fixed: (N + M,)."""
+def _places(problem: Problem, e: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Which of the experiment's N transition times and M parameters are free, and where in theta these stand."""
     spans = [np.arange(span.start, span.stop) for span in problem.unknowns.parameters.values()]
-    return np.concatenate([problem.unknowns.times[e], *spans]).astype(int)
+    places = np.concatenate([problem.unknowns.times[e], *spans]).astype(np.intp)
+    own = np.flatnonzero(places >= 0)
+    return own, places[own]
 
 
 def _resolve(method: Method, structure: Structure) -> Method:
