@@ -58,8 +58,9 @@ ARMIJO = 1e-4
 ARMIJO_ACROSS = 0.1
 #: Shortened steps across breakpoints are tried while they still cross this many.
 MANY_BREAKPOINTS = 3
-#: Differences of costs below this many units of rounding say nothing.
-NOISE = 32 * EPS
+#: Differences of costs below this part of the cost say nothing: where residuals are small beside what is measured, the
+#: rounding of a sum of their squares is a few hundred units, and a search by costs takes many short steps at the end.
+NOISE = 4096 * EPS
 #: Eigenvalues of the scaled Hessian below this are negative curvature, not rounding.
 NEGATIVE_CURVATURE = -1e-8
 #: A step below this part of the unknowns' size is negligible.
