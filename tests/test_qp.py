@@ -227,3 +227,13 @@ def test_wrong_answers_of_nonnegative_least_squares_are_noticed(g, signs):
 def test_without_active_constraints_the_residual_is_the_norm_of_the_gradient():
     g = np.array([3.0, 4.0])
     assert kkt_residual(g, g, np.zeros((0, 2)))[0] == 5.0
+
+
+def test_a_face_that_is_nearly_flat_leaves_a_definite_matrix():
+    """Along a collapsed mode J is all but flat; what ties the flat direction to the blocked one is then huge."""
+    along, across = np.array([1.0, 1.0, 0.0]) / np.sqrt(2), np.array([1.0, -1.0, 0.0]) / np.sqrt(2)
+    normals = np.array([[-1.0, 1.0, 0.0]])
+    for flat in np.logspace(-12, -2, 200):
+        hessian = flat * np.outer(along, along) + np.outer(across, across) + np.diag([0.0, 0.0, 1.0])
+        hessian += 0.8 * (np.outer(along, across) + np.outer(across, along))
+        solve_qp(np.ones(3), convexify(hessian, normals), normals, np.zeros(1))

@@ -1,5 +1,9 @@
 """switchfit: when did the system switch mode, and what were its parameters?"""
 
+from switchfit.batch.fits import Fits
+from switchfit.batch.logs import estimate_many
+from switchfit.batch.monte_carlo import MonteCarlo, monte_carlo
+from switchfit.batch.multistart import Multistart, multistart
 from switchfit.check import DerivativeCheck, check_derivatives
 from switchfit.data import Input, Measurements, ReferenceSignal, RunningCost, TerminalCost
 from switchfit.estimate import Estimate, estimate
@@ -23,9 +27,12 @@ __all__ = [
     "Estimate",
     "Evaluation",
     "Experiment",
+    "Fits",
     "HybridSystem",
     "Input",
     "Measurements",
+    "MonteCarlo",
+    "Multistart",
     "Parameter",
     "Problem",
     "ReferenceSignal",
@@ -35,6 +42,9 @@ __all__ = [
     "Trajectory",
     "check_derivatives",
     "estimate",
+    "estimate_many",
     "evaluate",
+    "monte_carlo",
+    "multistart",
     "simulate",
 ]

@@ -147,7 +147,9 @@ class ReferenceSignal:
     names : sequence of str, optional
         One for each channel, for reports and plots.
     samples : (times, values), optional
-        What the signal was made from, for plots.
+        What the signal was made from.
+    lowpass_hz : float, optional
+        The cut-off with which it was made.
     """
 
     signal: PiecewisePolynomial
@@ -155,6 +157,7 @@ class ReferenceSignal:
     weights: Any = None
     names: tuple[str, ...] | None = None
     samples: tuple[FloatArray, FloatArray] | None = None
+    lowpass_hz: float | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.signal, PiecewisePolynomial):
@@ -208,7 +211,7 @@ class ReferenceSignal:
         signal = _joined([_bridged_spline(part_times, part) for part_times, part in parts])
         if lowpass_hz is not None:
             signal = _lowpass(signal, lowpass_hz)
-        return cls(signal, observe, weights, names, (times, table))  # type: ignore[arg-type]  # made a tuple there
+        return cls(signal, observe, weights, names, (times, table), lowpass_hz)  # type: ignore[arg-type]  # made a tuple there
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from switchfit.certificate import certify
 from switchfit.data import FloatArray, Measurements
@@ -97,6 +98,7 @@ def estimate(
     tolerance: float = 1e-7,
     max_iterations: int = 200,
     callback: Callable[[IterationRecord], object] | None = None,
+    start: ArrayLike | None = None,
 ) -> Estimate:
     """Estimate all transition times and parameters of a problem together.
 
@@ -130,15 +132,15 @@ def estimate(
     if max_iterations < 0:
         raise ValueError(f"max_iterations must not be negative; got {max_iterations}.")
     began = time.perf_counter()
-    evaluator = evaluator_of(problem)
-    theta = problem.initial_theta
+    theta = problem.checked_theta(start)
+    evaluator = evaluator_of(problem) if start is None else Evaluator(problem, theta)
     history: list[IterationRecord] = []
     evaluations = 0
     for attempt in range(REFINEMENTS + 1):
         numbered = partial(_numbered_on, after=history[-1] if history else None)
         told = None if callback is None else lambda record, on=numbered: callback(on(record))
         left = max_iterations - max(len(history) - 1, 0)
-        result = _minimized(evaluator, theta, hessian, tolerance, max(left, 0), told)
+        result = minimized(evaluator, theta, hessian, tolerance, max(left, 0), told)
         records = [numbered(record) for record in result.history]
         history += records[1:] if history else records
         evaluations += result.evaluations
@@ -158,6 +160,7 @@ def estimate(
         history,
         hessian,
         tolerance,
+        initial_theta=problem.checked_theta(start),
         evaluations=evaluations,
         trajectories=trajectories,
         comparisons=comparisons,
@@ -186,15 +189,15 @@ def constraints_of(problem: Problem) -> LinearConstraints:
     return LinearConstraints(unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, tuple(names))
 
 
-def _minimized(
+def minimized(
     evaluator: Evaluator,
     theta: Any,
     hessian: HessianKind,
     tolerance: float,
     max_iterations: int,
-    callback: Callable[[IterationRecord], object] | None,
+    callback: Callable[[IterationRecord], object] | None = None,
 ) -> Result:
-    """One run of the optimiser on the evaluator's meshes."""
+    """One run of the optimiser on the evaluator's meshes; arguments as of `estimate`."""
     problem = evaluator.problem
 
     matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
@@ -237,7 +240,6 @@ def _estimate(
     return Estimate(
         theta_names=unknowns.names,
         theta_units=unknowns.units,
-        initial_theta=unknowns.initial.copy(),
         theta=result.theta,
         lower=unknowns.lower,
         upper=unknowns.upper,
@@ -249,12 +251,12 @@ def _estimate(
         optimality=result.optimality,
         iterations=max(len(history) - 1, 0),
         status=result.status,
-        message=_named(result.message, unknowns.names),
+        message=with_names(result.message, unknowns.names),
         history=tuple(history),
         active=result.active,
         kinks=tuple((unknowns.names[i], left, right) for i, left, right in result.kinks),
         free_basis=result.free_basis,
-        sigma_known=_sigma_known(problem),
+        sigma_known=sigma_known(problem),
         hessian_kind=hessian,
         tolerance=tolerance,
         problem=problem,
@@ -262,12 +264,12 @@ def _estimate(
     )
 
 
-def _named(message: str, names: tuple[str, ...]) -> str:
+def with_names(message: str, names: tuple[str, ...]) -> str:
     """The optimiser's message with the unknowns called by their names."""
     return re.sub(r"theta\[(\d+)\]", lambda match: names[int(match.group(1))], message)
 
 
-def _sigma_known(problem: Problem) -> bool | None:
+def sigma_known(problem: Problem) -> bool | None:
     """Whether sigma is known for all measurements; None where the cost is not made of measurements alone."""
     items = [item for experiment in problem.experiments for item in experiment.data]
     if not all(isinstance(item, Measurements) for item in items):

@@ -70,7 +70,7 @@ class Evaluator:
         self.meshes = list(meshes) if meshes is not None else [refined_mesh(problem, e, at) for e in indices]
         self.arguments = [problem.arguments(e, mesh) for e, mesh in enumerate(self.meshes)]
         self._compiled: set[tuple[Method, Matrix]] = set()
-        self._places = [_places(problem, e) for e in indices]
+        self._places = [(own, places[own]) for places in places_of(problem) for own in [np.flatnonzero(places >= 0)]]
 
     def divided(self, parts: int = 2) -> Evaluator:
         """The same problem with every cell of its meshes cut into equal parts."""
@@ -88,7 +88,7 @@ class Evaluator:
         compiled = (method, matrix) in self._compiled
         with float64(), nullcontext() if compiled else compilation_cache():
             results = [
-                _derivatives(a, tau, p, float(side), structure=s, method=_resolve(method, s), matrix=matrix)
+                derivatives(a, tau, p, float(side), structure=s, method=_resolve(method, s), matrix=matrix)
                 for s, a, tau, p in self._each(theta)
             ]
         self._compiled.add((method, matrix))
@@ -154,12 +154,10 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     return evaluator_of(problem)(problem.checked_theta(theta), method=method)
 
 
-def _places(problem: Problem, e: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Which of the experiment's N transition times and M parameters are free, and where in theta these stand."""
+def places_of(problem: Problem) -> list[NDArray[np.intp]]:
+    """For each experiment the positions in theta of its N transition times and M parameters, -1 where fixed."""
     spans = [np.arange(span.start, span.stop) for span in problem.unknowns.parameters.values()]
-    places = np.concatenate([problem.unknowns.times[e], *spans]).astype(np.intp)
-    own = np.flatnonzero(places >= 0)
-    return own, places[own]
+    return [np.concatenate([times, *spans]).astype(np.intp) for times in problem.unknowns.times]
 
 
 def _resolve(method: Method, structure: Structure) -> Method:
@@ -169,7 +167,7 @@ def _resolve(method: Method, structure: Structure) -> Method:
 
 
 @partial(jax.jit, static_argnames=("structure", "method", "matrix"))
-def _derivatives(
+def derivatives(
     arguments: Arguments,
     tau: jax.Array,
     p: jax.Array,
@@ -177,8 +175,9 @@ def _derivatives(
     *,
     structure: Structure,
     method: Method,
-    matrix: Matrix,
+    matrix: Matrix = "exact",
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Cost, gradient (D,) and Hessian (D, D) of one experiment in its N transition times and M parameters, traced."""
     model = Model(structure, arguments)
     if method == "adjoint":
         return paper_derivatives(model, tau, p, side)

@@ -17,7 +17,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from switchfit.data import FloatArray, Measurements, Observe, ReferenceSignal, RunningCost, TerminalCost
+from switchfit.data import (
+    FloatArray,
+    Measurements,
+    Observe,
+    PiecewisePolynomial,
+    ReferenceSignal,
+    RunningCost,
+    TerminalCost,
+)
 from switchfit.experiment import Experiment, Parameter, initial_state_of, reset_maps_of, signals_of
 from switchfit.mesh import Mesh, padded_length
 from switchfit.rungekutta import Density, Field, Tableau, tableau_of
@@ -424,13 +432,16 @@ def _padded_samples(item: Measurements, mesh: Mesh) -> Samples:
 
 def _signals_by_cell(experiment: Experiment, mesh: Mesh) -> FloatArray:
     """Every signal as a cubic in each cell, in powers of the time since the cell's first node: (G, 4, S)."""
+    none = np.zeros((len(mesh.nodes) - 1, 4, 0))
+    return np.concatenate([none, *(by_cell(signal, mesh) for signal in signals_of(experiment))], axis=2)
+
+
+def by_cell(signal: PiecewisePolynomial, mesh: Mesh) -> FloatArray:
+    """One signal as a cubic in each cell of a mesh that has its knots as nodes: (G, 4, q)."""
     starts = mesh.nodes[:-1]
     middles = 0.5 * (mesh.nodes[:-1] + mesh.nodes[1:])
-    tables = [np.zeros((len(starts), 4, 0))]
-    for signal in signals_of(experiment):
-        k = signal.interval(middles)
-        s = (starts - signal.knots[k])[:, None]
-        c0, c1, c2, c3 = np.moveaxis(signal.coefficients[k], 1, 0)
-        shifted = [c0 + s * (c1 + s * (c2 + s * c3)), c1 + s * (2 * c2 + 3 * s * c3), c2 + 3 * s * c3, c3]
-        tables.append(np.stack(shifted, axis=1))
-    return np.concatenate(tables, axis=2)
+    k = signal.interval(middles)
+    s = (starts - signal.knots[k])[:, None]
+    c0, c1, c2, c3 = np.moveaxis(signal.coefficients[k], 1, 0)
+    shifted = [c0 + s * (c1 + s * (c2 + s * c3)), c1 + s * (2 * c2 + 3 * s * c3), c2 + 3 * s * c3, c3]
+    return np.stack(shifted, axis=1)

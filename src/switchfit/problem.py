@@ -117,6 +117,10 @@ class Problem:
             check_functions(structure)
         object.__setattr__(self, "structures", structures)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled: not the meshes and programs that were made for it."""
+        return {key: value for key, value in self.__dict__.items() if key != "evaluator"}
+
     def _check_states(self, n: int, experiment: Experiment) -> None:
         own = self.system.initial_state
         if not callable(own) and n != own.size:

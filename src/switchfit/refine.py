@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -41,33 +41,56 @@ def fixed_nodes(experiment: Experiment) -> FloatArray:
     return nodes[(nodes >= t0) & (nodes <= tf)]
 
 
-def refined_mesh(problem: Problem, e: int, theta: FloatArray) -> Mesh:
-    """Mesh of experiment e on which its trajectory at theta meets the problem's tolerances.
+def refined_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1.0) -> Mesh:
+    """Mesh of experiment e on which its trajectory meets the problem's tolerances at each of the given thetas.
+
+    Parameters
+    ----------
+    finer : float
+        Multiplies the number of cells.
 
     Raises
     ------
     ValueError
         If a mode returns a value that is not finite, or the trajectory cannot be integrated to its end.
     """
-    experiment = problem.experiments[e]
-    nodes = fixed_nodes(experiment)
-    steps = _adaptive_steps(problem, e, theta, Mesh.from_times(nodes))
-    index = np.interp(nodes, steps, np.arange(len(steps)))
-    pieces = np.maximum(np.ceil(np.diff(index) - 0.05).astype(int), 1)
+    nodes = fixed_nodes(problem.experiments[e])
+    coarse = Mesh.from_times(nodes)
+    steps = _Steps.densest([_adaptive_steps(problem, e, theta, coarse) for theta in thetas])
+    pieces = np.maximum(np.ceil(finer * np.diff(steps.up_to(nodes)) - 0.05).astype(int), 1)
     inside = [_graded(nodes[k : k + 2], steps, int(pieces[k])) for k in np.flatnonzero(pieces > 1)]
     return Mesh.from_times(np.concatenate([nodes, *inside]))
 
 
-def _graded(ends: FloatArray, steps: FloatArray, pieces: int) -> FloatArray:
+class _Steps(NamedTuple):
+    """How many steps a solver takes up to each time: linear between `times` (K,), where it is `counts` (K,)."""
+
+    times: FloatArray
+    counts: FloatArray
+
+    @classmethod
+    def densest(cls, solutions: list[FloatArray]) -> _Steps:
+        """The steps of several solutions (all their times), at every moment those of the one with the shortest."""
+        times = np.unique(np.concatenate(solutions))
+        middles = 0.5 * (times[:-1] + times[1:])
+        lengths = [np.diff(steps)[np.searchsorted(steps, middles) - 1] for steps in solutions]
+        return cls(times, np.concatenate([[0.0], np.cumsum(np.diff(times) / np.min(lengths, axis=0))]))
+
+    def up_to(self, t: FloatArray) -> FloatArray:
+        """Steps taken up to times t."""
+        return np.interp(t, self.times, self.counts)
+
+
+def _graded(ends: FloatArray, steps: _Steps, pieces: int) -> FloatArray:
     """Nodes between two ends: half of them as dense as the solver's steps are, half of them evenly.
 
     The steps are short in the layers of a stiff mode, which evenly spaced nodes would miss; but layers move with the
     transition times, and the mesh does not.
     """
-    inner = steps[(steps > ends[0]) & (steps < ends[1])]
+    inner = steps.times[(steps.times > ends[0]) & (steps.times < ends[1])]
     times = np.concatenate([ends[:1], inner, ends[1:]])
-    index = np.interp(times, steps, np.arange(len(steps)))
-    density = 0.5 * (index - index[0]) / (index[-1] - index[0]) + 0.5 * (times - ends[0]) / (ends[1] - ends[0])
+    count = steps.up_to(times)
+    density = 0.5 * (count - count[0]) / (count[-1] - count[0]) + 0.5 * (times - ends[0]) / (ends[1] - ends[0])
     return np.interp(np.linspace(0.0, 1.0, pieces + 1)[1:-1], density, times)
 
 

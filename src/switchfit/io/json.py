@@ -15,8 +15,6 @@ What is read is checked against the types that the fields of the dataclasses dec
 from __future__ import annotations
 
 import json
-import os
-import secrets
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
@@ -27,6 +25,7 @@ from typing import Any, NoReturn, get_args, get_origin, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.io.files import write_atomically
 from switchfit.result import Certificate, Fit
 
 FORMAT = "switchfit fit"
@@ -55,7 +54,7 @@ def save_fit(fit: Fit, certificate: Certificate, path: Path) -> None:
         "fit": _encoded(fit, Fit),
         "certificate": _encoded(certificate, Certificate),
     }
-    _write_atomically(_dumped(content) + "\n", Path(path))
+    write_atomically(_dumped(content) + "\n", Path(path))
 
 
 def load_fit(path: Path) -> tuple[Fit, Certificate]:
@@ -130,20 +129,6 @@ def _dumped(value: Any, indent: str = "") -> str:
         return json.dumps(value, allow_nan=False, ensure_ascii=False)
     opening, closing = "{}" if isinstance(value, dict) else "[]"
     return f"{opening}\n{deeper}" + f",\n{deeper}".join(entries) + f"\n{indent}{closing}"
-
-
-def _write_atomically(text: str, path: Path) -> None:
-    """Write a new file beside `path`, which then takes its name."""
-    path = path.resolve()  # a link stays one
-    temporary = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
-    try:
-        with temporary.open("x", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 # --- from JSON --------------------------------------------------------------------------------------------------------

@@ -453,7 +453,9 @@ def convexify(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None
     bottom = _absolute(blocked.T @ scaled @ blocked - tie) + tie
     basis = np.hstack([free, blocked])
     convex = basis @ np.block([[top, cross], [cross.T, bottom]]) @ basis.T
-    if np.linalg.eigvalsh(convex)[0] < 0.1 * EIGENVALUE_FLOOR:
+    values = np.linalg.eigvalsh(convex)
+    # A nearly singular Z'HZ makes the tie huge, and the smallest eigenvalue rounding.
+    if values[0] < max(0.1 * EIGENVALUE_FLOOR, 64 * EPS * values[-1]):
         return _absolute(scaled) * weight
     return 0.5 * (convex + convex.T) * weight
 

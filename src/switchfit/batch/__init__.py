@@ -1,0 +1,1 @@
+"""Thousands of fits of one model: Monte Carlo, multistart, many logs."""

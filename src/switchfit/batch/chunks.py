@@ -1,0 +1,221 @@
+"""Long runs in chunks: on all cores or on a Dask cluster, with progress, and with what is done kept on disk.
+
+`run_chunks` knows nothing of fits. Its *work* is called with a range of runs and returns arrays with one entry a run; a
+chunk depends on nothing but its range, so it does not matter where, when and how often it is computed.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import io
+import json
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.io.files import write_atomically
+
+Arrays = dict[str, NDArray[Any]]
+Progress = Callable[[int, int], object]
+"""``progress(done, total)``, called after each chunk with the runs that are done; a true value stops."""
+
+RETRIES = 3
+"""Times a chunk is tried again on a Dask cluster after an error."""
+
+
+class Work(Protocol):
+    """What is repeated. It must survive pickling for a Dask cluster."""
+
+    @property
+    def size(self) -> int:
+        """Runs in a chunk."""
+        ...
+
+    def __call__(self, runs: range) -> Arrays:
+        """Arrays with one entry for each of the runs."""
+        ...
+
+    def fingerprint(self) -> str:
+        """Changes with everything that a result depends on."""
+        ...
+
+
+def run_chunks(
+    work: Work, count: int, *, client: Any = None, folder: str | Path | None = None, progress: Progress | None = None
+) -> tuple[NDArray[np.intp], Arrays]:
+    """Do all runs 0 .. count - 1, in chunks.
+
+    Parameters
+    ----------
+    work : Work
+    count : int
+    client : dask.distributed.Client, optional
+        Where the chunks are computed; in threads of this process, one a core, if left out. A chunk whose worker is
+        lost is computed again by another one.
+    folder : path, optional
+        Each chunk is written there when it is done, and chunks that are found there are not computed again.
+    progress : callable, optional
+        ``progress(done, total)``; a true return value stops, as Ctrl-C does.
+
+    Returns
+    -------
+    runs : (R,) int
+        Which runs are done, ascending: all, unless it was stopped.
+    arrays : dict of str -> (R, ...) array
+
+    Raises
+    ------
+    ValueError
+        If the folder holds the chunks of something else.
+    """
+    chunks = [range(first, min(first + work.size, count)) for first in range(0, count, work.size)]
+    store = None if folder is None else _Store(Path(folder), work.fingerprint(), work.size)
+    results: dict[int, Arrays] = {}
+    if store is not None:
+        results = {chunk.start: found for chunk in chunks if (found := store.load(chunk)) is not None}
+    done = sum(len(chunk) for chunk in chunks if chunk.start in results)
+    missing = [chunk for chunk in chunks if chunk.start not in results]
+    stopped = progress is not None and done > 0 and bool(progress(done, count))
+    if missing and not stopped:
+        computed = _threaded(work, missing) if client is None else _distributed(work, missing, client)
+        with _closing(computed):
+            try:
+                for chunk, arrays in computed:
+                    results[chunk.start] = arrays
+                    if store is not None:
+                        store.save(chunk, arrays)
+                    done += len(chunk)
+                    if progress is not None and progress(done, count):
+                        break
+            except KeyboardInterrupt:
+                pass
+    finished = [chunk for chunk in chunks if chunk.start in results]
+    if not finished:
+        raise KeyboardInterrupt
+    runs = np.concatenate([np.asarray(chunk) for chunk in finished])
+    names = results[finished[0].start]
+    return runs, {name: np.concatenate([results[chunk.start][name] for chunk in finished]) for name in names}
+
+
+@contextmanager
+def _closing(generator: Iterator[Any]) -> Iterator[None]:
+    try:
+        yield
+    finally:
+        generator.close()  # type: ignore[attr-defined]  # a generator
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _threaded(work: Work, chunks: list[range]) -> Iterator[tuple[range, Arrays]]:
+    """Chunks as they are done by threads; JAX's programs run outside Python's lock."""
+    pool = ThreadPoolExecutor(cores())
+    try:
+        futures: dict[Future[Arrays], range] = {pool.submit(work, chunk): chunk for chunk in chunks}
+        pending = set(futures)
+        while pending:
+            finished, pending = wait(pending, return_when=FIRST_COMPLETED)
+            for future in sorted(finished, key=lambda future: futures[future].start):
+                yield futures[future], future.result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _distributed(work: Work, chunks: list[range], client: Any) -> Iterator[tuple[range, Arrays]]:
+    """Chunks as they are done by the workers of a Dask cluster.
+
+    The work travels as bytes that are themselves the result of a task, so that they outlive the workers that hold
+    them; a worker unpickles them once, or it would compile the model's functions anew for every chunk.
+    """
+    import cloudpickle  # with dask: needed here only
+    from distributed import as_completed
+
+    blob = cloudpickle.dumps(work)
+    shared = client.submit(_received, blob, pure=False)
+    futures = {
+        client.submit(_remote, shared, chunk.start, chunk.stop, pure=False, retries=RETRIES): chunk for chunk in chunks
+    }
+    try:
+        for future in as_completed(list(futures)):
+            yield futures[future], future.result()
+    finally:
+        client.cancel([*futures, shared])
+
+
+def _received(blob: bytes) -> bytes:
+    return blob
+
+
+@functools.lru_cache(maxsize=4)
+def _unpickled(blob: bytes) -> Work:
+    import cloudpickle
+
+    work: Work = cloudpickle.loads(blob)
+    return work
+
+
+def _remote(blob: bytes, start: int, stop: int) -> Arrays:
+    return _unpickled(blob)(range(start, stop))
+
+
+class _Store:
+    """A folder with ``chunk-<first run>.npz`` files and ``run.json``, which says what they belong to."""
+
+    def __init__(self, folder: Path, fingerprint: str, size: int) -> None:
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+        description = {"fingerprint": fingerprint, "runs in a chunk": size}
+        label = folder / "run.json"
+        if label.exists():
+            try:
+                there = json.loads(label.read_text(encoding="utf-8"))
+            except ValueError:
+                there = None
+            if there != description:
+                raise ValueError(
+                    f"{folder} holds the results of another run (other data, settings, or version). Choose another "
+                    "folder, or delete this one."
+                )
+        elif any(folder.iterdir()):
+            raise ValueError(f"{folder} holds other files: give an empty or a new folder for the results.")
+        else:
+            write_atomically(json.dumps(description), label)
+
+    def load(self, chunk: range) -> Arrays | None:
+        """The chunk's arrays, None if it is not there."""
+        path = self._path(chunk)
+        if not path.exists():
+            return None
+        with np.load(path) as file:
+            arrays = {name: file[name] for name in file.files}
+        return arrays if all(len(array) == len(chunk) for array in arrays.values()) else None
+
+    def save(self, chunk: range, arrays: Arrays) -> None:
+        """Write a chunk, whole or not at all."""
+        buffer = io.BytesIO()
+        np.savez(buffer, **arrays)  # type: ignore[arg-type]
+        write_atomically(buffer.getvalue(), self._path(chunk))
+
+    def _path(self, chunk: range) -> Path:
+        return self.folder / f"chunk-{chunk.start:08d}.npz"
+
+
+def fingerprint(*parts: Any) -> str:
+    """A digest of numbers, strings and arrays."""
+    digest = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, np.ndarray):
+            digest.update(str((part.dtype, part.shape)).encode() + np.ascontiguousarray(part).tobytes())
+        else:
+            digest.update(repr(part).encode())
+    return digest.hexdigest()

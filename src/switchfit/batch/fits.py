@@ -1,0 +1,168 @@
+"""What many fits found: arrays with one entry a fit."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.special
+from numpy.typing import NDArray
+
+from switchfit.batch.chunks import Progress
+from switchfit.data import FloatArray, Measurements
+from switchfit.estimate import sigma_known
+from switchfit.optimize import Status
+from switchfit.problem import Problem
+
+
+@dataclass(frozen=True, eq=False)
+class Fits:
+    """Many fits of one model; R of them, d unknowns in the order of `theta_names`.
+
+    Attributes
+    ----------
+    theta_names, theta_units : tuple of str
+    requested : int
+        Fits that were asked for; more than R if it was stopped.
+    runs : (R,) int
+        Number of each fit, from 0.
+    start, theta : (R, d)
+    cost, optimality : (R,)
+    gradient, hessian : (R, d), (R, d, d)
+    iterations, evaluations : (R,) int
+    status : (R,) str
+        Name of the `Status` of each.
+    message : (R,) str
+        A sentence with a remedy where a fit is not an ordinary minimum, otherwise empty.
+    free : (R,) int
+        Directions that constraints and kinks leave free.
+    covariance : (R, d, d)
+        As `Estimate.covariance`; NaN where the cost has no noise model.
+    samples : (R,) int
+        Measured values that are not missing.
+    sigma_known : bool or None
+        Whether the noise of the measurements is known; None where the cost has no noise model.
+    seconds : float
+        Wall time of all.
+    """
+
+    theta_names: tuple[str, ...]
+    theta_units: tuple[str, ...]
+    requested: int
+    runs: NDArray[np.intp]
+    start: FloatArray
+    theta: FloatArray
+    cost: FloatArray
+    gradient: FloatArray
+    hessian: FloatArray
+    optimality: FloatArray
+    iterations: NDArray[np.int64]
+    evaluations: NDArray[np.int64]
+    status: NDArray[np.str_]
+    message: NDArray[np.str_]
+    free: NDArray[np.int64]
+    covariance: FloatArray
+    samples: NDArray[np.int64]
+    sigma_known: bool | None
+    seconds: float
+
+    def __len__(self) -> int:
+        """Number of fits that were done."""
+        return len(self.cost)
+
+    @cached_property
+    def success(self) -> NDArray[np.bool_]:
+        """Which of them converged: (R,)."""
+        good = [status.name for status in Status if status.successful or status is Status.SINGULAR]
+        return np.isin(self.status, good)
+
+    @property
+    def failures(self) -> list[tuple[int, str]]:
+        """Number and message of each fit that did not converge."""
+        return [(int(self.runs[k]), str(self.message[k])) for k in np.flatnonzero(~self.success)]
+
+    @property
+    def standard_errors(self) -> FloatArray:
+        """Square roots of the variances: (R, d)."""
+        with np.errstate(invalid="ignore"):
+            return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+    def confidence_intervals(self, level: float = 0.95) -> FloatArray:
+        """Symmetric intervals of each fit: (R, d, 2); see `Estimate.confidence_intervals`."""
+        if not 0 < level < 1:
+            raise ValueError(f"level must lie between 0 and 1; got {level}.")
+        freedom, tail = np.maximum(self.samples - self.free, 1), 0.5 + level / 2
+        quantile = scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail)
+        half = np.reshape(quantile, (-1, 1)) * self.standard_errors
+        return np.stack([self.theta - half, self.theta + half], axis=2)
+
+    def __str__(self) -> str:
+        return "\n".join(self._summary())
+
+    def _summary(self) -> list[str]:
+        count, good = len(self), int(self.success.sum())
+        each = 1e3 * self.seconds / max(count, 1)
+        lines = [f"{count} fits in {self.seconds:.1f} s ({each:.2f} ms each), {good} converged"]
+        if count < self.requested:
+            lines.append(f"STOPPED: {self.requested - count} of {self.requested} fits were not done")
+        lines += [f"  {number:>8} {name}" for name, number in Counter(self.status.tolist()).most_common()]
+        if good:
+            spent = self.iterations[self.success]
+            lines.append(f"iterations: median {np.median(spent):.0f}, most {spent.max()}")
+        if good < count:
+            lines.append("not converged (all of them in .failures):")
+            lines += [f"  run {run}: {message}" for run, message in self.failures[:3]]
+        return lines
+
+
+def as_fits(
+    problem: Problem, requested: int, runs: NDArray[np.intp], arrays: dict[str, NDArray[Any]], seconds: float
+) -> dict[str, Any]:
+    """The fields of `Fits` from what the chunks found, covariances scaled by the residual variance where needed."""
+    known = sigma_known(problem)
+    samples = arrays["samples"]
+    freedom = samples - arrays["free"]
+    scale = np.ones(len(samples)) if known else np.full(len(samples), np.nan)
+    if known is False:
+        scale = np.where(freedom > 0, 2 * arrays["cost"] / np.maximum(freedom, 1), np.nan)
+    named = {f.name for f in fields(Fits)}
+    found = {name: array for name, array in arrays.items() if name in named}
+    found["covariance"] = scale[:, None, None] * arrays["covariance"]
+    return {
+        "theta_names": problem.theta_names,
+        "theta_units": problem.unknowns.units,
+        "requested": requested,
+        "runs": runs,
+        "sigma_known": known,
+        "seconds": seconds,
+        **found,
+    }
+
+
+def sample_count(problem: Problem) -> int:
+    """Measured values that are not missing."""
+    return sum(item.count for run in problem.experiments for item in run.data if isinstance(item, Measurements))
+
+
+def reporting(callback: Callable[[int, int], object] | None, title: str) -> tuple[Progress, Callable[[], None]]:
+    """What `run_chunks` calls: the user's callback, and a bar where there is a terminal; and what ends the bar."""
+    if not sys.stderr.isatty():
+        return (lambda done, total: callback is not None and callback(done, total)), lambda: None
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    bar = Progress(*columns, console=Console(stderr=True), transient=True)
+    task = bar.add_task(title, total=None)
+    bar.start()
+
+    def report(done: int, total: int) -> object:
+        bar.update(task, completed=done, total=total)
+        return callback is not None and callback(done, total)
+
+    return report, bar.stop

@@ -1,0 +1,344 @@
+"""Monte Carlo: simulate, perturb, fit again, thousands of times."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+from numpy.typing import ArrayLike
+
+from switchfit.batch.chunks import Arrays, fingerprint, run_chunks
+from switchfit.batch.fits import Fits, as_fits, reporting, sample_count
+from switchfit.batch.program import Varying, chunk_size, fit_chunk
+from switchfit.data import FloatArray, Measurements, ReferenceSignal, as_numbers
+from switchfit.estimate import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, estimate
+from switchfit.evaluate import Evaluator
+from switchfit.mesh import Mesh
+from switchfit.model import by_cell
+from switchfit.problem import Problem
+from switchfit.refine import refined_mesh
+from switchfit.report.batch import plot_monte_carlo, table_of_monte_carlo
+from switchfit.simulate import compare
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Noise = float | ArrayLike | Callable[[np.random.Generator, FloatArray, Any], ArrayLike] | None
+
+
+@dataclass(frozen=True, eq=False)
+class MonteCarlo(Fits):
+    """Result of `monte_carlo`: everything in `Fits`, and the truth. Print it for the table.
+
+    Attributes
+    ----------
+    truth : (d,)
+        At which the data were simulated.
+    integration_error : float
+        Relative error of J at the truth, by halving all steps.
+    """
+
+    truth: FloatArray
+    integration_error: float
+
+    @property
+    def errors(self) -> FloatArray:
+        """Estimate less truth of the fits that converged: (S, d)."""
+        return self.theta[self.success] - self.truth
+
+    @property
+    def bias(self) -> FloatArray:
+        """Mean error: (d,)."""
+        return self.errors.mean(0)
+
+    @property
+    def standard_deviation(self) -> FloatArray:
+        """Of the estimates round their mean: (d,)."""
+        return self.errors.std(0, ddof=1)
+
+    def coverage(self, level: float = 0.95) -> FloatArray:
+        """Part of the fits that converged whose interval contains the truth: (d,); NaN without a noise model."""
+        low, high = np.moveaxis(self.confidence_intervals(level)[self.success], 2, 0)
+        inside = (low <= self.truth) & (self.truth <= high)
+        return np.where(np.isnan(low).any(0), np.nan, inside.mean(0))
+
+    def __str__(self) -> str:
+        return "\n".join([*self._summary(), "", *table_of_monte_carlo(self)])
+
+    def plot(self) -> Figure:
+        """Histogram of the estimates of each unknown with the truth, as a matplotlib Figure."""
+        return plot_monte_carlo(self)
+
+
+def monte_carlo(
+    problem: Problem,
+    runs: int = 1000,
+    *,
+    theta: ArrayLike | None = None,
+    start: ArrayLike | None = None,
+    noise: Noise = None,
+    seed: int = 0,
+    tolerance: float = 1e-7,
+    max_iterations: int = 200,
+    client: Any = None,
+    folder: str | Path | None = None,
+    callback: Callable[[int, int], object] | None = None,
+) -> MonteCarlo:
+    """Simulate the data of a problem, add noise, and fit them, many times.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its data say what is measured when; their values are replaced, missing ones stay missing.
+    runs : int
+    theta : (d,) array_like, optional
+        The truth; the problem's estimate if left out (a parametric bootstrap).
+    start : (d,) array_like, optional
+        Where every fit begins; the truth if left out. Give the problem's ``initial_theta`` to study convergence too.
+    noise : optional
+        Standard deviation of Gaussian noise: a number, one for each channel (q,), or by default the sigma of each of
+        the `Measurements`. Or a function ``noise(rng, clean, item) -> (K, q)`` that returns the noisy values of one
+        of the data from the clean ones. A `ReferenceSignal` is simulated at the samples it was made from, and
+        interpolated and filtered anew.
+    seed : int
+        Run k draws from ``numpy.random.default_rng([seed, k])``, wherever and in whatever order it is done.
+    tolerance, max_iterations : as of `estimate`
+    client : dask.distributed.Client, optional
+        A cluster to run on (extra ``cluster``); the cores of this machine if left out.
+    folder : path, optional
+        Where what is done is kept, so that a broken run goes on.
+    callback : callable, optional
+        ``callback(done, total)`` after each chunk; a true return value stops. Ctrl-C does as well; what is done is
+        returned.
+
+    Returns
+    -------
+    MonteCarlo
+
+    Raises
+    ------
+    ValueError
+        If the noise is not known, there is nothing to simulate, or the folder holds something else.
+
+    Notes
+    -----
+    All fits share one mesh, which resolves the trajectories at the start and at the truth.
+    """
+    if runs < 1:
+        raise ValueError(f"runs must be 1 or more; got {runs}.")
+    began = time.perf_counter()
+    truth = estimate(problem).theta if theta is None else problem.checked_theta(theta)
+    begin = truth if start is None else problem.checked_theta(start)
+    work = _Work(problem, [], truth, begin, noise, seed, tolerance, max_iterations, _clean(problem, truth))
+    work.check_noise()
+    work.meshes, error = _meshes(work.problem_of(0), truth, begin)
+    progress, end = reporting(callback, "Monte Carlo")
+    try:
+        done, arrays = run_chunks(work, runs, client=client, folder=folder, progress=progress)
+    finally:
+        end()
+    found = as_fits(problem, runs, done, arrays, time.perf_counter() - began)
+    return MonteCarlo(**found, truth=truth, integration_error=error)
+
+
+def _clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray | None]]:
+    """What each of the data of each experiment would be without noise: (K, q) arrays; None for costs without data."""
+    sampled, which = [], []
+    for experiment in problem.experiments:
+        items, kept = [], []
+        for k, item in enumerate(experiment.data):
+            if isinstance(item, Measurements):
+                items.append(replace(item, values=np.nan_to_num(item.values)))
+            elif isinstance(item, ReferenceSignal) and item.samples is not None:
+                times, values = item.samples
+                if np.any(np.diff(times) == 0):
+                    raise ValueError("A ReferenceSignal that was broken by a time given twice cannot be simulated.")
+                inside = (times >= experiment.t0) & (times <= experiment.tf)
+                if not inside.all():
+                    raise ValueError("A ReferenceSignal with samples outside the horizon cannot be simulated.")
+                items.append(Measurements(times, np.nan_to_num(values), item.observe))
+            else:
+                continue
+            kept.append(k)
+        if not items:
+            raise ValueError("monte_carlo needs Measurements or a ReferenceSignal made from samples to simulate.")
+        sampled.append(replace(experiment, data=items))
+        which.append(kept)
+    simulated = replace(problem, experiments=sampled)
+    meshes = Evaluator(simulated, truth).meshes
+    _, _, comparisons = compare(simulated, truth, [mesh.divided() for mesh in meshes])
+    clean: list[list[FloatArray | None]] = [[None] * len(experiment.data) for experiment in problem.experiments]
+    for e, (kept, found) in enumerate(zip(which, comparisons, strict=True)):
+        for k, comparison in zip(kept, found, strict=True):
+            clean[e][k] = comparison.fitted
+    return clean
+
+
+def _meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tuple[list[Mesh], float]:
+    """Meshes that resolve the trajectories at the start and at the truth, and the integration error at the truth.
+
+    A mode that is active in another part of the horizon at the start would run over cells that are far too long for it,
+    and lead somewhere else altogether.
+    """
+    finer = 1.0
+    thetas = (truth,) if np.array_equal(start, truth) else (start, truth)
+    for attempt in range(REFINEMENTS + 1):
+        indices = range(len(problem.experiments))
+        evaluator = Evaluator(problem, meshes=[refined_mesh(problem, e, *thetas, finer=finer) for e in indices])
+        fine = compare(problem, truth, [mesh.divided() for mesh in evaluator.meshes])[0]
+        error = abs(evaluator(truth).cost - fine) / max(abs(fine), 1e-300)
+        excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
+        if not excess > 1 or attempt == REFINEMENTS:
+            break
+        finer *= 1.1 * excess ** (1 / ORDER)
+    return evaluator.meshes, float(error)
+
+
+@dataclass
+class _Work:
+    """The runs of a Monte Carlo study, for `run_chunks`."""
+
+    problem: Problem
+    meshes: list[Mesh]
+    truth: FloatArray
+    start: FloatArray
+    noise: Any
+    seed: int
+    tolerance: float
+    max_iterations: int
+    clean: list[list[FloatArray | None]]
+
+    @property
+    def size(self) -> int:
+        return chunk_size()
+
+    def check_noise(self) -> None:
+        """One draw, for the errors in it."""
+        for (e, k), values in self._noisy(0).items():
+            shape = np.shape(self.clean[e][k])  # type: ignore[arg-type]  # what was drawn has a clean one
+            if values.shape != shape or not np.isfinite(values).all():
+                raise ValueError(f"noise must give finite values of shape {shape}; got shape {values.shape}.")
+
+    def _noisy(self, run: int) -> dict[tuple[int, int], FloatArray]:
+        """Values of the k-th data of experiment e, in one run."""
+        rng = np.random.default_rng([self.seed, run])
+        return {
+            (e, k): self._drawn(rng, clean, self.problem.experiments[e].data[k])
+            for e, items in enumerate(self.clean)
+            for k, clean in enumerate(items)
+            if clean is not None
+        }
+
+    def _drawn(self, rng: np.random.Generator, clean: FloatArray, item: Any) -> FloatArray:
+        if callable(self.noise):
+            return np.asarray(self.noise(rng, clean.copy(), item), dtype=np.float64)
+        sigma = self.noise
+        if sigma is None:
+            sigma = item.sigma if isinstance(item, Measurements) else None
+            if sigma is None:
+                raise ValueError(
+                    "noise must be given, since the data have no sigma from which to draw: a standard deviation, one "
+                    "for each channel, or a function."
+                )
+        try:
+            spread = np.broadcast_to(as_numbers(sigma, "noise"), clean.shape)
+        except ValueError as error:
+            raise ValueError(f"noise of shape {np.shape(sigma)} does not fit data of shape {clean.shape}.") from error
+        if not (np.isfinite(spread).all() and (spread >= 0).all()):
+            raise ValueError(f"noise must be zero or positive; got {sigma}.")
+        return clean + spread * rng.standard_normal(clean.shape)
+
+    def problem_of(self, run: int) -> Problem:
+        """The problem with the data of one run."""
+        noisy = self._noisy(run)
+        experiments = []
+        for e, experiment in enumerate(self.problem.experiments):
+            data = [
+                _with_values(item, noisy[e, k]) if (e, k) in noisy else item for k, item in enumerate(experiment.data)
+            ]
+            experiments.append(replace(experiment, data=data))
+        return replace(self.problem, experiments=experiments)
+
+    def __call__(self, runs: range) -> Arrays:
+        noisy = [self._noisy(run) for run in runs]
+        varying = self._varying({key: np.stack([values[key] for values in noisy]) for key in noisy[0]})
+        starts = np.repeat(self.start[None], len(runs), axis=0)
+        found = fit_chunk(
+            self.problem,
+            self.meshes,
+            varying,
+            starts,
+            tolerance=self.tolerance,
+            max_iterations=self.max_iterations,
+        )
+        return {**found._asdict(), "start": starts, "samples": np.full(len(runs), sample_count(self.problem))}
+
+    def _varying(self, values: dict[tuple[int, int], FloatArray]) -> Varying:
+        """Noisy values (R, K, q) of all data as leaves of the arguments."""
+        arguments = tuple(self.problem.arguments(e, mesh) for e, mesh in enumerate(self.meshes))
+        leaves, tree = jax.tree.flatten(arguments)
+        places = jax.tree.unflatten(tree, range(len(leaves)))
+        changed: dict[int, Any] = {}
+        for e, experiment in enumerate(self.problem.experiments):
+            measured = reference = channel = 0
+            for k, item in enumerate(experiment.data):
+                if isinstance(item, Measurements):
+                    leaf = places[e].samples[measured].value
+                    padded = np.zeros((len(values[e, k]), *leaves[leaf].shape))
+                    padded[:, : len(item.times)] = np.where(np.isnan(item.values), 0.0, values[e, k])
+                    changed[leaf] = padded
+                    measured += 1
+                elif isinstance(item, ReferenceSignal):
+                    q = item.signal.channels
+                    if (e, k) in values:
+                        leaf = places[e].signals
+                        R = len(values[e, k])
+                        if leaf not in changed:
+                            changed[leaf] = np.repeat(np.asarray(leaves[leaf])[None], R, axis=0)
+                        changed[leaf][..., channel : channel + q] = _cells_of(item, values[e, k], self.meshes[e])
+                    channel += q
+                    reference += 1
+        return Varying(tuple(changed), tuple(changed.values()))
+
+    def fingerprint(self) -> str:
+        unknowns = self.problem.unknowns
+        data = [np.asarray(values) for items in self.clean for values in items if values is not None]
+        drawn = list(self._noisy(0).values())  # stands for the noise, which may be a function
+        settings = self.seed, self.tolerance, self.max_iterations, unknowns.names, self.problem.solver
+        bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b
+        nodes = [mesh.nodes for mesh in self.meshes]
+        return fingerprint("monte carlo", settings, self.truth, self.start, *bounds, *nodes, *data, *drawn)
+
+
+def _with_values(item: Any, values: FloatArray) -> Any:
+    """The same kind of data with other values; missing ones stay missing."""
+    if isinstance(item, Measurements):
+        return replace(item, values=np.where(np.isnan(item.values), np.nan, values))
+    measured = item.samples[1]
+    return ReferenceSignal.from_samples(
+        item.samples[0],
+        np.where(np.isnan(measured), np.nan, values),
+        observe=item.observe,
+        lowpass_hz=item.lowpass_hz,
+        weights=item.weights,
+        names=item.names,
+    )
+
+
+def _cells_of(item: ReferenceSignal, values: FloatArray, mesh: Mesh) -> FloatArray:
+    """Reference signals made from values (R, K, q), as cubics in the cells of a mesh: (R, G, 4, q).
+
+    All R at once: interpolation and filter treat channels one by one, so that runs can be channels too.
+    """
+    assert item.samples is not None
+    R, K, q = values.shape
+    table = np.where(np.isnan(item.samples[1]), np.nan, values)
+    channels = np.moveaxis(table, 0, 1).reshape(K, R * q)
+    signal = ReferenceSignal.from_samples(item.samples[0], channels, lowpass_hz=item.lowpass_hz).signal
+    cells = by_cell(signal, mesh)
+    return np.moveaxis(cells.reshape(*cells.shape[:2], R, q), 2, 0)

@@ -1,0 +1,117 @@
+"""Tables and figures of many fits."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from switchfit.batch.monte_carlo import MonteCarlo
+    from switchfit.batch.multistart import Multistart
+
+ESTIMATE, TRUTH, NORMAL = "#4a7fb5", "#b2182b", "#222222"
+CLUSTER_COLOURS = ("#b2182b", "#4a7fb5", "#e0a030", "#5c9e5c", "#8a5fa3", "#777777")
+COLUMNS = 3
+
+
+def table_of_monte_carlo(study: MonteCarlo) -> list[str]:
+    """One line an unknown: truth, mean error with its own error, spread, standard error, coverage."""
+    count = int(study.success.sum())
+    if count < 2:
+        return ["Fewer than two fits converged: no statistics."]
+    spread, bias, coverage = study.standard_deviation, study.bias, study.coverage()
+    with np.errstate(invalid="ignore"):
+        reported = np.median(study.standard_errors[study.success], axis=0)
+    header = ("", "truth", "bias", "+-", "spread", "standard error", "in 95 % interval")
+    rows = [
+        (
+            f"{name} ({unit})" if unit and unit != "1" else name,
+            f"{truth:.6g}",
+            f"{b:+.2e}",
+            f"{s / np.sqrt(count):.1e}",
+            f"{s:.3e}",
+            "-" if np.isnan(error) else f"{error:.3e}",
+            "-" if np.isnan(part) else f"{100 * part:.1f} %",
+        )
+        for name, unit, truth, b, s, error, part in zip(
+            study.theta_names, study.theta_units, study.truth, bias, spread, reported, coverage, strict=True
+        )
+    ]
+    widths = [max(len(row[k]) for row in [header, *rows]) for k in range(len(header))]
+    lines = []
+    for first, *others in [header, *rows]:
+        aligned = [entry.rjust(width) for entry, width in zip(others, widths[1:], strict=True)]
+        lines.append("  ".join([first.ljust(widths[0]), *aligned]).rstrip())
+    return lines
+
+
+def plot_monte_carlo(study: MonteCarlo) -> Figure:
+    """A histogram an unknown: estimates, truth, and the normal density of the reported standard error."""
+    from matplotlib.figure import Figure
+
+    d = len(study.theta_names)
+    columns = min(d, COLUMNS)
+    rows = -(-d // columns)
+    figure = Figure(figsize=(3.4 * columns, 2.7 * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    theta = study.theta[study.success]
+    with np.errstate(invalid="ignore"):
+        errors = np.median(study.standard_errors[study.success], axis=0)
+    for k, ax in enumerate(axes):
+        if k >= d:
+            ax.set_visible(False)
+            continue
+        values = theta[:, k]
+        middle = np.percentile(values, [0.5, 99.5])
+        reach = max(float(np.ptp(middle)), 1e-12 * abs(study.truth[k]), np.finfo(float).tiny)
+        limits = (middle[0] - 0.25 * reach, middle[1] + 0.25 * reach)
+        ax.hist(values, bins=40, range=limits, density=True, color=ESTIMATE, alpha=0.7, label="estimates")
+        if np.isfinite(errors[k]) and errors[k] > 0:
+            x = np.linspace(*limits, 300)
+            normal = np.exp(-0.5 * ((x - study.truth[k]) / errors[k]) ** 2) / (np.sqrt(2 * np.pi) * errors[k])
+            ax.plot(x, normal, color=NORMAL, linewidth=1.2, label="normal, reported error")
+        ax.axvline(study.truth[k], color=TRUTH, linestyle="--", linewidth=1.4, label="truth")
+        unit = study.theta_units[k]
+        ax.set_xlabel(study.theta_names[k] + (f" ({unit})" if unit and unit != "1" else ""))
+        ax.set_xlim(limits)
+        ax.set_yticks([])
+        ax.ticklabel_format(axis="x", useOffset=False)
+        ax.locator_params(axis="x", nbins=4)
+    axes[0].set_ylabel("density")
+    handles, labels = axes[0].get_legend_handles_labels()
+    outside = int((~study.success).sum())
+    figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
+    figure.suptitle(f"{len(study)} runs" + (f", {outside} not converged" if outside else ""), fontsize=10)
+    return figure
+
+
+def plot_waterfall(study: Multistart) -> Figure:
+    """Final cost of every start, ascending, above the best; starts that ended together share a colour."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 3.6), layout="constrained")
+    ax = figure.subplots()
+    order = np.argsort(np.where(np.isfinite(study.cost), study.cost, np.inf), kind="stable")
+    best = study.cost[order[0]]
+    rank = np.arange(1, len(order) + 1)
+    height = study.cost[order] - best
+    floor = max(1e-12 * abs(best), 1e-300)  # differences below are rounding
+    ax.plot(rank, np.maximum(height, floor), color="#bbbbbb", linewidth=0.8, zorder=1)
+    labels = study.clusters[order]
+    for k in range(int(labels.max(initial=-1)) + 1):
+        here = labels == k
+        label = f"J = {study.cost[order][here][0]:.6g}: {here.sum()} starts" if k < len(CLUSTER_COLOURS) - 1 else None
+        colour = CLUSTER_COLOURS[min(k, len(CLUSTER_COLOURS) - 1)]
+        ax.scatter(rank[here], np.maximum(height[here], floor), s=22, color=colour, label=label, zorder=2)
+    failed = labels < 0
+    if failed.any():
+        ended = np.maximum(height[failed], floor)
+        ax.scatter(rank[failed], ended, s=24, marker="x", color="#222222", label="not converged")
+    ax.set_yscale("log")
+    ax.set_xlabel("starts, in the order of the cost at their end")
+    ax.set_ylabel("cost above the best")
+    ax.legend(frameon=False, fontsize=8)
+    return figure
