@@ -12,7 +12,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -281,7 +281,8 @@ def _finished(
         result = minimized(evaluator, found["theta"][k], "exact", tolerance, left, None)
         for name in ("theta", "cost", "gradient", "hessian", "optimality"):
             found[name][k] = getattr(result, name)
-        found["iterations"][k] += result.iterations
+        result = replace(result, iterations=int(found["iterations"][k]) + result.iterations)
+        found["iterations"][k] = result.iterations
         found["evaluations"][k] += result.evaluations
         status[k] = result.status.name
         message[k] = with_names(result.message, problem.unknowns.names)

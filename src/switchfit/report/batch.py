@@ -68,7 +68,9 @@ def plot_monte_carlo(study: MonteCarlo) -> Figure:
         middle = np.percentile(values, [0.5, 99.5])
         reach = max(float(np.ptp(middle)), 1e-12 * abs(study.truth[k]), np.finfo(float).tiny)
         limits = (middle[0] - 0.25 * reach, middle[1] + 0.25 * reach)
-        ax.hist(values, bins=40, range=limits, density=True, color=ESTIMATE, alpha=0.7, label="estimates")
+        ax.hist(
+            values, bins=40, range=limits, density=True, color=ESTIMATE, alpha=0.7, label=f"{len(values)} estimates"
+        )
         if np.isfinite(errors[k]) and errors[k] > 0:
             x = np.linspace(*limits, 300)
             normal = np.exp(-0.5 * ((x - study.truth[k]) / errors[k]) ** 2) / (np.sqrt(2 * np.pi) * errors[k])
@@ -82,9 +84,9 @@ def plot_monte_carlo(study: MonteCarlo) -> Figure:
         ax.locator_params(axis="x", nbins=4)
     axes[0].set_ylabel("density")
     handles, labels = axes[0].get_legend_handles_labels()
-    outside = int((~study.success).sum())
-    figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
-    figure.suptitle(f"{len(study)} runs" + (f", {outside} not converged" if outside else ""), fontsize=10)
+    failed = int((~study.success).sum())
+    title = f"{failed} runs that did not converge are left out" if failed else None
+    figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False, title=title)
     return figure
 
 

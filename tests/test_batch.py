@@ -1,0 +1,470 @@
+"""Many fits: the same as single ones, whatever the data, the order, the chunks, and the machine."""
+
+import os
+import pickle
+import signal
+from dataclasses import replace
+
+import cloudpickle
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import nnls
+
+import switchfit as sf
+from switchfit.batch import monte_carlo as module
+from switchfit.batch.chunks import run_chunks
+from switchfit.batch.program import CHUNK, Varying, fit_chunk
+from switchfit.estimate import minimized
+from switchfit.evaluate import Evaluator, evaluator_of
+from switchfit.model import float64
+from switchfit.optimize import LinearConstraints, minimize
+from switchfit.optimize.traced import Constraints, minimize_traced, nonnegative_minimum
+
+TIMES = np.linspace(0.25, 6.0, 24)
+TRUTH = np.array([2.1, 0.8])
+
+
+def heating(t, x, p):
+    return 1.0 - p["k"] * x
+
+
+def cooling(t, x, p):
+    return -p["k"] * x
+
+
+def root(t, x, p):
+    return jnp.sqrt(1.0 + x)
+
+
+ROOM = sf.HybridSystem({"on": heating, "off": cooling}, [0.2])
+
+
+def room(data=None, guess=(1.7, 1.0), upper=5.0, **settings):
+    """One transition and one parameter: a room that is heated, then cools."""
+    if data is None:
+        data = sf.Measurements(TIMES, np.zeros(24), sigma=0.01)
+    run = sf.Experiment(data, ("on", "off"), guess[:1], 0.0, 6.0)
+    return sf.Problem(ROOM, run, {"k": sf.Parameter(guess[1], lower=0.1, upper=upper)}, **settings)
+
+
+# The optimiser inside a program
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_dual_programme_against_scipy(seed):
+    """min ½ ‖N' lam − g‖² over lam >= 0, dependent rows among them."""
+    rng = np.random.default_rng(seed)
+    rows = rng.standard_normal((rng.integers(1, 9), rng.integers(1, 6)))
+    if seed % 3 == 0:
+        rows = np.vstack([rows, rows[:2] + rows[-1]])
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    g = rng.standard_normal(rows.shape[1])
+    allowed = rng.random(len(rows)) < 0.8
+    with float64():
+        lam = np.asarray(nonnegative_minimum(jnp.asarray(rows @ rows.T), jnp.asarray(-rows @ g), jnp.asarray(allowed)))
+    assert np.all(lam >= 0)
+    assert np.all(lam[~allowed] == 0)
+    distance = nnls(rows[allowed].T, g)[1] if allowed.any() else np.linalg.norm(g)
+    assert np.linalg.norm(g - rows.T @ lam) == pytest.approx(distance, abs=1e-9)
+
+
+def valley(theta):
+    """Rosenbrock's function, its gradient and its Hessian, in whatever `theta` is made of."""
+    x, y = theta
+    cost = 100 * (y - x * x) ** 2 + (1 - x) ** 2
+    gradient = [-400 * x * (y - x * x) - 2 * (1 - x), 200 * (y - x * x)]
+    return cost, gradient, [[1200 * x * x - 400 * y + 2, -400 * x], [-400 * x, 200.0]]
+
+
+CASES = {
+    "free": ([[0.0, 0.0]], [-10.0], [-5.0, -5.0], [5.0, 5.0], True),
+    "a row in the way": ([[1.0, -1.0]], [0.1], [-5.0, -5.0], [5.0, 5.0], False),
+    "a bound at the end": ([[0.0, 0.0]], [-10.0], [-5.0, -5.0], [0.5, np.inf], False),
+    "a corner at the end": ([[-1.0, -1.0]], [-0.4], [-5.0, 0.1], [5.0, 5.0], False),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_traced_optimiser_ends_where_the_other_one_does(name):
+    A, b, low, high, settled = CASES[name]
+    start = np.array([-1.2, 0.7]) if name != "a row in the way" else np.array([-1.2, -2.0])
+
+    class At:
+        def __init__(self, theta, side):
+            self.cost, self.gradient, self.hessian = map(np.asarray, valley(theta))
+
+    constraints = LinearConstraints(np.array(A), np.array(b), np.array(low), np.array(high), tuple("abcde"))
+    expected = minimize(At, start, constraints=constraints)
+    with float64():
+        outcome = jax.jit(
+            lambda start: minimize_traced(
+                lambda theta: tuple(map(jnp.asarray, valley(theta))),
+                start,
+                Constraints(*map(jnp.asarray, (A, b, low, high))),
+                lambda theta: jnp.zeros(1, int),
+                tolerance=1e-9,
+                max_iterations=200,
+            )
+        )(jnp.asarray(start))
+    assert bool(outcome.settled) is settled
+    assert float(outcome.optimality) <= 1e-9
+    np.testing.assert_allclose(outcome.theta, expected.theta, rtol=0, atol=1e-9)
+
+
+# The same as single fits
+
+
+def singles(problems, meshes, start):
+    """Each problem fitted by itself on the given meshes."""
+    results = [minimized(Evaluator(problem, meshes=meshes), start, "exact", 1e-7, 200) for problem in problems]
+    return results, np.array([result.theta for result in results])
+
+
+def work_of(problem, truth, start, noise=None, seed=3):
+    work = module._Work(problem, [], truth, start, noise, seed, 1e-7, 200, module._clean(problem, truth))
+    work.meshes, _ = module._meshes(work.problem_of(0), truth, start)
+    return work
+
+
+def test_monte_carlo_is_the_same_as_single_fits():
+    problem = room()
+    study = sf.monte_carlo(problem, 40, theta=TRUTH, start=problem.initial_theta, seed=3)
+    work = work_of(problem, TRUTH, problem.initial_theta)
+    results, theta = singles([work.problem_of(k) for k in range(40)], work.meshes, problem.initial_theta)
+    assert study.success.all()
+    assert not study.failures
+    np.testing.assert_allclose(study.theta, theta, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(study.cost, [result.cost for result in results], rtol=1e-12)
+    np.testing.assert_allclose(study.hessian, [result.hessian for result in results], rtol=1e-7)
+
+
+def test_standard_errors_and_intervals_are_those_of_an_estimate():
+    problem = room()
+    for known in (True, False):
+        item = problem.experiments[0].data[0]
+        here = room(item if known else replace(item, sigma=None))
+        study = sf.monte_carlo(here, 3, theta=TRUTH, noise=0.01, seed=3)
+        work = work_of(here, TRUTH, TRUTH, noise=0.01)
+        for k in range(3):
+            single = sf.estimate(work.problem_of(k), start=TRUTH)
+            np.testing.assert_allclose(study.standard_errors[k], single.standard_errors, rtol=1e-6)
+            np.testing.assert_allclose(study.confidence_intervals(0.9)[k], single.confidence_intervals(0.9), rtol=1e-6)
+
+
+def test_a_reference_signal_is_filtered_anew_in_every_run():
+    times = np.linspace(0.0, 6.0, 13)
+    values = np.zeros((13, 1))
+    values[4] = np.nan
+    signal = sf.ReferenceSignal.from_samples(times, values, lowpass_hz=0.8, weights=[3.0])
+    problem = room([sf.Measurements(TIMES, np.zeros(24), sigma=0.05), signal])
+    study = sf.monte_carlo(problem, 5, theta=TRUTH, noise=0.02, seed=3)
+    work = work_of(problem, TRUTH, TRUTH, noise=0.02)
+    _, theta = singles([work.problem_of(k) for k in range(5)], work.meshes, TRUTH)
+    np.testing.assert_allclose(study.theta, theta, rtol=0, atol=1e-8)
+    assert np.ptp(study.theta[:, 0]) > 1e-3
+
+
+def test_several_experiments_each_with_its_own_noise():
+    runs = [
+        sf.Experiment(sf.Measurements(TIMES, np.zeros(24), sigma=s), ("on", "off"), (2.0,), 0.0, 6.0)
+        for s in (0.01, 0.1)
+    ]
+    problem = sf.Problem(ROOM, runs, {"k": 0.9})
+    study = sf.monte_carlo(problem, 60, theta=[2.1, 3.0, 0.8])
+    assert study.success.all()
+    assert 5 < study.standard_deviation[1] / study.standard_deviation[0] < 20
+
+
+def test_lockstep_is_the_same_as_one_after_the_other():
+    work = work_of(room(), TRUTH, np.array([1.7, 1.0]))
+    values = np.stack([work._noisy(k)[0, 0] for k in range(12)])
+    varying, starts = work._varying({(0, 0): values}), np.repeat(work.start[None], 12, axis=0)
+    settings = {"tolerance": 1e-7, "max_iterations": 200}
+    one, other = (fit_chunk(work.problem, work.meshes, varying, starts, **settings, lockstep=m) for m in (False, True))
+    np.testing.assert_allclose(one.theta, other.theta, rtol=0, atol=1e-10)
+    np.testing.assert_array_equal(one.iterations, other.iterations)
+
+
+def test_what_is_not_an_ordinary_minimum_is_finished_as_a_single_fit_is():
+    """The bound on k is below its true value in some runs, so that some estimates end on it."""
+    problem = room(upper=0.8, guess=(1.7, 0.5))
+    study = sf.monte_carlo(problem, 20, theta=[2.1, 0.8], start=problem.initial_theta, noise=0.03, seed=3)
+    work = work_of(problem, np.array([2.1, 0.8]), problem.initial_theta, noise=0.03)
+    results, theta = singles([work.problem_of(k) for k in range(20)], work.meshes, problem.initial_theta)
+    np.testing.assert_allclose(study.theta, theta, rtol=0, atol=1e-8)
+    held = np.array([bool(result.active) for result in results])
+    assert 4 <= held.sum() <= 16
+    np.testing.assert_array_equal(study.free, np.where(held, 1, 2))
+    assert all("k at its upper bound" in study.message[k] for k in np.flatnonzero(held))
+    np.testing.assert_allclose(study.standard_errors[held, 1], 0.0, atol=1e-15)
+
+
+def test_fits_that_do_not_converge_are_listed():
+    study = sf.monte_carlo(room(), 5, theta=TRUTH, start=[4.0, 3.0], max_iterations=1)
+    assert not study.success.any()
+    assert [run for run, _ in study.failures] == list(range(5))
+    assert "Stopped after 1 iterations" in study.failures[0][1]
+    assert "not converged" in str(study)
+    assert "Fewer than two" in str(study)
+
+
+def test_a_model_that_is_not_finite_somewhere_does_not_stop_the_others():
+    system = sf.HybridSystem({"a": root, "b": lambda t, x, p: -p["k"] * x}, [0.5])
+    run = sf.Experiment(sf.Measurements(TIMES, np.ones(24), sigma=0.1), ("a", "b"), (2.0,), 0.0, 6.0)
+    problem = sf.Problem(system, run, {"k": sf.Parameter(0.5, lower=-1e4, upper=5.0)})
+    study = sf.multistart(problem, [[2.0, 0.5], [2.0, -9e3], [2.5, 0.3]])
+    assert study.success.tolist() == [True, False, True]
+    assert study.failures[0][0] == 1
+    assert "not finite" in study.failures[0][1]
+    assert study.clusters[1] == -1
+
+
+def test_the_intervals_cover_the_truth():
+    study = sf.monte_carlo(room(), 400, theta=TRUTH)
+    assert np.all(np.abs(study.coverage() - 0.95) < 0.03)
+    assert np.all(np.abs(study.bias) < 4 * study.standard_deviation / 20)
+    np.testing.assert_allclose(study.standard_errors.mean(0), study.standard_deviation, rtol=0.1)
+    assert "tau_1 (s)" in str(study)
+    assert "%" in str(study)
+
+
+def test_the_truth_is_the_estimate_if_none_is_given():
+    problem = work_of(room(), TRUTH, TRUTH).problem_of(0)
+    study = sf.monte_carlo(problem, 2)
+    np.testing.assert_allclose(study.truth, sf.estimate(problem).theta, rtol=0, atol=1e-12)
+
+
+def test_a_function_draws_the_noise():
+    def outliers(rng, clean, item):
+        assert clean.shape == item.values.shape
+        return clean + 0.01 * rng.standard_t(2, clean.shape)
+
+    study = sf.monte_carlo(room(), 3, theta=TRUTH, noise=outliers)
+    assert study.success.all()
+    assert np.ptp(study.theta[:, 0]) > 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"runs": 0}, "runs must be 1 or more; got 0"),
+        ({"noise": -1.0}, "noise must be zero or positive"),
+        ({"noise": [1.0, 2.0]}, "does not fit data of shape"),
+        ({"noise": lambda rng, clean, item: clean[:3]}, "noise must give finite values of shape"),
+        ({"theta": [2.0]}, "theta must have shape"),
+    ],
+)
+def test_bad_settings_of_monte_carlo(settings, message):
+    with pytest.raises(ValueError, match=message):
+        sf.monte_carlo(room(), **{"theta": TRUTH, **settings})
+
+
+def test_noise_must_be_known():
+    unknown = room(sf.Measurements(TIMES, np.zeros(24)))
+    with pytest.raises(ValueError, match="noise must be given"):
+        sf.monte_carlo(unknown, 2, theta=TRUTH)
+    with pytest.raises(ValueError, match="needs Measurements or a ReferenceSignal"):
+        sf.monte_carlo(room(sf.RunningCost(lambda t, x, p: x[0] ** 2)), 2, theta=TRUTH)
+
+
+# Multistart
+
+
+def pulses(t, x, p):
+    return jnp.array([1.0 - x[0]])
+
+
+def bump(t, x, p):
+    return jnp.array([-2.0 * x[0]])
+
+
+def two_minima(**bounds):
+    """One pulse, given twice in the data: a schedule with one gap fits the first or the second."""
+    system = sf.HybridSystem({"rest": pulses, "pulse": bump}, [0.9])
+    run = lambda data, times: sf.Experiment(data, ("rest", "pulse", "rest"), times, 0.0, 10.0)  # noqa: E731
+    once = [
+        sf.simulate(sf.Problem(system, run(sf.RunningCost(lambda t, x, p: x[0]), times), min_duration=0.2))
+        for times in ((2.0, 3.0), (7.0, 7.8))
+    ]
+    times = np.linspace(0.1, 9.9, 60)
+    curves = [np.interp(times, path.times + 1e-12 * np.arange(len(path.times)), path.states[:, 0]) for path in once]
+    data = sf.Measurements(times, np.minimum(*curves), sigma=0.05)
+    return sf.Problem(system, run(data, (4.0, 6.0)), min_duration=0.2)
+
+
+def test_multistart_finds_both_minima_and_estimates_the_lower_one():
+    problem = two_minima()
+    study = sf.multistart(problem, 24, seed=1)
+    assert len(study) == 24
+    np.testing.assert_array_equal(study.start[0], problem.initial_theta)
+    knots = np.hstack([np.zeros((24, 1)), study.start, np.full((24, 1), 10.0)])
+    assert np.all(np.diff(knots) >= 0.2 - 1e-12)
+    assert len(np.unique(study.start[:, 0])) == 24
+    ends = [study.theta[study.clusters == k].mean(0) for k in range(2)]
+    np.testing.assert_allclose(ends[0], [2.0, 3.0], atol=0.1)
+    np.testing.assert_allclose(ends[1], [7.0, 7.8], atol=0.1)
+    for k in range(2):
+        assert np.ptp(study.cost[study.clusters == k]) < 1e-6 * study.cost[study.clusters == k][0]
+    assert study.best.success
+    np.testing.assert_allclose(study.best.theta, ends[0], atol=1e-4)
+    assert study.best.cost == pytest.approx(np.nanmin(study.cost), rel=1e-6)
+    assert "minima:" in str(study)
+    figure = study.plot()
+    assert "cost above the best" in figure.axes[0].get_ylabel()
+
+
+def test_fixed_times_and_bounds_keep_their_place_among_the_starts():
+    data = sf.Measurements(TIMES, np.zeros(24), sigma=0.01)
+    times = (1.0, sf.Parameter(2.0, fixed=True), sf.Parameter(3.0, lower=2.5, upper=3.5), 4.0)
+    run = sf.Experiment(data, ("on", "off", "on", "off", "on"), times, 0.0, 6.0)
+    problem = sf.Problem(ROOM, run, {"k": sf.Parameter(0.8, lower=0.1, upper=2.0)}, min_duration=0.1)
+    study = sf.multistart(problem, 20, max_iterations=0)
+    first, third, fourth, k = study.start.T
+    assert np.all((first >= 0.1 - 1e-12) & (first <= 1.9 + 1e-12))
+    assert np.all((third >= 2.5) & (third <= 3.5) & (fourth - third >= 0.1 - 1e-12) & (fourth <= 5.9 + 1e-12))
+    assert k.min() < 0.4
+    assert k.max() > 1.6
+
+
+def test_bad_starts():
+    free = sf.Problem(ROOM, room().experiments, {"k": 1.0})
+    with pytest.raises(ValueError, match=r"k lacks one: give sf.Parameter\(..., lower=..., upper=...\)"):
+        sf.multistart(free, 8)
+    with pytest.raises(ValueError, match=r"array of shape \(S, 2\)"):
+        sf.multistart(room(), [1.0, 2.0])
+    with pytest.raises(ValueError, match="start 1 violates: k at its upper bound 5"):
+        sf.multistart(room(), [[1.0, 2.0], [1.0, 6.0]])
+    with pytest.raises(ValueError, match="starts must be 1 or more"):
+        sf.multistart(room(), 0)
+
+
+# Many logs
+
+
+def test_many_logs_are_the_same_as_single_estimates():
+    """Logs of two lengths, one of them with a missing sample."""
+    work = work_of(room(), TRUTH, TRUTH)
+    problems = [work.problem_of(k) for k in range(3)]
+    item = problems[1].experiments[0].data[0]
+    short = sf.Measurements(item.times[3:16], item.values[3:16], sigma=0.01)
+    holes = item.values.copy()
+    holes[5] = np.nan
+    problems += [room(short), room(replace(item, values=holes))]
+    fits = sf.estimate_many(problems)
+    assert fits.success.all()
+    assert fits.samples.tolist() == [24, 24, 24, 13, 23]
+    for k, problem in enumerate(problems):
+        single = sf.estimate(problem)
+        np.testing.assert_allclose(fits.theta[k], single.theta, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(fits.standard_errors[k], single.standard_errors, rtol=1e-6)
+    assert "5 fits" in str(fits)
+
+
+def test_logs_of_different_models_are_refused():
+    with pytest.raises(ValueError, match="problem 1 differs from the first one"):
+        sf.estimate_many([room(), sf.Problem(ROOM, room().experiments, {"k": sf.Parameter(1.0, fixed=True)})])
+    with pytest.raises(ValueError, match="one problem or more"):
+        sf.estimate_many([])
+
+
+# Chunks
+
+
+def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path):
+    folder, seen = tmp_path / "study", []
+    settings = {"theta": TRUTH, "folder": folder, "seed": 5}
+    partial = sf.monte_carlo(room(), 4 * CHUNK, **settings, callback=lambda done, total: seen.append(done) or True)
+    assert len(partial) < 4 * CHUNK
+    assert "STOPPED" in str(partial)
+    assert seen == [CHUNK]
+    kept = {path: path.stat().st_mtime_ns for path in folder.glob("chunk-*")}
+    whole = sf.monte_carlo(room(), 4 * CHUNK, **settings, callback=lambda done, total: seen.append(done))
+    assert seen[1] == len(kept) * CHUNK
+    assert seen[-1] == 4 * CHUNK
+    assert all(path.stat().st_mtime_ns == time for path, time in kept.items())
+    at_once = sf.monte_carlo(room(), 4 * CHUNK, theta=TRUTH, seed=5)
+    np.testing.assert_array_equal(whole.theta, at_once.theta)
+    np.testing.assert_array_equal(whole.runs, np.arange(4 * CHUNK))
+    assert len(list(folder.iterdir())) == 5
+
+
+def test_a_folder_of_another_run_is_refused(tmp_path):
+    sf.monte_carlo(room(), 2, theta=TRUTH, folder=tmp_path / "a")
+    with pytest.raises(ValueError, match="holds the results of another run"):
+        sf.monte_carlo(room(), 2, theta=TRUTH, folder=tmp_path / "a", seed=1)
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match="holds other files"):
+        sf.monte_carlo(room(), 2, theta=TRUTH, folder=tmp_path / "b")
+
+
+class Interrupted:
+    """Work whose third chunk is interrupted from the keyboard."""
+
+    size = 2
+
+    def __call__(self, runs):
+        if runs.start == 4:
+            raise KeyboardInterrupt
+        return {"value": np.arange(runs.start, runs.stop)}
+
+    def fingerprint(self):
+        return "interrupted"
+
+
+def test_ctrl_c_returns_what_is_done(tmp_path):
+    runs, arrays = run_chunks(Interrupted(), 6, folder=tmp_path / "x")
+    assert set(runs) <= {0, 1, 2, 3}
+    np.testing.assert_array_equal(arrays["value"], runs)
+
+
+def test_a_problem_is_pickled_without_its_programs():
+    problem = room()
+    evaluator_of(problem)
+    copy = pickle.loads(cloudpickle.dumps(problem))
+    assert "evaluator" not in copy.__dict__
+    assert sf.evaluate(copy).cost == sf.evaluate(problem).cost
+
+
+def test_nothing_is_compiled_for_other_data_or_another_number_of_runs():
+    work = work_of(room(), TRUTH, TRUTH)
+    varying = Varying(*work._varying({(0, 0): np.zeros((3, 24, 1))}))
+    settings = {"tolerance": 1e-7, "max_iterations": 200}
+    fit_chunk(work.problem, work.meshes, varying, np.repeat(TRUTH[None], 3, axis=0), **settings)
+    before = jax.config.jax_log_compiles
+    from switchfit.batch.program import _fits
+
+    count = _fits._cache_size()
+    more = Varying(*work._varying({(0, 0): np.ones((7, 24, 1))}))
+    fit_chunk(work.problem, work.meshes, more, np.repeat(TRUTH[None], 7, axis=0), **settings)
+    assert _fits._cache_size() == count
+    assert jax.config.jax_log_compiles is before
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_cluster_that_loses_a_worker_in_the_middle(tmp_path):
+    """Two worker processes, one of which is killed after the first chunk: nothing is missing, nothing differs."""
+    distributed = pytest.importorskip("distributed")
+    alone = sf.monte_carlo(room(), 6 * CHUNK, theta=TRUTH, seed=7)
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, local_directory=str(tmp_path)
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        workers = client.run(os.getpid)
+        assert len(set(workers.values())) == 2
+        killed = []
+
+        def progress(done, total):
+            if not killed:
+                killed.append(next(iter(workers.values())))
+                os.kill(killed[0], signal.SIGKILL)
+
+        study = sf.monte_carlo(room(), 6 * CHUNK, theta=TRUTH, seed=7, client=client, callback=progress)
+    assert killed
+    assert len(study) == 6 * CHUNK
+    assert study.success.all()
+    np.testing.assert_allclose(study.theta, alone.theta, rtol=0, atol=1e-12)
