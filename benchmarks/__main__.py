@@ -7,13 +7,13 @@ import time
 
 from benchmarks import machine
 
-PARTS = ("derivatives", "fit", "cold", "scaling")
+PARTS = ("derivatives", "peers", "fit", "fits", "cold", "scaling")
 
 
 def main() -> None:
     """Parse the command line and run the parts asked for."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="fewer cases and repetitions; below a minute when idle")
+    parser.add_argument("--quick", action="store_true", help="fewer cases and repetitions; some minutes")
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"only these of: {', '.join(PARTS)}")
     options = parser.parse_args()
     unknown = set(options.parts) - set(PARTS)
@@ -21,13 +21,15 @@ def main() -> None:
         parser.error(f"no such part: {', '.join(sorted(unknown))}")
     cores = machine.use_one_core()  # before JAX starts its threads
 
-    from benchmarks import cold, derivatives, fit, scaling
+    from benchmarks import cold, derivatives, fit, fits, scaling, side_by_side
     from benchmarks.report import Report
 
     report = Report(machine.describe(cores))
     run = {
         "derivatives": lambda: derivatives.run(report, options.quick),
+        "peers": lambda: side_by_side.run(report, options.quick),
         "fit": lambda: fit.run(report, options.quick),
+        "fits": lambda: fits.run(report, options.quick),
         "cold": lambda: cold.run(report, options.quick, cores),
         "scaling": lambda: scaling.run(report, options.quick),
     }

@@ -1,4 +1,4 @@
-"""Cold processes: the command line with an empty and with a filled compilation cache, and the import."""
+"""Cold processes: the command line, the import, and the same answer from switchfit and from other libraries."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
 
+from benchmarks.answer import DERIVATIVES, FITS
 from benchmarks.report import Report
 
 ROOT = Path(__file__).parent.parent
@@ -19,6 +21,7 @@ FIT = [sys.executable, "-c", "from switchfit.cli import main; main()", "fit", "e
 IMPORT = [sys.executable, "-c", "import switchfit"]
 NOTHING = [sys.executable, "-c", "pass"]
 EMPTY, FILLED = "switchfit fit toss, empty cache", "switchfit fit toss, filled cache"
+SAME_ANSWER = 1e-6
 TARGETS = {EMPTY: 6.0, FILLED: 2.5, "import switchfit": 1.2}
 
 
@@ -41,19 +44,85 @@ def run(report: Report, quick: bool, cores: set[int] | None) -> None:
     report.data["cold"] = taken
     for name, wanted in TARGETS.items():
         report.target(name, wanted, median(taken[name]), "s")
+    answers(report, quick, cores)
+
+
+def answers(report: Report, quick: bool, cores: set[int] | None) -> None:
+    """From the start of a process to the same answer, library by library; raises if the answers differ."""
+    report.section(
+        "Cold processes, side by side",
+        "From the start of the interpreter to its end, on all cores, at settings that give J to 1e-8. *Empty cache*: "
+        "the library's own cache of compiled programs, a new folder each time; *filled* by the same process before. "
+        "diffrax compiles each time as JAX does unless it is told otherwise; *JAX's cache*: JAX's persistent cache "
+        "turned on and filled, and EQX_ON_ERROR=nan, since programs that can raise are not kept in it.",
+    )
+    jax_cache = {
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+        "EQX_ON_ERROR": "nan",
+    }
+    asked = {"derivatives": "(J, gradient, Hessian) of the vehicle", "fit": "whole fit of the fishing problem"}
+    libraries = {"derivatives": DERIVATIVES, "fit": FITS}
+    for what, title in asked.items():
+        taken: dict[str, list[float]] = {}
+        found: dict[str, float] = {}
+        missing = []
+        with tempfile.TemporaryDirectory() as folder:
+            for library in libraries[what]:
+                if library != "switchfit" and find_spec(library) is None:
+                    missing.append(library)
+                    continue
+                command = [sys.executable, "-m", "benchmarks.answer", what, library]
+                caches = {library: ("{k}", {})}
+                if library in ("switchfit", "heyoka"):
+                    own = library + "{k}"
+                    caches = {
+                        f"{library}, empty cache": (own, {}),
+                        f"{library}, filled cache": (own.format(k=0), {}),
+                    }
+                if library == "diffrax":
+                    on = jax_cache | {"JAX_COMPILATION_CACHE_DIR": str(Path(folder) / "jax")}
+                    process(command, Path(folder) / "none", cores, on)
+                    caches["diffrax, JAX's cache"] = ("none", on)
+                for name, (cache, variables) in caches.items():
+                    taken[name] = []
+                    for k in range(1 if quick else 5):
+                        path = Path(folder) / cache.format(k=k)
+                        seconds, output = process(command, path, cores, variables)
+                        taken[name].append(seconds)
+                        found[name] = float(output.split()[-1])
+        J = next(iter(found.values()))
+        for name, other in found.items():
+            if not abs(other - J) <= SAME_ANSWER * abs(J):
+                raise ArithmeticError(f"{title}: J is {J!r} by switchfit and {other!r} by {name}")
+        rows = [
+            (name, f"{median(s):.2f} s", f"{min(s):.2f} s", f"{abs(found[name] - J) / abs(J):.0e}", len(s))
+            for name, s in taken.items()
+        ]
+        report.note(f"**{title}**")
+        header = ("", "median", "minimum", "J from switchfit's by", "processes")
+        report.table(header, rows + [(library, "not installed", "", "", "") for library in missing])
+        report.data[f"cold: {title}"] = taken
 
 
 def seconds_of(command: list[str], cache: Path, cores: set[int] | None) -> float:
     """Wall clock of one process with a compilation cache of its own, on `cores`."""
+    return process(command, cache, cores)[0]
+
+
+def process(
+    command: list[str], cache: Path, cores: set[int] | None, variables: dict[str, str] | None = None
+) -> tuple[float, str]:
+    """Wall clock and output of one process with a compilation cache of its own, on `cores`."""
     environment = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
-    environment |= {"SWITCHFIT_CACHE": str(cache), "XDG_CACHE_HOME": str(cache)}
+    environment |= {"SWITCHFIT_CACHE": str(cache), "XDG_CACHE_HOME": str(cache)} | (variables or {})
     with _on(cores):
         began = time.perf_counter()
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
         seconds = time.perf_counter() - began
     if done.returncode != 0:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr}")
-    return seconds
+    return seconds, done.stdout
 
 
 @contextmanager

@@ -111,14 +111,14 @@ def gap(ours: Any, J: float, g: np.ndarray, H: np.ndarray) -> float:
 
 def compiled_program(evaluator: Evaluator, theta: np.ndarray) -> Any:
     """The program behind `Evaluator.__call__`, with its arguments in place already."""
-    from switchfit.evaluate import _derivatives
+    from switchfit.evaluate import derivatives
 
     structure, arguments = evaluator.problem.structures[0], evaluator.arguments[0]
     N = structure.N
     settings = {"structure": structure, "method": "discrete-adjoint", "matrix": "exact"}
     with float64():
         at = (arguments, jnp.asarray(theta[:N]), jnp.asarray(theta[N:]), jnp.ones(()))
-        program = _derivatives.lower(*at, **settings).compile()
+        program = derivatives.lower(*at, **settings).compile()
     return lambda: jax.block_until_ready(program(*at))
 
 

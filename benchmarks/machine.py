@@ -8,7 +8,7 @@ import sys
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-PACKAGES = ("switchfit", "jax", "jaxlib", "numpy", "scipy", "casadi")
+PACKAGES = ("switchfit", "jax", "jaxlib", "numpy", "scipy", "casadi", "diffrax", "heyoka")
 
 
 def all_cores() -> set[int] | None:

@@ -47,3 +47,26 @@ def take_turns(calls: dict[str, Callable[[], object]], repetitions: int, block: 
 def ms(seconds: float) -> str:
     """Milliseconds to three digits."""
     return f"{seconds * 1e3:.3g} ms"
+
+
+def turns_within(calls: dict[str, Callable[[], object]], seconds: float, rounds: int = 5) -> dict[str, Timing]:
+    """Time calls of very different lengths: each gets `seconds` in all, in `rounds` turns, and at least one call.
+
+    All must be warm. As in `take_turns` the first call of a turn does not count, where a turn has several.
+    """
+    alone = {name: _seconds_of(call) for name, call in calls.items()}
+    taken: dict[str, list[float]] = {name: [] for name in calls}
+    for turn in range(rounds):
+        for name, call in calls.items():
+            if turn * alone[name] > seconds:  # too slow for another turn
+                continue
+            block = int(min(max(seconds / rounds / alone[name], 1), 200))
+            measured = [_seconds_of(call) for _ in range(block)]
+            taken[name] += measured[1:] if block > 1 else measured
+    return {name: Timing.of(measured) for name, measured in taken.items()}
+
+
+def _seconds_of(call: Callable[[], object]) -> float:
+    began = time.perf_counter()
+    call()
+    return time.perf_counter() - began

@@ -1,6 +1,9 @@
-"""The two sides of the benchmark against CasADi compute the same thing. Nothing here looks at the clock."""
+"""All sides of the benchmarks compute the same thing. Nothing here looks at the clock."""
 
+import math
 import sys
+from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +12,11 @@ import pytest
 pytest.importorskip("casadi")
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
-from benchmarks import casadi_forms, derivatives, vehicle
+import switchfit as sf
+from benchmarks import casadi_forms, derivatives, models, problems, side_by_side, vehicle
 from benchmarks.fit import CostBySciPy
+from benchmarks.peers import casadi_collocation, casadi_shooting, scipy_differences, scipy_fits
+from switchfit.model import float64
 
 ROWS = 22
 
@@ -43,3 +49,64 @@ def test_cost_by_scipy_is_that_of_switchfit():
     theta = problem.initial_theta
     ours = vehicle.evaluator_with(problem, None)(theta).cost
     assert CostBySciPy(problem)(theta) == pytest.approx(ours, rel=1e-6)
+
+
+def test_entrywise_models_are_those_of_switchfit():
+    random = np.random.default_rng(0)
+    for name, model in models.MODELS.items():
+        case = problems.case(name)
+        problem = case.problem()
+        assert len(problem.theta_names) == len(model.theta), name
+        np.testing.assert_array_equal(problem.initial_theta, model.theta)
+        x, p = random.standard_normal(len(model.x0)), [float(value) for value in model.p]
+        with float64():
+            for mode in model.modes:
+                theirs = model.field(mode, x.tolist(), p, math)
+                np.testing.assert_allclose(case.system.modes[mode](0.0, x, case.pack(np.array(p))), theirs, rtol=1e-12)
+            assert float(case.cost.ell(0.0, x, {})) == pytest.approx(model.density(x.tolist()), rel=1e-12)
+
+
+def test_tosses_are_well_formed_and_scipy_has_the_same_cost():
+    problem = problems.tosses()
+    theta = problem.initial_theta
+    assert len(theta) == 51
+    np.testing.assert_array_equal(theta, problems.tosses_theta(problems.read_tosses()))
+    np.testing.assert_array_equal(problems.tosses(theta + 1e-6).initial_theta, theta + 1e-6)
+    samples = [(toss.times, toss.positions) for toss in problems.read_tosses()]
+    fit = scipy_fits.Tosses(samples, problem.unknowns.lower, problem.unknowns.upper)
+    one, K = problem.experiments[0], len(samples)
+    single = sf.Problem(problem.system, one, problem.parameters)  # compiling all ten takes too long here
+    ours = sf.evaluate(single, np.concatenate([theta[:1], theta[K:]])).cost
+    r = fit.residuals(theta)[: 2 * len(samples[0][0])]
+    assert 0.5 * r @ r == pytest.approx(ours, rel=1e-8)
+
+
+def test_peers_agree_with_switchfit_on_a_small_model():
+    """Two switches and a parameter, short: every library has the same J, gradient and Hessian."""
+    model = replace(models.VEHICLE, times=(0.7, 1.3), horizon=(0.0, 2.0))
+    case = replace(problems.case("vehicle"), model=model)
+    ours = sf.evaluate(case.problem(rtol=1e-10, atol=1e-12))
+    rivals = {
+        "CasADi MX": casadi_shooting.build(model, 64, unrolled=False),
+        "SciPy": scipy_differences.build(model, 1e-10),
+    }
+    if find_spec("heyoka"):
+        from benchmarks.peers import heyoka_variational
+
+        rivals["heyoka"] = heyoka_variational.build(model, 1e-10)
+    for name, functions in rivals.items():
+        J, g, H = functions.hessian(model.theta)
+        allowed = (1e-8, 1e-3, 1e-2) if name == "SciPy" else (1e-8, 1e-8, 1e-7)
+        for mine, theirs, rtol in zip((ours.cost, ours.gradient, ours.hessian), (J, g, H), allowed, strict=True):
+            assert side_by_side.error_of(theirs, mine) < rtol, name
+        assert functions.cost(model.theta) == pytest.approx(J, rel=1e-12)
+        gradient = functions.gradient(model.theta)[1]
+        assert side_by_side.error_of(gradient, g) < (1e-3 if name == "SciPy" else 1e-10), name
+
+
+def test_collocation_finds_the_known_optimum_of_fishing():
+    none = np.zeros(0)
+    found = casadi_collocation.Collocation(models.FISHING, 8, (none, none))(np.array(models.FISHING_START))
+    assert found.success
+    assert found.cost == pytest.approx(models.FISHING.optimum, rel=1e-9)
+    np.testing.assert_allclose(found.theta, models.FISHING_BEST, atol=1e-6)

@@ -114,6 +114,8 @@ def estimate(
     callback : callable, optional
         Called with each `IterationRecord`; a true return value stops the fit. Ctrl-C does as well; both
         return the best point so far.
+    start : (d,) array_like, optional
+        Where to begin, in the order of ``problem.theta_names``; the problem's initial guess if left out.
 
     Returns
     -------

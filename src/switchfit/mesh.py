@@ -12,7 +12,7 @@ chunks with rows of length zero, so that a chunk has one mode and all shapes are
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -104,37 +104,38 @@ def chunk_count(cells: int, transitions: int) -> int:
     return (cells + transitions + (transitions + 1) * (CHUNK - 1)) // CHUNK
 
 
-def rows(nodes: jax.Array, tau: jax.Array, side: jax.Array) -> Rows:
+def rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
     """Cut the cells between `nodes` (G + 1,) at `tau` (N,).
 
     Where tau_i equals a node, `side` = +1 lets segment i begin in the cell after it, so that derivatives are those
-    for tau_i increasing, and -1 in the cell before it.
+    for tau_i increasing, and -1 in the cell before it. Computed in the arrays of
+    `xp`, JAX's or NumPy's.
     """
     cells, N = nodes.shape[0] - 1, tau.shape[0]
-    passed = jnp.where(side > 0, nodes[None] <= tau[:, None], nodes[None] < tau[:, None]).sum(1)
+    passed = xp.where(side > 0, nodes[None] <= tau[:, None], nodes[None] < tau[:, None]).sum(1)
     real_cells = (nodes[1:] > nodes[:-1]).sum()  # without the padding, so that tau = tf stays before what is at tf
-    first_cell = jnp.clip(passed - 1, 0, real_cells - 1)
-    first_cell = jnp.concatenate([jnp.zeros(1, first_cell.dtype), first_cell])
-    last_cell = jnp.concatenate([first_cell[1:], jnp.full(1, cells - 1, first_cell.dtype)])
+    first_cell = xp.clip(passed - 1, 0, real_cells - 1)
+    first_cell = xp.concatenate([xp.zeros(1, first_cell.dtype), first_cell])
+    last_cell = xp.concatenate([first_cell[1:], xp.full(1, cells - 1, first_cell.dtype)])
     count = last_cell - first_cell + 1
     chunks = -(-count // CHUNK)
-    first_chunk = jnp.concatenate([jnp.zeros(1, chunks.dtype), jnp.cumsum(chunks)[:-1]])
+    first_chunk = xp.concatenate([xp.zeros(1, chunks.dtype), xp.cumsum(chunks)[:-1]])
 
-    q = jnp.arange(chunk_count(cells, N))
+    q = xp.arange(chunk_count(cells, N))
     segment = (q[:, None] >= first_chunk[None, 1:]).sum(1)
-    offset = (q - first_chunk[segment])[:, None] * CHUNK + jnp.arange(CHUNK)
+    offset = (q - first_chunk[segment])[:, None] * CHUNK + xp.arange(CHUNK)
     rows_here = count[segment][:, None]
     padding = offset >= rows_here
-    cell = first_cell[segment][:, None] + jnp.minimum(offset, rows_here - 1)
+    cell = first_cell[segment][:, None] + xp.minimum(offset, rows_here - 1)
 
-    begins = jnp.concatenate([nodes[:1], tau])[segment][:, None]
-    finishes = jnp.concatenate([tau, nodes[-1:]])[segment][:, None]
+    begins = xp.concatenate([nodes[:1], tau])[segment][:, None]
+    finishes = xp.concatenate([tau, nodes[-1:]])[segment][:, None]
     opening = (offset == 0) & (segment > 0)[:, None]
     closing = (offset == rows_here - 1) & (segment < N)[:, None]
-    start = jnp.where(padding, finishes, jnp.where(opening, begins, nodes[cell]))
-    end = jnp.where(padding | closing, finishes, nodes[cell + 1])
-    starts_at = jnp.where(opening, segment[:, None] - 1, -1)
-    ends_at = jnp.where(closing, segment[:, None], -1)
+    start = xp.where(padding, finishes, xp.where(opening, begins, nodes[cell]))
+    end = xp.where(padding | closing, finishes, nodes[cell + 1])
+    starts_at = xp.where(opening, segment[:, None] - 1, -1)
+    ends_at = xp.where(closing, segment[:, None], -1)
     opens = opening[:, 0]
     last_row = first_chunk * CHUNK + count - 1
     return Rows(segment, opens, cell, start, end, starts_at, ends_at, first_chunk, last_row, first_cell)

@@ -8,7 +8,7 @@ nothing is compiled anew when transition times, parameters or data change.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -73,6 +73,11 @@ class Structure:
         return sum(int(np.prod(shape)) for _, shape, free in self.parameters if free)
 
     @property
+    def functions(self) -> Structure:
+        """The same with one segment: what programs depend on that work in one mode at a time."""
+        return replace(self, mode_of_segment=(0,), reset_maps=())
+
+    @property
     def resets(self) -> tuple[int, ...]:
         """The transitions (from 0) at which a reset map acts."""
         return tuple(i for i, reset in enumerate(self.reset_maps) if reset is not None)
@@ -108,6 +113,10 @@ class Arguments(NamedTuple):
     initial_state: Array
     samples: tuple[Samples, ...]
     weights: tuple[Array, ...]
+
+    def without_mesh(self) -> Arguments:
+        """What the functions of the model need of them: shapes do not depend on the number of nodes or samples."""
+        return self._replace(nodes=np.zeros(2), signals=np.zeros((1, *self.signals.shape[1:])), samples=())  # type: ignore[arg-type]
 
 
 class Piece(NamedTuple):
@@ -367,7 +376,7 @@ def arguments_of(
     x0 = np.zeros(structure.n) if callable(initial) else initial
     arrays = (mesh.nodes, _signals_by_cell(experiment, mesh), fixed, x0, samples, weights)
     with float64():
-        return Arguments(*jax.tree.map(jnp.asarray, arrays))
+        return Arguments(*jax.device_put(arrays))
 
 
 def check_functions(structure: Structure) -> None:

@@ -97,7 +97,8 @@ def _graded(ends: FloatArray, steps: _Steps, pieces: int) -> FloatArray:
 def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -> FloatArray:
     """All times at which the adaptive solver stopped, from t0 to tf, strictly increasing."""
     experiment, structure = problem.experiments[e], problem.structures[e]
-    arguments = jax.tree.map(np.asarray, problem.arguments(e, coarse))
+    whole = jax.tree.map(np.asarray, problem.arguments(e, coarse))
+    arguments, signals = whole.without_mesh(), whole.signals
     times, parameters = problem.split(theta)
     free = [np.ravel(parameters[name]) for name, _, is_free in structure.parameters if is_free]
     p = np.concatenate([np.zeros(0), *free])
@@ -105,17 +106,19 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
     inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
     steps = [np.array([experiment.t0])]
     with float64(), compilation_cache():
-        x = _finite(_initial_state(arguments, p, structure=structure), f"initial_state at p = {_rounded(parameters)}")
+        x = _finite(
+            initial_state(arguments, p, structure=structure.functions), f"initial_state at p = {_rounded(parameters)}"
+        )
         for i, mode in enumerate(structure.mode_of_segment):
             if i > 0 and structure.reset_maps[i - 1] is not None:
                 names = tuple(experiment.mode_sequence[i - 1 : i + 1])
-                value = _reset(arguments, ends[i], x, p, structure=structure, i=i - 1)
+                value = after_reset(arguments, ends[i], x, p, structure=structure, i=i - 1)
                 x = _finite(value, f"reset map {names} at t = {ends[i]:.6g}, x = {x.tolist()}")
             knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
             stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
             for start, end in pairwise(stops.tolist()):
                 if end > start:
-                    accepted, x = _solve(problem, structure, arguments, coarse, mode, start, end, x, p)
+                    accepted, x = _solve(problem, structure, arguments, signals, coarse, mode, start, end, x, p)
                     steps.append(accepted)
     return np.concatenate(steps)
 
@@ -124,6 +127,7 @@ def _solve(
     problem: Problem,
     structure: Structure,
     arguments: Arguments,
+    signals: FloatArray,
     coarse: Mesh,
     mode: int,
     start: float,
@@ -133,13 +137,13 @@ def _solve(
 ) -> tuple[FloatArray, FloatArray]:
     """Adaptive solve of one mode from start to end: accepted times (start left out) and the final state."""
     name = structure.mode_names[mode]
-    function = partial(_field_and_density, structure=structure, mode=mode)
+    function = partial(_field_and_density, structure=structure.functions, mode=mode)
     last = len(coarse.times) - 2
 
     def right_hand_side(t: float, y: FloatArray) -> FloatArray:
         inside = min(max(t, np.nextafter(start, end)), np.nextafter(end, start))
         cell = min(int(np.searchsorted(coarse.times, inside, side="right")) - 1, last)
-        value = np.asarray(function(arguments, arguments.nodes[cell], arguments.signals[cell], t, y[:-1], p))
+        value = np.asarray(function(arguments, coarse.nodes[cell], signals[cell], t, y[:-1], p))
         if not np.isfinite(value).all():
             slope, density = value[:-1].tolist(), value[-1]
             finite = np.isfinite(slope).all()
@@ -207,12 +211,14 @@ def _field_and_density(
 
 
 @partial(jax.jit, static_argnames=("structure",))
-def _initial_state(arguments: Arguments, p: jax.Array, *, structure: Structure) -> jax.Array:
+def initial_state(arguments: Arguments, p: jax.Array, *, structure: Structure) -> jax.Array:
+    """x(t0): (n,)."""
     return Model(structure, arguments).initial_state(p)
 
 
 @partial(jax.jit, static_argnames=("structure", "i"))
-def _reset(
+def after_reset(
     arguments: Arguments, t: jax.Array, x: jax.Array, p: jax.Array, *, structure: Structure, i: int
 ) -> jax.Array:
+    """State after the reset map of transition i (from 0): (n,)."""
     return Model(structure, arguments).reset(i)(t, x, p)

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.cache import compilation_cache
 from switchfit.data import FloatArray, Measurements, ReferenceSignal
-from switchfit.mesh import Mesh
-from switchfit.model import Arguments, Model, Structure, float64
+from switchfit.mesh import CHUNK, Mesh, rows
+from switchfit.model import Arguments, Model, Piece, Structure, float64
 from switchfit.problem import Problem
-from switchfit.propagate import Path, by_row, path_cost, propagate
-from switchfit.refine import refined_mesh
+from switchfit.refine import after_reset, initial_state, refined_mesh
+from switchfit.rungekutta import step
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,8 +115,8 @@ def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: in
     if not 0 <= experiment < len(problem.experiments):
         raise ValueError(f"experiment must lie in 0..{len(problem.experiments) - 1}; got {experiment}.")
     checked = problem.checked_theta(theta)
-    _, path, _ = _simulated(problem, experiment, checked, refined_mesh(problem, experiment, checked))
-    return _trajectory(problem, experiment, path)
+    mesh = refined_mesh(problem, experiment, checked)
+    return _trajectory(problem, experiment, _simulated(problem, experiment, checked, mesh))
 
 
 def compare(
@@ -124,21 +125,12 @@ def compare(
     """Total cost, trajectories and measured against fitted of all experiments at theta, on given meshes."""
     total, trajectories, comparisons = 0.0, [], []
     for e, mesh in enumerate(meshes):
-        cost, path, outputs = _simulated(problem, e, theta, mesh)
-        total += cost
-        trajectories.append(_trajectory(problem, e, path))
-        comparisons.append(_comparisons(problem, e, path, outputs))
+        run = _simulated(problem, e, theta, mesh)
+        trajectory = _trajectory(problem, e, run)
+        total += run.cost
+        trajectories.append(trajectory)
+        comparisons.append(_comparisons(problem, e, run, trajectory))
     return total, tuple(trajectories), tuple(comparisons)
-
-
-def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> tuple[float, Path, list[Outputs]]:
-    """Cost, path and outputs of experiment e on a given mesh, as NumPy arrays."""
-    times, parameters = problem.split(theta)
-    p = flat_parameters(problem, parameters)
-    with float64(), compilation_cache():
-        results = _simulation(problem.arguments(e, mesh), times[e], p, structure=problem.structures[e])
-    cost, path, outputs = jax.tree.map(np.asarray, results)
-    return float(cost), path, outputs
 
 
 def flat_parameters(problem: Problem, parameters: dict[str, FloatArray]) -> FloatArray:
@@ -147,53 +139,154 @@ def flat_parameters(problem: Problem, parameters: dict[str, FloatArray]) -> Floa
     return np.concatenate([np.zeros(0), *free])
 
 
-class Outputs(NamedTuple):
-    """What one of the data sees: at the start and at the end of each row (Q, C, q), and at the samples (K, q)."""
+BLOCK = 64
+"""Rows that one call of the program takes: with shapes that do not depend on the mesh it is compiled once a model."""
 
-    before: jax.Array
-    after: jax.Array
-    at_samples: jax.Array
+
+class Segment(NamedTuple):
+    """One mode's turn: its rows, in order.
+
+    Attributes
+    ----------
+    start, end : (R,) times
+    before, after : (R, n), states at the start and at the end of each row
+    y_before, y_after : (R, q), what the reference signals and the Measurements see there, in this order
+    """
+
+    start: FloatArray
+    end: FloatArray
+    before: FloatArray
+    after: FloatArray
+    y_before: FloatArray
+    y_after: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One simulation: its cost, its segments, the cells of the mesh in which these begin (N + 1,), and the mesh."""
+
+    cost: float
+    segments: list[Segment]
+    first_cell: NDArray[np.intp]
+    mesh: Mesh
+
+    def at_cells(self, cells: NDArray[np.intp], channels: slice) -> FloatArray:
+        """Outputs at the ends of cells (K,), before a jump; at t0 for cell -1: (K, q)."""
+        segment = (cells[:, None] >= self.first_cell[None, 1:]).sum(1)
+        values = np.empty((len(cells), self.segments[0].y_after[:, channels].shape[1]))
+        for i, part in enumerate(self.segments):
+            here = (segment == i) & (cells >= 0)
+            values[here] = part.y_after[cells[here] - self.first_cell[i], channels]
+        values[cells < 0] = self.segments[0].y_before[0, channels]
+        return values
+
+
+def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> Run:
+    """Integrate experiment e over the rows of a mesh, mode by mode."""
+    structure = problem.structures[e]
+    times, parameters = problem.split(theta)
+    p, tau = flat_parameters(problem, parameters), times[e]
+    whole = jax.tree.map(np.asarray, problem.arguments(e, mesh))
+    arguments = whole.without_mesh()
+    layout = rows(mesh.nodes, tau, 1.0, np)
+    cell, start, end = (np.reshape(a, -1) for a in (layout.cell, layout.start, layout.end))
+    segments, cost = [], 0.0
+    with float64(), compilation_cache():
+        x = np.asarray(initial_state(arguments, p, structure=structure.functions))
+        for i, mode in enumerate(structure.mode_of_segment):
+            if i > 0 and structure.reset_maps[i - 1] is not None:
+                x = np.asarray(after_reset(arguments, tau[i - 1], x, p, structure=structure, i=i - 1))
+            span = slice(layout.first_chunk[i] * CHUNK, layout.last_row[i] + 1)
+            pieces = Piece(whole.nodes[cell[span]], whole.signals[cell[span]])
+            part, added = _segment(structure, arguments, mode, x, p, start[span], end[span], pieces)
+            x = part.after[-1]
+            segments.append(part)
+            cost += added
+        cost += float(_terminal(arguments, x, p, structure=structure.functions))
+    run = Run(cost, segments, np.asarray(layout.first_cell), mesh)
+    first = sum(q for _, q in structure.references)
+    for samples, (_, q) in zip(whole.samples, structure.measurements, strict=True):
+        seen = run.at_cells(np.asarray(samples.cell), slice(first, first + q))
+        residuals = np.where(samples.weight > 0, seen - samples.value, 0.0)
+        cost += 0.5 * float(np.sum(samples.weight * residuals**2))
+        first += q
+    return replace(run, cost=cost)
+
+
+def _segment(
+    structure: Structure,
+    arguments: Arguments,
+    mode: int,
+    x: FloatArray,
+    p: FloatArray,
+    start: FloatArray,
+    end: FloatArray,
+    pieces: Piece,
+) -> tuple[Segment, float]:
+    """All rows of a segment from the state x, block by block, and the running cost; the last block is padded."""
+    count = len(start)
+    missing = -count % BLOCK
+    start_, end_ = np.append(start, np.repeat(end[-1:], missing)), np.append(end, np.repeat(end[-1:], missing))
+    padded = jax.tree.map(lambda a: np.concatenate([a, np.repeat(a[-1:], missing, axis=0)]), pieces)
+    parts, cost = [], 0.0
+    for k in range(0, len(start_), BLOCK):
+        span = slice(k, k + BLOCK)
+        here = jax.tree.map(lambda a, span=span: a[span], padded)
+        result = _block(arguments, mode, x, p, start_[span], end_[span], here, structure=structure.functions)
+        added, *columns = (np.asarray(a) for a in result)
+        x = columns[1][-1]
+        cost += float(added)
+        parts.append(columns)
+    before, after, y_before, y_after = (np.concatenate(column)[:count] for column in zip(*parts, strict=True))
+    return Segment(start, end, before, after, y_before, y_after), cost
 
 
 @partial(jax.jit, static_argnames=("structure",))
-def _simulation(
-    arguments: Arguments, tau: jax.Array, p: jax.Array, *, structure: Structure
-) -> tuple[jax.Array, Path, list[Outputs]]:
+def _block(
+    arguments: Arguments,
+    mode: jax.Array,
+    x: jax.Array,
+    p: jax.Array,
+    start: jax.Array,
+    end: jax.Array,
+    pieces: Piece,
+    *,
+    structure: Structure,
+) -> tuple[jax.Array, ...]:
+    """Running cost of a block of rows in one mode; states and outputs at the start and at the end of each row."""
     model = Model(structure, arguments)
-    path = propagate(model, tau, p, jnp.ones(()))
-    layout = path.layout
-    outputs: list[Outputs] = []
-    for observe, channels in (*structure.references, *structure.measurements):
+    tableau = model.tableau
 
-        def y(t: jax.Array, x: jax.Array, observe: Any = observe, channels: int = channels) -> jax.Array:
-            return model.observed(observe, t, x, p, channels)
+    def through(mode: int) -> Callable[..., tuple[jax.Array, ...]]:
+        def row(x: jax.Array, given: tuple[jax.Array, jax.Array, Piece]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+            start, end, piece = given
+            ell = model.density(piece) if model.has_running_cost else None
+            after, cost = step(tableau, model.field(mode, piece), ell, start, end, x, p)
+            return after, (cost, x, after)
 
-        k = len(outputs) - len(structure.references)
-        samples = arguments.samples[k] if k >= 0 else None
-        none = jnp.zeros((0, channels))
-        at = none if samples is None else jax.vmap(y)(samples.time, path.at_samples(samples.cell))
-        over_rows = jax.vmap(jax.vmap(y))
-        outputs.append(Outputs(over_rows(layout.start, path.before), over_rows(layout.end, path.after), at))
-    return path_cost(model, path, p), path, outputs
+        return lambda x: lax.scan(row, x, (start, end, pieces))[1]
 
+    modes = [through(k) for k in range(len(structure.modes))]
+    costs, before, after = modes[0](x) if len(modes) == 1 else lax.switch(mode, modes, x)
 
-def _pick(structure: Structure, path: Path, before: Any, after: Any) -> list[FloatArray]:
-    """Of values at the starts and ends of rows (Q, C, ...) those that a trajectory shows, a list by segment."""
-    layout = path.layout
-    real = (layout.end > layout.start).reshape(-1)
-    before, after = by_row(before), by_row(after)
-    parts = []
-    for i in range(structure.N + 1):
-        first, last = layout.first_chunk[i] * layout.start.shape[1], layout.last_row[i] + 1
-        parts.append(np.concatenate([before[first : first + 1], after[first:last][real[first:last]]]))
-    return parts
+    def outputs(t: jax.Array, x: jax.Array) -> jax.Array:
+        seen = (*structure.references, *structure.measurements)
+        return jnp.concatenate([jnp.zeros(0), *(model.observed(observe, t, x, p, q) for observe, q in seen)])
+
+    over_rows = jax.vmap(outputs)
+    return costs.sum(), before, after, over_rows(start, before), over_rows(end, after)
 
 
-def _trajectory(problem: Problem, e: int, path: Path) -> Trajectory:
-    """The start of every segment and the ends of all its rows that are not padding."""
+@partial(jax.jit, static_argnames=("structure",))
+def _terminal(arguments: Arguments, x: jax.Array, p: jax.Array, *, structure: Structure) -> jax.Array:
+    return Model(structure, arguments).terminal(x, p)
+
+
+def _trajectory(problem: Problem, e: int, run: Run) -> Trajectory:
+    """The start of every segment and the ends of all its rows that are not empty."""
     structure, system = problem.structures[e], problem.system
-    states = _pick(structure, path, path.before, path.after)
-    times = _pick(structure, path, path.layout.start, path.layout.end)
+    times = [_shown(part, part.start, part.end) for part in run.segments]
+    states = [_shown(part, part.before, part.after) for part in run.segments]
     modes = [
         np.full(len(part), structure.mode_names[mode])
         for part, mode in zip(times, structure.mode_of_segment, strict=True)
@@ -204,21 +297,29 @@ def _trajectory(problem: Problem, e: int, path: Path) -> Trajectory:
     return Trajectory(np.concatenate(times), np.concatenate(states), np.concatenate(modes), segments, names, units)
 
 
-def _comparisons(problem: Problem, e: int, path: Path, outputs: list[Outputs]) -> tuple[Comparison, ...]:
+def _shown(part: Segment, before: FloatArray, after: FloatArray) -> FloatArray:
+    """Of values at the starts and ends of a segment's rows those that a trajectory shows."""
+    return np.concatenate([before[:1], after[part.end > part.start]])
+
+
+def _comparisons(problem: Problem, e: int, run: Run, trajectory: Trajectory) -> tuple[Comparison, ...]:
     """Measured against fitted for each reference signal and each Measurements."""
-    structure, data = problem.structures[e], problem.experiments[e].data
-    times = np.concatenate(_pick(structure, path, path.layout.start, path.layout.end))
-    names = _trajectory(problem, e, path).state_names
+    data, times = problem.experiments[e].data, trajectory.times
+    curves = np.concatenate([_shown(part, part.y_before, part.y_after) for part in run.segments])
     comparisons = []
     items = [d for d in data if isinstance(d, ReferenceSignal)] + [d for d in data if isinstance(d, Measurements)]
-    for item, output in zip(items, outputs, strict=True):
-        curve = np.concatenate(_pick(structure, path, output.before, output.after))
-        default = names if item.observe is None else tuple(f"y{k + 1}" for k in range(curve.shape[1]))
+    first = 0
+    for item in items:
+        q = item.signal.channels if isinstance(item, ReferenceSignal) else item.values.shape[1]
+        channels = slice(first, first + q)
+        first += q
+        curve = curves[:, channels]
+        default = trajectory.state_names if item.observe is None else tuple(f"y{k + 1}" for k in range(q))
         label = item.names or default
         if isinstance(item, ReferenceSignal):
             here = Comparison("reference", label, times, item.signal(times), curve, None, times, curve)
         else:
-            fitted = np.asarray(output.at_samples)[: len(item.times)]
+            fitted = run.at_cells(run.mesh.cell_ending_at(item.times), channels)
             sigma = None if item.sigma is None else np.broadcast_to(item.sigma, item.values.shape).copy()
             here = Comparison("measurements", label, item.times, item.values, fitted, sigma, times, curve)
         comparisons.append(here)

@@ -32,8 +32,9 @@ class Fits:
     runs : (R,) int
         Number of each fit, from 0.
     start, theta : (R, d)
-    cost, optimality : (R,)
+    cost : (R,)
     gradient, hessian : (R, d), (R, d, d)
+    optimality : (R,)
     iterations, evaluations : (R,) int
     status : (R,) str
         Name of the `Status` of each.

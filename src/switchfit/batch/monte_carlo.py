@@ -335,10 +335,10 @@ def _cells_of(item: ReferenceSignal, values: FloatArray, mesh: Mesh) -> FloatArr
 
     All R at once: interpolation and filter treat channels one by one, so that runs can be channels too.
     """
-    assert item.samples is not None
     R, K, q = values.shape
-    table = np.where(np.isnan(item.samples[1]), np.nan, values)
+    times, measured = item.samples  # type: ignore[misc]  # there are some: they have been simulated
+    table = np.where(np.isnan(measured), np.nan, values)
     channels = np.moveaxis(table, 0, 1).reshape(K, R * q)
-    signal = ReferenceSignal.from_samples(item.samples[0], channels, lowpass_hz=item.lowpass_hz).signal
+    signal = ReferenceSignal.from_samples(times, channels, lowpass_hz=item.lowpass_hz).signal
     cells = by_cell(signal, mesh)
     return np.moveaxis(cells.reshape(*cells.shape[:2], R, q), 2, 0)
