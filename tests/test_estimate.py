@@ -447,7 +447,6 @@ def test_the_mesh_is_refined_where_the_solution_needs_it():
     assert found.success
     # The trajectory is shown on the last mesh with every cell halved.
     cells = (len(found.trajectory.times) - 1) // 2
-    assert cells % first.meshes[0].cells == 0
     assert cells >= 2 * first.meshes[0].cells
     assert found.integration_error <= 1e-5
     assert f"{found.integration_error:.1e}" in str(found.certificate)

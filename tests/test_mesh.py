@@ -15,7 +15,7 @@ from switchfit.evaluate import Evaluator
 from switchfit.mesh import CHUNK, Mesh, chunk_count, padded_length, row_ending_cell, rows
 from switchfit.model import Model, float64
 from switchfit.propagate import path_cost, propagate
-from switchfit.refine import fixed_nodes, refined_mesh
+from switchfit.refine import _solve, _solve_compiled, fixed_nodes, refined_mesh
 
 # Rows
 
@@ -315,3 +315,45 @@ def test_default_tolerances_give_the_cost_to_about_1e_8(make, solver, gap):
     found, exact = cost_of(make(), solver=solver), cost_of(make(), solver=solver, rtol=1e-12, atol=1e-14)
     assert found == pytest.approx(exact, rel=gap)
     assert found != exact
+
+
+# The adaptive solve
+
+
+def swinging(t, x, p, u):
+    return jnp.array([x[1], -4.0 * x[0] + u - 0.3 * x[1] ** 3])
+
+
+def test_the_compiled_solver_takes_the_steps_of_scipy():
+    """Also across the knots of a reference signal, from rest (a first step of its own kind) and in two modes."""
+    times = np.linspace(0.0, 6.0, 14)
+    signal = sf.ReferenceSignal.from_samples(times, np.sin(times))
+    system = sf.HybridSystem({"a": swinging, "b": lambda t, x, p, u: jnp.array([-x[0], -8.0 * x[1]])}, [0.0, 0.0])
+    inputs = sf.Input([0.0, 2.5, 6.0], [0.0, 3.0, -1.0], kind="linear")
+    data = sf.ReferenceSignal(signal.signal, observe=lambda t, x, p: x[:1])
+    run = sf.Experiment(data, ("a", "b", "a"), (1.7, 2.9), 0.0, 6.0, inputs=inputs)
+    problem = sf.Problem(system, run)
+    coarse = Mesh.from_times(fixed_nodes(run))
+    arguments = jax.tree.map(np.asarray, problem.arguments(0, coarse))
+    given = (problem, problem.structures[0], arguments.without_mesh(), arguments.signals, coarse)
+    for mode, start, end, x in ((0, 0.0, 1.7, [0.0, 0.0]), (1, 1.7, 2.5, [0.4, 1.0]), (0, 2.9, 6.0, [0.1, -0.2])):
+        with float64():
+            steps, after = _solve_compiled(*given, mode, start, end, np.array(x), np.zeros(0))
+            expected, state = _solve(*given, mode, start, end, np.array(x), np.zeros(0))
+        assert len(steps) == len(expected) > 10
+        np.testing.assert_allclose(steps, expected, rtol=0, atol=1e-4 * (end - start))
+        np.testing.assert_allclose(after, state, rtol=0, atol=1e-8)
+
+
+def test_a_mesh_for_several_thetas_is_as_dense_as_the_densest():
+    system = sf.HybridSystem(
+        {"fast": lambda t, x, p: -40.0 * (x - jnp.cos(9 * t)), "slow": lambda t, x, p: -0.1 * x}, [1.0]
+    )
+    run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("fast", "slow"), (1.0,), 0.0, 10.0)
+    problem = sf.Problem(system, run)
+    early, late = np.array([1.0]), np.array([8.0])
+    counts = [refined_mesh(problem, 0, *thetas).cells for thetas in ((early,), (late,), (early, late), (late, early))]
+    assert counts[0] < 0.3 * counts[1]
+    assert counts[2] == counts[3]
+    assert counts[1] <= counts[2] <= counts[1] + counts[0]
+    assert refined_mesh(problem, 0, early, finer=2.0).cells == pytest.approx(2 * counts[0], rel=0.1)

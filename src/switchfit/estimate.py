@@ -19,6 +19,7 @@ from switchfit.evaluate import Evaluation, Evaluator, evaluator_of
 from switchfit.io.json import load_fit, save_fit
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
 from switchfit.problem import Problem
+from switchfit.refine import refined_mesh
 from switchfit.report.plot import plot_fit
 from switchfit.report.text import report
 from switchfit.result import Certificate, Fit
@@ -154,7 +155,7 @@ def estimate(
         done = result.status in (Status.INTERRUPTED, Status.NONFINITE_START) or attempt == REFINEMENTS
         if done or not excess > 1:
             break
-        evaluator = evaluator.divided(2 ** max(int(np.ceil(np.log2(excess) / ORDER)), 1))
+        evaluator = _refined(evaluator, problem.checked_theta(start), theta, excess)
     return _estimate(
         problem,
         evaluator,
@@ -169,6 +170,17 @@ def estimate(
         integration_error=float(error),
         seconds=time.perf_counter() - began,
     )
+
+
+def _refined(evaluator: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:
+    """The problem on finer meshes: cells cut in two, or, where that is not enough, refined at the start and at theta.
+
+    A mode that has come to be active in another part of the horizon may find cells there that are far too long for it.
+    """
+    problem = evaluator.problem
+    if excess <= 2**ORDER:
+        return evaluator.divided()
+    return Evaluator(problem, meshes=[refined_mesh(problem, e, start, theta) for e in range(len(problem.experiments))])
 
 
 def _numbered_on(record: IterationRecord, after: IterationRecord | None) -> IterationRecord:

@@ -1,13 +1,16 @@
 """Choosing the mesh: how short the steps have to be, from one adaptive solve at a given theta.
 
-The adaptive solve is SciPy's, with the same order as the fixed steps that follow. It also integrates the running
-costs, so that they are resolved as well. Its steps are turned into a refinement of the intervals between the nodes
-that have to be there anyway; the mesh then stays as it is while theta moves.
+The adaptive solve has the same order as the fixed steps that follow. It also integrates the running costs, so that
+they are resolved as well. Its steps are turned into a refinement of the intervals between the nodes that have to be
+there anyway; the mesh then stays as it is while theta moves.
+
+Explicit solves take SciPy's RK45 step by step, in a compiled loop: a hundred steps cost a tenth of a millisecond there,
+ten in Python. SciPy itself solves stiff modes, and says what is wrong where a solve fails.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -16,6 +19,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.integrate
+from jax import lax
+from scipy.integrate import RK45
 
 from switchfit.cache import compilation_cache
 from switchfit.data import FloatArray, Measurements
@@ -23,6 +28,7 @@ from switchfit.experiment import Experiment, signals_of
 from switchfit.mesh import Mesh
 from switchfit.model import Arguments, Model, Piece, Structure, float64
 from switchfit.problem import Problem
+from switchfit.rungekutta import combine
 
 MAX_STEPS = 200_000
 """Adaptive steps in one mode before it is called stiff."""
@@ -118,7 +124,8 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
             stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
             for start, end in pairwise(stops.tolist()):
                 if end > start:
-                    accepted, x = _solve(problem, structure, arguments, signals, coarse, mode, start, end, x, p)
+                    solve = _solve_compiled if problem.solver == "explicit" else _solve
+                    accepted, x = solve(problem, structure, arguments, signals, coarse, mode, start, end, x, p)
                     steps.append(accepted)
     return np.concatenate(steps)
 
@@ -173,7 +180,122 @@ def _solve(
     return np.array(accepted[1:]), np.asarray(solver.y[:-1])
 
 
-def _too_many(accepted: list[float], end: float) -> bool:
+STEPS_AT_ONCE = 256
+"""Steps of the compiled solver in one call."""
+
+
+def _solve_compiled(
+    problem: Problem,
+    structure: Structure,
+    arguments: Arguments,
+    signals: FloatArray,
+    coarse: Mesh,
+    mode: int,
+    start: float,
+    end: float,
+    x: FloatArray,
+    p: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """The same as `_solve` for the explicit method, which takes over where this one fails."""
+    if signals.shape[2]:
+        length = 1 << (len(coarse.nodes) - 1).bit_length()  # few shapes, few programs
+        nodes = np.concatenate([coarse.nodes, np.repeat(coarse.nodes[-1:], length - len(coarse.nodes))])
+        cells = np.concatenate([signals, np.repeat(signals[-1:], length - 1 - len(signals), axis=0)])
+    else:
+        nodes, cells = np.asarray(arguments.nodes), np.asarray(arguments.signals)
+    accepted = np.array([start])
+    t, y, h = np.asarray(start), np.append(x, 0.0), np.asarray(np.nan)
+    while t < end and not _too_many(accepted, end):
+        now = (t, start, end, y, h, p, problem.rtol, problem.atol)
+        result = _steps(arguments, nodes, cells, mode, *now, structure=structure.functions)
+        times, count, t, y, h = (np.asarray(value) for value in result)
+        if count == 0 or not np.isfinite(y).all():
+            break
+        accepted = np.append(accepted, times[:count])
+    if t < end or not np.isfinite(y).all():
+        return _solve(problem, structure, arguments, signals, coarse, mode, start, end, x, p)
+    return accepted[1:], y[:-1]
+
+
+@partial(jax.jit, static_argnames=("structure",))
+def _steps(
+    arguments: Arguments,
+    nodes: jax.Array,
+    signals: jax.Array,
+    mode: jax.Array,
+    t: jax.Array,
+    start: jax.Array,
+    end: jax.Array,
+    y: jax.Array,
+    h: jax.Array,
+    p: jax.Array,
+    rtol: jax.Array,
+    atol: jax.Array,
+    *,
+    structure: Structure,
+) -> tuple[jax.Array, ...]:
+    """Up to `STEPS_AT_ONCE` accepted steps of SciPy's RK45 from t: their ends, their number, t, y, and the next step.
+
+    NaN for h asks for a first step. A step that would be too short to change t ends the loop.
+    """
+    model = Model(structure, arguments)
+    A, B, C, E = RK45.A, RK45.B, RK45.C, RK45.E
+    tiny = jnp.finfo(float).eps
+
+    def f(t: jax.Array, y: jax.Array) -> jax.Array:
+        inside = jnp.clip(t, jnp.nextafter(start, end), jnp.nextafter(end, start))
+        cell = jnp.clip(jnp.searchsorted(nodes, inside, side="right") - 1, 0, len(signals) - 1)
+        piece = Piece(nodes[cell], signals[cell])
+        cost = model.density(piece)(t, y[:-1], p) if model.has_running_cost else jnp.zeros(())
+        fields = [model.field(k, piece) for k in range(len(structure.modes))]
+        slope = fields[0](t, y[:-1], p) if len(fields) == 1 else lax.switch(mode, fields, t, y[:-1], p)
+        return jnp.append(slope, cost)
+
+    def size(error: jax.Array, y: jax.Array, other: jax.Array) -> jax.Array:
+        """Error in units of the tolerance: root mean square."""
+        scale = atol + rtol * jnp.maximum(jnp.abs(y), jnp.abs(other))
+        return jnp.sqrt(jnp.mean((error / scale) ** 2))
+
+    def first_step() -> jax.Array:
+        """Hairer, Norsett and Wanner I, section II.4, as SciPy has it."""
+        slope = f(t, y)
+        of_state, of_slope = size(y, y, y), size(slope, y, y)
+        small = (of_state < 1e-5) | (of_slope < 1e-5)
+        guess = jnp.minimum(jnp.where(small, 1e-6, 0.01 * of_state / of_slope), end - t)
+        bend = size(f(t + guess, y + guess * slope) - slope, y, y) / guess
+        flat = (of_slope <= 1e-15) & (bend <= 1e-15)
+        other = jnp.where(flat, jnp.maximum(1e-6, guess * 1e-3), (0.01 / jnp.maximum(of_slope, bend)) ** 0.2)
+        return jnp.minimum(jnp.minimum(100 * guess, other), end - t)
+
+    def turn(state: Any) -> Any:
+        t, y, h, times, count, refused, stuck = state
+        h = jnp.where(t + h >= end, end - t, h)
+        K = [f(t, y)]
+        for row, c in zip(A[1:], C[1:], strict=True):
+            K.append(f(t + c * h, y + h * combine(row[: len(K)], K)))
+        after = y + h * combine(B, K)
+        K.append(f(t + h, after))
+        error = size(h * combine(E, K), y, after)
+        accepted = error < 1
+        factor = jnp.where(error == 0, 10.0, jnp.clip(0.9 * error**-0.2, 0.2, 10.0))
+        factor = jnp.where(jnp.isnan(error), 0.2, jnp.where(accepted & refused, jnp.minimum(1.0, factor), factor))
+        reached = jnp.where(h == end - t, end, t + h)
+        times = times.at[count].set(jnp.where(accepted, reached, times[count]))
+        stuck = jnp.minimum(h, h * factor) <= 10 * tiny * jnp.abs(t)
+        t, y = jnp.where(accepted, reached, t), jnp.where(accepted, after, y)
+        return t, y, h * factor, times, count + accepted, ~accepted, stuck
+
+    def goes_on(state: Any) -> jax.Array:
+        t, _, _, _, count, _, stuck = state
+        return (t < end) & (count < STEPS_AT_ONCE) & ~stuck
+
+    none = jnp.zeros((), bool)
+    begin = (t, y, jnp.where(jnp.isnan(h), first_step(), h), jnp.zeros(STEPS_AT_ONCE), jnp.zeros((), int), none, none)
+    t, y, h, times, count, _, _ = lax.while_loop(goes_on, turn, begin)
+    return times, count, t, y, h
+
+
+def _too_many(accepted: Sequence[float] | FloatArray, end: float) -> bool:
     """Whether more than `MAX_STEPS` have been taken, or will be at the pace of the last `PACE` steps."""
     if len(accepted) < 5 * PACE:
         return False

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from typing import Any, Literal
 
 import jax.numpy as jnp
@@ -80,6 +82,32 @@ def skid_steer(
             raise ValueError(f"{name} must be four numbers, one for each wheel; got {forces!r}.")
     if restick not in ("continuous", "reset"):
         raise ValueError(f"restick must be 'continuous' or 'reset'; got {restick!r}.")
+    driving = tuple(map(float, stick_forces)), tuple(map(float, slip_forces))
+    stick, slip, at_restick = _functions(*driving, m_b, m_w, B_l, B_w, a, b, c_1, c_2, g)
+    return HybridSystem(
+        modes={"stick": stick, "slip": slip},
+        initial_state=initial_state,
+        reset_maps={("slip", "stick"): at_restick} if restick == "reset" else {},
+        state_names=("X", "dX", "Y", "dY", "theta", "dtheta"),
+        state_units=("m", "m/s", "m", "m/s", "rad", "rad/s"),
+    )
+
+
+@cache
+def _functions(
+    stick_forces: tuple[float, ...],
+    slip_forces: tuple[float, ...],
+    m_b: float,
+    m_w: float,
+    B_l: float,
+    B_w: float,
+    a: float,
+    b: float,
+    c_1: float,
+    c_2: float,
+    g: float,
+) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
+    """Vector fields and reset map; the same functions for the same constants, so that nothing is compiled twice."""
     m = m_b + 4 * m_w
     inertia = 4 * m_w * (12 * a**2 + 12 * b**2) + m_b * (B_l**2 + B_w**2)
     total_stick, total_slip = sum(stick_forces), sum(slip_forces)
@@ -107,10 +135,4 @@ def skid_steer(
         along = cos * dX + sin * dY
         return jnp.stack([X, along * cos, Y, along * sin, theta, jnp.zeros_like(dtheta)])
 
-    return HybridSystem(
-        modes={"stick": stick, "slip": slip},
-        initial_state=initial_state,
-        reset_maps={("slip", "stick"): at_restick} if restick == "reset" else {},
-        state_names=("X", "dX", "Y", "dY", "theta", "dtheta"),
-        state_units=("m", "m/s", "m", "m/s", "rad", "rad/s"),
-    )
+    return stick, slip, at_restick

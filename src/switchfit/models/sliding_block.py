@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import jax.numpy as jnp
@@ -38,6 +40,19 @@ def sliding_block(*, g: float = 9.81) -> HybridSystem:
     badly: the rest position is stationary in it exactly where the body comes to rest by itself.
     """
 
+    slide, stick, initial_state = _functions(g)
+    return HybridSystem(
+        modes={"slide": slide, "stick": stick},
+        initial_state=initial_state,
+        state_names=("x", "y", "vx", "vy"),
+        state_units=("m", "m", "m/s", "m/s"),
+    )
+
+
+@cache
+def _functions(g: float) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
+    """Vector fields and initial state; the same functions for the same g, so that nothing is compiled twice."""
+
     def slide(t: Any, x: Any, p: Any) -> Any:
         speed = jnp.sqrt(p["vx0"] ** 2 + p["vy0"] ** 2)
         deceleration = p["mu"] * g / speed
@@ -49,9 +64,4 @@ def sliding_block(*, g: float = 9.81) -> HybridSystem:
     def initial_state(p: Any) -> Any:
         return jnp.stack([p["x0"], p["y0"], p["vx0"], p["vy0"]])
 
-    return HybridSystem(
-        modes={"slide": slide, "stick": stick},
-        initial_state=initial_state,
-        state_names=("x", "y", "vx", "vy"),
-        state_units=("m", "m", "m/s", "m/s"),
-    )
+    return slide, stick, initial_state
