@@ -209,9 +209,9 @@ def _solve_compiled(
         now = (t, start, end, y, h, p, problem.rtol, problem.atol)
         result = _steps(arguments, nodes, cells, mode, *now, structure=structure.functions)
         times, count, t, y, h = (np.asarray(value) for value in result)
-        if count == 0 or not np.isfinite(y).all():
-            break
         accepted = np.append(accepted, times[:count])
+        if count < STEPS_AT_ONCE:
+            break
     if t < end or not np.isfinite(y).all():
         return _solve(problem, structure, arguments, signals, coarse, mode, start, end, x, p)
     return accepted[1:], y[:-1]
