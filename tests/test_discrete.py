@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from systems import KINDS, NODES, P0, Case, Derivatives, case, compiled, padded_mesh, problem_of, weighted
 
+from switchfit.derivatives import first_order
 from switchfit.model import Model
 from switchfit.propagate import propagate
 
@@ -37,6 +38,18 @@ def assert_all_same(this: Case, *at: object) -> None:
 def test_adjoint_forward_and_autodiff_agree(name: str, kind: str) -> None:
     this = case(name)
     assert_all_same(this, this.arguments(kind), INSIDE[name], P0)
+
+
+@pytest.mark.parametrize("name", ["resets", "stiff"])
+def test_derivatives_at_the_stages_that_are_found_again(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On long meshes they are not kept; the Gauss-Newton matrix takes them too."""
+    kept, at = case(name), (case(name).arguments(), INSIDE[name], P0)
+    expected = kept.discrete(*at)
+    monkeypatch.setattr(first_order, "KEPT", 0)
+    found = Case(kept.problem).discrete(*at)
+    assert_same(found, expected, 1e-9 if name == "stiff" else 1e-13)
+    largest = np.abs(expected.gauss_newton).max()
+    np.testing.assert_allclose(found.gauss_newton, expected.gauss_newton, rtol=0, atol=1e-9 * largest)
 
 
 @pytest.mark.parametrize("side", [-1, 1])

@@ -27,6 +27,7 @@ from switchfit.derivatives.first_order import (
     parameter_directions,
     sample_gradients,
     stage_time_directions,
+    stages_along,
     time_directions,
 )
 from switchfit.mesh import row_ending_cell
@@ -62,7 +63,7 @@ def adjoint_hessian(model: Model, first: FirstOrder, tau: Array, p: Array) -> Ar
     """Hessian (D, D) of the discretised cost."""
     path, X = first.path, first.tangents
     psi = costates(model, first, p)
-    H = stage_curvature(model, path, X, psi, p) + step_length_curvature(model, first, psi)
+    H = stage_curvature(model, first, psi, p) + step_length_curvature(model, first, psi)
     P = parameter_directions(model)
     for i in model.structure.resets:
         along = (jnp.arange(P.shape[1]) == i) * 1.0, X.before_transition(path.layout, i), P
@@ -85,7 +86,7 @@ def gauss_newton_hessian(model: Model, first: FirstOrder, p: Array) -> Array:
     """
     path, X = first.path, first.tangents
     P = parameter_directions(model)
-    H = stage_gauss_newton(model, path, X, p)
+    H = stage_gauss_newton(model, first, p)
     for k, samples in enumerate(model.arguments.samples):
         H = H + sample_curvature(model, path, X, k, samples, p, gauss_newton=True)
     if model.structure.terminal:
@@ -106,9 +107,9 @@ def costates(model: Model, first: FirstOrder, p: Array) -> Costates:
         jumps = jumps.at[where].add(sample_gradients(model, path, k, samples, p)[1])
 
     def row(psi: Array, given: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
-        h, f_x, l_x, jump = given
+        h, f_x, jump, *l_x = given
         psi = psi + jump
-        w, mu, before = stage_adjoints(model.tableau, h, f_x, l_x, psi)
+        w, mu, before = stage_adjoints(model.tableau, h, f_x, l_x[0] if l_x else jnp.zeros(f_x.shape[:2]), psi)
         return before, (psi, w, mu)
 
     def chunk(psi: Array, given: tuple[Array, Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
@@ -119,17 +120,19 @@ def costates(model: Model, first: FirstOrder, p: Array) -> Costates:
 
     layout = path.layout
     final = jax.grad(model.terminal)(path.after[-1, -1], p) if model.structure.terminal else jnp.zeros(n)
-    operands = (layout.end - layout.start, jacobians.f_x, jacobians.l_x, jumps[1:].reshape(Q, C, n))
+    of_ell = (jacobians.l_x,) if model.has_running_cost else ()
+    operands = (layout.end - layout.start, jacobians.f_x, jumps[1:].reshape(Q, C, n), *of_ell)
     psi, columns = lax.scan(chunk, final, (layout.segment, layout.opens, operands), reverse=True)
     return Costates(psi + jumps[0], *columns)
 
 
-def stage_curvature(model: Model, path: Path, X: Tangents, psi: Costates, p: Array) -> Array:
+def stage_curvature(model: Model, first: FirstOrder, psi: Costates, p: Array) -> Array:
     """``sum Z_j' D^2 (w_j . f + h b_j ell) Z_j`` over the stages of all rows, Z_j that of (t_j, X_j, p): (D, D).
 
     Along theta directly, or along (t, x, p) where these are fewer.
     """
     n, M = model.structure.n, model.structure.M
+    path, X = first.path, first.tangents
     P = parameter_directions(model)
     local = 1 + n + M < P.shape[1]
     basis = jnp.eye(1 + n + M)
@@ -147,17 +150,26 @@ def stage_curvature(model: Model, path: Path, X: Tangents, psi: Costates, p: Arr
             return Z.T @ _second(value, (t, x, p), (basis[0], basis[1 : 1 + n], basis[1 + n :])) @ Z
 
         def row(
-            start: Array, end: Array, piece: Piece, X: Array, w: Array, s_d: Array, e_d: Array, X_d: Array
+            start: Array,
+            end: Array,
+            piece: Piece,
+            states: Array,
+            w: Array,
+            s_d: Array,
+            e_d: Array,
+            *at_stages: Array,
         ) -> Array:
             h = end - start
+            X_d = stages_along(model, X.ends, h, s_d, e_d, *at_stages)
             times, times_d = start + model.tableau.c * h, stage_time_directions(model, s_d, e_d)
             over_stages = jax.vmap(at_stage, in_axes=(None, 0, 0, 0, 0, 0, 0))
-            return over_stages(piece, times, X, w, h * jnp.asarray(model.tableau.b), times_d, X_d).sum(0)
+            return over_stages(piece, times, states, w, h * jnp.asarray(model.tableau.b), times_d, X_d).sum(0)
 
         return lambda *operands: jax.vmap(row)(*operands).sum(0)
 
     layout = path.layout
-    operands = (layout.start, layout.end, path.pieces, path.stages, psi.w, *time_directions(model, layout), X.stages)
+    along = (*time_directions(model, layout), *X.at_stages)
+    operands = (layout.start, layout.end, path.pieces, path.stages, psi.w, *along)
     return _sum_over_chunks(model, of_mode, layout.segment, operands)
 
 
@@ -181,8 +193,9 @@ def step_length_curvature(model: Model, first: FirstOrder, psi: Costates) -> Arr
         def at(values: Array) -> Array:
             return by_row(values)[row]
 
-        J, X_d = jax.tree.map(at, first.jacobians), at(X.stages)
-        times_d = stage_time_directions(model, at(starts), at(ends))
+        J, start_d, end_d = jax.tree.map(at, first.jacobians), at(starts), at(ends)
+        X_d = stages_along(model, X.ends, at(layout.end - layout.start), start_d, end_d, *map(at, X.at_stages))
+        times_d = stage_time_directions(model, start_d, end_d)
         K_d = J.f_x @ X_d + J.f_t[:, :, None] * times_d[:, None] + J.f_p @ P
         total = jnp.einsum("n,s,snd->d", at(psi.after), b, K_d) + jnp.einsum("jn,js,snd->d", at(psi.mu), a, K_d)
         if model.has_running_cost:
@@ -195,8 +208,9 @@ def step_length_curvature(model: Model, first: FirstOrder, psi: Costates) -> Arr
     return half + half.T
 
 
-def stage_gauss_newton(model: Model, path: Path, X: Tangents, p: Array) -> Array:
+def stage_gauss_newton(model: Model, first: FirstOrder, p: Array) -> Array:
     """Gauss-Newton part of the running costs: (D, D)."""
+    path, X = first.path, first.tangents
     P = parameter_directions(model)
     if not model.has_running_cost:
         return jnp.zeros((P.shape[1], P.shape[1]))
@@ -214,13 +228,23 @@ def stage_gauss_newton(model: Model, path: Path, X: Tangents, p: Array) -> Array
             H = H + _second(value, (x, p), (x_d, P))
         return H
 
-    def row(start: Array, end: Array, piece: Piece, X: Array, s_d: Array, e_d: Array, X_d: Array) -> Array:
+    def row(
+        start: Array,
+        end: Array,
+        piece: Piece,
+        states: Array,
+        s_d: Array,
+        e_d: Array,
+        *at_stages: Array,
+    ) -> Array:
+        X_d = stages_along(model, X.ends, end - start, s_d, e_d, *at_stages)
         times, times_d = start + model.tableau.c * (end - start), stage_time_directions(model, s_d, e_d)
-        parts = jax.vmap(at_stage, in_axes=(None, 0, 0, 0, 0))(piece, times, X, times_d, X_d)
+        parts = jax.vmap(at_stage, in_axes=(None, 0, 0, 0, 0))(piece, times, states, times_d, X_d)
         return (end - start) * jnp.tensordot(jnp.asarray(model.tableau.b), parts, axes=1)
 
     layout = path.layout
-    operands = (layout.start, layout.end, path.pieces, path.stages, *time_directions(model, layout), X.stages)
+    along = (*time_directions(model, layout), *X.at_stages)
+    operands = (layout.start, layout.end, path.pieces, path.stages, *along)
     return _sum_over_chunks(model, lambda _: lambda *rows: jax.vmap(row)(*rows).sum(0), layout.segment, operands)
 
 

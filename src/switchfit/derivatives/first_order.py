@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +17,13 @@ from jax import lax
 from switchfit.mesh import Rows
 from switchfit.model import Model, Piece, Samples
 from switchfit.propagate import Path, at_cells, by_mode, by_row, propagate
-from switchfit.rungekutta import combine, end_tangents, stage_tangents
+from switchfit.rungekutta import combine, end_tangents, stage_adjoints, stage_tangents
 
 Array = jax.Array
+
+
+KEPT = 2**25
+"""Bytes up to which the derivatives at the stages are kept: finding them again takes a fifth of a Hessian's time."""
 
 
 class StageJacobians(NamedTuple):
@@ -28,16 +32,16 @@ class StageJacobians(NamedTuple):
     Attributes
     ----------
     f_t, f_x, f_p : (Q, C, s, n), (Q, C, s, n, n), (Q, C, s, n, M)
-    l, l_t, l_x, l_p : (Q, C, s), (Q, C, s), (Q, C, s, n), (Q, C, s, M)
+    l, l_t, l_x, l_p : (Q, C, s), (Q, C, s), (Q, C, s, n), (Q, C, s, M); no arrays where there is no running cost
     """
 
     f_t: Array
     f_x: Array
     f_p: Array
-    l: Array  # noqa: E741  # the paper's ell
-    l_t: Array
-    l_x: Array
-    l_p: Array
+    l: Any = None  # noqa: E741  # the paper's ell
+    l_t: Any = None
+    l_x: Any = None
+    l_p: Any = None
 
 
 class ResetJacobians(NamedTuple):
@@ -53,12 +57,16 @@ class Tangents(NamedTuple):
     Attributes
     ----------
     before, after : (Q, C, n, D), at the start and the end of each row
-    stages : (Q, C, s, n, D), at the stages of each row
+    ends : RowEnds
+    at_stages : tuple of arrays
+        From which `stages_along` has the derivatives at the stages: these themselves, (Q, C, s, n, D), where they take
+        up to `KEPT` bytes; otherwise what they follow from, since they need as much memory as all the rest.
     """
 
     before: Array
     after: Array
-    stages: Array
+    ends: RowEnds
+    at_stages: tuple[Array, ...]
 
     def before_transition(self, layout: Rows, i: int) -> Array:
         """At tau_i-: (n, D)."""
@@ -129,11 +137,12 @@ def stage_jacobians(model: Model, path: Path, p: Array) -> StageJacobians:
                 return jax.jvp(f, (t, x, p), (direction[0], direction[1 : 1 + n], direction[1 + n :]))[1]
 
             f_z = jax.vmap(column, out_axes=-1)(basis)
-            if model.has_running_cost:  # a scalar: backward is cheaper
-                l, gradient = jax.value_and_grad(model.density(piece), argnums=(0, 1, 2))(t, x, p)  # noqa: E741
-            else:
-                l, gradient = jnp.zeros(()), (jnp.zeros(()), jnp.zeros(n), jnp.zeros(M))  # noqa: E741
-            return StageJacobians(f_z[..., 0], f_z[..., 1 : 1 + n], f_z[..., 1 + n :], l, *gradient)
+            of_f = f_z[..., 0], f_z[..., 1 : 1 + n], f_z[..., 1 + n :]
+            if not model.has_running_cost:
+                return StageJacobians(*of_f)
+            # A scalar: backward is cheaper.
+            l, gradient = jax.value_and_grad(model.density(piece), argnums=(0, 1, 2))(t, x, p)  # noqa: E741
+            return StageJacobians(*of_f, l, *gradient)
 
         def row(start: Array, end: Array, piece: Piece, X: Array) -> StageJacobians:
             times = start + model.tableau.c * (end - start)
@@ -167,24 +176,26 @@ def reset_jacobians(model: Model, path: Path, tau: Array, p: Array) -> ResetJaco
 def tangents(model: Model, path: Path, jacobians: StageJacobians, resets: ResetJacobians | None, p: Array) -> Tangents:
     """``x_theta`` along the path: forward, linear, one row after another.
 
-    Only the first and the last row of a segment depend on a transition time directly: what that adds is found
-    before (to the state after the row) and put in afterwards (at its stages).
+    Only the first and the last row of a segment depend on a transition time directly: what that adds to the state after
+    the row is found before.
     """
     layout, tableau = path.layout, model.tableau
     b = tableau.b
     N, M = model.structure.N, model.structure.M
     ends = row_end_tangents(model, path, jacobians)
-    Q, C, s, n = path.stages.shape
+    Q, C, _, n = path.stages.shape
     extra = jnp.zeros((Q * C, n, N + M))
     index = jnp.arange(N)
     extra = extra.at[ends.rows, :, index].add(ends.after).reshape(Q, C, n, N + M)
+
+    keep = 8 * path.stages.size * (N + M) <= KEPT
 
     def row(X: Array, given: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         h, f_x, f_p, extra = given
         S = jnp.pad(f_p, ((0, 0), (0, 0), (N, 0)))
         stages_d, slopes_d = stage_tangents(tableau, h, f_x, S, X)
         after = X + h * combine(b, list(slopes_d)) + extra
-        return after, (X, after, stages_d)
+        return after, (X, after, stages_d) if keep else (X, after)
 
     def chunk(X: Array, given: tuple[Array, Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
         segment, opens, operands = given
@@ -194,9 +205,25 @@ def tangents(model: Model, path: Path, jacobians: StageJacobians, resets: ResetJ
 
     first = jax.jacfwd(model.initial_state)(p) @ parameter_directions(model)
     operands = (layout.end - layout.start, jacobians.f_x, jacobians.f_p, extra)
-    _, (before, after, stages) = lax.scan(chunk, first, (layout.segment, layout.opens, operands))
-    stages = stages.reshape(Q * C, s, n, N + M).at[ends.rows, :, :, index].add(ends.stages)
-    return Tangents(before, after, stages.reshape(Q, C, s, n, N + M))
+    _, (before, after, *kept) = lax.scan(chunk, first, (layout.segment, layout.opens, operands))
+    if not keep:
+        return Tangents(before, after, ends, (jacobians.f_x, jacobians.f_p, before))
+    stages = by_row(kept[0]).at[ends.rows, :, :, index].add(ends.stages)
+    return Tangents(before, after, ends, (stages.reshape(kept[0].shape),))
+
+
+def stages_along(model: Model, ends: RowEnds, h: Array, start_d: Array, end_d: Array, *given: Array) -> Array:
+    """Derivative (s, n, D) of the stage states of one row, given its `Tangents.at_stages`."""
+    if len(given) == 1:
+        return given[0]
+    f_x, f_p, x_d = given
+    N, M = model.structure.N, model.structure.M
+    S = jnp.pad(f_p, ((0, 0), (0, 0), (N, 0)))
+    X_d, _ = stage_tangents(model.tableau, h, f_x, S, x_d)
+    if N == 0:
+        return X_d
+    direct = start_d[:N, None, None] * ends.stages[0] + end_d[:N, None, None] * ends.stages[1]
+    return X_d + jnp.pad(jnp.moveaxis(direct, 0, -1), ((0, 0), (0, 0), (0, M)))
 
 
 class RowEnds(NamedTuple):
@@ -230,18 +257,31 @@ def running_cost_gradient(model: Model, path: Path, jacobians: StageJacobians, X
     P = parameter_directions(model)
     if not model.has_running_cost:
         return jnp.zeros(()), jnp.zeros(P.shape[1])
-    layout = path.layout
-    b = jnp.asarray(model.tableau.b)
-    weight = (layout.end - layout.start)[..., None] * b
-    starts, ends = time_directions(model, layout)
-    D = P.shape[1]  # products of flat arrays: XLA makes slow loops of the contractions they stand for
-    gradient = (weight[..., None] * jacobians.l_x).reshape(-1) @ X.stages.reshape(-1, D)
-    gradient = gradient + weight.reshape(-1) @ jacobians.l_p.reshape(weight.size, P.shape[0]) @ P
-    times_d = (weight * jacobians.l_t) @ jnp.stack([1 - model.tableau.c, model.tableau.c], axis=1)
-    by_start = times_d[..., 0] - jacobians.l @ b
-    by_end = times_d[..., 1] + jacobians.l @ b
-    gradient = gradient + by_start.reshape(-1) @ starts.reshape(-1, D) + by_end.reshape(-1) @ ends.reshape(-1, D)
-    return jnp.sum(weight * jacobians.l), gradient
+    layout, N = path.layout, model.structure.N
+    b, c = jnp.asarray(model.tableau.b), jnp.asarray(model.tableau.c)
+    h = layout.end - layout.start
+
+    def row(h: Array, J: StageJacobians, x_d: Array) -> Array:
+        """Through the state before the row, by the adjoint of its cost alone, and through the parameters."""
+        w, _, l_before = stage_adjoints(model.tableau, h, J.f_x, J.l_x, jnp.zeros(x_d.shape[0]))
+        by_p = jnp.einsum("sn,snm->m", w, J.f_p) + h * b @ J.l_p
+        return l_before @ x_d + by_p @ P
+
+    def beside(k: Array, stages_d: Array, t_d: Array, h_d: Array) -> Array:
+        """Through the time at which a row starts or ends: directly, and through its stages."""
+        J = jax.tree.map(lambda a: by_row(a)[k], jacobians)
+        rate = jnp.einsum("sn,sn->s", J.l_x, stages_d) + J.l_t * t_d
+        return by_row(h)[k] * (b @ rate) + h_d * (b @ J.l)
+
+    def chunk(gradient: Array, rows: tuple[Array, StageJacobians, Array]) -> tuple[Array, None]:
+        return gradient + jax.vmap(row)(*rows).sum(0), None
+
+    gradient, _ = lax.scan(chunk, jnp.zeros(P.shape[1]), (h, jacobians, X.before))
+    if N:
+        over = jax.vmap(jax.vmap(beside, in_axes=(0, 0, None, None)), in_axes=(0, 0, 0, 0))
+        direct = over(X.ends.rows, X.ends.stages, jnp.stack([1 - c, c]), jnp.array([-1.0, 1.0]))
+        gradient = gradient.at[:N].add(direct.sum(0))
+    return jnp.sum(h[..., None] * b * jacobians.l), gradient
 
 
 def sample_gradients(model: Model, path: Path, k: int, samples: Samples, p: Array) -> tuple[Array, Array, Array]:
