@@ -1,8 +1,12 @@
-"""How the cost of the Hessian grows: with the nodes of the mesh, and with the unknowns by method."""
+"""How the cost of the Hessian grows: with nodes, states, transitions and parameters, by method; and its memory."""
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -17,14 +21,63 @@ from switchfit.mesh import Mesh
 NODES = (500, 1000, 2000, 4000, 8000)
 HORIZON = 10.0
 METHODS = ("forward", "discrete-adjoint")
+GROWING = {
+    "states": ((2, 2, 2), (4, 2, 2), (8, 2, 2), (16, 2, 2), (32, 2, 2)),
+    "transitions": ((4, 1, 2), (4, 5, 2), (4, 10, 2), (4, 20, 2)),
+    "parameters": ((4, 2, 1), (4, 2, 5), (4, 2, 10), (4, 2, 20)),
+}
+"""(states, transitions, parameters) of each study."""
+
 MIX = {1: (1, 0), 2: (1, 1), 3: (2, 1), 4: (2, 2), 5: (3, 2), 6: (3, 3), 7: (4, 3), 8: (4, 4)}
 """Unknowns d: (transitions, parameters)."""
 
 
 def run(report: Report, quick: bool) -> None:
-    """Both studies."""
+    """All studies."""
     with_nodes(report, quick)
     with_unknowns(report, quick)
+    for what, cases in GROWING.items():
+        growing(report, what, cases[:2] if quick else cases)
+    memory(report, quick)
+
+
+def growing(report: Report, what: str, cases: tuple[tuple[int, int, int], ...]) -> None:
+    """One of states, transitions and parameters grows: 200 cells, all methods."""
+    rows = []
+    for states, transitions, parameters in cases:
+        problem = oscillators(transitions, parameters, states)
+        calls = {method: _call(problem, 200, method) for method in (*METHODS, "adjoint")}
+        timings = take_turns(calls, 15, block=3)
+        of = {method: timing.minimum for method, timing in timings.items()}
+        ours = of["discrete-adjoint"]
+        times = [ms(of[method]) for method in ("discrete-adjoint", "forward", "adjoint")]
+        ratios = [f"{of[method] / ours:.2f}" for method in ("forward", "adjoint")]
+        rows.append((states, transitions, parameters, *times, *ratios))
+        report.data[f"{what} {(states, transitions, parameters)}"] = {m: vars(t) for m, t in timings.items()}
+    report.section(f"Hessian against {what}: 200 cells (minima)")
+    header = ("states", "transitions", "parameters", "discrete-adjoint", "forward", "the paper's equations")
+    report.table((*header, "forward / discrete-adjoint", "the paper's / discrete-adjoint"), rows)
+
+
+def memory(report: Report, quick: bool) -> None:
+    """Long logs, each in a process of its own."""
+    rows = []
+    sizes = (10_000,) if quick else (10_000, 30_000, 100_000)
+    for method in ("discrete-adjoint",) if quick else ("discrete-adjoint", "forward", "adjoint"):
+        for size in sizes:
+            command = [sys.executable, "-m", "benchmarks.memory", str(size), method]
+            root = Path(__file__).parent.parent
+            done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True)
+            found = json.loads(done.stdout)
+            report.data[f"memory {method} {size}"] = found
+            of_all = f"{found['largest']:.0f} MB", f"{found['before']:.0f} MB"
+            rows.append((method, size, f"{found['seconds']:.3f} s", f"{found['first']:.1f} s", *of_all))
+            if method == "discrete-adjoint" and size == sizes[-1] and not quick:
+                report.target(f"(J, g, H) on {size} samples", 1.0, found["seconds"], "s")
+                report.target(f"memory of (J, g, H) on {size} samples", 1000.0, found["largest"], "MB")
+    report.section("(J, g, H) of long logs: 5 states, 5 transitions, 5 parameters, a step a sample")
+    header = ("method", "samples", "an evaluation", "the first", "largest memory of the process", "of it before")
+    report.table(header, rows)
 
 
 def oscillators(transitions: int, parameters: int, states: int = 4) -> sf.Problem:

@@ -129,6 +129,9 @@ def show(report: Report, name: str, sides: list[str], quick: bool) -> None:
             "ready": entry.ready,
             **{quantity: vars(timings[quantity][side]) for quantity in QUANTITIES if side in timings[quantity]},
         }
+    if name == "vehicle" and "CasADi SX" in timings["hessian"]:
+        ratio = timings["hessian"]["CasADi SX"].median / timings["hessian"]["switchfit"].median
+        report.target("(J, g, H) of the vehicle at 1e-8: CasADi SX / switchfit", 4.0, ratio, "x", at_least=True)
     rows += [(side, why, *[""] * 7) for side, why in missing.items()]
     report.note(f"**{TITLES[name]}**")
     header = ("", "setting", "J", "J, gradient", "J, gradient, Hessian")

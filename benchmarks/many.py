@@ -1,0 +1,137 @@
+"""Many fits at once: Monte Carlo on the paper's vehicle, in a process of its own that uses all cores.
+
+``python -m benchmarks.many RUNS`` prints what was measured as JSON; the part `many` runs it and makes the table.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+import switchfit as sf
+from benchmarks import vehicle
+from benchmarks.cold import _on
+from benchmarks.report import Report
+from switchfit.models import skid_steer
+
+TRUTH = np.array([*vehicle.TRUTH, vehicle.MU_TRUTH])
+START = np.array([*vehicle.START, vehicle.MU_START])
+STARTS = {"the truth": TRUTH, "the paper's start": START}
+SINGLE = 40
+TARGET = 2e-3
+"""Seconds a refit that were aimed at, on two cores."""
+
+
+def positions(t: Any, x: Any, p: Any) -> Any:
+    """What a GPS receiver sees."""
+    return x[jnp.array([0, 2])]
+
+
+def problem() -> sf.Problem:
+    """Positions at 1 Hz for 15 s, noise of 0.1 m."""
+    times = np.arange(0.0, 15.5, 1.0)
+    data = sf.Measurements(times, np.zeros((16, 2)), observe=positions, sigma=0.1, names=("X", "Y"))
+    run = sf.Experiment(data, vehicle.SEQUENCE, vehicle.START, *vehicle.HORIZON)
+    return sf.Problem(skid_steer(), run, {"mu": sf.Parameter(vehicle.MU_START, lower=0.05, upper=2.0)})
+
+
+def measure(runs: int) -> dict[str, Any]:
+    """Seconds a fit: `runs` refits at once, and some of them by `estimate`, one after the other."""
+    from switchfit.batch.monte_carlo import _clean, _meshes, _Work
+    from switchfit.estimate import minimized
+    from switchfit.evaluate import Evaluator
+
+    found: dict[str, Any] = {}
+    here = problem()
+    for name, start in STARTS.items():
+        began = time.perf_counter()
+        sf.monte_carlo(here, 64, theta=TRUTH, start=start)
+        first = time.perf_counter() - began
+        began = time.perf_counter()
+        study = sf.monte_carlo(here, runs, theta=TRUTH, start=start)
+        seconds = time.perf_counter() - began
+        work = _Work(here, [], TRUTH, start, None, 0, 1e-7, 200, _clean(here, TRUTH))
+        work.meshes = _meshes(work.problem_of(0), TRUTH, start)[0]
+        few = min(SINGLE, runs)
+        singles = [
+            minimized(Evaluator(work.problem_of(k), meshes=work.meshes), start, "exact", 1e-7, 200) for k in range(few)
+        ]
+        gap = max(float(np.max(np.abs(single.theta - study.theta[k]))) for k, single in enumerate(singles))
+        problems = [work.problem_of(k) for k in range(few)]
+        sf.estimate(problems[0], start=start)
+        began = time.perf_counter()
+        for single in problems:
+            sf.estimate(single, start=start)
+        found[name] = {
+            "runs": runs,
+            "seconds": seconds,
+            "first 64, with compilation": first,
+            "converged": int(study.success.sum()),
+            "iterations": float(np.median(study.iterations)),
+            "cells": work.meshes[0].cells,
+            "seconds of a single estimate": (time.perf_counter() - began) / few,
+            "largest difference to single fits": gap,
+            "coverage": study.coverage().tolist(),
+        }
+    return found
+
+
+def run(report: Report, quick: bool, cores: set[int] | None) -> None:
+    """The study in a process on all cores."""
+    runs = 500 if quick else 10_000
+    with _on(cores):
+        command = [sys.executable, "-m", "benchmarks.many", str(runs)]
+        root = Path(__file__).parent.parent
+        done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr}")
+    found = json.loads(done.stdout.splitlines()[-1])
+    report.section(
+        "Many fits at once",
+        f"`sf.monte_carlo` on {len(cores) if cores else 'all'} cores: positions of the vehicle at 1 Hz, noise of 0.1 m, "
+        f"{runs} runs. *Single*: median of the same fits by `estimate()`, one after the other, each on a mesh of its own. "
+        f"*Difference*: the largest in any unknown to single fits of the first {SINGLE} runs on the same mesh.",
+    )
+    report.table(
+        (
+            "every fit begins at",
+            "all",
+            "a fit",
+            "single",
+            "ratio",
+            "first 64, cold",
+            "converged",
+            "iterations",
+            "cells",
+            "difference",
+        ),
+        [
+            (
+                name,
+                f"{row['seconds']:.1f} s",
+                f"{1e3 * row['seconds'] / runs:.2f} ms",
+                f"{1e3 * row['seconds of a single estimate']:.1f} ms",
+                f"{row['seconds of a single estimate'] * runs / row['seconds']:.1f}",
+                f"{row['first 64, with compilation']:.1f} s",
+                f"{row['converged']} of {runs}",
+                f"{row['iterations']:.0f}",
+                row["cells"],
+                f"{row['largest difference to single fits']:.0e}",
+            )
+            for name, row in found.items()
+        ],
+    )
+    report.data["many"] = found
+    for name, row in found.items():
+        report.target(f"a refit of the vehicle from {name}", 1e3 * TARGET, 1e3 * row["seconds"] / runs, "ms")
+
+
+if __name__ == "__main__":
+    print(json.dumps(measure(int(sys.argv[1]))))
