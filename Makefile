@@ -5,13 +5,14 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: help demo test test-slow check format bench docs clean
+.PHONY: help demo test test-slow check format bench speed docs clean
 
 help:
 	@echo "make demo       fit a measured toss and the paper's simulated vehicle: reports, figures in out/"
 	@echo "make test       the tests;  make test-slow: statistics and long runs too"
 	@echo "make check      ruff and mypy;  make format: put the code into form"
-	@echo "make bench      measure speed;  make docs: build the documentation;  make clean: remove what was built"
+	@echo "make bench      measure speed;  make speed: and put the figures into the documentation"
+	@echo "make docs       build the documentation;  make clean: remove what was built"
 
 demo: $(VENV)/.installed
 	$(BIN)/switchfit fit examples/toss/problem.toml --out out/demo
@@ -34,6 +35,10 @@ format: $(VENV)/.installed-dev
 
 bench: $(VENV)/.installed-bench
 	$(BIN)/python -m benchmarks
+
+speed: bench
+	cp benchmarks/results/full.md docs/speed-results.md
+	cp benchmarks/results/full.json docs/speed-results.json
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/sphinx-build -W --keep-going -q docs out/docs

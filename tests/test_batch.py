@@ -362,6 +362,46 @@ def test_many_logs_are_the_same_as_single_estimates():
     assert "5 fits" in str(fits)
 
 
+def test_a_log_that_needs_a_finer_mesh_is_done_again_by_itself():
+    """The guess is slow and the truth fast: the mesh of the guess is too coarse for one of the logs."""
+
+    def follow(t, x, p):
+        return p["k"] * (jnp.cos(t) - x)
+
+    system = sf.HybridSystem({"follow": follow}, [0.0])
+    times, rng = np.linspace(0.4, 4.0, 10), np.random.default_rng(1)
+
+    def log(k):
+        exact = (k**2 * np.cos(times) + k * np.sin(times) - k**2 * np.exp(-k * times)) / (1 + k**2)
+        data = sf.Measurements(times, exact + 0.01 * rng.standard_normal(10), sigma=0.01)
+        return sf.Problem(system, sf.Experiment(data, ("follow",), (), 0.0, 4.0), {"k": 1.0}, rtol=1e-5, atol=1e-7)
+
+    problems = [log(1.0), log(12.0), log(1.1)]
+    fits = sf.estimate_many(problems)
+    on_its_mesh = minimized(evaluator_of(problems[1]), problems[1].initial_theta, "exact", 1e-7, 200)
+    assert abs(on_its_mesh.theta[0] - fits.theta[1, 0]) > 1e-5
+    for k, problem in enumerate(problems):
+        single = sf.estimate(problem)
+        np.testing.assert_allclose(fits.theta[k], single.theta, rtol=1e-5)
+        np.testing.assert_allclose(fits.standard_errors[k], single.standard_errors, rtol=1e-4)
+    assert fits.message.tolist() == ["", "", ""]
+
+
+def test_logs_that_end_at_a_kink_end_at_their_own_sample():
+    """A ramp that may start at a sample: the residual there says later, the one after it says earlier."""
+    modes = {"rest": lambda t, x, p: 0.0 * x, "ramp": lambda t, x, p: 1.0 + 0.0 * x}
+    system = sf.HybridSystem(modes, [0.0])
+
+    def log(shift):
+        data = sf.Measurements([1.0 + shift, 2.0 + shift], [-0.5, 1.3], sigma=1.0)
+        return sf.Problem(system, sf.Experiment(data, ("rest", "ramp"), (1.6,), 0.0, 3.0))
+
+    fits = sf.estimate_many([log(0.1), log(0.2), log(0.0)])
+    assert fits.status.tolist() == ["CONVERGED_AT_KINK"] * 3
+    np.testing.assert_array_equal(fits.theta[:, 0], [1.1, 1.2, 1.0])
+    assert fits.free.tolist() == [0, 0, 0]
+
+
 def test_logs_of_different_models_are_refused():
     with pytest.raises(ValueError, match="problem 1 differs from the first one"):
         sf.estimate_many([room(), sf.Problem(ROOM, room().experiments, {"k": sf.Parameter(1.0, fixed=True)})])

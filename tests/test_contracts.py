@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.evaluate import evaluator_of
+from switchfit.evaluate import derivatives, evaluator_of
 from switchfit.mesh import padded_length
+from switchfit.refine import _steps, initial_state
+from switchfit.simulate import _block, _terminal
 from switchfit.xla import SMALL_LOOPS
 
 # Nothing is compiled anew
@@ -102,6 +104,38 @@ def test_nothing_is_traced_in_a_second_fit(compiled):
     other = oscillator(tau=1.2, seed=2)
     assert cells_of(other) == cells_of(compiled)
     assert traces_of(lambda: sf.estimate(other)) == 0
+
+
+PROGRAMS = (derivatives, _block, _terminal, _steps, initial_state)
+
+
+def compiled_by(call):
+    """How many programs of each kind a call compiles."""
+    before = [program._cache_size() for program in PROGRAMS]
+    call()
+    return [program._cache_size() - count for program, count in zip(PROGRAMS, before, strict=True)]
+
+
+@pytest.mark.parametrize("change", [{}, {"samples": 40}, {"transitions": 3}], ids=["nothing", "samples", "transitions"])
+def test_another_number_of_samples_or_transitions_compiles_one_program_that_of_the_derivatives(change):
+    def room(samples=9, transitions=1):
+        times = np.linspace(0.2, 3.0, samples)
+        knots = np.linspace(0.0, 3.0, transitions + 2)[1:-1] + 0.01
+        data = sf.Measurements(times, np.sin(times), sigma=10.0)
+        modes = [("on", "off")[k % 2] for k in range(transitions + 1)]
+        return sf.Problem(ROOM, sf.Experiment(data, modes, knots, 0.0, 3.0), {"k": sf.Parameter(1.0, 0.5, 2.0)})
+
+    sf.estimate(room())
+    size = padded_length(evaluator_of(room()).meshes[0].cells)
+    if "samples" in change:
+        assert padded_length(evaluator_of(room(**change)).meshes[0].cells) > size
+    fits = []
+    counts = compiled_by(lambda: fits.append(sf.estimate(room(**change))))
+    assert fits[0].integration_error < 1e-8, "the mesh has not been refined after the fit"
+    assert counts == [1 if change else 0, 0, 0, 0, 0]
+
+
+ROOM = sf.HybridSystem({"on": lambda t, x, p: p["k"] * (1.0 - x), "off": lambda t, x, p: -p["k"] * x}, [0.3])
 
 
 def test_building_a_problem_calls_every_function_once():

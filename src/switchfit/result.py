@@ -166,18 +166,8 @@ class Fit:
         collapsed mode or a kink has variance 0 here. NaN where the cost has no noise model (anything but
         `Measurements`), the Hessian is not positive definite, or there are too few samples.
         """
-        d = len(self.theta)
-        Z = self.free_basis
         scale = self.residual_variance if self.sigma_known is False else 1.0
-        if self.sigma_known is None or np.isnan(scale) or not np.isfinite(self.hessian).all():
-            return np.full((d, d), np.nan)
-        reduced = Z.T @ self.hessian @ Z
-        size = 1 / np.sqrt(np.maximum(np.abs(np.diag(reduced)), np.finfo(float).tiny))
-        values, vectors = np.linalg.eigh(reduced * np.outer(size, size))
-        if len(values) and values[0] <= 1e-14:
-            return np.full((d, d), np.nan)
-        root = Z @ (size[:, None] * vectors / np.sqrt(values))
-        return scale * root @ root.T
+        return (np.nan if self.sigma_known is None else scale) * inverse_on(self.free_basis, self.hessian)
 
     @property
     def standard_errors(self) -> FloatArray:
@@ -206,6 +196,20 @@ class Fit:
         quantile = scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail)
         half = quantile * self.standard_errors
         return np.stack([self.theta - half, self.theta + half], axis=1)
+
+
+def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:
+    """``Z (Z' H Z)^-1 Z'``: (d, d); NaN where H is not finite, or not positive definite on the directions Z (d, k)."""
+    nothing = np.full(hessian.shape, np.nan)
+    if not np.isfinite(hessian).all():
+        return nothing
+    reduced = Z.T @ hessian @ Z
+    size = 1 / np.sqrt(np.maximum(np.abs(np.diag(reduced)), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(reduced * np.outer(size, size))
+    if len(values) and values[0] <= 1e-14:
+        return nothing
+    root = Z @ (size[:, None] * vectors / np.sqrt(values))
+    return np.asarray(root @ root.T)
 
 
 class FreeCurvature(NamedTuple):

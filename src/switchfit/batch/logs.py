@@ -16,7 +16,9 @@ from switchfit.batch.fits import Fits, as_fits, reporting, sample_count
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
 from switchfit.estimate import LARGEST_INTEGRATION_ERROR, estimate, sigma_known
 from switchfit.evaluate import evaluator_of, places_of
+from switchfit.optimize import Status
 from switchfit.problem import Problem
+from switchfit.result import inverse_on
 from switchfit.simulate import compare
 
 
@@ -126,8 +128,10 @@ class _Work:
         arrays["iterations"][k] += again.iterations
         arrays["evaluations"][k] += again.evaluations
         arrays["status"][k] = again.status.name
-        Z = again.free_basis
-        arrays["free"][k] = Z.shape[1]
+        arrays["free"][k] = again.free_basis.shape[1]
+        arrays["covariance"][k] = inverse_on(again.free_basis, again.hessian)
+        ordinary = again.status is Status.CONVERGED and not again.active
+        arrays["message"][k] = "" if ordinary else again.message
 
     def fingerprint(self) -> str:
         parts: list[Any] = ["logs", len(self.problems), self.tolerance, self.max_iterations]

@@ -31,11 +31,12 @@ from switchfit.model import Arguments, Structure, float64
 from switchfit.optimize import Status
 from switchfit.optimize.traced import Constraints, Outcome, minimize_traced
 from switchfit.problem import Problem
+from switchfit.result import inverse_on
 
 CHUNK = 32
 """Fits that one call of the program takes on a CPU."""
 
-CHUNK_IN_LOCKSTEP = 4096
+CHUNK_IN_LOCKSTEP = 1024
 """The same on a GPU, where they go in lockstep."""
 
 
@@ -277,6 +278,7 @@ def _finished(
         values = tuple(value[k] for value in varying.values)
         with float64():
             evaluator.arguments = list(replaced(base, varying.places, [jnp.asarray(value) for value in values]))
+        evaluator.meshes = [Mesh.from_times(np.asarray(own.nodes)) for own in evaluator.arguments]
         left = max(max_iterations - int(found["iterations"][k]), 0)
         result = minimized(evaluator, found["theta"][k], "exact", tolerance, left, None)
         for name in ("theta", "cost", "gradient", "hessian", "optimality"):
@@ -286,9 +288,6 @@ def _finished(
         found["evaluations"][k] += result.evaluations
         status[k] = result.status.name
         message[k] = with_names(result.message, problem.unknowns.names)
-        Z = result.free_basis
-        free[k] = Z.shape[1]
-        reduced = Z.T @ result.hessian @ Z
-        if np.isfinite(reduced).all() and (Z.shape[1] == 0 or result.smallest_eigenvalue > 0):
-            covariance[k] = Z @ np.linalg.solve(reduced, Z.T)
+        free[k] = result.free_basis.shape[1]
+        covariance[k] = inverse_on(result.free_basis, result.hessian)
     return Chunk(**found, status=status.astype(str), message=message.astype(str), free=free, covariance=covariance)
