@@ -39,6 +39,7 @@ def root(t, x, p):
 
 
 ROOM = sf.HybridSystem({"on": heating, "off": cooling}, [0.2])
+OTHER = sf.HybridSystem({"on": lambda t, x, p: 2.0 * heating(t, x, p), "off": cooling}, [0.2])
 
 
 def room(data=None, guess=(1.7, 1.0), upper=5.0, **settings):
@@ -434,10 +435,18 @@ def test_a_folder_of_another_run_is_refused(tmp_path):
     sf.monte_carlo(room(), 2, theta=TRUTH, folder=tmp_path / "a")
     with pytest.raises(ValueError, match="holds the results of another run"):
         sf.monte_carlo(room(), 2, theta=TRUTH, folder=tmp_path / "a", seed=1)
+    sf.multistart(room(), 2, folder=tmp_path / "c")
+    with pytest.raises(ValueError, match="holds the results of another run"):
+        sf.multistart(sf.Problem(OTHER, room().experiments, room().parameters), 2, folder=tmp_path / "c")
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "notes.txt").write_text("mine")
     with pytest.raises(ValueError, match="holds other files"):
         sf.monte_carlo(room(), 2, theta=TRUTH, folder=tmp_path / "b")
+
+
+def test_a_client_that_is_none_is_refused():
+    with pytest.raises(TypeError, match=r"client must be a dask\.distributed\.Client; got str"):
+        sf.monte_carlo(room(), 2, theta=TRUTH, client="scheduler:8786")
 
 
 class Interrupted:

@@ -138,6 +138,8 @@ class _Work:
         for problem in self.problems:
             leaves = jax.tree.leaves(tuple(evaluator_of(problem).arguments))
             parts += [problem.theta_names, problem.initial_theta, *map(np.asarray, leaves)]
+        first = self.problems[0]
+        parts.append(compare(first, first.initial_theta, evaluator_of(first).meshes)[0])  # stands for the functions
         return fingerprint(*parts)
 
 

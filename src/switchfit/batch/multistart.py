@@ -23,6 +23,7 @@ from switchfit.mesh import Mesh
 from switchfit.optimize.qp import solve_qp
 from switchfit.problem import Problem
 from switchfit.report.batch import plot_waterfall
+from switchfit.simulate import compare
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -150,7 +151,8 @@ class _Work:
         unknowns = self.problem.unknowns
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b
         leaves = jax.tree.leaves([self.problem.arguments(e, mesh) for e, mesh in enumerate(self.meshes)])
-        settings = self.tolerance, self.max_iterations, unknowns.names
+        first = compare(self.problem, self.starts[0], self.meshes)[0]  # stands for the functions of the model
+        settings = self.tolerance, self.max_iterations, unknowns.names, first
         return fingerprint("multistart", settings, self.starts, *bounds, *map(np.asarray, leaves))
 
 
