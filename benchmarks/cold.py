@@ -22,7 +22,7 @@ IMPORT = [sys.executable, "-c", "import switchfit"]
 NOTHING = [sys.executable, "-c", "pass"]
 EMPTY, FILLED = "switchfit fit toss, empty cache", "switchfit fit toss, filled cache"
 SAME_ANSWER = 1e-6
-TARGETS = {EMPTY: 6.0, FILLED: 2.5, "import switchfit": 1.2}
+TARGETS = {EMPTY: 4.0, FILLED: 2.0, "import switchfit": 1.2}
 
 
 def run(report: Report, quick: bool, cores: set[int] | None) -> None:

@@ -1,6 +1,13 @@
 """Sphinx configuration; `make docs` builds to out/docs."""
 
+import sys
 from importlib.metadata import version as installed_version
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+from speed_figures import draw  # noqa: E402  # it stands beside this file
+
+draw(Path(__file__).parent / "_figures")
 
 project = "switchfit"
 author = "switchfit developers"
