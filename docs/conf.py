@@ -5,7 +5,7 @@ from importlib.metadata import version as installed_version
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
-from speed_figures import draw  # noqa: E402  # it stands beside this file
+from speed_figures import draw  # it stands beside this file
 
 draw(Path(__file__).parent / "_figures")
 

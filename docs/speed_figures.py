@@ -47,7 +47,7 @@ def peers(results: dict) -> Figure:
         at = [(i, of[library]) for i, of in enumerate(times.values()) if library in of]
         places = [i + (k - (len(COLOURS) - 1) / 2) * width for i, _ in at]
         bars = ax.bar(places, [value for _, value in at], width, color=colour, label=library)
-        ax.bar_label(bars, [f"{value:.2g}" for _, value in at], fontsize=6, padding=1)
+        ax.bar_label(bars, [plain(value) for _, value in at], fontsize=6, padding=1)
     ax.set_yscale("log")
     ax.set_ylabel("J, gradient, Hessian (ms)")
     ax.set_xticks(range(len(times)), list(times))
@@ -77,7 +77,18 @@ def growth(results: dict) -> Figure:
     for ax in axes:
         ax.set_xscale("log")
         ax.set_yscale("log")
+        sizes = ax.lines[0].get_xdata()
+        ax.set_xticks(sizes, [plain(size) for size in sizes], fontsize=8)
+        ax.yaxis.set_major_formatter(lambda value, _: plain(value))
+        ax.minorticks_off()
+    axes[0].set_yticks([20, 50, 100, 200])
+    axes[0].minorticks_off()
     axes[0].set_ylabel("Hessian (ms)")
     handles, labels = axes[1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False, fontsize=8)
     return figure
+
+
+def plain(value: float) -> str:
+    """Two significant digits without an exponent."""
+    return f"{float(f'{value:.2g}'):g}"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -379,8 +379,11 @@ def arguments_of(
         return Arguments(*jax.device_put(arrays))
 
 
+@lru_cache(maxsize=256)
 def check_functions(structure: Structure) -> None:
     """Call every function of the user's once, abstractly: that shapes, dtypes and parameter names are right.
+
+    What has been found right is not looked at again when another problem is made of it.
 
     Raises
     ------
