@@ -145,7 +145,7 @@ def stage_curvature(model: Model, first: FirstOrder, psi: Costates, p: Array) ->
                 return w @ f(t, x, p) + (hb * ell(t, x, p) if model.has_running_cost else 0.0)
 
             if not local:
-                return _second(value, (t, x, p), (t_d, x_d, P))
+                return _second(value, (t, x, p), (t_d, x_d, P), P_last=True)
             Z = jnp.concatenate([t_d[None], x_d, P])
             return Z.T @ _second(value, (t, x, p), (basis[0], basis[1 : 1 + n], basis[1 + n :])) @ Z
 
@@ -291,8 +291,13 @@ def _weighted(function: Callable[..., Array], psi: Array) -> Callable[..., Array
     return lambda *z: psi @ function(*z)
 
 
-def _second(value: Callable[..., Array], at: tuple[Array, ...], along: tuple[Array, ...]) -> Array:
-    """Second derivative of a scalar function along D directions (last axes of `along`): (D, D)."""
+def _second(
+    value: Callable[..., Array], at: tuple[Array, ...], along: tuple[Array, ...], P_last: bool = False
+) -> Array:
+    """Second derivative of a scalar function along D directions (last axes of `along`): (D, D).
+
+    With `P_last` the last of `along` is that of p, [0 | I], whose product need not be computed.
+    """
     gradient = jax.grad(value, argnums=tuple(range(len(at))))
 
     def column(*direction: Array) -> tuple[Array, ...]:
@@ -301,7 +306,11 @@ def _second(value: Callable[..., Array], at: tuple[Array, ...], along: tuple[Arr
     columns = jax.vmap(column, in_axes=-1, out_axes=-1)(*along)
     D = along[0].shape[-1]
     pairs = [(a.reshape(a.size // D, D), c.reshape(a.size // D, D)) for a, c in zip(along, columns, strict=True)]
-    return sum((a.T @ c for a, c in pairs), jnp.zeros((D, D)))
+    of_p = jnp.zeros((D, D))
+    if P_last:
+        _, c = pairs.pop()
+        of_p = jnp.pad(c, ((D - c.shape[0], 0), (0, 0)))
+    return sum((a.T @ c for a, c in pairs), of_p)
 
 
 def _columns(function: Callable[..., Array], at: tuple[Array, ...], along: tuple[Array, ...]) -> Array:

@@ -125,19 +125,13 @@ def stage_time_directions(model: Model, start_d: Array, end_d: Array) -> Array:
 
 
 def stage_jacobians(model: Model, path: Path, p: Array) -> StageJacobians:
-    """D_2 f, D_1 f, D_p f at all stages, by forward differentiation along (t, x, p), and the gradient of ell."""
-    n, M = model.structure.n, model.structure.M
-    basis = jnp.eye(1 + n + M)
+    """D_2 f, D_1 f, D_p f at all stages, by forward differentiation, and the gradient of ell."""
 
     def of_mode(mode: int) -> Callable[..., StageJacobians]:
         def at_stage(piece: Piece, t: Array, x: Array) -> StageJacobians:
             f = model.field(mode, piece)
 
-            def column(direction: Array) -> Array:
-                return jax.jvp(f, (t, x, p), (direction[0], direction[1 : 1 + n], direction[1 + n :]))[1]
-
-            f_z = jax.vmap(column, out_axes=-1)(basis)
-            of_f = f_z[..., 0], f_z[..., 1 : 1 + n], f_z[..., 1 + n :]
+            of_f = jax.jacfwd(f, argnums=(0, 1, 2))(t, x, p)
             if not model.has_running_cost:
                 return StageJacobians(*of_f)
             # A scalar: backward is cheaper.
