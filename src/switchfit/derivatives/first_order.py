@@ -131,12 +131,12 @@ def stage_jacobians(model: Model, path: Path, p: Array) -> StageJacobians:
         def at_stage(piece: Piece, t: Array, x: Array) -> StageJacobians:
             f = model.field(mode, piece)
 
-            of_f = jax.jacfwd(f, argnums=(0, 1, 2))(t, x, p)
+            f_t, f_x, f_p = jax.jacfwd(f, argnums=(0, 1, 2))(t, x, p)
             if not model.has_running_cost:
-                return StageJacobians(*of_f)
+                return StageJacobians(f_t, f_x, f_p)
             # A scalar: backward is cheaper.
             l, gradient = jax.value_and_grad(model.density(piece), argnums=(0, 1, 2))(t, x, p)  # noqa: E741
-            return StageJacobians(*of_f, l, *gradient)
+            return StageJacobians(f_t, f_x, f_p, l, *gradient)
 
         def row(start: Array, end: Array, piece: Piece, X: Array) -> StageJacobians:
             times = start + model.tableau.c * (end - start)
