@@ -331,7 +331,7 @@ def test_fixed_times_and_bounds_keep_their_place_among_the_starts():
 
 def test_bad_starts():
     free = sf.Problem(ROOM, room().experiments, {"k": 1.0})
-    with pytest.raises(ValueError, match=r"k lacks one: give sf.Parameter\(..., lower=..., upper=...\)"):
+    with pytest.raises(ValueError, match=r"there are none for k: give sf.Parameter\(..., lower=..., upper=...\)"):
         sf.multistart(free, 8)
     with pytest.raises(ValueError, match=r"array of shape \(S, 2\)"):
         sf.multistart(room(), [1.0, 2.0])

@@ -184,8 +184,8 @@ def _drawn(problem: Problem, count: int, seed: int) -> FloatArray:
     if unbounded.any():
         names = ", ".join(np.array(unknowns.names)[unbounded])
         raise ValueError(
-            f"multistart draws starts between bounds, and {names} lacks one: give sf.Parameter(..., lower=..., "
-            "upper=...), or the starts themselves."
+            f"multistart draws starts between bounds, but there are none for {names}: give sf.Parameter(..., "
+            "lower=..., upper=...), or the starts themselves."
         )
     sobol = qmc.Sobol(len(unknowns.names), seed=seed)
     cube = sobol.random(1 << max(count - 1, 0).bit_length())[:count]
