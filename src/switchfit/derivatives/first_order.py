@@ -177,11 +177,7 @@ def tangents(model: Model, path: Path, jacobians: StageJacobians, resets: ResetJ
     b = tableau.b
     N, M = model.structure.N, model.structure.M
     ends = row_end_tangents(model, path, jacobians)
-    Q, C, _, n = path.stages.shape
-    extra = jnp.zeros((Q * C, n, N + M))
     index = jnp.arange(N)
-    extra = extra.at[ends.rows, :, index].add(ends.after).reshape(Q, C, n, N + M)
-
     keep = 8 * path.stages.size * (N + M) <= KEPT
 
     def row(X: Array, given: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
@@ -191,15 +187,19 @@ def tangents(model: Model, path: Path, jacobians: StageJacobians, resets: ResetJ
         after = X + h * combine(b, list(slopes_d)) + extra
         return after, (X, after, stages_d) if keep else (X, after)
 
-    def chunk(X: Array, given: tuple[Array, Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
-        segment, opens, operands = given
+    def chunk(X: Array, given: Any) -> tuple[Array, tuple[Array, ...]]:
+        segment, opens, starts_at, ends_at, operands = given
         if resets is not None:
             X = jnp.where(opens, resets.x[segment] @ X + resets.theta[segment], X)
-        return lax.scan(row, X, operands)
+        direct = (starts_at[:, None] == index)[..., None] * ends.after[0]  # (C, N, n)
+        direct = direct + (ends_at[:, None] == index)[..., None] * ends.after[1]
+        extra = jnp.pad(jnp.moveaxis(direct, 1, 2), ((0, 0), (0, 0), (0, M)))
+        return lax.scan(row, X, (*operands, extra))
 
     first = jax.jacfwd(model.initial_state)(p) @ parameter_directions(model)
-    operands = (layout.end - layout.start, jacobians.f_x, jacobians.f_p, extra)
-    _, (before, after, *kept) = lax.scan(chunk, first, (layout.segment, layout.opens, operands))
+    operands = (layout.end - layout.start, jacobians.f_x, jacobians.f_p)
+    given = (layout.segment, layout.opens, layout.starts_at, layout.ends_at, operands)
+    _, (before, after, *kept) = lax.scan(chunk, first, given)
     if not keep:
         return Tangents(before, after, ends, (jacobians.f_x, jacobians.f_p, before))
     stages = by_row(kept[0]).at[ends.rows, :, :, index].add(ends.stages)
