@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy.special
 from numpy.typing import NDArray
 
-from switchfit.batch.chunks import Progress
+from switchfit.batch.chunks import Progress, Work, run_chunks
 from switchfit.data import FloatArray, Measurements
 from switchfit.estimate import sigma_known
 from switchfit.optimize import Status
@@ -121,7 +123,39 @@ class Fits:
         return lines
 
 
-def as_fits(
+def repeat(
+    problem: Problem,
+    work: Work,
+    count: int,
+    title: str,
+    began: float,
+    *,
+    client: Any,
+    folder: str | Path | None,
+    callback: Callable[[int, int], object] | None,
+) -> dict[str, Any]:
+    """Do `count` runs with a bar on the terminal: the fields of `Fits`.
+
+    Parameters
+    ----------
+    problem : Problem
+        One of those that are fitted: its names, and whether its noise is known.
+    work, count, client, folder : as of `run_chunks`
+    title : str
+        Of the bar.
+    began : float
+        ``time.perf_counter()`` when the call began.
+    callback : callable ``(done, total)``, a true value stops; or None
+    """
+    progress, end = _reporting(callback, title)
+    try:
+        runs, arrays = run_chunks(work, count, client=client, folder=folder, progress=progress)
+    finally:
+        end()
+    return _fields(problem, count, runs, arrays, time.perf_counter() - began)
+
+
+def _fields(
     problem: Problem, requested: int, runs: NDArray[np.intp], arrays: dict[str, NDArray[Any]], seconds: float
 ) -> dict[str, Any]:
     """The fields of `Fits` from what the chunks found, covariances scaled by the residual variance where needed."""
@@ -150,7 +184,7 @@ def sample_count(problem: Problem) -> int:
     return sum(item.count for run in problem.experiments for item in run.data if isinstance(item, Measurements))
 
 
-def reporting(callback: Callable[[int, int], object] | None, title: str) -> tuple[Progress, Callable[[], None]]:
+def _reporting(callback: Callable[[int, int], object] | None, title: str) -> tuple[Progress, Callable[[], None]]:
     """What `run_chunks` calls: the user's callback, and a bar where there is a terminal; and what ends the bar."""
     if not sys.stderr.isatty():
         return (lambda done, total: callback is not None and callback(done, total)), lambda: None

@@ -11,8 +11,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from switchfit.batch.chunks import Arrays, fingerprint, run_chunks
-from switchfit.batch.fits import Fits, as_fits, reporting, sample_count
+from switchfit.batch.chunks import Arrays, fingerprint
+from switchfit.batch.fits import Fits, repeat, sample_count
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
 from switchfit.estimate import LARGEST_INTEGRATION_ERROR, estimate, sigma_known
 from switchfit.evaluate import evaluator_of, places_of
@@ -63,12 +63,7 @@ def estimate_many(
             )
     began = time.perf_counter()
     work = _Work(problems, tolerance, max_iterations)
-    progress, end = reporting(callback, "Logs")
-    try:
-        done, arrays = run_chunks(work, len(problems), client=client, folder=folder, progress=progress)
-    finally:
-        end()
-    return Fits(**as_fits(first, len(problems), done, arrays, time.perf_counter() - began))
+    return Fits(**repeat(first, work, len(problems), "Logs", began, client=client, folder=folder, callback=callback))
 
 
 @dataclass

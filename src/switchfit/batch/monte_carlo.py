@@ -12,8 +12,8 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.batch.chunks import Arrays, fingerprint, run_chunks
-from switchfit.batch.fits import Fits, as_fits, reporting, sample_count
+from switchfit.batch.chunks import Arrays, fingerprint
+from switchfit.batch.fits import Fits, repeat, sample_count
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
 from switchfit.data import FloatArray, Measurements, ReferenceSignal, as_numbers
 from switchfit.estimate import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, estimate
@@ -137,12 +137,7 @@ def monte_carlo(
     work = _Work(problem, [], truth, begin, noise, seed, tolerance, max_iterations, _clean(problem, truth))
     work.check_noise()
     work.meshes, error = _meshes(work.problem_of(0), truth, begin)
-    progress, end = reporting(callback, "Monte Carlo")
-    try:
-        done, arrays = run_chunks(work, runs, client=client, folder=folder, progress=progress)
-    finally:
-        end()
-    found = as_fits(problem, runs, done, arrays, time.perf_counter() - began)
+    found = repeat(problem, work, runs, "Monte Carlo", began, client=client, folder=folder, callback=callback)
     return MonteCarlo(**found, truth=truth, integration_error=error)
 
 
@@ -285,7 +280,7 @@ class _Work:
         places = jax.tree.unflatten(tree, range(len(leaves)))
         changed: dict[int, Any] = {}
         for e, experiment in enumerate(self.problem.experiments):
-            measured = reference = channel = 0
+            measured = channel = 0
             for k, item in enumerate(experiment.data):
                 if isinstance(item, Measurements):
                     leaf = places[e].samples[measured].value
@@ -302,7 +297,6 @@ class _Work:
                             changed[leaf] = np.repeat(np.asarray(leaves[leaf])[None], R, axis=0)
                         changed[leaf][..., channel : channel + q] = _cells_of(item, values[e, k], self.meshes[e])
                     channel += q
-                    reference += 1
         return Varying(tuple(changed), tuple(changed.values()))
 
     def fingerprint(self) -> str:

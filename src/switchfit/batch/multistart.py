@@ -13,8 +13,8 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.batch.chunks import Arrays, fingerprint, run_chunks
-from switchfit.batch.fits import Fits, as_fits, reporting, sample_count
+from switchfit.batch.chunks import Arrays, fingerprint
+from switchfit.batch.fits import Fits, repeat, sample_count
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
 from switchfit.data import FloatArray, as_numbers
 from switchfit.estimate import Estimate, constraints_of, estimate
@@ -106,12 +106,7 @@ def multistart(
     began = time.perf_counter()
     points = _drawn(problem, starts, seed) if isinstance(starts, int) else _given(problem, starts)
     work = _Work(problem, list(evaluator_of(problem).meshes), points, tolerance, max_iterations)
-    progress, end = reporting(callback, "Multistart")
-    try:
-        done, arrays = run_chunks(work, len(points), client=client, folder=folder, progress=progress)
-    finally:
-        end()
-    found = as_fits(problem, len(points), done, arrays, time.perf_counter() - began)
+    found = repeat(problem, work, len(points), "Multistart", began, client=client, folder=folder, callback=callback)
     fits = Fits(**found)
     clusters = _clusters(problem, fits)
     lowest = np.where(fits.success, fits.cost, np.inf) if fits.success.any() else np.nan_to_num(fits.cost, nan=np.inf)

@@ -179,9 +179,19 @@ def minimize_traced(
         after = lax.cond(finite & (first | lower), accept, refuse, state, cost, gradient, hessian, theta, optimality)
         return after._replace(done=after.done | (first & ~finite))
 
+    state = lax.while_loop(lambda state: ~state.done, turn, _not_begun(start))
+    interior = ~jnp.any(_active(constraints, state.theta, state.scale))
+    scaling = _scaling(state.hessian, _flatness(state))
+    smallest = jnp.linalg.eigvalsh(jnp.nan_to_num(state.hessian / jnp.outer(scaling, scaling)))[0]
+    settled = state.stationary & interior & (smallest > EIGENVALUE_FLOOR)
+    return Outcome(*state[:7], settled)
+
+
+def _not_begun(start: Array) -> _State:
+    """The state before the first evaluation, which is accepted whatever it gives, if it is finite."""
     d = start.shape[0]
     infinite, none = jnp.full((), jnp.inf), jnp.zeros((), int)
-    state = _State(
+    return _State(
         theta=start,
         cost=infinite,
         gradient=jnp.full(d, jnp.nan),
@@ -200,12 +210,6 @@ def minimize_traced(
         done=jnp.zeros((), bool),
         stationary=jnp.zeros((), bool),
     )
-    state = lax.while_loop(lambda state: ~state.done, turn, state)
-    interior = ~jnp.any(_active(constraints, state.theta, state.scale))
-    scaling = _scaling(state.hessian, _flatness(state))
-    smallest = jnp.linalg.eigvalsh(jnp.nan_to_num(state.hessian / jnp.outer(scaling, scaling)))[0]
-    settled = state.stationary & interior & (smallest > EIGENVALUE_FLOOR)
-    return Outcome(*state[:7], settled)
 
 
 def _active(constraints: Constraints, theta: Array, scale: Array) -> Array:

@@ -241,7 +241,8 @@ def _channels(fit: Fit) -> list[str]:
     if not rows:
         return []
     most = 4 * LISTED_EXPERIMENTS
-    table = _table([["channel", "values", "rmse", "", "rmse/sigma"], *rows[:most]], "<>><>")
+    in_sigmas = "rmse/sigma" if any(row[-1] for row in rows) else ""
+    table = _table([["channel", "values", "rmse", "", in_sigmas], *rows[:most]], "<>><>")
     return ["", *table] + ([f"  and {len(rows) - most} more channels"] if len(rows) > most else [])
 
 
