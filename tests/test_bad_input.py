@@ -530,7 +530,7 @@ def test_transition_times_in_theta_out_of_order():
         (lambda: sf.simulate(GOOD, experiment=-1), ["experiment must lie in 0..0; got -1"]),
         (
             lambda: sf.estimate(GOOD, hessian="full"),
-            ["hessian must be one of exact, block-diagonal, gauss-newton, none; got 'full'"],
+            ["hessian must be one of exact, descent-first, block-diagonal, gauss-newton, none; got 'full'"],
         ),
         (lambda: sf.estimate(GOOD, tolerance=0.0), ["tolerance must be positive; got 0.0"]),
         (lambda: sf.estimate(GOOD, tolerance=math.nan), ["tolerance must be positive; got nan"]),

@@ -207,6 +207,24 @@ def test_all_quadratic_terms_reach_the_same_optimum_and_the_others_are_far_slowe
     assert block.iterations > 20 * exact.iterations
 
 
+def test_the_scheme_of_the_paper_descends_until_the_hessian_is_positive_definite():
+    """Section II-A; the Hessian at the start has a negative eigenvalue, so that the first steps are along −DJ."""
+    found = sf.estimate(vehicle_problem(), hessian="descent-first")
+    assert found.success
+    np.testing.assert_allclose(found.theta, [6.0, 10.0, 0.7], rtol=0, atol=1e-6)
+    problem = vehicle_problem()
+    positive = [np.linalg.eigvalsh(sf.evaluate(problem, record.theta).hessian)[0] > 0 for record in found.history]
+    first = positive.index(True)
+    assert first > 5
+    assert all(positive[first:])
+    start = sf.evaluate(problem)
+    step = found.history[1].theta - found.history[0].theta
+    np.testing.assert_allclose(
+        step / np.linalg.norm(step), -start.gradient / np.linalg.norm(start.gradient), atol=1e-12
+    )
+    assert found.iterations - first <= 10
+
+
 @pytest.mark.slow
 def test_steepest_descent_reaches_the_same_optimum_after_thousands_of_iterations():
     problem = vehicle_problem()

@@ -1,4 +1,4 @@
-"""The command line: ``switchfit fit | check | simulate``.
+"""The command line: ``switchfit fit | check | simulate | paper``.
 
 Exit codes: 0 converged, 1 not converged (what was found is still written), 2 a problem with what was given,
 3 an error of switchfit itself. Only typer is imported here; the numerical parts load when a command needs them, so
@@ -69,7 +69,7 @@ def fit(
         Path | None, typer.Option(help="Folder for report.txt, estimate.json and fit.png.", show_default=False)
     ] = None,
     hessian: Annotated[
-        Literal["exact", "block-diagonal", "gauss-newton", "none"] | None,
+        Literal["exact", "descent-first", "block-diagonal", "gauss-newton", "none"] | None,
         typer.Option(help="Quadratic term of the optimiser.", show_default="exact"),
     ] = None,
     tolerance: Annotated[
@@ -156,6 +156,43 @@ def simulate(
                         table.writerow([name, t, mode, *x])
 
         _write(out, save)
+
+
+@app.command()
+def paper(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for figures, results.json and table.md.")] = Path(
+        "paper"
+    ),
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer repetitions: two minutes instead of fifteen.")] = False,
+    only: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="One part: lti, magic-formula, convergence, noise, trials or horizon.",
+            show_default=False,
+        ),
+    ] = None,
+    debug: Debug = False,
+) -> None:
+    """Do every experiment and figure of Miller and Murphey's paper, and set its numbers beside ours.
+
+    An interrupted run goes on where it stopped when the same command is given again.
+    """
+    os.environ.setdefault("MPLBACKEND", "Agg")
+    with _reported(debug):
+        from switchfit.io.errors import InputError
+        from switchfit.paper import run
+        from switchfit.paper.run import TABLE
+
+        _make_folder(out)
+        try:
+            run(out, quick=quick, only=only, say=lambda text: typer.echo(text, err=True))
+        except KeyboardInterrupt:
+            _fail("interrupted; the same command goes on from here.", NOT_CONVERGED)
+        except OSError as error:
+            raise InputError(f"{out} cannot be written: {error.strerror}; name another with --out.") from error
+        typer.echo((out / TABLE).read_text(encoding="utf-8"))
+        typer.echo(f"written to {out}", err=True)
 
 
 # --- errors -----------------------------------------------------------------------------------------------------------

@@ -25,8 +25,8 @@ from switchfit.report.text import report
 from switchfit.result import Certificate, Fit
 from switchfit.simulate import compare
 
-HessianKind = Literal["exact", "block-diagonal", "gauss-newton", "none"]
-HESSIANS = ("exact", "block-diagonal", "gauss-newton", "none")
+HessianKind = Literal["exact", "descent-first", "block-diagonal", "gauss-newton", "none"]
+HESSIANS = ("exact", "descent-first", "block-diagonal", "gauss-newton", "none")
 
 REFINEMENTS = 2
 """Times the mesh may be refined at the solution and the fit resumed, if the integration error asks for it."""
@@ -106,9 +106,10 @@ def estimate(
     Parameters
     ----------
     problem : Problem
-    hessian : {"exact", "block-diagonal", "gauss-newton", "none"}
-        Quadratic term of the sequential quadratic programme: equation (3), equation (4), the Gauss-Newton
-        matrix, or none (steepest descent).
+    hessian : {"exact", "descent-first", "block-diagonal", "gauss-newton", "none"}
+        Quadratic term of the sequential quadratic programme: equation (3), made positive definite where it is not;
+        steepest descent until it is positive definite, then equation (3), as the paper does it (Section II-A);
+        equation (4); the Gauss-Newton matrix; or none (steepest descent).
     tolerance : float
         On the KKT residual, the norm of the gradient where no constraint is active.
     max_iterations : int

@@ -16,7 +16,7 @@ from switchfit.batch.chunks import Arrays, fingerprint
 from switchfit.batch.fits import Fits, repeat, sample_count
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
 from switchfit.data import FloatArray, Measurements, ReferenceSignal, as_numbers
-from switchfit.estimate import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, estimate
+from switchfit.estimate import LARGEST_INTEGRATION_ERROR, ORDER, PERFECT_FIT, REFINEMENTS, estimate
 from switchfit.evaluate import Evaluator
 from switchfit.mesh import Mesh
 from switchfit.model import by_cell
@@ -40,7 +40,7 @@ class MonteCarlo(Fits):
     truth : (d,)
         At which the data were simulated.
     integration_error : float
-        Relative error of J at the truth, by halving all steps.
+        Error of J at the truth by halving all steps, relative to J, or to 1e-3 of J at the start where that is more.
     """
 
     truth: FloatArray
@@ -186,7 +186,9 @@ def _meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tuple[lis
         indices = range(len(problem.experiments))
         evaluator = Evaluator(problem, meshes=[refined_mesh(problem, e, *thetas, finer=finer) for e in indices])
         fine = compare(problem, truth, [mesh.divided() for mesh in evaluator.meshes])[0]
-        error = abs(evaluator(truth).cost - fine) / max(abs(fine), 1e-300)
+        # Without noise J vanishes at the truth; then the error is measured against J where the fits begin.
+        size = max(abs(fine), PERFECT_FIT * abs(evaluator(start).cost), 1e-300)
+        error = abs(evaluator(truth).cost - fine) / size
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
         if not excess > 1 or attempt == REFINEMENTS:
             break

@@ -29,7 +29,7 @@ from switchfit.models import BUILT_IN
 from switchfit.problem import Problem
 from switchfit.system import HybridSystem
 
-HessianKind = Literal["exact", "block-diagonal", "gauss-newton", "none"]
+HessianKind = Literal["exact", "descent-first", "block-diagonal", "gauss-newton", "none"]
 
 
 @dataclass(frozen=True)

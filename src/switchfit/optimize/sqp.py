@@ -50,7 +50,7 @@ from switchfit.optimize.qp import (
     split_space,
 )
 
-HessianKind = Literal["exact", "block-diagonal", "gauss-newton", "none"]
+HessianKind = Literal["exact", "descent-first", "block-diagonal", "gauss-newton", "none"]
 
 #: Fraction of the predicted linear decrease that a step must achieve (Armijo).
 ARMIJO = 1e-4
@@ -591,7 +591,8 @@ def _solve_on_sides(
 def _model_matrix(problem: _Problem, state: _State, hessian: FloatArray, free: Index) -> FloatArray:
     """The matrix B of the quadratic programme: positive definite on the free coordinates, H elsewhere."""
     point = state.point
-    if not problem.uses_hessian:
+    first = problem.hessian == "descent-first" and not _is_positive_definite(hessian[free][:, free])
+    if first or not problem.uses_hessian:
         return np.eye(point.theta.size) / state.metric
     matrix = hessian.copy() if problem.mask is None else hessian * problem.mask
     pressed = problem.normals[point.multipliers > 0.0][:, free]
@@ -602,6 +603,10 @@ def _model_matrix(problem: _Problem, state: _State, hessian: FloatArray, free: I
     block = free if isinstance(free, slice) else np.ix_(free, free)
     matrix[block] = convexify(matrix[block], pressed, floor[free])
     return matrix
+
+
+def _is_positive_definite(matrix: FloatArray) -> bool:
+    return bool(np.all(np.linalg.eigvalsh(matrix) > 0.0))
 
 
 def _flatness(state: _State) -> FloatArray:
@@ -874,9 +879,10 @@ def minimize(
         ``A theta >= b`` and bounds.
     breakpoints : sequence of d arrays, optional
         Sorted values of each coordinate where the derivatives of J may jump. None: J is smooth.
-    hessian : {"exact", "block-diagonal", "gauss-newton", "none"}
+    hessian : {"exact", "descent-first", "block-diagonal", "gauss-newton", "none"}
         What stands in the quadratic programme: the Hessian as evaluated, made positive definite where needed; the
-        same without the entries between different `blocks`; the same again, for a caller whose `evaluate` returns
+        Hessian where it is positive definite and steepest descent until then (the paper's scheme, Section II-A); the
+        first without the entries between different `blocks`; the same again, for a caller whose `evaluate` returns
         Gauss-Newton's matrix; or nothing (steepest descent in the metric of theta, as in the paper).
     blocks : array of int, shape (d,), optional
         Label of each coordinate, for "block-diagonal".

@@ -31,6 +31,7 @@ TREND = 0.5
 
 METHODS = {
     "exact": "SQP with the exact Hessian",
+    "descent-first": "steepest descent until the Hessian is positive definite, then SQP with it",
     "block-diagonal": "SQP with the block-diagonal Hessian",
     "gauss-newton": "SQP with the Gauss-Newton matrix",
     "none": "steepest descent",

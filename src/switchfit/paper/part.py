@@ -1,0 +1,64 @@
+"""What the parts share: lines of the table, and how figures look."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Found = dict[str, Any]
+Say = Callable[[str], None]
+
+#: Width of a figure over one and over two columns (inches).
+COLUMN, PAGE = 3.5, 7.16
+#: Dark, middle and light, so that they differ in grey too; lines differ in their dashes besides.
+DARK, RED, BLUE, LIGHT = "#222222", "#b2182b", "#4a7fb5", "#b5b5b5"
+SYMBOLS = {"tau_1": r"$\tau_1$", "tau_2": r"$\tau_2$", "mu": r"$\mu$"}
+
+
+class Row(NamedTuple):
+    """One line of the table of results."""
+
+    claim: str
+    paper: str
+    ours: str
+    remark: str = ""
+
+
+class Part(Protocol):
+    """A module that does one part."""
+
+    TITLE: str
+
+    def compute(self, quick: bool, folder: Path, say: Say) -> Found: ...
+    def draw(self, found: Found) -> dict[str, Figure]: ...
+    def rows(self, found: Found) -> list[Row]: ...
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure with small type."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def tidy(ax: Axes, xlabel: str, ylabel: str, *, letter: str = "") -> Axes:
+    """Labels at a size for a column, thin frame, panel's letter."""
+    ax.set_xlabel(xlabel, fontsize=8)
+    ax.set_ylabel(ylabel, fontsize=8)
+    ax.tick_params(labelsize=7)
+    ax.spines[["top", "right"]].set_visible(False)
+    if letter:
+        ax.set_title(letter, loc="left", fontsize=8)
+    return ax
+
+
+def conditions(found: Found) -> str:
+    """The second-order sufficient conditions of one fit, in words."""
+    if not found["sufficient"]:
+        return "not satisfied"
+    return f"satisfied: ‖DJ‖ = {found['gradient_norm']:.0e}, smallest eigenvalue {found['smallest_eigenvalue']:.3g}"

@@ -1,0 +1,125 @@
+"""All parts in turn: figures, ``results.json`` and the table of the paper's numbers beside ours."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, cast
+
+from switchfit.io.files import write_atomically
+from switchfit.paper import convergence, horizon, lti, magic, noise, trials
+from switchfit.paper.part import Found, Part, Row, Say
+
+#: Name -> part, in the order of the paper.
+PARTS: Mapping[str, Part] = MappingProxyType(
+    {
+        "lti": cast(Part, lti),
+        "magic-formula": cast(Part, magic),
+        "convergence": cast(Part, convergence),
+        "noise": cast(Part, noise),
+        "trials": cast(Part, trials),
+        "horizon": cast(Part, horizon),
+    }
+)
+RESULTS, TABLE = "results.json", "table.md"
+
+
+def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say | None = None) -> dict[str, Any]:
+    """Do every part of the paper, or one, and write what comes of it.
+
+    Parameters
+    ----------
+    out : Path
+        Folder for the figures (PDF and PNG), ``results.json`` and ``table.md``; made if it does not exist.
+    quick : bool
+        Fewer repetitions of the statistics; everything else is the same.
+    only : str, optional
+        One name of `PARTS`; in ``results.json`` and the table the other parts stay as they are.
+    say : callable, optional
+        Called with a line of text whenever something new begins.
+
+    Returns
+    -------
+    dict
+        The content of ``results.json``.
+
+    Raises
+    ------
+    ValueError
+        For an unknown part.
+    OSError
+        If something cannot be written.
+
+    Notes
+    -----
+    What is done is kept in a hidden folder in `out` until the run is complete. After an interruption (the exception is
+    KeyboardInterrupt then) the same call goes on from there.
+    """
+    if only is not None and only not in PARTS:
+        raise ValueError(f"there is no part {only!r}; the parts are {', '.join(PARTS)}.")
+    tell = say or (lambda text: None)
+    names = list(PARTS) if only is None else [only]
+    unfinished = out / f".unfinished-{version('switchfit')}-{'quick' if quick else 'full'}-{only or 'all'}"
+    unfinished.mkdir(parents=True, exist_ok=True)
+    results = _earlier(out / RESULTS) if only is not None else {}
+    for number, name in enumerate(names, start=1):
+        part, place = PARTS[name], f"[{number}/{len(names)}] {PARTS[name].TITLE}"
+        kept = unfinished / f"{name}.json"
+        if kept.exists():
+            tell(f"{place}: done before the interruption")
+            entry = json.loads(kept.read_text(encoding="utf-8"))
+        else:
+            began = time.perf_counter()
+            found = part.compute(quick, unfinished / name, lambda text, place=place: tell(f"{place}: {text}"))  # type: ignore[misc]  # mypy cannot infer the default
+            entry = {"quick": quick, "seconds": round(time.perf_counter() - began, 1), "found": found}
+            write_atomically(json.dumps(entry), kept)
+        results[name] = entry
+        for title, figure in part.draw(entry["found"]).items():
+            for kind in ("pdf", "png"):
+                _save(figure, out / f"{title}.{kind}")
+    results = {name: results[name] for name in PARTS if name in results}
+    write_atomically(json.dumps(results, indent=1), out / RESULTS)
+    write_atomically(table(results), out / TABLE)
+    shutil.rmtree(unfinished)
+    return results
+
+
+def table(results: Mapping[str, Found]) -> str:
+    """The paper's numbers beside ours as Markdown, from the content of ``results.json``."""
+    lines = ["| claim | paper | switchfit | remark |", "|---|---|---|---|"]
+    for name, entry in results.items():
+        lines += [_line(row) for row in PARTS[name].rows(entry["found"])]
+    seconds = sum(entry["seconds"] for entry in results.values())
+    fewer = [name for name, entry in results.items() if entry["quick"]]
+    note = f"switchfit {version('switchfit')}, {seconds:.0f} s in all."
+    if fewer:
+        note += f" With fewer repetitions (--quick): {', '.join(fewer)}."
+    return "\n".join([*lines, "", note, ""])
+
+
+def _line(row: Row) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |"
+
+
+def _earlier(path: Path) -> dict[str, Any]:
+    """Results of parts that were run before, if there are any that can be read."""
+    try:
+        earlier = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return {name: entry for name, entry in earlier.items() if name in PARTS} if isinstance(earlier, dict) else {}
+
+
+def _save(figure: Any, path: Path) -> None:
+    """A figure as a file that is whole or not there."""
+    temporary = path.with_name(f".{path.name}")
+    try:
+        figure.savefig(temporary, dpi=200, format=path.suffix[1:])
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)

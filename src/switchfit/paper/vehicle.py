@@ -1,0 +1,156 @@
+"""The vehicle of Section V: its simulated problem, and logs of one that runs on tyres of the Magic Formula."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from switchfit.batch.fits import Fits
+from switchfit.data import Data, FloatArray, Input, Measurements, ReferenceSignal
+from switchfit.estimate import Estimate
+from switchfit.experiment import Experiment, Parameter
+from switchfit.models.magic_formula import MAGIC_FORMULA, magic_formula
+from switchfit.models.skid_steer import skid_steer
+from switchfit.optimize import Status
+from switchfit.problem import Problem
+from switchfit.result import free_curvature
+from switchfit.simulate import Trajectory, simulate
+
+SEQUENCE = ("stick", "slip", "stick")
+NAMES = ("tau_1", "tau_2", "mu")
+#: Truth and start of the simulated problem, in the order of NAMES (s, s, 1).
+TRUTH, START = (6.0, 10.0, 0.7), (5.0, 9.0, 0.8)
+#: Horizon (s): the paper samples over 15 s.
+HORIZON = 15.0
+#: Cut-off (Hz) of the low-pass filter of 1 Hz positions; the paper gives none.
+LOWPASS_HZ = 0.3
+
+#: When the wheels of the Magic Formula vehicle are commanded to turn it and to stop turning (s), as in the paper.
+COMMANDED = (5.0, 10.0)
+#: Time (s) in which the wheels take up a commanded difference of speed.
+RISE = 0.6
+#: Speed (m/s) of the treads on one side above and on the other below the mean while it turns.
+DIFFERENTIAL = 0.17
+WHEEL_RADIUS = 0.15
+
+Restick = Literal["continuous", "reset"]
+
+
+def position(t: Any, x: Any, p: Any) -> Any:
+    """What GPS sees: (X, Y)."""
+    return x[jnp.array([0, 2])]
+
+
+def stick_slip(
+    data: Data,
+    start: tuple[float, float, float] = START,
+    *,
+    t0: float = 0.0,
+    tf: float = HORIZON,
+    stick_force: float = 15.0,
+    restick: Restick = "continuous",
+    initial_state: Any = None,
+) -> Problem:
+    """The estimation problem of equation (18): tau_1, tau_2 and mu from `data`."""
+    system = skid_steer(stick_forces=(stick_force,) * 4, restick=restick)
+    run = Experiment(data, SEQUENCE, start[:2], t0, tf, initial_state=initial_state)
+    return Problem(system, run, {"mu": Parameter(start[2], lower=0.05, upper=2.0, unit="1")})
+
+
+def driven(
+    theta: tuple[float, float, float] = TRUTH,
+    *,
+    tf: float = HORIZON,
+    stick_force: float = 15.0,
+    restick: Restick = "continuous",
+    step: float = 0.1,
+) -> Trajectory:
+    """What equation (18) does at given transition times and mu, with a node every `step` seconds."""
+    times = step * np.arange(round(tf / step) + 1)
+    nothing = Measurements(times, np.zeros((len(times), 6)))
+    return simulate(stick_slip(nothing, theta, tf=tf, stick_force=stick_force, restick=restick))
+
+
+def simulated(start: tuple[float, float, float] = START, tf: float = HORIZON) -> Problem:
+    """The simulated problem of Section V-A 2: the whole state of (18) at TRUTH is the reference signal."""
+    path = driven(tf=tf)
+    return stick_slip(ReferenceSignal.from_samples(path.times, path.states), start, tf=tf)
+
+
+def wheel_speeds(differential: float = DIFFERENTIAL, stick_force: float = 15.0) -> Input:
+    """Wheel speeds of the Magic Formula vehicle (rad/s): the paper does not print its own, so these are a choice.
+
+    The mean speed of the treads is the forward speed that (18) has with the paper's torques, mu = 0.7 and slip from 5
+    to 10 s (with reset at re-stick, so that it drives straight on). From 5 to 10 s wheels 1 and 4 are `differential`
+    faster and 2 and 3 as much slower, which they become and cease to be within RISE.
+    """
+    path = driven((*COMMANDED, TRUTH[2]), stick_force=stick_force, restick="reset")
+    theta = path.states[:, 4]
+    forward = np.cos(theta) * path.states[:, 1] + np.sin(theta) * path.states[:, 3]
+    knots = [0.0, COMMANDED[0], COMMANDED[0] + RISE, COMMANDED[1], COMMANDED[1] + RISE, HORIZON]
+    times = np.unique(np.concatenate([np.arange(0.0, HORIZON + 0.05, 0.1).round(1), knots]))
+    mean = np.interp(times, path.times, forward)
+    extra = np.interp(times, knots, [0.0, 0.0, differential, differential, 0.0, 0.0])
+    treads = np.stack([mean + extra, mean - extra, mean - extra, mean + extra], axis=1)
+    return Input(times, treads / WHEEL_RADIUS, kind="linear")
+
+
+def on_tyres(data: Data, speeds: Input, parameters: dict[str, Any] | None = None) -> Problem:
+    """The Magic Formula vehicle under given wheel speeds; `parameters` are its coefficients, published if left out."""
+    run = Experiment(data, ("drive",), (), 0.0, HORIZON, inputs=speeds)
+    coefficients = dict(MAGIC_FORMULA) if parameters is None else parameters
+    return Problem(magic_formula(wheel_radius=WHEEL_RADIUS), run, coefficients, solver="stiff")
+
+
+def log_on_tyres(times: FloatArray, speeds: Input) -> tuple[FloatArray, Trajectory]:
+    """Positions (K, 2) of the Magic Formula vehicle at `times`, and its trajectory."""
+    path = simulate(on_tyres(Measurements(times, np.zeros((len(times), 2)), position), speeds))
+    return states_at(path, times)[:, [0, 2]], path
+
+
+def states_at(path: Trajectory, times: FloatArray) -> FloatArray:
+    """States (K, n) at times that are nodes of the trajectory."""
+    nodes = np.searchsorted(path.times, np.asarray(times) - 1e-9)
+    if not np.allclose(path.times[nodes], times, rtol=0, atol=1e-9):
+        raise ValueError("these times are no nodes of the trajectory.")
+    return path.states[nodes]
+
+
+def curve(path: Trajectory) -> FloatArray:
+    """Positions (K, 2) along a trajectory, a tenth of a second or less apart, for figures."""
+    at = np.linspace(path.times[0], path.times[-1], 151)
+    return np.stack([np.interp(at, path.times, path.states[:, i]) for i in (0, 2)], axis=1).round(4)
+
+
+def gps_reference(times: FloatArray, positions: FloatArray) -> ReferenceSignal:
+    """1 Hz positions interpolated and low-pass filtered, as in the paper."""
+    return ReferenceSignal.from_samples(times, positions, observe=position, lowpass_hz=LOWPASS_HZ, names=("X", "Y"))
+
+
+Study = TypeVar("Study", bound=Fits)
+
+
+def complete(study: Study) -> Study:
+    """The study itself; KeyboardInterrupt if it was stopped before its end."""
+    if len(study) < study.requested:
+        raise KeyboardInterrupt
+    return study
+
+
+def summary(fit: Estimate) -> dict[str, Any]:
+    """What a fit found, with the second-order sufficient conditions, as plain numbers."""
+    if fit.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
+    curvature = free_curvature(fit)
+    return {
+        "theta": dict(zip(fit.theta_names, fit.theta.tolist(), strict=True)),
+        "cost": fit.cost,
+        "gradient_norm": fit.optimality,
+        "iterations": fit.iterations,
+        "status": fit.status.name,
+        "smallest_eigenvalue": curvature.smallest,
+        "scaled_eigenvalues": curvature.scaled.tolist(),
+        "sufficient": bool(fit.success and curvature.smallest > 0),
+    }
