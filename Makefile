@@ -5,13 +5,14 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: help demo test test-slow check format bench speed docs clean
+.PHONY: help demo test test-slow check format bench speed paper docs clean
 
 help:
 	@echo "make demo       fit a measured toss and the paper's simulated vehicle: reports, figures in out/"
 	@echo "make test       the tests;  make test-slow: statistics and long runs too"
 	@echo "make check      ruff and mypy;  make format: put the code into form"
 	@echo "make bench      measure speed;  make speed: and put the figures into the documentation"
+	@echo "make paper      every experiment and figure of the paper, into out/paper and the documentation (ten minutes)"
 	@echo "make docs       build the documentation;  make clean: remove what was built"
 
 demo: $(VENV)/.installed
@@ -39,6 +40,11 @@ bench: $(VENV)/.installed-bench
 speed: bench
 	cp benchmarks/results/full.md docs/speed-results.md
 	cp benchmarks/results/full.json docs/speed-results.json
+
+paper: $(VENV)/.installed
+	$(BIN)/switchfit paper --out out/paper
+	cp out/paper/table.md docs/paper-results.md
+	cp out/paper/results.json docs/paper-results.json
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/sphinx-build -W --keep-going -q docs out/docs

@@ -5,9 +5,11 @@ from importlib.metadata import version as installed_version
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
-from speed_figures import draw  # it stands beside this file
+import paper_figures  # these two stand beside this file
+import speed_figures
 
-draw(Path(__file__).parent / "_figures")
+for pictures in (speed_figures, paper_figures):
+    pictures.draw(Path(__file__).parent / "_figures")
 
 project = "switchfit"
 author = "switchfit developers"
@@ -17,6 +19,7 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = ["_build"]
 html_theme = "alabaster"
+html_static_path = ["_static"]
 html_theme_options = {"description": "When did it switch, and what were the parameters?", "page_width": "1100px"}
 
 autodoc_member_order = "bysource"

@@ -1,10 +1,13 @@
 """The ready models against values worked out by hand."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from switchfit.models import BUILT_IN, skid_steer, sliding_block
+from switchfit.model import float64
+from switchfit.models import BUILT_IN, magic_formula, skid_steer, sliding_block
+from switchfit.models.magic_formula import MAGIC_FORMULA, lateral_force, longitudinal_force
 
 
 def value(function, *arguments):
@@ -126,3 +129,87 @@ def test_every_built_in_model_can_be_made():
     for name, factory in BUILT_IN.items():
         assert factory.__name__ == name
         assert factory().state_names
+
+
+# --- the Magic Formula ------------------------------------------------------------------------------------------------
+
+
+def test_magic_formula_against_published_values():
+    """Bakker, Nyborg and Pacejka (1987): lateral force at 5 degrees, longitudinal at 10 %, 2 to 8 kN."""
+    lateral = [float(lateral_force(5.0, load, MAGIC_FORMULA)) for load in (2, 4, 6, 8)]
+    longitudinal = [float(longitudinal_force(10.0, load, MAGIC_FORMULA)) for load in (2, 4, 6, 8)]
+    np.testing.assert_allclose(lateral, [1828.90, 3389.60, 4409.00, 4821.91], rtol=0, atol=0.006)
+    np.testing.assert_allclose(longitudinal, [2191.82, 4234.44, 6090.57, 7736.34], rtol=0, atol=0.006)
+
+
+def on_tyres(x, treads, **constants):
+    """Accelerations (ddX, ddY, ddtheta) at the state `x` with treads moving at the given speeds (m/s)."""
+    with float64():
+        drive = magic_formula(wheel_radius=0.2, **constants).modes["drive"]
+        rate = drive(0.0, jnp.asarray(x), dict(MAGIC_FORMULA), jnp.asarray(treads) / 0.2)
+    np.testing.assert_array_equal(np.asarray(rate)[[0, 2, 4]], np.asarray(x)[[1, 3, 5]])
+    return np.asarray(rate)[[1, 3, 5]]
+
+
+def test_tyres_that_roll_feel_no_force():
+    np.testing.assert_allclose(on_tyres([1.0, 3.0, 2.0, 4.0, np.arctan2(4, 3), 0.0], [5.0] * 4), 0.0, atol=1e-12)
+
+
+def test_small_slip_ratio_gives_the_longitudinal_force_at_that_slip():
+    V, slip, load = 4.0, 0.03, 1e-3 * 9.81 * 80 / 4
+    forward, sideways, yaw = on_tyres([0.0, V, 0.0, 0.0, 0.0, 0.0], [V * (1 + slip)] * 4, low_speed=1e-6)
+    expected = 4 * float(longitudinal_force(100 * slip, load, MAGIC_FORMULA)) / 80
+    assert forward == pytest.approx(expected, rel=0.02)  # the mean of both speeds is not the hub's: half of 3 %
+    assert abs(sideways) + abs(yaw) < 1e-12
+
+
+def test_small_slip_angle_gives_the_lateral_force_at_that_angle():
+    V, angle, load = 4.0, np.radians(2.0), 1e-3 * 9.81 * 80 / 4
+    forward, sideways, yaw = on_tyres([0.0, V, 0.0, V * np.tan(angle), 0.0, 0.0], [V] * 4, low_speed=1e-6)
+    expected = -4 * float(lateral_force(2.0, load, MAGIC_FORMULA)) / 80
+    assert sideways == pytest.approx(expected, rel=1e-3)  # 1e-3: the slip below which the force is linear
+    assert abs(forward) + abs(yaw) < 1e-12
+
+
+def test_faster_wheels_on_the_right_turn_to_the_left():
+    """Wheels 1 and 4 are the right ones, as in equation (18); in the limit of small slip by hand."""
+    V, slip, load = 5.0, 1e-5, 1e-3 * 9.81 * 80 / 4
+    forward, _, yaw = on_tyres(
+        [0.0, V, 0.0, 0.0, 0.0, 0.0], [V * (1 + slip), V * (1 - slip), V * (1 - slip), V * (1 + slip)], low_speed=1e-6
+    )
+    stiffness = float(longitudinal_force(0.1, load, MAGIC_FORMULA)) / 1e-3  # at the slip below which it is linear
+    inertia = 70 * (0.89**2 + 0.55**2) / 12 + 10 * (0.25**2 + 0.23**2)
+    assert yaw == pytest.approx(4 * 0.23 * stiffness * slip / inertia, rel=1e-3)
+    assert abs(forward) < 1e-6
+
+
+def test_yaw_is_damped_by_all_wheels():
+    V, rate, load = 5.0, 1e-6, 1e-3 * 9.81 * 80 / 4
+    yaw = on_tyres([0.0, V, 0.0, 0.0, 0.0, rate], [V] * 4, low_speed=1e-6)[2]
+    longitudinal = float(longitudinal_force(0.1, load, MAGIC_FORMULA)) / 1e-3
+    lateral = float(lateral_force(np.degrees(1e-3), load, MAGIC_FORMULA)) / 1e-3
+    inertia = 70 * (0.89**2 + 0.55**2) / 12 + 10 * (0.25**2 + 0.23**2)
+    expected = -4 * (longitudinal * 0.23**2 + lateral * 0.25**2) * rate / V / inertia
+    assert yaw == pytest.approx(expected, rel=1e-3)
+
+
+def test_forces_do_not_depend_on_the_heading():
+    turn = 0.7
+    c, s = np.cos(turn), np.sin(turn)
+    straight = on_tyres([0.0, 3.0, 0.0, 0.4, 0.0, 0.2], [3.5, 3.0, 2.0, 4.0])
+    turned = on_tyres([0.0, 3 * c - 0.4 * s, 0.0, 3 * s + 0.4 * c, turn, 0.2], [3.5, 3.0, 2.0, 4.0])
+    along, across, yaw = straight
+    np.testing.assert_allclose(turned, [c * along - s * across, s * along + c * across, yaw], rtol=1e-12)
+
+
+def test_standstill_is_smooth_and_the_force_bounded():
+    rest = on_tyres([0.0] * 6, [0.0] * 4)
+    np.testing.assert_array_equal(rest, 0.0)
+    spinning = on_tyres([0.0] * 6, [20.0] * 4)
+    assert 0 < spinning[0] < 1.2 * 9.81
+
+
+@pytest.mark.parametrize("name", ["wheel_radius", "low_speed"])
+def test_magic_formula_refuses_what_is_not_positive(name):
+    with pytest.raises(ValueError, match=f"{name} must be positive; got 0"):
+        magic_formula(**{name: 0.0})

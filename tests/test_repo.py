@@ -128,7 +128,7 @@ def test_links_in_the_pages_lead_somewhere():
 
 
 def test_the_table_of_equations_names_what_exists():
-    page = (ROOT / "docs" / "equations.md").read_text()
+    page = (ROOT / "docs" / "paper.md").read_text()
     named = re.findall(r"`([\w/]+\.py): (\w+)`", page)
     assert len(named) > 20
     for file, function in named:

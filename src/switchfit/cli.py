@@ -182,7 +182,7 @@ def paper(
     with _reported(debug):
         from switchfit.io.errors import InputError
         from switchfit.paper import run
-        from switchfit.paper.run import TABLE
+        from switchfit.paper.runner import TABLE
 
         _make_folder(out)
         try:

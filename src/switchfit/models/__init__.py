@@ -3,13 +3,14 @@
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
+from switchfit.models.magic_formula import magic_formula
 from switchfit.models.skid_steer import skid_steer
 from switchfit.models.sliding_block import sliding_block
 from switchfit.system import HybridSystem
 
 #: Name in a problem file -> function that returns the system; its arguments are keyword-only.
 BUILT_IN: Mapping[str, Callable[..., HybridSystem]] = MappingProxyType(
-    {"skid_steer": skid_steer, "sliding_block": sliding_block}
+    {"skid_steer": skid_steer, "sliding_block": sliding_block, "magic_formula": magic_formula}
 )
 
-__all__ = ["BUILT_IN", "skid_steer", "sliding_block"]
+__all__ = ["BUILT_IN", "magic_formula", "skid_steer", "sliding_block"]

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from switchfit.system import HybridSystem
 
-#: Coefficients a_1 to a_8 of the longitudinal (x) and the lateral (y) force of [1]_, by the parameter's name.
+#: Coefficients a_1 to a_8 of the longitudinal (x) and the lateral (y) force of 1987, by the parameter's name.
 MAGIC_FORMULA: Mapping[str, float] = MappingProxyType(
     {
         **{f"a_x{i}": a for i, a in enumerate((-21.3, 1144.0, 49.6, 226.0, 0.069, -0.006, 0.056, 0.486), start=1)},
@@ -104,7 +104,7 @@ def magic_formula(
 
     References
     ----------
-    .. [1] E. Bakker, L. Nyborg, H. B. Pacejka, Tyre modelling for use in vehicle dynamics studies, SAE 870421, 1987.
+    E. Bakker, L. Nyborg, H. B. Pacejka, Tyre modelling for use in vehicle dynamics studies, SAE 870421, 1987.
     """
     for name, value in (("wheel_radius", wheel_radius), ("low_speed", low_speed)):
         if not value > 0:

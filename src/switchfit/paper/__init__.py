@@ -9,6 +9,6 @@ L. M. Miller, T. D. Murphey, Simultaneous optimal estimation of mode transition 
 traction models.
 """
 
-from switchfit.paper.run import PARTS, run
+from switchfit.paper.runner import PARTS, run
 
 __all__ = ["PARTS", "run"]

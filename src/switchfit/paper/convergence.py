@@ -61,15 +61,20 @@ def draw_histories(ax: Axes, fits: Found) -> Axes:
         ax.loglog(np.array(iterations) + 1, np.maximum(norms, 1e-13), linewidth=1.2, **LOOKS[kind])
     ax.axhline(1e-7, color=DARK, linewidth=0.6)
     ax.annotate("tolerance", (1, 1e-7), xytext=(1, 3), textcoords="offset points", fontsize=6)
-    ax.legend(frameon=False, fontsize=6.5, loc="lower right")
     return tidy(ax, "iteration + 1", r"$\|DJ\|$")
+
+
+def convergence_figure(fits: Found) -> Figure:
+    """`draw_histories` as a figure of one column."""
+    figure = new_figure(COLUMN, 3.0)
+    draw_histories(figure.subplots(), fits)
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=6.5)
+    return figure
 
 
 def draw(found: Found) -> dict[str, Figure]:
     """Figure 4."""
-    figure = new_figure(COLUMN, 2.8)
-    draw_histories(figure.subplots(), found["fits"])
-    return {"fig4-convergence": figure}
+    return {"fig4-convergence": convergence_figure(found["fits"])}
 
 
 def order(history: list[list[float]]) -> float:

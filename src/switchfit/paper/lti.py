@@ -20,8 +20,8 @@ from switchfit.estimate import HessianKind, estimate
 from switchfit.evaluate import evaluate
 from switchfit.experiment import Experiment, Parameter
 from switchfit.model import float64
-from switchfit.paper.convergence import draw_histories, thinned
-from switchfit.paper.part import COLUMN, Found, Row, Say, conditions, new_figure
+from switchfit.paper.convergence import convergence_figure, thinned
+from switchfit.paper.part import Found, Row, Say, conditions
 from switchfit.paper.vehicle import summary
 from switchfit.problem import Problem
 from switchfit.simulate import simulate
@@ -79,9 +79,13 @@ def _matrix(k: Any, c: Any) -> Any:
 def exact(theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
     """J, its gradient and its Hessian from matrix exponentials, at tau before or at that of the truth."""
     with float64():
-        at = jnp.asarray(theta)
-        gradient, hessian = jax.jacfwd(_cost), jax.jacfwd(jax.jacfwd(_cost))
-        return float(_cost(at)), np.asarray(gradient(at)), np.asarray(hessian(at))
+        cost, gradient, hessian = _exact(jnp.asarray(theta))
+        return float(cost), np.asarray(gradient), np.asarray(hessian)
+
+
+@jax.jit
+def _exact(theta: Any) -> tuple[Any, Any, Any]:
+    return _cost(theta), jax.jacfwd(_cost)(theta), jax.jacfwd(jax.jacfwd(_cost))(theta)
 
 
 def _cost(theta: Any) -> Any:
@@ -130,9 +134,7 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
 
 def draw(found: Found) -> dict[str, Figure]:
     """Gradient norm against iteration."""
-    figure = new_figure(COLUMN, 2.6)
-    draw_histories(figure.subplots(), found["fits"])
-    return {"lti": figure}
+    return {"lti": convergence_figure(found["fits"])}
 
 
 def rows(found: Found) -> list[Row]:

@@ -104,7 +104,7 @@ def draw(found: Found) -> dict[str, Figure]:
     paths.plot(*np.array(literal["path"]).T, "-", color=DARK, linewidth=1.1, label="stick-slip, optimal")
     paths.plot(*np.array(reset["path"]).T, ":", color=RED, linewidth=1.3, label="with reset at re-stick")
     paths.set_aspect("equal", "datalim")
-    paths.legend(frameon=False, fontsize=6.5, loc="upper left")
+    paths.legend(frameon=False, fontsize=6.5, loc="center left")
     tidy(paths, "X (m)", "Y (m)", letter="(a)")
     yaw.axvspan(*COMMANDED, color=MODE_COLOURS[1], linewidth=0, label="turn commanded")
     yaw.plot(found["times"], found["yaw"], "--", color="#888888", linewidth=2.0)

@@ -118,38 +118,29 @@ def draw(found: Found) -> dict[str, Figure]:
     figure = new_figure(PAGE, 4.6)
     axes = figure.subplots(2, 3, sharex=True, height_ratios=(1.6, 1.0))
     variance = np.array(found["sigma"]) ** 2
-    looks: dict[str, dict[str, Any]] = {
-        FILTERED: {"color": DARK, "hatch": "////", "style": "--s", "alpha": 0.18},
-        DIRECT: {"color": BLUE, "hatch": None, "style": "-o", "alpha": 0.35},
+    line: dict[str, Any] = {"markersize": 3, "linewidth": 1}
+    looks = {
+        FILTERED: {**line, "color": DARK, "linestyle": "--", "marker": "s"},
+        DIRECT: {**line, "color": BLUE, "linestyle": "-", "marker": "o"},
     }
     for k, name in enumerate(NAMES):
         errors, coverage = axes[:, k]
         for way, levels in found["ways"].items():
             look = looks[way]
             bands = 100 * np.array([level["percentiles"][k] for level in levels]).T
-            errors.fill_between(
-                variance,
-                bands[0],
-                bands[4],
-                color=look["color"],
-                alpha=look["alpha"],
-                linewidth=0,
-                label=f"5 to 95 %, {way}",
-            )
-            errors.plot(
-                variance,
-                bands[2],
-                look["style"],
-                color=look["color"],
-                markersize=3,
-                linewidth=1,
-                label=f"median, {way}",
-            )
+            if way == DIRECT:
+                errors.fill_between(
+                    variance, bands[0], bands[4], color=look["color"], alpha=0.3, linewidth=0, label=f"5 to 95 %, {way}"
+                )
+            else:
+                errors.plot(variance, bands[0], ":", color=look["color"], linewidth=1.2, label=f"5 and 95 %, {way}")
+                errors.plot(variance, bands[4], ":", color=look["color"], linewidth=1.2)
+            errors.plot(variance, bands[2], **look, label=f"median, {way}")
             inside = [100 * level["coverage"][k] for level in levels[1:]]
-            coverage.plot(variance[1:], inside, look["style"], color=look["color"], markersize=3, linewidth=1)
+            coverage.plot(variance[1:], inside, **look)
         errors.axhline(0.0, color=RED, linewidth=0.8)
         coverage.axhline(95.0, color=RED, linewidth=0.8)
-        coverage.set_ylim(0, 102)
+        coverage.set_ylim(60, 101)
         tidy(errors, "", f"normalised error of {SYMBOLS[name]} (%)", letter=f"({'abc'[k]})")
         tidy(coverage, "noise variance (m²)", f"coverage, {SYMBOLS[name]} (%)")
         above = errors.secondary_xaxis("top", functions=(lambda v: np.sqrt(np.maximum(v, 0.0)), np.square))
@@ -164,7 +155,7 @@ def draw(found: Found) -> dict[str, Figure]:
 def rows(found: Found) -> list[Row]:
     """Lines of the table."""
     filtered, direct = found["ways"][FILTERED], found["ways"][DIRECT]
-    last = -1
+    last, quarter = -1, found["sigma"].index(0.25)
     runs, sigma = found["runs"], found["sigma"][last]
     bias = [m - t for m, t in zip(filtered[0]["median"], TRUTH, strict=True)]
     return [
@@ -182,7 +173,13 @@ def rows(found: Found) -> list[Row]:
             f"{runs} runs a level, {filtered[last]['converged']} converged",
         ),
         Row(
-            "the same with the samples fitted directly (%)",
+            "Fig. 5: the same at standard deviation 0.25 m, the other reading of the paper's unit (%)",
+            "",
+            f"{_list([100 * e for e in filtered[quarter]['mean_size']], '.2f')}",
+            f"samples fitted directly: {_list([100 * e for e in direct[quarter]['mean_size']], '.2f')}",
+        ),
+        Row(
+            f"at variance {sigma**2:g} m² with the samples fitted directly (%)",
             "not done",
             f"{_list([100 * e for e in direct[last]['mean_size']], '.2f')}",
             f"{direct[last]['converged']} of {runs} converged; rms error of the filtered fit is "

@@ -34,9 +34,17 @@ class Part(Protocol):
 
     TITLE: str
 
-    def compute(self, quick: bool, folder: Path, say: Say) -> Found: ...
-    def draw(self, found: Found) -> dict[str, Figure]: ...
-    def rows(self, found: Found) -> list[Row]: ...
+    def compute(self, quick: bool, folder: Path, say: Say) -> Found:
+        """What there is to find, as it is written to JSON; long studies keep what is done in `folder`."""
+        ...
+
+    def draw(self, found: Found) -> dict[str, Figure]:
+        """Figures by the name of their file."""
+        ...
+
+    def rows(self, found: Found) -> list[Row]:
+        """Lines of the table."""
+        ...
 
 
 def new_figure(width: float, height: float) -> Figure:

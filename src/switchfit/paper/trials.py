@@ -90,17 +90,16 @@ def _paths(found: Found, restick: str) -> Figure:
             markeredgewidth=0,
             label=label.get("samples"),
         )
-        theta, end = fit["theta"], np.array(trial["samples"])[-1] + shift
+        theta = fit["theta"]
         ax.annotate(
             f"Trial {k + 1}\n$\\tau$ = ({theta['tau_1']:.2f}, {theta['tau_2']:.2f}) s\n$\\mu$ = {theta['mu']:.3f}",
-            end,
-            xytext=(0, 5),
-            textcoords="offset points",
+            (shift[0] + 8.0, -2.5),
             ha="center",
+            va="top",
             fontsize=6.5,
         )
-    ax.margins(x=0.06, y=0.14)
-    ax.legend(frameon=False, fontsize=7, loc="upper left", ncols=1)
+    ax.set_ylim(bottom=-15)
+    figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=7)
     model = "with reset at re-stick" if restick == "reset" else "as printed"
     ax.set_title(f"Simulated logs (Magic Formula vehicle), equation (18) {model}", fontsize=8, loc="left")
     tidy(ax, f"X (m), each trial shifted by {SHIFT:g} m", "Y (m)")

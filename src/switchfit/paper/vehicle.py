@@ -45,18 +45,16 @@ def position(t: Any, x: Any, p: Any) -> Any:
 
 def stick_slip(
     data: Data,
-    start: tuple[float, float, float] = START,
+    start: tuple[float, ...] = START,
     *,
-    t0: float = 0.0,
     tf: float = HORIZON,
     stick_force: float = 15.0,
     restick: Restick = "continuous",
-    initial_state: Any = None,
 ) -> Problem:
-    """The estimation problem of equation (18): tau_1, tau_2 and mu from `data`."""
+    """The estimation problem of equation (18): the transition times and mu from `data`, in this order in `start`."""
     system = skid_steer(stick_forces=(stick_force,) * 4, restick=restick)
-    run = Experiment(data, SEQUENCE, start[:2], t0, tf, initial_state=initial_state)
-    return Problem(system, run, {"mu": Parameter(start[2], lower=0.05, upper=2.0, unit="1")})
+    run = Experiment(data, SEQUENCE[: len(start)], start[:-1], 0.0, tf)
+    return Problem(system, run, {"mu": Parameter(start[-1], lower=0.05, upper=2.0, unit="1")})
 
 
 def driven(

@@ -83,7 +83,7 @@ def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say | N
             for kind in ("pdf", "png"):
                 _save(figure, out / f"{title}.{kind}")
     results = {name: results[name] for name in PARTS if name in results}
-    write_atomically(json.dumps(results, indent=1), out / RESULTS)
+    write_atomically(_lines(results), out / RESULTS)
     write_atomically(table(results), out / TABLE)
     shutil.rmtree(unfinished)
     return results
@@ -100,6 +100,11 @@ def table(results: Mapping[str, Found]) -> str:
     if fewer:
         note += f" With fewer repetitions (--quick): {', '.join(fewer)}."
     return "\n".join([*lines, "", note, ""])
+
+
+def _lines(results: Mapping[str, Found]) -> str:
+    """JSON with a line for each part."""
+    return "{\n" + ",\n".join(f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in results.items()) + "\n}\n"
 
 
 def _line(row: Row) -> str:

@@ -1,0 +1,186 @@
+"""The paper's claims, each checked with fewer repetitions than `switchfit paper` makes."""
+
+import json
+import types
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from switchfit.cli import app
+from switchfit.paper import PARTS, convergence, horizon, lti, magic, noise, run, trials
+from switchfit.paper.part import Row
+from switchfit.paper.runner import table
+from switchfit.paper.vehicle import NAMES, TRUTH
+
+
+def found_by(part, folder):
+    """What a part finds, as it comes back from the file; its table and figures have to work with that."""
+    found = json.loads(json.dumps(part.compute(True, folder, lambda text: None)))
+    for row in part.rows(found):
+        assert "nan" not in " ".join(row)
+        assert row.ours
+    for figure in part.draw(found).values():
+        for ax in figure.axes:
+            assert ax.get_ylabel() or ax.get_xlabel()
+    return found
+
+
+def test_lti_example_agrees_with_matrix_exponentials_and_exact_sqp_is_the_fastest(tmp_path):
+    found = found_by(lti, tmp_path)
+    assert max(found["gaps"]) < 1e-8
+    assert found["error"] < 1e-8
+    steepest, block, exact = (found["fits"][kind]["iterations"] for kind in ("none", "block-diagonal", "exact"))
+    assert exact <= 8
+    assert steepest > block > 3 * exact
+    assert found["fits"]["exact"]["sufficient"]
+
+
+def test_closed_form_of_the_lti_example_at_its_truth():
+    """J and DJ vanish, and D²J is positive definite: had a term of Van Loan's been lost, J would not vanish."""
+    cost, gradient, hessian = lti.exact(np.array(lti.TRUTH))
+    assert abs(cost) < 1e-12
+    assert np.max(np.abs(gradient)) < 1e-12
+    assert np.linalg.eigvalsh(hessian)[0] > 0.1
+
+
+def test_exact_sqp_is_quadratic_and_the_block_diagonal_hessian_linear(tmp_path):
+    found = found_by(convergence, tmp_path)
+    fits = found["fits"]
+    assert all(fit["gradient_norm"] < 1e-7 for fit in fits.values())
+    for fit in fits.values():
+        np.testing.assert_allclose([fit["theta"][name] for name in NAMES], TRUTH, rtol=0, atol=1e-6)
+    assert fits["exact"]["iterations"] <= 12
+    assert 1.7 < convergence.order(fits["exact"]["history"]) < 2.4
+    assert fits["block-diagonal"]["iterations"] > 20 * fits["exact"]["iterations"]
+    assert 0.9 < convergence.factor(fits["block-diagonal"]["history"]) < 1.0
+    assert fits["none"]["iterations"] >= 1000
+    assert found["eigenvalues_at_start"][0] < 0 < found["descents"]
+    assert fits["descent-first"]["iterations"] - found["descents"] <= 12
+    assert fits["exact"]["sufficient"]
+
+
+def test_magic_formula_reference_gives_values_like_the_paper_and_sixteen_coefficients_do_not_work(tmp_path):
+    found = found_by(magic, tmp_path)
+    literal, reset = found["fits"]["continuous"], found["fits"]["reset"]
+    for fit in (literal, reset):
+        assert fit["sufficient"]
+        assert abs(fit["theta"]["tau_1"] - 5.0) < 0.15
+        assert 10.0 < fit["theta"]["tau_2"] < 12.0
+        assert 0.6 < fit["theta"]["mu"] < 0.85
+    assert reset["rms_position_error"] < 0.2 * literal["rms_position_error"]
+    values = np.array(found["eigenvalues"])
+    assert found["determined"] < 10
+    assert values[0] < 1e-12 * values[-1]
+
+
+def test_error_grows_with_noise_and_is_largest_for_mu(tmp_path, monkeypatch):
+    monkeypatch.setattr(noise, "QUICK_LEVELS", (0.0, 0.05, 0.25, 0.5))
+    found = found_by(noise, tmp_path)
+    filtered, direct = found["ways"][noise.FILTERED], found["ways"][noise.DIRECT]
+    for levels in (filtered, direct):
+        rms = np.array([level["rms"] for level in levels])
+        assert np.all(np.diff(rms, axis=0) > 0)
+        assert np.all(rms[1:, 2] > rms[1:, :2].max(axis=1))
+        coverage = np.array([level["coverage"] for level in levels[1:]])
+        assert np.all(coverage > 0.8)
+        assert all(level["converged"] > 0.9 * found["runs"] for level in levels[1:])
+    # Without noise the samples hold the truth, their interpolation does not.
+    assert max(direct[0]["rms"]) < 1e-7
+    assert max(filtered[0]["rms"]) > 1e-4
+    assert np.mean(np.divide(filtered[-1]["rms"], direct[-1]["rms"])) > 1.0
+
+
+def test_trials_converge_in_fewer_than_fifteen_iterations_and_a_reset_explains_them_better(tmp_path, monkeypatch):
+    monkeypatch.setattr(trials, "TRIALS", trials.TRIALS[2:4])
+    found = found_by(trials, tmp_path)
+    assert [trial["force"] for trial in found["trials"]] == [12.0, 15.0]
+    for trial in found["trials"]:
+        for fit in trial["fits"].values():
+            assert fit["iterations"] < 15
+            assert fit["gradient_norm"] < 1e-7
+            assert fit["sufficient"]
+            assert 0.6 < fit["theta"]["mu"] < 0.85
+        assert trial["fits"]["reset"]["cost"] < 0.25 * trial["fits"]["continuous"]["cost"]
+
+
+def test_a_longer_horizon_is_more_accurate_but_does_not_always_widen_the_region_of_starts(tmp_path, monkeypatch):
+    monkeypatch.setattr(horizon, "QUICK_ENDS", (8.0, 15.0, 26.0))
+    found = found_by(horizon, tmp_path)
+    levels = found["horizons"]
+    assert levels[0]["names"] == ["tau_1", "mu"]
+    assert all(level["names"] == list(NAMES) for level in levels[1:])
+    errors = np.array([level["standard_errors"] for level in levels[1:]])
+    assert np.all(np.diff(errors, axis=0) < 0)
+    for level in levels:
+        ratio = np.array(level["rms_errors"]) / level["standard_errors"]
+        assert np.all((ratio > 0.6) & (ratio < 1.7))
+    arrived = [level["arrived"] for level in levels[1:]]
+    assert arrived[1] < arrived[0]
+    assert min(arrived) > 0.2
+
+
+def part_that(title, computes):
+    return types.SimpleNamespace(
+        TITLE=title,
+        compute=computes,
+        draw=lambda found: {},
+        rows=lambda found: [Row(title, "1 | 2", str(found["value"]))],
+    )
+
+
+def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    calls = []
+
+    def interrupted(quick, folder, say):
+        calls.append("second")
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return {"value": 2}
+
+    def first(quick, folder, say):
+        calls.append("first")
+        return {"value": 1}
+
+    parts = {"lti": part_that("one", first), "noise": part_that("two", interrupted)}
+    monkeypatch.setattr("switchfit.paper.runner.PARTS", parts)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, quick=True)
+    said = []
+    results = run(tmp_path, quick=True, say=said.append)
+    assert calls == ["first", "second", "second"]
+    assert said == ["[1/2] one: done before the interruption"]
+    assert [entry["found"]["value"] for entry in results.values()] == [1, 2]
+    assert json.loads((tmp_path / "results.json").read_text()) == results
+    assert (tmp_path / "table.md").read_text() == table(results)
+    assert "| one | 1 \\| 2 | 1 |" in table(results)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["results.json", "table.md"]
+    # A complete run begins anew; one part alone leaves the others as they were.
+    run(tmp_path, quick=False, only="lti")
+    assert calls[3:] == ["first"]
+    again = json.loads((tmp_path / "results.json").read_text())
+    assert [entry["quick"] for entry in again.values()] == [False, True]
+
+
+def test_interrupted_study_is_not_taken_for_a_result(tmp_path, monkeypatch):
+    class Stopped:
+        requested = 5
+
+        def __len__(self):
+            return 3
+
+    monkeypatch.setattr(noise, "monte_carlo", lambda *args, **kwargs: Stopped())
+    with pytest.raises(KeyboardInterrupt):
+        noise.compute(True, tmp_path, lambda text: None)
+
+
+def test_command_writes_figures_and_table_and_names_the_parts(tmp_path):
+    runner = CliRunner()
+    out = runner.invoke(app, ["paper", "--quick", "--only", "lti", "--out", str(tmp_path / "new")])
+    assert out.exit_code == 0, out.output
+    assert "| LTI: the correct values are found |" in out.stdout
+    names = {path.name for path in (tmp_path / "new").iterdir()}
+    assert names == {"lti.pdf", "lti.png", "results.json", "table.md"}
+    wrong = runner.invoke(app, ["paper", "--only", "fig7", "--out", str(tmp_path)])
+    assert wrong.exit_code == 2
+    assert f"there is no part 'fig7'; the parts are {', '.join(PARTS)}" in wrong.output
