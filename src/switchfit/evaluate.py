@@ -11,7 +11,7 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from switchfit.cache import compilation_cache
 from switchfit.data import FloatArray
@@ -24,7 +24,6 @@ from switchfit.model import Arguments, Model, Structure, float64
 from switchfit.problem import Problem
 from switchfit.propagate import path_cost, propagate
 from switchfit.refine import refined_mesh
-from switchfit.simulate import flat_parameters
 
 Method = Literal["auto", "forward", "discrete-adjoint", "adjoint", "autodiff"]
 Matrix = Literal["exact", "gauss-newton", "none"]
@@ -70,7 +69,7 @@ class Evaluator:
         self.meshes = list(meshes) if meshes is not None else [refined_mesh(problem, e, at) for e in indices]
         self.arguments = [problem.arguments(e, mesh) for e, mesh in enumerate(self.meshes)]
         self._compiled: set[tuple[Method, Matrix]] = set()
-        self._places = [(own, places[own]) for places in places_of(problem) for own in [np.flatnonzero(places >= 0)]]
+        self._places = [(own, places[own]) for places in problem.places for own in [np.flatnonzero(places >= 0)]]
 
     def divided(self, parts: int = 2) -> Evaluator:
         """The same problem with every cell of its meshes cut into equal parts."""
@@ -95,8 +94,9 @@ class Evaluator:
         for result, (own, mine) in zip(results, self._places, strict=True):
             J, g, H = map(np.asarray, result)
             total += float(J)
-            gradient[mine] += g[own]
-            hessian[mine[:, None], mine] += H[own[:, None], own]
+            # Two names of the model may mean one parameter: its place then stands twice, and both count.
+            np.add.at(gradient, mine, g[own])
+            np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
         return Evaluation(total, gradient, hessian)
 
     def breakpoints(self) -> list[FloatArray]:
@@ -108,9 +108,11 @@ class Evaluator:
         return points
 
     def _each(self, theta: FloatArray) -> list[tuple[Structure, Arguments, FloatArray, FloatArray]]:
-        times, parameters = self.problem.split(np.asarray(theta, dtype=np.float64))
-        p = flat_parameters(self.problem, parameters)
-        return [(s, a, tau, p) for s, a, tau in zip(self.problem.structures, self.arguments, times, strict=True)]
+        theta = np.asarray(theta, dtype=np.float64)
+        return [
+            (structure, arguments, *self.problem.vectors(theta, e))
+            for e, (structure, arguments) in enumerate(zip(self.problem.structures, self.arguments, strict=True))
+        ]
 
 
 def evaluator_of(problem: Problem) -> Evaluator:
@@ -154,12 +156,6 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     return evaluator_of(problem)(problem.checked_theta(theta), method=method)
 
 
-def places_of(problem: Problem) -> list[NDArray[np.intp]]:
-    """For each experiment the positions in theta of its N transition times and M parameters, -1 where fixed."""
-    spans = [np.arange(span.start, span.stop) for span in problem.unknowns.parameters.values()]
-    return [np.concatenate([times, *spans]).astype(np.intp) for times in problem.unknowns.times]
-
-
 def _resolve(method: Method, structure: Structure) -> Method:
     if method != "auto":
         return method
@@ -177,7 +173,7 @@ def derivatives(
     method: Method,
     matrix: Matrix = "exact",
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Cost, gradient (D,) and Hessian (D, D) of one experiment in its N transition times and M parameters, traced."""
+    """Cost, gradient (D,) and Hessian (D, D) of one experiment in its N transition times and its p (M,), traced."""
     model = Model(structure, arguments)
     if method == "adjoint":
         return paper_derivatives(model, tau, p, side)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from switchfit.cache import compilation_cache
 from switchfit.data import FloatArray
 from switchfit.estimate import minimized, with_names
-from switchfit.evaluate import Evaluator, derivatives, places_of
+from switchfit.evaluate import Evaluator, derivatives
 from switchfit.mesh import Mesh
 from switchfit.model import Arguments, Structure, float64
 from switchfit.optimize import Status
@@ -135,7 +135,7 @@ def fit_chunk(
     lockstep = in_lockstep() if lockstep is None else lockstep
     layout = Layout(
         problem.structures,
-        tuple(tuple(int(k) for k in places) for places in places_of(problem)),
+        tuple(tuple(int(k) for k in places) for places in problem.places),
         varying.places,
         lockstep,
         tolerance,
