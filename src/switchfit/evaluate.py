@@ -66,7 +66,8 @@ class Evaluator:
         self.problem = problem
         indices = range(len(problem.experiments))
         at = problem.initial_theta if theta is None else theta
-        self.meshes = list(meshes) if meshes is not None else [refined_mesh(problem, e, at) for e in indices]
+        given = list(meshes) if meshes is not None else [refined_mesh(problem, e, at) for e in indices]
+        self.meshes = problem.with_common_lengths(given)
         self.arguments = [problem.arguments(e, mesh) for e, mesh in enumerate(self.meshes)]
         self._compiled: set[tuple[Method, Matrix]] = set()
         self._places = [(own, places[own]) for places in problem.places for own in [np.flatnonzero(places >= 0)]]

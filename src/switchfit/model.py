@@ -7,7 +7,7 @@ nothing is compiled anew when transition times, parameters or data change.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import pairwise
@@ -27,7 +27,7 @@ from switchfit.data import (
     TerminalCost,
 )
 from switchfit.experiment import Experiment, Parameter, initial_state_of, reset_maps_of, signals_of
-from switchfit.mesh import Mesh, padded_length
+from switchfit.mesh import Mesh
 from switchfit.rungekutta import Density, Field, Tableau, tableau_of
 from switchfit.system import HybridSystem
 
@@ -461,12 +461,17 @@ def arguments_of(
     experiment: Experiment,
     parameters: Mapping[str, Parameter],
     mesh: Mesh,
+    sample_lengths: Sequence[int],
 ) -> Arguments:
-    """The arrays of one experiment on a mesh that holds all its sample times and knots as nodes."""
+    """The arrays of one experiment on a mesh that holds all its sample times and knots as nodes.
+
+    The samples of each of its Measurements are padded to the given lengths.
+    """
     initial = initial_state_of(system, experiment)
     mapped = experiment.parameter_map
     fixed = tuple(parameters[mapped.get(name, name)].value for name, _, free in structure.parameters if not free)
-    samples = tuple(_padded_samples(item, mesh) for item in _of_kind(experiment.data, Measurements))
+    measurements = _of_kind(experiment.data, Measurements)
+    samples = tuple(_padded_samples(*given, mesh) for given in zip(measurements, sample_lengths, strict=True))
     weights = tuple(_compact(item.weights) for item in _of_kind(experiment.data, ReferenceSignal))
     x0 = np.zeros(structure.n) if callable(initial) else initial_values(initial)
     arrays = (mesh.nodes, _signals_by_cell(experiment, mesh), fixed, x0, samples, weights)
@@ -554,9 +559,9 @@ def _state_size(initial: Any, parameters: Mapping[str, Parameter]) -> int:
     return int(shape[0])
 
 
-def _padded_samples(item: Measurements, mesh: Mesh) -> Samples:
-    """Samples of one Measurements, padded with missing ones to a length out of `padded_length`."""
-    extra = padded_length(len(item.times)) - len(item.times)
+def _padded_samples(item: Measurements, length: int, mesh: Mesh) -> Samples:
+    """Samples of one Measurements, padded with missing ones to a length."""
+    extra = length - len(item.times)
     rows = ((0, extra), (0, 0))
     return Samples(
         np.pad(mesh.cell_ending_at(item.times), (0, extra), mode="edge"),  # type: ignore[arg-type]  # made jax arrays

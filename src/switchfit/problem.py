@@ -7,7 +7,7 @@ is fixed stays out of it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
@@ -15,9 +15,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.data import FloatArray, as_number, as_numbers
+from switchfit.data import FloatArray, Measurements, as_number, as_numbers
 from switchfit.experiment import Experiment, initial_state_of, run_names
-from switchfit.mesh import Mesh
+from switchfit.mesh import Mesh, common_lengths
 from switchfit.model import Arguments, Structure, arguments_of, structure_of
 from switchfit.parameter import Parameter, as_parameter
 from switchfit.system import HybridSystem
@@ -186,7 +186,36 @@ class Problem:
 
     def arguments(self, e: int, mesh: Mesh) -> Arguments:
         """The arrays that the compiled programs of experiment e take, on a given mesh."""
-        return arguments_of(self.structures[e], self.system, self.experiments[e], self.parameters, mesh)
+        return arguments_of(
+            self.structures[e], self.system, self.experiments[e], self.parameters, mesh, self.sample_lengths[e]
+        )
+
+    @cached_property
+    def alike(self) -> tuple[tuple[int, ...], ...]:
+        """Groups of experiments (from 0) that have equal structures: one program each, if their lengths agree too."""
+        groups: dict[Structure, list[int]] = {}
+        for e, structure in enumerate(self.structures):
+            groups.setdefault(structure, []).append(e)
+        return tuple(tuple(group) for group in groups.values())
+
+    @cached_property
+    def sample_lengths(self) -> tuple[tuple[int, ...], ...]:
+        """For each experiment the lengths to which the samples of each of its Measurements are padded."""
+        counts = [[len(item.times) for item in e.data if isinstance(item, Measurements)] for e in self.experiments]
+        for group in self.alike:
+            for k in range(len(counts[group[0]])):
+                for e, length in zip(group, common_lengths([counts[e][k] for e in group]), strict=True):
+                    counts[e][k] = length
+        return tuple(tuple(lengths) for lengths in counts)
+
+    def with_common_lengths(self, meshes: Sequence[Mesh]) -> list[Mesh]:
+        """The meshes of all experiments, those of experiments that are alike padded to common lengths."""
+        padded = list(meshes)
+        for group in self.alike:
+            lengths = common_lengths([meshes[e].cells for e in group])
+            for e, length in zip(group, lengths, strict=True):
+                padded[e] = meshes[e] if len(group) == 1 else meshes[e].padded_to(length)
+        return padded
 
     def checked_theta(self, theta: ArrayLike | None) -> FloatArray:
         """`theta`, or the initial guess for None, as a ``(d,)`` array; ValueError where shape or order is wrong."""

@@ -184,7 +184,8 @@ class ExperimentTable(_Table):
     t0: float | None = Field(default=None, description="start of the horizon (s); left out, the first sample")
     tf: float | None = Field(default=None, description="end of the horizon (s); left out, the last sample")
     initial_state: list[Annotated[StateTable, pydantic.BeforeValidator(_known_as_table)]] | None = Field(
-        default=None, description="state at t0, instead of the model's: a number, or a table where it is to be estimated"
+        default=None,
+        description="state at t0, instead of the model's: a number, or a table where it is to be estimated",
     )
     parameter_map: dict[str, str] = Field(
         default_factory=dict,
