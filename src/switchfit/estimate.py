@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from switchfit.certificate import certify
 from switchfit.data import FloatArray, Measurements
-from switchfit.evaluate import Evaluation, Evaluator, evaluator_of
+from switchfit.evaluate import ArrowEvaluation, Evaluation, Evaluator, evaluator_of
 from switchfit.io.json import load_fit, save_fit
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
 from switchfit.problem import Problem
@@ -37,6 +37,9 @@ LARGEST_INTEGRATION_ERROR = 1e-8
 PERFECT_FIT = 1e-3
 """Where J has fallen to less than this part of its first value, the integration error is measured against that part:
 the relative error of a cost that vanishes says nothing."""
+
+MANY_RUNS = 8
+"""Experiments from which on the Hessian's shape of an arrow is made use of."""
 
 ORDER = 5
 """Order of both integrators: what dividing the steps gains."""
@@ -215,8 +218,11 @@ def minimized(
     problem = evaluator.problem
 
     matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
+    by_blocks = len(problem.experiments) >= MANY_RUNS and 2 * len(evaluator.layout.shared) < len(theta)
 
-    def evaluate(theta: Any, side: int) -> Evaluation | CostAndGradient:
+    def evaluate(theta: Any, side: int) -> Evaluation | ArrowEvaluation | CostAndGradient:
+        if hessian != "none" and by_blocks:
+            return evaluator.arrow(theta, side, matrix)
         here = evaluator(theta, side, matrix=matrix)
         return CostAndGradient(here.cost, here.gradient) if hessian == "none" else here
 
