@@ -293,7 +293,7 @@ def test_a_parameter_that_neither_map_nor_problem_has():
 
 
 def test_a_name_of_a_map_with_another_shape():
-    with pytest.raises(ValueError, match="mode 'swing': .* raised IndexError"):
+    with pytest.raises(ValueError, match=r"mode 'swing': .* raised IndexError"):
         sf.Problem(SWING, run(parameter_map={"k": "b"}), GUESS)
 
 
