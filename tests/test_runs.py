@@ -1,5 +1,7 @@
 """Several runs: what they share, what is their own, initial states that are estimated, and what all this costs."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 import switchfit as sf
+from switchfit.batch.program import Layout, _total
 from switchfit.cli import app
 from switchfit.estimate import minimized
 from switchfit.evaluate import derivatives, evaluator_of
@@ -487,6 +490,24 @@ def test_batches(fitted):
     np.testing.assert_allclose(many.theta[0], fitted.theta, rtol=1e-7)
     other = sf.estimate(tanks(2, seed=5))
     np.testing.assert_allclose(many.theta[1], other.theta, rtol=1e-7)
+
+
+def test_a_batch_of_runs_with_times_that_are_known():
+    """In the loop over runs that are alike, known transition times are not mixed up with those of others."""
+    known = sf.Parameter(1.9, fixed=True)
+    given = tanks(2)
+    runs = [replace(run, transition_times=(known,), name=f"known{e}") for e, run in enumerate(given.experiments)]
+    problem = sf.Problem(TANK, [*given.experiments, *runs], given.parameters)
+    evaluator, theta = evaluator_of(problem), problem.initial_theta + 0.1
+    places = tuple(tuple(where.tolist()) for where in problem.places)
+    for lockstep in (False, True):
+        layout = Layout(problem.structures, places, (), lockstep, 1e-7, 10)
+        times = tuple(run.initial_times for run in problem.experiments)
+        with jax.enable_x64(True):
+            found = jax.jit(lambda theta, f=layout, t=times: _total(f, tuple(evaluator.arguments), t, theta))(theta)
+        expected = evaluator(theta)
+        for one, other in zip(found, (expected.cost, expected.gradient, expected.hessian), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-8)
 
 
 PROGRAMS = (derivatives, _block, _terminal, _steps, initial_state)
