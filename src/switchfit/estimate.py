@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from switchfit.certificate import certify
 from switchfit.data import FloatArray, Measurements
-from switchfit.evaluate import Evaluation, Evaluator, evaluator_of
+from switchfit.evaluate import ArrowEvaluation, Evaluation, Evaluator, evaluator_of
 from switchfit.io.json import load_fit, save_fit
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
 from switchfit.problem import Problem
@@ -37,6 +37,10 @@ LARGEST_INTEGRATION_ERROR = 1e-8
 PERFECT_FIT = 1e-3
 """Where J has fallen to less than this part of its first value, the integration error is measured against that part:
 the relative error of a cost that vanishes says nothing."""
+
+MANY_RUNS = 16
+"""Experiments from which on the Hessian's shape of an arrow is made use of; with fewer, the algebra of full matrices
+takes no longer (the runs part of the benchmarks)."""
 
 ORDER = 5
 """Order of both integrators: what dividing the steps gains."""
@@ -211,13 +215,21 @@ def minimized(
     tolerance: float,
     max_iterations: int,
     callback: Callable[[IterationRecord], object] | None = None,
+    by_blocks: bool | None = None,
 ) -> Result:
-    """One run of the optimiser on the evaluator's meshes; arguments as of `estimate`."""
+    """One run of the optimiser on the evaluator's meshes; arguments as of `estimate`.
+
+    `by_blocks` says whether to use the shape that the Hessian of several runs has; left out, where it pays.
+    """
     problem = evaluator.problem
 
     matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
+    if by_blocks is None:
+        by_blocks = len(problem.experiments) >= MANY_RUNS and 2 * len(evaluator.layout.shared) < len(theta)
 
-    def evaluate(theta: Any, side: int) -> Evaluation | CostAndGradient:
+    def evaluate(theta: Any, side: int) -> Evaluation | ArrowEvaluation | CostAndGradient:
+        if hessian not in ("none", "descent-first") and by_blocks:
+            return evaluator.arrow(theta, side, matrix)
         here = evaluator(theta, side, matrix=matrix)
         return CostAndGradient(here.cost, here.gradient) if hessian == "none" else here
 

@@ -1,8 +1,8 @@
-"""One run of the system: its data, its sequence of modes, its guesses; and `Parameter`, an unknown of any kind."""
+"""One run of the system: its data, its sequence of modes, its guesses, and what in it is its own."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -20,60 +20,9 @@ from switchfit.data import (
     TerminalCost,
     as_number,
 )
+from switchfit.parameter import Parameter as Parameter
+from switchfit.parameter import as_parameter
 from switchfit.system import HybridSystem, ResetMap, as_state
-
-
-@dataclass(frozen=True, eq=False)
-class Parameter:
-    """One unknown, scalar or array: its initial guess and what is known about it.
-
-    Parameters
-    ----------
-    value : float or array_like
-        Initial guess, or the value itself where `fixed`.
-    lower, upper : float or array_like, optional
-        Bounds; broadcast to the shape of `value`.
-    unit : str, optional
-        For the report.
-    fixed : bool, optional
-        A fixed parameter is not estimated.
-
-    Raises
-    ------
-    ValueError
-        If a value is not finite, bounds cross, or the guess lies outside them.
-    """
-
-    value: Any
-    lower: Any = -np.inf
-    upper: Any = np.inf
-    unit: str = ""
-    fixed: bool = False
-
-    def __post_init__(self) -> None:
-        try:
-            value = np.array(self.value, dtype=np.float64)
-            lower = np.broadcast_to(np.asarray(self.lower, dtype=np.float64), value.shape).copy()
-            upper = np.broadcast_to(np.asarray(self.upper, dtype=np.float64), value.shape).copy()
-        except (TypeError, ValueError) as error:
-            raise ValueError(
-                f"Parameter needs numbers: value {self.value!r}, lower {self.lower!r}, upper {self.upper!r}; {error}."
-            ) from error
-        if value.size == 0:
-            raise ValueError("Parameter value must have one entry or more; got none.")
-        if not np.all(np.isfinite(value)):
-            raise ValueError(f"Parameter value must be finite; got {self.value!r}.")
-        if not np.all(lower <= upper):
-            raise ValueError(f"Parameter bounds must satisfy lower <= upper; got [{self.lower}, {self.upper}].")
-        if not (np.all(lower <= value) and np.all(value <= upper)):
-            raise ValueError(f"Parameter value {self.value} lies outside its bounds [{self.lower}, {self.upper}].")
-        for name, array in (("value", value), ("lower", lower), ("upper", upper)):
-            object.__setattr__(self, name, array)
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of the parameter, () for a scalar."""
-        return tuple(self.value.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,14 +43,25 @@ class Experiment:
     inputs : Input, optional
         Known input; modes are then called as ``f(t, x, p, u)``.
     initial_state : (n,) array_like or callable ``p -> (n,)``, optional
-        Overrides the system's.
+        Overrides the system's. An entry may be a `Parameter`: it is then estimated for this run, or fixed.
     name : str, optional
-        Used in the names of transition times when there are several experiments.
+        Used in the names of this run's own unknowns when there are several experiments.
+    parameter_map : mapping of str to str, optional
+        The model's name of a parameter -> the problem's: with ``{"beta": "beta_run3"}`` the functions of this run find
+        the problem's ``beta_run3`` under ``p["beta"]``. Names that are not in it mean themselves, and several names
+        may mean one parameter.
 
     Raises
     ------
     ValueError
         If lengths do not match, times are unordered or outside the horizon, or data lies outside it.
+
+    Notes
+    -----
+    ``p`` holds the names of the map, and all parameters of the problem that no run's map has as its target; a target
+    is there under its own name only if a function asks for it. A run is differentiated with respect to the parameters
+    that its functions ask for and to no others, so that many runs with parameters of their own cost each what it alone
+    would. (Functions that look at ``p`` as a whole, or hand it to ``jax.jit``, ask for all that it holds.)
     """
 
     data: Any
@@ -112,6 +72,7 @@ class Experiment:
     inputs: Input | None = None
     initial_state: Any = None
     name: str | None = None
+    parameter_map: Any = None
 
     def __post_init__(self) -> None:
         t0, tf = as_number(self.t0, "t0"), as_number(self.tf, "tf")
@@ -133,6 +94,7 @@ class Experiment:
         for field, value in (("t0", t0), ("tf", tf), ("mode_sequence", sequence), ("transition_times", times)):
             object.__setattr__(self, field, value)
         object.__setattr__(self, "data", _checked_data(self.data))
+        object.__setattr__(self, "parameter_map", _checked_map(self.parameter_map))
         self._check_times()
         self._check_data_inside()
         if self.inputs is not None:
@@ -191,14 +153,21 @@ def signals_of(experiment: Experiment) -> tuple[PiecewisePolynomial, ...]:
     return tuple(signals)
 
 
-def as_parameter(value: Any, what: str) -> Parameter:
-    """`value` itself if it is a `Parameter`, otherwise a free one without bounds; errors call it `what`."""
-    if isinstance(value, Parameter):
-        return value
-    try:
-        return Parameter(value)
-    except ValueError as error:
-        raise ValueError(f"{what} must be a number, an array or an sf.Parameter: {error}") from error
+def run_names(experiments: Sequence[Experiment]) -> tuple[str, ...]:
+    """What each experiment is called: its name, or run1, run2, ..."""
+    return tuple(experiment.name or f"run{e + 1}" for e, experiment in enumerate(experiments))
+
+
+def _checked_map(given: Any) -> Mapping[str, str]:
+    """A map of the model's names to the problem's; empty for None."""
+    names = {} if given is None else given
+    strings = isinstance(names, Mapping) and all(isinstance(name, str) for pair in names.items() for name in pair)
+    if not strings:
+        raise TypeError(
+            "parameter_map must be a dict of the model's name -> the problem's name, such as "
+            f"{{'beta': 'beta_run3'}}; got {given!r}."
+        )
+    return dict(names)
 
 
 def _checked_data(data: Any) -> tuple[Data, ...]:

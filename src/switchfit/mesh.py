@@ -11,6 +11,7 @@ chunks with rows of length zero, so that a chunk has one mode and all shapes are
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -54,6 +55,10 @@ class Mesh:
         """The nodes without the padding."""
         return self.nodes[: self.cells + 1]
 
+    def padded_to(self, cells: int) -> Mesh:
+        """The mesh with its padding made so long that it has the given number of cells."""
+        return Mesh(np.append(self.times, np.full(cells - self.cells, self.times[-1])), self.cells)
+
     def divided(self, parts: int = 2) -> Mesh:
         """The mesh with every cell cut into equal parts."""
         nodes = self.times
@@ -70,6 +75,21 @@ def padded_length(length: int) -> int:
     """`length` rounded up to four significant bits: at most an eighth too long, few distinct values."""
     unit = 1 << max(int(length).bit_length() - 4, 3)
     return -(-length // unit) * unit
+
+
+LONGEST_PADDING = 2.0
+"""Runs of one problem share a length, and with it a program, where that makes none of them longer than this many times
+its own. Compiling a program costs as much as some thousand evaluations, a row of padding as much as any other row."""
+
+
+def common_lengths(lengths: Sequence[int]) -> list[int]:
+    """Lengths out of `padded_length`, as few distinct ones as `LONGEST_PADDING` allows."""
+    padded = [padded_length(length) for length in lengths]
+    common: dict[int, int] = {}
+    for length in sorted(set(padded), reverse=True):
+        shared = min(common.values(), default=0)
+        common[length] = shared if 0 < shared <= LONGEST_PADDING * length else length
+    return [common[length] for length in padded]
 
 
 class Rows(NamedTuple):

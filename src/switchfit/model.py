@@ -7,9 +7,9 @@ nothing is compiled anew when transition times, parameters or data change.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ from switchfit.data import (
     TerminalCost,
 )
 from switchfit.experiment import Experiment, Parameter, initial_state_of, reset_maps_of, signals_of
-from switchfit.mesh import Mesh, padded_length
+from switchfit.mesh import Mesh
 from switchfit.rungekutta import Density, Field, Tableau, tableau_of
 from switchfit.system import HybridSystem
 
@@ -49,7 +49,8 @@ class Structure:
     reset_maps: tuple[Callable[..., Any] | None, ...]
     initial_state: Callable[..., Any] | None
     n: int
-    parameters: tuple[tuple[str, tuple[int, ...], bool], ...]  # name, shape, free
+    unknown_states: tuple[int, ...]  # entries of the initial state that are estimated
+    parameters: tuple[tuple[str, tuple[int, ...], bool], ...]  # the model's name, shape, free
     running: tuple[Callable[..., Any], ...]
     references: tuple[tuple[Observe | None, int], ...]  # observe, channels
     measurements: tuple[tuple[Observe | None, int], ...]  # observe, channels
@@ -67,10 +68,10 @@ class Structure:
         """Number of transitions."""
         return len(self.reset_maps)
 
-    @property
+    @cached_property
     def M(self) -> int:
-        """Number of free scalar parameters."""
-        return sum(int(np.prod(shape)) for _, shape, free in self.parameters if free)
+        """Length of p: the free scalar parameters, then the unknown entries of the initial state."""
+        return sum(int(np.prod(shape)) for _, shape, free in self.parameters if free) + len(self.unknown_states)
 
     @property
     def functions(self) -> Structure:
@@ -102,7 +103,7 @@ class Arguments(NamedTuple):
         Polynomial of each signal channel in each cell, in powers of time since the cell's first node: the
         references in the order of the data, then the input.
     fixed : values of the fixed parameters, in order
-    initial_state : (n,), zeros where it is a function of the parameters
+    initial_state : (n,), zeros where it is a function of the parameters; unknown entries are not looked at
     samples : one `Samples` for each `Measurements`
     weights : W of each `ReferenceSignal`, its diagonal (q,) where it is diagonal, else (q, q)
     """
@@ -155,7 +156,7 @@ def _polynomial_jvp(at: tuple[Array, Array], direction: tuple[Array, Array]) -> 
 class Model:
     """The functions of one experiment, bound to its arguments while a program is traced.
 
-    All functions take the flat vector p (M,) of the free parameters.
+    All functions take the flat vector p (M,) of the free parameters and the unknown entries of the initial state.
     """
 
     def __init__(self, structure: Structure, arguments: Arguments) -> None:
@@ -163,7 +164,7 @@ class Model:
         self.arguments = arguments
         self.tableau = structure.tableau
 
-    def parameters(self, p: Array) -> dict[str, Array]:
+    def parameters(self, p: Array) -> Mapping[str, Array]:
         """The dict the user's functions get."""
         named: dict[str, Array] = {}
         fixed = iter(self.arguments.fixed)
@@ -269,11 +270,81 @@ class Model:
     def initial_state(self, p: Array) -> Array:
         """x(t0), (n,)."""
         if self.structure.initial_state is None:
-            return self.arguments.initial_state
+            unknown = self.structure.unknown_states
+            x0 = self.arguments.initial_state
+            return x0.at[np.array(unknown)].set(p[-len(unknown) :]) if unknown else x0
         given = (self.parameters(p),)
         return checked_vector(
             self.structure.initial_state, given, (self.structure.n,), "initial_state", "initial_state(p)"
         )
+
+
+class _Asked(dict[str, Array]):
+    """The dict the user's functions get while it is found out which parameters they ask for.
+
+    Parameters
+    ----------
+    shown : what the dict holds
+    others : what it holds only for a function that asks by name: the targets of parameter maps
+    asked : set of str, to which every name that is asked for is added
+    """
+
+    def __init__(self, shown: Mapping[str, Array], others: Mapping[str, Array], asked: set[str]) -> None:
+        super().__init__(shown)
+        self.others = others
+        self.asked = asked
+
+    def __getitem__(self, name: str) -> Array:
+        value = super().__getitem__(name) if name in self.keys_alone() else self.others[name]
+        self.asked.add(name)
+        return value
+
+    def __contains__(self, name: object) -> bool:
+        there = name in self.keys_alone()
+        if there:
+            self.asked.add(str(name))
+        return there
+
+    def get(self, name: str, default: Any = None) -> Any:
+        return self[name] if name in self.keys_alone() or name in self.others else default
+
+    def keys_alone(self) -> Any:
+        """The names, without asking for them."""
+        return super().keys()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.whole())
+
+    def __len__(self) -> int:
+        return len(self.whole())
+
+    def keys(self) -> Any:
+        return self.whole().keys()
+
+    def values(self) -> Any:
+        return self.whole().values()
+
+    def items(self) -> Any:
+        return self.whole().items()
+
+    def whole(self) -> dict[str, Array]:
+        """All that is shown, which counts as asked for."""
+        self.asked.update(self.keys_alone())
+        return {name: super(_Asked, self).__getitem__(name) for name in self.keys_alone()}
+
+
+class _Asking(Model):
+    """A model whose functions are watched: which parameters do they ask for?"""
+
+    def __init__(self, structure: Structure, arguments: Arguments, others: frozenset[str], asked: set[str]) -> None:
+        super().__init__(structure, arguments)
+        self.others = others
+        self.asked = asked
+
+    def parameters(self, p: Array) -> Mapping[str, Array]:
+        named = super().parameters(p)
+        shown = {name: value for name, value in named.items() if name not in self.others}
+        return _Asked(shown, {name: named[name] for name in self.others}, self.asked)
 
 
 UNTRACEABLE = (
@@ -338,20 +409,39 @@ def checked_vector(
 
 
 def structure_of(
-    system: HybridSystem, experiment: Experiment, parameters: Mapping[str, Parameter], solver: str
+    system: HybridSystem,
+    experiment: Experiment,
+    parameters: Mapping[str, Parameter],
+    solver: str,
+    targets: frozenset[str] = frozenset(),
 ) -> Structure:
-    """The structure of one experiment."""
+    """The structure of one experiment, its functions checked.
+
+    Parameters
+    ----------
+    targets : set of str
+        Parameters of the problem that some experiment's map names as what it maps to. They are this experiment's
+        where it maps to them, or asks for them by their own name.
+    """
     names = tuple(dict.fromkeys(experiment.mode_sequence))
     initial = initial_state_of(system, experiment)
     of_kind = partial(_of_kind, experiment.data)
-    return Structure(
+    mapped = experiment.parameter_map
+    order = {name: k for k, name in enumerate(parameters)}
+    # The same order in every run, whatever its map: runs then share a program.
+    named = sorted({*parameters, *mapped}, key=lambda name: (order.get(name, len(order)), name))
+    others = frozenset(name for name in targets if name not in mapped)
+    meant = {name: parameters[mapped.get(name, name)] for name in named}
+    unknown = () if callable(initial) else tuple(k for k, x in enumerate(initial) if not getattr(x, "fixed", True))
+    structure = Structure(
         mode_names=names,
         modes=tuple(system.modes[name] for name in names),
         mode_of_segment=tuple(names.index(mode) for mode in experiment.mode_sequence),
         reset_maps=reset_maps_of(system, experiment.mode_sequence),
         initial_state=initial if callable(initial) else None,
-        n=_state_size(initial, parameters),
-        parameters=tuple((name, q.shape, not q.fixed) for name, q in parameters.items()),
+        n=_state_size(initial, meant),
+        unknown_states=unknown,
+        parameters=tuple((name, q.shape, not q.fixed) for name, q in meant.items()),
         running=tuple(item.ell for item in of_kind(RunningCost)),
         references=tuple((item.observe, item.signal.channels) for item in of_kind(ReferenceSignal)),
         measurements=tuple((item.observe, item.values.shape[1]) for item in of_kind(Measurements)),
@@ -359,6 +449,10 @@ def structure_of(
         input_shape=None if experiment.inputs is None else tuple(experiment.inputs.values.shape[1:]),
         solver=solver,
     )
+    asked = checked_functions(structure, others)
+    # What is fixed costs nothing, and functions may look at it in ways that do not show.
+    used = tuple(q for q in structure.parameters if q[0] in asked or not (q[2] or q[0] in others))
+    return replace(structure, parameters=used)
 
 
 def arguments_of(
@@ -367,29 +461,70 @@ def arguments_of(
     experiment: Experiment,
     parameters: Mapping[str, Parameter],
     mesh: Mesh,
+    sample_lengths: Sequence[int],
 ) -> Arguments:
-    """The arrays of one experiment on a mesh that holds all its sample times and knots as nodes."""
+    """The arrays of one experiment on a mesh that holds all its sample times and knots as nodes.
+
+    The samples of each of its Measurements are padded to the given lengths.
+    """
     initial = initial_state_of(system, experiment)
-    fixed = tuple(np.asarray(q.value) for q in parameters.values() if q.fixed)
-    samples = tuple(_padded_samples(item, mesh) for item in _of_kind(experiment.data, Measurements))
+    mapped = experiment.parameter_map
+    fixed = tuple(parameters[mapped.get(name, name)].value for name, _, free in structure.parameters if not free)
+    measurements = _of_kind(experiment.data, Measurements)
+    samples = tuple(_padded_samples(*given, mesh) for given in zip(measurements, sample_lengths, strict=True))
     weights = tuple(_compact(item.weights) for item in _of_kind(experiment.data, ReferenceSignal))
-    x0 = np.zeros(structure.n) if callable(initial) else initial
+    x0 = np.zeros(structure.n) if callable(initial) else initial_values(initial)
     arrays = (mesh.nodes, _signals_by_cell(experiment, mesh), fixed, x0, samples, weights)
     with float64():
         return Arguments(*jax.device_put(arrays))
 
 
+def initial_values(initial: Any) -> FloatArray:
+    """An initial state that is no function, as numbers (n,): where it is unknown, its guess."""
+    return np.array([x.value if isinstance(x, Parameter) else x for x in initial], dtype=np.float64)
+
+
 @lru_cache(maxsize=256)
-def check_functions(structure: Structure) -> None:
+def checked_functions(structure: Structure, others: frozenset[str] = frozenset()) -> frozenset[str]:
     """Call every function of the user's once, abstractly: that shapes, dtypes and parameter names are right.
 
     What has been found right is not looked at again when another problem is made of it.
+
+    Parameters
+    ----------
+    structure : Structure
+        With all parameters that functions may ask for.
+    others : set of str
+        Those among them that a function sees only if it asks for them by name.
+
+    Returns
+    -------
+    asked : set of str
+        The parameters that they ask for; all but the `others` where that cannot be told, since a function does
+        something with the dict that only an ordinary one allows.
 
     Raises
     ------
     ValueError
         Naming the mode or function, what it should return and what it returned.
     """
+    asked: set[str] = set()
+    try:
+        _call_functions(structure, partial(_Asking, others=others, asked=asked))
+        return frozenset(asked)
+    except Exception:
+        shown = tuple(q for q in structure.parameters if q[0] not in others)
+    try:
+        _call_functions(replace(structure, parameters=shown), Model)
+    except ValueError:
+        if not others:
+            raise
+        shown = structure.parameters  # one of the others may be asked for; if not, this says what is wrong
+        _call_functions(structure, Model)
+    return frozenset(name for name, _, _ in shown)
+
+
+def _call_functions(structure: Structure, model_of: Callable[[Structure, Arguments], Model]) -> None:
     channels = sum(q for _, q in structure.references) + int(np.prod(structure.input_shape or ()))
     with float64():
         arguments = Arguments(
@@ -400,7 +535,7 @@ def check_functions(structure: Structure) -> None:
             samples=(),
             weights=tuple(jnp.ones(q) for _, q in structure.references),
         )
-        model = Model(structure, arguments)
+        model = model_of(structure, arguments)
         piece = Piece(jnp.zeros(()), arguments.signals[0])
         t, x, p = (jax.ShapeDtypeStruct(shape, jnp.float64) for shape in ((), (structure.n,), (structure.M,)))
         for mode in range(len(structure.modes)):
@@ -421,7 +556,7 @@ def _of_kind(data: tuple[Any, ...], kind: type) -> list[Any]:
 def _state_size(initial: Any, parameters: Mapping[str, Parameter]) -> int:
     """Number of states, from the initial state or what its function returns."""
     if not callable(initial):
-        return int(initial.size)
+        return len(initial)
     with float64():
         p = {name: jax.ShapeDtypeStruct(q.shape, jnp.float64) for name, q in parameters.items()}
         shape = jax.eval_shape(lambda p: called(initial, (p,), "initial_state", "initial_state(p)"), p).shape
@@ -430,9 +565,9 @@ def _state_size(initial: Any, parameters: Mapping[str, Parameter]) -> int:
     return int(shape[0])
 
 
-def _padded_samples(item: Measurements, mesh: Mesh) -> Samples:
-    """Samples of one Measurements, padded with missing ones to a length out of `padded_length`."""
-    extra = padded_length(len(item.times)) - len(item.times)
+def _padded_samples(item: Measurements, length: int, mesh: Mesh) -> Samples:
+    """Samples of one Measurements, padded with missing ones to a length."""
+    extra = length - len(item.times)
     rows = ((0, extra), (0, 0))
     return Samples(
         np.pad(mesh.cell_ending_at(item.times), (0, extra), mode="edge"),  # type: ignore[arg-type]  # made jax arrays

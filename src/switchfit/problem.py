@@ -1,22 +1,25 @@
 """What is estimated: parameters, experiments, and the flat vector theta of all unknowns with its constraints.
 
 ``theta`` holds the free transition times of the first experiment, of the second, ..., then the free parameters
-in the order given. Everything that is fixed stays out of it.
+in the order given, then the unknown entries of the initial states, again experiment by experiment. Everything that
+is fixed stays out of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.data import FloatArray, as_number, as_numbers
-from switchfit.experiment import Experiment, Parameter, as_parameter
-from switchfit.mesh import Mesh
-from switchfit.model import Arguments, Structure, arguments_of, check_functions, structure_of
+from switchfit.data import FloatArray, Measurements, as_number, as_numbers
+from switchfit.experiment import Experiment, initial_state_of, run_names
+from switchfit.mesh import Mesh, common_lengths
+from switchfit.model import Arguments, Structure, arguments_of, structure_of
+from switchfit.parameter import Parameter, as_parameter
 from switchfit.system import HybridSystem
 
 SMALLEST_RTOL = 1e-13
@@ -33,6 +36,8 @@ class Unknowns:
     initial, lower, upper : (d,) arrays
     times : for each experiment the positions in theta of its transition times, -1 where fixed: (N,) int arrays
     parameters : dict of name -> slice into theta of the free parameters
+    initial_states : for each experiment the positions in theta of the entries of its initial state, -1 where it is not
+        estimated: (n,) int arrays; (0,) where it is a function
     A, b : ordering and minimum durations as ``A theta >= b``, (m, d) and (m,)
     constraint_names : what each row means when it is active
     """
@@ -44,6 +49,7 @@ class Unknowns:
     upper: FloatArray
     times: tuple[NDArray[np.intp], ...]
     parameters: Mapping[str, slice]
+    initial_states: tuple[NDArray[np.intp], ...]
     A: FloatArray
     b: FloatArray
     constraint_names: tuple[str, ...]
@@ -57,7 +63,8 @@ class Problem:
     ----------
     system : HybridSystem
     experiments : Experiment or list of Experiment
-        Parameters are shared by all of them, each has its own transition times.
+        Parameters are shared by all of them, unless their `parameter_map` says otherwise; each has its own transition
+        times, and its own initial state where that is unknown.
     parameters : mapping of str to Parameter, number or array
         A bare number is a free parameter without bounds.
     min_duration : float, optional
@@ -70,8 +77,8 @@ class Problem:
     Raises
     ------
     ValueError
-        For unknown modes, impossible minimum durations, or a vector field, reset map, observation or cost of
-        the wrong shape or dtype.
+        For unknown modes, unknown parameters in a map, impossible minimum durations, or a vector field, reset map,
+        observation or cost of the wrong shape or dtype.
     """
 
     system: HybridSystem
@@ -110,25 +117,41 @@ class Problem:
         object.__setattr__(self, "experiments", experiments)
         object.__setattr__(self, "parameters", parameters)
         dwell = as_number(self.min_duration, "min_duration")
-        object.__setattr__(self, "unknowns", _unknowns(experiments, parameters, dwell))
-        structures = tuple(structure_of(self.system, e, parameters, self.solver) for e in experiments)
-        for structure, experiment in zip(structures, experiments, strict=True):
-            self._check_states(structure.n, experiment)
-            check_functions(structure)
+        self._check_maps()
+        self._check_states()
+        object.__setattr__(self, "unknowns", _unknowns(self.system, experiments, parameters, dwell))
+        targets = frozenset(name for e in experiments for name in e.parameter_map.values())
+        structures = tuple(structure_of(self.system, e, parameters, self.solver, targets) for e in experiments)
+        for structure in structures:
+            self.system.check_labels_of(structure.n)
         object.__setattr__(self, "structures", structures)
 
     def __getstate__(self) -> dict[str, Any]:
         """What is pickled: not the meshes and programs that were made for it."""
         return {key: value for key, value in self.__dict__.items() if key != "evaluator"}
 
-    def _check_states(self, n: int, experiment: Experiment) -> None:
+    def _check_maps(self) -> None:
+        for name, experiment in zip(run_names(self.experiments), self.experiments, strict=True):
+            for here, target in experiment.parameter_map.items():
+                if target not in self.parameters:
+                    raise ValueError(
+                        f"parameter_map of experiment {name} gives the model's {here!r} as the unknown parameter "
+                        f"{target!r}; the problem has {', '.join(self.parameters) or 'none'}."
+                    )
+
+    def _check_states(self) -> None:
+        """Sizes of initial states that are no functions."""
         own = self.system.initial_state
-        if not callable(own) and n != own.size:
-            raise ValueError(
-                f"initial_state of experiment {experiment.name or self.experiments.index(experiment) + 1} must have "
-                f"{own.size} entries, as the system's has; got {n}."
-            )
-        self.system.check_labels_of(n)
+        for e, experiment in enumerate(self.experiments):
+            initial = initial_state_of(self.system, experiment)
+            if callable(initial):
+                continue
+            if not callable(own) and len(initial) != len(own):
+                raise ValueError(
+                    f"initial_state of experiment {experiment.name or e + 1} must have "
+                    f"{len(own)} entries, as the system's has; got {len(initial)}."
+                )
+            self.system.check_labels_of(len(initial))
 
     @property
     def initial_theta(self) -> FloatArray:
@@ -140,9 +163,59 @@ class Problem:
         """Name of each entry of theta, transition times first."""
         return self.unknowns.names
 
+    @cached_property
+    def places(self) -> tuple[NDArray[np.intp], ...]:
+        """For each experiment the positions in theta of its N transition times and of its p (M,), -1 where fixed."""
+        unknowns = self.unknowns
+        found = []
+        for e, (structure, experiment) in enumerate(zip(self.structures, self.experiments, strict=True)):
+            free = [name for name, _, is_free in structure.parameters if is_free]
+            spans = [unknowns.parameters[experiment.parameter_map.get(name, name)] for name in free]
+            states = unknowns.initial_states[e]
+            parts = [unknowns.times[e], *(np.arange(s.start, s.stop) for s in spans), states[states >= 0]]
+            found.append(np.concatenate(parts).astype(np.intp))
+        return tuple(found)
+
+    def vectors(self, theta: FloatArray, e: int) -> tuple[FloatArray, FloatArray]:
+        """What the compiled programs of experiment e take: its transition times (N,) and its p (M,)."""
+        places, N = self.places[e], self.structures[e].N
+        where = places[:N]
+        tau = self.experiments[e].initial_times
+        tau[where >= 0] = theta[where[where >= 0]]
+        return tau, theta[places[N:]]
+
     def arguments(self, e: int, mesh: Mesh) -> Arguments:
         """The arrays that the compiled programs of experiment e take, on a given mesh."""
-        return arguments_of(self.structures[e], self.system, self.experiments[e], self.parameters, mesh)
+        return arguments_of(
+            self.structures[e], self.system, self.experiments[e], self.parameters, mesh, self.sample_lengths[e]
+        )
+
+    @cached_property
+    def alike(self) -> tuple[tuple[int, ...], ...]:
+        """Groups of experiments (from 0) that have equal structures: one program each, if their lengths agree too."""
+        groups: dict[Structure, list[int]] = {}
+        for e, structure in enumerate(self.structures):
+            groups.setdefault(structure, []).append(e)
+        return tuple(tuple(group) for group in groups.values())
+
+    @cached_property
+    def sample_lengths(self) -> tuple[tuple[int, ...], ...]:
+        """For each experiment the lengths to which the samples of each of its Measurements are padded."""
+        counts = [[len(item.times) for item in e.data if isinstance(item, Measurements)] for e in self.experiments]
+        for group in self.alike:
+            for k in range(len(counts[group[0]])):
+                for e, length in zip(group, common_lengths([counts[e][k] for e in group]), strict=True):
+                    counts[e][k] = length
+        return tuple(tuple(lengths) for lengths in counts)
+
+    def with_common_lengths(self, meshes: Sequence[Mesh]) -> list[Mesh]:
+        """The meshes of all experiments, those of experiments that are alike padded to common lengths."""
+        padded = list(meshes)
+        for group in self.alike:
+            lengths = common_lengths([meshes[e].cells for e in group])
+            for e, length in zip(group, lengths, strict=True):
+                padded[e] = meshes[e] if len(group) == 1 else meshes[e].padded_to(length)
+        return padded
 
     def checked_theta(self, theta: ArrayLike | None) -> FloatArray:
         """`theta`, or the initial guess for None, as a ``(d,)`` array; ValueError where shape or order is wrong."""
@@ -188,13 +261,15 @@ def _checked_parameters(parameters: Any) -> dict[str, Parameter]:
     return {name: as_parameter(value, f"parameter {name!r}") for name, value in (parameters or {}).items()}
 
 
-def _unknowns(experiments: tuple[Experiment, ...], parameters: dict[str, Parameter], dwell: float) -> Unknowns:
+def _unknowns(
+    system: HybridSystem, experiments: tuple[Experiment, ...], parameters: dict[str, Parameter], dwell: float
+) -> Unknowns:
     names: list[str] = []
     units: list[str] = []
     pieces: list[Parameter] = []
     where: list[NDArray[np.intp]] = []
-    for e, experiment in enumerate(experiments):
-        prefix = "" if len(experiments) == 1 else f"{experiment.name or f'run{e + 1}'}."
+    prefixes = [""] if len(experiments) == 1 else [f"{name}." for name in run_names(experiments)]
+    for prefix, experiment in zip(prefixes, experiments, strict=True):
         positions = np.full(len(experiment.transition_times), -1, dtype=np.intp)
         for i, tau in enumerate(experiment.transition_times):
             if not tau.fixed:
@@ -210,6 +285,17 @@ def _unknowns(experiments: tuple[Experiment, ...], parameters: dict[str, Paramet
             names += [f"{name}{_index(k)}" for k in np.ndindex(parameter.shape)]
             units += [parameter.unit] * parameter.value.size
             pieces.append(parameter)
+    states: list[NDArray[np.intp]] = []
+    for prefix, experiment in zip(prefixes, experiments, strict=True):
+        initial = initial_state_of(system, experiment)
+        positions = np.full(0 if callable(initial) else len(initial), -1, dtype=np.intp)
+        for k in range(len(positions)):
+            if isinstance(initial[k], Parameter) and not initial[k].fixed:
+                positions[k] = len(names)
+                names.append(f"{prefix}{system.state_names[k] if system.state_names else f'x{k + 1}'}(t0)")
+                units.append(initial[k].unit or (system.state_units[k] if system.state_units else ""))
+                pieces.append(initial[k])
+        states.append(positions)
     if not names:
         raise ValueError("Nothing to estimate: every parameter and transition time is fixed.")
     if len(set(names)) != len(names):
@@ -217,9 +303,8 @@ def _unknowns(experiments: tuple[Experiment, ...], parameters: dict[str, Paramet
         raise ValueError(f"Two unknowns share a name: {', '.join(twice)}; rename the parameter or the experiment.")
     flat = {key: np.concatenate([getattr(q, key).ravel() for q in pieces]) for key in ("value", "lower", "upper")}
     A, b, rows = _ordering(experiments, where, len(names), dwell)
-    return Unknowns(
-        tuple(names), tuple(units), flat["value"], flat["lower"], flat["upper"], tuple(where), spans, A, b, rows
-    )
+    vectors = flat["value"], flat["lower"], flat["upper"]
+    return Unknowns(tuple(names), tuple(units), *vectors, tuple(where), spans, tuple(states), A, b, rows)
 
 
 def _index(k: tuple[int, ...]) -> str:
@@ -233,8 +318,9 @@ def _ordering(
     if not (np.isfinite(dwell) and dwell >= 0):
         raise ValueError(f"min_duration must be zero or positive; got {dwell}.")
     rows, bounds, names = [], [], []
+    labels = run_names(experiments)
     for e, (experiment, positions) in enumerate(zip(experiments, where, strict=True)):
-        run = "" if len(experiments) == 1 else f" of {experiment.name or f'run{e + 1}'}"
+        run = "" if len(experiments) == 1 else f" of {labels[e]}"
         knots = np.concatenate([[experiment.t0], experiment.initial_times, [experiment.tf]])
         ends = np.concatenate([[-1], positions, [-1]])
         for i, mode in enumerate(experiment.mode_sequence):

@@ -105,15 +105,14 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
     experiment, structure = problem.experiments[e], problem.structures[e]
     whole = jax.tree.map(np.asarray, problem.arguments(e, coarse))
     arguments, signals = whole.without_mesh(), whole.signals
-    times, parameters = problem.split(theta)
-    free = [np.ravel(parameters[name]) for name, _, is_free in structure.parameters if is_free]
-    p = np.concatenate([np.zeros(0), *free])
-    ends = np.concatenate([[experiment.t0], times[e], [experiment.tf]])
+    tau, p = problem.vectors(theta, e)
+    ends = np.concatenate([[experiment.t0], tau, [experiment.tf]])
     inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
     steps = [np.array([experiment.t0])]
     with float64(), compilation_cache():
         x = _finite(
-            initial_state(arguments, p, structure=structure.functions), f"initial_state at p = {_rounded(parameters)}"
+            initial_state(arguments, p, structure=structure.functions),
+            f"initial_state at p = {_rounded(problem.split(theta)[1])}",
         )
         for i, mode in enumerate(structure.mode_of_segment):
             if i > 0 and structure.reset_maps[i - 1] is not None:

@@ -148,6 +148,11 @@ class Fit:
         return self.trajectories[0]
 
     @property
+    def initial_state(self) -> tuple[FloatArray, ...]:
+        """The state at t0 of each experiment, its estimated entries and those that are known: (n,) arrays."""
+        return tuple(trajectory.states[0] for trajectory in self.trajectories)
+
+    @property
     def samples(self) -> int:
         """Number of measured values that are not missing."""
         return sum(int(np.isfinite(c.measured).sum()) for run in self.comparisons for c in run if _discrete(c))

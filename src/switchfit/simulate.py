@@ -133,12 +133,6 @@ def compare(
     return total, tuple(trajectories), tuple(comparisons)
 
 
-def flat_parameters(problem: Problem, parameters: dict[str, FloatArray]) -> FloatArray:
-    """The free parameters as the vector p (M,) that the compiled programs take."""
-    free = [np.ravel(parameters[name]) for name, q in problem.parameters.items() if not q.fixed]
-    return np.concatenate([np.zeros(0), *free])
-
-
 BLOCK = 64
 """Rows that one call of the program takes: with shapes that do not depend on the mesh it is compiled once a model."""
 
@@ -184,8 +178,7 @@ class Run:
 def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> Run:
     """Integrate experiment e over the rows of a mesh, mode by mode."""
     structure = problem.structures[e]
-    times, parameters = problem.split(theta)
-    p, tau = flat_parameters(problem, parameters), times[e]
+    tau, p = problem.vectors(theta, e)
     whole = jax.tree.map(np.asarray, problem.arguments(e, mesh))
     arguments = whole.without_mesh()
     layout = rows(mesh.nodes, tau, 1.0, np)

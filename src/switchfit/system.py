@@ -8,7 +8,9 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
+
+from switchfit.parameter import Parameter
 
 VectorField = Callable[..., Any]
 """``f(t, x, p) -> (n,)``, or ``f(t, x, p, u) -> (n,)`` in an experiment with inputs."""
@@ -16,8 +18,8 @@ VectorField = Callable[..., Any]
 ResetMap = Callable[..., Any]
 """``R(t, x, p) -> (n,)``: the state just after a transition from the state just before it."""
 
-InitialState = NDArray[np.float64] | Callable[[Mapping[str, Any]], Any]
-"""An ``(n,)`` array, or a function of the parameters that returns one."""
+InitialState = NDArray[np.float64] | tuple[Parameter, ...] | Callable[[Mapping[str, Any]], Any]
+"""An ``(n,)`` array, a `Parameter` for each of n states, or a function of the parameters that returns an array."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +34,8 @@ class HybridSystem:
         with inputs modes are called as ``f(t, x, p, u)``, ``u`` being a dict or an array as the
         `switchfit.Input` was given.
     initial_state : (n,) array_like, or callable ``p -> (n,)``
-        State at ``t0``; as a function of the parameters it is differentiated with them.
+        State at ``t0``; as a function of the parameters it is differentiated with them. An entry may be a
+        `switchfit.Parameter`: it is then estimated, for each experiment by itself.
     reset_maps : mapping of (str, str) to callable, optional
         ``reset_maps[a, b]`` is applied at every transition from mode ``a`` to mode ``b``:
         ``x(tau+) = R(tau, x(tau-), p)``. Transitions without an entry leave the state continuous.
@@ -78,7 +81,7 @@ class HybridSystem:
             raise TypeError(f"{label} must be a sequence of strings, one for each state; got {given!r}.")
         _set(self, label, tuple(str(g) for g in given))
         if not callable(self.initial_state):
-            self.check_labels_of(self.initial_state.size)
+            self.check_labels_of(len(self.initial_state))
 
     def check_labels_of(self, n: int) -> None:
         """ValueError unless names and units, where given, have one entry for each of n states."""
@@ -94,8 +97,21 @@ class HybridSystem:
         return self.reset_maps.get((before, after))
 
 
-def as_state(value: ArrayLike, name: str) -> NDArray[np.float64]:
-    """`value` as a finite, read-only ``(n,)`` float64 array; ValueError naming `name` otherwise."""
+def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ...]:
+    """`value` as a finite, read-only ``(n,)`` float64 array, or as n `Parameter` where it has any.
+
+    Raises
+    ------
+    ValueError
+        Naming `name`.
+    """
+    if isinstance(value, Parameter):
+        if len(value.shape) != 1:
+            raise ValueError(f"{name} must have shape (n,), one entry for each state; got shape {value.shape}.")
+        bounds = zip(value.value, value.lower, value.upper, strict=True)
+        return tuple(Parameter(x, low, high, value.unit, value.fixed) for x, low, high in bounds)
+    if isinstance(value, (list, tuple)) and any(isinstance(entry, Parameter) for entry in value):
+        return tuple(_as_entry(entry, name) for entry in value)
     try:
         state = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -106,6 +122,20 @@ def as_state(value: ArrayLike, name: str) -> NDArray[np.float64]:
         raise ValueError(f"{name} must be finite; got {state.tolist()}.")
     state.flags.writeable = False
     return state
+
+
+def _as_entry(entry: Any, name: str) -> Parameter:
+    """One entry of an initial state that has unknown ones: a number is known."""
+    try:
+        parameter = entry if isinstance(entry, Parameter) else Parameter(entry, fixed=True)
+    except ValueError as error:
+        raise ValueError(f"{name} must have a number or an sf.Parameter for each state; got {entry!r}.") from error
+    if parameter.shape != ():
+        raise ValueError(
+            f"{name} must have one number or one sf.Parameter of one number for each state; got an entry of shape "
+            f"{parameter.shape}."
+        )
+    return parameter
 
 
 def _checked_reset_maps(

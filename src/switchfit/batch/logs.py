@@ -15,7 +15,7 @@ from switchfit.batch.chunks import Arrays, fingerprint
 from switchfit.batch.fits import Fits, repeat, sample_count
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
 from switchfit.estimate import LARGEST_INTEGRATION_ERROR, estimate, sigma_known
-from switchfit.evaluate import evaluator_of, places_of
+from switchfit.evaluate import evaluator_of
 from switchfit.optimize import Status
 from switchfit.problem import Problem
 from switchfit.result import inverse_on
@@ -143,7 +143,7 @@ def _kind(problem: Problem) -> Any:
     evaluator = evaluator_of(problem)
     shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(tuple(evaluator.arguments)))
     unknowns = problem.unknowns
-    numbers = [unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, *places_of(problem)]
+    numbers = [unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, *problem.places]
     times = [experiment.initial_times for experiment in problem.experiments]
     fixed = [np.where(where < 0, t, 0.0) for where, t in zip(unknowns.times, times, strict=True)]
     return problem.structures, shapes, tuple(np.asarray(a).tobytes() for a in (*numbers, *fixed))

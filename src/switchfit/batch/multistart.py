@@ -219,7 +219,9 @@ def _nearest_feasible(problem: Problem, point: FloatArray) -> FloatArray:
 def _clusters(problem: Problem, fits: Fits) -> NDArray[np.int64]:
     """Number of the minimum in which each fit ended, ascending in cost; -1 where it did not converge."""
     labels = np.full(len(fits), -1)
-    places = [k for span in problem.unknowns.parameters.values() for k in range(span.start, span.stop)]
+    unknowns = problem.unknowns
+    times = np.concatenate(unknowns.times)
+    places = np.setdiff1d(np.arange(len(unknowns.names)), times).tolist()
     spread = np.maximum(np.ptp(fits.start, axis=0), 1e-12 * (1 + np.max(np.abs(fits.start), axis=0)))[places]
     found: list[tuple[float, FloatArray, list[Any]]] = []
     for k in np.argsort(fits.cost, kind="stable"):

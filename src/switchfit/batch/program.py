@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from switchfit.cache import compilation_cache
 from switchfit.data import FloatArray
 from switchfit.estimate import minimized, with_names
-from switchfit.evaluate import Evaluator, derivatives, places_of
+from switchfit.evaluate import Evaluator, derivatives
 from switchfit.mesh import Mesh
 from switchfit.model import Arguments, Structure, float64
 from switchfit.optimize import Status
@@ -135,7 +135,7 @@ def fit_chunk(
     lockstep = in_lockstep() if lockstep is None else lockstep
     layout = Layout(
         problem.structures,
-        tuple(tuple(int(k) for k in places) for places in places_of(problem)),
+        tuple(tuple(int(k) for k in places) for places in problem.places),
         varying.places,
         lockstep,
         tolerance,
@@ -238,21 +238,46 @@ def _fits(
 def _total(
     layout: Layout, arguments: tuple[Arguments, ...], times: tuple[jax.Array, ...], theta: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Cost, gradient and Hessian of all experiments together."""
+    """Cost, gradient and Hessian of all experiments together.
+
+    Those that share a structure and all lengths are taken in a loop, so that the program does not grow with them.
+    """
     d = theta.shape[0]
     J, g, H = jnp.zeros(()), jnp.zeros(d), jnp.zeros((d, d))
-    for structure, places, own, fixed in zip(layout.structures, layout.places, arguments, times, strict=True):
-        where = np.array(places, dtype=int)
-        free = np.flatnonzero(where >= 0)
+    extended = jnp.append(theta, 0.0)
+    for group in _alike(layout, arguments):
+        structure = layout.structures[group[0]]
         N = structure.N
-        tau = jnp.where(where[:N] >= 0, theta[np.maximum(where[:N], 0)], fixed) if N else fixed
-        J_e, g_e, H_e = derivatives(
-            own, tau, theta[where[N:]], jnp.ones(()), structure=structure, method="discrete-adjoint"
-        )
-        J = J + J_e
-        g = g.at[where[free]].add(g_e[free])
-        H = H.at[where[free][:, None], where[free]].add(H_e[free[:, None], free])
+        where = np.array([layout.places[e] for e in group])
+        where = np.where(where < 0, d, where)  # what is fixed stands one past the last, and is dropped below
+        fixed = jnp.stack([times[e] for e in group])
+        tau = jnp.where(where[:, :N] < d, extended[where[:, :N]], fixed)
+        given = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(arguments[e] for e in group))
+
+        def one(
+            given: tuple[Arguments, jax.Array, jax.Array], structure: Structure = structure
+        ) -> tuple[jax.Array, jax.Array, jax.Array]:
+            own, tau, p = given
+            return derivatives(own, tau, p, jnp.ones(()), structure=structure, method="discrete-adjoint")
+
+        operands = (given, tau, extended[where[:, N:]])
+        if len(group) == 1:
+            J_e, g_e, H_e = (value[None] for value in one(jax.tree.map(lambda leaf: leaf[0], operands)))
+        else:
+            J_e, g_e, H_e = jax.vmap(one)(operands) if layout.lockstep else lax.map(one, operands)
+        J = J + J_e.sum()
+        g = g.at[where].add(g_e, mode="drop")
+        H = H.at[where[:, :, None], where[:, None, :]].add(H_e, mode="drop")
     return J, g, H
+
+
+def _alike(layout: Layout, arguments: tuple[Arguments, ...]) -> list[list[int]]:
+    """Groups of experiments that one program can take."""
+    groups: dict[Any, list[int]] = {}
+    for e, (structure, own) in enumerate(zip(layout.structures, arguments, strict=True)):
+        shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(own))
+        groups.setdefault((structure, shapes), []).append(e)
+    return list(groups.values())
 
 
 def _finished(

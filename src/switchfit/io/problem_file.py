@@ -86,6 +86,11 @@ def _number_as_table(given: Any) -> Any:
     return {"value": given} if isinstance(given, (int, float, list)) and not isinstance(given, bool) else given
 
 
+def _known_as_table(given: Any) -> Any:
+    """``0.5`` means ``{ value = 0.5, fixed = true }``: a state at t0 that is given as a number is known."""
+    return {"value": given, "fixed": True} if isinstance(given, (int, float)) and not isinstance(given, bool) else given
+
+
 def _name_as_table(given: Any) -> Any:
     """``model = "skid_steer"`` means ``model = { name = "skid_steer" }``."""
     return {"name": given} if isinstance(given, str) else given
@@ -113,6 +118,16 @@ class TransitionTable(_Table):
     lower: float = Field(default=-np.inf, description="earliest time (s)")
     upper: float = Field(default=np.inf, description="latest time (s)")
     fixed: bool = Field(default=False, description="true if the time is known and not to be estimated")
+
+
+class StateTable(_Table):
+    """An entry of the initial state that is not known, or a guess of it."""
+
+    value: float = Field(description="first guess of the state at t0, or the value itself where fixed")
+    lower: float = Field(default=-np.inf, description="lower bound")
+    upper: float = Field(default=np.inf, description="upper bound")
+    unit: str = Field(default="", description="unit, for the report; left out, that of the state")
+    fixed: bool = Field(default=False, description="true if it is known and not to be estimated")
 
 
 class LogTable(_Table):
@@ -168,7 +183,14 @@ class ExperimentTable(_Table):
     )
     t0: float | None = Field(default=None, description="start of the horizon (s); left out, the first sample")
     tf: float | None = Field(default=None, description="end of the horizon (s); left out, the last sample")
-    initial_state: list[float] | None = Field(default=None, description="state at t0, instead of the model's")
+    initial_state: list[Annotated[StateTable, pydantic.BeforeValidator(_known_as_table)]] | None = Field(
+        default=None,
+        description="state at t0, instead of the model's: a number, or a table where it is to be estimated",
+    )
+    parameter_map: dict[str, str] = Field(
+        default_factory=dict,
+        description="the model's name of a parameter = the name under [parameters] of what this run has for it",
+    )
     inputs: InputTable | None = Field(default=None, description="a known input")
     name: str | None = Field(default=None, description="used in the report where there are several experiments")
 
@@ -415,9 +437,19 @@ def _experiment(folder: Path, table: ExperimentTable, system: HybridSystem, wher
         t0=min(span[0] for span in spans) if table.t0 is None else table.t0,
         tf=max(span[-1] for span in spans) if table.tf is None else table.tf,
         inputs=None if table.inputs is None else _explained(f"{where}.inputs", _input, folder, table.inputs),
-        initial_state=table.initial_state,
+        initial_state=_initial_state(table),
+        parameter_map=table.parameter_map,
         name=table.name,
     )
+
+
+def _initial_state(table: ExperimentTable) -> list[Parameter] | list[float] | None:
+    """State at t0 for an Experiment: plain numbers where all of it is known."""
+    if table.initial_state is None:
+        return None
+    if all(entry.fixed for entry in table.initial_state):
+        return [entry.value for entry in table.initial_state]
+    return [Parameter(**entry.model_dump()) for entry in table.initial_state]
 
 
 def _data(folder: Path, table: DataTable, system: HybridSystem, where: str) -> Measurements | ReferenceSignal:

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -122,6 +123,26 @@ class LinearConstraints:
         identity = np.eye(self.size)
         return np.vstack([self.A, identity, -identity])
 
+    def rows(self, index: NDArray[np.intp]) -> FloatArray:
+        """The normals at the given places, shape (k, d)."""
+        m, d = self.b.size, self.size
+        chosen = np.zeros((index.size, d))
+        in_A = index < m
+        chosen[in_A] = self.A[index[in_A]]
+        bounds = np.flatnonzero(~in_A)
+        place = index[bounds] - m
+        chosen[bounds, place % d] = np.where(place < d, 1.0, -1.0)
+        return chosen
+
+    @property
+    def row_norms(self) -> FloatArray:
+        """Lengths of the normals, shape (m + 2 d,)."""
+        return np.concatenate([np.linalg.norm(self.A, axis=1), np.ones(2 * self.size)])
+
+    def slopes(self, step: FloatArray) -> FloatArray:
+        """Products of the normals with a step, shape (m + 2 d,)."""
+        return np.concatenate([self.A @ step, step, -step])
+
     def slack(self, theta: FloatArray) -> FloatArray:
         """How far theta is inside each constraint, shape (m + 2 d,); negative where violated."""
         return np.concatenate([self.A @ theta - self.b, theta - self.lower, self.upper - theta])
@@ -175,11 +196,44 @@ def solve_qp(gradient: FloatArray, matrix: FloatArray, normals: FloatArray, offs
     step -= factor.solve(gradient + matrix @ step)
     if np.all(normals @ step >= offsets):
         return QPSolution(step, multipliers)
+    return QPSolution(*solve_whitened(gradient, matrix, factor, normals, offsets))
+
+
+class Factor(Protocol):
+    """A factorisation B = D L Lᵀ D, of a matrix whatever its shape."""
+
+    def whiten(self, vectors: FloatArray) -> FloatArray:
+        """L⁻¹ D⁻¹ v for a vector or each of the rows v."""
+        ...
+
+    def unwhiten(self, vector: FloatArray) -> FloatArray:
+        """D⁻¹ L⁻ᵀ v."""
+        ...
+
+
+class Matrix(Protocol):
+    """What can be multiplied with a vector."""
+
+    def __matmul__(self, vector: FloatArray, /) -> Any: ...
+
+
+def solve_whitened(
+    gradient: FloatArray, matrix: Matrix, factor: Factor, normals: FloatArray, offsets: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Step and multipliers of a quadratic programme whose matrix has been factorised, in white variables.
+
+    Parameters
+    ----------
+    gradient, matrix, normals, offsets : as of `solve_qp`
+    factor : Factor
+        Of the matrix.
+    """
+    multipliers = np.zeros(offsets.size)
     white = _whiten(gradient, factor, normals, offsets)
     e, white_multipliers = _least_distance(white.target, white.rows, white.offsets)
     e, white_multipliers = _refine(white, e, white_multipliers, gradient, matrix)
     multipliers[white.kept] = white_multipliers * white.length / white.norms
-    return QPSolution(white.unwhiten(e), multipliers)
+    return white.unwhiten(e), multipliers
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +276,7 @@ def _solve_triangular(matrix: FloatArray, right: FloatArray, lower: int = 0, tra
 class _White:
     """The whitened problem: minimise ½‖e + target‖² subject to rows e >= offsets; d = length D⁻¹ L⁻ᵀ e."""
 
-    factor: _Factor
+    factor: Factor
     length: float  # norm of L⁻¹ D⁻¹ g
     target: FloatArray  # q, of norm 1
     kept: NDArray[np.intp]  # which constraints can be active at all
@@ -234,7 +288,7 @@ class _White:
         return self.length * self.factor.unwhiten(e)
 
 
-def _whiten(gradient: FloatArray, factor: _Factor, normals: FloatArray, offsets: FloatArray) -> _White:
+def _whiten(gradient: FloatArray, factor: Factor, normals: FloatArray, offsets: FloatArray) -> _White:
     target = factor.whiten(gradient)
     length = float(np.linalg.norm(target))
     target = target / length
@@ -354,7 +408,7 @@ def _feasible_fraction(
 
 
 def _refine(
-    white: _White, e: FloatArray, multipliers: FloatArray, gradient: FloatArray, matrix: FloatArray
+    white: _White, e: FloatArray, multipliers: FloatArray, gradient: FloatArray, matrix: Matrix
 ) -> tuple[FloatArray, FloatArray]:
     """One step of iterative refinement: the residual is computed with B itself, not with its factor."""
     working = np.flatnonzero(multipliers > 0.0)

@@ -38,6 +38,7 @@ from typing import Literal, Protocol, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.optimize.arrow import Arrow, ArrowFactor, arrow_scaling, convexify_arrow, solve_arrow_qp
 from switchfit.optimize.qp import (
     EIGENVALUE_FLOOR,
     EPS,
@@ -75,14 +76,14 @@ LONGEST_STEP = 1e3
 
 
 class Evaluation(Protocol):
-    """What the caller's function returns: cost J, gradient, shape (d,), and Hessian, shape (d, d)."""
+    """What the caller's function returns: cost J, gradient, shape (d,), and Hessian, shape (d, d) or an `Arrow`."""
 
     @property
     def cost(self) -> float: ...
     @property
     def gradient(self) -> FloatArray: ...
     @property
-    def hessian(self) -> FloatArray | None: ...
+    def hessian(self) -> FloatArray | Arrow | None: ...
 
 
 class Status(Enum):
@@ -179,7 +180,8 @@ class Result:
     free_basis : array, shape (d, k)
         Orthonormal basis of the directions left free by active constraints and kinks.
     free_eigenvalues : array, shape (k,)
-        Eigenvalues, ascending, of the diagonally scaled Hessian on the free directions.
+        Eigenvalues, ascending, of the diagonally scaled Hessian on the free directions; the smallest alone where the
+        Hessian has the shape of an arrow.
     smallest_eigenvalue, smallest_unscaled_eigenvalue : float
         The smallest of these, and that of ``free_basisᵀ H free_basis``; NaN if there are none.
     flat_direction : array, shape (d,)
@@ -243,10 +245,9 @@ class Result:
 class _Problem:
     evaluate: Evaluate
     constraints: LinearConstraints
-    normals: FloatArray
     breakpoints: tuple[tuple[int, FloatArray], ...]  # of the coordinates that have any
     hessian: HessianKind
-    mask: FloatArray | None  # 1 inside a block, 0 between blocks
+    labels: FloatArray | None  # of the blocks, where the Hessian is cut into blocks
     tolerance: float
     max_iterations: int
 
@@ -261,7 +262,7 @@ class _Sample:
 
     cost: float
     gradient: FloatArray
-    hessian: FloatArray
+    hessian: FloatArray | Arrow
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,7 +287,7 @@ class _Point:
     def largest_derivative(self) -> float:
         return float(max(np.max(np.abs(self.plus.gradient)), np.max(np.abs(self.minus.gradient))))
 
-    def derivatives(self, sides: NDArray[np.int_]) -> tuple[FloatArray, FloatArray]:
+    def derivatives(self, sides: NDArray[np.int_]) -> tuple[FloatArray, FloatArray | Arrow]:
         """Gradient and Hessian on the given sides (+1, -1; 0 for their mean).
 
         An entry of the Hessian that joins a left and a right coordinate is known from neither evaluation: the mean.
@@ -296,9 +297,16 @@ class _Point:
             return plus.gradient, plus.hessian
         gradient = np.where(sides > 0, plus.gradient, minus.gradient)
         gradient = np.where(sides == 0, 0.5 * (plus.gradient + minus.gradient), gradient)
-        pair = sides[:, None] + sides[None, :]
-        mean = 0.5 * (plus.hessian + minus.hessian)
-        return gradient, np.where(pair > 0, plus.hessian, np.where(pair < 0, minus.hessian, mean))
+        return gradient, _mixed(plus.hessian, minus.hessian, sides)
+
+
+def _mixed(plus: FloatArray | Arrow, minus: FloatArray | Arrow, sides: NDArray[np.int_]) -> FloatArray | Arrow:
+    if isinstance(plus, Arrow):
+        return plus.mixed(minus, sides.astype(float)) if isinstance(minus, Arrow) else plus
+    if isinstance(minus, Arrow):
+        return minus
+    pair = sides[:, None] + sides[None, :]
+    return np.where(pair > 0, plus, np.where(pair < 0, minus, 0.5 * (plus + minus)))
 
 
 def _first_order(
@@ -358,14 +366,15 @@ class _Oracle:
         value = self.problem.evaluate(theta.copy(), side)
         d = theta.size
         gradient = np.asarray(value.gradient, dtype=float).reshape(d)
-        hessian = np.full((d, d), np.nan)
-        if value.hessian is not None:
-            hessian = np.asarray(value.hessian, dtype=float).reshape(d, d)
+        hessian: FloatArray | Arrow = np.full((d, d), np.nan) if value.hessian is None else value.hessian
+        if not isinstance(hessian, Arrow):
+            hessian = np.asarray(hessian, dtype=float).reshape(d, d)
+            hessian = 0.5 * (hessian + hessian.T)
         if not (np.isfinite(value.cost) and np.isfinite(gradient).all()):
             return None
-        if self.problem.uses_hessian and not np.isfinite(hessian).all():
+        if self.problem.uses_hessian and not _is_finite(hessian):
             return None
-        return _Sample(float(value.cost), gradient, 0.5 * (hessian + hessian.T))
+        return _Sample(float(value.cost), gradient, hessian)
 
     def first(self, theta: FloatArray) -> _Sample | None:
         """The evaluation that suffices to judge the cost."""
@@ -381,11 +390,11 @@ class _Oracle:
             if other is None:
                 return None
             minus = other
-        constraints, normals = self.problem.constraints, self.problem.normals
+        constraints = self.problem.constraints
         rounding = constraints.rounding(np.maximum(scale, np.abs(theta)))
         active = np.flatnonzero(constraints.slack(theta) <= rounding)
-        optimality, values, downhill = _first_order(plus, minus, kink, side, normals[active])
-        multipliers = np.zeros(normals.shape[0])
+        optimality, values, downhill = _first_order(plus, minus, kink, side, constraints.rows(active))
+        multipliers = np.zeros(len(constraints.names))
         multipliers[active] = values
         return _Point(theta, plus, minus, kink, side, active, optimality, multipliers, downhill)
 
@@ -402,6 +411,10 @@ class _Oracle:
                 room = int(x < upper[i]) - int(x > lower[i])
                 kink[i], side[i] = room == 0 and lower[i] < upper[i], room
         return kink, side
+
+
+def _is_finite(hessian: FloatArray | Arrow) -> bool:
+    return hessian.finite if isinstance(hessian, Arrow) else bool(np.isfinite(hessian).all())
 
 
 def _nearest(points: FloatArray, x: float) -> float:
@@ -490,7 +503,9 @@ def _stalled(oracle: _Oracle, state: _State, direction: _Direction) -> _State:
         return _finish(oracle, state, Status.CONVERGED)
     floor = state.gradient_scale
     if oracle.problem.uses_hessian:
-        floor = max(floor, float(np.max(np.abs(state.point.plus.hessian) @ state.scale)))
+        hessian = state.point.plus.hessian
+        size = abs(hessian) if isinstance(hessian, Arrow) else np.abs(hessian)
+        floor = max(floor, float(np.max(size @ state.scale)))
     below_rounding = direction.reduction <= 10 * NOISE * state.cost_scale
     if below_rounding and state.point.optimality <= 1e5 * EPS * floor:
         return _finish(oracle, state, Status.CONVERGED_PRECISION)
@@ -500,7 +515,7 @@ def _stalled(oracle: _Oracle, state: _State, direction: _Direction) -> _State:
 def _finish(oracle: _Oracle, state: _State, status: Status) -> _State:
     """At a KKT point: leave a saddle if possible, otherwise classify the point by its free curvature."""
     problem = oracle.problem
-    if problem.uses_hessian or np.isfinite(state.point.plus.hessian).all():
+    if problem.uses_hessian or _is_finite(state.point.plus.hessian):
         accepted = _escape(oracle, state) if state.iteration < problem.max_iterations else None
         if accepted is not None:
             return _advance(problem, state, accepted)
@@ -570,6 +585,8 @@ def _solve_on_sides(
     upper[point.kink & (sides < 0)] = 0.0
     free = ~(point.kink & (sides == 0)) & (constraints.lower < constraints.upper)
     m, k = constraints.b.size, int(np.count_nonzero(free))
+    if isinstance(hessian, Arrow) and problem.uses_hessian:
+        return _solve_arrow(problem, state, gradient, hessian, free, lower, upper)
     # What is held is left out of the programme.
     part = slice(None) if k == free.size else np.flatnonzero(free)
     rows = slice(None) if k == free.size else np.concatenate([np.ones(m, dtype=bool), free, free])
@@ -578,7 +595,7 @@ def _solve_on_sides(
     slack[point.active[point.active < m]] = 0.0
     lower, upper = lower[part], upper[part]
     offsets = np.concatenate([-slack, lower, -upper])
-    solution = solve_qp(gradient[part], matrix[part][:, part], problem.normals[rows][:, part], offsets)
+    solution = solve_qp(gradient[part], matrix[part][:, part], constraints.normals[rows][:, part], offsets)
     # A bound that presses is reached exactly, whatever rounding did to the step: kinks depend on it.
     at_lower, at_upper = solution.multipliers[m : m + k] > 0.0, solution.multipliers[m + k :] > 0.0
     step = np.zeros(free.size)
@@ -588,21 +605,55 @@ def _solve_on_sides(
     return _Direction(step, slope, -(slope + 0.5 * float(step @ curved))), force
 
 
-def _model_matrix(problem: _Problem, state: _State, hessian: FloatArray, free: Index) -> FloatArray:
+def _solve_arrow(
+    problem: _Problem,
+    state: _State,
+    gradient: FloatArray,
+    hessian: Arrow,
+    free: NDArray[np.bool_],
+    lower: FloatArray,
+    upper: FloatArray,
+) -> tuple[_Direction, FloatArray]:
+    """The same for a Hessian in the shape of an arrow; what is held keeps its place, with a step of zero."""
+    point, constraints = state.point, problem.constraints
+    m, d = constraints.b.size, free.size
+    matrix = hessian if problem.labels is None else hessian.masked(problem.labels)
+    pressed = constraints.rows(np.flatnonzero(point.multipliers > 0.0)) * free
+    convex = convexify_arrow(matrix.held(free), pressed[np.any(pressed != 0.0, axis=1)], _floor(state) * free)
+    slack = np.maximum(constraints.A @ point.theta - constraints.b, 0.0)
+    slack[point.active[point.active < m]] = 0.0
+    bounds = np.where(free, lower, -np.inf), np.where(free, -upper, -np.inf)
+    solution = solve_arrow_qp(gradient * free, convex, constraints, np.concatenate([-slack, *bounds]))
+    at_lower, at_upper = solution.multipliers[m : m + d] > 0.0, solution.multipliers[m + d :] > 0.0
+    step = np.clip(np.where(at_lower, lower, np.where(at_upper, upper, solution.step)), lower, upper)
+    step = np.where(free, step, 0.0)
+    slope, curved = float(gradient @ step), convex @ step
+    force = constraints.A.T @ solution.multipliers[:m] - np.where(free, curved, matrix @ step)
+    return _Direction(step, slope, -(slope + 0.5 * float(step @ curved))), force
+
+
+def _model_matrix(problem: _Problem, state: _State, hessian: FloatArray | Arrow, free: Index) -> FloatArray:
     """The matrix B of the quadratic programme: positive definite on the free coordinates, H elsewhere."""
     point = state.point
-    first = problem.hessian == "descent-first" and not _is_positive_definite(hessian[free][:, free])
-    if first or not problem.uses_hessian:
+    if not problem.uses_hessian or isinstance(hessian, Arrow):
         return np.eye(point.theta.size) / state.metric
-    matrix = hessian.copy() if problem.mask is None else hessian * problem.mask
-    pressed = problem.normals[point.multipliers > 0.0][:, free]
+    if problem.hessian == "descent-first" and not _is_positive_definite(hessian[free][:, free]):
+        return np.eye(point.theta.size) / state.metric
+    matrix = hessian.copy()
+    if problem.labels is not None:
+        matrix *= problem.labels[:, None] == problem.labels[None, :]
+    pressed = problem.constraints.rows(np.flatnonzero(point.multipliers > 0.0))[:, free]
+    block = free if isinstance(free, slice) else np.ix_(free, free)
+    matrix[block] = convexify(matrix[block], pressed, _floor(state)[free])
+    return matrix
+
+
+def _floor(state: _State) -> FloatArray:
+    """Curvature below which an unknown's counts as none: where J is nearly linear in it, its step is limited too."""
+    point = state.point
     gradient = np.maximum(np.abs(point.plus.gradient), np.abs(point.minus.gradient))
     size = np.where(state.scale > 0.0, state.scale, 1.0)
-    # Where J is nearly linear in an unknown, its step is limited to a multiple of its size.
-    floor = np.maximum(_flatness(state), gradient / (LONGEST_STEP * size))
-    block = free if isinstance(free, slice) else np.ix_(free, free)
-    matrix[block] = convexify(matrix[block], pressed, floor[free])
-    return matrix
+    return np.maximum(_flatness(state), gradient / (LONGEST_STEP * size))
 
 
 def _is_positive_definite(matrix: FloatArray) -> bool:
@@ -785,10 +836,16 @@ def _curvature(problem: _Problem, state: _State, rows: NDArray[np.intp]) -> _Cur
     """Curvature of J, unmodified, in the null space of the given constraints and off the kinks."""
     point = state.point
     d = point.theta.size
-    free = np.flatnonzero(~_genuine_kinks(state) & (problem.constraints.lower < problem.constraints.upper))
-    normals = problem.normals[rows][:, free]
+    held = _genuine_kinks(state) | ~(problem.constraints.lower < problem.constraints.upper)
+    hessian = point.derivatives(_reported_sides(point))[1]
+    if isinstance(hessian, Arrow):
+        found = _arrow_curvature(problem, state, rows, hessian, held)
+        if found is not None:
+            return found
+        hessian = hessian.dense()
+    free = np.flatnonzero(~held)
+    normals = problem.constraints.rows(rows)[:, free]
     basis = np.zeros((d, 0)) if free.size == 0 else np.eye(d)[:, free] @ split_space(normals)[0]
-    _, hessian = point.derivatives(_reported_sides(point))
     count = basis.shape[1]
     if count == 0 or not np.isfinite(hessian).all():
         nothing = np.full(count, np.nan)
@@ -803,6 +860,44 @@ def _curvature(problem: _Problem, state: _State, rows: NDArray[np.intp]) -> _Cur
     return _Curvature(basis, np.asarray(values, dtype=float), unscaled, lowest / np.linalg.norm(lowest))
 
 
+def _arrow_curvature(
+    problem: _Problem, state: _State, rows: NDArray[np.intp], hessian: Arrow, held: NDArray[np.bool_]
+) -> _Curvature | None:
+    """The same where only bounds are active and the curvature is positive: its smallest eigenvalue alone.
+
+    None in all other cases, which are rare enough to be left to the algebra of full matrices.
+    """
+    m, d = problem.constraints.b.size, held.size
+    if np.any(rows < m) or not hessian.finite:
+        return None
+    held = held.copy()
+    held[(rows - m) % d] = True
+    kept = hessian.held(~held)
+    scaling = arrow_scaling(kept, _flatness(state))
+    smallest, lowest = _smallest(kept.scaled(scaling), ~held)
+    unscaled, _ = _smallest(kept, ~held)
+    if lowest is None or held.all():
+        return None
+    lowest = lowest / scaling
+    return _Curvature(np.eye(d)[:, ~held], np.array([smallest]), np.array([unscaled]), lowest / np.linalg.norm(lowest))
+
+
+def _smallest(matrix: Arrow, free: NDArray[np.bool_]) -> tuple[float, FloatArray | None]:
+    """Smallest eigenvalue on the free coordinates, and its eigenvector, by inverse iteration; None if it is not > 0."""
+    factor = ArrowFactor.of(matrix)
+    if factor is None:
+        return np.nan, None
+    vector = np.where(free, np.random.default_rng(0).normal(size=free.size), 0.0)
+    value = np.inf
+    for _ in range(1000):
+        vector = vector / np.linalg.norm(vector)
+        vector = np.where(free, factor.solve(vector), 0.0)
+        before, value = value, 1.0 / float(np.linalg.norm(vector))
+        if abs(value - before) <= 1e-8 * value:
+            break
+    return value, vector / np.linalg.norm(vector)
+
+
 def _reported_sides(point: _Point) -> NDArray[np.int_]:
     """The right-hand side for every coordinate on a breakpoint that has one."""
     return np.where(point.kink, 1, point.side)
@@ -812,7 +907,8 @@ def _escape(oracle: _Oracle, state: _State) -> _Accepted | None:
     """A step along negative curvature: on the face of the pressing constraints first, then of all active ones."""
     problem = oracle.problem
     pressing = np.flatnonzero(state.point.multipliers > max(problem.tolerance, 1e-10 * state.gradient_scale))
-    for rows in (pressing, state.point.active):
+    active = state.point.active
+    for rows in (pressing,) if np.array_equal(pressing, active) else (pressing, active):
         curvature = _curvature(problem, state, rows)
         if not curvature.smallest < NEGATIVE_CURVATURE:
             continue
@@ -827,14 +923,14 @@ def _descend_along(oracle: _Oracle, state: _State, ray: FloatArray) -> _Accepted
     """Backtracking on the quadratic decrease ½ t² rayᵀH ray, starting at a tenth of the size of the unknowns."""
     problem, point = oracle.problem, state.point
     _, hessian = point.derivatives(_reported_sides(point))
-    bending = float(ray @ hessian @ ray)
+    bending = float(ray @ (hessian @ ray))
     sized = state.scale > 0.0
     relative = float(np.max(np.abs(ray[sized]) / state.scale[sized], initial=0.0))
     length = 0.1 / relative if relative > 0.0 else 0.1 / float(np.max(np.abs(ray)))
-    slope = problem.normals @ ray
+    slope = problem.constraints.slopes(ray)
     slack = np.maximum(problem.constraints.slack(point.theta), 0.0)
     slack[point.active] = 0.0
-    approaching = slope < -1e-12 * np.linalg.norm(problem.normals, axis=1)
+    approaching = slope < -1e-12 * problem.constraints.row_norms
     length = min(length, float(np.min(slack[approaching] / -slope[approaching], initial=np.inf)))
     for _ in range(40):
         decrease = -0.5 * bending * length**2
@@ -870,9 +966,10 @@ def minimize(
     Parameters
     ----------
     evaluate : callable
-        ``evaluate(theta, side)`` returns cost, gradient, shape (d,), and Hessian, shape (d, d). `side` is +1 or -1:
-        which one-sided derivatives to return for coordinates that sit exactly on a breakpoint. A cost or derivative
-        that is not finite marks a point as unacceptable.
+        ``evaluate(theta, side)`` returns cost, gradient, shape (d,), and Hessian, shape (d, d), or a
+        `switchfit.optimize.arrow.Arrow`, with which the cost of an iteration is linear in d. `side` is +1 or -1: which
+        one-sided derivatives to return for coordinates that sit exactly on a breakpoint. A cost or derivative that is
+        not finite marks a point as unacceptable.
     theta0 : array, shape (d,)
         Start, feasible up to rounding.
     constraints : LinearConstraints
@@ -953,10 +1050,9 @@ def _make_problem(
     return _Problem(
         evaluate=evaluate,
         constraints=constraints,
-        normals=constraints.normals,
         breakpoints=_checked_breakpoints(breakpoints, d),
         hessian=hessian,
-        mask=_mask(hessian, blocks, d),
+        labels=_labels(hessian, blocks, d),
         tolerance=tolerance,
         max_iterations=max_iterations,
     )
@@ -973,14 +1069,14 @@ def _checked_breakpoints(breakpoints: Sequence[ArrayLike] | None, d: int) -> tup
     return tuple((i, points) for i, points in enumerate(arrays) if points.size)
 
 
-def _mask(hessian: HessianKind, blocks: ArrayLike | None, d: int) -> FloatArray | None:
-    """1 where two coordinates carry the same label, 0 elsewhere; None unless the Hessian is to be cut into blocks."""
+def _labels(hessian: HessianKind, blocks: ArrayLike | None, d: int) -> FloatArray | None:
+    """Labels of the blocks; None unless the Hessian is to be cut into blocks."""
     if hessian != "block-diagonal":
         return None
     labels = np.asarray(blocks)
     if blocks is None or labels.shape != (d,):
         raise ValueError(f"hessian='block-diagonal' needs blocks, an integer label for each of the {d} coordinates")
-    return (labels[:, None] == labels[None, :]).astype(float)
+    return labels.astype(float)
 
 
 def _feasible_start(problem: _Problem, theta: FloatArray) -> FloatArray:
@@ -1032,7 +1128,7 @@ def _result(oracle: _Oracle, state: _State, status: Status, history: tuple[Itera
         theta=point.theta,
         cost=point.cost,
         gradient=gradient,
-        hessian=hessian,
+        hessian=hessian.dense() if isinstance(hessian, Arrow) else hessian,
         optimality=point.optimality,
         iterations=state.iteration,
         evaluations=oracle.evaluations,
@@ -1063,7 +1159,7 @@ def _nonfinite_start(oracle: _Oracle, theta: FloatArray) -> Result:
         evaluations=oracle.evaluations,
         status=Status.NONFINITE_START,
         active=(),
-        multipliers=np.zeros(oracle.problem.normals.shape[0]),
+        multipliers=np.zeros(len(oracle.problem.constraints.names)),
         kinks=(),
         free_basis=np.zeros((d, 0)),
         free_eigenvalues=np.zeros(0),

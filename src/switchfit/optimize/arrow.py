@@ -1,0 +1,378 @@
+"""Hessians in the shape of an arrow: many runs with unknowns of their own, and a few unknowns that they share.
+
+Two unknowns of different runs never meet in one term of J, so that with the own unknowns of each run first
+
+        ( H_1             G_1 )
+    H = (      ...        ... )        H_e: blocks (k, k),  G_e: borders (k, s),  C: corner (s, s).
+        (           H_R   G_R )
+        ( G_1' ...  G_R'  C   )
+
+What `switchfit.optimize.sqp` does with a Hessian is done here block by block, at a cost that is linear in the number R
+of runs: products, the Cholesky factorisation (own unknowns first, then the Schur complement
+``C - sum_e G_e' H_e^-1 G_e`` of the shared ones), the quadratic programme, and making H positive definite. Constraints
+join unknowns of one run at most, so that they keep this shape.
+
+Runs with fewer than k own unknowns are padded with unknowns that are zero: ones on the diagonal, nothing beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.optimize.qp import (
+    EIGENVALUE_FLOOR,
+    EIGENVALUE_REPLACEMENT,
+    FloatArray,
+    LinearConstraints,
+    QPSolution,
+    convexify,
+    solve_whitened,
+    split_space,
+)
+
+IntArray = NDArray[np.intp]
+
+#: Rounds of adding violated constraints to the quadratic programme; each adds one or more, a few are enough.
+MAX_ROUNDS = 1000
+#: By how much the constrained directions of a run are made stiffer, in turn, until they no longer spoil the others.
+STIFFENINGS = (1.0, 1e2, 1e4, 1e6)
+
+
+@dataclass(frozen=True, eq=False)
+class ArrowLayout:
+    """Where each unknown stands.
+
+    Attributes
+    ----------
+    size : int
+        d, the number of unknowns.
+    own : (R, k) int array
+        Positions of the own unknowns of each run; d, one past the last, where it has fewer than k.
+    shared : (s,) int array
+        Positions of all others.
+    """
+
+    size: int
+    own: IntArray
+    shared: IntArray
+
+    @classmethod
+    def of(cls, size: int, places: Sequence[IntArray]) -> ArrowLayout:
+        """The layout of runs that depend on the unknowns at the given places each."""
+        used = [np.unique(where[where >= 0]) for where in places]
+        count = np.bincount(np.concatenate(used), minlength=size)
+        alone = [where[count[where] == 1] for where in used]
+        own = np.full((len(used), max(map(len, alone))), size, dtype=np.intp)
+        for e, where in enumerate(alone):
+            own[e, : len(where)] = where
+        return cls(size, own, np.flatnonzero(count != 1))
+
+    def slots(self, e: int, places: IntArray) -> IntArray:
+        """Index of unknowns of run e in its own (k) and the shared (s) ones, one after the other."""
+        slot = np.full(self.size, -1, dtype=np.intp)
+        k = self.own.shape[1]
+        here = self.own[e][self.own[e] < self.size]
+        slot[here] = np.arange(len(here))
+        slot[self.shared] = k + np.arange(len(self.shared))
+        return slot[places]
+
+    def split(self, vector: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Own (R, k), zero where padded, and shared (s,) entries of a vector (d,)."""
+        return np.append(vector, 0.0)[self.own], vector[self.shared]
+
+    def joined(self, own: FloatArray, shared: FloatArray) -> FloatArray:
+        """The vector (d,) with these own (R, k) and shared (s,) entries."""
+        vector = np.zeros(self.size + 1)
+        vector[self.own] = own
+        vector[self.shared] = shared
+        return vector[:-1]
+
+
+@dataclass(frozen=True, eq=False)
+class Arrow:
+    """A symmetric matrix of the shape above.
+
+    Attributes
+    ----------
+    layout : ArrowLayout
+    blocks, borders, corner : (R, k, k), (R, k, s), (s, s) arrays
+    """
+
+    layout: ArrowLayout
+    blocks: FloatArray
+    borders: FloatArray
+    corner: FloatArray
+
+    __array_ufunc__ = None  # a product with an array on the left is not that of its entries
+
+    @classmethod
+    def of_runs(cls, layout: ArrowLayout, parts: Sequence[FloatArray]) -> Arrow:
+        """Sum of symmetric matrices (k + s, k + s), one a run, in the order of `ArrowLayout.slots`."""
+        k = layout.own.shape[1]
+        stacked = np.asarray(parts)
+        stacked = 0.5 * (stacked + np.swapaxes(stacked, 1, 2))
+        blocks = stacked[:, :k, :k].copy()
+        padded = layout.own == layout.size
+        blocks[:, np.arange(k), np.arange(k)] += padded
+        return cls(layout, blocks, stacked[:, :k, k:], stacked[:, k:, k:].sum(0))
+
+    @property
+    def finite(self) -> bool:
+        """Whether all entries are."""
+        return all(bool(np.isfinite(part).all()) for part in (self.blocks, self.borders, self.corner))
+
+    def __matmul__(self, vector: FloatArray) -> FloatArray:
+        own, shared = self.layout.split(vector)
+        of_own = (self.blocks @ own[..., None])[..., 0] + self.borders @ shared
+        return self.layout.joined(of_own, np.einsum("eks,ek->s", self.borders, own) + self.corner @ shared)
+
+    def __abs__(self) -> Arrow:
+        return Arrow(self.layout, np.abs(self.blocks), np.abs(self.borders), np.abs(self.corner))
+
+    def diagonal(self) -> FloatArray:
+        """(d,)."""
+        return self.layout.joined(np.diagonal(self.blocks, axis1=1, axis2=2), np.diagonal(self.corner))
+
+    def largest_in_rows(self) -> FloatArray:
+        """Largest entry of each row: (d,)."""
+        own = np.maximum(self.blocks.max(2, initial=0.0), self.borders.max(2, initial=0.0))
+        shared = np.maximum(self.borders.max((0, 1), initial=0.0), self.corner.max(1, initial=0.0))
+        return self.layout.joined(own, shared)
+
+    def dense(self) -> FloatArray:
+        """The matrix in full: (d, d)."""
+        d, layout = self.layout.size, self.layout
+        full = np.zeros((d + 1, d + 1))
+        full[layout.own[:, :, None], layout.own[:, None, :]] = self.blocks
+        full[layout.own[:, :, None], layout.shared] = self.borders
+        full[layout.shared[:, None, None], layout.own] = np.moveaxis(self.borders, 2, 0)
+        full[layout.shared[:, None], layout.shared] = self.corner
+        return full[:d, :d]
+
+    def _pairs(self, vector: FloatArray, padding: float) -> tuple[tuple[FloatArray, FloatArray], ...]:
+        """Of a vector (d,) the entries of rows and columns of blocks, borders and corner, to be broadcast."""
+        own = np.append(vector, padding)[self.layout.own]
+        shared = vector[self.layout.shared]
+        return (own[:, :, None], own[:, None, :]), (own[:, :, None], shared), (shared[:, None], shared)
+
+    def scaled(self, scaling: FloatArray) -> Arrow:
+        """D⁻¹ H D⁻¹ for a diagonal D (d,)."""
+        pairs = self._pairs(scaling, 1.0)
+        return Arrow(self.layout, *(part / (a * b) for part, (a, b) in zip(self._parts, pairs, strict=True)))
+
+    def plus_diagonal(self, value: float) -> Arrow:
+        """H + value I."""
+        k, s = self.borders.shape[1:]
+        return replace(self, blocks=self.blocks + value * np.eye(k), corner=self.corner + value * np.eye(s))
+
+    def held(self, free: NDArray[np.bool_]) -> Arrow:
+        """The matrix with rows and columns of the identity for the unknowns that are not free."""
+        pairs = self._pairs(np.asarray(free, dtype=float), 1.0)
+        blocks, borders, corner = (part * a * b for part, (a, b) in zip(self._parts, pairs, strict=True))
+        own, shared = self.layout.split(np.where(free, 0.0, 1.0))
+        k, s = borders.shape[1:]
+        blocks[:, np.arange(k), np.arange(k)] += own
+        corner[np.arange(s), np.arange(s)] += shared
+        return Arrow(self.layout, blocks, borders, corner)
+
+    def masked(self, labels: FloatArray) -> Arrow:
+        """The matrix without the entries that join unknowns of different labels (d,)."""
+        pairs = self._pairs(labels, np.nan)
+        blocks, borders, corner = (part * (a == b) for part, (a, b) in zip(self._parts, pairs, strict=True))
+        k = blocks.shape[1]
+        blocks[:, np.arange(k), np.arange(k)] = np.diagonal(self.blocks, axis1=1, axis2=2)
+        return Arrow(self.layout, blocks, borders, corner)
+
+    def mixed(self, minus: Arrow, sides: FloatArray) -> Arrow:
+        """This matrix where two unknowns are to the right (sides 1), `minus` to the left (-1), else their mean."""
+
+        def mix(right: FloatArray, left: FloatArray, pair: FloatArray) -> FloatArray:
+            return np.where(pair > 0, right, np.where(pair < 0, left, 0.5 * (right + left)))
+
+        pairs = self._pairs(sides, 0.0)
+        parts = zip(self._parts, minus._parts, pairs, strict=True)
+        return Arrow(self.layout, *(mix(right, left, a + b) for right, left, (a, b) in parts))
+
+    @property
+    def _parts(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        return self.blocks, self.borders, self.corner
+
+
+@dataclass(frozen=True, eq=False)
+class ArrowFactor:
+    """``B = D L Lᵀ D`` with own unknowns first: L_e of the blocks, ``W_e = L_e⁻¹ G_e``, and L_s of the complement.
+
+    White vectors are the own ones of all runs, padding included, followed by the shared ones: (R k + s,).
+    """
+
+    layout: ArrowLayout
+    scaling: FloatArray
+    own: FloatArray  # (R, k, k)
+    border: FloatArray  # (R, k, s)
+    shared: FloatArray  # (s, s)
+
+    @classmethod
+    def of(cls, matrix: Arrow) -> ArrowFactor | None:
+        """The factorisation; None where the matrix is not positive definite."""
+        variances = matrix.diagonal()
+        if not np.all(variances > 0.0):
+            return None
+        scaling = np.sqrt(variances)
+        scaled = matrix.scaled(scaling)
+        try:
+            own = np.asarray(np.linalg.cholesky(scaled.blocks), float)
+            border = np.asarray(np.linalg.solve(own, scaled.borders), float)
+            shared = np.linalg.cholesky(scaled.corner - np.einsum("eks,ekt->st", border, border))
+        except np.linalg.LinAlgError:
+            return None
+        return cls(matrix.layout, np.asarray(scaling, float), own, border, shared)
+
+    @cached_property
+    def _inverses(self) -> tuple[FloatArray, FloatArray]:
+        """L_e⁻¹ and L_s⁻¹: each is used a few times, and NumPy has no triangular solve of many small systems."""
+        return np.asarray(np.linalg.inv(self.own), float), np.asarray(np.linalg.inv(self.shared), float)
+
+    def whiten(self, vectors: FloatArray) -> FloatArray:
+        """L⁻¹ D⁻¹ v for a vector (d,) or each of the rows (r, d)."""
+        if vectors.ndim == 2:
+            return np.array([self.whiten(row) for row in vectors]).reshape(len(vectors), -1)
+        of_own, of_shared = self._inverses
+        own, shared = self.layout.split(vectors / self.scaling)
+        y = (of_own @ own[..., None])[..., 0]
+        return np.concatenate([y.ravel(), of_shared @ (shared - np.einsum("eks,ek->s", self.border, y))])
+
+    def unwhiten(self, vector: FloatArray) -> FloatArray:
+        """D⁻¹ L⁻ᵀ v."""
+        of_own, of_shared = self._inverses
+        R, k, _ = self.border.shape
+        shared = of_shared.T @ vector[R * k :]
+        own = vector[: R * k].reshape(R, k) - self.border @ shared
+        return self.layout.joined((np.swapaxes(of_own, 1, 2) @ own[..., None])[..., 0], shared) / self.scaling
+
+    def solve(self, vector: FloatArray) -> FloatArray:
+        """B⁻¹ v."""
+        return self.unwhiten(self.whiten(vector))
+
+
+def solve_arrow_qp(
+    gradient: FloatArray, matrix: Arrow, constraints: LinearConstraints, offsets: FloatArray
+) -> QPSolution:
+    """Minimise ``gᵀd + ½ dᵀBd`` subject to ``C d >= c`` with B positive definite and d = 0 feasible.
+
+    As `switchfit.optimize.qp.solve_qp`; C are the rows and bounds of `constraints`. The programme is solved with the
+    constraints that the step before has violated, until it violates no other: since it is strictly convex, that is the
+    solution with all of them.
+
+    Parameters
+    ----------
+    gradient : (d,)
+    matrix : Arrow
+    constraints : LinearConstraints
+    offsets : (m + 2 d,)
+        c, not positive; minus infinity where a row does not constrain.
+    """
+    factor = ArrowFactor.of(matrix)
+    if factor is None:
+        raise ValueError("the matrix of the quadratic programme is not positive definite; convexify it first")
+    multipliers = np.zeros(offsets.size)
+    step = -factor.solve(gradient)
+    step -= factor.solve(gradient + matrix @ step)
+    working = np.zeros(0, dtype=np.intp)
+    for _ in range(MAX_ROUNDS):
+        gap = constraints.slopes(step) - offsets
+        violated = np.setdiff1d(np.flatnonzero(gap < 0.0), working)
+        if working.size:  # from then on rounding may violate a row
+            length = constraints.row_norms[violated] * float(np.max(np.abs(step), initial=0.0))
+            violated = violated[gap[violated] < -1e-13 * length]
+        if violated.size == 0:
+            break
+        working = np.union1d(working, violated)
+        step, found = solve_whitened(gradient, matrix, factor, constraints.rows(working), offsets[working])
+        multipliers[:] = 0.0
+        multipliers[working] = found
+    return QPSolution(step, multipliers)
+
+
+def arrow_scaling(hessian: Arrow, floor: FloatArray) -> FloatArray:
+    """As `switchfit.optimize.qp.diagonal_scaling`: (d,)."""
+    size = abs(hessian)
+    largest = size.largest_in_rows()
+    square = np.maximum(size.diagonal(), floor)
+    square = np.where(square > 0.0, square, np.where(largest > 0.0, largest, 1.0))
+    scaling = np.sqrt(square)
+    for _ in range(20):
+        largest = size.scaled(scaling).largest_in_rows()
+        if np.all(largest <= 1.0 + 1e-9):
+            break
+        scaling = scaling * np.sqrt(np.maximum(largest, 1.0))
+    return scaling
+
+
+def convexify_arrow(hessian: Arrow, normals: FloatArray, floor: FloatArray) -> Arrow:
+    """Positive definite B of the same shape that equals H wherever H can be kept.
+
+    A positive definite H is kept. Otherwise its blocks are made positive definite, each by `convexify`, and then the
+    Schur complement of the shared unknowns. With Z the directions free of the presumably active constraints: where
+    ZᵀHZ is positive definite ZᵀBZ is the same, so that Newton's step on that face is not spoiled. For this the
+    directions of each run across its active constraints are made as stiff as it takes.
+
+    Parameters
+    ----------
+    hessian : Arrow
+    normals : (r, d)
+        Normals of the constraints expected to be active; each joins unknowns of one run, or shared ones.
+    floor : (d,)
+        See `switchfit.optimize.qp.diagonal_scaling`.
+    """
+    layout = hessian.layout
+    scaling = arrow_scaling(hessian, floor)
+    scaled = hessian.scaled(scaling)
+    if ArrowFactor.of(scaled.plus_diagonal(-EIGENVALUE_FLOOR)) is not None:
+        return hessian
+    pressed = np.append(normals / scaling, np.zeros((len(normals), 1)), axis=1)
+    blocks, across = _convex_blocks(scaled, pressed)
+    of_shared = pressed[:, layout.shared]
+    of_shared = of_shared[np.any(of_shared != 0.0, axis=1)]
+    free = split_space(of_shared)[0]
+    for stiffness in (0.0, *STIFFENINGS) if across.any() else (0.0,):
+        stiff = blocks + stiffness * across
+        tie = np.einsum("eks,ekt->st", scaled.borders, np.linalg.solve(stiff, scaled.borders))
+        complement = scaled.corner - tie
+        on_face = free.T @ complement @ free
+        if on_face.size == 0 or np.linalg.eigvalsh(0.5 * (on_face + on_face.T))[0] > EIGENVALUE_FLOOR:
+            break
+    else:
+        stiff, tie = blocks, np.einsum("eks,ekt->st", scaled.borders, np.linalg.solve(blocks, scaled.borders))
+        complement = scaled.corner - tie
+    corner = convexify(0.5 * (complement + complement.T), of_shared) + tie
+    convex = Arrow(layout, stiff, scaled.borders, 0.5 * (corner + corner.T))
+    ridge = EIGENVALUE_FLOOR
+    while ArrowFactor.of(convex) is None:  # rounding, where a block is nearly singular
+        convex, ridge = convex.plus_diagonal(ridge), 10.0 * ridge
+    return convex.scaled(1.0 / scaling)
+
+
+def _convex_blocks(scaled: Arrow, pressed: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Positive definite blocks, and projections on what is across the active constraints of each run: (R, k, k)."""
+    values, vectors = np.linalg.eigh(scaled.blocks)
+    # An eigenvalue that is replaced is made large enough for the shared unknowns not to lose their own curvature to it.
+    coupling = (np.swapaxes(vectors, 1, 2) @ scaled.borders) ** 2
+    replaced = np.maximum(np.maximum(np.abs(values), EIGENVALUE_REPLACEMENT), 2.0 * coupling.sum(2))
+    changed = np.where(values > EIGENVALUE_FLOOR, values, replaced)
+    convex = (vectors * changed[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    indefinite = values[:, 0] <= EIGENVALUE_FLOOR
+    blocks = np.where(indefinite[:, None, None], 0.5 * (convex + np.swapaxes(convex, 1, 2)), scaled.blocks)
+    across = np.zeros_like(blocks)
+    for e in np.flatnonzero(np.any(pressed[:, scaled.layout.own] != 0.0, axis=(0, 2))):
+        normals = pressed[:, scaled.layout.own[e]]
+        normals = normals[np.any(normals != 0.0, axis=1)]
+        if indefinite[e]:
+            blocks[e] = convexify(scaled.blocks[e], normals)
+        rows = split_space(normals)[1]
+        across[e] = rows @ rows.T
+    return blocks, across

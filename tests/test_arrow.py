@@ -1,0 +1,277 @@
+"""The algebra of arrow-shaped Hessians, against that of full matrices."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from switchfit.optimize import minimize
+from switchfit.optimize.arrow import Arrow, ArrowFactor, ArrowLayout, arrow_scaling, convexify_arrow, solve_arrow_qp
+from switchfit.optimize.qp import LinearConstraints, diagonal_scaling, solve_qp, split_space
+
+PLACES = [np.array([0, 1, 2, 9, 10]), np.array([3, 4, 9, 10]), np.array([5, 6, 7, 10, 9]), np.array([8, 9])]
+LAYOUT = ArrowLayout.of(11, PLACES)
+"""Four runs with 3, 2, 3 and 1 unknowns of their own; two are shared."""
+
+SHARED = [9, 10]
+
+
+def arrow_of(full):
+    """The arrow that holds a full matrix of its shape."""
+    k = LAYOUT.own.shape[1]
+    extended = np.zeros((12, 12))
+    extended[:11, :11] = full
+    parts = []
+    for e, own in enumerate(LAYOUT.own):
+        place = np.concatenate([own, LAYOUT.shared])
+        part = extended[np.ix_(place, place)]
+        if e:
+            part[k:, k:] = 0.0  # shared with shared counts once
+        parts.append(part)
+    return Arrow.of_runs(LAYOUT, parts)
+
+
+def random_matrix(rng, lowest=None):
+    """Of the arrow's shape; shifted to a given smallest eigenvalue if one is named."""
+    full = rng.normal(size=(11, 11)) * rng.choice([0.1, 1.0, 10.0], size=(11, 1))
+    full = full + full.T
+    run = np.full(11, -1)
+    for e, own in enumerate(LAYOUT.own):
+        run[own[own < 11]] = e
+    full[(run[:, None] != run) & (run[:, None] >= 0) & (run >= 0)] = 0.0
+    return full if lowest is None else full + (lowest - np.linalg.eigvalsh(full)[0]) * np.eye(11)
+
+
+def test_own_and_shared_unknowns():
+    np.testing.assert_array_equal(LAYOUT.own, [[0, 1, 2], [3, 4, 11], [5, 6, 7], [8, 11, 11]])
+    np.testing.assert_array_equal(LAYOUT.shared, SHARED)
+    np.testing.assert_array_equal(LAYOUT.slots(2, PLACES[2]), [0, 1, 2, 4, 3])
+    # What no run depends on is with the shared ones.
+    np.testing.assert_array_equal(ArrowLayout.of(3, [np.array([0, -1]), np.array([1])]).shared, [2])
+
+
+def test_parts_of_runs_add_up():
+    """Each run's own matrix at its slots, as the sum over runs in full."""
+    rng = np.random.default_rng(0)
+    full, parts = np.zeros((11, 11)), []
+    for e, places in enumerate(PLACES):
+        own = rng.normal(size=(len(places), len(places)))
+        own = own + own.T
+        full[np.ix_(places, places)] += own
+        slots = LAYOUT.slots(e, places)
+        part = np.zeros((5, 5))
+        part[np.ix_(slots, slots)] = own
+        parts.append(part)
+    np.testing.assert_allclose(Arrow.of_runs(LAYOUT, parts).dense(), full, atol=1e-14)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_operations_are_those_of_the_full_matrix(seed):
+    rng = np.random.default_rng(seed)
+    full, other = random_matrix(rng), random_matrix(rng)
+    arrow = arrow_of(full)
+    vector, scaling, free = rng.normal(size=11), rng.uniform(0.1, 9.0, 11), rng.random(11) > 0.3
+    labels, sides = rng.integers(0, 2, 11).astype(float), rng.integers(-1, 2, 11).astype(float)
+    np.testing.assert_array_equal(arrow.dense(), full)
+    np.testing.assert_allclose(arrow @ vector, full @ vector, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(arrow.diagonal(), np.diag(full))
+    np.testing.assert_array_equal(abs(arrow).dense(), abs(full))
+    np.testing.assert_array_equal(abs(arrow).largest_in_rows(), abs(full).max(1))
+    np.testing.assert_allclose(arrow.scaled(scaling).dense(), full / np.outer(scaling, scaling), rtol=1e-12)
+    np.testing.assert_array_equal(arrow.held(free).dense(), np.where(np.outer(free, free), full, np.diag(1.0 - free)))
+    np.testing.assert_array_equal(arrow.masked(labels).dense(), full * (labels[:, None] == labels))
+    pair = sides[:, None] + sides
+    mixed = np.where(pair > 0, full, np.where(pair < 0, other, 0.5 * (full + other)))
+    np.testing.assert_allclose(arrow.mixed(arrow_of(other), sides).dense(), mixed, rtol=1e-14)
+    floor = rng.uniform(0.0, 1.0, 11)
+    np.testing.assert_allclose(arrow_scaling(arrow, floor), diagonal_scaling(full, floor), rtol=1e-12)
+    assert arrow.finite
+    assert not arrow_of(np.where(full == full[0, 0], np.nan, full)).finite
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_factorisation(seed):
+    rng = np.random.default_rng(seed)
+    full = random_matrix(rng, lowest=0.3)
+    factor, vector = ArrowFactor.of(arrow_of(full)), rng.normal(size=11)
+    np.testing.assert_allclose(factor.solve(vector), np.linalg.solve(full, vector), rtol=1e-10, atol=1e-12)
+    white = factor.whiten(np.eye(11))  # rows L^-1 D^-1 e_i
+    np.testing.assert_allclose(white @ white.T, np.linalg.inv(full), rtol=1e-9, atol=1e-11)
+    assert ArrowFactor.of(arrow_of(random_matrix(rng, lowest=-0.1))) is None
+
+
+ORDERED = np.zeros((4, 11))
+ORDERED[[0, 1], [1, 2]], ORDERED[[0, 1], [0, 1]] = 1.0, -1.0  # theta_0 <= theta_1 <= theta_2
+ORDERED[2, 4], ORDERED[2, 3] = 1.0, -1.0
+ORDERED[3, 6], ORDERED[3, 5] = 1.0, -1.0
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_quadratic_programmes(seed):
+    """The solution of the full programme, from none of the constraints active to nearly all."""
+    rng = np.random.default_rng(seed)
+    full, gradient = random_matrix(rng, lowest=10.0 ** rng.uniform(-4, 1)), rng.normal(size=11)
+    wide = 10.0 ** rng.uniform(-3, 2)
+    lower, upper = -wide * rng.random(11), wide * rng.random(11)
+    slack = wide * rng.random(4) * (rng.random(4) > 0.3)
+    constraints = LinearConstraints(ORDERED, np.zeros(4), lower, upper, tuple("abcdefghijklmnopqrstuvwxyz"))
+    offsets = np.concatenate([-slack, lower, -upper])
+    expected = solve_qp(gradient, full, constraints.normals, offsets)
+    found = solve_arrow_qp(gradient, arrow_of(full), constraints, offsets)
+    size = np.max(np.abs(expected.step))
+    np.testing.assert_allclose(found.step, expected.step, atol=1e-8 * size)
+    np.testing.assert_allclose(full @ found.step + gradient, constraints.normals.T @ found.multipliers, atol=1e-8)
+    assert np.all(found.multipliers >= 0.0)
+    assert np.all(constraints.slopes(found.step) - offsets >= -1e-11 * size)
+
+
+def test_a_programme_that_is_not_convex_is_refused():
+    box = LinearConstraints.box(-np.ones(11), np.ones(11))
+    with pytest.raises(ValueError, match="the quadratic programme is not positive definite; convexify it first"):
+        solve_arrow_qp(np.ones(11), arrow_of(random_matrix(np.random.default_rng(0), -1.0)), box, -np.ones(22))
+
+
+NONE, NO_FLOOR = np.zeros((0, 11)), np.zeros(11)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_what_is_made_positive_definite(seed):
+    rng = np.random.default_rng(seed)
+    kept = arrow_of(random_matrix(rng, lowest=0.1))
+    assert convexify_arrow(kept, NONE, NO_FLOOR) is kept
+    full = random_matrix(rng, lowest=-(10.0 ** rng.uniform(-2, 2)))
+    convex = convexify_arrow(arrow_of(full), NONE, NO_FLOOR).dense()
+    assert np.linalg.eigvalsh(convex)[0] > 0.0
+    scale = diagonal_scaling(full)
+    assert np.linalg.cond(convex / np.outer(scale, scale)) < 1e7
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_curvature_on_the_face_of_active_constraints_is_kept(seed):
+    """H is indefinite only across the active constraints: Newton's step along them must not be spoiled."""
+    rng = np.random.default_rng(seed)
+    normals = np.zeros((4, 11))
+    normals[0], normals[1, 3], normals[2, 5], normals[3, 9] = ORDERED[0], 1.0, -1.0, 1.0
+    chosen = normals[rng.random(4) > 0.3] if seed else normals
+    Z, Y = split_space(chosen)
+    full = random_matrix(rng, lowest=0.2)
+    for n in chosen:
+        full -= rng.uniform(0.1, 30.0) * np.outer(n, n)  # of the arrow's shape, and nothing on the face
+    convex = convexify_arrow(arrow_of(full), chosen, NO_FLOOR).dense()
+    assert np.linalg.eigvalsh(convex)[0] > 0.0
+    np.testing.assert_allclose(Z.T @ convex @ Z, Z.T @ full @ Z, rtol=1e-9, atol=1e-9)
+    assert Y.shape[1] == len(chosen)
+
+
+# --- the whole optimiser ----------------------------------------------------------------------------------------------
+
+
+def rugged(theta, arrow):
+    """A sum over runs, not convex away from its minimum, with unknowns of each run's own and two shared ones."""
+    J, g, H = 0.0, np.zeros(11), np.zeros((11, 11))
+    for e, places in enumerate(PLACES):
+        z = theta[places]
+        a = np.cos(np.arange(len(places)) + e)
+        s = a @ z
+        J += np.cosh(0.1 * s) + 0.5 * z @ z - np.cos(2.0 * z).sum()
+        g[places] += 0.1 * np.sinh(0.1 * s) * a + z + 2.0 * np.sin(2.0 * z)
+        H[np.ix_(places, places)] += 0.01 * np.cosh(0.1 * s) * np.outer(a, a) + np.diag(1.0 + 4.0 * np.cos(2.0 * z))
+    return SimpleNamespace(cost=J, gradient=g, hessian=arrow_of(H) if arrow else H)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_optimiser_ends_where_it_does_with_full_matrices(seed):
+    """From where it is convex at the same point by the same steps; from elsewhere at a regular minimum too."""
+    rng = np.random.default_rng(seed)
+    lower = np.where(rng.random(11) < 0.3, 0.05, -9.0)
+    constraints = LinearConstraints(ORDERED, np.zeros(4), lower, np.full(11, 9.0), tuple("abcdefghijklmnopqrstuvwxyz"))
+    for size in (0.3, 3.0):
+        start = np.maximum(np.sort(size * rng.random(11)), lower)
+        full, arrow = (
+            minimize(lambda theta, side, a=a: rugged(theta, a), start, constraints=constraints) for a in (False, True)
+        )
+        assert arrow.successful, arrow.message
+        assert arrow.optimality < 1e-7
+        if size < 1.0:
+            np.testing.assert_allclose(arrow.theta, full.theta, atol=1e-9)
+            assert arrow.active == full.active
+            assert arrow.iterations == full.iterations
+            assert arrow.smallest_eigenvalue == pytest.approx(full.smallest_eigenvalue, rel=1e-5)
+            assert arrow.smallest_unscaled_eigenvalue == pytest.approx(full.smallest_unscaled_eigenvalue, rel=1e-5)
+        np.testing.assert_allclose(arrow.hessian, rugged(arrow.theta, False).hessian, rtol=1e-12)
+
+
+def test_kinks_and_block_diagonal_hessians():
+    """A term |theta_1 - 0.5|, whose one-sided derivatives meet at a breakpoint."""
+
+    def kinked(theta, side, arrow):
+        found = rugged(theta, arrow)
+        found.cost += 20.0 * abs(theta[1] - 0.5)
+        sign = np.sign(theta[1] - 0.5) or side
+        found.gradient[1] += 20.0 * sign
+        return found
+
+    box = LinearConstraints.box(np.full(11, -9.0), np.full(11, 9.0))
+    breakpoints = [np.array([0.5]) if i == 1 else () for i in range(11)]
+    for kind in ("exact", "block-diagonal"):
+        full, arrow = (
+            minimize(
+                lambda theta, side, a=a: kinked(theta, side, a),
+                np.full(11, 0.2),
+                constraints=box,
+                breakpoints=breakpoints,
+                hessian=kind,
+                blocks=np.arange(11) % 2,
+            )
+            for a in (False, True)
+        )
+        assert arrow.status is full.status
+        assert [kink[0] for kink in arrow.kinks] == [1]
+        np.testing.assert_allclose(arrow.theta, full.theta, atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_coordinates_are_released_from_kinks(seed):
+    """From a start on five kinks, some of which hold and some of which give way because others move."""
+    rng = np.random.default_rng(seed)
+    places, marks = rng.choice(11, 5, replace=False), rng.uniform(-0.3, 0.3, 5)
+    weights = 10.0 ** rng.uniform(-2, 0.5, 5)
+    full_matrix, pull = random_matrix(rng, lowest=0.2), rng.normal(size=11)
+
+    def kinked(theta, side, arrow):
+        H = full_matrix
+        away = theta[places] - marks
+        sign = np.where(away == 0.0, side, np.sign(away))
+        gradient = H @ theta + pull
+        gradient[places] += weights * sign
+        cost = 0.5 * theta @ H @ theta + pull @ theta + weights @ np.abs(away)
+        return SimpleNamespace(cost=cost, gradient=gradient, hessian=arrow_of(H) if arrow else H)
+
+    start = np.zeros(11)
+    start[places] = marks
+    breakpoints = [np.sort(marks[places == i]) for i in range(11)]
+    box = LinearConstraints.box(np.full(11, -9.0), np.full(11, 9.0))
+    full, arrow = (
+        minimize(lambda theta, side, a=a: kinked(theta, side, a), start, constraints=box, breakpoints=breakpoints)
+        for a in (False, True)
+    )
+    assert arrow.successful
+    assert arrow.status is full.status
+    assert arrow.iterations == full.iterations
+    assert arrow.evaluations == full.evaluations
+    np.testing.assert_allclose(arrow.theta, full.theta, rtol=1e-7, atol=1e-8)
+
+
+def test_saddle_points_are_left():
+    start = np.zeros(11)
+
+    def saddle(theta, side, arrow):
+        H = np.diag(np.r_[-2.0, np.full(10, 2.0)]) + np.diag(np.r_[12 * theta[0] ** 2, np.zeros(10)])
+        g = np.r_[-2 * theta[0] + 4 * theta[0] ** 3, 2 * theta[1:]]
+        J = -(theta[0] ** 2) + theta[0] ** 4 + theta[1:] @ theta[1:]
+        return SimpleNamespace(cost=J, gradient=g, hessian=arrow_of(H))
+
+    box = LinearConstraints.box(np.full(11, -9.0), np.full(11, 9.0))
+    found = minimize(lambda theta, side: saddle(theta, side, True), start, constraints=box)
+    assert found.successful
+    assert abs(found.theta[0]) == pytest.approx(np.sqrt(0.5), rel=1e-6)

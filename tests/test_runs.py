@@ -1,0 +1,645 @@
+"""Several runs: what they share, what is their own, initial states that are estimated, and what all this costs."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import switchfit as sf
+from switchfit.batch.program import Layout, _total
+from switchfit.cli import app
+from switchfit.estimate import minimized
+from switchfit.evaluate import derivatives, evaluator_of
+from switchfit.io.errors import InputError
+from switchfit.io.problem_file import load_problem
+from switchfit.mesh import common_lengths, padded_length
+from switchfit.refine import _steps, initial_state
+from switchfit.simulate import _block, _terminal
+
+METHODS = ("auto", "forward", "discrete-adjoint", "autodiff")
+TIMES = np.linspace(0.0, 2.0, 12)
+
+
+def swing(t, x, p):
+    """k is a vector, b a number; the Jacobian depends on time."""
+    return jnp.array([x[1] * jnp.cos(t) + 0.2 * x[0] * x[1], -p["k"][0] * x[0] + 0.3 * p["k"][1] * x[1] ** 2])
+
+
+def sway(t, x, p):
+    return jnp.array([p["b"] * x[1] ** 2 - x[0] + 0.2 * jnp.cos(2 * t) * x[1], -x[0] * jnp.exp(-p["b"] * t)])
+
+
+def kick(t, x, p):
+    return jnp.array([1.1 * x[0] + p["b"] * t * x[1] ** 2, 0.2 * p["k"][0] ** 2 * jnp.sin(x[0]) - 0.7 * x[1]])
+
+
+def seen(t, x, p):
+    return jnp.array([x[0] + p["b"] * x[1] ** 2])
+
+
+def last(x, p):
+    return p["k"][1] * x[0] ** 2 * x[1]
+
+
+SWING = sf.HybridSystem({"swing": swing, "sway": sway}, [0.7, 0.9], {("sway", "swing"): kick}, ("q", "v"), ("m", "m/s"))
+GUESS = {"k": [0.8, 0.5], "b": 1.2, "k_2": [0.7, 0.6], "b_2": 1.1}
+
+
+def run(sequence=("sway", "swing"), tau=(0.63,), seed=0, **given):
+    values = np.random.default_rng(seed).normal(size=len(TIMES))
+    data = [sf.Measurements(TIMES, values, observe=seen, sigma=0.5), sf.TerminalCost(last)]
+    return sf.Experiment(data, sequence, tau, 0.0, 2.0, **given)
+
+
+UNKNOWN = (sf.Parameter(0.75, lower=0.0, upper=3.0), sf.Parameter(0.85, lower=-2.0, upper=4.0, unit="mm/s"))
+
+
+def mixed(**settings):
+    """Nothing mapped and one state unknown; all mapped and both unknown; one name mapped and no state unknown."""
+    runs = [
+        run(initial_state=[UNKNOWN[0], 0.9], seed=1),
+        run(initial_state=UNKNOWN, seed=2, parameter_map={"k": "k_2", "b": "b_2"}, name="second"),
+        run(("swing", "sway", "swing"), (0.57, 1.31), seed=3, parameter_map={"b": "b_2"}),
+    ]
+    return sf.Problem(SWING, runs, GUESS, **settings)
+
+
+def by_hand(**settings):
+    """The same cost of the same theta, with functions made for each run, and initial states that are functions of p."""
+    names = ("k", "b", "k_2", "b_2", "starts")
+
+    def with_names(function, **names):
+        return lambda *given: function(*given[:-1], {key: given[-1][name] for key, name in names.items()})
+
+    systems = [
+        sf.HybridSystem(
+            {"swing": with_names(swing, k=k, b=b), "sway": with_names(sway, k=k, b=b)},
+            start,
+            {("sway", "swing"): with_names(kick, k=k, b=b)},
+        )
+        for k, b, start in (
+            ("k", "b", lambda p: jnp.array([p["starts"][0], 0.9])),
+            ("k_2", "b_2", lambda p: p["starts"][1:]),
+            ("k", "b_2", [0.7, 0.9]),
+        )
+    ]
+    given = mixed().experiments
+    parts = []
+    for system, experiment, k, b in zip(systems, given, ("k", "k_2", "k"), ("b", "b_2", "b_2"), strict=True):
+        samples, _ = experiment.data
+        data = [
+            sf.Measurements(samples.times, samples.values, observe=with_names(seen, k=k, b=b), sigma=samples.sigma),
+            sf.TerminalCost(with_names(last, k=k, b=b)),
+        ]
+        own = sf.Experiment(data, experiment.mode_sequence, tuple(experiment.initial_times), 0.0, 2.0)
+        parts.append(sf.Problem(system, own, GUESS | {"starts": [0.75, 0.75, 0.85]}, **settings))
+    assert [*parts[0].parameters] == list(names)
+    return parts
+
+
+def summed(parts):
+    """Cost, gradient and Hessian of `by_hand` in the order of theta of `mixed`."""
+    J, g, H = 0.0, np.zeros(13), np.zeros((13, 13))
+    first = 0
+    for part in parts:
+        found = sf.evaluate(part)
+        N = len(part.theta_names) - 9
+        place = [*range(first, first + N), *range(4, 13)]
+        first += N
+        J += found.cost
+        g[place] += found.gradient
+        H[np.ix_(place, place)] += found.hessian
+    return J, g, H
+
+
+# --- names ------------------------------------------------------------------------------------------------------------
+
+
+def test_theta_in_its_order():
+    problem = mixed()
+    assert problem.theta_names == (
+        "run1.tau_1", "second.tau_1", "run3.tau_1", "run3.tau_2",
+        "k[0]", "k[1]", "b", "k_2[0]", "k_2[1]", "b_2",
+        "run1.q(t0)", "second.q(t0)", "second.v(t0)",
+    )  # fmt: skip
+    assert problem.unknowns.units == ("s",) * 4 + ("",) * 6 + ("m", "m", "mm/s")
+    np.testing.assert_array_equal(
+        problem.initial_theta, [0.63, 0.63, 0.57, 1.31, 0.8, 0.5, 1.2, 0.7, 0.6, 1.1, 0.75, 0.75, 0.85]
+    )
+    np.testing.assert_array_equal(problem.unknowns.lower[10:], [0.0, 0.0, -2.0])
+    np.testing.assert_array_equal(problem.unknowns.upper[10:], [3.0, 3.0, 4.0])
+
+
+def test_one_experiment_needs_no_prefix_and_states_need_no_names():
+    system = sf.HybridSystem({"m": lambda t, x, p: -x}, [1.0, sf.Parameter(2.0), sf.Parameter(3.0, fixed=True)])
+    one = sf.Experiment(sf.TerminalCost(lambda x, p: x @ x), ("m",), (), 0.0, 1.0)
+    assert sf.Problem(system, one).theta_names == ("x2(t0)",)
+    both = sf.Problem(system, [one, one])
+    assert both.theta_names == ("run1.x2(t0)", "run2.x2(t0)")  # those of the system too are each run's own
+    np.testing.assert_allclose(sf.simulate(both, [5.0, 7.0], experiment=1).states[0], [1.0, 7.0, 3.0])
+
+
+def test_a_parameter_of_n_numbers_is_an_initial_state():
+    start = sf.Parameter([1.0, 2.0], lower=[0.0, 1.0], upper=9.0, unit="m")
+    problem = sf.Problem(SWING, run(initial_state=start), GUESS)
+    assert problem.theta_names[-2:] == ("q(t0)", "v(t0)")
+    np.testing.assert_array_equal(problem.unknowns.lower[-2:], [0.0, 1.0])
+    assert problem.unknowns.units[-2:] == ("m", "m")
+
+
+# --- derivatives ------------------------------------------------------------------------------------------------------
+
+
+def test_runs_add_up_to_runs_written_by_hand():
+    J, g, H = summed(by_hand())
+    found = sf.evaluate(mixed())
+    assert found.cost == pytest.approx(J, rel=1e-12)
+    np.testing.assert_allclose(found.gradient, g, rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(found.hessian, H, rtol=1e-8, atol=1e-9)
+    assert np.count_nonzero(H[9]) > 3  # the initial state tells on the transition time and the parameters of its run
+
+
+def test_all_methods_agree():
+    """With an initial state of which one entry is known, and parameters under other names."""
+    start = [0.9, UNKNOWN[0]]
+    problem = sf.Problem(SWING, run(initial_state=start, parameter_map={"k": "k_2", "b": "b_2"}), GUESS)
+    found = {method: sf.evaluate(problem, method=method) for method in METHODS}
+    base = found["auto"]
+    for other in found.values():
+        assert other.cost == pytest.approx(base.cost, rel=1e-12)
+        np.testing.assert_allclose(other.gradient, base.gradient, rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(other.hessian, base.hessian, rtol=1e-8, atol=1e-9)
+    check = sf.check_derivatives(problem)  # by the paper's equations too, and by Taylor's
+    assert check.passed, str(check)
+    assert np.isfinite(check.observed_orders).all()
+    assert check.hessian_gap_halved < check.hessian_gap / 16
+    assert np.count_nonzero(base.gradient) == 5  # of tau, k_2, b_2 and v(t0); k and b belong to others
+
+
+def test_taylor_orders_with_the_stiff_solver():
+    start = [sf.Parameter(0.7), sf.Parameter(0.4)]
+    system = sf.HybridSystem({"m": lambda t, x, p: jnp.array([-p["k"] * x[0] * x[1], jnp.sin(x[0]) - x[1]])}, start)
+    data = sf.Measurements([0.5, 1.0], [[0.5, 0.2], [0.3, 0.4]])
+    runs = [sf.Experiment(data, ("m",), (), 0.0, 1.0, parameter_map={"k": name}) for name in ("k_1", "k_2")]
+    problem = sf.Problem(system, runs, {"k_1": 1.0, "k_2": 2.0}, solver="stiff")
+    check = sf.check_derivatives(problem)
+    assert check.passed, str(check)
+    assert np.isfinite(check.observed_orders).all()
+
+
+def test_gauss_newton_is_that_of_runs_written_by_hand():
+    problem, parts = mixed(), by_hand()
+    whole = evaluator_of(problem)(problem.initial_theta, matrix="gauss-newton").hessian
+    own = evaluator_of(parts[1])(parts[1].initial_theta, matrix="gauss-newton").hessian
+    np.testing.assert_allclose(whole[11:, 11:], own[-2:, -2:], rtol=1e-9)
+
+
+def test_two_names_may_mean_one_parameter():
+    """Derivatives in it are those in both names together."""
+    system = sf.HybridSystem({"m": lambda t, x, p: -p["slow"] * p["fast"] ** 2 * x}, [1.0])
+    cost = sf.TerminalCost(lambda x, p: x[0] * p["fast"])
+    once = sf.Experiment(cost, ("m",), (), 0.0, 1.0, parameter_map={"slow": "rate", "fast": "rate"})
+    found = sf.evaluate(sf.Problem(system, once, {"rate": 0.7}, rtol=1e-11))
+    with jax.enable_x64(True):
+        J, slope, bend = (float(f(0.7)) for f in derivatives_of(lambda q: q * jnp.exp(-(q**3))))
+    assert found.cost == pytest.approx(J, rel=1e-10)
+    np.testing.assert_allclose(found.gradient, [slope], rtol=1e-7)
+    np.testing.assert_allclose(found.hessian, [[bend]], rtol=1e-7)
+
+
+def derivatives_of(function):
+    first = jax.grad(function)
+    return function, first, jax.grad(first)
+
+
+# --- which parameters a run has ---------------------------------------------------------------------------------------
+
+
+def names_of(problem, e=0):
+    return [name for name, _, _ in problem.structures[e].parameters]
+
+
+def test_a_run_is_differentiated_in_what_its_functions_ask_for():
+    problem = mixed()
+    assert [names_of(problem, e) for e in range(3)] == [["k", "b"]] * 3
+    assert [structure.M for structure in problem.structures] == [4, 5, 3]
+    unused = sf.Problem(SWING, run(), GUESS | {"idle": 1.0})
+    assert names_of(unused) == ["k", "b"]
+    assert sf.evaluate(unused).gradient[-1] == 0.0
+
+
+def test_a_target_is_there_under_its_own_name_too_if_asked_for():
+    system = sf.HybridSystem({"m": lambda t, x, p: -p["k"] * x}, [1.0])
+    cost = sf.TerminalCost(lambda x, p: x[0])
+    plain = sf.Experiment(cost, ("m",), (), 0.0, 1.0)
+    doubled = sf.HybridSystem({"m": lambda t, x, p: -p["k"] * x, "n": lambda t, x, p: -p["k1"] * p["k2"] * x}, [1.0])
+    mapped = sf.Experiment(cost, ("n",), (), 0.0, 1.0, parameter_map={"k1": "k", "k2": "k"})
+    both = sf.Problem(doubled, [plain, mapped], {"k": 0.5})
+    assert names_of(both, 0) == ["k"]
+    expected = np.exp(-0.5) + np.exp(-0.25)
+    assert sf.evaluate(both).cost == pytest.approx(expected, rel=1e-8)
+    np.testing.assert_allclose(sf.evaluate(both).gradient, [-np.exp(-0.5) - np.exp(-0.25)], rtol=1e-7)
+    assert sf.Problem(system, plain, {"k": 0.5}).theta_names == ("k",)
+
+
+@pytest.mark.parametrize(
+    "whole", [lambda p: sum(p.values()), lambda p: jax.jit(lambda q: q["a"] + q["b"])(p), lambda p: {**p}["a"] + p["b"]]
+)
+def test_a_function_that_takes_p_as_a_whole_sees_what_is_its_own(whole):
+    """Not the parameters of other runs, which their maps name."""
+    system = sf.HybridSystem({"m": lambda t, x, p: -whole(p) * x}, [1.0])
+    runs = [
+        sf.Experiment(sf.TerminalCost(lambda x, p: x[0]), ("m",), (), 0.0, 1.0, parameter_map={"b": name})
+        for name in ("b_1", "b_2")
+    ]
+    problem = sf.Problem(system, runs, {"a": 0.3, "b_1": 0.1, "b_2": sf.Parameter(0.2, fixed=True)})
+    assert sf.evaluate(problem).cost == pytest.approx(np.exp(-0.4) + np.exp(-0.5), rel=1e-8)
+    assert [names_of(problem, e) for e in range(2)] == [["a", "b"]] * 2
+
+
+def test_a_run_of_a_map_may_have_a_vector_and_a_fixed_parameter():
+    system = sf.HybridSystem({"m": lambda t, x, p: -jnp.sum(p["rates"]) * x}, [1.0])
+    runs = [
+        sf.Experiment(sf.TerminalCost(lambda x, p: x[0]), ("m",), (), 0.0, 1.0, parameter_map={"rates": name})
+        for name in ("one", "three")
+    ]
+    problem = sf.Problem(system, runs, {"three": [0.1, 0.2, 0.3], "one": sf.Parameter(0.4, fixed=True)})
+    found = sf.evaluate(problem)
+    assert found.cost == pytest.approx(np.exp(-0.4) + np.exp(-0.6), rel=1e-8)
+    np.testing.assert_allclose(found.gradient, -np.exp(-0.6) * np.ones(3), rtol=1e-7)
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("given", [["k"], {"k": 1}, {1: "k"}, "k"])
+def test_a_map_that_is_none(given):
+    with pytest.raises(TypeError, match="parameter_map must be a dict of the model's name -> the problem's name"):
+        run(parameter_map=given)
+
+
+def test_a_map_to_a_parameter_that_does_not_exist():
+    message = (
+        "parameter_map of experiment run2 gives the model's 'k' as the unknown parameter 'k_3'; the problem has k, b"
+    )
+    with pytest.raises(ValueError, match=message):
+        sf.Problem(SWING, [run(), run(parameter_map={"k": "k_3"})], GUESS)
+
+
+def test_a_parameter_that_neither_map_nor_problem_has():
+    lacking = {name: value for name, value in GUESS.items() if name != "b"}
+    with pytest.raises(ValueError, match="mode 'sway' asks for the parameter 'b', which the problem lacks; it has k"):
+        sf.Problem(SWING, run(parameter_map={"k": "k_2"}), lacking)
+
+
+def test_a_name_of_a_map_with_another_shape():
+    with pytest.raises(ValueError, match=r"mode 'swing': .* raised IndexError"):
+        sf.Problem(SWING, run(parameter_map={"k": "b"}), GUESS)
+
+
+@pytest.mark.parametrize(
+    ("start", "message"),
+    [
+        ([sf.Parameter(1.0), "v"], "initial_state must have a number or an sf.Parameter for each state; got 'v'"),
+        (
+            [sf.Parameter([1.0, 2.0]), 0.0],
+            r"one sf.Parameter of one number for each state; got an entry of shape \(2,\)",
+        ),
+        (sf.Parameter(1.0), r"initial_state must have shape \(n,\), one entry for each state; got shape \(\)"),
+    ],
+)
+def test_an_initial_state_that_is_none(start, message):
+    with pytest.raises(ValueError, match=message):
+        run(initial_state=start)
+    with pytest.raises(ValueError, match=message):
+        sf.HybridSystem({"swing": swing}, start)
+
+
+def test_an_initial_state_of_another_length():
+    three = [sf.Parameter(1.0), 2.0, 3.0]
+    with pytest.raises(
+        ValueError, match="initial_state of experiment 2 must have 2 entries, as the system's has; got 3"
+    ):
+        sf.Problem(SWING, [run(), run(initial_state=three)], GUESS)
+    with pytest.raises(ValueError, match="state_names must have one entry for each of the 3 states"):
+        sf.HybridSystem({"swing": swing}, three, state_names=("q", "v"))
+
+
+def test_an_unknown_that_is_called_like_an_initial_state():
+    with pytest.raises(ValueError, match=r"Two unknowns share a name: q\(t0\)"):
+        sf.Problem(SWING, run(initial_state=[UNKNOWN[0], 0.9]), GUESS | {"q(t0)": 1.0})
+
+
+# --- fits -------------------------------------------------------------------------------------------------------------
+
+TRUTH = {"k": 1.3, "c": 0.25}
+GROWTH = (0.7, 0.4)
+
+
+def fall(t, x, p):
+    return -p["k"] * x + p["c"]
+
+
+def rise(t, x, p):
+    return p["r"] * jnp.ones(1)
+
+
+def height(t, x, p):
+    return x
+
+
+TANK = sf.HybridSystem({"fall": fall, "rise": rise}, [0.0], state_names=("h",), state_units=("m",))
+
+
+def level(t, tau, x0, r, k=TRUTH["k"], c=TRUTH["c"]):
+    """x' = c - k x, then x' = r: the closed form."""
+    falling = c / k + (x0 - c / k) * np.exp(-k * np.minimum(t, tau))
+    return falling + r * np.maximum(t - tau, 0.0)
+
+
+def tank(e, samples=25, sigma=0.02, seed=0, names=None, **given):
+    """A tank that falls and then rises: of each run its own are tau, x(0) and, by its map, r."""
+    times = np.linspace(0.0, 4.0, samples)
+    x0, r, tau = 2.0 + e, GROWTH[e % 2], 1.93 + 0.2 * (e % 3)
+    values = level(times, tau, x0, r) + sigma * np.random.default_rng([seed, e]).normal(size=samples)
+    data = sf.Measurements(times, values, observe=height, sigma=sigma)
+    own = {"r": f"r_{e}"} if names is None else names
+    start = [sf.Parameter(1.5 + e, lower=0.0, upper=20.0)]
+    return sf.Experiment(
+        data, ("fall", "rise"), (2.0,), 0.0, 4.0, initial_state=start, parameter_map=own, name=f"tank{e}", **given
+    )
+
+
+def tanks(count, samples=None, **given):
+    guess = {"k": 1.0, "c": 0.2} | {f"r_{e}": sf.Parameter(0.5, lower=0.0, upper=3.0) for e in range(count)}
+    runs = [tank(e, samples=25 if samples is None else samples[e], **given) for e in range(count)]
+    return sf.Problem(TANK, runs, guess)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return sf.estimate(tanks(2))
+
+
+def test_the_truth_is_found(fitted):
+    assert fitted.success
+    assert fitted.theta_names == (
+        "tank0.tau_1", "tank1.tau_1", "k", "c", "r_0", "r_1", "tank0.h(t0)", "tank1.h(t0)",
+    )  # fmt: skip
+    truth = [1.93, 2.13, *TRUTH.values(), *GROWTH, 2.0, 3.0]
+    assert np.all(np.abs(fitted.theta - truth) < 3.5 * fitted.standard_errors)
+    assert [x.tolist() for x in fitted.initial_state] == [[fitted.theta[6]], [fitted.theta[7]]]
+
+
+def test_covariance_of_the_closed_form(fitted):
+    """Hessian of the least-squares cost written with the closed form, differentiated by JAX alone."""
+    measured = [run.data[0] for run in fitted.problem.experiments]
+
+    def cost(theta):
+        total = 0.0
+        for e, item in enumerate(measured):
+            t = jnp.asarray(item.times)
+            tau, (k, c), r, x0 = theta[e], theta[2:4], theta[4 + e], theta[6 + e]
+            falling = c / k + (x0 - c / k) * jnp.exp(-k * jnp.where(t < tau, t, tau))
+            model = falling + r * jnp.where(t < tau, 0.0, t - tau)
+            total += 0.5 * jnp.sum(((model - item.values[:, 0]) / item.sigma) ** 2)
+        return total
+
+    with jax.enable_x64(True):
+        H = np.asarray(jax.hessian(cost)(jnp.asarray(fitted.theta)))
+        J = float(cost(jnp.asarray(fitted.theta)))
+    assert fitted.cost == pytest.approx(J, rel=1e-7)
+    np.testing.assert_allclose(fitted.hessian, H, rtol=1e-5, atol=1e-5 * np.abs(H).max())
+    np.testing.assert_allclose(fitted.covariance, np.linalg.inv(H), rtol=1e-4, atol=1e-9)
+
+
+def test_runs_that_share_nothing_are_fits_of_their_own():
+    own = [{"k": f"k_{e}", "c": f"c_{e}", "r": f"r_{e}"} for e in range(2)]
+    guess = {name: 0.5 for e in range(2) for name in own[e].values()}
+    runs = [tank(e, names=own[e]) for e in range(2)]
+    joint = sf.estimate(sf.Problem(TANK, runs, guess))
+    alone = [sf.estimate(sf.Problem(TANK, run, guess_of(run, guess))) for run in runs]
+    assert joint.cost == pytest.approx(sum(fit.cost for fit in alone), rel=1e-10)
+    for e, fit in enumerate(alone):
+        for name, value, error in zip(fit.theta_names, fit.theta, fit.standard_errors, strict=True):
+            in_joint = name if "_" in name and "tau" not in name else f"tank{e}.{name}"
+            k = joint.theta_names.index(in_joint)
+            assert joint.theta[k] == pytest.approx(value, rel=1e-7)
+            assert joint.standard_errors[k] == pytest.approx(error, rel=1e-5)
+
+
+def guess_of(run, guess):
+    return {name: guess[name] for name in run.parameter_map.values()}
+
+
+def test_by_blocks_a_fit_is_the_same():
+    problem = tanks(6)
+    evaluator = evaluator_of(problem)
+    full, blocks = (minimized(evaluator, problem.initial_theta, "exact", 1e-7, 200, by_blocks=b) for b in (False, True))
+    assert blocks.successful
+    np.testing.assert_allclose(blocks.theta, full.theta, rtol=1e-8, atol=1e-9)
+    at, arrow = evaluator(full.theta), evaluator.arrow(full.theta)
+    assert arrow.cost == at.cost
+    np.testing.assert_allclose(arrow.gradient, at.gradient, rtol=1e-14, atol=1e-10)
+    np.testing.assert_allclose(arrow.hessian.dense(), at.hessian, rtol=1e-12, atol=1e-10)
+
+
+def test_all_that_is_done_with_a_fit(fitted, tmp_path):
+    """Report, figure, file, and back."""
+    text = str(fitted)
+    for expected in ("tank0.h(t0)", "r_1", "tank1.tau_1", "fall -> rise"):
+        assert expected in text
+    line = next(line for line in text.splitlines() if line.strip().startswith("tank1.h(t0)"))
+    assert float(line.split()[1]) == pytest.approx(fitted.theta[7], abs=1e-3)
+    assert " m " in line
+    assert len(fitted.plot().axes) >= 2
+    fitted.save(tmp_path / "fit.json")
+    loaded = sf.Estimate.load(tmp_path / "fit.json")
+    assert loaded.theta_names == fitted.theta_names
+    for there, here in zip(loaded.initial_state, fitted.initial_state, strict=True):
+        np.testing.assert_array_equal(there, here)
+    assert str(loaded) == text
+
+
+@pytest.mark.parametrize("kind", ["block-diagonal", "gauss-newton", "none"])
+def test_other_quadratic_terms(kind, fitted):
+    found = sf.estimate(tanks(2), hessian=kind, start=fitted.theta * 1.001, max_iterations=400)
+    assert found.cost <= sf.evaluate(tanks(2), fitted.theta * 1.001).cost
+    if kind == "gauss-newton":
+        np.testing.assert_allclose(found.theta, fitted.theta, rtol=1e-4)
+
+
+def test_batches(fitted):
+    """Every kind of them has the unknowns of every kind; runs that are alike go through one program."""
+    problem = tanks(2)
+    study = sf.monte_carlo(problem, 40, theta=fitted.theta, seed=1)
+    assert study.success.all()
+    np.testing.assert_allclose(study.standard_deviation, fitted.standard_errors, rtol=0.5)
+    with pytest.raises(ValueError, match=r"there are none for k, c: give sf.Parameter"):
+        sf.multistart(problem, 4)
+    bounded = {"k": sf.Parameter(1.0, lower=0.5, upper=2.0), "c": sf.Parameter(0.2, lower=0.0, upper=0.5)}
+    several = sf.multistart(sf.Problem(TANK, problem.experiments, dict(problem.parameters) | bounded), 8)
+    assert several.best.cost == pytest.approx(fitted.cost, rel=1e-8)
+    low = [0.0, 0.0]
+    assert np.all(several.start[:, 6:] >= low)
+    assert np.ptp(several.start[:, 6]) > 5.0
+    many = sf.estimate_many([problem, tanks(2, seed=5)])
+    np.testing.assert_allclose(many.theta[0], fitted.theta, rtol=1e-7)
+    other = sf.estimate(tanks(2, seed=5))
+    np.testing.assert_allclose(many.theta[1], other.theta, rtol=1e-7)
+
+
+def test_a_batch_of_runs_with_times_that_are_known():
+    """In the loop over runs that are alike, known transition times are not mixed up with those of others."""
+    known = sf.Parameter(1.9, fixed=True)
+    given = tanks(2)
+    runs = [replace(run, transition_times=(known,), name=f"known{e}") for e, run in enumerate(given.experiments)]
+    problem = sf.Problem(TANK, [*given.experiments, *runs], given.parameters)
+    evaluator, theta = evaluator_of(problem), problem.initial_theta + 0.1
+    places = tuple(tuple(where.tolist()) for where in problem.places)
+    for lockstep in (False, True):
+        layout = Layout(problem.structures, places, (), lockstep, 1e-7, 10)
+        times = tuple(run.initial_times for run in problem.experiments)
+        with jax.enable_x64(True):
+            found = jax.jit(lambda theta, f=layout, t=times: _total(f, tuple(evaluator.arguments), t, theta))(theta)
+        expected = evaluator(theta)
+        for one, other in zip(found, (expected.cost, expected.gradient, expected.hessian), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-8)
+
+
+PROGRAMS = (derivatives, _block, _terminal, _steps, initial_state)
+
+
+def test_one_program_for_ten_runs_of_different_lengths():
+    """One of each kind: for the first of them, and nothing for the others, nor for the ten together."""
+    samples = [29, 37, 31, 42, 51, 38, 49, 54, 59, 33]
+
+    def compiled(call):
+        before = [program._cache_size() for program in PROGRAMS]
+        call()
+        return [program._cache_size() - b for program, b in zip(PROGRAMS, before, strict=True)]
+
+    def blank(t, x, p):
+        return fall(t, x, p)
+
+    global TANK  # new functions, which nothing has compiled before
+    before = TANK
+    try:
+        TANK = sf.HybridSystem({"fall": blank, "rise": rise}, [0.0], state_names=("h",))
+        problem = tanks(10, samples)
+        assert len(set(problem.structures)) == 1
+        found = compiled(lambda: evaluated(problem))
+        assert found == [1, 1, 1, 1, 1]
+        assert compiled(lambda: evaluated(tanks(10, samples[::-1]))) == [0, 0, 0, 0, 0]
+        assert compiled(lambda: evaluated(tanks(12, [*samples, 40, 45]))) == [0, 0, 0, 0, 0]
+    finally:
+        TANK = before
+
+
+def evaluated(problem):
+    sf.evaluate(problem)
+    sf.estimate(problem, max_iterations=1)
+
+
+def test_common_lengths():
+    """Few distinct lengths, and none more than twice what is needed."""
+    assert common_lengths([29, 59, 41]) == [64, 64, 64]
+    assert common_lengths([100]) == [padded_length(100)]
+    lengths = list(range(1, 3000, 17))
+    common = common_lengths(lengths)
+    assert all(length <= there <= 2 * padded_length(length) for length, there in zip(lengths, common, strict=True))
+    assert len(set(common)) <= 11
+
+
+# --- problem files ----------------------------------------------------------------------------------------------------
+
+FILE = """
+model = "tank.py:tank"
+[parameters]
+k = 1.0
+c = 0.2
+r_0 = { value = 0.5, lower = 0.0 }
+r_1 = 0.5
+[[experiments]]
+name = "first"
+mode_sequence = ["fall", "rise"]
+transition_times = [2.0]
+initial_state = [{ value = 1.5, lower = 0.0, upper = 9.0, unit = "cm" }, 0.5]
+parameter_map = { r = "r_0" }
+data = { file = "log.csv", time = "t", columns = ["h"], observe = ["h"], sigma = 0.02 }
+[[experiments]]
+mode_sequence = ["fall", "rise"]
+transition_times = [2.0]
+initial_state = [2.5, { value = 3.5, fixed = true }]
+parameter_map = { r = "r_1" }
+data = { file = "log.csv", time = "t", columns = ["h"], observe = ["h"], sigma = 0.02 }
+"""
+
+MODEL = """
+import jax.numpy as jnp
+import switchfit as sf
+tank = sf.HybridSystem(
+    {"fall": lambda t, x, p: p["c"] - p["k"] * x, "rise": lambda t, x, p: p["r"] * jnp.ones(2)},
+    [0.0, 0.0], state_names=("h", "g"),
+)
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    times = np.linspace(0.0, 4.0, 25)
+    rows = [f"{t},{h}" for t, h in zip(times, level(times, 1.93, 2.0, 0.7), strict=True)]
+    (tmp_path / "log.csv").write_text("\n".join(["t,h", *rows]))
+    (tmp_path / "tank.py").write_text(MODEL)
+    (tmp_path / "p.toml").write_text(FILE)
+    return tmp_path
+
+
+def test_problem_files_say_it_too(folder):
+    problem = load_problem(folder / "p.toml").problem
+    assert problem.theta_names == ("first.tau_1", "run2.tau_1", "k", "c", "r_0", "r_1", "first.h(t0)")
+    assert problem.unknowns.units[-1] == "cm"
+    assert (problem.unknowns.lower[-1], problem.unknowns.upper[-1], problem.initial_theta[-1]) == (0.0, 9.0, 1.5)
+    assert problem.experiments[1].parameter_map == {"r": "r_1"}
+    np.testing.assert_array_equal(problem.experiments[1].initial_state, [2.5, 3.5])
+    assert sf.simulate(problem).states[0].tolist() == [1.5, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "lower = 0.0, upper = 9.0",
+            "lowr = 0.0",
+            r"'experiments\[1\]\.initial_state\[1\]\.lowr'; did you mean 'lower'",
+        ),
+        ("upper = 9.0", "upper = 1.0", r"experiments\[1\]: Parameter value 1.5 lies outside its bounds \[0.0, 1.0\]"),
+        (
+            '{ r = "r_0" }',
+            '{ r = "r_9" }',
+            "gives the model's 'r' as the unknown parameter 'r_9'; the problem has k, c",
+        ),
+        ('{ r = "r_0" }', "{ r = 1 }", r"'experiments\[1\]\.parameter_map.*' must be a string; got 1"),
+        ("[2.5, {", '["x", {', r"'experiments\[2\]\.initial_state\[1\]' must be a table; got 'x'"),
+    ],
+)
+def test_problem_files_that_are_wrong(folder, old, new, message):
+    assert old in FILE
+    (folder / "p.toml").write_text(FILE.replace(old, new, 1))
+    with pytest.raises(InputError, match=message):
+        load_problem(folder / "p.toml")
+
+
+def test_command_line(folder):
+    """Fitted and simulated by ``switchfit``."""
+    main = CliRunner()
+    done = main.invoke(app, ["fit", str(folder / "p.toml"), "--out", str(folder / "out"), "--no-figures"])
+    assert done.exit_code == 0, done.output
+    assert "first.h(t0)" in done.output
+    assert sf.Estimate.load(folder / "out" / "estimate.json").theta_names[-1] == "first.h(t0)"
+    done = main.invoke(app, ["simulate", str(folder / "p.toml"), "--out", str(folder / "path.csv")])
+    assert done.exit_code == 0, done.output
+    assert (folder / "path.csv").read_text().splitlines()[1] == "first,0.0,fall,1.5,0.5"
