@@ -51,10 +51,8 @@ def ball_in_closed_form(e):
 def test_bouncing_ball_has_the_derivatives_of_its_closed_form():
     found = sf.evaluate_on_guards(ball())
     with float64():
-        J, g, H = (
-            f(jnp.float64(0.8))
-            for f in (ball_in_closed_form, jax.grad(ball_in_closed_form), jax.hessian(ball_in_closed_form))
-        )
+        at, cost = jnp.float64(0.8), ball_in_closed_form
+        J, g, H = cost(at), jax.grad(cost)(at), jax.hessian(cost)(at)
         rest = np.sqrt(2 * HEIGHT / G)
     assert found.names == ("e",)
     np.testing.assert_allclose(found.times, rest + 2 * rest * np.array([0.0, 0.8, 0.8 + 0.64]), rtol=1e-13)
@@ -305,7 +303,7 @@ def test_a_guard_that_is_not_reached_is_told():
     problem = ball(guess=(3.0, 8.0, 12.0))
     high = sf.HybridSystem({"air": ball_falls}, [HEIGHT, 0.0], guards={("air", "air"): lambda t, x, p: x[0] - 60.0})
     run = sf.Experiment(problem.experiments[0].data, ("air", "air"), (3.0,), 0.0, END)
-    with pytest.raises(ValueError, match="No transition times near .* put tau_1 on their guards"):
+    with pytest.raises(ValueError, match=r"No transition times near .* put tau_1 on their guards"):
         sf.evaluate_on_guards(sf.Problem(high, run, {"e": 0.5}))
 
 
@@ -323,9 +321,7 @@ def test_a_guarded_time_cannot_be_fixed():
 
 @pytest.mark.parametrize("kind", ["gauss-newton", "block-diagonal", "descent-first", "none"])
 def test_only_the_exact_hessian_knows_constraints(kind):
-    with pytest.raises(
-        ValueError, match=r"with guards or terminal constraints hessian must be 'exact'|hessian must be one of"
-    ):
+    with pytest.raises(ValueError, match=r"hessian must be ('exact'|one of)"):
         sf.estimate(tank(), hessian=kind)
 
 

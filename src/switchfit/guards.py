@@ -76,7 +76,7 @@ def evaluate_on_guards(problem: Problem, theta: ArrayLike | None = None) -> Guar
     rows = guard_rows(problem)
     here = evaluator.constrained(at)
     C = here.jacobian[rows]
-    slope = -np.linalg.solve(C[:, guarded], C[:, free])
+    slope: FloatArray = np.asarray(-np.linalg.solve(C[:, guarded], C[:, free]), dtype=np.float64)
     multipliers = np.zeros(len(problem.constraint_names))
     multipliers[rows] = -np.linalg.solve(C[:, guarded].T, here.gradient[guarded])
     Z = np.zeros((len(at), len(free)))

@@ -42,11 +42,11 @@ class HybridSystem:
     reset_maps : mapping of (str, str) to callable, optional
         ``reset_maps[a, b]`` is applied at every transition from mode ``a`` to mode ``b``:
         ``x(tau+) = R(tau, x(tau-), p)``. Transitions without an entry leave the state continuous.
+    state_names, state_units : sequence of str, optional
+        One for each state; they label reports and plots.
     guards : mapping of (str, str) to callable, optional
         Every transition from mode ``a`` to mode ``b`` happens where ``guards[a, b](tau, x(tau-), p) = 0``: its time is
         then no free unknown but follows from the others. Transitions without an entry happen at any time.
-    state_names, state_units : sequence of str, optional
-        One for each state; they label reports and plots.
 
     Raises
     ------

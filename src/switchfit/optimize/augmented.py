@@ -110,7 +110,8 @@ def minimize_constrained(
     settings : the other arguments of `minimize`
     """
     m, d = len(names), len(theta0)
-    theta, multipliers = np.array(theta0, dtype=float), np.zeros(m)
+    theta: FloatArray = np.array(theta0, dtype=float)
+    multipliers: FloatArray = np.zeros(m)
     first = evaluate(theta, 1, multipliers, np.zeros(m))
     size = np.where(theta != 0.0, np.abs(theta), 1.0)
     unit = _lengths(first.jacobian * size)
@@ -120,7 +121,8 @@ def minimize_constrained(
     penalty = PENALTY * curvature / unit**2
     highest = penalty * LARGEST_PENALTY / PENALTY
     if np.isfinite(first.jacobian).all() and np.isfinite(first.gradient).all():
-        multipliers = -np.linalg.lstsq((first.jacobian * size).T, first.gradient * size, rcond=None)[0]
+        found = np.linalg.lstsq((first.jacobian * size).T, first.gradient * size, rcond=None)[0]
+        multipliers = -np.asarray(found, dtype=np.float64)
 
     history: list[IterationRecord] = []
     evaluations, before = 1, np.full(m, np.inf)
@@ -179,6 +181,7 @@ def _finished(
     status = result.status
     if violated and status not in (Status.INTERRUPTED, Status.NONFINITE_START, Status.MAX_ITERATIONS):
         status = Status.INFEASIBLE
+    unscaled = np.linalg.eigvalsh(free.T @ here.hessian @ free)
     lowest = basis @ vectors[:, 0] / scaling if len(values) else np.zeros(d)
     final = replace(
         result,
@@ -191,9 +194,7 @@ def _finished(
         free_basis=free,
         free_eigenvalues=values,
         smallest_eigenvalue=float(values[0]) if len(values) else np.nan,
-        smallest_unscaled_eigenvalue=float(np.linalg.eigvalsh(free.T @ here.hessian @ free)[0])
-        if len(values)
-        else np.nan,
+        smallest_unscaled_eigenvalue=float(unscaled[0]) if len(values) else np.nan,
         flat_direction=lowest / max(float(np.linalg.norm(lowest)), np.finfo(float).tiny),
         history=tuple(history),
         violated="; ".join(violated),
