@@ -5,10 +5,11 @@ from switchfit.batch.logs import estimate_many
 from switchfit.batch.monte_carlo import MonteCarlo, monte_carlo
 from switchfit.batch.multistart import Multistart, multistart
 from switchfit.check import DerivativeCheck, check_derivatives
-from switchfit.data import Input, Measurements, ReferenceSignal, RunningCost, TerminalCost
+from switchfit.data import Input, Measurements, ReferenceSignal, RunningCost, TerminalConstraint, TerminalCost
 from switchfit.estimate import Estimate, estimate
 from switchfit.evaluate import Evaluation, evaluate
 from switchfit.experiment import Experiment, Parameter
+from switchfit.guards import GuardedEvaluation, evaluate_on_guards
 from switchfit.optimize import Status
 from switchfit.problem import Problem
 from switchfit.result import Certificate
@@ -28,6 +29,7 @@ __all__ = [
     "Evaluation",
     "Experiment",
     "Fits",
+    "GuardedEvaluation",
     "HybridSystem",
     "Input",
     "Measurements",
@@ -38,12 +40,14 @@ __all__ = [
     "ReferenceSignal",
     "RunningCost",
     "Status",
+    "TerminalConstraint",
     "TerminalCost",
     "Trajectory",
     "check_derivatives",
     "estimate",
     "estimate_many",
     "evaluate",
+    "evaluate_on_guards",
     "monte_carlo",
     "multistart",
     "simulate",

@@ -131,6 +131,22 @@ class TerminalCost:
 
 
 @dataclass(frozen=True, eq=False)
+class TerminalConstraint:
+    """What has to hold at the end: ``psi(x(tf), p) = 0``, an equality constraint and no cost.
+
+    Parameters
+    ----------
+    psi : callable ``psi(x, p) -> () or (m,)``, twice differentiable.
+    """
+
+    psi: Callable[..., Any]
+
+    def __post_init__(self) -> None:
+        if not callable(self.psi):
+            raise TypeError(f"TerminalConstraint needs a function psi(x, p); got {type(self.psi).__name__}.")
+
+
+@dataclass(frozen=True, eq=False)
 class ReferenceSignal:
     """A continuous measured signal y_m(t): adds ``integral of 1/2 (y - y_m)' W (y - y_m) dt`` to J.
 
@@ -274,7 +290,7 @@ class Measurements:
         return int(np.count_nonzero(~np.isnan(self.values)))
 
 
-Data = RunningCost | TerminalCost | ReferenceSignal | Measurements
+Data = RunningCost | TerminalCost | TerminalConstraint | ReferenceSignal | Measurements
 
 
 def _samples(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -14,10 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.certificate import certify
-from switchfit.data import FloatArray, Measurements
+from switchfit.data import FloatArray, Measurements, TerminalConstraint
 from switchfit.evaluate import ArrowEvaluation, Evaluation, Evaluator, evaluator_of
+from switchfit.guards import on_guards
 from switchfit.io.json import load_fit, save_fit
-from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
+from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize, minimize_constrained
 from switchfit.problem import Problem
 from switchfit.refine import refined_mesh
 from switchfit.report.plot import plot_fit
@@ -139,16 +141,26 @@ def estimate(
         raise ValueError(f"tolerance must be positive; got {tolerance}.")
     if max_iterations < 0:
         raise ValueError(f"max_iterations must not be negative; got {max_iterations}.")
+    if problem.constraint_names and hessian != "exact":
+        raise ValueError(f"with guards or terminal constraints hessian must be 'exact'; got {hessian!r}.")
     began = time.perf_counter()
     theta = problem.checked_theta(start)
     evaluator = evaluator_of(problem) if start is None else Evaluator(problem, theta)
+    if any(structure.guarded for structure in problem.structures):
+        with suppress(ValueError):  # if there is no such point nearby, the optimiser may find one farther off
+            theta = on_guards(evaluator, theta)
+            evaluator = Evaluator(problem, theta)
+    held: tuple[tuple[str, float, float], ...] = ()
     history: list[IterationRecord] = []
     evaluations = 0
     for attempt in range(REFINEMENTS + 1):
         numbered = partial(_numbered_on, after=history[-1] if history else None)
         told = None if callback is None else lambda record, on=numbered: callback(on(record))
         left = max_iterations - max(len(history) - 1, 0)
-        result = minimized(evaluator, theta, hessian, tolerance, max(left, 0), told)
+        if problem.constraint_names:
+            result, held = _minimized_with_constraints(evaluator, theta, tolerance, max(left, 0), told)
+        else:
+            result = minimized(evaluator, theta, hessian, tolerance, max(left, 0), told)
         records = [numbered(record) for record in result.history]
         history += records[1:] if history else records
         evaluations += result.evaluations
@@ -174,7 +186,32 @@ def estimate(
         comparisons=comparisons,
         integration_error=float(error),
         seconds=time.perf_counter() - began,
+        constraints=held,
     )
+
+
+def _minimized_with_constraints(
+    evaluator: Evaluator,
+    theta: FloatArray,
+    tolerance: float,
+    max_iterations: int,
+    callback: Callable[[IterationRecord], object] | None,
+) -> tuple[Result, tuple[tuple[str, float, float], ...]]:
+    """One run of the optimiser with guards and terminal constraints: its result, and each with value and multiplier."""
+    problem = evaluator.problem
+    names = problem.constraint_names
+    found = minimize_constrained(
+        evaluator.constrained,
+        theta,
+        names,
+        tolerance=tolerance,
+        max_iterations=max_iterations,
+        callback=callback,
+        constraints=constraints_of(problem),
+        breakpoints=evaluator.breakpoints(),
+    )
+    values, multipliers = found.constraints.tolist(), found.multipliers.tolist()
+    return found.result, tuple(zip(names, values, multipliers, strict=True))
 
 
 def _refined(evaluator: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:
@@ -298,7 +335,7 @@ def with_names(message: str, names: tuple[str, ...]) -> str:
 
 def sigma_known(problem: Problem) -> bool | None:
     """Whether sigma is known for all measurements; None where the cost is not made of measurements alone."""
-    items = [item for experiment in problem.experiments for item in experiment.data]
-    if not all(isinstance(item, Measurements) for item in items):
+    items = [item for run in problem.experiments for item in run.data if not isinstance(item, TerminalConstraint)]
+    if not items or not all(isinstance(item, Measurements) for item in items):
         return None
     return all(item.sigma is not None for item in items)

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.cache import compilation_cache
 from switchfit.data import FloatArray
 from switchfit.derivatives.adjoint import paper_derivatives
+from switchfit.derivatives.constraints import augmented
 from switchfit.derivatives.discrete import adjoint_hessian, gauss_newton_hessian
 from switchfit.derivatives.first_order import first_order
 from switchfit.derivatives.forward import forward_hessian
@@ -60,6 +61,28 @@ class ArrowEvaluation:
     hessian: Arrow
 
 
+@dataclass(frozen=True, eq=False)
+class ConstrainedEvaluation:
+    """Cost and constraints at one theta.
+
+    Attributes
+    ----------
+    cost : J
+    gradient : (d,), J's derivative in theta
+    value, slope : the augmented Lagrangian and its derivative (d,)
+    hessian : (d, d), of the augmented Lagrangian
+    constraints, jacobian : c (m,) and its derivative (m, d)
+    """
+
+    cost: float
+    gradient: FloatArray
+    value: float
+    slope: FloatArray
+    hessian: FloatArray
+    constraints: FloatArray
+    jacobian: FloatArray
+
+
 class Evaluator:
     """A problem on fixed meshes, one an experiment: cost, gradient and Hessian as functions of theta alone.
 
@@ -102,6 +125,28 @@ class Evaluator:
             np.add.at(gradient, mine, g[own])
             np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
         return Evaluation(total, gradient, hessian)
+
+    def constrained(
+        self, theta: FloatArray, side: int = 1, multipliers: ArrayLike = 0.0, penalty: ArrayLike = 0.0
+    ) -> ConstrainedEvaluation:
+        """Cost, constraints and their augmented Lagrangian with the given multipliers and penalties, (m,) or ()."""
+        d, count = len(theta), len(self.problem.constraint_names)
+        multipliers, penalty = (np.broadcast_to(np.asarray(a, float), count) for a in (multipliers, penalty))
+        cost, value, gradient, slope, hessian = 0.0, 0.0, np.zeros(d), np.zeros(d), np.zeros((d, d))
+        jacobian, c = np.zeros((count, d)), np.zeros(count)
+        last = 0
+        for e, ((s, a, tau, p), (own, mine)) in enumerate(zip(self._each(theta), self._places, strict=True)):
+            here = slice(last, last := last + self.problem.constraint_counts[e])
+            with float64(), compilation_cache():
+                found = constrained_derivatives(a, tau, p, float(side), multipliers[here], penalty[here], structure=s)
+            J, g, L, L_d, H, c_e, A = map(np.asarray, found)
+            cost, value = cost + float(J), value + float(L)
+            np.add.at(gradient, mine, g[own])
+            np.add.at(slope, mine, L_d[own])
+            np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
+            np.add.at(jacobian[here].T, mine, A[:, own].T)
+            c[here] = c_e
+        return ConstrainedEvaluation(cost, gradient, value, slope, hessian, c, jacobian)
 
     def arrow(self, theta: FloatArray, side: int = 1, matrix: Matrix = "exact") -> ArrowEvaluation:
         """The same by the method "auto", in time and memory that are linear in the number of experiments."""
@@ -223,6 +268,25 @@ def derivatives(
         return first.cost, first.gradient, gauss_newton_hessian(model, first, p)
     second = forward_hessian if method == "forward" else adjoint_hessian
     return first.cost, first.gradient, second(model, first, tau, p)
+
+
+@partial(jax.jit, static_argnames=("structure",))
+def constrained_derivatives(
+    arguments: Arguments,
+    tau: jax.Array,
+    p: jax.Array,
+    side: jax.Array,
+    multipliers: jax.Array,
+    penalty: jax.Array,
+    *,
+    structure: Structure,
+) -> tuple[jax.Array, ...]:
+    """Cost, gradient; augmented Lagrangian, its gradient and Hessian; constraints (m,), their derivatives (m, D)."""
+    model = Model(structure, arguments)
+    first = first_order(model, tau, p, side)
+    L, L_d, weights, c, A = augmented(model, first, tau, p, multipliers, penalty)
+    H = adjoint_hessian(model, first, tau, p, weights) + (A.T * penalty) @ A
+    return first.cost, first.gradient, L, L_d, H, c, A
 
 
 def _autodiff(model: Model, tau: jax.Array, p: jax.Array, side: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

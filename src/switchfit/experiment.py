@@ -17,12 +17,13 @@ from switchfit.data import (
     PiecewisePolynomial,
     ReferenceSignal,
     RunningCost,
+    TerminalConstraint,
     TerminalCost,
     as_number,
 )
 from switchfit.parameter import Parameter as Parameter
 from switchfit.parameter import as_parameter
-from switchfit.system import HybridSystem, ResetMap, as_state
+from switchfit.system import Guard, HybridSystem, ResetMap, as_state
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +33,8 @@ class Experiment:
     Parameters
     ----------
     data : cost or list of costs
-        `Measurements`, `ReferenceSignal`, `RunningCost`, `TerminalCost`; several add up.
+        `Measurements`, `ReferenceSignal`, `RunningCost`, `TerminalCost`; several add up. A `TerminalConstraint` beside
+        them has to hold.
     mode_sequence : sequence of str
         Names of the modes in the order in which they are active; a mode may return.
     transition_times : sequence of float or Parameter
@@ -145,6 +147,11 @@ def reset_maps_of(system: HybridSystem, mode_sequence: Sequence[str]) -> tuple[R
     return tuple(system.reset_map(a, b) for a, b in pairwise(mode_sequence))
 
 
+def guards_of(system: HybridSystem, mode_sequence: Sequence[str]) -> tuple[Guard | None, ...]:
+    """The guard of each of the N transitions of a mode sequence, None where its time is free."""
+    return tuple(system.guard(a, b) for a, b in pairwise(mode_sequence))
+
+
 def signals_of(experiment: Experiment) -> tuple[PiecewisePolynomial, ...]:
     """Reference signals in the order of the data, then the input: all that varies in time beside the modes."""
     signals = [item.signal for item in experiment.data if isinstance(item, ReferenceSignal)]
@@ -171,13 +178,13 @@ def _checked_map(given: Any) -> Mapping[str, str]:
 
 
 def _checked_data(data: Any) -> tuple[Data, ...]:
-    kinds = (Measurements, ReferenceSignal, RunningCost, TerminalCost)
+    kinds = (Measurements, ReferenceSignal, RunningCost, TerminalCost, TerminalConstraint)
     items = (data,) if isinstance(data, kinds) else tuple(data) if isinstance(data, (list, tuple)) else (data,)
     for item in items:
         if not isinstance(item, kinds):
             raise TypeError(
-                "data must be sf.Measurements, sf.ReferenceSignal, sf.RunningCost, sf.TerminalCost or a list of them; "
-                f"got {type(item).__name__}."
+                "data must be sf.Measurements, sf.ReferenceSignal, sf.RunningCost, sf.TerminalCost, "
+                f"sf.TerminalConstraint or a list of them; got {type(item).__name__}."
             )
     if not items:
         raise ValueError("data is empty: an experiment needs at least one cost.")

@@ -24,9 +24,10 @@ from switchfit.data import (
     PiecewisePolynomial,
     ReferenceSignal,
     RunningCost,
+    TerminalConstraint,
     TerminalCost,
 )
-from switchfit.experiment import Experiment, Parameter, initial_state_of, reset_maps_of, signals_of
+from switchfit.experiment import Experiment, Parameter, guards_of, initial_state_of, reset_maps_of, signals_of
 from switchfit.mesh import Mesh
 from switchfit.rungekutta import Density, Field, Tableau, tableau_of
 from switchfit.system import HybridSystem
@@ -55,6 +56,8 @@ class Structure:
     references: tuple[tuple[Observe | None, int], ...]  # observe, channels
     measurements: tuple[tuple[Observe | None, int], ...]  # observe, channels
     terminal: tuple[Callable[..., Any], ...]
+    guards: tuple[Callable[..., Any] | None, ...]
+    terminal_constraints: tuple[Callable[..., Any], ...]
     input_shape: tuple[int, ...] | None
     solver: str
 
@@ -76,12 +79,22 @@ class Structure:
     @property
     def functions(self) -> Structure:
         """The same with one segment: what programs depend on that work in one mode at a time."""
-        return replace(self, mode_of_segment=(0,), reset_maps=())
+        return replace(self, mode_of_segment=(0,), reset_maps=(), guards=(), terminal_constraints=())
 
     @property
     def resets(self) -> tuple[int, ...]:
         """The transitions (from 0) at which a reset map acts."""
         return tuple(i for i, reset in enumerate(self.reset_maps) if reset is not None)
+
+    @property
+    def guarded(self) -> tuple[int, ...]:
+        """The transitions (from 0) that have a guard."""
+        return tuple(i for i, guard in enumerate(self.guards) if guard is not None)
+
+    @property
+    def constrained(self) -> bool:
+        """Whether anything has to hold beside the differential equation."""
+        return bool(self.guarded or self.terminal_constraints)
 
 
 class Samples(NamedTuple):
@@ -267,6 +280,32 @@ class Model:
 
         return R
 
+    def guard(self, i: int) -> Callable[[Array, Array, Array], Array]:
+        """Guard g_i(t, x, p) of transition i, which must have one."""
+        function = self.structure.guards[i]
+        sequence = [self.structure.mode_names[m] for m in self.structure.mode_of_segment[i : i + 2]]
+        if function is None:
+            raise ValueError(f"transition {i + 1} has no guard.")
+        apply = function
+
+        def g(t: Array, x: Array, p: Array) -> Array:
+            return checked_vector(apply, (t, x, self.parameters(p)), (), f"guard {tuple(sequence)}", "g(t, x, p)")
+
+        return g
+
+    def terminal_constraint(self, x: Array, p: Array) -> Array:
+        """All terminal constraints in one: (m,)."""
+        parts = []
+        for psi in self.structure.terminal_constraints:
+            value = called(psi, (x, self.parameters(p)), "TerminalConstraint", "psi(x, p)")
+            if value.ndim > 1:
+                raise ValueError(
+                    f"TerminalConstraint: psi(x, p) must return a number or an array of shape (m,); got shape "
+                    f"{value.shape}."
+                )
+            parts.append(checked_vector(psi, (x, self.parameters(p)), value.shape, "TerminalConstraint", "psi(x, p)"))
+        return jnp.concatenate([part.reshape(-1) for part in parts])
+
     def initial_state(self, p: Array) -> Array:
         """x(t0), (n,)."""
         if self.structure.initial_state is None:
@@ -446,6 +485,8 @@ def structure_of(
         references=tuple((item.observe, item.signal.channels) for item in of_kind(ReferenceSignal)),
         measurements=tuple((item.observe, item.values.shape[1]) for item in of_kind(Measurements)),
         terminal=tuple(item.phi for item in of_kind(TerminalCost)),
+        guards=guards_of(system, experiment.mode_sequence),
+        terminal_constraints=tuple(item.psi for item in of_kind(TerminalConstraint)),
         input_shape=None if experiment.inputs is None else tuple(experiment.inputs.values.shape[1:]),
         solver=solver,
     )
@@ -525,16 +566,8 @@ def checked_functions(structure: Structure, others: frozenset[str] = frozenset()
 
 
 def _call_functions(structure: Structure, model_of: Callable[[Structure, Arguments], Model]) -> None:
-    channels = sum(q for _, q in structure.references) + int(np.prod(structure.input_shape or ()))
+    arguments = _no_arguments(structure)
     with float64():
-        arguments = Arguments(
-            nodes=jnp.zeros(2),
-            signals=jnp.zeros((1, 4, channels)),
-            fixed=tuple(jnp.zeros(shape) for _, shape, free in structure.parameters if not free),
-            initial_state=jnp.zeros(structure.n),
-            samples=(),
-            weights=tuple(jnp.ones(q) for _, q in structure.references),
-        )
         model = model_of(structure, arguments)
         piece = Piece(jnp.zeros(()), arguments.signals[0])
         t, x, p = (jax.ShapeDtypeStruct(shape, jnp.float64) for shape in ((), (structure.n,), (structure.M,)))
@@ -542,11 +575,40 @@ def _call_functions(structure: Structure, model_of: Callable[[Structure, Argumen
             jax.eval_shape(model.field(mode, piece), t, x, p)
         for i in structure.resets:
             jax.eval_shape(model.reset(i), t, x, p)
+        for i in structure.guarded:
+            jax.eval_shape(model.guard(i), t, x, p)
+        if structure.terminal_constraints:
+            jax.eval_shape(model.terminal_constraint, x, p)
         jax.eval_shape(model.density(piece), t, x, p)
         for observe, q in structure.measurements:
             jax.eval_shape(partial(model.observed, observe, channels=q), t, x, p)
         jax.eval_shape(model.terminal, x, p)
         jax.eval_shape(model.initial_state, p)
+
+
+@lru_cache(maxsize=256)
+def terminal_constraint_count(structure: Structure) -> int:
+    """Number of terminal constraints, m."""
+    if not structure.terminal_constraints:
+        return 0
+    model = Model(structure, _no_arguments(structure))
+    with float64():
+        x, p = (jax.ShapeDtypeStruct((size,), jnp.float64) for size in (structure.n, structure.M))
+        return int(jax.eval_shape(model.terminal_constraint, x, p).shape[0])
+
+
+def _no_arguments(structure: Structure) -> Arguments:
+    """Arguments with zeros, of the shapes that functions of the model look at."""
+    channels = sum(q for _, q in structure.references) + int(np.prod(structure.input_shape or ()))
+    with float64():
+        return Arguments(
+            nodes=jnp.zeros(2),
+            signals=jnp.zeros((1, 4, channels)),
+            fixed=tuple(jnp.zeros(shape) for _, shape, free in structure.parameters if not free),
+            initial_state=jnp.zeros(structure.n),
+            samples=(),
+            weights=tuple(jnp.ones(q) for _, q in structure.references),
+        )
 
 
 def _of_kind(data: tuple[Any, ...], kind: type) -> list[Any]:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.data import FloatArray, Measurements, as_number, as_numbers
 from switchfit.experiment import Experiment, initial_state_of, run_names
 from switchfit.mesh import Mesh, common_lengths
-from switchfit.model import Arguments, Structure, arguments_of, structure_of
+from switchfit.model import Arguments, Structure, arguments_of, structure_of, terminal_constraint_count
 from switchfit.parameter import Parameter, as_parameter
 from switchfit.system import HybridSystem
 
@@ -162,6 +162,28 @@ class Problem:
     def theta_names(self) -> tuple[str, ...]:
         """Name of each entry of theta, transition times first."""
         return self.unknowns.names
+
+    @cached_property
+    def constraint_names(self) -> tuple[str, ...]:
+        """What has to be zero: guards at transitions, then terminal constraints, experiment by experiment."""
+        names = []
+        for prefix, structure, experiment in zip(self._prefixes, self.structures, self.experiments, strict=True):
+            for i in structure.guarded:
+                before, after = experiment.mode_sequence[i : i + 2]
+                names.append(f"{prefix}guard of tau_{i + 1} ({before} -> {after})")
+            names += [f"{prefix}terminal constraint {k + 1}" for k in range(terminal_constraint_count(structure))]
+        return tuple(names)
+
+    @cached_property
+    def constraint_counts(self) -> tuple[int, ...]:
+        """Number of constraints of each experiment."""
+        return tuple(len(s.guarded) + terminal_constraint_count(s) for s in self.structures)
+
+    @property
+    def _prefixes(self) -> list[str]:
+        if len(self.experiments) == 1:
+            return [""]
+        return [f"{name}." for name in run_names(self.experiments)]
 
     @cached_property
     def places(self) -> tuple[NDArray[np.intp], ...]:

@@ -105,6 +105,8 @@ class Fit:
     tolerance : float
     seconds : float
         Wall time of the estimation.
+    constraints : tuple of (name, value, multiplier)
+        Guards and terminal constraints. With them the Hessian is that of J plus multipliers times constraints.
     """
 
     theta_names: tuple[str, ...]
@@ -134,6 +136,7 @@ class Fit:
     hessian_kind: str
     tolerance: float
     seconds: float
+    constraints: tuple[tuple[str, float, float], ...] = ()
 
     @property
     def success(self) -> bool:

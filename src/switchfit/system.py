@@ -1,4 +1,4 @@
-"""What is fitted: a hybrid system, that is named modes, reset maps between them, and an initial state."""
+"""What is fitted: a hybrid system, that is named modes, reset maps and guards between them, and an initial state."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ VectorField = Callable[..., Any]
 
 ResetMap = Callable[..., Any]
 """``R(t, x, p) -> (n,)``: the state just after a transition from the state just before it."""
+
+Guard = Callable[..., Any]
+"""``g(t, x, p) -> ()``: zero where a transition happens, of the state just before it."""
 
 InitialState = NDArray[np.float64] | tuple[Parameter, ...] | Callable[[Mapping[str, Any]], Any]
 """An ``(n,)`` array, a `Parameter` for each of n states, or a function of the parameters that returns an array."""
@@ -41,11 +44,14 @@ class HybridSystem:
         ``x(tau+) = R(tau, x(tau-), p)``. Transitions without an entry leave the state continuous.
     state_names, state_units : sequence of str, optional
         One for each state; they label reports and plots.
+    guards : mapping of (str, str) to callable, optional
+        Every transition from mode ``a`` to mode ``b`` happens where ``guards[a, b](tau, x(tau-), p) = 0``: its time is
+        then no free unknown but follows from the others. Transitions without an entry happen at any time.
 
     Raises
     ------
     ValueError
-        If a reset map names an unknown mode, or names, units and initial state differ in length.
+        If a reset map or a guard names an unknown mode, or names, units and initial state differ in length.
     TypeError
         If a mode or a reset map is not callable.
     """
@@ -55,6 +61,7 @@ class HybridSystem:
     reset_maps: Mapping[tuple[str, str], ResetMap] = field(default_factory=dict)
     state_names: tuple[str, ...] | None = None
     state_units: tuple[str, ...] | None = None
+    guards: Mapping[tuple[str, str], Guard] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not isinstance(self.modes, Mapping) or not self.modes:
@@ -65,7 +72,8 @@ class HybridSystem:
             if not callable(mode):
                 raise TypeError(f"mode {name!r} must be a function f(t, x, p); got {type(mode).__name__}.")
         _set(self, "modes", MappingProxyType(dict(self.modes)))
-        _set(self, "reset_maps", MappingProxyType(_checked_reset_maps(self.reset_maps, self.modes)))
+        for name in ("reset_maps", "guards"):
+            _set(self, name, MappingProxyType(_checked_pairs(getattr(self, name), name, self.modes)))
         if not callable(self.initial_state):
             _set(self, "initial_state", as_state(self.initial_state, "initial_state"))
         for label in ("state_names", "state_units"):
@@ -95,6 +103,10 @@ class HybridSystem:
     def reset_map(self, before: str, after: str) -> ResetMap | None:
         """The map applied at a transition from mode `before` to mode `after`; None where x is continuous."""
         return self.reset_maps.get((before, after))
+
+    def guard(self, before: str, after: str) -> Guard | None:
+        """What is zero at a transition from mode `before` to mode `after`; None where it is free."""
+        return self.guards.get((before, after))
 
 
 def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ...]:
@@ -138,20 +150,22 @@ def _as_entry(entry: Any, name: str) -> Parameter:
     return parameter
 
 
-def _checked_reset_maps(
-    reset_maps: Mapping[tuple[str, str], ResetMap] | None, modes: Mapping[str, VectorField]
-) -> dict[tuple[str, str], ResetMap]:
-    if not isinstance(reset_maps or {}, Mapping):
-        raise TypeError(f"reset_maps must be a dict of (mode before, mode after) -> function; got {reset_maps!r}.")
-    checked = dict(reset_maps or {})
-    for key, reset in checked.items():
+def _checked_pairs(
+    given: Mapping[tuple[str, str], Callable[..., Any]] | None, name: str, modes: Mapping[str, VectorField]
+) -> dict[tuple[str, str], Callable[..., Any]]:
+    """Functions of transitions, by the modes before and after."""
+    if not isinstance(given or {}, Mapping):
+        raise TypeError(f"{name} must be a dict of (mode before, mode after) -> function; got {given!r}.")
+    checked = dict(given or {})
+    for key, function in checked.items():
         if not (isinstance(key, tuple) and len(key) == 2):
-            raise ValueError(f"reset_maps must have keys (mode before, mode after); got {key!r}.")
+            raise ValueError(f"{name} must have keys (mode before, mode after); got {key!r}.")
         for mode in key:
             if mode not in modes:
-                raise ValueError(f"reset_maps names the unknown mode {mode!r}; the modes are {', '.join(modes)}.")
-        if not callable(reset):
-            raise TypeError(f"reset map {key} must be a function R(t, x, p); got {type(reset).__name__}.")
+                raise ValueError(f"{name} names the unknown mode {mode!r}; the modes are {', '.join(modes)}.")
+        if not callable(function):
+            what, form = ("reset map", "R(t, x, p)") if name == "reset_maps" else ("guard", "g(t, x, p)")
+            raise TypeError(f"{what} {key} must be a function {form}; got {type(function).__name__}.")
     return checked
 
 

@@ -146,7 +146,17 @@ def repeat(
     began : float
         ``time.perf_counter()`` when the call began.
     callback : callable ``(done, total)``, a true value stops; or None
+
+    Raises
+    ------
+    ValueError
+        For a problem with guards or terminal constraints.
     """
+    if problem.constraint_names:
+        raise ValueError(
+            f"{title} takes no guards and no terminal constraints; this problem has {problem.constraint_names[0]!r}. "
+            "Call sf.estimate for one fit after the other."
+        )
     progress, end = _reporting(callback, title)
     try:
         runs, arrays = run_chunks(work, count, client=client, folder=folder, progress=progress)

@@ -59,16 +59,22 @@ class Costates(NamedTuple):
     mu: Array
 
 
-def adjoint_hessian(model: Model, first: FirstOrder, tau: Array, p: Array) -> Array:
-    """Hessian (D, D) of the discretised cost."""
+def adjoint_hessian(model: Model, first: FirstOrder, tau: Array, p: Array, weights: Array | None = None) -> Array:
+    """Hessian (D, D) of the discretised cost, with ``weights . c`` of the constraints (m,) added where given."""
     path, X = first.path, first.tangents
-    psi = costates(model, first, p)
+    guards, final = weighted_constraints(model, weights)
+    psi = costates(model, first, p, tau, guards, final)
     H = stage_curvature(model, first, psi, p) + step_length_curvature(model, first, psi)
     P = parameter_directions(model)
     for i in model.structure.resets:
         along = (jnp.arange(P.shape[1]) == i) * 1.0, X.before_transition(path.layout, i), P
         value = _weighted(model.reset(i), psi.opened[path.layout.first_chunk[i + 1]])
         H = H + _second(value, (tau[i], path.before_transition(i), p), along)
+    for i, guard in guards.items():
+        along = (jnp.arange(P.shape[1]) == i) * 1.0, X.before_transition(path.layout, i), P
+        H = H + _second(guard, (tau[i], path.before_transition(i), p), along)
+    if final is not None:
+        H = H + _second(final, (path.after[-1, -1], p), (X.after[-1, -1], P))
     for k, samples in enumerate(model.arguments.samples):
         H = H + sample_curvature(model, path, X, k, samples, p, gauss_newton=False)
     if model.structure.terminal:
@@ -94,10 +100,33 @@ def gauss_newton_hessian(model: Model, first: FirstOrder, p: Array) -> Array:
     return H
 
 
-def costates(model: Model, first: FirstOrder, p: Array) -> Costates:
+Scalar = Callable[..., Array]
+
+
+def weighted_constraints(model: Model, weights: Array | None) -> tuple[dict[int, Scalar], Scalar | None]:
+    """Each guard g_i(t, x, p) by its transition and all terminal constraints (x, p), times their weights."""
+    if weights is None:
+        return {}, None
+    guarded = model.structure.guarded
+    guards = {i: (lambda t, x, p, i=i, w=weights[k]: w * model.guard(i)(t, x, p)) for k, i in enumerate(guarded)}
+    if not model.structure.terminal_constraints:
+        return guards, None
+    rest = weights[len(guarded) :]
+    return guards, lambda x, p: rest @ model.terminal_constraint(x, p)
+
+
+def costates(
+    model: Model,
+    first: FirstOrder,
+    p: Array,
+    tau: Array,
+    guards: dict[int, Scalar],
+    final_constraint: Scalar | None,
+) -> Costates:
     """The costate psi, backward.
 
-    It jumps at the samples, ``psi(t_k-) = psi(t_k+) + D ell_k``, and at reset maps, ``psi(tau-) = psi(tau+) D_x R``.
+    It jumps at the samples, ``psi(t_k-) = psi(t_k+) + D ell_k``, at reset maps, ``psi(tau-) = psi(tau+) D_x R``, and at
+    guards that have a weight, by its product with D_x g.
     """
     path, jacobians, resets = first.path, first.jacobians, first.resets
     Q, C, n = path.after.shape
@@ -116,10 +145,17 @@ def costates(model: Model, first: FirstOrder, p: Array) -> Costates:
         segment, opens, operands = given
         opened, columns = lax.scan(row, psi, operands, reverse=True)
         psi = opened if resets is None else jnp.where(opens, opened @ resets.x[segment], opened)
+        if guards:
+            psi = psi + jnp.where(opens, at_guards[segment], 0.0)
         return psi, (opened, *columns)
 
     layout = path.layout
+    at_guards = jnp.zeros((model.structure.N + 1, n))
+    for i, guard in guards.items():
+        at_guards = at_guards.at[i + 1].set(jax.grad(guard, argnums=1)(tau[i], path.before_transition(i), p))
     final = jax.grad(model.terminal)(path.after[-1, -1], p) if model.structure.terminal else jnp.zeros(n)
+    if final_constraint is not None:
+        final = final + jax.grad(final_constraint)(path.after[-1, -1], p)
     of_ell = (jacobians.l_x,) if model.has_running_cost else ()
     operands = (layout.end - layout.start, jacobians.f_x, jumps[1:].reshape(Q, C, n), *of_ell)
     psi, columns = lax.scan(chunk, final, (layout.segment, layout.opens, operands), reverse=True)

@@ -120,6 +120,10 @@ class Status(Enum):
         "{smallest_eigenvalue:.1e}): these unknowns are not identified. Fix one of them or add data."
     )
 
+    INFEASIBLE = (
+        "The constraints are not met: {violated}. Start nearer to a point that meets them, or check that one can."
+    )
+
     @property
     def successful(self) -> bool:
         """Whether the point is a local minimiser as far as second-order conditions can tell."""
@@ -190,6 +194,8 @@ class Result:
         The tolerance asked for.
     history : tuple of IterationRecord
         The start and every iteration.
+    violated : str
+        Equality constraints that are not met, with their values.
     """
 
     theta: FloatArray
@@ -210,6 +216,7 @@ class Result:
     flat_direction: FloatArray
     tolerance: float
     history: tuple[IterationRecord, ...]
+    violated: str = ""
 
     @property
     def successful(self) -> bool:
@@ -234,6 +241,7 @@ class Result:
             smallest_eigenvalue=self.smallest_eigenvalue,
             kinks=kinks,
             direction=direction,
+            violated=self.violated,
         )
         return sentence + (f" Active: {'; '.join(self.active)}." if self.active else "")
 

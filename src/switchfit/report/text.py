@@ -218,6 +218,8 @@ def _quality(fit: Fit) -> Iterator[str]:
     start = f"   (first guess: {fit.history[0].cost:.8g})" if fit.history else ""
     yield from _row("cost J", f"{fit.cost:.8g}{start}")
     yield from _row("KKT residual", f"{fit.optimality:.1e}   (tolerance: {fit.tolerance:.1e})")
+    for name, value, multiplier in fit.constraints:
+        yield from _row(name, f"{value:.1e}   (multiplier {multiplier:.6g})")
     variance, unknowns = fit.residual_variance, _count(fit.free_basis.shape[1], "free unknown")
     if np.isfinite(variance):
         origin = f"2 J / ({fit.samples} values - {unknowns})"

@@ -1,0 +1,363 @@
+"""Guards and terminal constraints: derivatives against closed forms and JAX, fits with known answers."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import switchfit as sf
+from switchfit.evaluate import Evaluator
+from switchfit.model import Model, float64
+from switchfit.propagate import path_cost, propagate
+
+G = 9.8
+HEIGHT, END, TARGET = 50.0, 15.0, 20.0
+
+
+# --- known answers ----------------------------------------------------------------------------------------------------
+
+
+def ball_falls(t, x, p):
+    return jnp.stack([x[1], -G + 0 * x[0]])
+
+
+def ball_bounces(t, x, p):
+    return jnp.stack([0 * x[0], -p["e"] * x[1]])
+
+
+def ball(e=0.8, bounces=3, guess=(3.0, 8.0, 12.0)):
+    """A ball is dropped; its restitution e is to bring it to 20 m at 15 s (SciML's problem)."""
+    system = sf.HybridSystem(
+        {"air": ball_falls},
+        [HEIGHT, 0.0],
+        reset_maps={("air", "air"): ball_bounces},
+        guards={("air", "air"): lambda t, x, p: x[0]},
+    )
+    cost = sf.TerminalCost(lambda x, p: (x[0] - TARGET) ** 2)
+    run = sf.Experiment(cost, ("air",) * (bounces + 1), guess, 0.0, END)
+    return sf.Problem(system, run, {"e": sf.Parameter(e, lower=0.1, upper=1.0)})
+
+
+def ball_in_closed_form(e):
+    t, v = jnp.sqrt(2 * HEIGHT / G), e * jnp.sqrt(2 * G * HEIGHT)
+    for _ in range(2):
+        t, v = t + 2 * v / G, e * v
+    s = END - t
+    return (v * s - G * s**2 / 2 - TARGET) ** 2
+
+
+def test_bouncing_ball_has_the_derivatives_of_its_closed_form():
+    found = sf.evaluate_on_guards(ball())
+    with float64():
+        at, cost = jnp.float64(0.8), ball_in_closed_form
+        J, g, H = cost(at), jax.grad(cost)(at), jax.hessian(cost)(at)
+        rest = np.sqrt(2 * HEIGHT / G)
+    assert found.names == ("e",)
+    np.testing.assert_allclose(found.times, rest + 2 * rest * np.array([0.0, 0.8, 0.8 + 0.64]), rtol=1e-13)
+    assert found.cost == pytest.approx(float(J), rel=1e-12)
+    assert found.gradient[0] == pytest.approx(float(g), rel=1e-12)
+    assert found.hessian[0, 0] == pytest.approx(float(H), rel=1e-12)
+
+
+def test_bouncing_ball_is_fitted_to_twelve_digits():
+    fit = sf.estimate(ball())
+    assert fit.success
+    assert fit.parameters["e"] == pytest.approx(0.86655410543691079, abs=1e-12)
+    assert max(abs(value) for _, value, _ in fit.constraints) < 1e-9
+    assert "guard of tau_2 (air -> air)" in str(fit)
+    # One unknown is left free, and J bends upwards in it.
+    assert fit.free_basis.shape == (4, 1)
+    assert (fit.free_basis.T @ fit.hessian @ fit.free_basis)[0, 0] > 0
+
+
+AMICI = {"alpha": np.log(2), "beta": np.log(4), "gamma": np.log(3), "delta": 1.0, "eta": 0.5, "zeta": 0.25}
+
+
+def amici():
+    """x1 grows until t reaches x2, then decays; x2 grows until delta, then in proportion to time (AMICI's test)."""
+
+    def second(p, x, growing):
+        return p["gamma"] * x[1] if growing else p["eta"] + 0 * x[1]
+
+    system = sf.HybridSystem(
+        {
+            "early": lambda t, x, p: jnp.stack([p["alpha"] * x[0], second(p, x, True)]),
+            "growth": lambda t, x, p: jnp.stack([p["alpha"] * x[0], second(p, x, False)]),
+            "decay": lambda t, x, p: jnp.stack([-p["beta"] * x[0], second(p, x, False)]),
+        },
+        lambda p: jnp.stack([p["zeta"], 1.0 + 0 * p["zeta"]]),
+        guards={("early", "growth"): lambda t, x, p: t - p["delta"], ("growth", "decay"): lambda t, x, p: t - x[1]},
+    )
+    run = sf.Experiment(sf.TerminalCost(lambda x, p: x[0]), ("early", "growth", "decay"), (1.1, 4.5), 0.0, 10.0)
+    return sf.Problem(system, run, AMICI, rtol=1e-12, atol=1e-14)
+
+
+def test_events_of_amici_to_twelve_digits():
+    found = sf.evaluate_on_guards(amici())
+
+    def closed(q):
+        alpha, beta, gamma, delta, eta, zeta = q
+        event = (jnp.exp(gamma * delta) - eta * delta) / (1 - eta)
+        return zeta * jnp.exp(alpha * event - beta * (10 - event))
+
+    with float64():
+        hessian = np.asarray(jax.hessian(closed)(jnp.array(list(AMICI.values()))))
+    np.testing.assert_allclose(found.times, [1.0, 5.0], rtol=1e-12)
+    assert found.cost == pytest.approx(0.0078125, rel=1e-11)
+    published = [0.0390625, -0.0390625, 0.09747382226625, 0.09084030192077, 0.12996509635499, 0.03125]
+    np.testing.assert_allclose(found.gradient, published, rtol=0, atol=2e-12)
+    np.testing.assert_allclose(found.hessian, hessian, rtol=0, atol=1e-10)
+
+
+def test_minimum_time_needs_no_more_than_a_last_mode_at_rest():
+    """From rest to rest over 1 m with at most 1 m/s²: one switch half way, 2 s."""
+    one = jnp.ones
+
+    system = sf.HybridSystem(
+        {
+            "push": lambda t, x, p: jnp.stack([x[1], one(()), one(())]),
+            "brake": lambda t, x, p: jnp.stack([x[1], -one(()), one(())]),
+            "done": lambda t, x, p: jnp.zeros(3),
+        },
+        [0.0, 0.0, 0.0],
+    )
+    costs = [
+        sf.TerminalCost(lambda x, p: x[2]),
+        sf.TerminalConstraint(lambda x, p: x[0] - 1.0),
+        sf.TerminalConstraint(lambda x, p: x[1:2]),
+    ]
+    fit = sf.estimate(sf.Problem(system, sf.Experiment(costs, ("push", "brake", "done"), (0.7, 2.5), 0.0, 5.0)))
+    assert fit.success
+    np.testing.assert_allclose(fit.theta, [1.0, 2.0], rtol=0, atol=1e-9)
+    # T = 2 sqrt(q): 1 m more takes dT/dq = 1 s/m longer, which is what the multiplier says.
+    assert fit.constraints[0][2] == pytest.approx(-1.0, abs=1e-8)
+    assert [name for name, _, _ in fit.constraints] == ["terminal constraint 1", "terminal constraint 2"]
+
+
+def tank_fills(t, x, p):
+    return jnp.stack([p["inflow"] - 0.1 * x[0]])
+
+
+def tank_overflows(t, x, p):
+    return jnp.zeros(1)
+
+
+def level(inflow, rim, t):
+    return np.minimum(10 * inflow * (1 - np.exp(-0.1 * t)), rim)
+
+
+def tank(sigma=0.02, rng=None):
+    """A tank fills until it overflows: when depends on the inflow and on the height of the rim."""
+    times = np.linspace(0.25, 10.0, 40)
+    values = level(0.5, 2.2, times) + (0.0 if rng is None else sigma * rng.standard_normal(40))
+    system = sf.HybridSystem(
+        {"fills": tank_fills, "overflows": tank_overflows},
+        [0.0],
+        guards={("fills", "overflows"): lambda t, x, p: x[0] - p["rim"]},
+        state_names=("level",),
+        state_units=("m",),
+    )
+    data = sf.Measurements(times, values, sigma=sigma)
+    run = sf.Experiment(data, ("fills", "overflows"), (3.0,), 0.0, 10.0)
+    return sf.Problem(system, run, {"inflow": 0.8, "rim": sf.Parameter(1.5, lower=0.0)})
+
+
+def test_a_tank_that_overflows_is_fitted_with_the_covariance_of_its_closed_form():
+    fit = sf.estimate(tank())
+    assert fit.success
+    overflow = -10 * np.log(1 - 2.2 / 5)
+    np.testing.assert_allclose(fit.theta, [overflow, 0.5, 2.2], rtol=0, atol=1e-8)
+    times = np.linspace(0.25, 10.0, 40)
+    filling = times < overflow
+    slopes = np.stack([np.where(filling, 10 * (1 - np.exp(-0.1 * times)), 0.0), np.where(filling, 0.0, 1.0)], axis=1)
+    covariance = 0.02**2 * np.linalg.inv(slopes.T @ slopes)
+    np.testing.assert_allclose(fit.covariance[1:, 1:], covariance, rtol=1e-6, atol=1e-15)
+    # The overflow's time follows from both: inflow = rim / (10 (1 - exp(-t/10))).
+    by_rim = 1 / (0.5 * np.exp(-0.1 * overflow))
+    gradient = np.array([-(1 - np.exp(-0.1 * overflow)) * 10 * by_rim, by_rim])
+    assert fit.covariance[0, 0] == pytest.approx(gradient @ covariance @ gradient, rel=1e-6)
+
+
+def test_a_fit_with_guards_and_noise_is_where_the_closed_form_has_its_minimum():
+    problem = tank(rng=np.random.default_rng(4))
+    fit = sf.estimate(problem)
+    assert fit.success
+    data = problem.experiments[0].data[0]
+
+    def cost(inflow, rim):
+        return 0.5 * np.sum((data.values[:, 0] - level(inflow, rim, data.times)) ** 2) / 0.02**2
+
+    inflow, rim = fit.theta[1:]
+    assert fit.cost == pytest.approx(cost(inflow, rim), rel=1e-7)
+    for step in ((1e-4, 0.0), (-1e-4, 0.0), (0.0, 1e-4), (0.0, -1e-4)):
+        assert cost(inflow + step[0], rim + step[1]) > fit.cost
+
+
+def test_constraints_are_saved_and_loaded(tmp_path):
+    fit = sf.estimate(tank())
+    fit.save(tmp_path / "fit.json")
+    again = sf.Estimate.load(tmp_path / "fit.json")
+    assert again.constraints == fit.constraints
+    assert str(again) == str(fit)
+
+
+# --- derivatives ------------------------------------------------------------------------------------------------------
+
+
+@cache
+def everything():
+    """Two runs with guards, reset maps, samples, a running cost and terminal constraints, all depending on t, x, p."""
+
+    def first(t, x, p):
+        return jnp.stack([x[1] * jnp.cos(t), -p["a"] * x[0] + 0.3 * x[1] ** 2])
+
+    def second(t, x, p):
+        return jnp.stack([p["b"] * x[1] ** 2 - x[0], jnp.sin(x[0]) * p["a"] - 0.2 * x[1]])
+
+    system = sf.HybridSystem(
+        {"first": first, "second": second},
+        lambda p: jnp.stack([1.0 + 0.1 * p["a"], p["b"]]),
+        reset_maps={("first", "second"): lambda t, x, p: jnp.stack([x[0] * p["a"], x[1] + 0.1 * x[0] ** 2 * t])},
+        guards={
+            ("first", "second"): lambda t, x, p: x[0] * p["b"] - jnp.sin(t) * x[1],
+            ("second", "first"): lambda t, x, p: p["a"] ** 2 * x[1] ** 2 + t * x[0] - 1.0,
+        },
+    )
+    data = [
+        sf.Measurements([0.5, 1.4, 2.6], [[0.3, 0.2], [0.4, -0.2], [0.1, 0.5]], sigma=0.5),
+        sf.RunningCost(lambda t, x, p: p["b"] * x[0] ** 2 * jnp.cos(t)),
+        sf.TerminalConstraint(lambda x, p: jnp.stack([x[0] * x[1] - p["a"], p["b"] * x[0] ** 2])),
+    ]
+    runs = [
+        sf.Experiment(data, ("first", "second", "first"), (1.0, 2.0), 0.0, 3.0),
+        sf.Experiment(data[0], ("second", "first"), (1.2,), 0.0, 3.0),
+    ]
+    return Evaluator(sf.Problem(system, runs, {"a": 0.7, "b": 0.4}))
+
+
+def by_jax(evaluator, theta, multipliers, penalty):
+    """The augmented Lagrangian by running the constraints through JAX as they are written."""
+    problem = evaluator.problem
+
+    def value(theta):
+        total, last = 0.0, 0
+        for e, (structure, arguments) in enumerate(zip(problem.structures, evaluator.arguments, strict=True)):
+            places, N = problem.places[e], structure.N
+            tau, p = theta[places[:N]], theta[places[N:]]
+            model = Model(structure, arguments)
+            path = propagate(model, tau, p, 1.0)
+            c = [model.guard(i)(tau[i], path.before_transition(i), p) for i in structure.guarded]
+            if structure.terminal_constraints:
+                c += list(model.terminal_constraint(path.after[-1, -1], p))
+            here = slice(last, last := last + len(c))
+            c = jnp.stack(c)
+            total = total + path_cost(model, path, p) + multipliers[here] @ c + 0.5 * penalty[here] @ c**2
+        return total
+
+    with float64():
+        theta = jnp.asarray(theta)
+        return value(theta), jax.jacfwd(value)(theta), jax.jacfwd(jax.jacfwd(value))(theta)
+
+
+def test_augmented_lagrangian_has_exact_derivatives():
+    evaluator = everything()
+    problem = evaluator.problem
+    assert problem.constraint_names == (
+        "run1.guard of tau_1 (first -> second)",
+        "run1.guard of tau_2 (second -> first)",
+        "run1.terminal constraint 1",
+        "run1.terminal constraint 2",
+        "run2.guard of tau_1 (second -> first)",
+    )
+    rng = np.random.default_rng(3)
+    multipliers, penalty = rng.standard_normal(5), rng.uniform(0.5, 2.0, 5)
+    theta = problem.initial_theta
+    here = evaluator.constrained(theta, multipliers=multipliers, penalty=penalty)
+    value, slope, hessian = by_jax(evaluator, theta, multipliers, penalty)
+    assert here.value == pytest.approx(float(value), rel=1e-13)
+    np.testing.assert_allclose(here.slope, slope, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(here.hessian, hessian, rtol=0, atol=1e-11)
+    plain = sf.evaluate(problem)
+    assert here.cost == pytest.approx(plain.cost, rel=1e-14)
+    np.testing.assert_allclose(here.gradient, plain.gradient, rtol=0, atol=1e-13)
+    weights = multipliers + penalty * here.constraints
+    np.testing.assert_allclose(here.gradient + weights @ here.jacobian, here.slope, rtol=0, atol=1e-12)
+
+
+# --- what can go wrong ------------------------------------------------------------------------------------------------
+
+
+def test_constraints_that_cannot_be_met_are_named():
+    system = sf.HybridSystem({"decay": lambda t, x, p: -p["k"] * x}, [1.0])
+    costs = [sf.TerminalCost(lambda x, p: p["k"] ** 2), sf.TerminalConstraint(lambda x, p: x[0] + 1.0)]
+    problem = sf.Problem(system, sf.Experiment(costs, ("decay",), (), 0.0, 1.0), {"k": sf.Parameter(1.0, 0.1, 5.0)})
+    fit = sf.estimate(problem)
+    assert fit.status is sf.Status.INFEASIBLE
+    assert not fit.success
+    assert "The constraints are not met: terminal constraint 1 = 1.0" in fit.message
+
+
+def test_a_guard_that_is_not_reached_is_told():
+    problem = ball(guess=(3.0, 8.0, 12.0))
+    high = sf.HybridSystem({"air": ball_falls}, [HEIGHT, 0.0], guards={("air", "air"): lambda t, x, p: x[0] - 60.0})
+    run = sf.Experiment(problem.experiments[0].data, ("air", "air"), (3.0,), 0.0, END)
+    with pytest.raises(ValueError, match=r"No transition times near .* put tau_1 on their guards"):
+        sf.evaluate_on_guards(sf.Problem(high, run, {"e": 0.5}))
+
+
+def test_without_guards_there_is_nothing_to_be_on():
+    system = sf.HybridSystem({"decay": lambda t, x, p: -p["k"] * x}, [1.0])
+    run = sf.Experiment(sf.TerminalCost(lambda x, p: x[0]), ("decay",), (), 0.0, 1.0)
+    with pytest.raises(ValueError, match="This problem has no guards"):
+        sf.evaluate_on_guards(sf.Problem(system, run, {"k": 1.0}))
+
+
+def test_a_guarded_time_cannot_be_fixed():
+    with pytest.raises(ValueError, match="A transition with a guard cannot have a fixed time"):
+        sf.evaluate_on_guards(ball(bounces=1, guess=(sf.Parameter(3.2, fixed=True),)))
+
+
+@pytest.mark.parametrize("kind", ["gauss-newton", "block-diagonal", "descent-first", "none"])
+def test_only_the_exact_hessian_knows_constraints(kind):
+    with pytest.raises(ValueError, match=r"hessian must be ('exact'|one of)"):
+        sf.estimate(tank(), hessian=kind)
+
+
+def test_batches_refuse_constraints():
+    with pytest.raises(ValueError, match="Monte Carlo takes no guards and no terminal constraints"):
+        sf.monte_carlo(tank(), 3)
+
+
+@pytest.mark.parametrize(
+    ("guards", "error", "message"),
+    [
+        ([1], TypeError, r"guards must be a dict of \(mode before, mode after\) -> function"),
+        ({"a": abs}, ValueError, r"guards must have keys \(mode before, mode after\); got 'a'"),
+        ({("a", "c"): abs}, ValueError, "guards names the unknown mode 'c'; the modes are a, b"),
+        ({("a", "b"): 3.0}, TypeError, r"guard \('a', 'b'\) must be a function g\(t, x, p\); got float"),
+    ],
+)
+def test_bad_guards(guards, error, message):
+    modes = {"a": lambda t, x, p: -x, "b": lambda t, x, p: 0 * x}
+    with pytest.raises(error, match=message):
+        sf.HybridSystem(modes, [1.0], guards=guards)
+
+
+def test_a_guard_returns_one_number():
+    system = sf.HybridSystem(
+        {"a": lambda t, x, p: -x, "b": lambda t, x, p: 0 * x}, [1.0, 2.0], guards={("a", "b"): lambda t, x, p: x}
+    )
+    run = sf.Experiment(sf.TerminalCost(lambda x, p: x[0]), ("a", "b"), (0.5,), 0.0, 1.0)
+    with pytest.raises(ValueError, match=r"guard \('a', 'b'\): g\(t, x, p\) must return an array of shape \(\)"):
+        sf.Problem(system, run)
+
+
+def test_bad_terminal_constraints():
+    with pytest.raises(TypeError, match=r"TerminalConstraint needs a function psi\(x, p\); got int"):
+        sf.TerminalConstraint(3)
+    system = sf.HybridSystem({"a": lambda t, x, p: -x}, [1.0])
+    data = [sf.TerminalCost(lambda x, p: x[0]), sf.TerminalConstraint(lambda x, p: jnp.ones((2, 2)) * x[0])]
+    with pytest.raises(ValueError, match=r"must return a number or an array of shape \(m,\); got shape \(2, 2\)"):
+        sf.Problem(system, sf.Experiment(data, ("a",), (), 0.0, 1.0), {"k": 1.0})
