@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -14,16 +13,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.certificate import certify
-from switchfit.data import FloatArray, Measurements
-from switchfit.evaluate import Evaluation, Evaluator, evaluator_of
+from switchfit.data import FloatArray
+from switchfit.evaluate import Evaluator, evaluator_of
 from switchfit.io.json import load_fit, save_fit
-from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
+from switchfit.optimize import IterationRecord, Result, Status
 from switchfit.problem import Problem
 from switchfit.refine import refined_mesh
 from switchfit.report.plot import plot_fit
 from switchfit.report.text import report
 from switchfit.result import Certificate, Fit
 from switchfit.simulate import compare
+from switchfit.solve import minimized, sigma_known, with_names
 
 HessianKind = Literal["exact", "block-diagonal", "gauss-newton", "none"]
 HESSIANS = ("exact", "block-diagonal", "gauss-newton", "none")
@@ -81,15 +81,6 @@ class Estimate(Fit):
         """
         fit, certificate = load_fit(Path(path))
         return cls(**{f.name: getattr(fit, f.name) for f in fields(Fit)}, saved_certificate=certificate)
-
-
-@dataclass(frozen=True, eq=False)
-class CostAndGradient:
-    """All that steepest descent is given."""
-
-    cost: float
-    gradient: FloatArray
-    hessian: None = None
 
 
 def estimate(
@@ -192,50 +183,6 @@ def _numbered_on(record: IterationRecord, after: IterationRecord | None) -> Iter
     )
 
 
-def constraints_of(problem: Problem) -> LinearConstraints:
-    """Ordering, minimum durations and bounds of a problem as the optimiser takes them."""
-    unknowns = problem.unknowns
-    names = [
-        *unknowns.constraint_names,
-        *(f"{name} at its lower bound {value:g}" for name, value in zip(unknowns.names, unknowns.lower, strict=True)),
-        *(f"{name} at its upper bound {value:g}" for name, value in zip(unknowns.names, unknowns.upper, strict=True)),
-    ]
-    return LinearConstraints(unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, tuple(names))
-
-
-def minimized(
-    evaluator: Evaluator,
-    theta: Any,
-    hessian: HessianKind,
-    tolerance: float,
-    max_iterations: int,
-    callback: Callable[[IterationRecord], object] | None = None,
-) -> Result:
-    """One run of the optimiser on the evaluator's meshes; arguments as of `estimate`."""
-    problem = evaluator.problem
-
-    matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
-
-    def evaluate(theta: Any, side: int) -> Evaluation | CostAndGradient:
-        here = evaluator(theta, side, matrix=matrix)
-        return CostAndGradient(here.cost, here.gradient) if hessian == "none" else here
-
-    is_time = np.zeros(len(theta), dtype=int)
-    for where in problem.unknowns.times:
-        is_time[where[where >= 0]] = 1
-    return minimize(
-        evaluate,
-        theta,
-        constraints=constraints_of(problem),
-        breakpoints=evaluator.breakpoints(),
-        hessian=hessian,
-        blocks=is_time,
-        tolerance=tolerance,
-        max_iterations=max_iterations,
-        callback=callback,
-    )
-
-
 def _estimate(
     problem: Problem,
     evaluator: Evaluator,
@@ -276,16 +223,3 @@ def _estimate(
         problem=problem,
         **rest,
     )
-
-
-def with_names(message: str, names: tuple[str, ...]) -> str:
-    """The optimiser's message with the unknowns called by their names."""
-    return re.sub(r"theta\[(\d+)\]", lambda match: names[int(match.group(1))], message)
-
-
-def sigma_known(problem: Problem) -> bool | None:
-    """Whether sigma is known for all measurements; None where the cost is not made of measurements alone."""
-    items = [item for experiment in problem.experiments for item in experiment.data]
-    if not all(isinstance(item, Measurements) for item in items):
-        return None
-    return all(item.sigma is not None for item in items)
