@@ -11,6 +11,7 @@ from switchfit.evaluate import Evaluation, evaluate
 from switchfit.experiment import Experiment, Parameter
 from switchfit.optimize import Status
 from switchfit.problem import Problem
+from switchfit.profile import Profile, profile
 from switchfit.result import Certificate
 from switchfit.simulate import Comparison, Trajectory, simulate
 from switchfit.system import HybridSystem
@@ -35,6 +36,7 @@ __all__ = [
     "Multistart",
     "Parameter",
     "Problem",
+    "Profile",
     "ReferenceSignal",
     "RunningCost",
     "Status",
@@ -46,5 +48,6 @@ __all__ = [
     "evaluate",
     "monte_carlo",
     "multistart",
+    "profile",
     "simulate",
 ]

@@ -18,10 +18,13 @@ from switchfit.evaluate import Evaluator, evaluator_of
 from switchfit.io.json import load_fit, save_fit
 from switchfit.optimize import IterationRecord, Result, Status
 from switchfit.problem import Problem
+from switchfit.profile import Profile, profile
+from switchfit.progress import Progress
 from switchfit.refine import refined_mesh
 from switchfit.report.plot import plot_fit
 from switchfit.report.text import report
 from switchfit.result import Certificate, Fit
+from switchfit.sensitivity import Sensitivity, gauss_newton_of, sample_derivatives, sensitivity
 from switchfit.simulate import compare
 from switchfit.solve import minimized, sigma_known, with_names
 
@@ -48,6 +51,7 @@ class Estimate(Fit):
 
     saved_certificate: Certificate | None = None
     problem: Problem | None = None
+    evaluator: Evaluator | None = None
 
     @cached_property
     def certificate(self) -> Certificate:
@@ -59,6 +63,45 @@ class Estimate(Fit):
             return self.saved_certificate
         return certify(self, None if self.problem is None else Evaluator(self.problem, theta=self.theta))
 
+    @cached_property
+    def gauss_newton(self) -> FloatArray | None:  # type: ignore[override]  # found when it is asked for
+        """The Gauss-Newton matrix ``sum (D h / sigma)' (D h / sigma)``: (d, d); None where it is not known."""
+        if self.saved_gauss_newton is not None or self.sigma_known is None or self.problem is None:
+            return self.saved_gauss_newton
+        return gauss_newton_of(sample_derivatives(self.problem, self.sensitivities))
+
+    @cached_property
+    def sensitivities(self) -> tuple[Sensitivity, ...]:
+        """States and outputs with their derivatives in theta, one an experiment, on the meshes of the fit."""
+        evaluator = self.evaluator_at_solution()
+        meshes = enumerate(evaluator.meshes)
+        return tuple(sensitivity(evaluator.problem, e, self.theta, mesh) for e, mesh in meshes)
+
+    def evaluator_at_solution(self) -> Evaluator:
+        """The problem on the meshes of the fit.
+
+        Raises
+        ------
+        ValueError
+            If the estimate was loaded from a file without its problem.
+        """
+        if self.problem is None:
+            raise ValueError(
+                "This estimate was loaded without its model: load it with Estimate.load(path, problem=problem)."
+            )
+        return self.evaluator or Evaluator(self.problem, theta=self.theta)
+
+    def profile(self, name: str, *, level: float = 0.95, callback: Progress | None = None) -> Profile:
+        """Profile likelihood of one parameter or transition time, see `switchfit.profile`.
+
+        Parameters
+        ----------
+        name : str
+        level : float
+        callback : callable, optional
+        """
+        return profile(self, name, level=level, callback=callback)
+
     def __str__(self) -> str:
         return report(self)
 
@@ -68,19 +111,35 @@ class Estimate(Fit):
 
     def save(self, path: str | Path) -> None:
         """Write everything but the model to a JSON file, atomically; `load` reads it."""
-        save_fit(self, self.certificate, Path(path))
+        save_fit(self.complete(), self.certificate, Path(path))
+
+    def complete(self) -> Estimate:
+        """The same with everything that is saved, which is the Gauss-Newton matrix."""
+        return replace(self, saved_gauss_newton=self.gauss_newton)
 
     @classmethod
-    def load(cls, path: str | Path) -> Estimate:
+    def load(cls, path: str | Path, *, problem: Problem | None = None) -> Estimate:
         """Read what `save` wrote.
+
+        Parameters
+        ----------
+        path : path
+        problem : Problem, optional
+            The problem that was fitted, where profiles or predictions are wanted: a file does not hold the model.
 
         Raises
         ------
         ValueError
-            If the file is not one of switchfit's.
+            If the file is not one of switchfit's, or the problem has other unknowns.
         """
         fit, certificate = load_fit(Path(path))
-        return cls(**{f.name: getattr(fit, f.name) for f in fields(Fit)}, saved_certificate=certificate)
+        if problem is not None and problem.theta_names != fit.theta_names:
+            raise ValueError(
+                f"{path} holds the unknowns {', '.join(fit.theta_names)}, the problem has "
+                f"{', '.join(problem.theta_names)}: it is the fit of another problem."
+            )
+        own = {f.name: getattr(fit, f.name) for f in fields(Fit)}
+        return cls(**own, saved_certificate=certificate, problem=problem)
 
 
 def estimate(
@@ -221,5 +280,6 @@ def _estimate(
         hessian_kind=hessian,
         tolerance=tolerance,
         problem=problem,
+        evaluator=evaluator,
         **rest,
     )

@@ -241,9 +241,7 @@ def _block_along(
         return lambda x, X: lax.scan(row, (x, X), given)
 
     modes = [through(k) for k in range(len(structure.modes))]
-    carried, (before, before_d, after, after_d) = (
-        modes[0](x, X) if len(modes) == 1 else lax.switch(mode, modes, x, X)
-    )
+    carried, (before, before_d, after, after_d) = modes[0](x, X) if len(modes) == 1 else lax.switch(mode, modes, x, X)
 
     def outputs(t: jax.Array, x: jax.Array, X: jax.Array) -> tuple[jax.Array, jax.Array]:
         def seen(x: jax.Array, p: jax.Array) -> jax.Array:
