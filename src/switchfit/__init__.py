@@ -9,9 +9,12 @@ from switchfit.data import Input, Measurements, ReferenceSignal, RunningCost, Te
 from switchfit.estimate import Estimate, estimate
 from switchfit.evaluate import Evaluation, evaluate
 from switchfit.experiment import Experiment, Parameter
+from switchfit.identifiability import Direction, Identifiability, identifiability
 from switchfit.optimize import Status
+from switchfit.prediction import Prediction, predict
 from switchfit.problem import Problem
 from switchfit.profile import Profile, profile
+from switchfit.residuals import ChannelResiduals, ResidualDiagnostics
 from switchfit.result import Certificate
 from switchfit.simulate import Comparison, Trajectory, simulate
 from switchfit.system import HybridSystem
@@ -23,21 +26,26 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Certificate",
+    "ChannelResiduals",
     "Comparison",
     "DerivativeCheck",
+    "Direction",
     "Estimate",
     "Evaluation",
     "Experiment",
     "Fits",
     "HybridSystem",
+    "Identifiability",
     "Input",
     "Measurements",
     "MonteCarlo",
     "Multistart",
     "Parameter",
+    "Prediction",
     "Problem",
     "Profile",
     "ReferenceSignal",
+    "ResidualDiagnostics",
     "RunningCost",
     "Status",
     "TerminalCost",
@@ -46,8 +54,10 @@ __all__ = [
     "estimate",
     "estimate_many",
     "evaluate",
+    "identifiability",
     "monte_carlo",
     "multistart",
+    "predict",
     "profile",
     "simulate",
 ]

@@ -15,14 +15,18 @@ from numpy.typing import ArrayLike
 from switchfit.certificate import certify
 from switchfit.data import FloatArray
 from switchfit.evaluate import Evaluator, evaluator_of
+from switchfit.identifiability import Identifiability, identifiability
 from switchfit.io.json import load_fit, save_fit
 from switchfit.optimize import IterationRecord, Result, Status
+from switchfit.prediction import Prediction, predict
 from switchfit.problem import Problem
 from switchfit.profile import Profile, profile
 from switchfit.progress import Progress
 from switchfit.refine import refined_mesh
-from switchfit.report.plot import plot_fit
-from switchfit.report.text import report
+from switchfit.report.plot import LARGEST_FIGURE, Bands, plot_fit
+from switchfit.report.text import report, run_names, standard_errors_of
+from switchfit.report.uncertainty import plot_diagnostics
+from switchfit.residuals import ResidualDiagnostics, diagnose
 from switchfit.result import Certificate, Fit
 from switchfit.sensitivity import Sensitivity, gauss_newton_of, sample_derivatives, sensitivity
 from switchfit.simulate import compare
@@ -40,6 +44,9 @@ LARGEST_INTEGRATION_ERROR = 1e-8
 PERFECT_FIT = 1e-3
 """Where J has fallen to less than this part of its first value, the integration error is measured against that part:
 the relative error of a cost that vanishes says nothing."""
+
+MOST_SENSITIVITIES = 2**28
+"""Bytes that the derivatives of states and outputs at all nodes may take; beyond, figures have no bands."""
 
 ORDER = 5
 """Order of both integrators: what dividing the steps gains."""
@@ -64,11 +71,22 @@ class Estimate(Fit):
         return certify(self, None if self.problem is None else Evaluator(self.problem, theta=self.theta))
 
     @cached_property
-    def gauss_newton(self) -> FloatArray | None:  # type: ignore[override]  # found when it is asked for
+    def gauss_newton(self) -> FloatArray | None:
         """The Gauss-Newton matrix ``sum (D h / sigma)' (D h / sigma)``: (d, d); None where it is not known."""
         if self.saved_gauss_newton is not None or self.sigma_known is None or self.problem is None:
             return self.saved_gauss_newton
-        return gauss_newton_of(sample_derivatives(self.problem, self.sensitivities))
+        if self._sensitivities_fit():
+            return gauss_newton_of(sample_derivatives(self.problem, self.sensitivities))
+        return self.evaluator_at_solution()(self.theta, matrix="gauss-newton").hessian
+
+    def _sensitivities_fit(self) -> bool:
+        """Whether the derivatives at all nodes take less memory than is worth it."""
+        rows = sum(len(mesh.nodes) for mesh in self.evaluator_at_solution().meshes)
+        width = max(
+            t.states.shape[1] + sum(len(c.names) for c in run)
+            for t, run in zip(self.trajectories, self.comparisons, strict=True)
+        )
+        return 16 * rows * width * len(self.theta) <= MOST_SENSITIVITIES
 
     @cached_property
     def sensitivities(self) -> tuple[Sensitivity, ...]:
@@ -103,11 +121,48 @@ class Estimate(Fit):
         return profile(self, name, level=level, callback=callback)
 
     def __str__(self) -> str:
-        return report(self)
+        known = self.saved_certificate or self.__dict__.get("certificate")
+        return report(self, known, self.identifiability)
 
-    def plot(self) -> Any:
-        """Measured against fitted over time with the modes shaded, as a matplotlib Figure."""
-        return plot_fit(self)
+    def plot(self, *, bands: bool = True, level: float = 0.95) -> Any:
+        """Measured against fitted over time with the modes shaded, as a matplotlib Figure.
+
+        Parameters
+        ----------
+        bands : bool
+            Confidence and prediction bands of what is fitted, where there is a model and a covariance; the first ones
+            of a model are compiled for a second.
+        level : float, between 0 and 1
+            Of the bands.
+        """
+        quantile = self.quantile(level)
+        drawn = bands and self.problem is not None and np.isfinite(standard_errors_of(self)).all()
+        shown = range(min(len(self.trajectories), LARGEST_FIGURE)) if drawn and self._sensitivities_fit() else range(0)
+        return plot_fit(self, [Bands.of(predict(self, experiment=e), quantile, level) for e in shown])
+
+    def predict(self, times: ArrayLike | None = None, *, experiment: int = 0) -> Prediction:
+        """States and outputs at any times with their standard errors and bands, see `switchfit.predict`.
+
+        Parameters
+        ----------
+        times : (K,) array_like, optional
+        experiment : int
+        """
+        return predict(self, times, experiment=experiment)
+
+    @property
+    def residuals(self) -> ResidualDiagnostics:
+        """Tests of the residuals, channel by channel: whiteness, normality, effective sample size."""
+        return diagnose(self, run_names(self))
+
+    def plot_residuals(self) -> Any:
+        """Residuals in time, their autocorrelation and their quantiles, as a matplotlib Figure."""
+        return plot_diagnostics(self.residuals)
+
+    @cached_property
+    def identifiability(self) -> Identifiability:
+        """Which combinations of the unknowns the data determine badly, with J evaluated there."""
+        return identifiability(self)
 
     def save(self, path: str | Path) -> None:
         """Write everything but the model to a JSON file, atomically; `load` reads it."""

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -97,7 +98,7 @@ class Trace:
         self.limits = {side: self._limit(side) for side in (-1, 1)}
         self.told: Callable[[], bool] = lambda: False
 
-    # --- what the points say -----------------------------------------------------------------------------------------
+    # --- what the points say
 
     def zeta(self, point: Point) -> float:
         """Signed root of the likelihood ratio; 0 where the cost is below that of the estimate."""
@@ -114,7 +115,7 @@ class Trace:
         """The lowest of all."""
         return min(self.points, key=lambda q: q.cost)
 
-    # --- making points -------------------------------------------------------------------------------------------------
+    # --- making points
 
     def _limit(self, side: int) -> float:
         """How far the constraints let the unknown go."""
@@ -210,7 +211,7 @@ class Trace:
     def _insert(self, point: Point) -> None:
         self.points = sorted([q for q in self.points if q.value != point.value] + [point], key=lambda q: q.value)
 
-    # --- marching ------------------------------------------------------------------------------------------------------
+    # --- marching
 
     def march(self, side: int, threshold: float) -> None:
         """Add points on one side until zeta has crossed the threshold, or there is a reason why it will not."""
@@ -294,8 +295,8 @@ class Trace:
 
     def _sweep_inward(self, side: int) -> None:
         """A branch that is lower further out may be lower further in as well: follow it back."""
-        points = self.side(side)[::-1]
-        for outer, inner in zip(points[:-1], points[1:-1], strict=True):
+        outer, *inward = self.side(side)[:0:-1]
+        for inner in inward:
             start = outer.theta.copy()
             start[self.index] = inner.value
             feasible = self._feasible(start, outer.theta)
@@ -303,6 +304,7 @@ class Trace:
             if found is None or not found.converged or found.cost >= inner.cost - 1e-9 * abs(inner.cost):
                 return
             self._insert(found)
+            outer = found
 
     def _along_covariance(self, centre: Point) -> Point | None:
         """A second point on the tangent of the path of the others at the estimate: theta moves along C e_k."""
@@ -313,7 +315,7 @@ class Trace:
         return Point(float(theta[self.index]), np.nan, theta, True)
 
     def _first_step(self, side: int, spacing: float) -> float:
-        """A length after which zeta should be the spacing: by the standard error, or at a kink or bound by the slope."""
+        """A length after which zeta should be the spacing: by the standard error; at a kink or a bound by the slope."""
         k, size = self.index, self._size
         error = self.fit.standard_errors[k]
         if np.isfinite(error) and error > 0:
@@ -333,7 +335,7 @@ class Trace:
         error = self.fit.standard_errors[self.index]
         return FAR * max(abs(self.centre.value) or 1.0, float(error) if np.isfinite(error) else 0.0)
 
-    # --- where it crosses ------------------------------------------------------------------------------------------------
+    # --- where it crosses
 
     def crossing(self, a: Point, b: Point, threshold: float) -> float:
         """Where |zeta| is the threshold between two neighbouring points on different sides of it."""
@@ -535,11 +537,10 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     threshold = fit.quantile(level)
     index = fit.theta_names.index(name)
     report, end = reporting(callback, f"Profile of {name}")
-    expected = 2 * (STEPS + LOOK_AHEAD + 2)
     trace = Trace(fit, evaluator, index)
     try:
         for _ in range(2):
-            trace.told = lambda: bool(report(min(trace.fits, expected), max(expected, trace.fits)))
+            trace.told = partial(_told, report, trace)
             for side in (-1, 1):
                 trace.march(side, threshold)
             if trace.integration_error() <= LARGE_ERROR * threshold**2:
@@ -556,6 +557,11 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     times = _sample_times(evaluator, index)
     error = float(fit.standard_errors[index])
     return Profile(name, fit.theta_units[index], trace.centre.value, error, level, fit, times, trace)
+
+
+def _told(report: Progress, trace: Trace) -> bool:
+    """Tell how many fits are done, of as many as a profile usually takes; whether to stop."""
+    return bool(report(trace.fits, max(2 * (STEPS + LOOK_AHEAD + 2), trace.fits)))
 
 
 def _check(fit: Fit) -> None:

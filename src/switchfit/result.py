@@ -14,7 +14,6 @@ from switchfit.data import FloatArray
 from switchfit.optimize import IterationRecord, Status
 from switchfit.simulate import Comparison, Trajectory
 
-
 CovarianceKind = Literal["exact", "gauss-newton"]
 
 
@@ -40,8 +39,14 @@ class Certificate:
     gradient_gap, hessian_gap : float
         Relative gap between the paper's equations (6)-(17) and the exact derivatives of the discretised cost; NaN
         where that was not checked.
+    taylor_orders : tuple of float
+        Orders of the remainders of J, of J with its gradient and of J with its Hessian along a random direction: at
+        least 1, 2, 3 where the derivatives are right (2, 2, 3 at a minimum, where the gradient vanishes); NaN where a
+        remainder is rounding, or where that was not checked.
     active : tuple of str
         Constraints that hold with equality, collapsed modes and bounds among them, and kinks.
+    failures : tuple of str
+        What of all this is not as it has to be; nothing: the certificate is good.
     """
 
     optimality: float
@@ -52,7 +57,14 @@ class Certificate:
     integration_error: float
     gradient_gap: float
     hessian_gap: float
+    taylor_orders: tuple[float, ...]
     active: tuple[str, ...]
+    failures: tuple[str, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing that was checked failed."""
+        return not self.failures
 
     def __str__(self) -> str:
         rows = [
@@ -64,13 +76,21 @@ class Certificate:
             ("integration error of J, relative", f"{self.integration_error:.1e}"),
             ("paper's gradient against discretised, relative", _gap(self.gradient_gap)),
             ("paper's Hessian against discretised, relative", _gap(self.hessian_gap)),
+            ("Taylor orders of J, with gradient, with Hessian", _orders(self.taylor_orders)),
             ("active constraints", "; ".join(self.active) or "none"),
+            ("verdict", f"FAILED: {'; '.join(self.failures)}" if self.failures else "passed"),
         ]
         return "\n".join(f"{label:<48} {value}" for label, value in rows)
 
 
 def _gap(gap: float) -> str:
     return "not checked" if np.isnan(gap) else f"{gap:.1e}"
+
+
+def _orders(orders: tuple[float, ...]) -> str:
+    if np.isnan(orders).all():
+        return "not checked"
+    return ", ".join("rounding" if np.isnan(order) else f"{order:.2f}" for order in orders)
 
 
 @dataclass(frozen=True, eq=False)
@@ -333,13 +353,31 @@ def free_curvature(fit: Fit) -> FreeCurvature:
     Z = fit.free_basis
     if Z.shape[1] == 0 or not np.isfinite(fit.hessian).all():
         return FreeCurvature(np.nan, np.zeros(0), ())
-    size = 1 / np.sqrt(np.maximum(np.abs(np.diag(fit.hessian)), np.finfo(float).tiny))
-    basis = np.linalg.qr(Z / size[:, None])[0]
-    scaled, vectors = np.linalg.eigh(basis.T @ (fit.hessian * np.outer(size, size)) @ basis)
-    weight = np.abs(basis @ vectors[:, 0])
+    spectrum = scaled_spectrum(fit.hessian, Z)
+    weight = np.abs(spectrum.vectors[:, 0])
     strong = [i for i in np.argsort(-weight, kind="stable") if weight[i] > 0.3 * weight.max()][:4]
     smallest = float(np.linalg.eigvalsh(Z.T @ fit.hessian @ Z)[0])
-    return FreeCurvature(smallest, scaled, tuple(fit.theta_names[i] for i in strong))
+    return FreeCurvature(smallest, spectrum.values, tuple(fit.theta_names[i] for i in strong))
+
+
+class ScaledSpectrum(NamedTuple):
+    """Eigenvalues (k,), ascending, and eigenvectors (d, k) of a Hessian scaled to unit curvature of each unknown.
+
+    `size` (d,) is the scaling: an eigenvector times it is a direction in theta.
+    """
+
+    values: FloatArray
+    vectors: FloatArray
+    size: FloatArray
+
+
+def scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> ScaledSpectrum:
+    """Of a finite Hessian (d, d) on the directions Z (d, k)."""
+    diagonal = np.abs(np.diag(hessian))
+    size = 1 / np.sqrt(np.where(diagonal > np.finfo(float).tiny, diagonal, 1.0))
+    basis = np.linalg.qr(Z / size[:, None])[0]
+    values, vectors = np.linalg.eigh(basis.T @ (hessian * np.outer(size, size)) @ basis)
+    return ScaledSpectrum(values, basis @ vectors, size)
 
 
 def _discrete(comparison: Comparison) -> bool:

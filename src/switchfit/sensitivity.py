@@ -294,7 +294,7 @@ def sample_derivatives(problem: Problem, sensitivities: Sequence[Sensitivity]) -
     sensitivities : sequence of Sensitivity, one an experiment
     """
     d = len(problem.theta_names)
-    columns: list[tuple[FloatArray, ...]] = []
+    columns: list[tuple[NDArray[Any], ...]] = []
     for e, (experiment, found) in enumerate(zip(problem.experiments, sensitivities, strict=True)):
         first = sum(q for _, q in problem.structures[e].references)
         items = [item for item in experiment.data if isinstance(item, Measurements)]

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.special
 
+from switchfit.report.plot import LARGEST_FIGURE
 from switchfit.report.text import rounded
 
 if TYPE_CHECKING:
@@ -13,6 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from switchfit.profile import Profile
+    from switchfit.residuals import ChannelResiduals, ResidualDiagnostics
 
 LINE, QUADRATIC, THRESHOLD, SHADE = "#b2182b", "#777777", "#333333", "#4a7fb5"
 LEVELS = (0.683, 0.95, 0.99)
@@ -123,6 +126,8 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     -------
     matplotlib.axes.Axes
     """
+    from scipy.interpolate import PchipInterpolator  # here, since importing it takes longer than a profile
+
     regions = profile.regions()
     top = 1.5 * profile.fit.quantile(profile.level) ** 2
     values, ratio = profile.values, profile.zeta**2
@@ -136,7 +141,12 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
         ax.axvspan(
             *bounds, color=SHADE, alpha=0.15, linewidth=0, label="" if k else f"{100 * profile.level:g} % interval"
         )
-    ax.plot(values[first : last + 1], ratio[first : last + 1], "o-", color=LINE, markersize=3.5, label="profile")
+    # zeta is near to a straight line: a curve through its points, squared, is the profile between them.
+    shown = slice(first, last + 1)
+    fine = np.linspace(values[first], values[last], 500)
+    between = PchipInterpolator(values[shown], profile.zeta[shown])(fine) if last > first else profile.zeta[shown]
+    ax.plot(fine[: len(between)], between**2, "-", color=LINE, linewidth=1.5, label="profile")
+    ax.plot(values[shown], ratio[shown], "o", color=LINE, markersize=3.5)
     x = np.linspace(low - margin, high + margin, 400)
     if np.isfinite(profile.standard_error) and profile.standard_error > 0:
         parabola = ((x - profile.value) / profile.standard_error) ** 2
@@ -164,4 +174,94 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     ax.set_title(f"Profile likelihood of {profile.name}")
     ax.ticklabel_format(axis="x", useOffset=False)
     ax.legend(frameon=False, fontsize=8, loc="upper center", ncols=2)
+    return ax
+
+
+def plot_diagnostics(diagnostics: ResidualDiagnostics) -> Figure:
+    """A row a channel: residuals in time, their autocorrelation, and their quantiles against those of a normal one.
+
+    Parameters
+    ----------
+    diagnostics : ResidualDiagnostics
+        Of more than ten channels the first ten are shown.
+    """
+    from matplotlib.figure import Figure
+
+    shown = list(zip(diagnostics.labels, diagnostics.channels, strict=True))[:LARGEST_FIGURE]
+    figure = Figure(figsize=(10.5, 0.5 + 2.5 * max(len(shown), 1)), layout="constrained")
+    if not shown:
+        figure.suptitle("No residuals: the cost has no Measurements")
+        return figure
+    axes = figure.subplots(len(shown), 3, squeeze=False, width_ratios=[2.0, 1.2, 1.0])
+    for row, (label, channel) in zip(axes, shown, strict=True):
+        draw_in_time(channel, row[0])
+        draw_autocorrelation(channel, row[1])
+        draw_quantiles(channel, row[2])
+        row[0].set_ylabel(f"{label}\nresidual / sigma" if channel.sigma_known else f"{label}\nresidual / rms")
+    for ax, title in zip(axes[0], ("Residuals in time", "Autocorrelation", "Quantiles"), strict=True):
+        ax.set_title(title)
+    for ax, label in zip(axes[-1], ("time (s)", "lag (samples)", "normal quantile"), strict=True):
+        ax.set_xlabel(label)
+    return figure
+
+
+def draw_in_time(channel: ChannelResiduals, ax: Axes) -> Axes:
+    """Standardised residuals over time with lines at two standard deviations.
+
+    Parameters
+    ----------
+    channel : ChannelResiduals
+    ax : matplotlib.axes.Axes
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    ax.axhline(0.0, color=LINE, linewidth=0.9)
+    for side in (-2.0, 2.0):
+        ax.axhline(side, color=THRESHOLD, linewidth=0.8, linestyle=":")
+    size = 3.5 if len(channel.values) <= 300 else 1.5
+    ax.plot(channel.times, channel.values, "o", color=THRESHOLD, markersize=size, markeredgewidth=0, alpha=0.8)
+    return ax
+
+
+def draw_autocorrelation(channel: ChannelResiduals, ax: Axes) -> Axes:
+    """Autocorrelation against lag, with the limits within which that of white noise lies in 95 %.
+
+    Parameters
+    ----------
+    channel : ChannelResiduals
+    ax : matplotlib.axes.Axes
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    limit = 1.96 / np.sqrt(max(len(channel.values), 1))
+    ax.axhspan(-limit, limit, color=SHADE, alpha=0.15, linewidth=0)
+    ax.axhline(0.0, color=THRESHOLD, linewidth=0.8)
+    lags = np.arange(1, channel.lags + 1)
+    ax.vlines(lags, 0.0, channel.autocorrelation, color=LINE, linewidth=1.5)
+    ax.plot(lags, channel.autocorrelation, "o", color=LINE, markersize=4)
+    reach = max(1.3 * float(np.max(np.abs(channel.autocorrelation), initial=0.0)), 2 * limit)
+    ax.set_ylim(-min(reach, 1.05), min(reach, 1.05))
+    return ax
+
+
+def draw_quantiles(channel: ChannelResiduals, ax: Axes) -> Axes:
+    """Sorted standardised residuals against the quantiles of the normal distribution: a straight line if normal.
+
+    Parameters
+    ----------
+    channel : ChannelResiduals
+    ax : matplotlib.axes.Axes
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    n = len(channel.values)
+    expected = scipy.special.ndtri((np.arange(1, n + 1) - 0.5) / n)
+    ax.plot(expected[[0, -1]], expected[[0, -1]], "-", color=LINE, linewidth=1.0)
+    ax.plot(expected, np.sort(channel.values), "o", color=THRESHOLD, markersize=3, markeredgewidth=0)
     return ax
