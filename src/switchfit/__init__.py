@@ -1,5 +1,6 @@
 """switchfit: when did the system switch mode, and what were its parameters?"""
 
+from switchfit.batch.bootstrap import Bootstrap, bootstrap
 from switchfit.batch.fits import Fits
 from switchfit.batch.logs import estimate_many
 from switchfit.batch.monte_carlo import MonteCarlo, monte_carlo
@@ -25,6 +26,7 @@ compile_small_loops_whole()
 __version__ = "0.1.0"
 
 __all__ = [
+    "Bootstrap",
     "Certificate",
     "ChannelResiduals",
     "Comparison",
@@ -50,6 +52,7 @@ __all__ = [
     "Status",
     "TerminalCost",
     "Trajectory",
+    "bootstrap",
     "check_derivatives",
     "estimate",
     "estimate_many",

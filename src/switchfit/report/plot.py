@@ -346,9 +346,18 @@ def _draw_bands(fit: Fit, e: int, axes: Sequence[Axes], bands: Bands) -> None:
         for ax, band in zip(axes, np.moveaxis(bands.states, 1, 0), strict=True):
             plot_band(bands, band, ax, alpha=0.3, label=f"{100 * bands.level:g} % confidence")
         return
-    for k, ax in enumerate(axes[::2]):
-        plot_band(bands, bands.predicted[:, k], ax, alpha=0.12, label=f"{100 * bands.level:g} % prediction")
-        plot_band(bands, bands.outputs[:, k], ax, alpha=0.3, label=f"{100 * bands.level:g} % confidence")
+    for k, (ax, below) in enumerate(zip(axes[::2], axes[1::2], strict=True)):
+        fitted = bands.outputs[:, k].mean(axis=1, keepdims=True)
+        # About the fitted curve and, since it is often too narrow to be seen there, about the residuals' zero.
+        for about, panel in ((0.0, ax), (fitted, below)):
+            limits = panel.get_ylim()
+            label = f"{100 * bands.level:g} % prediction"
+            plot_band(bands, bands.predicted[:, k] - about, panel, alpha=0.12, label=label)
+            label = f"{100 * bands.level:g} % confidence"
+            plot_band(bands, bands.outputs[:, k] - about, panel, alpha=0.3, label=label)
+            if panel is below and np.isfinite(bands.predicted[:, k]).any():
+                reach = np.nanmax(np.abs(bands.predicted[:, k] - about))
+                panel.set_ylim(min(limits[0], -1.1 * reach), max(limits[1], 1.1 * reach))
 
 
 def plot_band(bands: Bands, band: FloatArray, ax: Axes, *, alpha: float, label: str) -> Axes:
@@ -388,7 +397,8 @@ def _head(fit: Fit, figure: Figure, shown: int, colours: Mapping[str, str]) -> N
     drawn = {mode for trajectory in fit.trajectories[:shown] for mode, a, b in trajectory.mode_spans if b > a}
     for mode in (mode for mode in colours if mode in drawn - named):  # too short for a name
         handles[mode] = Patch(facecolor=colours[mode], edgecolor=TRANSITION, linewidth=0.5)
-    figure.legend(handles.values(), handles.keys(), loc="outside upper right", ncols=len(handles), frameon=False)
+    ncols = min(len(handles), max(3, int(figure.get_figwidth() / 1.6)))
+    figure.legend(handles.values(), handles.keys(), loc="outside upper right", ncols=ncols, frameon=False)
     notes = [] if fit.success else [f"Not a minimum: {fit.status.name.lower().replace('_', ' ')}"]
     if shown < len(fit.trajectories):
         notes.append(f"{shown} of {len(fit.trajectories)} experiments")
