@@ -361,7 +361,8 @@ def _found(rises: tuple[float, float], told: str, base: float) -> str:
     if not finite:
         return ": J could not be evaluated there."
     worst = max(finite)
-    relative = f" ({100 * worst / abs(base):.2g} %)" if np.isfinite(base) and base != 0 else ""
+    related = np.isfinite(base) and abs(worst) < 10 * abs(base)  # of a J near 0 nothing is a part
+    relative = f" ({100 * worst / abs(base):.2g} %)" if related else ""
     both = ", or the opposite," if len(finite) == 2 else ""
     return f"{both} raises J by {worst:.2g}{relative}" + (f"; {told}." if told else ".")
 

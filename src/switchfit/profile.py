@@ -24,15 +24,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq, linprog
+from scipy.optimize import brentq, linprog, minimize_scalar
 
 from switchfit.data import FloatArray, Measurements
 from switchfit.evaluate import Evaluator
 from switchfit.optimize import Status, solve_qp
+from switchfit.problem import Problem
 from switchfit.progress import Progress, reporting
 from switchfit.refine import refined_mesh
 from switchfit.report.uncertainty import plot_profile, profile_text
@@ -49,13 +51,14 @@ STEPS = 5
 """Points between the estimate and the crossing of the threshold, on each side."""
 BEYOND = 1.15
 """The march goes on until zeta is this many times the threshold ..."""
-LOOK_AHEAD = 2
-"""... and then looks this many times further out, each time twice as far, for a second region."""
+LOOK_AHEAD = 3
+"""... and then looks this many times further out, each time twice as far, for a second region; as many times more while
+the cost falls on the way."""
 MOST_POINTS = 60
 """On one side."""
 LONGEST_GROWTH = 2.5
 """Factor by which a step may be longer than the one before."""
-FAR = 1e3
+FAR = 1e2
 """A side is flat if nothing is crossed up to this many times the unknown's size or its standard error."""
 HALVINGS = 8
 """Times a step is halved where the fit does not succeed."""
@@ -67,10 +70,11 @@ ITERATIONS = 100
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """One fit with the unknown held at `value`."""
+    """One fit with the unknown held at `value`; `slope` is the derivative of its cost in that value."""
 
     value: float
     cost: float
+    slope: float
     theta: FloatArray
     converged: bool
 
@@ -84,6 +88,10 @@ class Trace:
         Ascending in value; the estimate's own among them.
     ends : dict
         How the march to the lower (-1) and to the upper (+1) side ended.
+    interrupted : bool
+        No more is done.
+    coarse : bool
+        The mesh is too coarse at the ends.
     """
 
     def __init__(self, fit: Fit, evaluator: Evaluator, index: int) -> None:
@@ -91,11 +99,13 @@ class Trace:
         self.constraints = constraints_of(evaluator.problem)
         self.scale = fit.residual_variance if fit.sigma_known is False else 1.0
         value = float(fit.theta[index])
-        self.centre = Point(value, evaluator(fit.theta).cost, fit.theta, True)
+        self.centre = Point(value, evaluator(fit.theta).cost, 0.0, fit.theta, True)
         self.points = [self.centre]
         self.ends: dict[int, End] = {}
         self.fits = 0
         self.limits = {side: self._limit(side) for side in (-1, 1)}
+        self.interrupted = False
+        self.coarse = False
         self.told: Callable[[], bool] = lambda: False
 
     # --- what the points say
@@ -183,7 +193,10 @@ class Trace:
             raise KeyboardInterrupt
         if not np.isfinite(result.cost):
             return None
-        return Point(value, result.cost, result.theta, result.successful or result.status is Status.SINGULAR)
+        # The others are optimal: their change contributes nothing to the derivative.
+        slope = float(result.gradient[self.index])
+        good = result.successful or result.status is Status.SINGULAR
+        return Point(value, result.cost, slope, result.theta, good)
 
     def add(self, value: float, near: Point, before: Point | None = None) -> Point | None:
         """A new point, from a neighbour or along the line through two of them; None where no fit succeeds."""
@@ -215,7 +228,7 @@ class Trace:
 
     def march(self, side: int, threshold: float) -> None:
         """Add points on one side until zeta has crossed the threshold, or there is a reason why it will not."""
-        if self.ends.get(side) in ("limit", "flat", "failed"):
+        if self.interrupted or self.ends.get(side) in ("limit", "flat", "failed"):
             return
         spacing = threshold / STEPS
         points = self.side(side)
@@ -229,12 +242,12 @@ class Trace:
             last = points[-1]
             height = abs(self.zeta(last))
             if last.value == self.limits[side]:
-                self.ends[side] = "crossed" if max(abs(self.zeta(q)) for q in points) >= threshold else "limit"
-                return
+                self.ends[side] = "crossed" if abs(self.zeta(last)) >= threshold else "limit"
+                return self._dip(side)
             if height >= BEYOND * threshold:
                 self.ends[side] = "crossed"
-                if ahead == LOOK_AHEAD:
-                    return
+                if ahead >= LOOK_AHEAD * (1 + (side * last.slope < 0)):
+                    return self._dip(side)
                 ahead += 1
                 step = abs(last.value - self.centre.value)
             elif abs(last.value - self.centre.value) > self._far:
@@ -243,7 +256,7 @@ class Trace:
             new = self._next(side, points, step, spacing, threshold, looking=ahead > 0)
             if new is None:
                 self.ends[side] = "crossed" if height >= threshold else "failed"
-                return
+                return self._dip(side)
             if new.cost < last.cost - 1e-9 * abs(last.cost):
                 self._sweep_inward(side)
             points = self.side(side)
@@ -293,6 +306,22 @@ class Trace:
             found = self.add(inner.value + float(part) * (outer.value - inner.value), previous)
             previous = found if found is not None else previous
 
+    def _dip(self, side: int) -> None:
+        """Points at minima that the slopes tell of between points far apart."""
+        points = self.side(side)[1:]
+        for inner, outer in pairwise(points):
+            if side * inner.slope < 0 < side * outer.slope:
+                near = min((inner, outer), key=lambda q: q.cost)
+
+                def cost(value: float, near: Point = near) -> float:
+                    found = self.add(value, near)
+                    return np.inf if found is None else found.cost
+
+                bounds = sorted((inner.value, outer.value))
+                minimize_scalar(
+                    cost, bounds=bounds, method="bounded", options={"xatol": 1e-3 * (bounds[1] - bounds[0])}
+                )
+
     def _sweep_inward(self, side: int) -> None:
         """A branch that is lower further out may be lower further in as well: follow it back."""
         outer, *inward = self.side(side)[:0:-1]
@@ -312,7 +341,7 @@ class Trace:
         if not (np.isfinite(column).all() and column[self.index] > 0):
             return None
         theta = centre.theta - column / column[self.index]
-        return Point(float(theta[self.index]), np.nan, theta, True)
+        return Point(float(theta[self.index]), np.nan, np.nan, theta, True)
 
     def _first_step(self, side: int, spacing: float) -> float:
         """A length after which zeta should be the spacing: by the standard error; at a kink or a bound by the slope."""
@@ -545,18 +574,29 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
                 trace.march(side, threshold)
             if trace.integration_error() <= LARGE_ERROR * threshold**2:
                 break
-            thetas = [fit.theta, trace.points[0].theta, trace.points[-1].theta]
-            runs = range(len(evaluator.problem.experiments))
-            finer = [refined_mesh(evaluator.problem, e, *thetas, finer=2.0) for e in runs]
-            trace = Trace(fit, Evaluator(evaluator.problem, meshes=finer), index)
+            trace.coarse = True
+            finer = _finer(evaluator.problem, trace) if trace.evaluator is evaluator else None
+            if finer is None:
+                break
+            trace = Trace(fit, finer, index)
     except KeyboardInterrupt:
-        pass
+        trace.interrupted = True
     finally:
         end()
         trace.told = lambda: False
     times = _sample_times(evaluator, index)
     error = float(fit.standard_errors[index])
     return Profile(name, fit.theta_units[index], trace.centre.value, error, level, fit, times, trace)
+
+
+def _finer(problem: Problem, trace: Trace) -> Evaluator | None:
+    """The problem on meshes that resolve both ends of a profile as well; None where these cannot be integrated."""
+    thetas = [trace.centre.theta, trace.points[0].theta, trace.points[-1].theta]
+    try:
+        meshes = [refined_mesh(problem, e, *thetas, finer=2.0) for e in range(len(problem.experiments))]
+    except ValueError:
+        return None
+    return Evaluator(problem, meshes=meshes)
 
 
 def _told(report: Progress, trace: Trace) -> bool:

@@ -103,7 +103,7 @@ def plot_bootstrap(study: Bootstrap) -> Figure:
         ax.locator_params(axis="x", nbins=4)
     for ax in axes[len(shown) :]:
         ax.set_visible(False)
-    axes[0].set_ylabel("density")
+    axes[0].set_ylabel("fits")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(
         handles, labels, loc="outside upper center", ncols=3, frameon=False, title=BOOTSTRAP_TITLES[study.resample]

@@ -95,6 +95,8 @@ def profile_notes(profile: Profile) -> list[str]:
     if len(inside):
         count = f"{len(inside)} sample times lie" if len(inside) > 1 else f"the sample at {inside[0]:.6g} s lies"
         notes.append(f"{count} in the interval, where the slope of the profile may jump")
+    if profile.trace.coarse:
+        notes.append("towards its ends the steps of the integration are too long: give the Problem a smaller rtol")
     if not profile.converged.all():
         notes.append(f"{int((~profile.converged).sum())} of the fits did not converge")
     return notes
