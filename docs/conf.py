@@ -5,9 +5,11 @@ from importlib.metadata import version as installed_version
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
-from speed_figures import draw  # it stands beside this file
+import speed_figures  # these stand beside this file
+import uncertainty_figures
 
-draw(Path(__file__).parent / "_figures")
+for figures in (speed_figures, uncertainty_figures):
+    figures.draw(Path(__file__).parent / "_figures")
 
 project = "switchfit"
 author = "switchfit developers"

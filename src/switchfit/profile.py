@@ -64,6 +64,8 @@ HALVINGS = 8
 """Times a step is halved where the fit does not succeed."""
 LARGE_ERROR = 1e-2
 """Error of zeta^2 by the integration, as a part of the threshold, above which the mesh is refined."""
+MOST_KINKS = 10
+"""Sample times at which a profile is evaluated, to show the kinks there."""
 ITERATIONS = 100
 """Most of one fit along the profile."""
 
@@ -404,13 +406,26 @@ class Trace:
             return last
         return float(side * np.inf) if end == "flat" else float("nan")
 
-    def integration_error(self) -> float:
-        """Largest error of zeta^2 by the integration at the outermost points, by halving all steps."""
+    def edges(self, threshold: float) -> list[Point]:
+        """On each side the first point beyond the threshold, or the last one if there is none."""
+        sides = [self.side(side) for side in (-1, 1)]
+        return [next((q for q in points if abs(self.zeta(q)) >= threshold), points[-1]) for points in sides]
+
+    def integration_error(self, threshold: float) -> float:
+        """Largest error of zeta^2 by the integration where it crosses the threshold, by halving all steps."""
         meshes = [mesh.divided() for mesh in self.evaluator.meshes]
         problem = self.evaluator.problem
         base = compare(problem, self.centre.theta, meshes)[0] - self.centre.cost
-        ends = [self.points[0], self.points[-1]]
+        ends = self.edges(threshold)
         return max(abs(compare(problem, q.theta, meshes)[0] - q.cost - base) * 2 / self.scale for q in ends)
+
+    def add_kinks(self, times: FloatArray, threshold: float) -> None:
+        """Points at the sample times up to the threshold, where the slope may jump, unless there are many."""
+        low, high = (q.value for q in self.edges(threshold))
+        inside = times[(times > low) & (times < high)]
+        for time in inside if len(inside) <= MOST_KINKS else ():
+            if all(q.value != time for q in self.points):
+                self.add(float(time), min(self.points, key=lambda q, time=time: abs(q.value - time)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -565,6 +580,7 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     _check(fit)
     threshold = fit.quantile(level)
     index = fit.theta_names.index(name)
+    times = _sample_times(evaluator, index)
     report, end = reporting(callback, f"Profile of {name}")
     trace = Trace(fit, evaluator, index)
     try:
@@ -572,10 +588,11 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
             trace.told = partial(_told, report, trace)
             for side in (-1, 1):
                 trace.march(side, threshold)
-            if trace.integration_error() <= LARGE_ERROR * threshold**2:
+            trace.add_kinks(times, threshold)
+            if trace.integration_error(threshold) <= LARGE_ERROR * threshold**2:
                 break
             trace.coarse = True
-            finer = _finer(evaluator.problem, trace) if trace.evaluator is evaluator else None
+            finer = _finer(evaluator.problem, trace, threshold) if trace.evaluator is evaluator else None
             if finer is None:
                 break
             trace = Trace(fit, finer, index)
@@ -584,14 +601,13 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     finally:
         end()
         trace.told = lambda: False
-    times = _sample_times(evaluator, index)
     error = float(fit.standard_errors[index])
     return Profile(name, fit.theta_units[index], trace.centre.value, error, level, fit, times, trace)
 
 
-def _finer(problem: Problem, trace: Trace) -> Evaluator | None:
+def _finer(problem: Problem, trace: Trace, threshold: float) -> Evaluator | None:
     """The problem on meshes that resolve both ends of a profile as well; None where these cannot be integrated."""
-    thetas = [trace.centre.theta, trace.points[0].theta, trace.points[-1].theta]
+    thetas = [trace.centre.theta, *(q.theta for q in trace.edges(threshold))]
     try:
         meshes = [refined_mesh(problem, e, *thetas, finer=2.0) for e in range(len(problem.experiments))]
     except ValueError:

@@ -102,7 +102,7 @@ class Bootstrap(Fits):
         level : float, between 0 and 1
         method : {"bca", "percentile", "basic"}
             As in ``scipy.stats.bootstrap``: "percentile" takes quantiles of the estimates; "basic" mirrors them at the
-            estimate; "bca" shifts them for bias and for acceleration ([5]_), whose sum over the leave-one-out
+            estimate; "bca" shifts them for bias and for acceleration (Efron 1987), whose sum over the leave-one-out
             estimates is taken to first order, from exact derivatives, instead of fitting again without each sample.
         """
         if not 0 < level < 1:

@@ -71,6 +71,7 @@ def profile_notes(profile: Profile) -> list[str]:
     profile : Profile
     """
     notes = []
+    unit = "" if profile.unit in ("", "1") else f" {profile.unit}"
     for side, end, limit in zip(("downward", "upward"), profile.ends, profile.trace.limits.values(), strict=True):
         if end == "limit":
             notes.append(f"{side} the limit {limit:.6g} comes before the threshold: the interval is one-sided")
@@ -93,7 +94,7 @@ def profile_notes(profile: Profile) -> list[str]:
         )
     inside = profile.sample_times[(profile.sample_times > low) & (profile.sample_times < high)]
     if len(inside):
-        count = f"{len(inside)} sample times lie" if len(inside) > 1 else f"the sample at {inside[0]:.6g} s lies"
+        count = f"{len(inside)} sample times lie" if len(inside) > 1 else f"the sample at {inside[0]:.6g}{unit} lies"
         notes.append(f"{count} in the interval, where the slope of the profile may jump")
     if profile.trace.coarse:
         notes.append("towards its ends the steps of the integration are too long: give the Problem a smaller rtol")
