@@ -1,4 +1,4 @@
-"""How certain is it? A heater is switched off at an unknown time; twelve noisy readings say when, and what else they say.
+"""How certain is it? A heater is switched off at an unknown time; twelve noisy readings say when, and how surely.
 
 Prints intervals, a profile likelihood, a bootstrap, what the data determine worst and tests of the residuals;
 with a folder as its argument it writes the figures there.
@@ -29,9 +29,8 @@ log = sf.Measurements(
     minutes, exact + 0.8 * np.random.default_rng(4).standard_normal(len(minutes)), sigma=0.8, names=("T",)
 )
 
-run = sf.Experiment(
-    log, mode_sequence=("on", "off"), transition_times=(sf.Parameter(40.0, unit="min"),), t0=0.0, tf=120.0
-)
+off = sf.Parameter(40.0, unit="min")
+run = sf.Experiment(log, mode_sequence=("on", "off"), transition_times=(off,), t0=0.0, tf=120.0)
 problem = sf.Problem(
     room,
     run,

@@ -90,6 +90,8 @@ class Trace:
         Ascending in value; the estimate's own among them.
     ends : dict
         How the march to the lower (-1) and to the upper (+1) side ended.
+    jumps : list of float
+        Where the threshold was crossed by a jump: the minimum of the others that was followed ends there.
     interrupted : bool
         No more is done.
     coarse : bool
@@ -107,6 +109,7 @@ class Trace:
         self.fits = 0
         self.limits = {side: self._limit(side) for side in (-1, 1)}
         self.interrupted = False
+        self.jumps: list[float] = []
         self.coarse = False
         self.told: Callable[[], bool] = lambda: False
 
@@ -207,7 +210,7 @@ class Trace:
         if before is not None and before.value != near.value:
             slope = (near.theta - before.theta) / (near.value - before.value)
             starts.append(near.theta + (value - near.value) * slope)
-        starts.append(near.theta.copy())
+        starts += [near.theta.copy(), self.centre.theta.copy()]
         best: Point | None = None
         for start in starts:
             start[k] = value
@@ -217,11 +220,21 @@ class Trace:
                 best is None or (not found.converged, found.cost) < (not best.converged, best.cost)
             ):
                 best = found
-            if best is not None and best.converged:
+            if best is not None and best.converged and not self._suspicious(best, near):
                 break
         if best is not None:
             self._insert(best)
         return best
+
+    def _suspicious(self, point: Point, near: Point) -> bool:
+        """Whether zeta has risen so much faster than a straight line that this may be another, higher minimum."""
+        distance, reached = abs(point.value - self.centre.value), abs(near.value - self.centre.value)
+        if reached > 0:
+            expected = abs(self.zeta(near)) * distance / reached
+        else:
+            error = float(self.fit.standard_errors[self.index])
+            expected = distance / error if np.isfinite(error) and error > 0 else np.inf
+        return abs(self.zeta(point)) > 1.5 * expected + 0.5
 
     def _insert(self, point: Point) -> None:
         self.points = sorted([q for q in self.points if q.value != point.value] + [point], key=lambda q: q.value)
@@ -381,7 +394,10 @@ class Trace:
             return abs(self.zeta(point)) - threshold
 
         precision = 1e-7 * max(abs(b.value - a.value), abs(inner.value - self.centre.value))
-        return float(brentq(excess, a.value, b.value, xtol=max(precision, 1e-300), rtol=1e-12))
+        root = float(brentq(excess, a.value, b.value, xtol=max(precision, 1e-300), rtol=1e-12))
+        if min(abs(abs(self.zeta(q)) - threshold) for q in found.values()) > 1e-3 * threshold:
+            self.jumps.append(root)
+        return root
 
     def regions(self, threshold: float) -> list[tuple[float, float]]:
         """All intervals found in which |zeta| is at most the threshold, ascending; open ends are infinite."""
@@ -425,7 +441,8 @@ class Trace:
         inside = times[(times > low) & (times < high)]
         for time in inside if len(inside) <= MOST_KINKS else ():
             if all(q.value != time for q in self.points):
-                self.add(float(time), min(self.points, key=lambda q, time=time: abs(q.value - time)))
+                nearest = int(np.argmin([abs(q.value - time) for q in self.points]))
+                self.add(float(time), self.points[nearest])
 
 
 @dataclass(frozen=True, eq=False)
