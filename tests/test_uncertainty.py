@@ -380,3 +380,24 @@ def test_where_quadratic_intervals_fail_profiles_do_better():
         profiled += low <= truth <= high
     assert abs(profiled / runs - 0.95) < 0.03
     assert abs(profiled / runs - 0.95) < abs(quadratic / runs - 0.95)
+
+
+@pytest.mark.slow
+def test_a_profile_of_the_sparse_vehicle_is_the_lowest_cost_there_is():
+    """One position every 2 s, noise of 1 m: other starts of the other unknowns find nothing lower along the profile."""
+    problem = vehicle(rate=0.5, sigma=1.0)
+    truth = [6.0, 10.0, 0.7]
+    item = problem.experiments[0].data[0]
+    clean = sf.estimate(problem, start=truth, max_iterations=0).comparisons[0][0].fitted
+    noise = np.random.default_rng([3, 1]).standard_normal(clean.shape)
+    run = replace(problem.experiments[0], data=replace(item, values=clean + noise))
+    fit = sf.estimate(replace(problem, experiments=run), start=truth)
+    found = fit.profile("tau_2")
+    low, high = found.interval()
+    assert high > fit.confidence_intervals()[1, 1] + 0.5
+    inside = [q for q in found.trace.points if low <= q.value <= high]
+    for point in inside[::4]:
+        for tau_1 in (4.6, 5.5, 6.4):
+            for mu in (0.4, 0.7, 1.1):
+                other = found.trace._fitted(point.value, np.array([tau_1, point.value, mu]))
+                assert other is None or other.cost >= point.cost - 1e-6

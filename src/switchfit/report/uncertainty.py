@@ -98,9 +98,7 @@ def profile_notes(profile: Profile) -> list[str]:
         notes.append(f"{count} in the interval, where the slope of the profile may jump")
     if profile.trace.jumps:
         places = ", ".join(f"{value:.6g}" for value in sorted(set(profile.trace.jumps)))
-        notes.append(
-            f"the profile jumps at {places}: the other unknowns have several minima, and one of them ends there"
-        )
+        notes.append(f"the profile jumps at {places}: the others have several minima, and the one followed ends there")
     if profile.trace.coarse:
         notes.append("towards its ends the steps of the integration are too long: give the Problem a smaller rtol")
     if not profile.converged.all():
