@@ -74,6 +74,15 @@ def test_where_the_covariances_differ_the_report_says_so():
     assert "Gauss-Newton's are within" not in str(far)
 
 
+@pytest.mark.parametrize("part", [4.0, 0.25])
+def test_the_factor_between_the_covariances_goes_either_way(part):
+    hessian = np.diag([1.0, 4.0, 9.0])
+    found = disagreement(made(hessian=hessian, saved_gauss_newton=np.diag([1.0, part, 1.0]) @ hessian))
+    assert found.factor == pytest.approx(2.0, rel=1e-12)
+    assert (found.name, found.exact) == ("tau_2", pytest.approx(0.5, rel=1e-12))
+    assert found.gauss_newton == pytest.approx(0.5 / np.sqrt(part), rel=1e-12)
+
+
 def test_no_covariance_of_another_kind():
     fit = sf.estimate(noisy_decay(0.1))
     with pytest.raises(ValueError, match="hessian must be 'exact' or 'gauss-newton'; got 'fisher'"):
