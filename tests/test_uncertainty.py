@@ -83,6 +83,14 @@ def test_the_factor_between_the_covariances_goes_either_way(part):
     assert found.gauss_newton == pytest.approx(0.5 / np.sqrt(part), rel=1e-12)
 
 
+def test_an_unknown_that_is_seen_to_second_order_only():
+    hessian = np.diag([100.0, 400.0, 900.0])
+    fit = made(hessian=hessian, saved_gauss_newton=np.diag([1.0, 1e-8, 1.0]) @ hessian)
+    (warning,) = warnings_of(fit)
+    assert warning.startswith("To first order the fitted values hardly depend on tau_2: its standard errors")
+    assert "are 0.05 and 5e+02." in warning
+
+
 def test_no_covariance_of_another_kind():
     fit = sf.estimate(noisy_decay(0.1))
     with pytest.raises(ValueError, match="hessian must be 'exact' or 'gauss-newton'; got 'fisher'"):

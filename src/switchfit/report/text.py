@@ -25,6 +25,9 @@ SMALL_CORRELATION = 0.1
 """Correlations below this in size are not listed."""
 BARELY_DETERMINED = 1e-6
 """Smallest eigenvalue of the scaled Hessian below which the report warns; correlations of 0.999999 give it."""
+UNSEEN = 100.0
+"""The same from which the Gauss-Newton matrix is singular rather than another: as for a transition at which the vector
+field does not jump, such as a block that comes to rest."""
 UNLIKELY = 1e-3
 """Probability of the residual variance below which the report warns, if it is 10 % off as well."""
 DIFFERENT = 1.2
@@ -450,11 +453,20 @@ def _trends(fit: Fit) -> Iterator[str]:
 def _covariances(fit: Fit) -> Iterator[str]:
     """Where the exact Hessian and the Gauss-Newton matrix tell different standard errors."""
     found = disagreement(fit) if fit.success else None
-    if found is not None and found.factor > DIFFERENT:
+    if found is None or not found.factor > DIFFERENT:
+        return
+    both = f"{found.exact:.2g} and {found.gauss_newton:.2g}"
+    if found.factor > UNSEEN:
         yield (
-            f"Standard errors from the exact Hessian and from the Gauss-Newton matrix differ by up to a factor "
-            f"{found.factor:.3g} (of {found.name}: {found.exact:.2g} and {found.gauss_newton:.2g}): within its noise "
-            "the model is not linear in its unknowns. Trust profile likelihoods more than either."
+            f"To first order the fitted values hardly depend on {found.name}: its standard errors from the exact "
+            f"Hessian and from the Gauss-Newton matrix are {both}. What is known of it is known to second order: trust "
+            "its profile likelihood more than either."
+        )
+    else:
+        yield (
+            "Standard errors from the exact Hessian and from the Gauss-Newton matrix differ by up to a factor "
+            f"{found.factor:.3g} (of {found.name}: {both}): within its noise the model is not linear in its unknowns. "
+            "Trust profile likelihoods more than either."
         )
 
 
