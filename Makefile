@@ -5,11 +5,12 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: help demo test test-slow check format bench speed paper docs clean
+.PHONY: help demo test test-slow coverage check format bench speed paper docs clean
 
 help:
 	@echo "make demo       fit a measured toss and the paper's simulated vehicle: reports, figures in out/"
 	@echo "make test       the tests;  make test-slow: statistics and long runs too"
+	@echo "make coverage   how often intervals contain the truth (minutes)"
 	@echo "make check      ruff and mypy;  make format: put the code into form"
 	@echo "make bench      measure speed;  make speed: and put the figures into the documentation"
 	@echo "make paper      every experiment and figure of the paper, into out/paper and the documentation (ten minutes)"
@@ -24,6 +25,9 @@ test: $(VENV)/.installed-dev
 
 test-slow: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) -m "slow or not slow"
+
+coverage: $(VENV)/.installed-dev
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/test_uncertainty.py -m slow -v
 
 check: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

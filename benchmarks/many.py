@@ -45,8 +45,8 @@ def problem() -> sf.Problem:
 def measure(runs: int) -> dict[str, Any]:
     """Seconds a fit: `runs` refits at once, and some of them by `estimate`, one after the other."""
     from switchfit.batch.monte_carlo import _clean, _meshes, _Work
-    from switchfit.estimate import minimized
     from switchfit.evaluate import Evaluator
+    from switchfit.solve import minimized
 
     found: dict[str, Any] = {}
     here = problem()

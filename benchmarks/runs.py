@@ -11,8 +11,8 @@ import numpy as np
 import switchfit as sf
 from benchmarks.report import Report
 from benchmarks.timing import ms
-from switchfit.estimate import minimized
 from switchfit.evaluate import Evaluator, derivatives
+from switchfit.solve import minimized
 
 RUNS = (10, 20, 40, 80, 160)
 SHARED = {"k": 2.0, "c": 0.3, "b": 0.2}

@@ -5,10 +5,11 @@ from importlib.metadata import version as installed_version
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
-import paper_figures  # these two stand beside this file
+import paper_figures  # these stand beside this file
 import speed_figures
+import uncertainty_figures
 
-for pictures in (speed_figures, paper_figures):
+for pictures in (paper_figures, speed_figures, uncertainty_figures):
     pictures.draw(Path(__file__).parent / "_figures")
 
 project = "switchfit"

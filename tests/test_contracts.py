@@ -399,14 +399,14 @@ def test_docstrings_name_the_parameters_of_the_signature(thing):
     given = [
         name for name in inspect.signature(thing).parameters if name not in ("unknowns", "structures", "cls", "self")
     ]
-    if thing in (sf.MonteCarlo, sf.Multistart):  # what they add to Fits
+    if thing in (sf.Bootstrap, sf.MonteCarlo, sf.Multistart):  # what they add to Fits
         assert [*sections(sf.Fits)["Attributes"], *documented["Attributes"]] == given
         return
     if inspect.isclass(thing) and documented["Attributes"]:
         assert documented["Attributes"] == given
         return
     if thing is sf.Estimate:  # its attributes are those of Fit, and what it adds is not for users to give
-        assert sections(sf.Estimate.__base__)["Attributes"] == given[: -len(("certificate", "problem"))]
+        assert sections(sf.Estimate.__base__)["Attributes"] == given[: -len(("certificate", "problem", "evaluator"))]
         return
     assert documented["Parameters"] == given
 

@@ -19,6 +19,25 @@ def test_own_model_finds_what_made_its_log(capsys):
     assert capsys.readouterr().out == ""
 
 
+def test_uncertainty_prints_and_draws_all_there_is(capsys, tmp_path):
+    example = runpy.run_path(str(EXAMPLES / "uncertainty.py"))
+    example["main"](tmp_path)
+    text = capsys.readouterr().out
+    for part in (
+        "trade off",
+        "Unknowns",
+        "Profile of tau_1",
+        "99 % interval",
+        "BCa",
+        "Standardised residuals",
+        "passed",
+    ):
+        assert part in text
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "bootstrap.svg", "fit.svg", "profile.svg", "residuals.svg",
+    ]  # fmt: skip
+
+
 def test_vehicle_finds_the_truth():
     module = runpy.run_path(str(EXAMPLES / "vehicle" / "vehicle.py"))
     estimate = sf.estimate(module["make_problem"]())

@@ -77,7 +77,7 @@ def front_door():
 
 
 #: Only `estimate` makes these.
-NOT_FOR_USERS = {"sf.Estimate": {"problem", "saved_certificate"}}
+NOT_FOR_USERS = {"sf.Estimate": {"evaluator", "problem", "saved_certificate"}}
 
 
 @pytest.mark.parametrize("name", sorted(front_door()))

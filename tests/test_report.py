@@ -185,6 +185,7 @@ def test_what_failed_is_said_first():
         Status.NONFINITE_START: "NOT STARTED",
         Status.SADDLE: "NOT A MINIMUM",
         Status.SINGULAR: "NOT UNIQUE",
+        Status.INFEASIBLE: "CONSTRAINTS NOT MET",
     }
     for status in Status:
         first = report(made(status=status)).splitlines()[0]

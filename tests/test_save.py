@@ -29,7 +29,9 @@ CERTIFICATE = Certificate(
     integration_error=1e-12,
     gradient_gap=5e-324,
     hessian_gap=1.7976931348623157e308,
+    taylor_orders=(np.nan, 2.0, 3.0),
     active=("mu at its lower bound 0.05", "mode 1 ('ü\"\\') has collapsed to nothing"),
+    failures=("the Taylor orders are wrong",),
 )
 
 
@@ -153,7 +155,15 @@ def test_a_real_fit_comes_back(tmp_path):
     estimate.save(tmp_path / "fit.json")
     loaded = sf.Estimate.load(tmp_path / "fit.json")
     for field in fields(Fit):
-        assert_same(getattr(estimate, field.name), getattr(loaded, field.name), field.name)
+        assert_same(getattr(estimate.complete(), field.name), getattr(loaded, field.name), field.name)
+    assert_same(estimate.covariance_from("gauss-newton"), loaded.covariance_from("gauss-newton"))
+    with pytest.raises(ValueError, match=r"loaded without its model: load it with Estimate.load\(path, problem="):
+        loaded.profile("v")
+    with_model = sf.Estimate.load(tmp_path / "fit.json", problem=problem)
+    np.testing.assert_allclose(with_model.predict([1.0]).outputs, estimate.predict([1.0]).outputs, rtol=1e-9)
+    other = sf.Problem(system, problem.experiments[0], {"v": sf.Parameter(2.0, fixed=True)})
+    with pytest.raises(ValueError, match="holds the unknowns tau_1, v, the problem has tau_1: it is the fit of"):
+        sf.Estimate.load(tmp_path / "fit.json", problem=other)
     assert_same(estimate.certificate, loaded.certificate)
     assert str(loaded) == str(estimate)
     np.testing.assert_array_equal(loaded.standard_errors, estimate.standard_errors)
@@ -216,14 +226,14 @@ def test_a_missing_file(tmp_path):
     [
         (b"", "no valid JSON"),
         (b"PK\x03\x04\xff\xfe", "no valid JSON"),
-        (b'{"format": "switchfit fit", "version": 1, "fit"', "no valid JSON"),
+        (b'{"format": "switchfit fit", "version": 2, "fit"', "no valid JSON"),
         (b'{"format": "switchfit fit", "version": NaN}', "no valid JSON \\(it contains NaN\\)"),
         (b"[" * 100_000, "no valid JSON"),
         (b"[1, 2]", 'no entry "format": "switchfit fit"'),
         (b'{"theta": [1.0]}', 'no entry "format": "switchfit fit"'),
-        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads version 1"),
-        (b'{"format": "switchfit fit", "version": 2}', "of version 2; this switchfit reads version 1"),
-        (b'{"format": "switchfit fit", "version": 1}', "is damaged: fit must be an object; got null"),
+        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads version 2"),
+        (b'{"format": "switchfit fit", "version": 3}', "of version 3; this switchfit reads version 2"),
+        (b'{"format": "switchfit fit", "version": 2}', "is damaged: fit must be an object; got null"),
     ],
 )
 def test_what_is_no_saved_fit(text, message, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,6 +11,42 @@ from numpy.typing import ArrayLike
 from switchfit.data import FloatArray
 from switchfit.evaluate import Evaluation, Evaluator, evaluator_of
 from switchfit.problem import Problem
+
+LARGEST_GAP = 1e-4
+"""Relative gap between the paper's equations and the discretised cost's derivatives that is still the integrator's."""
+
+
+class TaylorTable(NamedTuple):
+    """Remainders of J along a direction: steps (S,), remainders (S, 3), observed orders (S - 1, 3), and where (d,)."""
+
+    steps: FloatArray
+    remainders: FloatArray
+    orders: FloatArray
+    theta: FloatArray
+
+
+def taylor_table(evaluator: Evaluator, theta: FloatArray, *, seed: int = 0) -> TaylorTable:
+    """Remainders of J with its gradient and its Hessian along a random direction, at theta but off the nodes."""
+    at = _off_nodes(evaluator, theta)
+    base = evaluator(at)
+    direction = np.random.default_rng(seed).choice([-1.0, 1.0], size=len(at)) * _scales(base, at)
+    largest = _room(evaluator, at, direction)
+    steps: FloatArray = largest * 0.5 ** np.arange(8.0)
+    remainders = np.array([_remainders(evaluator, base, at, h, direction) for h in steps])
+    rounding = remainders < 1e3 * np.finfo(float).eps * max(abs(base.cost), float(remainders.max()))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        orders = np.where(rounding[1:], np.nan, np.log2(remainders[:-1] / remainders[1:]))
+    return TaylorTable(steps, remainders, orders, at)
+
+
+def observed_orders(orders: FloatArray) -> tuple[float, ...]:
+    """Median order of each remainder over the steps at which it is not yet rounding; NaN if it always is."""
+    return tuple(_median(orders[:, k]) for k in range(3))
+
+
+def orders_right(observed: tuple[float, ...]) -> bool:
+    """Whether they are 1, 2, 3 or more within 0.25, or beyond what can be seen."""
+    return all(order > k - 0.25 or np.isnan(order) for k, order in enumerate(observed, start=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,14 +84,13 @@ class DerivativeCheck:
     @property
     def observed_orders(self) -> tuple[float, ...]:
         """Median order of each remainder over the steps at which it is not yet rounding; NaN if it always is."""
-        return tuple(_median(self.orders[:, k]) for k in range(3))
+        return observed_orders(self.orders)
 
     @property
     def passed(self) -> bool:
         """Whether the orders are 1, 2, 3 within 0.25, or beyond what can be seen, and the methods agree to 1e-4."""
-        agree = self.stiff or max(self.gradient_gap, self.hessian_gap) < 1e-4
-        right = all(order > k - 0.25 or np.isnan(order) for k, order in enumerate(self.observed_orders, start=1))
-        return right and agree
+        agree = self.stiff or max(self.gradient_gap, self.hessian_gap) < LARGEST_GAP
+        return orders_right(self.observed_orders) and agree
 
     def __str__(self) -> str:
         lines = ["Taylor remainders of J along a random direction", ""]
@@ -91,18 +127,11 @@ def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, seed:
         Print it, or look at ``.passed``.
     """
     evaluator = evaluator_of(problem)
-    at = _off_nodes(evaluator, problem.checked_theta(theta))
-    base = evaluator(at)
-    direction = np.random.default_rng(seed).choice([-1.0, 1.0], size=len(at)) * _scales(base, at)
-    largest = _room(evaluator, at, direction)
-    steps: FloatArray = largest * 0.5 ** np.arange(8.0)
-    remainders = np.array([_remainders(evaluator, base, at, h, direction) for h in steps])
-    rounding = remainders < 1e3 * np.finfo(float).eps * max(abs(base.cost), float(remainders.max()))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        orders = np.where(rounding[1:], np.nan, np.log2(remainders[:-1] / remainders[1:]))
+    table = taylor_table(evaluator, problem.checked_theta(theta), seed=seed)
+    at = table.theta
     gaps = derivative_gap(evaluator, at)
     halved = derivative_gap(evaluator.divided(), at)
-    return DerivativeCheck(steps, remainders, orders, *gaps, *halved, at, problem.solver == "stiff")
+    return DerivativeCheck(table.steps, table.remainders, table.orders, *gaps, *halved, at, problem.solver == "stiff")
 
 
 def derivative_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[float, float]:

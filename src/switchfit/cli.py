@@ -98,9 +98,8 @@ def fit(
         if out is not None:
             _make_folder(out)
         estimate = _estimate(loaded, options, prepare_figures=figures)
-        report = str(estimate)
-        if certificate:
-            report += f"\n\nCertificate\n{estimate.certificate}"
+        checked = f"\n\nCertificate\n{estimate.certificate}" if certificate else ""
+        report = str(estimate) + checked  # after the certificate, which it begins with where that fails
         typer.echo(report)
         if out is not None:
             _write(out / "report.txt", lambda path: path.write_text(report + "\n", encoding="utf-8"))
@@ -122,12 +121,12 @@ def check(problem: ProblemPath, debug: Debug = False) -> None:
     with _reported(debug):
         loaded = _load(problem)
         import switchfit as sf
-        from switchfit.io.summary import describe, identifiability
+        from switchfit.io.summary import describe
 
         typer.echo(f"{describe(loaded.problem)}\n")
         derivatives = sf.check_derivatives(loaded.problem)
         typer.echo(f"{derivatives}\n")
-        typer.echo(identifiability(loaded.problem))
+        typer.echo(sf.identifiability(loaded.problem))
     if not derivatives.passed:
         raise typer.Exit(NOT_CONVERGED)
 
@@ -263,7 +262,7 @@ def _save(estimate: Any, path: Path, *, complete: bool) -> None:
     from switchfit.certificate import certify
     from switchfit.io.json import save_fit
 
-    save_fit(estimate, estimate.certificate if complete else certify(estimate, None), path)
+    save_fit(estimate.complete(), estimate.certificate if complete else certify(estimate, None), path)
 
 
 @contextlib.contextmanager

@@ -2,33 +2,40 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.certificate import certify
-from switchfit.data import FloatArray, Measurements, TerminalConstraint
-from switchfit.evaluate import ArrowEvaluation, Evaluation, Evaluator, evaluator_of
+from switchfit.data import FloatArray
+from switchfit.evaluate import Evaluator, evaluator_of
 from switchfit.guards import on_guards
+from switchfit.identifiability import Identifiability, identifiability
 from switchfit.io.json import load_fit, save_fit
-from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize, minimize_constrained
+from switchfit.optimize import IterationRecord, Result, Status, minimize_constrained
+from switchfit.optimize.sqp import HessianKind
+from switchfit.prediction import Prediction, predict
 from switchfit.problem import Problem
+from switchfit.profile import Profile, profile
+from switchfit.progress import Progress
 from switchfit.refine import refined_mesh
-from switchfit.report.plot import plot_fit
-from switchfit.report.text import report
+from switchfit.report.plot import LARGEST_FIGURE, Bands, plot_fit
+from switchfit.report.text import report, run_names, standard_errors_of
+from switchfit.report.uncertainty import plot_diagnostics
+from switchfit.residuals import ResidualDiagnostics, diagnose
 from switchfit.result import Certificate, Fit
+from switchfit.sensitivity import Sensitivity, gauss_newton_of, sample_derivatives, sensitivity
 from switchfit.simulate import compare
+from switchfit.solve import constraints_of, minimized, sigma_known, with_names
 
-HessianKind = Literal["exact", "descent-first", "block-diagonal", "gauss-newton", "none"]
-HESSIANS = ("exact", "descent-first", "block-diagonal", "gauss-newton", "none")
+HESSIANS = get_args(HessianKind)
 
 REFINEMENTS = 2
 """Times the mesh may be refined at the solution and the fit resumed, if the integration error asks for it."""
@@ -40,9 +47,8 @@ PERFECT_FIT = 1e-3
 """Where J has fallen to less than this part of its first value, the integration error is measured against that part:
 the relative error of a cost that vanishes says nothing."""
 
-MANY_RUNS = 16
-"""Experiments from which on the Hessian's shape of an arrow is made use of; with fewer, the algebra of full matrices
-takes no longer (the runs part of the benchmarks)."""
+MOST_SENSITIVITIES = 2**28
+"""Bytes that the derivatives of states and outputs at all nodes may take; beyond, figures have no bands."""
 
 ORDER = 5
 """Order of both integrators: what dividing the steps gains."""
@@ -54,6 +60,7 @@ class Estimate(Fit):
 
     saved_certificate: Certificate | None = None
     problem: Problem | None = None
+    evaluator: Evaluator | None = None
 
     @cached_property
     def certificate(self) -> Certificate:
@@ -65,37 +72,131 @@ class Estimate(Fit):
             return self.saved_certificate
         return certify(self, None if self.problem is None else Evaluator(self.problem, theta=self.theta))
 
-    def __str__(self) -> str:
-        return report(self)
+    @cached_property
+    def gauss_newton(self) -> FloatArray | None:
+        """The Gauss-Newton matrix ``sum (D h / sigma)' (D h / sigma)``: (d, d); None where it is not known."""
+        if self.saved_gauss_newton is not None or self.sigma_known is None or self.problem is None:
+            return self.saved_gauss_newton
+        if self._sensitivities_fit():
+            return gauss_newton_of(sample_derivatives(self.problem, self.sensitivities))
+        return self.evaluator_at_solution()(self.theta, matrix="gauss-newton").hessian
 
-    def plot(self) -> Any:
-        """Measured against fitted over time with the modes shaded, as a matplotlib Figure."""
-        return plot_fit(self)
+    def _sensitivities_fit(self) -> bool:
+        """Whether the derivatives at all nodes take less memory than is worth it."""
+        rows = sum(len(mesh.nodes) for mesh in self.evaluator_at_solution().meshes)
+        width = max(
+            t.states.shape[1] + sum(len(c.names) for c in run)
+            for t, run in zip(self.trajectories, self.comparisons, strict=True)
+        )
+        return 16 * rows * width * len(self.theta) <= MOST_SENSITIVITIES
 
-    def save(self, path: str | Path) -> None:
-        """Write everything but the model to a JSON file, atomically; `load` reads it."""
-        save_fit(self, self.certificate, Path(path))
+    @cached_property
+    def sensitivities(self) -> tuple[Sensitivity, ...]:
+        """States and outputs with their derivatives in theta, one an experiment, on the meshes of the fit."""
+        evaluator = self.evaluator_at_solution()
+        meshes = enumerate(evaluator.meshes)
+        return tuple(sensitivity(evaluator.problem, e, self.theta, mesh) for e, mesh in meshes)
 
-    @classmethod
-    def load(cls, path: str | Path) -> Estimate:
-        """Read what `save` wrote.
+    def evaluator_at_solution(self) -> Evaluator:
+        """The problem on the meshes of the fit.
 
         Raises
         ------
         ValueError
-            If the file is not one of switchfit's.
+            If the estimate was loaded from a file without its problem.
+        """
+        if self.problem is None:
+            raise ValueError(
+                "This estimate was loaded without its model: load it with Estimate.load(path, problem=problem)."
+            )
+        return self.evaluator or Evaluator(self.problem, theta=self.theta)
+
+    def profile(self, name: str, *, level: float = 0.95, callback: Progress | None = None) -> Profile:
+        """Profile likelihood of one parameter or transition time, see `switchfit.profile`.
+
+        Parameters
+        ----------
+        name : str
+        level : float
+        callback : callable, optional
+        """
+        return profile(self, name, level=level, callback=callback)
+
+    def __str__(self) -> str:
+        known = self.saved_certificate or self.__dict__.get("certificate")
+        return report(self, known, self.identifiability)
+
+    def plot(self, *, bands: bool = True, level: float = 0.95) -> Any:
+        """Measured against fitted over time with the modes shaded, as a matplotlib Figure.
+
+        Parameters
+        ----------
+        bands : bool
+            Confidence and prediction bands of what is fitted, where there is a model and a covariance; the first ones
+            of a model are compiled for a second.
+        level : float, between 0 and 1
+            Of the bands.
+        """
+        quantile = self.quantile(level)
+        drawn = bands and self.problem is not None and np.isfinite(standard_errors_of(self)).all()
+        shown = range(min(len(self.trajectories), LARGEST_FIGURE)) if drawn and self._sensitivities_fit() else range(0)
+        return plot_fit(self, [Bands.of(predict(self, experiment=e), quantile, level) for e in shown])
+
+    def predict(self, times: ArrayLike | None = None, *, experiment: int = 0) -> Prediction:
+        """States and outputs at any times with their standard errors and bands, see `switchfit.predict`.
+
+        Parameters
+        ----------
+        times : (K,) array_like, optional
+        experiment : int
+        """
+        return predict(self, times, experiment=experiment)
+
+    @property
+    def residuals(self) -> ResidualDiagnostics:
+        """Tests of the residuals, channel by channel: whiteness, normality, effective sample size."""
+        return diagnose(self, run_names(self))
+
+    def plot_residuals(self) -> Any:
+        """Residuals in time, their autocorrelation and their quantiles, as a matplotlib Figure."""
+        return plot_diagnostics(self.residuals)
+
+    @cached_property
+    def identifiability(self) -> Identifiability:
+        """Which combinations of the unknowns the data determine badly, with J evaluated there."""
+        return identifiability(self)
+
+    def save(self, path: str | Path) -> None:
+        """Write everything but the model to a JSON file, atomically; `load` reads it."""
+        save_fit(self.complete(), self.certificate, Path(path))
+
+    def complete(self) -> Estimate:
+        """The same with everything that is saved, which is the Gauss-Newton matrix."""
+        return replace(self, saved_gauss_newton=self.gauss_newton)
+
+    @classmethod
+    def load(cls, path: str | Path, *, problem: Problem | None = None) -> Estimate:
+        """Read what `save` wrote.
+
+        Parameters
+        ----------
+        path : path
+        problem : Problem, optional
+            The problem that was fitted, where profiles or predictions are wanted: a file does not hold the model.
+
+        Raises
+        ------
+        ValueError
+            If the file is not one of switchfit's, or the problem has other unknowns.
         """
         fit, certificate = load_fit(Path(path))
-        return cls(**{f.name: getattr(fit, f.name) for f in fields(Fit)}, saved_certificate=certificate)
-
-
-@dataclass(frozen=True, eq=False)
-class CostAndGradient:
-    """All that steepest descent is given."""
-
-    cost: float
-    gradient: FloatArray
-    hessian: None = None
+        if problem is not None and problem.theta_names != fit.theta_names:
+            raise ValueError(
+                f"{path} holds the unknowns {', '.join(fit.theta_names)}, the problem has "
+                f"{', '.join(problem.theta_names)}: it is the fit of another problem."
+            )
+        own = {f.name: getattr(fit, f.name) for f in fields(Fit)}
+        return cls(**own, saved_certificate=certificate, problem=problem)
 
 
 def estimate(
@@ -234,58 +335,6 @@ def _numbered_on(record: IterationRecord, after: IterationRecord | None) -> Iter
     )
 
 
-def constraints_of(problem: Problem) -> LinearConstraints:
-    """Ordering, minimum durations and bounds of a problem as the optimiser takes them."""
-    unknowns = problem.unknowns
-    names = [
-        *unknowns.constraint_names,
-        *(f"{name} at its lower bound {value:g}" for name, value in zip(unknowns.names, unknowns.lower, strict=True)),
-        *(f"{name} at its upper bound {value:g}" for name, value in zip(unknowns.names, unknowns.upper, strict=True)),
-    ]
-    return LinearConstraints(unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, tuple(names))
-
-
-def minimized(
-    evaluator: Evaluator,
-    theta: Any,
-    hessian: HessianKind,
-    tolerance: float,
-    max_iterations: int,
-    callback: Callable[[IterationRecord], object] | None = None,
-    by_blocks: bool | None = None,
-) -> Result:
-    """One run of the optimiser on the evaluator's meshes; arguments as of `estimate`.
-
-    `by_blocks` says whether to use the shape that the Hessian of several runs has; left out, where it pays.
-    """
-    problem = evaluator.problem
-
-    matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
-    if by_blocks is None:
-        by_blocks = len(problem.experiments) >= MANY_RUNS and 2 * len(evaluator.layout.shared) < len(theta)
-
-    def evaluate(theta: Any, side: int) -> Evaluation | ArrowEvaluation | CostAndGradient:
-        if hessian not in ("none", "descent-first") and by_blocks:
-            return evaluator.arrow(theta, side, matrix)
-        here = evaluator(theta, side, matrix=matrix)
-        return CostAndGradient(here.cost, here.gradient) if hessian == "none" else here
-
-    is_time = np.zeros(len(theta), dtype=int)
-    for where in problem.unknowns.times:
-        is_time[where[where >= 0]] = 1
-    return minimize(
-        evaluate,
-        theta,
-        constraints=constraints_of(problem),
-        breakpoints=evaluator.breakpoints(),
-        hessian=hessian,
-        blocks=is_time,
-        tolerance=tolerance,
-        max_iterations=max_iterations,
-        callback=callback,
-    )
-
-
 def _estimate(
     problem: Problem,
     evaluator: Evaluator,
@@ -324,18 +373,6 @@ def _estimate(
         hessian_kind=hessian,
         tolerance=tolerance,
         problem=problem,
+        evaluator=evaluator,
         **rest,
     )
-
-
-def with_names(message: str, names: tuple[str, ...]) -> str:
-    """The optimiser's message with the unknowns called by their names."""
-    return re.sub(r"theta\[(\d+)\]", lambda match: names[int(match.group(1))], message)
-
-
-def sigma_known(problem: Problem) -> bool | None:
-    """Whether sigma is known for all measurements; None where the cost is not made of measurements alone."""
-    items = [item for run in problem.experiments for item in run.data if not isinstance(item, TerminalConstraint)]
-    if not items or not all(isinstance(item, Measurements) for item in items):
-        return None
-    return all(item.sigma is not None for item in items)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import scipy.special
@@ -13,6 +13,8 @@ import scipy.special
 from switchfit.data import FloatArray
 from switchfit.optimize import IterationRecord, Status
 from switchfit.simulate import Comparison, Trajectory
+
+CovarianceKind = Literal["exact", "gauss-newton"]
 
 
 @dataclass(frozen=True)
@@ -37,8 +39,14 @@ class Certificate:
     gradient_gap, hessian_gap : float
         Relative gap between the paper's equations (6)-(17) and the exact derivatives of the discretised cost; NaN
         where that was not checked.
+    taylor_orders : tuple of float
+        Orders of the remainders of J, of J with its gradient and of J with its Hessian along a random direction: at
+        least 1, 2, 3 where the derivatives are right (2, 2, 3 at a minimum, where the gradient vanishes); NaN where a
+        remainder is rounding, or where that was not checked.
     active : tuple of str
         Constraints that hold with equality, collapsed modes and bounds among them, and kinks.
+    failures : tuple of str
+        What of all this is not as it has to be; nothing: the certificate is good.
     """
 
     optimality: float
@@ -49,7 +57,14 @@ class Certificate:
     integration_error: float
     gradient_gap: float
     hessian_gap: float
+    taylor_orders: tuple[float, ...]
     active: tuple[str, ...]
+    failures: tuple[str, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing that was checked failed."""
+        return not self.failures
 
     def __str__(self) -> str:
         rows = [
@@ -61,13 +76,21 @@ class Certificate:
             ("integration error of J, relative", f"{self.integration_error:.1e}"),
             ("paper's gradient against discretised, relative", _gap(self.gradient_gap)),
             ("paper's Hessian against discretised, relative", _gap(self.hessian_gap)),
+            ("Taylor orders of J, with gradient, with Hessian", _orders(self.taylor_orders)),
             ("active constraints", "; ".join(self.active) or "none"),
+            ("verdict", f"FAILED: {'; '.join(self.failures)}" if self.failures else "passed"),
         ]
         return "\n".join(f"{label:<48} {value}" for label, value in rows)
 
 
 def _gap(gap: float) -> str:
     return "not checked" if np.isnan(gap) else f"{gap:.1e}"
+
+
+def _orders(orders: tuple[float, ...]) -> str:
+    if np.isnan(orders).all():
+        return "not checked"
+    return ", ".join("rounding" if np.isnan(order) else f"{order:.2f}" for order in orders)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +130,8 @@ class Fit:
         Wall time of the estimation.
     constraints : tuple of (name, value, multiplier)
         Guards and terminal constraints. With them the Hessian is that of J plus multipliers times constraints.
+    saved_gauss_newton : (d, d) or None
+        The Gauss-Newton matrix of the samples, where it has been evaluated.
     """
 
     theta_names: tuple[str, ...]
@@ -137,6 +162,7 @@ class Fit:
     tolerance: float
     seconds: float
     constraints: tuple[tuple[str, float, float], ...] = ()
+    saved_gauss_newton: FloatArray | None = None
 
     @property
     def success(self) -> bool:
@@ -163,8 +189,17 @@ class Fit:
     @property
     def residual_variance(self) -> float:
         """``2 J / (samples - free unknowns)``: near 1 where sigma is right; NaN without measurements."""
-        freedom = self.samples - self.free_basis.shape[1]
-        return 2 * self.cost / freedom if self.sigma_known is not None and freedom > 0 else np.nan
+        return 2 * self.cost / self.freedom if self.sigma_known is not None and self.freedom > 0 else np.nan
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom of the residuals: values less unknowns that no constraint holds."""
+        return self.samples - self.free_basis.shape[1]
+
+    @property
+    def gauss_newton(self) -> FloatArray | None:
+        """The Gauss-Newton matrix ``sum (D h / sigma)' (D h / sigma)``: (d, d); None where it is not known."""
+        return self.saved_gauss_newton
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -174,8 +209,34 @@ class Fit:
         collapsed mode or a kink has variance 0 here. NaN where the cost has no noise model (anything but
         `Measurements`), the Hessian is not positive definite, or there are too few samples.
         """
+        return self.covariance_from("exact")
+
+    def covariance_from(self, hessian: CovarianceKind) -> FloatArray:
+        """Covariance of theta from the exact Hessian or from the Gauss-Newton matrix: (d, d).
+
+        Parameters
+        ----------
+        hessian : {"exact", "gauss-newton"}
+            "exact", the observed information, is what `covariance` and everything else here uses. The Gauss-Newton
+            matrix, the expected information, leaves ``sum r D^2 h / sigma^2`` out: it is positive semi-definite
+            whatever the residuals are, and sees the model as linear.
+
+        Raises
+        ------
+        ValueError
+            For another kind, or where the Gauss-Newton matrix is not known: the cost is not made of Measurements
+            alone, or the estimate was loaded without its problem from a file that lacks it.
+        """
+        if hessian not in ("exact", "gauss-newton"):
+            raise ValueError(f"hessian must be 'exact' or 'gauss-newton'; got {hessian!r}.")
+        matrix = self.hessian if hessian == "exact" else self.gauss_newton
+        if matrix is None:
+            raise ValueError(
+                "The Gauss-Newton matrix of this fit is not known: it needs a cost made of Measurements alone, and the "
+                "problem. Take hessian='exact'."
+            )
         scale = self.residual_variance if self.sigma_known is False else 1.0
-        return (np.nan if self.sigma_known is None else scale) * inverse_on(self.free_basis, self.hessian)
+        return (np.nan if self.sigma_known is None else scale) * inverse_on(self.free_basis, matrix)
 
     @property
     def standard_errors(self) -> FloatArray:
@@ -185,25 +246,82 @@ class Fit:
     @property
     def correlation(self) -> FloatArray:
         """Correlation matrix of theta: (d, d); NaN for unknowns that are held."""
-        errors = self.standard_errors
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return self.covariance / np.outer(errors, errors)
+        return correlation_of(self.covariance)
 
-    def confidence_intervals(self, level: float = 0.95) -> FloatArray:
-        """Symmetric intervals theta +- quantile x standard error: (d, 2).
+    def quantile(self, level: float) -> float:
+        """Two-sided quantile: of Student's t where sigma is unknown, of the normal distribution where it is known."""
+        if not 0 < level < 1:
+            raise ValueError(f"level must lie between 0 and 1; got {level}.")
+        tail = 0.5 + level / 2
+        freedom = max(self.freedom, 1)
+        return float(scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail))
+
+    def confidence_intervals(self, level: float = 0.95, *, hessian: CovarianceKind = "exact") -> FloatArray:
+        """Intervals theta +- quantile x standard error, cut off at the bounds: (d, 2).
+
+        NaN for an unknown that is held by a bound, a collapsed mode or a kink: the quadratic approximation knows no
+        interval there. `profile` does.
 
         Parameters
         ----------
         level : float, between 0 and 1
             The quantile is of Student's t where sigma is unknown, of the normal distribution where it is known.
+        hessian : {"exact", "gauss-newton"}
+            As of `covariance_from`.
         """
-        if not 0 < level < 1:
-            raise ValueError(f"level must lie between 0 and 1; got {level}.")
-        freedom = max(self.samples - self.free_basis.shape[1], 1)
-        tail = 0.5 + level / 2
-        quantile = scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail)
-        half = quantile * self.standard_errors
-        return np.stack([self.theta - half, self.theta + half], axis=1)
+        half = self.quantile(level) * np.sqrt(np.diag(self.covariance_from(hessian)))
+        half = np.where(half > 0, half, np.nan)
+        return np.stack([np.maximum(self.theta - half, self.lower), np.minimum(self.theta + half, self.upper)], axis=1)
+
+
+def correlation_of(covariance: FloatArray) -> FloatArray:
+    """Correlations (d, d) from covariances; NaN where a variance is 0."""
+    errors = np.sqrt(np.diag(covariance))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(covariance / np.outer(errors, errors))
+
+
+class Disagreement(NamedTuple):
+    """How far the standard errors from the exact Hessian and from the Gauss-Newton matrix lie apart.
+
+    Attributes
+    ----------
+    factor : float
+        Largest ratio of the two, one way or the other, of any linear combination of the unknowns.
+    name : str
+        The unknown whose own standard errors differ the most.
+    exact, gauss_newton : float
+        Its standard errors.
+    """
+
+    factor: float
+    name: str
+    exact: float
+    gauss_newton: float
+
+
+def disagreement(fit: Fit) -> Disagreement | None:
+    """Compare the two covariances of a fit; None where one of them is not known.
+
+    The ratios of the two variances over all linear combinations of the unknowns lie between the smallest and the
+    largest eigenvalue of ``A v = lambda H v`` on the free directions, A being the Gauss-Newton matrix.
+    """
+    Z, A = fit.free_basis, fit.gauss_newton
+    if A is None or fit.sigma_known is None or Z.shape[1] == 0:
+        return None
+    both = fit.covariance, fit.covariance_from("gauss-newton")
+    if not all(np.isfinite(covariance).all() for covariance in both):
+        return None
+    errors = np.sqrt([np.diag(covariance) for covariance in both])
+    size = 1 / np.sqrt(np.diag(Z.T @ fit.hessian @ Z))
+    root = np.linalg.cholesky((Z.T @ fit.hessian @ Z) * np.outer(size, size))
+    half = np.linalg.solve(root, (Z.T @ A @ Z) * np.outer(size, size))
+    ratios = np.linalg.eigvalsh(np.linalg.solve(root, half.T))
+    held = errors[0] <= 0
+    changes = np.where(held, 0.0, np.abs(np.log(np.where(held, 1.0, errors[0]) / np.where(held, 1.0, errors[1]))))
+    k = int(np.argmax(changes))
+    factor = float(np.sqrt(max(ratios[-1], 1 / ratios[0])))
+    return Disagreement(factor, fit.theta_names[k], float(errors[0][k]), float(errors[1][k]))
 
 
 def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:
@@ -243,13 +361,31 @@ def free_curvature(fit: Fit) -> FreeCurvature:
     Z = fit.free_basis
     if Z.shape[1] == 0 or not np.isfinite(fit.hessian).all():
         return FreeCurvature(np.nan, np.zeros(0), ())
-    size = 1 / np.sqrt(np.maximum(np.abs(np.diag(fit.hessian)), np.finfo(float).tiny))
-    basis = np.linalg.qr(Z / size[:, None])[0]
-    scaled, vectors = np.linalg.eigh(basis.T @ (fit.hessian * np.outer(size, size)) @ basis)
-    weight = np.abs(basis @ vectors[:, 0])
+    spectrum = scaled_spectrum(fit.hessian, Z)
+    weight = np.abs(spectrum.vectors[:, 0])
     strong = [i for i in np.argsort(-weight, kind="stable") if weight[i] > 0.3 * weight.max()][:4]
     smallest = float(np.linalg.eigvalsh(Z.T @ fit.hessian @ Z)[0])
-    return FreeCurvature(smallest, scaled, tuple(fit.theta_names[i] for i in strong))
+    return FreeCurvature(smallest, spectrum.values, tuple(fit.theta_names[i] for i in strong))
+
+
+class ScaledSpectrum(NamedTuple):
+    """Eigenvalues (k,), ascending, and eigenvectors (d, k) of a Hessian scaled to unit curvature of each unknown.
+
+    `size` (d,) is the scaling: an eigenvector times it is a direction in theta.
+    """
+
+    values: FloatArray
+    vectors: FloatArray
+    size: FloatArray
+
+
+def scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> ScaledSpectrum:
+    """Of a finite Hessian (d, d) on the directions Z (d, k)."""
+    diagonal = np.abs(np.diag(hessian))
+    size = 1 / np.sqrt(np.where(diagonal > np.finfo(float).tiny, diagonal, 1.0))
+    basis = np.linalg.qr(Z / size[:, None])[0]
+    values, vectors = np.linalg.eigh(basis.T @ (hessian * np.outer(size, size)) @ basis)
+    return ScaledSpectrum(values, basis @ vectors, size)
 
 
 def _discrete(comparison: Comparison) -> bool:

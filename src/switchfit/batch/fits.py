@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -15,11 +14,12 @@ import numpy as np
 import scipy.special
 from numpy.typing import NDArray
 
-from switchfit.batch.chunks import Progress, Work, run_chunks
+from switchfit.batch.chunks import Work, run_chunks
 from switchfit.data import FloatArray, Measurements
-from switchfit.estimate import sigma_known
 from switchfit.optimize import Status
 from switchfit.problem import Problem
+from switchfit.progress import reporting
+from switchfit.solve import sigma_known
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ def repeat(
             f"{title} takes no guards and no terminal constraints; this problem has {problem.constraint_names[0]!r}. "
             "Call sf.estimate for one fit after the other."
         )
-    progress, end = _reporting(callback, title)
+    progress, end = reporting(callback, title)
     try:
         runs, arrays = run_chunks(work, count, client=client, folder=folder, progress=progress)
     finally:
@@ -192,22 +192,3 @@ def _fields(
 def sample_count(problem: Problem) -> int:
     """Measured values that are not missing."""
     return sum(item.count for run in problem.experiments for item in run.data if isinstance(item, Measurements))
-
-
-def _reporting(callback: Callable[[int, int], object] | None, title: str) -> tuple[Progress, Callable[[], None]]:
-    """What `run_chunks` calls: the user's callback, and a bar where there is a terminal; and what ends the bar."""
-    if not sys.stderr.isatty():
-        return (lambda done, total: callback is not None and callback(done, total)), lambda: None
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    bar = Progress(*columns, console=Console(stderr=True), transient=True)
-    task = bar.add_task(title, total=None)
-    bar.start()
-
-    def report(done: int, total: int) -> object:
-        bar.update(task, completed=done, total=total)
-        return callback is not None and callback(done, total)
-
-    return report, bar.stop

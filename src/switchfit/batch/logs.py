@@ -14,12 +14,13 @@ import numpy as np
 from switchfit.batch.chunks import Arrays, fingerprint
 from switchfit.batch.fits import Fits, repeat, sample_count
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
-from switchfit.estimate import LARGEST_INTEGRATION_ERROR, estimate, sigma_known
+from switchfit.estimate import LARGEST_INTEGRATION_ERROR, estimate
 from switchfit.evaluate import evaluator_of
 from switchfit.optimize import Status
 from switchfit.problem import Problem
 from switchfit.result import inverse_on
 from switchfit.simulate import compare
+from switchfit.solve import sigma_known
 
 
 def estimate_many(

@@ -134,11 +134,57 @@ def monte_carlo(
     began = time.perf_counter()
     truth = estimate(problem).theta if theta is None else problem.checked_theta(theta)
     begin = truth if start is None else problem.checked_theta(start)
+    found, error = simulated(
+        problem,
+        runs,
+        truth,
+        begin,
+        noise,
+        seed=seed,
+        tolerance=tolerance,
+        max_iterations=max_iterations,
+        title="Monte Carlo",
+        began=began,
+        client=client,
+        folder=folder,
+        callback=callback,
+    )
+    return MonteCarlo(**found, truth=truth, integration_error=error)
+
+
+def simulated(
+    problem: Problem,
+    runs: int,
+    truth: FloatArray,
+    begin: FloatArray,
+    noise: Noise,
+    *,
+    seed: int,
+    tolerance: float,
+    max_iterations: int,
+    title: str,
+    began: float,
+    client: Any,
+    folder: str | Path | None,
+    callback: Callable[[int, int], object] | None,
+) -> tuple[dict[str, Any], float]:
+    """Fits of simulated data: the fields of `Fits`, and the integration error at the truth.
+
+    Parameters
+    ----------
+    problem, runs, noise, seed, tolerance, max_iterations, client, folder, callback : as of `monte_carlo`
+    truth, begin : (d,)
+        Where the data are simulated, and where every fit begins.
+    title : str
+        Of the bar on the terminal.
+    began : float
+        ``time.perf_counter()`` when the call began.
+    """
     work = _Work(problem, [], truth, begin, noise, seed, tolerance, max_iterations, _clean(problem, truth))
     work.check_noise()
     work.meshes, error = _meshes(work.problem_of(0), truth, begin)
-    found = repeat(problem, work, runs, "Monte Carlo", began, client=client, folder=folder, callback=callback)
-    return MonteCarlo(**found, truth=truth, integration_error=error)
+    found = repeat(problem, work, runs, title, began, client=client, folder=folder, callback=callback)
+    return found, error
 
 
 def _clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray | None]]:

@@ -17,13 +17,14 @@ from switchfit.batch.chunks import Arrays, fingerprint
 from switchfit.batch.fits import Fits, repeat, sample_count
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
 from switchfit.data import FloatArray, as_numbers
-from switchfit.estimate import Estimate, constraints_of, estimate
+from switchfit.estimate import Estimate, estimate
 from switchfit.evaluate import evaluator_of
 from switchfit.mesh import Mesh
 from switchfit.optimize.qp import solve_qp
 from switchfit.problem import Problem
 from switchfit.report.batch import plot_waterfall
 from switchfit.simulate import compare
+from switchfit.solve import constraints_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from switchfit.cache import compilation_cache
 from switchfit.data import FloatArray
-from switchfit.estimate import minimized, with_names
 from switchfit.evaluate import Evaluator, derivatives
 from switchfit.mesh import Mesh
 from switchfit.model import Arguments, Structure, float64
@@ -32,6 +31,7 @@ from switchfit.optimize import Status
 from switchfit.optimize.traced import Constraints, Outcome, minimize_traced
 from switchfit.problem import Problem
 from switchfit.result import inverse_on
+from switchfit.solve import minimized, with_names
 
 CHUNK = 32
 """Fits that one call of the program takes on a CPU."""

@@ -1,16 +1,12 @@
-"""What `switchfit check` says about a problem before any fit: its data, its unknowns, what the data can tell."""
+"""What `switchfit check` says about a problem before any fit: its data and its unknowns."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from switchfit.data import Measurements, ReferenceSignal
-from switchfit.evaluate import evaluator_of
 from switchfit.experiment import Experiment
 from switchfit.problem import Problem
-
-#: Eigenvalues of the scaled Gauss-Newton matrix below this are called undetermined.
-UNDETERMINED = 1e-10
 
 
 def describe(problem: Problem) -> str:
@@ -58,28 +54,3 @@ def _experiment_lines(experiment: Experiment) -> list[str]:
 
 def _names(names: tuple[str, ...] | None, channels: int) -> str:
     return ", ".join(names) if names else f"{channels} channels"
-
-
-def identifiability(problem: Problem) -> str:
-    """How well the data determine the unknowns at the first guess, by the Gauss-Newton matrix, as text.
-
-    Parameters
-    ----------
-    problem : Problem
-    """
-    H = evaluator_of(problem)(problem.initial_theta, matrix="gauss-newton").hessian
-    scale = np.sqrt(np.diag(H))
-    names = np.array(problem.theta_names)
-    without = names[~(scale > 0)]
-    if len(without):
-        return f"At the first guess the cost does not depend on {', '.join(without)}, to first order."
-    values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
-    worst = vectors[:, 0] * np.sign(vectors[np.argmax(np.abs(vectors[:, 0])), 0])
-    order = [k for k in np.argsort(-np.abs(worst), kind="stable") if abs(worst[k]) > 0.2]
-    together = " ".join(f"{worst[k]:+.2f} {names[k]}" for k in order)
-    if values[0] < UNDETERMINED:
-        return f"At the first guess the data do not determine this combination of the scaled unknowns: {together}."
-    return (
-        f"At the first guess the data determine all {len(names)} unknowns; condition number of the scaled problem "
-        f"{values[-1] / values[0]:.3g}, worst determined: {together}."
-    )

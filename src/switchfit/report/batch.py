@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,12 +10,19 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from switchfit.batch.bootstrap import Bootstrap
     from switchfit.batch.monte_carlo import MonteCarlo
     from switchfit.batch.multistart import Multistart
 
 ESTIMATE, TRUTH, NORMAL = "#4a7fb5", "#b2182b", "#222222"
 CLUSTER_COLOURS = ("#b2182b", "#4a7fb5", "#e0a030", "#5c9e5c", "#8a5fa3", "#777777")
 COLUMNS = 3
+BOOTSTRAP_TITLES = {
+    "residuals": "Bootstrap of residuals",
+    "wild": "Bootstrap of residuals with random signs",
+    "blocks": "Bootstrap of blocks of residuals",
+    "runs": "Bootstrap of runs",
+}
 
 
 def table_of_monte_carlo(study: MonteCarlo) -> list[str]:
@@ -26,7 +34,7 @@ def table_of_monte_carlo(study: MonteCarlo) -> list[str]:
     with np.errstate(invalid="ignore"):
         reported = np.median(study.standard_errors[study.success], axis=0)
     header = ("", "truth", "bias", "+-", "spread", "standard error", "in 95 % interval")
-    rows = [
+    rows: list[Sequence[str]] = [
         (
             f"{name} ({unit})" if unit and unit != "1" else name,
             f"{truth:.6g}",
@@ -40,12 +48,67 @@ def table_of_monte_carlo(study: MonteCarlo) -> list[str]:
             study.theta_names, study.theta_units, study.truth, bias, spread, reported, coverage, strict=True
         )
     ]
-    widths = [max(len(row[k]) for row in [header, *rows]) for k in range(len(header))]
+    return _table([header, *rows])
+
+
+def _table(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Rows with their columns aligned to the right, the first one to the left."""
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     lines = []
-    for first, *others in [header, *rows]:
+    for first, *others in rows:
         aligned = [entry.rjust(width) for entry, width in zip(others, widths[1:], strict=True)]
         lines.append("  ".join([first.ljust(widths[0]), *aligned]).rstrip())
     return lines
+
+
+def table_of_bootstrap(study: Bootstrap) -> list[str]:
+    """One line an unknown: estimate, bias, bootstrap standard error, 95 % interval (BCa)."""
+    if int(study.success.sum()) < 2:
+        return ["Fewer than two fits converged: no statistics."]
+    rows: list[Sequence[str]] = [("", "estimate", "bias", "standard error", "95 % interval (BCa)")]
+    columns = study.theta_names, study.theta_units, study.estimate, study.bias, study.standard_deviation
+    for k, (name, unit, value, bias, error) in enumerate(zip(*columns, strict=True)):
+        label = f"{name} ({unit})" if unit and unit != "1" else name
+        if not study.resampled[k]:
+            rows.append((label, f"{value:.6g}", "-", "-", "of one run alone"))
+            continue
+        low, high = study.intervals()[k]
+        rows.append((label, f"{value:.6g}", f"{bias:+.2e}", f"{error:.3e}", f"[{low:.6g}, {high:.6g}]"))
+    return _table(rows)
+
+
+def plot_bootstrap(study: Bootstrap) -> Figure:
+    """A histogram an unknown: estimates of the resampled data, the estimate, and its 95 % interval."""
+    from matplotlib.figure import Figure
+
+    shown = np.flatnonzero(study.resampled)
+    columns = max(min(len(shown), COLUMNS), 1)
+    rows = max(-(-len(shown) // columns), 1)
+    figure = Figure(figsize=(3.4 * columns, 2.7 * rows + 0.5), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    theta, intervals = study.theta[study.success], study.intervals()
+    for ax, k in zip(axes, shown, strict=False):
+        middle = np.percentile(theta[:, k], [0.5, 99.5])
+        reach = max(float(np.ptp(middle)), 1e-12 * abs(study.estimate[k]), np.finfo(float).tiny)
+        limits = (middle[0] - 0.25 * reach, middle[1] + 0.25 * reach)
+        ax.hist(theta[:, k], bins=40, range=limits, color=ESTIMATE, alpha=0.7, label=f"{len(theta)} estimates")
+        ax.axvline(study.estimate[k], color=TRUTH, linewidth=1.4, label="estimate")
+        for side, edge in enumerate(intervals[k]):
+            ax.axvline(edge, color=NORMAL, linestyle=":", linewidth=1.2, label="" if side else "95 % interval (BCa)")
+        unit = study.theta_units[k]
+        ax.set_xlabel(study.theta_names[k] + (f" ({unit})" if unit and unit != "1" else ""))
+        ax.set_xlim(limits)
+        ax.set_yticks([])
+        ax.ticklabel_format(axis="x", useOffset=False)
+        ax.locator_params(axis="x", nbins=4)
+    for ax in axes[len(shown) :]:
+        ax.set_visible(False)
+    axes[0].set_ylabel("fits")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside upper center", ncols=3, frameon=False, title=BOOTSTRAP_TITLES[study.resample]
+    )
+    return figure
 
 
 def plot_monte_carlo(study: MonteCarlo) -> Figure:

@@ -9,9 +9,11 @@ matplotlib is imported where a figure is made, not at the top: it takes longer t
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.data import FloatArray
 from switchfit.optimize import IterationRecord
@@ -33,12 +35,53 @@ MODE_COLOURS = ("#eef4fb", "#f9dfbf", "#e2f2df", "#e9d0e2", "#faf7d4", "#c9dfe1"
 FIT, DATA, REFERENCE, TRANSITION = "#b2182b", "#222222", "#777777", "#333333"
 
 
-def plot_fit(fit: Fit) -> Figure:
+@dataclass(frozen=True, eq=False)
+class Bands:
+    """Bands of what is fitted in one experiment, at times as of `Trajectory`.
+
+    Attributes
+    ----------
+    times : (L,)
+    segments : (N + 2,) int
+        As of `Trajectory`.
+    states : (L, n, 2)
+        Confidence band.
+    outputs, predicted : (L, q, 2)
+        Confidence band, and where a new sample would fall, NaN for reference signals.
+    level : float
+    """
+
+    times: FloatArray
+    segments: NDArray[np.intp]
+    states: FloatArray
+    outputs: FloatArray
+    predicted: FloatArray
+    level: float
+
+    @classmethod
+    def of(cls, prediction: Any, quantile: float, level: float) -> Bands:
+        """Of a `Prediction` at all nodes."""
+        jumps = np.flatnonzero(np.diff(prediction.times) == 0) + 1
+        half = quantile * prediction.state_errors
+        errors = quantile * prediction.output_errors, quantile * np.hypot(prediction.output_errors, prediction.noise)
+        states, outputs = prediction.states, prediction.outputs
+        return cls(
+            prediction.times,
+            np.concatenate([[0], jumps, [len(prediction.times)]]),
+            np.stack([states - half, states + half], axis=-1),
+            np.stack([outputs - errors[0], outputs + errors[0]], axis=-1),
+            np.stack([outputs - errors[1], outputs + errors[1]], axis=-1),
+            level,
+        )
+
+
+def plot_fit(fit: Fit, bands: Sequence[Bands] = ()) -> Figure:
     """Every channel of every experiment, measured and fitted, with its residuals below; states where there is no data.
 
     Parameters
     ----------
     fit : Fit
+    bands : sequence of Bands, one an experiment, optional
 
     Returns
     -------
@@ -61,6 +104,8 @@ def plot_fit(fit: Fit) -> Figure:
     for e in range(shown):
         block = figure.add_subfigure(grid[divmod(e, columns)])
         _draw_experiment(fit, e, block, panels[e // columns], colours)
+        if bands:
+            _draw_bands(fit, e, block.axes, bands[e])
     _head(fit, figure, shown, colours)
     return figure
 
@@ -294,6 +339,51 @@ def _draw_experiment(fit: Fit, e: int, block: Any, rows: int, colours: Mapping[s
         block.suptitle(run_names(fit)[e], fontsize="medium", fontweight="bold")
 
 
+def _draw_bands(fit: Fit, e: int, axes: Sequence[Axes], bands: Bands) -> None:
+    """Bands in the panels of one experiment; its channels come with their residuals, states alone."""
+    panels = _panels(fit, e)
+    if panels[0][0] is None:
+        for ax, band in zip(axes, np.moveaxis(bands.states, 1, 0), strict=True):
+            plot_band(bands, band, ax, alpha=0.3, label=f"{100 * bands.level:g} % confidence")
+        return
+    for k, (ax, below) in enumerate(zip(axes[::2], axes[1::2], strict=True)):
+        fitted = bands.outputs[:, k].mean(axis=1, keepdims=True)
+        # About the fitted curve and, since it is often too narrow to be seen there, about the residuals' zero.
+        for about, panel in ((0.0, ax), (fitted, below)):
+            limits = panel.get_ylim()
+            label = f"{100 * bands.level:g} % prediction"
+            plot_band(bands, bands.predicted[:, k] - about, panel, alpha=0.12, label=label)
+            label = f"{100 * bands.level:g} % confidence"
+            plot_band(bands, bands.outputs[:, k] - about, panel, alpha=0.3, label=label)
+            if panel is below and np.isfinite(bands.predicted[:, k]).any():
+                reach = np.nanmax(np.abs(bands.predicted[:, k] - about))
+                panel.set_ylim(min(limits[0], -1.1 * reach), max(limits[1], 1.1 * reach))
+
+
+def plot_band(bands: Bands, band: FloatArray, ax: Axes, *, alpha: float, label: str) -> Axes:
+    """A band about a fitted curve, broken at the transitions, where it jumps.
+
+    Parameters
+    ----------
+    bands : Bands
+    band : (L, 2)
+    ax : matplotlib.axes.Axes
+    alpha : float
+    label : str
+        For the legend.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    if np.isfinite(band).any():
+        inner = bands.segments[1:-1]
+        times = np.insert(bands.times, inner, bands.times[inner])
+        low, high = (np.insert(edge, inner, np.nan) for edge in band.T)
+        ax.fill_between(times, low, high, color=FIT, alpha=alpha, linewidth=0, zorder=2, label=label)
+    return ax
+
+
 def _head(fit: Fit, figure: Figure, shown: int, colours: Mapping[str, str]) -> None:
     """Legend, a warning where the fit did not succeed, and a note where not everything is shown."""
     from matplotlib.patches import Patch
@@ -307,7 +397,8 @@ def _head(fit: Fit, figure: Figure, shown: int, colours: Mapping[str, str]) -> N
     drawn = {mode for trajectory in fit.trajectories[:shown] for mode, a, b in trajectory.mode_spans if b > a}
     for mode in (mode for mode in colours if mode in drawn - named):  # too short for a name
         handles[mode] = Patch(facecolor=colours[mode], edgecolor=TRANSITION, linewidth=0.5)
-    figure.legend(handles.values(), handles.keys(), loc="outside upper right", ncols=len(handles), frameon=False)
+    ncols = min(len(handles), max(3, int(figure.get_figwidth() / 1.6)))
+    figure.legend(handles.values(), handles.keys(), loc="outside upper right", ncols=ncols, frameon=False)
     notes = [] if fit.success else [f"Not a minimum: {fit.status.name.lower().replace('_', ' ')}"]
     if shown < len(fit.trajectories):
         notes.append(f"{shown} of {len(fit.trajectories)} experiments")

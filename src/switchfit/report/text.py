@@ -9,8 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.special
 
+from switchfit.certificate import LARGE_INTEGRATION_ERROR, certify
 from switchfit.data import FloatArray
-from switchfit.result import Fit, free_curvature
+from switchfit.identifiability import WEAK, Identifiability, after
+from switchfit.residuals import diagnose
+from switchfit.result import Certificate, Fit, disagreement, free_curvature
 from switchfit.simulate import Comparison, Trajectory
 
 WIDTH = 100
@@ -22,12 +25,14 @@ SMALL_CORRELATION = 0.1
 """Correlations below this in size are not listed."""
 BARELY_DETERMINED = 1e-6
 """Smallest eigenvalue of the scaled Hessian below which the report warns; correlations of 0.999999 give it."""
-LARGE_INTEGRATION_ERROR = 1e-6
-"""Relative error of the cost by halving the steps above which the report warns."""
+UNSEEN = 100.0
+"""The same from which the Gauss-Newton matrix is singular rather than another: as for a transition at which the vector
+field does not jump, such as a block that comes to rest."""
 UNLIKELY = 1e-3
 """Probability of the residual variance below which the report warns, if it is 10 % off as well."""
-TREND = 0.5
-"""Correlation of neighbouring residuals above which the report warns, if it is 4 standard errors from 0 as well."""
+DIFFERENT = 1.2
+"""Factor between the standard errors of the two Hessians, of any combination of the unknowns, above which the report
+warns: a 95 % interval that is too narrow by it covers 90 %, one too wide 98 %."""
 
 METHODS = {
     "exact": "SQP with the exact Hessian",
@@ -38,12 +43,16 @@ METHODS = {
 }
 
 
-def report(fit: Fit) -> str:
+def report(fit: Fit, certificate: Certificate | None = None, found: Identifiability | None = None) -> str:
     """What was fitted, how it ended, how well it fits, the unknowns with their errors, and what to be wary of.
 
     Parameters
     ----------
     fit : Fit
+    certificate : Certificate, optional
+        Left out, what can be checked without the model is checked.
+    found : Identifiability, optional
+        Left out, what the Hessian alone tells.
 
     Returns
     -------
@@ -51,12 +60,13 @@ def report(fit: Fit) -> str:
         Several lines without a newline at the end.
     """
     sections = [
-        _failure(fit),
+        _failure(fit, certify(fit, None) if certificate is None else certificate),
         _section("Fit", [*_experiments(fit), *_course(fit)]),
         _section("Quality of the fit", [*_quality(fit), *_channels(fit)]),
         _section("Unknowns", _unknowns(fit)),
         _section("Held fixed", _fixed(fit)),
         _section(f"Correlations above {SMALL_CORRELATION:g}", _correlations(fit)),
+        _section("Determined worst by the data", _weak(fit, after(fit, None) if found is None else found)),
         _section("Warnings", [line for warning in warnings_of(fit) for line in _wrapped(warning, "  - ", "    ")]),
     ]
     return "\n\n".join("\n".join(section) for section in sections if section)
@@ -69,7 +79,7 @@ def warnings_of(fit: Fit) -> list[str]:
     ----------
     fit : Fit
     """
-    sources = (_held, _at_kinks, _undetermined, _without_errors, _noise, _trends, _integration)
+    sources = (_held, _at_kinks, _undetermined, _without_errors, _noise, _trends, _covariances, _integration)
     return [warning for source in sources for warning in source(fit)]
 
 
@@ -165,10 +175,12 @@ def standard_errors_of(fit: Fit) -> FloatArray:
 # --- sections ---------------------------------------------------------------------------------------------------------
 
 
-def _failure(fit: Fit) -> list[str]:
-    """A line in capitals, unless a minimum was found and it is the only one nearby."""
+def _failure(fit: Fit, certificate: Certificate) -> list[str]:
+    """Lines in capitals, unless a minimum was found, it is the only one nearby, and nothing that was checked failed."""
     if fit.status.successful:
-        return []
+        return _wrapped(f"*** CERTIFICATE FAILED: {'; '.join(certificate.failures)}. ***", "", "    ") * bool(
+            certificate.failures
+        )
     return [f"*** {_FAILURES.get(fit.status.name, 'NOT CONVERGED: the numbers below are not a minimum')}. ***"]
 
 
@@ -176,6 +188,7 @@ _FAILURES = {
     "NONFINITE_START": "NOT STARTED: the numbers below are the first guess",
     "INTERRUPTED": "NOT CONVERGED: interrupted; the numbers below are the best so far",
     "SADDLE": "NOT A MINIMUM: the numbers below are a saddle point of the cost",
+    "INFEASIBLE": "CONSTRAINTS NOT MET: the numbers below break a guard or a terminal constraint",
     "SINGULAR": "NOT UNIQUE: other numbers than those below fit the data as well",
 }
 
@@ -276,7 +289,16 @@ def _unknowns(fit: Fit) -> list[str]:
         )
     if not known:
         rows = [row[:2] + row[4:] for row in rows]
-    return _table(rows, "<><><><" if known else "<><><")
+        return _table(rows, "<><><")
+    return [*_table(rows, "<><><><"), "", f"  Standard errors from the exact Hessian{_beside(fit)}."]
+
+
+def _beside(fit: Fit) -> str:
+    """How the other covariance compares."""
+    found = disagreement(fit)
+    if found is None:
+        return ""
+    return f"; Gauss-Newton's are within {100 * (found.factor - 1):.2g} % of them" if found.factor < DIFFERENT else ""
 
 
 def _mark(fit: Fit, i: int) -> str:
@@ -335,6 +357,12 @@ def _correlations(fit: Fit) -> list[str]:
     rows = [[f"{names[j]}, {names[i]}", f"{correlation[i, j]:+.3f}"] for i, j in above[:LISTED_CORRELATIONS]]
     more = len(above) - len(rows)
     return _table(rows, "<>") + ([f"  and {more} more"] if more > 0 else [])
+
+
+def _weak(fit: Fit, found: Identifiability) -> list[str]:
+    """The combinations of unknowns that the data hardly see, if there are any."""
+    weak = [d for d in found.directions if d.eigenvalue < WEAK] if fit.success else []
+    return [line for direction in weak for line in _wrapped(direction.sentence, "  - ", "    ")]
 
 
 # --- warnings ---------------------------------------------------------------------------------------------------------
@@ -421,30 +449,29 @@ def _noise(fit: Fit) -> Iterator[str]:
 
 
 def _trends(fit: Fit) -> Iterator[str]:
-    """Residuals that are alike from one sample to the next: the errors of the model, not of the sensor."""
-    if not fit.success or fit.sigma_known is None:
+    """Residuals that are no white, normal noise."""
+    if fit.success and fit.sigma_known is not None:
+        yield from diagnose(fit, run_names(fit)).sentences()
+
+
+def _covariances(fit: Fit) -> Iterator[str]:
+    """Where the exact Hessian and the Gauss-Newton matrix tell different standard errors."""
+    found = disagreement(fit) if fit.success else None
+    if found is None or not found.factor > DIFFERENT:
         return
-    single = len(fit.trajectories) == 1
-    found = []
-    for name, run in zip(run_names(fit), fit.comparisons, strict=True):
-        for comparison in run:
-            for channel, residual in zip(comparison.names, comparison.residuals.T, strict=True):
-                correlation = _lag_correlation(residual[np.isfinite(residual)])
-                if correlation > TREND:
-                    found.append(f"{'' if single else f'{name} '}{channel} ({correlation:.2f})")
-    if found:
-        more = f" and {len(found) - 6} more" if len(found) > 6 else ""
+    both = f"{found.exact:.2g} and {found.gauss_newton:.2g}"
+    if found.factor > UNSEEN:
         yield (
-            f"Neighbouring residuals are correlated in {', '.join(found[:6])}{more}: the model misses something there, "
-            "or the samples were smoothed before. The standard errors take them as independent and are too small."
+            f"To first order the fitted values hardly depend on {found.name}: its standard errors from the exact "
+            f"Hessian and from the Gauss-Newton matrix are {both}. What is known of it is known to second order: trust "
+            "its profile likelihood more than either."
         )
-
-
-def _lag_correlation(residual: FloatArray) -> float:
-    """Correlation of each residual with the next, about zero; 0 where chance may explain it."""
-    square = float(residual @ residual)
-    correlation = float(residual[1:] @ residual[:-1]) / square if square > 0 else 0.0
-    return correlation if abs(correlation) * np.sqrt(len(residual)) > 4 else 0.0
+    else:
+        yield (
+            "Standard errors from the exact Hessian and from the Gauss-Newton matrix differ by up to a factor "
+            f"{found.factor:.3g} (of {found.name}: {both}): within its noise the model is not linear in its unknowns. "
+            "Trust profile likelihoods more than either."
+        )
 
 
 def _integration(fit: Fit) -> Iterator[str]:

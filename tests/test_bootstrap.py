@@ -1,0 +1,233 @@
+"""Bootstrap: against scipy where the estimate is a mean, and what it is for where the noise is not what it seems."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+import switchfit as sf
+from switchfit.batch.bootstrap import _acceleration, _Draw, _Runs
+
+TIMES = np.linspace(0.1, 4.0, 40)
+
+
+def still(t, x, p):
+    return 0.0 * x
+
+
+def level(t, x, p):
+    return jnp.array([p["m"]])
+
+
+def line(t, x, p):
+    return jnp.array([p["m"] + p["s"] * t])
+
+
+def up(t, x, p):
+    return p["v"] + 0.0 * x
+
+
+STILL = sf.HybridSystem({"still": still}, [0.0])
+RAMP = sf.HybridSystem({"up": up, "rest": still}, [0.0])
+
+
+def mean_of(values, sigma=None):
+    data = sf.Measurements(TIMES[: len(values)], values, observe=level, sigma=sigma)
+    return sf.estimate(sf.Problem(STILL, sf.Experiment(data, ("still",), (), 0.0, 4.0), {"m": 0.0}))
+
+
+def skewed(seed=0, count=40):
+    return 2.0 + np.random.default_rng(seed).exponential(size=count)
+
+
+def test_the_bootstrap_of_a_mean_is_that_of_scipy():
+    """Estimates are the mean plus sqrt(n / (n - 1)) times that of resampled, centred values."""
+    values = skewed()
+    fit = mean_of(values)
+    study = sf.bootstrap(fit, 4000)
+    assert study.success.all()
+    inflation = np.sqrt(40 / 39)
+    assert study.estimate[0] == pytest.approx(values.mean(), rel=1e-9)
+    assert study.standard_deviation[0] == pytest.approx(values.std(ddof=1) / np.sqrt(40), rel=0.04)
+    assert abs(study.bias[0]) < 4 * study.standard_deviation[0] / np.sqrt(4000)
+    for method in ("percentile", "basic", "BCa"):
+        other = scipy.stats.bootstrap(
+            (values,), np.mean, n_resamples=20_000, method=method, rng=np.random.default_rng(1), vectorized=True
+        ).confidence_interval
+        expected = values.mean() + inflation * (np.array([other.low, other.high]) - values.mean())
+        np.testing.assert_allclose(study.intervals(method=method.lower())[0], expected, atol=0.02)
+    # scipy's acceleration, by leaving each value out and taking the mean of the rest
+    without = (values.sum() - values) / 39
+    influence = without.mean() - without
+    expected = np.sum(influence**3) / (6 * np.sum(influence**2) ** 1.5)
+    assert study.acceleration[0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_intervals_are_the_quantiles_of_the_estimates():
+    study = sf.bootstrap(mean_of(skewed()), 400)
+    theta = study.theta[:, 0]
+    low, high = np.quantile(theta, [0.05, 0.95])
+    np.testing.assert_allclose(study.intervals(0.9, method="percentile")[0], [low, high], rtol=1e-12)
+    mirrored = 2 * study.estimate[0] - np.array([high, low])
+    np.testing.assert_allclose(study.intervals(0.9, method="basic")[0], mirrored, rtol=1e-12)
+    z0 = scipy.stats.norm.ppf(np.mean(theta < study.estimate[0]))
+    a = study.acceleration[0]
+    z = z0 + scipy.stats.norm.ppf([0.05, 0.95])
+    parts = scipy.stats.norm.cdf(z0 + z / (1 - a * z))
+    np.testing.assert_allclose(study.intervals(0.9)[0], np.quantile(theta, parts), rtol=1e-9)
+
+
+def test_wild_follows_noise_that_grows():
+    """Noise ten times larger at the end: the classical error of the slope is too small, the wild one is right."""
+    rng = np.random.default_rng(3)
+    size = np.linspace(0.1, 2.0, 40) ** 2
+    values = 1.0 + 0.5 * TIMES + size * rng.standard_normal(40)
+    data = sf.Measurements(TIMES, values, observe=line)
+    fit = sf.estimate(sf.Problem(STILL, sf.Experiment(data, ("still",), (), 0.0, 4.0), {"m": 0.0, "s": 0.0}))
+    design = np.stack([np.ones(40), TIMES], axis=1)
+    residual = values - design @ fit.theta
+    inverse = np.linalg.inv(design.T @ design)
+    sandwich = inverse @ (design.T * residual**2 * 40 / 38) @ design @ inverse
+    study = sf.bootstrap(fit, 3000, resample="wild")
+    np.testing.assert_allclose(study.standard_deviation, np.sqrt(np.diag(sandwich)), rtol=0.06)
+
+
+def test_blocks_follow_noise_that_is_correlated():
+    """The mean of first-order autoregressive noise: its error is sqrt((1 + r) / (1 - r)) times the classical one."""
+    rng = np.random.default_rng(5)
+    n, r = 1500, 0.7
+    noise = np.zeros(n)
+    for k in range(1, n):
+        noise[k] = r * noise[k - 1] + rng.standard_normal()
+    times = np.linspace(0.001, 4.0, n)
+    data = sf.Measurements(times, 1.0 + noise, observe=level)
+    fit = sf.estimate(sf.Problem(STILL, sf.Experiment(data, ("still",), (), 0.0, 4.0), {"m": 0.0}))
+    blocks = sf.bootstrap(fit, 1000, resample="blocks")
+    single = sf.bootstrap(fit, 1000)
+    assert 10 < blocks.block < 60
+    expected = np.sqrt((1 + r) / (1 - r))
+    assert blocks.standard_deviation[0] / single.standard_deviation[0] == pytest.approx(expected, rel=0.2)
+    assert single.standard_deviation[0] == pytest.approx(fit.standard_errors[0], rel=0.1)
+    assert "resampled: blocks of" in str(blocks)
+    assert sf.bootstrap(fit, 5, resample="blocks", block=7).block == 7
+
+
+def ramps(slopes, sigma=0.05, seed=0):
+    """Runs whose slopes differ from one to the next by more than the noise explains."""
+    rng = np.random.default_rng(seed)
+    runs = []
+    for slope in slopes:
+        values = slope * np.minimum(TIMES, 2.05) + sigma * rng.standard_normal(40)
+        runs.append(sf.Experiment(sf.Measurements(TIMES, values, sigma=sigma), ("up", "rest"), (2.0,), 0.0, 4.0))
+    return sf.Problem(RAMP, runs, {"v": 1.0})
+
+
+def test_over_runs_the_spread_is_that_of_the_runs():
+    slopes = 1.0 + 0.1 * np.random.default_rng(7).standard_normal(12)
+    fit = sf.estimate(ramps(slopes))
+    study = sf.bootstrap(fit, 600, resample="runs")
+    assert study.success.all()
+    assert study.resampled.tolist() == [False] * 12 + [True]
+    assert np.isnan(study.intervals()[:12]).all()
+    assert np.isnan(study.standard_deviation[:12]).all()
+    assert study.standard_deviation[-1] == pytest.approx(slopes.std() / np.sqrt(12), rel=0.25)
+    assert study.standard_deviation[-1] > 5 * fit.standard_errors[-1]
+    assert "of one run alone" in str(study)
+    figure = study.plot()
+    assert [ax.get_xlabel() for ax in figure.axes if ax.get_visible()] == ["v"]
+    figure.draw_without_rendering()
+
+
+def test_a_run_weighs_as_often_as_it_was_drawn():
+    problem = ramps([0.9, 1.0, 1.2])
+    fit = sf.estimate(problem)
+    study = sf.bootstrap(fit, 6, resample="runs", seed=2)
+    work = _Runs(problem, list(fit.evaluator.meshes), fit.theta, 2, 1e-7, 200)
+    for k in range(6):
+        weights = np.round(work.weights(k)).astype(int)
+        assert weights.sum() == 3
+        drawn = np.repeat(np.arange(3), weights)
+        again = sf.estimate(replace(problem, experiments=[problem.experiments[e] for e in drawn]))
+        assert study.theta[k][-1] == pytest.approx(again.theta[-1], rel=1e-6)
+
+
+def test_missing_values_stay_missing_and_channels_stay_together():
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((40, 1)) * np.array([1.0, -2.0])
+    values = np.array([1.0, 3.0]) + noise
+    values[[3, 9], 1] = np.nan
+
+    def two(t, x, p):
+        return jnp.array([p["m"], p["n"]])
+
+    data = sf.Measurements(TIMES, values, observe=two)
+    fit = sf.estimate(sf.Problem(STILL, sf.Experiment(data, ("still",), (), 0.0, 4.0), {"m": 0.0, "n": 0.0}))
+    study = sf.bootstrap(fit, 300)
+    assert study.samples.tolist() == [78] * 300
+    assert np.corrcoef(study.theta.T)[0, 1] < -0.9
+    draw = _Draw(fit, fit.problem, "residuals", None)
+    clean = np.zeros((40, 2))
+    assert np.isfinite(draw(np.random.default_rng(0), clean, fit.problem.experiments[0].data[0])).all()
+
+
+def test_seeds_and_folders(tmp_path):
+    fit = mean_of(skewed(), sigma=1.0)
+    one, same, other = (sf.bootstrap(fit, 40, seed=seed) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(one.theta, same.theta)
+    assert not np.array_equal(one.theta, other.theta)
+    first = sf.bootstrap(fit, 40, folder=tmp_path, callback=lambda done, total: True)
+    assert len(first) < 40
+    assert "STOPPED" in str(first)
+    np.testing.assert_array_equal(sf.bootstrap(fit, 40, folder=tmp_path).theta, one.theta)
+    with pytest.raises(ValueError, match="holds the results of another run"):
+        sf.bootstrap(fit, 40, folder=tmp_path, resample="wild")
+    runs = sf.estimate(ramps([0.9, 1.0, 1.2]))
+    with pytest.raises(ValueError, match="holds the results of another run"):
+        sf.bootstrap(runs, 40, folder=tmp_path, resample="runs")
+
+
+def test_figure_of_a_bootstrap():
+    study = sf.bootstrap(mean_of(skewed()), 100)
+    figure = study.plot()
+    assert figure.axes[0].get_xlabel() == "m"
+    assert figure.legends[0].get_title().get_text() == "Bootstrap of residuals"
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        "100 estimates", "estimate", "95 % interval (BCa)",
+    ]  # fmt: skip
+    figure.draw_without_rendering()
+
+
+def test_what_cannot_be_resampled():
+    fit = mean_of(skewed())
+    with pytest.raises(ValueError, match="resample must be one of residuals, wild, blocks, runs; got 'pairs'"):
+        sf.bootstrap(fit, resample="pairs")
+    with pytest.raises(ValueError, match="block is the length of blocks: give it with resample='blocks'"):
+        sf.bootstrap(fit, block=3)
+    with pytest.raises(ValueError, match=r"block must lie between 1 and the 40 samples there are; got 41"):
+        sf.bootstrap(fit, resample="blocks", block=41)
+    with pytest.raises(ValueError, match="runs must be 1 or more; got 0"):
+        sf.bootstrap(fit, 0)
+    with pytest.raises(ValueError, match="resample='runs' needs two experiments or more"):
+        sf.bootstrap(fit, resample="runs")
+    with pytest.raises(TypeError, match=r"bootstrap needs the result of sf.estimate; got Problem"):
+        sf.bootstrap(fit.problem)
+    with pytest.raises(ValueError, match="a bootstrap begins at a minimum"):
+        sf.bootstrap(sf.estimate(fit.problem, max_iterations=0))
+    signal = sf.ReferenceSignal.from_samples(TIMES, skewed(), observe=level)
+    mixed = sf.Problem(STILL, sf.Experiment(signal, ("still",), (), 0.1, 4.0), {"m": 0.0})
+    with pytest.raises(ValueError, match="a bootstrap resamples Measurements; this problem has a ReferenceSignal"):
+        sf.bootstrap(sf.estimate(mixed))
+    study = sf.bootstrap(fit, 10)
+    with pytest.raises(ValueError, match="level must lie between 0 and 1; got 0"):
+        study.intervals(0)
+    with pytest.raises(ValueError, match="method must be one of percentile, basic, bca; got 't'"):
+        study.intervals(method="t")
+
+
+def test_the_acceleration_of_a_symmetric_sample_is_zero():
+    values = np.concatenate([1.0 + np.arange(20), 1.0 - np.arange(20)])
+    assert _acceleration(mean_of(values), by_run=False)[0] == pytest.approx(0.0, abs=1e-12)

@@ -1,0 +1,228 @@
+"""Sensitivities and bands: closed forms, finite differences, Monte Carlo."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from systems import problem_of
+
+import switchfit as sf
+from switchfit.evaluate import evaluator_of
+from switchfit.mesh import Mesh
+from switchfit.sensitivity import gauss_newton_of, sample_derivatives, sensitivity
+
+SIGMA = 0.1
+TIMES = np.linspace(0.25, 6.0, 24)
+
+
+def heating(t, x, p):
+    return p["power"] - p["k"] * x
+
+
+def cooling(t, x, p):
+    return -p["k"] * x
+
+
+def doubled(t, x, p):
+    return 2.0 * x + p["power"]
+
+
+ROOM = sf.HybridSystem({"on": heating, "off": cooling}, [0.5], state_names=("T",), state_units=("K",))
+JUMPING = sf.HybridSystem({"on": heating, "off": cooling}, [0.5], {("on", "off"): doubled})
+
+
+def temperature(t, tau, power, k, *, jump=False):
+    """The closed form; after a jump at tau x becomes 2 x + power."""
+    on = power / k + (0.5 - power / k) * np.exp(-k * np.minimum(t, tau))
+    after = 2.0 * on + power if jump else on
+    return np.where(t <= tau, on, after * np.exp(-k * np.maximum(t - tau, 0.0)))
+
+
+def slopes(t, tau, power, k, *, jump=False):
+    """Its derivatives in (tau, power, k) by central differences, with tau not among t."""
+    columns = []
+    for j in range(3):
+        step = np.zeros(3)
+        step[j] = 1e-6
+        up, down = (temperature(t, *(np.array([tau, power, k]) + s * step), jump=jump) for s in (1, -1))
+        columns.append((up - down) / 2e-6)
+    return np.stack(columns, axis=1)
+
+
+def room(values=None, system=ROOM, sigma=SIGMA, theta=(2.1, 1.0, 0.4), **settings):
+    values = temperature(TIMES, 2.1, 1.0, 0.4) if values is None else values
+    data = sf.Measurements(TIMES, values, sigma=sigma, names=("T",))
+    run = sf.Experiment(data, ("on", "off"), theta[:1], 0.0, 6.0)
+    return sf.Problem(system, run, {"power": theta[1], "k": theta[2]}, rtol=1e-11, atol=1e-13, **settings)
+
+
+def noisy(seed=0, sigma=SIGMA, **settings):
+    rng = np.random.default_rng(seed)
+    return room(temperature(TIMES, 2.1, 1.0, 0.4) + SIGMA * rng.standard_normal(24), sigma=sigma, **settings)
+
+
+# Sensitivities
+
+
+@pytest.mark.parametrize("jump", [False, True], ids=["continuous", "reset map"])
+def test_sensitivities_in_closed_form(jump):
+    problem = room(system=JUMPING if jump else ROOM)
+    theta = np.array([2.13, 1.1, 0.37])
+    found = sensitivity(problem, 0, theta, evaluator_of(problem).meshes[0]).nodes
+    away = np.abs(found.times - theta[0]) > 1e-5
+    assert away.sum() > 20
+    np.testing.assert_allclose(found.states[:, 0][away], temperature(found.times, *theta, jump=jump)[away], rtol=1e-8)
+    expected = slopes(found.times, *theta, jump=jump)
+    np.testing.assert_allclose(found.states_d[away][:, 0], expected[away], atol=1e-7)
+    np.testing.assert_array_equal(found.outputs_d, found.states_d)
+
+
+def test_at_a_transition_the_derivative_jumps_by_that_of_the_vector_field():
+    problem = room()
+    tau, power, k = theta = np.array([2.13, 1.1, 0.37])
+    found = sensitivity(problem, 0, theta, evaluator_of(problem).meshes[0]).nodes
+    before, after = np.flatnonzero(found.times == tau)
+    x = found.states[before, 0]
+    assert found.states_d[before, 0, 0] == pytest.approx(0.0, abs=1e-14)
+    assert found.states_d[after, 0, 0] == pytest.approx((power - k * x) - (-k * x), rel=1e-12)  # X of equation (8)
+    np.testing.assert_allclose(found.states_d[before, 0, 1:], found.states_d[after, 0, 1:], rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["plain", "resets", "stiff"])
+def test_gradient_and_gauss_newton_matrix_follow_from_those_at_the_samples(name):
+    problem = problem_of(name, parts=("samples",))
+    evaluator = evaluator_of(problem)
+    theta = problem.initial_theta + 0.013 * (np.arange(len(problem.initial_theta)) < 2)
+    samples = sample_derivatives(problem, [sensitivity(problem, 0, theta, evaluator.meshes[0])])
+    expected = evaluator(theta, matrix="gauss-newton")
+    gradient = samples.derivative.T @ (samples.weight * samples.residual)
+    scale = np.abs(expected.hessian).max()
+    np.testing.assert_allclose(gradient, expected.gradient, atol=1e-11 * scale)
+    np.testing.assert_allclose(gauss_newton_of(samples), expected.hessian, atol=1e-11 * scale)
+    assert len(samples.time) == problem.experiments[0].data[0].count
+
+
+def test_several_experiments_have_their_own_transition_times():
+    data = sf.Measurements(TIMES, temperature(TIMES, 2.1, 1.0, 0.4), sigma=SIGMA)
+    fixed = sf.Parameter(2.4, fixed=True)
+    runs = [sf.Experiment(data, ("on", "off"), (tau,), 0.0, 6.0) for tau in (2.0, fixed, 2.2)]
+    problem = sf.Problem(ROOM, runs, {"power": 1.0, "k": 0.4})
+    meshes = evaluator_of(problem).meshes
+    found = [sensitivity(problem, e, problem.initial_theta, mesh) for e, mesh in enumerate(meshes)]
+    last = [s.nodes.states_d[-1, 0] for s in found]
+    assert [np.flatnonzero(row[:2]).tolist() for row in last] == [[0], [], [1]]
+    samples = sample_derivatives(problem, found)
+    np.testing.assert_allclose(
+        gauss_newton_of(samples),
+        evaluator_of(problem)(problem.initial_theta, matrix="gauss-newton").hessian,
+        rtol=1e-9,
+    )
+
+
+# Bands
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["sigma known", "sigma unknown"])
+def test_bands_in_closed_form(known):
+    fit = sf.estimate(noisy(sigma=SIGMA if known else None))
+    times = np.array([0.0, 0.33, 1.0, 2.5, 3.333, 6.0])
+    found = fit.predict(times)
+    X = slopes(times, *fit.theta)
+    errors = np.sqrt(np.einsum("ki,ij,kj->k", X, fit.covariance, X))
+    np.testing.assert_allclose(found.states[:, 0], temperature(times, *fit.theta), rtol=1e-8)
+    np.testing.assert_allclose(found.state_errors[:, 0], errors, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(found.output_errors[:, 0], errors, rtol=1e-5, atol=1e-9)
+    noise = SIGMA if known else np.sqrt(fit.residual_variance)
+    np.testing.assert_allclose(found.noise, noise, rtol=1e-12)
+    half = fit.quantile(0.9) * np.sqrt(errors**2 + noise**2)
+    band = found.prediction_band(0.9)[:, 0]
+    np.testing.assert_allclose(band, found.outputs + np.stack([-half, half], axis=1), rtol=1e-6)
+    inner = found.output_band(0.9)[:, 0]
+    np.testing.assert_allclose(inner[:, 1] - inner[:, 0], 2 * fit.quantile(0.9) * errors, rtol=1e-5, atol=1e-9)
+    np.testing.assert_array_equal(found.state_band(0.9)[:, 0], inner)
+    assert (found.state_names, found.state_units, found.output_names) == (("T",), ("K",), ("T",))
+
+
+def test_bands_are_the_spread_of_monte_carlo():
+    """Away from the transition; so near to it that it does not apply the delta method says so."""
+    problem = room(sigma=0.02)
+    truth = np.array([2.1, 1.0, 0.4])
+    fit = sf.estimate(problem, start=truth)
+    times = np.array([0.5, 1.5, 2.1, 2.8, 4.0, 6.0])
+    study = sf.monte_carlo(problem, 1500, theta=truth)
+    spread = np.array([temperature(times, *theta) for theta in study.theta]).std(0, ddof=1)
+    found = fit.predict(times)
+    assert found.near_transition.tolist() == [False, False, True, False, False, False]
+    far = ~found.near_transition
+    np.testing.assert_allclose(found.state_errors[far, 0], spread[far], rtol=0.1)
+
+
+def test_the_noise_of_a_sample_is_that_of_the_nearest():
+    sigma = np.where(TIMES < 3.0, 0.1, 0.4)[:, None]
+    fit = sf.estimate(noisy(sigma=sigma))
+    np.testing.assert_array_equal(fit.predict([0.0, 2.7, 2.9, 6.0]).noise[:, 0], [0.1, 0.1, 0.4, 0.4])
+
+
+def test_left_out_times_are_the_nodes_with_each_transition_twice():
+    fit = sf.estimate(noisy())
+    found = fit.predict()
+    assert np.sum(found.times == fit.theta[0]) == 2
+    assert found.times[0] == 0.0
+    assert found.times[-1] == 6.0
+    assert found.near_transition[np.flatnonzero(found.times == fit.theta[0])].all()
+
+
+def test_what_cannot_be_predicted():
+    fit = sf.estimate(noisy())
+    with pytest.raises(ValueError, match=r"times must lie inside \[t0, tf\] = \[0.0, 6.0\]; got 6.5"):
+        fit.predict([1.0, 6.5])
+    with pytest.raises(ValueError, match="times must be finite numbers of shape"):
+        fit.predict([np.nan])
+    with pytest.raises(ValueError, match=r"experiment must lie in 0..0; got 1"):
+        fit.predict(experiment=1)
+    with pytest.raises(TypeError, match=r"predict needs the result of sf.estimate; got Problem"):
+        sf.predict(fit.problem)
+    few = sf.Measurements(TIMES[[1, 20]], np.array([0.7, 0.8]))
+    run = sf.Experiment(few, ("on", "off"), (2.1,), 0.0, 6.0)
+    without = sf.estimate(sf.Problem(ROOM, run, {"power": 1.0, "k": sf.Parameter(0.4, fixed=True)}))
+    with pytest.raises(ValueError, match="There are no bands without a covariance"):
+        without.predict()
+
+
+def test_bands_in_the_figure():
+    fit = sf.estimate(noisy())
+    figure = fit.plot()
+    panel, residuals = figure.axes
+    assert len(panel.collections) == len(residuals.collections) == 2
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "95 % prediction" in labels
+    assert "95 % confidence" in labels
+    top = max(path.vertices[:, 1].max() for path in panel.collections[1].get_paths())
+    assert top == pytest.approx(fit.predict().output_band().max(), rel=1e-9)
+    assert not fit.plot(bands=False).axes[0].collections
+    assert not replace(fit, problem=None).plot().axes[0].collections
+    with pytest.raises(ValueError, match="level must lie between 0 and 1; got 2"):
+        fit.plot(level=2)
+    figure.draw_without_rendering()
+
+
+def test_the_mesh_of_a_prediction_has_the_times_as_nodes():
+    problem = room()
+    mesh = Mesh.from_times(np.append(evaluator_of(problem).meshes[0].times, 1.2345))
+    found = sensitivity(problem, 0, problem.initial_theta, mesh).at(np.array([0.0, 1.2345, 6.0, 1.2345]))
+    np.testing.assert_allclose(found.states[:, 0], temperature(found.times, 2.1, 1.0, 0.4), rtol=1e-9)
+
+
+def test_a_sensor_that_depends_on_parameters():
+    def seen(t, x, p):
+        return jnp.array([p["k"] * x[0] ** 2 + t])
+
+    data = sf.Measurements(TIMES, TIMES, observe=seen, sigma=SIGMA)
+    problem = sf.Problem(ROOM, sf.Experiment(data, ("on", "off"), (2.1,), 0.0, 6.0), {"power": 1.0, "k": 0.4})
+    found = sensitivity(problem, 0, problem.initial_theta, evaluator_of(problem).meshes[0]).nodes
+    x, X, k = found.states, found.states_d, 0.4
+    expected = 2 * k * x[:, :, None] * X + (x**2)[:, :, None] * np.array([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(found.outputs_d, expected, atol=1e-12)

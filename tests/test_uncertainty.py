@@ -1,0 +1,420 @@
+"""Both covariances, identifiability in words, tests of the residuals, the certificate; and slowly, coverage."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+from test_report import comparison_of, made, trajectory_of
+
+import switchfit as sf
+from switchfit.certificate import certify
+from switchfit.evaluate import Evaluation, Evaluator, evaluator_of
+from switchfit.identifiability import analyse
+from switchfit.models import skid_steer
+from switchfit.optimize import Status
+from switchfit.report.text import report, warnings_of
+from switchfit.residuals import diagnose, of_channel
+from switchfit.result import disagreement
+
+TIMES = np.linspace(0.25, 6.0, 24)
+
+
+def still(t, x, p):
+    return 0.0 * x
+
+
+STILL = sf.HybridSystem({"still": still}, [0.0])
+
+
+def observed(h, values, parameters, sigma, times=TIMES):
+    data = sf.Measurements(times, values, observe=h, sigma=sigma)
+    return sf.Problem(STILL, sf.Experiment(data, ("still",), (), 0.0, 6.0), parameters)
+
+
+def decay(t, x, p):
+    return jnp.array([p["a"] * jnp.exp(-p["k"] * t)])
+
+
+def noisy_decay(sigma, seed=0, **changes):
+    values = np.exp(-0.5 * TIMES) + sigma * np.random.default_rng(seed).standard_normal(24)
+    return observed(decay, values, {"a": 1.0, "k": 0.5}, sigma, **changes)
+
+
+# Covariances
+
+
+def test_the_gauss_newton_covariance_in_closed_form():
+    fit = sf.estimate(noisy_decay(0.1))
+    a, k = fit.theta
+    design = np.stack([np.exp(-k * TIMES), -a * TIMES * np.exp(-k * TIMES)], axis=1) / 0.1
+    np.testing.assert_allclose(fit.gauss_newton, design.T @ design, rtol=1e-9)
+    covariance = np.linalg.inv(design.T @ design)
+    np.testing.assert_allclose(fit.covariance_from("gauss-newton"), covariance, rtol=1e-8)
+    half = scipy.stats.norm.ppf(0.95) * np.sqrt(np.diag(covariance))
+    interval = fit.confidence_intervals(0.9, hessian="gauss-newton")
+    np.testing.assert_allclose(interval, np.stack([fit.theta - half, fit.theta + half], axis=1), rtol=1e-8)
+    np.testing.assert_array_equal(fit.covariance_from("exact"), fit.covariance)
+
+
+def test_where_the_covariances_differ_the_report_says_so():
+    """The model far from its data: the second derivatives of h matter."""
+    near, far = sf.estimate(noisy_decay(0.01)), sf.estimate(noisy_decay(0.4, seed=3))
+    assert disagreement(near).factor < 1.02
+    assert "Gauss-Newton's are within" in str(near)
+    found = disagreement(far)
+    both = far.covariance, far.covariance_from("gauss-newton")
+    ratios = np.linalg.eigvals(np.linalg.solve(both[0], both[1])).real
+    assert found.factor == pytest.approx(np.sqrt(max(ratios.max(), 1 / ratios.min())), rel=1e-9)
+    assert found.factor > 1.2
+    assert any("Standard errors from the exact Hessian and from the Gauss-Newton" in w for w in warnings_of(far))
+    assert "Gauss-Newton's are within" not in str(far)
+
+
+@pytest.mark.parametrize("part", [4.0, 0.25])
+def test_the_factor_between_the_covariances_goes_either_way(part):
+    hessian = np.diag([1.0, 4.0, 9.0])
+    found = disagreement(made(hessian=hessian, saved_gauss_newton=np.diag([1.0, part, 1.0]) @ hessian))
+    assert found.factor == pytest.approx(2.0, rel=1e-12)
+    assert (found.name, found.exact) == ("tau_2", pytest.approx(0.5, rel=1e-12))
+    assert found.gauss_newton == pytest.approx(0.5 / np.sqrt(part), rel=1e-12)
+
+
+def test_an_unknown_that_is_seen_to_second_order_only():
+    hessian = np.diag([100.0, 400.0, 900.0])
+    fit = made(hessian=hessian, saved_gauss_newton=np.diag([1.0, 1e-8, 1.0]) @ hessian)
+    (warning,) = warnings_of(fit)
+    assert warning.startswith("To first order the fitted values hardly depend on tau_2: its standard errors")
+    assert "are 0.05 and 5e+02." in warning
+
+
+def test_no_covariance_of_another_kind():
+    fit = sf.estimate(noisy_decay(0.1))
+    with pytest.raises(ValueError, match="hessian must be 'exact' or 'gauss-newton'; got 'fisher'"):
+        fit.covariance_from("fisher")
+    with pytest.raises(ValueError, match="The Gauss-Newton matrix of this fit is not known"):
+        made().covariance_from("gauss-newton")
+    assert disagreement(made()) is None
+
+
+# Identifiability
+
+
+def test_a_trade_off_in_words_with_its_size_and_what_was_found():
+    """y = (a + b) + 0.01 (a - b) t / 6: only the sum is well determined."""
+
+    def h(t, x, p):
+        return jnp.array([p["a"] + p["b"] + 0.01 * (p["a"] - p["b"]) * t])
+
+    problem = observed(h, 30.0 + 0.0 * TIMES, {"a": sf.Parameter(10.0, unit="m"), "b": 20.0}, 0.1)
+    for found in (sf.identifiability(problem), sf.estimate(problem).identifiability):
+        (direction,) = found.directions
+        assert direction.summary in ("a and b trade off", "b and a trade off")
+        assert np.sign(direction.change[0]) == -np.sign(direction.change[1])
+        assert direction.rises == pytest.approx((found.rise, found.rise), rel=1e-6)  # the model is linear
+        assert found.rise == pytest.approx(0.5 * scipy.stats.chi2.ppf(0.95, 1), rel=1e-9)
+        moved = f"a {abs(direction.change[0]):.2g} m {'higher' if direction.change[0] > 0 else 'lower'}"
+        assert moved in str(found)
+        assert "or the opposite, raises J by 1.9; noise hides 1.9 (95 %)" in str(found).replace("\n    ", " ")
+    evaluate = evaluator_of(problem)
+    theta = sf.estimate(problem).theta
+    rise = evaluate(theta + direction.change).cost - evaluate(theta).cost
+    assert direction.rises[0] == pytest.approx(rise, rel=1e-6)
+
+
+def test_a_singular_hessian_and_unknowns_without_effect():
+    def h(t, x, p):
+        return jnp.array([p["a"] * p["b"] * t + 0.0 * p["c"]])
+
+    problem = observed(h, 2.0 * TIMES, {"a": 1.0, "b": 2.0, "c": 3.0}, 0.1)
+    before, after = sf.identifiability(problem), sf.identifiability(sf.estimate(problem))
+    for found in (before, after):
+        assert found.without == ("c",)
+        assert found.undetermined == 2
+        assert found.condition_number == np.inf
+        assert {"a", "b"} == set(found.directions[0].summary.removesuffix(" trade off").split(" and "))
+        assert "the cost does not depend on c" in str(found)
+        assert "do not determine one combination of the 3 unknowns" in str(found)
+
+
+def test_twenty_unknowns_over_eight_decades():
+    """A quadratic cost: the planted pair is found and named whatever the units of the unknowns are."""
+    d = 20
+    rng = np.random.default_rng(1)
+    size = 10.0 ** rng.uniform(-4, 4, d)
+    H = np.eye(d)
+    H[4, 11] = H[11, 4] = 0.9999
+    H = H / np.outer(size, size)
+    theta = 3.0 * size
+    names = tuple(f"p{k}" for k in range(d))
+
+    def cost(at):
+        return 0.5 * float((at - theta) @ H @ (at - theta))
+
+    found = analyse(H, np.eye(d), theta, names, ("",) * d, cost, 0.02, "", "Here")
+    np.testing.assert_allclose(found.eigenvalues[[0, -1]], [1e-4, 1.9999], rtol=1e-6)
+    (direction,) = found.directions
+    assert set(direction.summary.removesuffix(" trade off").split(" and ")) == {"p4", "p11"}
+    assert np.flatnonzero(np.abs(direction.weights) > 1e-6).tolist() == [4, 11]
+    # No unknown moves by more than its own size, so that J rises by less than asked for.
+    assert np.max(np.abs(direction.change / theta)) <= 1.0 + 1e-12
+    assert direction.rises[0] == pytest.approx(cost(theta + direction.change), rel=1e-9)
+
+
+def test_where_the_valley_bends_the_change_is_shortened():
+    H = np.array([[1.0, 0.99], [0.99, 1.0]])
+
+    def bent(at):
+        return 0.5 * at @ H @ at + 10.0 * (at[0] - at[1]) ** 4
+
+    found = analyse(H, np.eye(2), np.zeros(2), ("a", "b"), ("", ""), bent, 1.0, "1 % of J is {}", "Here", base=100.0)
+    (direction,) = found.directions
+    assert max(direction.rises) <= 2.0
+    quadratic = 0.5 * direction.change @ H @ direction.change
+    assert quadratic < 0.5
+    assert f"raises J by {max(direction.rises):.2g} ({max(direction.rises):.2g} %); 1 % of J is 1" in direction.sentence
+
+
+def test_only_the_side_that_is_allowed_is_tried():
+    def h(t, x, p):
+        return jnp.array([p["a"] + 1.01 * p["b"]])
+
+    problem = observed(h, 1.0 + 0.0 * TIMES, {"a": sf.Parameter(0.0, lower=0.0), "b": sf.Parameter(1.0)}, 0.1)
+    (direction,) = sf.identifiability(problem).directions
+    for sign, rise in zip((1.0, -1.0), direction.rises, strict=True):
+        assert np.isfinite(rise) == (sign * direction.change[0] >= 0)
+    assert np.isfinite(direction.rises).sum() == 1
+    assert "or the opposite" not in direction.sentence
+    assert f"a {abs(direction.change[0]):.2g} higher" in direction.sentence
+
+
+def test_identifiability_of_what_is_neither():
+    with pytest.raises(TypeError, match=r"identifiability needs an sf.Estimate or an sf.Problem; got int"):
+        sf.identifiability(3)
+
+
+def test_before_a_fit_without_sigma_and_without_measurements():
+    data = sf.Measurements(TIMES, 0.0 * TIMES, observe=decay)
+    run = sf.Experiment(data, ("still",), (), 0.0, 6.0)
+    unknown = sf.identifiability(sf.Problem(STILL, run, {"a": 1.0, "k": 0.5}))
+    assert "a change of all that is measured by 1 % of how it varies does" in str(unknown).replace("\n    ", " ")
+    signal = sf.ReferenceSignal.from_samples(TIMES, np.exp(-0.4 * TIMES), observe=decay)
+    run = sf.Experiment(signal, ("still",), (), 0.25, 6.0)
+    found = sf.identifiability(sf.Problem(STILL, run, {"a": 1.0, "k": 0.5}))
+    assert "1 % of J is" in str(found)
+
+
+def test_the_report_says_what_is_determined_worst():
+    def h(t, x, p):
+        return jnp.array([p["a"] + p["b"] + 0.01 * (p["a"] - p["b"]) * t])
+
+    text = str(sf.estimate(observed(h, 3.0 + 0.1 * np.cos(9 * TIMES), {"a": 1.0, "b": 2.0}, 0.1)))
+    assert "Determined worst by the data\n  - " in text
+    assert "Determined worst" not in report(made())
+
+
+# Residuals
+
+
+def diagnostics_of(residual, sigma=0.1):
+    trajectory = trajectory_of()
+    comparison = comparison_of(trajectory, samples=len(residual), names=("X", "h"), sigma=sigma)
+    comparison.measured[:] = comparison.fitted + np.asarray(residual)[:, None]
+    return comparison
+
+
+def test_residuals_against_scipy_and_the_textbook():
+    rng = np.random.default_rng(0)
+    residual = 0.1 * rng.standard_normal(200)
+    found = of_channel(diagnostics_of(residual), 0)
+    z = residual / 0.1
+    assert found.normality == pytest.approx(scipy.stats.jarque_bera(z).pvalue, rel=1e-9)
+    assert found.skewness == pytest.approx(scipy.stats.skew(z), rel=1e-9)
+    assert found.kurtosis == pytest.approx(scipy.stats.kurtosis(z, fisher=False), rel=1e-9)
+    r = [np.sum(z[k:] * z[:-k]) / np.sum(z**2) for k in range(1, 11)]
+    np.testing.assert_allclose(found.autocorrelation, r, rtol=1e-9)
+    Q = 200 * 202 * sum(value**2 / (200 - k) for k, value in enumerate(r, start=1))
+    assert found.whiteness == pytest.approx(scipy.stats.chi2.sf(Q, 10), rel=1e-9)
+    assert found.rms == pytest.approx(np.sqrt(np.mean(z**2)), rel=1e-12)
+    assert found.white
+    assert found.normal
+
+
+def test_the_tests_fail_as_often_as_they_say():
+    """Of white normal noise the probabilities are uniform: 10 % of them below 0.1."""
+    rng = np.random.default_rng(1)
+    found = [of_channel(diagnostics_of(0.1 * rng.standard_normal(300)), 0) for _ in range(400)]
+    assert np.mean([c.whiteness < 0.1 for c in found]) == pytest.approx(0.1, abs=0.045)
+    assert np.mean([c.normality < 0.1 for c in found]) == pytest.approx(0.1, abs=0.045)
+
+
+def test_correlated_residuals_are_worth_fewer():
+    rng = np.random.default_rng(2)
+    noise = rng.standard_normal(2000)
+    residual = np.zeros(2000)
+    for k in range(1, 2000):
+        residual[k] = 0.6 * residual[k - 1] + 0.08 * noise[k]
+    found = of_channel(diagnostics_of(residual), 0)
+    assert not found.white
+    assert found.correlation == pytest.approx(0.6, abs=0.05)
+    assert found.effective == pytest.approx(2000 * 0.4 / 1.6, rel=0.15)
+    fit = made(comparisons=((diagnostics_of(residual),),), cost=2000.0, sigma_known=False)
+    (warning,) = warnings_of(fit)
+    assert warning.startswith("Neighbouring residuals are correlated in X (0.")
+    assert f"too small by a factor of up to {found.narrowing:.2g}." in warning
+
+
+def test_outliers_are_told():
+    rng = np.random.default_rng(3)
+    residual = 0.1 * rng.standard_normal(100)
+    residual[[20, 70]] = 1.0, -1.2
+    fit = made(comparisons=((diagnostics_of(residual),),), cost=100.0, sigma_known=False)
+    found = diagnose(fit)
+    assert not found.passed
+    assert found.channels[0].outliers == 2
+    assert any(w.startswith("The residuals are not normal in X (kurtosis") for w in warnings_of(fit))
+
+
+def test_residuals_as_text_and_as_a_figure():
+    fit = sf.estimate(noisy_decay(0.1))
+    text = str(fit.residuals)
+    assert text.splitlines()[0] == "Standardised residuals"
+    assert text.splitlines()[2].split()[0] == "y1"
+    figure = fit.plot_residuals()
+    assert [ax.get_title() for ax in figure.axes] == ["Residuals in time", "Autocorrelation", "Quantiles"]
+    assert [ax.get_xlabel() for ax in figure.axes] == ["time (s)", "lag (samples)", "normal quantile"]
+    assert figure.axes[0].get_ylabel() == "y1\nresidual / sigma"
+    assert all(ax.lines for ax in figure.axes)
+    figure.draw_without_rendering()
+    cost = sf.TerminalCost(lambda x, p: (p["a"] - 1.0) ** 2)
+    none = sf.estimate(sf.Problem(STILL, sf.Experiment(cost, ("still",), (), 0.0, 1.0), {"a": 2.0}))
+    assert str(none.residuals) == "No residuals: the cost has no Measurements."
+    assert none.plot_residuals().get_suptitle() == "No residuals: the cost has no Measurements"
+
+
+def test_a_channel_met_exactly_and_a_short_one():
+    exact = of_channel(diagnostics_of(np.zeros(30), sigma=None), 0)
+    assert (exact.white, exact.normal, exact.outliers) == (True, True, 0)
+    short = of_channel(diagnostics_of(np.ones(4)), 0)
+    assert np.isnan(short.whiteness)
+    assert short.lags == 0
+    assert short.correlation == 0.0
+
+
+# The certificate
+
+
+def test_a_good_certificate():
+    certificate = sf.estimate(noisy_decay(0.1)).certificate
+    assert certificate.passed
+    assert certificate.failures == ()
+    assert certificate.taylor_orders[1:] == pytest.approx((2.0, 3.0), abs=0.1)
+    assert str(certificate).splitlines()[-1].split() == ["verdict", "passed"]
+
+
+class WrongHessian(Evaluator):
+    """An evaluator whose Hessian is off by 1 %."""
+
+    def __call__(self, theta, side=1, method="auto", matrix="exact"):
+        found = super().__call__(theta, side, method, matrix)
+        return found if method == "adjoint" else Evaluation(found.cost, found.gradient, 1.01 * found.hessian)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"optimality": 1e-3}, "the KKT residual 1.0e-03 is above the tolerance 1.0e-07"),
+        ({"hessian": np.diag([1.0, -1.0, 1.0])}, "the Hessian has a negative eigenvalue on the free directions"),
+        ({"integration_error": 1e-3}, "the integration error of J is 1.0e-03, relative"),
+    ],
+)
+def test_a_certificate_that_fails_is_the_first_line_of_the_report(changes, words):
+    fit = made(**changes)
+    certificate = certify(fit, None)
+    assert not certificate.passed
+    assert any(words in failure for failure in certificate.failures)
+    first = report(fit).splitlines()[0]
+    assert first.startswith("*** CERTIFICATE FAILED: ")
+    assert words[:30] in first
+    assert "FAILED" in str(certificate).splitlines()[-1]
+    assert not report(replace(fit, status=Status.MAX_ITERATIONS)).startswith("*** CERTIFICATE")
+
+
+def test_a_wrong_hessian_fails_the_certificate_and_the_report_says_so():
+    fit = sf.estimate(noisy_decay(0.1))
+    certificate = certify(fit, WrongHessian(fit.problem))
+    assert any("the paper's equations differ from the derivatives of J" in f for f in certificate.failures)
+    assert any("the Taylor orders are" in f for f in certificate.failures)
+    assert report(fit, certificate).startswith("*** CERTIFICATE FAILED")
+    assert not str(fit).startswith("***")
+
+
+# Coverage
+
+
+def position(t, x, p):
+    return x[jnp.array([0, 2])]
+
+
+def vehicle(rate=10.0, sigma=0.1, guess=(6.0, 10.0, 0.7)):
+    """The paper's simulated vehicle: positions at a rate (Hz) on [0, 15] s."""
+    times = np.arange(1, round(15 * rate)) / rate
+    data = sf.Measurements(times, np.zeros((len(times), 2)), observe=position, sigma=sigma, names=("X", "Y"))
+    run = sf.Experiment(data, ("stick", "slip", "stick"), guess[:2], 0.0, 15.0)
+    return sf.Problem(skid_steer(), run, {"mu": sf.Parameter(guess[2], lower=0.05, upper=2.0)})
+
+
+@pytest.mark.slow
+def test_intervals_cover_the_truth_of_the_papers_vehicle():
+    """2,400 runs: the fraction of 95 % intervals that cover has a standard deviation of 0.45 %."""
+    study = sf.monte_carlo(vehicle(), 2400, theta=[6.0, 10.0, 0.7], seed=1)
+    assert study.success.sum() >= 2395
+    coverage = study.coverage(0.95)
+    assert np.all((coverage > 0.93) & (coverage < 0.97)), coverage
+
+
+@pytest.mark.slow
+def test_where_quadratic_intervals_fail_profiles_do_better():
+    """A rate seen by few, noisy samples: its likelihood is skew, and the quadratic interval is too short upward."""
+    times = np.array([0.3, 0.8, 1.5, 2.5])
+    truth, sigma, runs = 1.0, 0.25, 300
+    problem = observed(lambda t, x, p: jnp.array([jnp.exp(-p["k"] * t)]), 0.0 * times, {"k": 1.0}, sigma, times)
+    rng = np.random.default_rng(4)
+    quadratic = profiled = 0
+    for _ in range(runs):
+        values = np.exp(-truth * times) + sigma * rng.standard_normal(4)
+        data = replace(problem.experiments[0].data[0], values=values[:, None])
+        here = replace(problem, experiments=[replace(problem.experiments[0], data=data)])
+        fit = sf.estimate(here)
+        if not fit.success:
+            continue
+        low, high = fit.confidence_intervals(0.95)[0]
+        quadratic += low <= truth <= high
+        low, high = fit.profile("k").interval(0.95)
+        profiled += low <= truth <= high
+    assert abs(profiled / runs - 0.95) < 0.03
+    assert abs(profiled / runs - 0.95) < abs(quadratic / runs - 0.95)
+
+
+@pytest.mark.slow
+def test_a_profile_of_the_sparse_vehicle_is_the_lowest_cost_there_is():
+    """One position every 2 s, noise of 1 m: other starts of the other unknowns find nothing lower along the profile."""
+    problem = vehicle(rate=0.5, sigma=1.0)
+    truth = [6.0, 10.0, 0.7]
+    item = problem.experiments[0].data[0]
+    clean = sf.estimate(problem, start=truth, max_iterations=0).comparisons[0][0].fitted
+    noise = np.random.default_rng([3, 1]).standard_normal(clean.shape)
+    run = replace(problem.experiments[0], data=replace(item, values=clean + noise))
+    fit = sf.estimate(replace(problem, experiments=run), start=truth)
+    found = fit.profile("tau_2")
+    low, high = found.interval()
+    assert high > fit.confidence_intervals()[1, 1] + 0.5
+    inside = [q for q in found.trace.points if low <= q.value <= high]
+    for point in inside[::4]:
+        for tau_1 in (4.6, 5.5, 6.4):
+            for mu in (0.4, 0.7, 1.1):
+                other = found.trace._fitted(point.value, np.array([tau_1, point.value, mu]))
+                assert other is None or other.cost >= point.cost - 1e-6
