@@ -4,6 +4,7 @@ import runpy
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import switchfit as sf
 
@@ -62,3 +63,17 @@ def test_tosses_share_a_friction_coefficient_or_do_not():
     F, probability = module["is_one_enough"](one, each)
     assert F > 50.0
     assert probability < 1e-6
+
+
+def test_a_toss_from_release_has_its_impacts_where_they_are_seen():
+    module = runpy.run_path(str(EXAMPLES / "toss" / "release.py"))
+    estimate = sf.estimate(module["make_problem"]())
+    assert estimate.success
+    assert not estimate.active
+    np.testing.assert_allclose(estimate.transition_times[0][:5], module["SEEN"], atol=0.005)
+    # From its flat part alone 0.2162, and it sticks at 0.351 + 0.351 s.
+    assert estimate.parameters["mu"] == pytest.approx(0.2162, abs=0.003)
+    assert estimate.transition_times[0][5] == pytest.approx(0.702, abs=0.01)
+    assert np.all(estimate.comparisons[0][0].rmse < 2.5e-4)
+    # The residuals are no noise, and the report says so.
+    assert "Neighbouring residuals are correlated" in str(estimate)
