@@ -16,8 +16,11 @@ from numpy.typing import ArrayLike
 from switchfit.certificate import certify
 from switchfit.data import FloatArray, Measurements
 from switchfit.evaluate import ArrowEvaluation, Evaluation, Evaluator, evaluator_of
+from switchfit.hidden import refuse_hidden_switches
 from switchfit.io.json import load_fit, save_fit
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
+from switchfit.optimize.arrow import Arrow
+from switchfit.optimize.variables import Variables
 from switchfit.problem import Problem
 from switchfit.refine import refined_mesh
 from switchfit.report.plot import plot_fit
@@ -113,7 +116,8 @@ def estimate(
         Quadratic term of the sequential quadratic programme: equation (3), equation (4), the Gauss-Newton
         matrix, or none (steepest descent).
     tolerance : float
-        On the KKT residual, the norm of the gradient where no constraint is active.
+        On the KKT residual, the norm of the gradient where no constraint is active. An unknown on a logarithmic scale
+        counts by its logarithm, one whose first guess is below 1e-3 or above 1e3 in units of (about) that guess.
     max_iterations : int
     callback : callable, optional
         Called with each `IterationRecord`; a true return value stops the fit. Ctrl-C does as well; both
@@ -217,29 +221,83 @@ def minimized(
     """One run of the optimiser on the evaluator's meshes; arguments as of `estimate`."""
     problem = evaluator.problem
 
+    unknowns = problem.unknowns
     matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
     by_blocks = len(problem.experiments) >= MANY_RUNS and 2 * len(evaluator.layout.shared) < len(theta)
+    variables, constraints = unknowns.variables, constraints_of(problem)
+    seen: list[bool] = []
 
-    def evaluate(theta: Any, side: int) -> Evaluation | ArrowEvaluation | CostAndGradient:
+    def evaluate_theta(theta: Any, side: int) -> Evaluation | ArrowEvaluation | CostAndGradient:
         if hessian != "none" and by_blocks:
             return evaluator.arrow(theta, side, matrix)
         here = evaluator(theta, side, matrix=matrix)
         return CostAndGradient(here.cost, here.gradient) if hessian == "none" else here
 
+    def evaluate(z: Any, side: int) -> Any:
+        theta = _outward(variables, constraints, z)
+        here = evaluate_theta(theta, side)
+        if not seen:
+            seen.append(True)
+            refuse_hidden_switches(evaluator, theta, here.gradient)
+        return _inward(variables, theta, here)
+
     is_time = np.zeros(len(theta), dtype=int)
     for where in problem.unknowns.times:
         is_time[where[where >= 0]] = 1
-    return minimize(
+    told = callback
+    if callback is not None and not variables.identity:
+        told = lambda record: callback(_told(variables, constraints, record))  # noqa: E731
+    result = minimize(
         evaluate,
-        theta,
-        constraints=constraints_of(problem),
+        theta if variables.identity else variables.inward(np.asarray(theta)),
+        constraints=constraints if variables.identity else _constraints_inward(variables, constraints),
         breakpoints=evaluator.breakpoints(),
         hessian=hessian,
         blocks=is_time,
         tolerance=tolerance,
         max_iterations=max_iterations,
-        callback=callback,
+        callback=told,
     )
+    return _result_outward(variables, constraints, result)
+
+
+def _outward(variables: Variables, constraints: LinearConstraints, z: FloatArray) -> FloatArray:
+    """theta at z, inside its bounds whatever the rounding."""
+    return z if variables.identity else np.clip(variables.outward(z), constraints.lower, constraints.upper)
+
+
+def _inward(variables: Variables, theta: FloatArray, here: Any) -> Any:
+    """An evaluation at theta as one of the optimiser's variables."""
+    if variables.identity:
+        return here
+    if here.hessian is None:
+        return CostAndGradient(here.cost, variables.slopes(theta)[0] * here.gradient)
+    if isinstance(here.hessian, Arrow):
+        D, E = variables.slopes(theta)
+        hessian = here.hessian.scaled(1.0 / D).plus_diagonal(E * here.gradient)
+        return ArrowEvaluation(here.cost, D * here.gradient, hessian)
+    return Evaluation(here.cost, *variables.derivatives_inward(theta, here.gradient, here.hessian))
+
+
+def _constraints_inward(variables: Variables, constraints: LinearConstraints) -> LinearConstraints:
+    """Bounds of the optimiser's variables; the rows join transition times alone, which are not changed."""
+    lower, upper = variables.inward(constraints.lower), variables.inward(constraints.upper)
+    return replace(constraints, lower=lower, upper=upper)
+
+
+def _told(variables: Variables, constraints: LinearConstraints, record: IterationRecord) -> IterationRecord:
+    """A record of the optimiser's with theta in place of its own variables."""
+    return replace(record, theta=_outward(variables, constraints, record.theta))
+
+
+def _result_outward(variables: Variables, constraints: LinearConstraints, result: Result) -> Result:
+    """The optimiser's result in theta; its optimality and its eigenvalues stay those of its own variables."""
+    if variables.identity:
+        return result
+    theta = _outward(variables, constraints, result.theta)
+    gradient, hessian = variables.derivatives_outward(theta, result.gradient, result.hessian)
+    history = tuple(_told(variables, constraints, record) for record in result.history)
+    return replace(result, theta=theta, gradient=gradient, hessian=hessian, history=history)
 
 
 def _estimate(
@@ -277,6 +335,9 @@ def _estimate(
         kinks=tuple((unknowns.names[i], left, right) for i, left, right in result.kinks),
         free_basis=result.free_basis,
         sigma_known=sigma_known(problem),
+        priors={name: text for name, text in zip(unknowns.names, unknowns.priors.texts(), strict=True) if text},
+        log_scaled=unknowns.log_names,
+        least_squares=least_squares(problem),
         hessian_kind=hessian,
         tolerance=tolerance,
         problem=problem,
@@ -289,8 +350,17 @@ def with_names(message: str, names: tuple[str, ...]) -> str:
     return re.sub(r"theta\[(\d+)\]", lambda match: names[int(match.group(1))], message)
 
 
+def least_squares(problem: Problem) -> bool:
+    """Whether J is half a sum of squares: no loss is robust, no sigma a parameter."""
+    items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
+    return not any(item.sigma_names or item.loss != "linear" for item in items)
+
+
 def sigma_known(problem: Problem) -> bool | None:
-    """Whether sigma is known for all measurements; None where the cost is not made of measurements alone."""
+    """Whether sigma is known for all measurements, as a number or as a parameter beside the others.
+
+    None where the cost is not made of measurements alone.
+    """
     items = [item for experiment in problem.experiments for item in experiment.data]
     if not all(isinstance(item, Measurements) for item in items):
         return None

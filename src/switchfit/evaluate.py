@@ -101,6 +101,10 @@ class Evaluator:
             # Two names of the model may mean one parameter: its place then stands twice, and both count.
             np.add.at(gradient, mine, g[own])
             np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
+        priors = self.problem.unknowns.priors
+        if priors.any:
+            J, g, h = priors.evaluate(theta, gauss_newton=matrix == "gauss-newton")
+            total, gradient, hessian = total + float(J), gradient + g, hessian + np.diag(h)
         return Evaluation(total, gradient, hessian)
 
     def arrow(self, theta: FloatArray, side: int = 1, matrix: Matrix = "exact") -> ArrowEvaluation:
@@ -114,7 +118,12 @@ class Evaluator:
             part = np.zeros((size, size))
             np.add.at(part, (slots[:, None], slots), H[own[:, None], own])
             parts.append(part)
-        return ArrowEvaluation(total, gradient, Arrow.of_runs(self.layout, parts))
+        arrow = Arrow.of_runs(self.layout, parts)
+        priors = self.problem.unknowns.priors
+        if priors.any:
+            J, g, h = priors.evaluate(theta, gauss_newton=matrix == "gauss-newton")
+            total, gradient, arrow = total + float(J), gradient + g, arrow.plus_diagonal(h)
+        return ArrowEvaluation(total, gradient, arrow)
 
     @cached_property
     def layout(self) -> ArrowLayout:

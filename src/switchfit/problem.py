@@ -19,7 +19,9 @@ from switchfit.data import FloatArray, Measurements, as_number, as_numbers
 from switchfit.experiment import Experiment, initial_state_of, run_names
 from switchfit.mesh import Mesh, common_lengths
 from switchfit.model import Arguments, Structure, arguments_of, structure_of
+from switchfit.optimize.variables import Variables
 from switchfit.parameter import Parameter, as_parameter
+from switchfit.priors import PriorTerms
 from switchfit.system import HybridSystem
 
 SMALLEST_RTOL = 1e-13
@@ -40,6 +42,8 @@ class Unknowns:
         estimated: (n,) int arrays; (0,) where it is a function
     A, b : ordering and minimum durations as ``A theta >= b``, (m, d) and (m,)
     constraint_names : what each row means when it is active
+    priors : PriorTerms
+    log : (d,) bool, whether an unknown is estimated on a logarithmic scale
     """
 
     names: tuple[str, ...]
@@ -53,6 +57,21 @@ class Unknowns:
     A: FloatArray
     b: FloatArray
     constraint_names: tuple[str, ...]
+    priors: PriorTerms
+    log: NDArray[np.bool_]
+
+    @cached_property
+    def variables(self) -> Variables:
+        """What the optimiser works with: transition times as they are, other unknowns scaled or their logarithms."""
+        is_time = np.zeros(len(self.names), dtype=bool)
+        for where in self.times:
+            is_time[where[where >= 0]] = True
+        return Variables.of(self.initial, self.lower, self.upper, self.log, keep=is_time)
+
+    @property
+    def log_names(self) -> tuple[str, ...]:
+        """Names of the unknowns that are estimated on a logarithmic scale."""
+        return tuple(name for name, log in zip(self.names, self.log, strict=True) if log)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +139,7 @@ class Problem:
         self._check_maps()
         self._check_states()
         object.__setattr__(self, "unknowns", _unknowns(self.system, experiments, parameters, dwell))
+        self._check_noise()
         targets = frozenset(name for e in experiments for name in e.parameter_map.values())
         structures = tuple(structure_of(self.system, e, parameters, self.solver, targets) for e in experiments)
         for structure in structures:
@@ -138,6 +158,35 @@ class Problem:
                         f"parameter_map of experiment {name} gives the model's {here!r} as the unknown parameter "
                         f"{target!r}; the problem has {', '.join(self.parameters) or 'none'}."
                     )
+
+    def _check_noise(self) -> None:
+        """Parameters that are a sigma, and whether the noise is known where something is weighed against it."""
+        items = [(e, item) for e in self.experiments for item in e.data if isinstance(item, Measurements)]
+        for experiment, item in items:
+            for name in filter(None, item.sigma_names):
+                parameter = self.parameters.get(experiment.parameter_map.get(name, name))
+                if parameter is None:
+                    raise ValueError(
+                        f"sigma names the parameter {name!r}, which the problem lacks; it has "
+                        f"{', '.join(self.parameters) or 'none'}."
+                    )
+                if parameter.shape != () or not (parameter.positive or (parameter.fixed and parameter.value > 0)):
+                    raise ValueError(
+                        f"sigma names the parameter {name!r}, which must be one number that stays positive: give it a "
+                        f"lower bound above 0, or scale='log'; got shape {parameter.shape}, lower bound "
+                        f"{parameter.lower.tolist()}."
+                    )
+        unknown = any(item.sigma is None for _, item in items)
+        if unknown and any(item.sigma_names or item.loss != "linear" for _, item in items):
+            raise ValueError(
+                "sigma is left out in some Measurements, and a parameter or measured against by a robust loss in "
+                "others: their costs are then not in the same units. Name a parameter for it there too."
+            )
+        if unknown and self.unknowns.priors.any:
+            raise ValueError(
+                "a prior is weighed against the noise of the Measurements, whose sigma is left out: give sigma a "
+                "number, or the name of a parameter to estimate it."
+            )
 
     def _check_states(self) -> None:
         """Sizes of initial states that are no functions."""
@@ -216,6 +265,12 @@ class Problem:
             for e, length in zip(group, lengths, strict=True):
                 padded[e] = meshes[e] if len(group) == 1 else meshes[e].padded_to(length)
         return padded
+
+    def named(self, theta: FloatArray, e: int) -> dict[str, FloatArray]:
+        """The parameters of experiment e under the names that the model has for them."""
+        own = self.split(theta)[1]
+        mapped = self.experiments[e].parameter_map
+        return own | {name: own[target] for name, target in mapped.items()}
 
     def checked_theta(self, theta: ArrayLike | None) -> FloatArray:
         """`theta`, or the initial guess for None, as a ``(d,)`` array; ValueError where shape or order is wrong."""
@@ -302,9 +357,13 @@ def _unknowns(
         twice = sorted({name for name in names if names.count(name) > 1})
         raise ValueError(f"Two unknowns share a name: {', '.join(twice)}; rename the parameter or the experiment.")
     flat = {key: np.concatenate([getattr(q, key).ravel() for q in pieces]) for key in ("value", "lower", "upper")}
+    priors = PriorTerms.joined([PriorTerms.of(q.prior, q.shape) for q in pieces])
+    log = np.concatenate([np.full(q.value.size, q.scale == "log") for q in pieces])
     A, b, rows = _ordering(experiments, where, len(names), dwell)
     vectors = flat["value"], flat["lower"], flat["upper"]
-    return Unknowns(tuple(names), tuple(units), *vectors, tuple(where), spans, tuple(states), A, b, rows)
+    return Unknowns(
+        tuple(names), tuple(units), *vectors, tuple(where), spans, tuple(states), A, b, rows, priors, log
+    )
 
 
 def _index(k: tuple[int, ...]) -> str:

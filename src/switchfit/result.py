@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import scipy.special
+from numpy.typing import NDArray
 
 from switchfit.data import FloatArray
 from switchfit.optimize import IterationRecord, Status
@@ -105,6 +106,12 @@ class Fit:
     tolerance : float
     seconds : float
         Wall time of the estimation.
+    priors : dict of name -> str
+        The prior of each unknown that has one, in words.
+    log_scaled : tuple of str
+        Unknowns that were estimated on a logarithmic scale.
+    least_squares : bool
+        Whether what measurements and priors add to J is half a sum of squares: no sigma is a parameter, no loss robust.
     """
 
     theta_names: tuple[str, ...]
@@ -134,6 +141,9 @@ class Fit:
     hessian_kind: str
     tolerance: float
     seconds: float
+    priors: Mapping[str, str] = field(default_factory=dict)
+    log_scaled: tuple[str, ...] = ()
+    least_squares: bool = True
 
     @property
     def success(self) -> bool:
@@ -159,15 +169,26 @@ class Fit:
 
     @property
     def residual_variance(self) -> float:
-        """``2 J / (samples - free unknowns)``: near 1 where sigma is right; NaN without measurements."""
-        freedom = self.samples - self.free_basis.shape[1]
-        return 2 * self.cost / freedom if self.sigma_known is not None and freedom > 0 else np.nan
+        """``2 J / (samples + priors - free unknowns)``: near 1 where sigma is right.
+
+        NaN without measurements, and where J is no sum of squares (`least_squares`).
+        """
+        freedom = self.freedom
+        judged = self.sigma_known is not None and self.least_squares and freedom > 0
+        return 2 * self.cost / freedom if judged else np.nan
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom: measured values, and priors, which count as such, less free unknowns."""
+        return self.samples + len(self.priors) - self.free_basis.shape[1]
 
     @cached_property
     def covariance(self) -> FloatArray:
         """Covariance of theta from the exact Hessian on the free directions: (d, d).
 
-        ``Z (Z' H Z)^-1 Z'``, times the residual variance where sigma is unknown. An unknown held by a bound, a
+        ``Z (Z' H Z)^-1 Z'``, times the residual variance where sigma is unknown. With priors it is the covariance of
+        the posterior (Laplace's approximation); with a robust loss, that of noise whose negative log-likelihood the
+        loss is; a sigma that is a parameter is an unknown like others. An unknown held by a bound, a
         collapsed mode or a kink has variance 0 here. NaN where the cost has no noise model (anything but
         `Measurements`), the Hessian is not positive definite, or there are too few samples.
         """
@@ -187,7 +208,9 @@ class Fit:
             return self.covariance / np.outer(errors, errors)
 
     def confidence_intervals(self, level: float = 0.95) -> FloatArray:
-        """Symmetric intervals theta +- quantile x standard error: (d, 2).
+        """Intervals theta +- quantile x standard error: (d, 2).
+
+        Symmetric, but for unknowns on a logarithmic scale: theta times or by exp(quantile x relative standard error).
 
         Parameters
         ----------
@@ -196,11 +219,20 @@ class Fit:
         """
         if not 0 < level < 1:
             raise ValueError(f"level must lie between 0 and 1; got {level}.")
-        freedom = max(self.samples - self.free_basis.shape[1], 1)
+        freedom = max(self.freedom, 1)
         tail = 0.5 + level / 2
         quantile = scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail)
-        half = quantile * self.standard_errors
-        return np.stack([self.theta - half, self.theta + half], axis=1)
+        log = np.isin(self.theta_names, self.log_scaled)
+        return interval(self.theta, quantile * self.standard_errors, log)
+
+
+def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_]) -> FloatArray:
+    """``theta -+ half``, or where `log` ``theta exp(-+ half / theta)``: (..., 2)."""
+    size = np.where(log, theta, 1.0)
+    factor = np.exp(np.where(log, half / size, 0.0))
+    return np.stack(
+        [np.where(log, theta / factor, theta - half), np.where(log, theta * factor, theta + half)], axis=-1
+    )
 
 
 def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.cache import compilation_cache
 from switchfit.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.losses import robust
 from switchfit.mesh import CHUNK, Mesh, rows
 from switchfit.model import Arguments, Model, Piece, Structure, float64
 from switchfit.problem import Problem
@@ -67,6 +68,8 @@ class Comparison:
     sigma : (K, q) or None where unknown
     curve_times, curve : (L,), (L, q)
         The fitted output at all nodes, for plots.
+    downweighted : (K, q) of bool, or None
+        Where a robust loss counts a residual as an outlier, one larger than its `loss_scale`; None without such a loss.
     """
 
     kind: str
@@ -77,6 +80,7 @@ class Comparison:
     sigma: FloatArray | None
     curve_times: FloatArray
     curve: FloatArray
+    downweighted: NDArray[np.bool_] | None = None
 
     @property
     def residuals(self) -> FloatArray:
@@ -129,7 +133,8 @@ def compare(
         trajectory = _trajectory(problem, e, run)
         total += run.cost
         trajectories.append(trajectory)
-        comparisons.append(_comparisons(problem, e, run, trajectory))
+        comparisons.append(_comparisons(problem, e, theta, run, trajectory))
+    total += float(problem.unknowns.priors.evaluate(theta)[0])
     return total, tuple(trajectories), tuple(comparisons)
 
 
@@ -198,11 +203,17 @@ def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> Run:
         cost += float(_terminal(arguments, x, p, structure=structure.functions))
     run = Run(cost, segments, np.asarray(layout.first_cell), mesh)
     first = sum(q for _, q in structure.references)
-    for samples, (_, q) in zip(whole.samples, structure.measurements, strict=True):
-        seen = run.at_cells(np.asarray(samples.cell), slice(first, first + q))
-        residuals = np.where(samples.weight > 0, seen - samples.value, 0.0)
-        cost += 0.5 * float(np.sum(samples.weight * residuals**2))
-        first += q
+    named = problem.named(theta, e)
+    for samples, sensor in zip(whole.samples, structure.measurements, strict=True):
+        seen = run.at_cells(np.asarray(samples.cell), slice(first, first + sensor.channels))
+        there = np.asarray(samples.weight) > 0
+        u = samples.weight * np.where(there, seen - samples.value, 0.0) ** 2
+        if sensor.sigma:
+            sigma = np.array([1.0 if name is None else float(named[name]) for name in sensor.sigma])
+            u = u / sigma**2
+            cost += float(np.sum(there * np.log(sigma)))
+        cost += 0.5 * float(np.sum(robust(sensor.loss, sensor.loss_scale, u)))
+        first += sensor.channels
     return replace(run, cost=cost)
 
 
@@ -263,7 +274,7 @@ def _block(
     costs, before, after = modes[0](x) if len(modes) == 1 else lax.switch(mode, modes, x)
 
     def outputs(t: jax.Array, x: jax.Array) -> jax.Array:
-        seen = (*structure.references, *structure.measurements)
+        seen = (*structure.references, *((sensor.observe, sensor.channels) for sensor in structure.measurements))
         return jnp.concatenate([jnp.zeros(0), *(model.observed(observe, t, x, p, q) for observe, q in seen)])
 
     over_rows = jax.vmap(outputs)
@@ -295,7 +306,9 @@ def _shown(part: Segment, before: FloatArray, after: FloatArray) -> FloatArray:
     return np.concatenate([before[:1], after[part.end > part.start]])
 
 
-def _comparisons(problem: Problem, e: int, run: Run, trajectory: Trajectory) -> tuple[Comparison, ...]:
+def _comparisons(
+    problem: Problem, e: int, theta: FloatArray, run: Run, trajectory: Trajectory
+) -> tuple[Comparison, ...]:
     """Measured against fitted for each reference signal and each Measurements."""
     data, times = problem.experiments[e].data, trajectory.times
     curves = np.concatenate([_shown(part, part.y_before, part.y_after) for part in run.segments])
@@ -313,7 +326,10 @@ def _comparisons(problem: Problem, e: int, run: Run, trajectory: Trajectory) -> 
             here = Comparison("reference", label, times, item.signal(times), curve, None, times, curve)
         else:
             fitted = run.at_cells(run.mesh.cell_ending_at(item.times), channels)
-            sigma = None if item.sigma is None else np.broadcast_to(item.sigma, item.values.shape).copy()
-            here = Comparison("measurements", label, item.times, item.values, fitted, sigma, times, curve)
+            sigma = item.noise(problem.named(theta, e))
+            beyond = None
+            if item.loss != "linear" and sigma is not None:
+                beyond = np.abs(np.nan_to_num(item.values - fitted)) > item.loss_scale * sigma
+            here = Comparison("measurements", label, item.times, item.values, fitted, sigma, times, curve, beyond)
         comparisons.append(here)
     return tuple(comparisons)

@@ -81,8 +81,9 @@ def adjoint_hessian(model: Model, first: FirstOrder, tau: Array, p: Array) -> Ar
 def gauss_newton_hessian(model: Model, first: FirstOrder, p: Array) -> Array:
     """Hessian without the second derivatives of the trajectory and of the observations: (D, D).
 
-    For Measurements and ReferenceSignal this is the Gauss-Newton matrix; a RunningCost or TerminalCost
-    contributes its own second derivative in (x, p).
+    For Measurements and ReferenceSignal this is the Gauss-Newton matrix, a robust loss weighing each residual by rho',
+    which is never negative; a sigma that is a parameter contributes its Fisher information. A RunningCost or
+    TerminalCost contributes its own second derivative in (x, p).
     """
     path, X = first.path, first.tangents
     P = parameter_directions(model)
@@ -272,7 +273,12 @@ def sample_curvature(
         if not gauss_newton:
             return _second(lambda x, p: model.sample_cost(k, sample, x, p), (x, p), (x_d, P))
         r_d = _columns(lambda x, p: model.sample_residual(k, sample, x, p), (x, p), (x_d, P))
-        return r_d.T @ (sample.weight[:, None] * r_d)
+        H = r_d.T @ (model.sample_information(k, sample, x, p)[:, None] * r_d)
+        if model.structure.measurements[k].sigma:
+            # Fisher's information of normal noise: 2 of log sigma, none between sigma and the rest.
+            s_d = _columns(lambda p: model.log_sigma(k, sample, p), (p,), (P,))
+            H = H + 2.0 * s_d.T @ s_d
+        return H
 
     def block(H: Array, given: Any) -> tuple[Array, None]:
         return H + jax.vmap(one)(given).sum(0), None
