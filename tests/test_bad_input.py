@@ -143,7 +143,7 @@ def test_state_names_are_counted_where_the_initial_state_is_a_function():
         (lambda: samples(sigma=-1.0), ValueError, ["sigma must be positive and finite", "-1.0"]),
         (lambda: samples(sigma=math.nan), ValueError, ["sigma must be positive and finite", "nan"]),
         (lambda: samples(sigma=math.inf), ValueError, ["sigma must be positive and finite", "inf"]),
-        (lambda: samples(sigma="x"), ValueError, ["sigma must be a number or an array of numbers; got 'x'"]),
+        (lambda: samples(sigma={"x": 1}), ValueError, ["sigma must be a number or an array of numbers; got {'x': 1}"]),
         (lambda: samples(sigma=[1.0, 2.0]), ValueError, ["sigma must be", "of shape (1,) (one a channel)", "(2,)"]),
         (lambda: samples(names=("a", "b")), ValueError, ["names must have one entry for each of the 1 channels"]),
         (lambda: samples(names=3), TypeError, ["names must be a sequence of strings", "got 3"]),

@@ -10,6 +10,7 @@ from switchfit.estimate import Estimate, estimate
 from switchfit.evaluate import Evaluation, evaluate
 from switchfit.experiment import Experiment, Parameter
 from switchfit.optimize import Status
+from switchfit.priors import LogNormal, Normal
 from switchfit.problem import Problem
 from switchfit.result import Certificate
 from switchfit.simulate import Comparison, Trajectory, simulate
@@ -30,9 +31,11 @@ __all__ = [
     "Fits",
     "HybridSystem",
     "Input",
+    "LogNormal",
     "Measurements",
     "MonteCarlo",
     "Multistart",
+    "Normal",
     "Parameter",
     "Problem",
     "ReferenceSignal",

@@ -157,7 +157,7 @@ def estimate(
         theta = result.theta
         fine_cost, trajectories, comparisons = compare(problem, theta, [mesh.divided() for mesh in evaluator.meshes])
         first_cost = abs(history[0].cost) if history else 0.0
-        error = abs(fine_cost - result.cost) / max(abs(fine_cost), PERFECT_FIT * first_cost, 1e-300)
+        error = abs(fine_cost - result.cost) / max(abs(fine_cost), PERFECT_FIT * first_cost, smallest_cost(problem))
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
         done = result.status in (Status.INTERRUPTED, Status.NONFINITE_START) or attempt == REFINEMENTS
         if done or not excess > 1:
@@ -348,6 +348,15 @@ def _estimate(
 def with_names(message: str, names: tuple[str, ...]) -> str:
     """The optimiser's message with the unknowns called by their names."""
     return re.sub(r"theta\[(\d+)\]", lambda match: names[int(match.group(1))], message)
+
+
+def smallest_cost(problem: Problem) -> float:
+    """A cost below which an error is not measured against it.
+
+    The negative logarithm of a likelihood may be anything, 0 too; its parts are of the size of half the samples.
+    """
+    items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
+    return 1e-300 if least_squares(problem) else 0.5 * sum(item.count for item in items)
 
 
 def least_squares(problem: Problem) -> bool:

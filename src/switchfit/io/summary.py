@@ -7,6 +7,7 @@ import numpy as np
 from switchfit.data import Measurements, ReferenceSignal
 from switchfit.evaluate import evaluator_of
 from switchfit.experiment import Experiment
+from switchfit.hidden import refuse_hidden_switches
 from switchfit.problem import Problem
 
 #: Eigenvalues of the scaled Gauss-Newton matrix below this are called undetermined.
@@ -27,11 +28,13 @@ def describe(problem: Problem) -> str:
     unknowns = problem.unknowns
     width = max(len(name) for name in unknowns.names)
     lines.append("Unknowns, first guess and bounds")
-    columns = (unknowns.names, unknowns.units, unknowns.initial, unknowns.lower, unknowns.upper)
-    for name, unit, value, lower, upper in zip(*columns, strict=True):
+    numbers = (unknowns.initial, unknowns.lower, unknowns.upper)
+    columns = (unknowns.names, unknowns.units, *numbers, unknowns.priors.texts(), unknowns.log)
+    for name, unit, value, lower, upper, prior, log in zip(*columns, strict=True):
         unit = "" if unit == "1" else f" {unit}"
         bounds = "" if np.isinf(lower) and np.isinf(upper) else f"   in [{lower:.6g}, {upper:.6g}]"
-        lines.append(f"  {name:<{width}}  {value:.6g}{unit}{bounds}")
+        known = f"   prior: {prior}" if prior else ""
+        lines.append(f"  {name:<{width}}  {value:.6g}{unit}{bounds}{known}{'   (log scale)' if log else ''}")
     return "\n".join(lines)
 
 
@@ -45,7 +48,7 @@ def _experiment_lines(experiment: Experiment) -> list[str]:
             lines.append(
                 f"{len(item.times)} samples of {_names(item.names, item.values.shape[1])}, "
                 f"{item.times[0]:.6g} to {item.times[-1]:.6g} s, typically {step:.4g} s apart, {missing} values missing"
-                f"{', noise unknown' if item.sigma is None else ''}"
+                f"{_noise(item)}{'' if item.loss == 'linear' else f', loss {item.loss} ({item.loss_scale:g} sigma)'}"
             )
         elif isinstance(item, ReferenceSignal):
             knots = item.signal.knots
@@ -54,6 +57,14 @@ def _experiment_lines(experiment: Experiment) -> list[str]:
         else:
             lines.append(type(item).__name__)
     return lines
+
+
+def _noise(item: Measurements) -> str:
+    """What is not known of the noise."""
+    if item.sigma is None:
+        return ", noise unknown"
+    named = sorted({name for name in item.sigma_names if name})
+    return f", sigma estimated: {', '.join(named)}" if named else ""
 
 
 def _names(names: tuple[str, ...] | None, channels: int) -> str:
@@ -66,8 +77,16 @@ def identifiability(problem: Problem) -> str:
     Parameters
     ----------
     problem : Problem
+
+    Raises
+    ------
+    ValueError
+        For a parameter that changes the cost while its derivative is zero: a switch hidden in a function.
     """
-    H = evaluator_of(problem)(problem.initial_theta, matrix="gauss-newton").hessian
+    evaluator, theta = evaluator_of(problem), problem.initial_theta
+    here = evaluator(theta, matrix="gauss-newton")
+    refuse_hidden_switches(evaluator, theta, here.gradient)
+    H = here.hessian
     scale = np.sqrt(np.diag(H))
     names = np.array(problem.theta_names)
     without = names[~(scale > 0)]
