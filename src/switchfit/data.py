@@ -243,6 +243,10 @@ class Measurements:
         As in `scipy.optimize.least_squares`; all but the first count outliers for less.
     loss_scale : float, optional
         C, in units of sigma: residuals beyond it are outliers.
+    delay : float or str, optional
+        By how much (s) the sensor is late: a sample stamped t_k is of the state at ``t_k - delay``, and `observe` is
+        called with that time. A string names the parameter that it is. Give channels of different delays as several
+        `Measurements`.
 
     Raises
     ------
@@ -258,6 +262,7 @@ class Measurements:
     names: tuple[str, ...] | None = None
     loss: Literal["linear", "soft_l1", "huber", "cauchy"] = "linear"
     loss_scale: float = 1.0
+    delay: float | str = 0.0
 
     def __post_init__(self) -> None:
         times, values = _samples(self.times, self.values, "Measurements", at_least=1)
@@ -273,6 +278,16 @@ class Measurements:
         object.__setattr__(self, "sigma", _checked_sigma(self.sigma, values.shape))
         object.__setattr__(self, "names", _channel_names(self.names, values.shape[1]))
         self._check_loss()
+        if not isinstance(self.delay, str):
+            delay = as_number(self.delay, "delay (a number, or the name of a parameter)")
+            if not np.isfinite(delay):
+                raise ValueError(f"delay must be finite; got {self.delay}.")
+            object.__setattr__(self, "delay", delay)
+
+    @property
+    def seen_times(self) -> FloatArray:
+        """Times of the states that were seen, (K,): with a delay that is a parameter, as if there were none."""
+        return self.times if isinstance(self.delay, str) or self.delay == 0.0 else self.times - self.delay
 
     def _check_loss(self) -> None:
         if self.loss not in LOSSES:

@@ -48,11 +48,13 @@ class Sensor(NamedTuple):
     sigma: tuple[str | None, ...]  # the parameter that is the sigma of each channel; empty where all are numbers
     loss: str
     loss_scale: float
+    delay: str | None  # the parameter that is the delay; None where it is a number, which is in the times
 
     @classmethod
     def of(cls, item: Measurements) -> Sensor:
         """That of one of the data."""
-        return cls(item.observe, item.values.shape[1], item.sigma_names, item.loss, item.loss_scale)
+        delay = item.delay if isinstance(item.delay, str) else None
+        return cls(item.observe, item.values.shape[1], item.sigma_names, item.loss, item.loss_scale, delay)
 
 
 @dataclass(frozen=True)
@@ -256,6 +258,11 @@ class Model:
         sensor = self.structure.measurements[k]
         h = self.observed(sensor.observe, sample.time, x, p, sensor.channels)
         return jnp.where(sample.weight > 0, h - sample.value, 0.0)
+
+    def seen_at(self, k: int, sample: Samples, p: Array) -> Samples:
+        """A late sample with the time of the state that it is of, ``t - delay``, in place of its own."""
+        delay = self.structure.measurements[k].delay
+        return sample if delay is None else sample._replace(time=sample.time - self.parameters(p)[delay])
 
     def log_sigma(self, k: int, sample: Samples, p: Array) -> Array:
         """Logarithm of the sigma of each channel that is a parameter and has a value in this sample, else 0: (q,)."""
@@ -582,8 +589,8 @@ def _call_functions(structure: Structure, model_of: Callable[[Structure, Argumen
         jax.eval_shape(model.density(piece), t, x, p)
         for k, sensor in enumerate(structure.measurements):
             row = jax.ShapeDtypeStruct((sensor.channels,), jnp.float64)
-            sample = Samples(jax.ShapeDtypeStruct((), jnp.int64), t, row, row)
-            jax.eval_shape(partial(model.sample_cost, k), sample, x, p)
+            sample: Any = Samples(jax.ShapeDtypeStruct((), jnp.int64), t, row, row)  # type: ignore[arg-type]  # shapes
+            jax.eval_shape(lambda s, x, p, k=k: model.sample_cost(k, model.seen_at(k, s, p), x, p), sample, x, p)
         jax.eval_shape(model.terminal, x, p)
         jax.eval_shape(model.initial_state, p)
 
@@ -609,8 +616,8 @@ def _padded_samples(item: Measurements, length: int, mesh: Mesh) -> Samples:
     extra = length - len(item.times)
     rows = ((0, extra), (0, 0))
     return Samples(
-        np.pad(mesh.cell_ending_at(item.times), (0, extra), mode="edge"),  # type: ignore[arg-type]  # made jax arrays
-        np.pad(item.times, (0, extra), mode="edge"),  # type: ignore[arg-type]
+        np.pad(mesh.cell_ending_at(item.seen_times), (0, extra), mode="edge"),  # type: ignore[arg-type]  # made jax arrays
+        np.pad(item.seen_times, (0, extra), mode="edge"),  # type: ignore[arg-type]
         np.pad(np.nan_to_num(item.values), rows),  # type: ignore[arg-type]
         np.pad(item.weights, rows),  # type: ignore[arg-type]
     )

@@ -140,6 +140,7 @@ class Problem:
         self._check_states()
         object.__setattr__(self, "unknowns", _unknowns(self.system, experiments, parameters, dwell))
         self._check_noise()
+        self._check_delays()
         targets = frozenset(name for e in experiments for name in e.parameter_map.values())
         structures = tuple(structure_of(self.system, e, parameters, self.solver, targets) for e in experiments)
         for structure in structures:
@@ -187,6 +188,28 @@ class Problem:
                 "a prior is weighed against the noise of the Measurements, whose sigma is left out: give sigma a "
                 "number, or the name of a parameter to estimate it."
             )
+
+    def _check_delays(self) -> None:
+        """Parameters that are a delay: within their bounds all samples must be of moments inside the horizon."""
+        for experiment in self.experiments:
+            for item in experiment.data:
+                if not (isinstance(item, Measurements) and isinstance(item.delay, str)):
+                    continue
+                parameter = self.parameters.get(experiment.parameter_map.get(item.delay, item.delay))
+                if parameter is None or parameter.shape != ():
+                    raise ValueError(
+                        f"delay names {item.delay!r}, which must be a parameter of one number; the problem has "
+                        f"{', '.join(self.parameters) or 'none'}."
+                    )
+                low, high = item.times[-1] - experiment.tf, item.times[0] - experiment.t0
+                least, most = (parameter.value,) * 2 if parameter.fixed else (parameter.lower, parameter.upper)
+                if not low <= least <= most <= high:
+                    raise ValueError(
+                        f"the delay {item.delay!r} may lie in [{least}, {most}] (its bounds, if it is not fixed), but "
+                        f"only from {low:.6g} to {high:.6g} are all samples of moments inside (t0, tf) = "
+                        f"({experiment.t0}, {experiment.tf}): give it narrower bounds, move t0 or tf, or leave out "
+                        "samples at the ends."
+                    )
 
     def _check_states(self) -> None:
         """Sizes of initial states that are no functions."""
@@ -291,7 +314,20 @@ class Problem:
                     f"The transition times in theta must not decrease inside (t0, tf) = ({experiment.t0}, "
                     f"{experiment.tf}); got {times.tolist()}."
                 )
+        self._check_delays_inside(checked)
         return checked
+
+    def _check_delays_inside(self, theta: FloatArray) -> None:
+        for e, experiment in enumerate(self.experiments):
+            for item in experiment.data:
+                if isinstance(item, Measurements) and isinstance(item.delay, str):
+                    seen = item.times[[0, -1]] - self.named(theta, e)[item.delay]
+                    if seen[0] < experiment.t0 or seen[1] > experiment.tf:
+                        raise ValueError(
+                            f"theta has the delay {item.delay!r} = {self.named(theta, e)[item.delay]}, with which "
+                            f"samples are of moments from {seen[0]:.6g} to {seen[1]:.6g}, outside (t0, tf) = "
+                            f"({experiment.t0}, {experiment.tf})."
+                        )
 
     def split(self, theta: FloatArray) -> tuple[list[FloatArray], dict[str, FloatArray]]:
         """All transition times, one ``(N,)`` array an experiment, and all parameters by name, fixed ones included."""
@@ -361,9 +397,7 @@ def _unknowns(
     log = np.concatenate([np.full(q.value.size, q.scale == "log") for q in pieces])
     A, b, rows = _ordering(experiments, where, len(names), dwell)
     vectors = flat["value"], flat["lower"], flat["upper"]
-    return Unknowns(
-        tuple(names), tuple(units), *vectors, tuple(where), spans, tuple(states), A, b, rows, priors, log
-    )
+    return Unknowns(tuple(names), tuple(units), *vectors, tuple(where), spans, tuple(states), A, b, rows, priors, log)
 
 
 def _index(k: tuple[int, ...]) -> str:

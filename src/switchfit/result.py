@@ -230,9 +230,7 @@ def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_]) -> Flo
     """``theta -+ half``, or where `log` ``theta exp(-+ half / theta)``: (..., 2)."""
     size = np.where(log, theta, 1.0)
     factor = np.exp(np.where(log, half / size, 0.0))
-    return np.stack(
-        [np.where(log, theta / factor, theta - half), np.where(log, theta * factor, theta + half)], axis=-1
-    )
+    return np.stack([np.where(log, theta / factor, theta - half), np.where(log, theta * factor, theta + half)], axis=-1)
 
 
 def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:

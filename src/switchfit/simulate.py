@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.cache import compilation_cache
 from switchfit.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.losses import robust
-from switchfit.mesh import CHUNK, Mesh, rows
+from switchfit.mesh import CHUNK, Mesh, Rows, rows
 from switchfit.model import Arguments, Model, Piece, Structure, float64
 from switchfit.problem import Problem
 from switchfit.refine import after_reset, initial_state, refined_mesh
@@ -162,12 +162,16 @@ class Segment(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One simulation: its cost, its segments, the cells of the mesh in which these begin (N + 1,), and the mesh."""
+    """One simulation: its cost, its segments, the cells of the mesh in which these begin (N + 1,), and the mesh.
+
+    `seen` is what each of the Measurements sees at its samples, (K, q) arrays.
+    """
 
     cost: float
     segments: list[Segment]
     first_cell: NDArray[np.intp]
     mesh: Mesh
+    seen: tuple[FloatArray, ...] = ()
 
     def at_cells(self, cells: NDArray[np.intp], channels: slice) -> FloatArray:
         """Outputs at the ends of cells (K,), before a jump; at t0 for cell -1: (K, q)."""
@@ -204,8 +208,13 @@ def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> Run:
     run = Run(cost, segments, np.asarray(layout.first_cell), mesh)
     first = sum(q for _, q in structure.references)
     named = problem.named(theta, e)
-    for samples, sensor in zip(whole.samples, structure.measurements, strict=True):
-        seen = run.at_cells(np.asarray(samples.cell), slice(first, first + sensor.channels))
+    all_seen = []
+    for k, (samples, sensor) in enumerate(zip(whole.samples, structure.measurements, strict=True)):
+        if sensor.delay is None:
+            seen = run.at_cells(np.asarray(samples.cell), slice(first, first + sensor.channels))
+        else:
+            seen = _late_outputs(structure, whole, run, layout, k, named, p)
+        all_seen.append(seen)
         there = np.asarray(samples.weight) > 0
         u = samples.weight * np.where(there, seen - samples.value, 0.0) ** 2
         if sensor.sigma:
@@ -214,7 +223,68 @@ def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> Run:
             cost += float(np.sum(there * np.log(sigma)))
         cost += 0.5 * float(np.sum(robust(sensor.loss, sensor.loss_scale, u)))
         first += sensor.channels
-    return replace(run, cost=cost)
+    return replace(run, cost=cost, seen=tuple(all_seen))
+
+
+def _late_outputs(
+    structure: Structure,
+    whole: Arguments,
+    run: Run,
+    layout: Rows,
+    k: int,
+    named: Mapping[str, FloatArray],
+    p: FloatArray,
+) -> FloatArray:
+    """What the k-th Measurements sees at its samples, which are late by a parameter: (K, q)."""
+    sensor, samples = structure.measurements[k], whole.samples[k]
+    times = np.asarray(samples.time) - float(named[sensor.delay or ""])
+    start, end, before = (
+        np.concatenate([getattr(part, a) for part in run.segments]) for a in ("start", "end", "before")
+    )
+    row = np.minimum(np.searchsorted(end, times), len(end) - 1)
+    mode = np.repeat(structure.mode_of_segment, [len(part.start) for part in run.segments])[row]
+    flat = np.concatenate(
+        [np.arange(len(part.start)) + c for part, c in zip(run.segments, run.first_cell, strict=True)]
+    )
+    cell = flat[row]
+    rows = (times, mode, start[row], before[row], whole.nodes[cell], whole.signals[cell])
+    count = len(times)
+    padded = [np.concatenate([a, np.repeat(a[-1:], -count % BLOCK, axis=0)]) for a in rows]
+    parts = []
+    with float64(), compilation_cache():
+        for first in range(0, len(padded[0]), BLOCK):
+            block = [a[first : first + BLOCK] for a in padded]
+            found = _late_block(whole.without_mesh(), *block, p, structure=structure.functions, k=k)
+            parts.append(np.asarray(found))
+    return np.concatenate(parts)[:count]
+
+
+@partial(jax.jit, static_argnames=("structure", "k"))
+def _late_block(
+    arguments: Arguments,
+    times: jax.Array,
+    mode: jax.Array,
+    start: jax.Array,
+    x: jax.Array,
+    origin: jax.Array,
+    coefficients: jax.Array,
+    p: jax.Array,
+    *,
+    structure: Structure,
+    k: int,
+) -> jax.Array:
+    """Outputs of the k-th Measurements at times inside rows, a step from the start of each: (BLOCK, q)."""
+    model = Model(structure, arguments)
+    sensor = structure.measurements[k]
+
+    def one(time: jax.Array, mode: jax.Array, start: jax.Array, x: jax.Array, piece: Piece) -> jax.Array:
+        steps = [
+            lambda x, m=m: step(model.tableau, model.field(m, piece), None, start, time, x, p)[0]
+            for m in range(len(structure.modes))
+        ]
+        return model.observed(sensor.observe, time, lax.switch(mode, steps, x), p, sensor.channels)
+
+    return jax.vmap(one)(times, mode, start, x, Piece(origin, coefficients))
 
 
 def _segment(
@@ -314,7 +384,7 @@ def _comparisons(
     curves = np.concatenate([_shown(part, part.y_before, part.y_after) for part in run.segments])
     comparisons = []
     items = [d for d in data if isinstance(d, ReferenceSignal)] + [d for d in data if isinstance(d, Measurements)]
-    first = 0
+    first = measured = 0
     for item in items:
         q = item.signal.channels if isinstance(item, ReferenceSignal) else item.values.shape[1]
         channels = slice(first, first + q)
@@ -325,11 +395,15 @@ def _comparisons(
         if isinstance(item, ReferenceSignal):
             here = Comparison("reference", label, times, item.signal(times), curve, None, times, curve)
         else:
-            fitted = run.at_cells(run.mesh.cell_ending_at(item.times), channels)
-            sigma = item.noise(problem.named(theta, e))
+            named = problem.named(theta, e)
+            fitted = run.seen[measured][: len(item.times)]
+            measured += 1
+            delay = float(named[item.delay]) if isinstance(item.delay, str) else item.delay
+            sigma = item.noise(named)
             beyond = None
             if item.loss != "linear" and sigma is not None:
                 beyond = np.abs(np.nan_to_num(item.values - fitted)) > item.loss_scale * sigma
-            here = Comparison("measurements", label, item.times, item.values, fitted, sigma, times, curve, beyond)
+            shown = times + delay  # as the sensor says it
+            here = Comparison("measurements", label, item.times, item.values, fitted, sigma, shown, curve, beyond)
         comparisons.append(here)
     return tuple(comparisons)

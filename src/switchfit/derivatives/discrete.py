@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from switchfit.derivatives.delayed import anchors, late_costates, late_curvature, late_gauss_newton
 from switchfit.derivatives.first_order import (
     FirstOrder,
     Tangents,
@@ -103,15 +104,22 @@ def costates(model: Model, first: FirstOrder, p: Array) -> Costates:
     path, jacobians, resets = first.path, first.jacobians, first.resets
     Q, C, n = path.after.shape
     jumps = jnp.zeros((Q * C + 1, n))  # the first entry is that of samples at t0
+    late = jnp.zeros((Q * C, n))  # at the starts of rows
+    any_late = any(sensor.delay is not None for sensor in model.structure.measurements)
     for k, samples in enumerate(model.arguments.samples):
+        if model.structure.measurements[k].delay is not None:
+            at = anchors(model, path, first.tangents.before, k, p)
+            late = late.at[at.row].add(late_costates(model, at, k, samples, p))
+            continue
         where = row_ending_cell(path.layout, samples.cell) + 1
         jumps = jumps.at[where].add(sample_gradients(model, path, k, samples, p)[1])
 
     def row(psi: Array, given: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
-        h, f_x, jump, *l_x = given
+        h, f_x, jump, *more = given
         psi = psi + jump
-        w, mu, before = stage_adjoints(model.tableau, h, f_x, l_x[0] if l_x else jnp.zeros(f_x.shape[:2]), psi)
-        return before, (psi, w, mu)
+        l_x = more[0] if model.has_running_cost else jnp.zeros(f_x.shape[:2])
+        w, mu, before = stage_adjoints(model.tableau, h, f_x, l_x, psi)
+        return before + more[-1] if any_late else before, (psi, w, mu)
 
     def chunk(psi: Array, given: tuple[Array, Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
         segment, opens, operands = given
@@ -122,7 +130,8 @@ def costates(model: Model, first: FirstOrder, p: Array) -> Costates:
     layout = path.layout
     final = jax.grad(model.terminal)(path.after[-1, -1], p) if model.structure.terminal else jnp.zeros(n)
     of_ell = (jacobians.l_x,) if model.has_running_cost else ()
-    operands = (layout.end - layout.start, jacobians.f_x, jumps[1:].reshape(Q, C, n), *of_ell)
+    of_late = (late.reshape(Q, C, n),) if any_late else ()
+    operands = (layout.end - layout.start, jacobians.f_x, jumps[1:].reshape(Q, C, n), *of_ell, *of_late)
     psi, columns = lax.scan(chunk, final, (layout.segment, layout.opens, operands), reverse=True)
     return Costates(psi + jumps[0], *columns)
 
@@ -267,6 +276,9 @@ def sample_curvature(
 ) -> Array:
     """Second derivative of the costs of the k-th Measurements: (D, D)."""
     P = parameter_directions(model)
+    if model.structure.measurements[k].delay is not None:
+        of_late = late_gauss_newton if gauss_newton else late_curvature
+        return of_late(model, anchors(model, path, X.before, k, p), k, samples, p, P)
 
     def one(given: tuple[Samples, Array, Array]) -> Array:
         sample, x, x_d = given

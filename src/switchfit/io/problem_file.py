@@ -108,7 +108,9 @@ class PriorTable(_Table):
     mean: float | None = Field(default=None, description="mean of a normal prior")
     sd: float | None = Field(default=None, description="standard deviation of a normal prior")
     median: float | None = Field(default=None, description="median of a log-normal prior")
-    log_sd: float | None = Field(default=None, description="standard deviation of the logarithm, for a log-normal prior")
+    log_sd: float | None = Field(
+        default=None, description="standard deviation of the logarithm, for a log-normal prior"
+    )
 
 
 class ParameterTable(_Table):
@@ -119,7 +121,9 @@ class ParameterTable(_Table):
     upper: float = Field(default=np.inf, description="upper bound")
     unit: str = Field(default="", description="unit, for the report")
     fixed: bool = Field(default=False, description="true if it is known and not to be estimated")
-    prior: PriorTable | None = Field(default=None, description="what is known of it: { mean, sd } or { median, log_sd }")
+    prior: PriorTable | None = Field(
+        default=None, description="what is known of it: { mean, sd } or { median, log_sd }"
+    )
     scale: Literal["linear", "log"] = Field(default="linear", description="'log': estimated as its logarithm")
 
 
@@ -130,7 +134,9 @@ class TransitionTable(_Table):
     lower: float = Field(default=-np.inf, description="earliest time (s)")
     upper: float = Field(default=np.inf, description="latest time (s)")
     fixed: bool = Field(default=False, description="true if the time is known and not to be estimated")
-    prior: PriorTable | None = Field(default=None, description="what is known of it: { mean, sd } or { median, log_sd }")
+    prior: PriorTable | None = Field(
+        default=None, description="what is known of it: { mean, sd } or { median, log_sd }"
+    )
 
 
 class StateTable(_Table):
@@ -141,7 +147,9 @@ class StateTable(_Table):
     upper: float = Field(default=np.inf, description="upper bound")
     unit: str = Field(default="", description="unit, for the report; left out, that of the state")
     fixed: bool = Field(default=False, description="true if it is known and not to be estimated")
-    prior: PriorTable | None = Field(default=None, description="what is known of it: { mean, sd } or { median, log_sd }")
+    prior: PriorTable | None = Field(
+        default=None, description="what is known of it: { mean, sd } or { median, log_sd }"
+    )
     scale: Literal["linear", "log"] = Field(default="linear", description="'log': estimated as its logarithm")
 
 
@@ -178,6 +186,9 @@ class DataTable(LogTable):
         default="linear", description="what outliers cost (measurements only)"
     )
     loss_scale: float = Field(default=1.0, gt=0, description="size of a residual, in sigmas, beyond which it is one")
+    delay: float | str = Field(
+        default=0.0, description="by how much the sensor is late (s), or the parameter that it is (measurements only)"
+    )
     lowpass_hz: float | None = Field(
         default=None, gt=0, description="cut-off of a low-pass filter (Hz; reference only)"
     )
@@ -390,8 +401,7 @@ def _from_tables(path: Path, contents: Contents) -> Problem:
         known = frozenset(contents.parameters) | frozenset(table.parameter_map)
         experiments.append(_explained(where, _experiment, path.parent, table, system, where, known))
     parameters = {
-        name: _explained(f"{path}: parameters.{name}", _parameter, table)
-        for name, table in contents.parameters.items()
+        name: _explained(f"{path}: parameters.{name}", _parameter, table) for name, table in contents.parameters.items()
     }
     options = contents.options.model_dump(include={"min_duration", "solver", "rtol", "atol"}, exclude_none=True)
     return _explained(f"{path}", Problem, system, experiments, parameters, **options)
@@ -467,7 +477,7 @@ def _experiment(
         _explained(place, _data, folder, item, system, place, parameters)
         for place, item in zip(places, table.data, strict=True)
     ]
-    spans = [item.times if isinstance(item, Measurements) else item.signal.knots for item in data]
+    spans = [item.seen_times if isinstance(item, Measurements) else item.signal.knots for item in data]
     return Experiment(
         data=data,
         mode_sequence=tuple(table.mode_sequence),
@@ -498,8 +508,9 @@ def _data(
     if table.kind == "reference":
         if table.sigma is not None:
             raise ValueError("sigma belongs to kind = 'measurements'; a reference has weights.")
-        if table.loss != "linear":
-            raise ValueError("loss belongs to kind = 'measurements'; a reference has weights.")
+        for key, default in (("loss", "linear"), ("delay", 0.0)):
+            if getattr(table, key) != default:
+                raise ValueError(f"{key} belongs to kind = 'measurements', not to a reference.")
         times, values = _log(folder, table)
         return ReferenceSignal.from_samples(
             times, values, observe=observe, lowpass_hz=table.lowpass_hz, weights=table.weights, names=names
@@ -511,8 +522,16 @@ def _data(
     times, values = _log(folder, table, sigma_columns)
     q = len(table.columns)
     sigma = values[:, q:] if sigma_columns else table.sigma
-    loss = {"loss": table.loss, "loss_scale": table.loss_scale}
-    return Measurements(times, values[:, :q], observe=observe, sigma=sigma, names=names, **loss)
+    return Measurements(
+        times,
+        values[:, :q],
+        observe=observe,
+        sigma=sigma,
+        names=names,
+        loss=table.loss,
+        loss_scale=table.loss_scale,
+        delay=table.delay,
+    )
 
 
 def _sigma_columns(table: DataTable, parameters: frozenset[str]) -> list[str]:

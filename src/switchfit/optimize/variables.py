@@ -36,7 +36,9 @@ class Variables(NamedTuple):
         log : (d,) of bool
         keep : (d,) of bool, what is not to be scaled
         """
-        bounds = np.maximum(np.where(np.isfinite(lower), np.abs(lower), 0), np.where(np.isfinite(upper), np.abs(upper), 0))
+        bounds = np.maximum(
+            np.where(np.isfinite(lower), np.abs(lower), 0), np.where(np.isfinite(upper), np.abs(upper), 0)
+        )
         typical = np.where(theta != 0.0, np.abs(theta), bounds)
         outside = (typical > 0) & ((typical < ORDINARY[0]) | (typical > ORDINARY[1])) & ~keep & ~log
         # A power of 2, so that scaling rounds nothing.
