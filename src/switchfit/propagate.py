@@ -125,9 +125,9 @@ def sample_costs(model: Model, path: Path, p: Array) -> Array:
         if model.structure.measurements[k].delay is None:
             x = path.at_samples(samples.cell)
         else:
-            _, *where = row_holding(model, path, k, p)
+            _, segment, piece, start, before = row_holding(model, path, k, p)
             late = jax.vmap(partial(seen_late, model, k), in_axes=(0, 0, 0, 0, 0, None))
-            samples, x = late(samples, *where, p)
+            samples, x = late(samples, segment, piece, start, before, p)
         total = total + jax.vmap(lambda s, x, k=k: model.sample_cost(k, s, x, p))(samples, x).sum()
     return total
 
