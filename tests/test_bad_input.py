@@ -624,7 +624,7 @@ PRIOR = {"k": sf.Parameter(1.0, prior=sf.Normal(1.0, 0.1))}
                 [0.4, 1.0, 0.6],
             ),
             ValueError,
-            ["theta has the delay 'd' = 0.6", "moments from -0.1 to -0.1, outside (t0, tf) = (0.0, 1.0)"],
+            ["theta has delays with which samples are of moments from -0.1 to -0.1, outside (t0, tf) = (0.0, 1.0)"],
         ),
         (lambda: sf.Parameter(1.0, scale="ln"), ValueError, ["Parameter scale must be 'linear' or 'log'; got 'ln'"]),
         (lambda: sf.Parameter(0.0, scale="log"), ValueError, ["with scale='log' must be positive", "the value 0.0"]),

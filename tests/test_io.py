@@ -241,6 +241,7 @@ def test_loss_delay_priors_and_scales(folder):
     assert priors == {"tau_1": "log-normal(3, 0.2)", "heating": "normal(0.4, 0.1)", "d": "", "cooling": ""}
     assert problem.unknowns.log_names == ("cooling",)
     text = describe(problem)
+    assert "late by d" in text
     assert "loss huber (1.5 sigma)" in text
     assert "prior: normal(0.4, 0.1)" in text
     assert "(log scale)" in text

@@ -33,7 +33,8 @@ def exponent(tau, side):
     """Exponent of x at the samples, and which samples feel each transition move to one side."""
     t1, t2 = tau
     s = np.minimum(TIMES, t1) * A + np.clip(TIMES - t1, 0, max(t2 - t1, 0)) * B + np.clip(TIMES - t2, 0, None) * C
-    after = [t < TIMES if side > 0 else t <= TIMES for t in tau]
+    last = TIMES[-1]  # tf: nothing moves beyond it
+    after = [t < TIMES if side > 0 and t < last else t <= TIMES for t in tau]
     return s, np.array([(A - B) * after[0], (B - C) * after[1]])
 
 

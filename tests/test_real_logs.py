@@ -275,7 +275,11 @@ def test_priors_and_scales_in_a_joint_fit_of_many_runs():
     runs = [sf.Experiment(item, ("free", "damped"), (1.1,), 0.0, 3.3) for item in data]
     k = sf.Parameter(2.0, scale="log", prior=sf.LogNormal(2.3, 0.02))
     damping = sf.Parameter(0.3, prior=sf.Normal(0.3, 0.01))
-    found = sf.estimate(sf.Problem(SYSTEM, runs, {"k": k, "damping": damping}))
+    together = sf.Problem(SYSTEM, runs, {"k": k, "damping": damping})
+    found = sf.estimate(together)
+    dense = sf.evaluate(together, found.theta)
+    np.testing.assert_allclose(found.hessian, dense.hessian, rtol=1e-5, atol=1e-6 * np.abs(dense.hessian).max())
+    assert found.cost == pytest.approx(dense.cost, rel=1e-7)
     k_prior, damping_prior = sf.LogNormal(2.3, 0.02 * np.sqrt(8)), sf.Normal(0.3, 0.01 * np.sqrt(8))
     one = sf.Problem(
         SYSTEM, runs[0],
@@ -306,9 +310,9 @@ def test_an_unknown_delay_is_found():
     np.testing.assert_allclose(comparison.curve_times - found.trajectory.times, 0.07, rtol=1e-6)
 
 
-@pytest.mark.parametrize("tau", [TIMES[5], TIMES[5] - 0.043, 0.0, 3.3])
+@pytest.mark.parametrize("tau", [TIMES[5], TIMES[5] - 0.043, TIMES[5] - 0.044, 0.0, 3.3])
 def test_late_samples_and_transitions_at_hard_moments(tau):
-    """tau at a sample, at what a sample sees, at t0 and at tf."""
+    """tau at a sample, at what a sample sees, shortly before that, at t0 and at tf."""
     this = CASES["delay"]()
     theta = this.initial_theta
     theta[0] = tau
@@ -319,6 +323,15 @@ def test_late_samples_and_transitions_at_hard_moments(tau):
             found.gradient, expected.gradient, rtol=0, atol=1e-10 * np.abs(expected.gradient).max()
         )
         np.testing.assert_allclose(found.hessian, expected.hessian, rtol=0, atol=1e-10 * np.abs(expected.hessian).max())
+
+
+def test_the_check_of_derivatives_keeps_transitions_off_what_late_samples_see():
+    this = CASES["delay"]()
+    theta = this.initial_theta
+    theta[0] = TIMES[5] - 0.043
+    check = sf.check_derivatives(this, theta)
+    assert np.abs(check.theta[0] - this.late_times(theta, 0)).min() > 1e-4
+    np.testing.assert_allclose(check.observed_orders, [1.0, 2.0, 3.0], atol=0.1)
 
 
 def test_nothing_compiles_anew_as_delay_and_noise_move(case):

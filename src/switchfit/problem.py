@@ -295,6 +295,13 @@ class Problem:
         mapped = self.experiments[e].parameter_map
         return own | {name: own[target] for name, target in mapped.items()}
 
+    def late_times(self, theta: FloatArray, e: int) -> FloatArray:
+        """Moments of which the samples of experiment e are whose delay is a parameter: (K,), in no order."""
+        items = [item for item in self.experiments[e].data if isinstance(item, Measurements)]
+        late = [(item.times, item.delay) for item in items if isinstance(item.delay, str)]
+        named = self.named(theta, e) if late else {}
+        return np.concatenate([np.zeros(0), *(times - named[delay] for times, delay in late)])
+
     def checked_theta(self, theta: ArrayLike | None) -> FloatArray:
         """`theta`, or the initial guess for None, as a ``(d,)`` array; ValueError where shape or order is wrong."""
         if theta is None:
@@ -319,15 +326,12 @@ class Problem:
 
     def _check_delays_inside(self, theta: FloatArray) -> None:
         for e, experiment in enumerate(self.experiments):
-            for item in experiment.data:
-                if isinstance(item, Measurements) and isinstance(item.delay, str):
-                    seen = item.times[[0, -1]] - self.named(theta, e)[item.delay]
-                    if seen[0] < experiment.t0 or seen[1] > experiment.tf:
-                        raise ValueError(
-                            f"theta has the delay {item.delay!r} = {self.named(theta, e)[item.delay]}, with which "
-                            f"samples are of moments from {seen[0]:.6g} to {seen[1]:.6g}, outside (t0, tf) = "
-                            f"({experiment.t0}, {experiment.tf})."
-                        )
+            seen = self.late_times(theta, e)
+            if seen.size and (seen.min() < experiment.t0 or seen.max() > experiment.tf):
+                raise ValueError(
+                    f"theta has delays with which samples are of moments from {seen.min():.6g} to {seen.max():.6g}, "
+                    f"outside (t0, tf) = ({experiment.t0}, {experiment.tf})."
+                )
 
     def split(self, theta: FloatArray) -> tuple[list[FloatArray], dict[str, FloatArray]]:
         """All transition times, one ``(N,)`` array an experiment, and all parameters by name, fixed ones included."""

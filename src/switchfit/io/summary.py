@@ -48,7 +48,7 @@ def _experiment_lines(experiment: Experiment) -> list[str]:
             lines.append(
                 f"{len(item.times)} samples of {_names(item.names, item.values.shape[1])}, "
                 f"{item.times[0]:.6g} to {item.times[-1]:.6g} s, typically {step:.4g} s apart, {missing} values missing"
-                f"{_noise(item)}{'' if item.loss == 'linear' else f', loss {item.loss} ({item.loss_scale:g} sigma)'}"
+                f"{_sensor(item)}"
             )
         elif isinstance(item, ReferenceSignal):
             knots = item.signal.knots
@@ -59,12 +59,16 @@ def _experiment_lines(experiment: Experiment) -> list[str]:
     return lines
 
 
-def _noise(item: Measurements) -> str:
-    """What is not known of the noise."""
-    if item.sigma is None:
-        return ", noise unknown"
+def _sensor(item: Measurements) -> str:
+    """What is to be said of delay, noise and loss, where there is anything."""
     named = sorted({name for name in item.sigma_names if name})
-    return f", sigma estimated: {', '.join(named)}" if named else ""
+    said = [
+        f"late by {item.delay}" if item.delay else "",
+        "noise unknown" if item.sigma is None else "",
+        f"sigma: {', '.join(named)}" if named else "",
+        f"loss {item.loss} ({item.loss_scale:g} sigma)" if item.loss != "linear" else "",
+    ]
+    return "".join(f", {text}" for text in said if text)
 
 
 def _names(names: tuple[str, ...] | None, channels: int) -> str:
