@@ -225,6 +225,7 @@ def minimized(
     matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
     by_blocks = len(problem.experiments) >= MANY_RUNS and 2 * len(evaluator.layout.shared) < len(theta)
     variables, constraints = unknowns.variables, constraints_of(problem)
+    identity = variables.identity
     seen: list[bool] = []
 
     def evaluate_theta(theta: Any, side: int) -> Evaluation | ArrowEvaluation | CostAndGradient:
@@ -234,23 +235,23 @@ def minimized(
         return CostAndGradient(here.cost, here.gradient) if hessian == "none" else here
 
     def evaluate(z: Any, side: int) -> Any:
-        theta = _outward(variables, constraints, z)
+        theta = z if identity else _outward(variables, constraints, z)
         here = evaluate_theta(theta, side)
         if not seen:
             seen.append(True)
             refuse_hidden_switches(evaluator, theta, here.gradient)
-        return _inward(variables, theta, here)
+        return here if identity else _inward(variables, theta, here)
 
     is_time = np.zeros(len(theta), dtype=int)
     for where in problem.unknowns.times:
         is_time[where[where >= 0]] = 1
     told = callback
-    if callback is not None and not variables.identity:
+    if callback is not None and not identity:
         told = lambda record: callback(_told(variables, constraints, record))  # noqa: E731
     result = minimize(
         evaluate,
-        theta if variables.identity else variables.inward(np.asarray(theta)),
-        constraints=constraints if variables.identity else _constraints_inward(variables, constraints),
+        theta if identity else variables.inward(np.asarray(theta)),
+        constraints=constraints if identity else _constraints_inward(variables, constraints),
         breakpoints=evaluator.breakpoints(),
         hessian=hessian,
         blocks=is_time,
@@ -258,18 +259,16 @@ def minimized(
         max_iterations=max_iterations,
         callback=told,
     )
-    return _result_outward(variables, constraints, result)
+    return result if identity else _result_outward(variables, constraints, result)
 
 
 def _outward(variables: Variables, constraints: LinearConstraints, z: FloatArray) -> FloatArray:
     """theta at z, inside its bounds whatever the rounding."""
-    return z if variables.identity else np.clip(variables.outward(z), constraints.lower, constraints.upper)
+    return np.asarray(np.clip(variables.outward(z), constraints.lower, constraints.upper))
 
 
 def _inward(variables: Variables, theta: FloatArray, here: Any) -> Any:
     """An evaluation at theta as one of the optimiser's variables."""
-    if variables.identity:
-        return here
     if here.hessian is None:
         return CostAndGradient(here.cost, variables.slopes(theta)[0] * here.gradient)
     if isinstance(here.hessian, Arrow):
@@ -292,8 +291,6 @@ def _told(variables: Variables, constraints: LinearConstraints, record: Iteratio
 
 def _result_outward(variables: Variables, constraints: LinearConstraints, result: Result) -> Result:
     """The optimiser's result in theta; its optimality and its eigenvalues stay those of its own variables."""
-    if variables.identity:
-        return result
     theta = _outward(variables, constraints, result.theta)
     gradient, hessian = variables.derivatives_outward(theta, result.gradient, result.hessian)
     history = tuple(_told(variables, constraints, record) for record in result.history)
