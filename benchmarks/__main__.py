@@ -7,7 +7,7 @@ import time
 
 from benchmarks import machine
 
-PARTS = ("derivatives", "peers", "fit", "fits", "cold", "many", "scaling")
+PARTS = ("derivatives", "peers", "fit", "fits", "cold", "many", "scaling", "runs")
 
 
 def main() -> None:
@@ -21,7 +21,7 @@ def main() -> None:
         parser.error(f"no such part: {', '.join(sorted(unknown))}")
     cores = machine.use_one_core()  # before JAX starts its threads
 
-    from benchmarks import cold, derivatives, fit, fits, many, scaling, side_by_side
+    from benchmarks import cold, derivatives, fit, fits, many, runs, scaling, side_by_side
     from benchmarks.report import Report
 
     report = Report(machine.describe(cores))
@@ -33,6 +33,7 @@ def main() -> None:
         "cold": lambda: cold.run(report, options.quick, cores),
         "many": lambda: many.run(report, options.quick, cores),
         "scaling": lambda: scaling.run(report, options.quick),
+        "runs": lambda: runs.run(report, options.quick),
     }
     began = time.perf_counter()
     for part in options.parts or PARTS:

@@ -230,6 +230,38 @@ def test_kinks_and_block_diagonal_hessians():
         np.testing.assert_allclose(arrow.theta, full.theta, atol=1e-8)
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_coordinates_are_released_from_kinks(seed):
+    """From a start on five kinks, some of which hold and some of which give way because others move."""
+    rng = np.random.default_rng(seed)
+    places, marks = rng.choice(11, 5, replace=False), rng.uniform(-0.3, 0.3, 5)
+    weights = 10.0 ** rng.uniform(-2, 0.5, 5)
+    full_matrix, pull = random_matrix(rng, lowest=0.2), rng.normal(size=11)
+
+    def kinked(theta, side, arrow):
+        H = full_matrix
+        away = theta[places] - marks
+        sign = np.where(away == 0.0, side, np.sign(away))
+        gradient = H @ theta + pull
+        gradient[places] += weights * sign
+        cost = 0.5 * theta @ H @ theta + pull @ theta + weights @ np.abs(away)
+        return SimpleNamespace(cost=cost, gradient=gradient, hessian=arrow_of(H) if arrow else H)
+
+    start = np.zeros(11)
+    start[places] = marks
+    breakpoints = [np.sort(marks[places == i]) for i in range(11)]
+    box = LinearConstraints.box(np.full(11, -9.0), np.full(11, 9.0))
+    full, arrow = (
+        minimize(lambda theta, side, a=a: kinked(theta, side, a), start, constraints=box, breakpoints=breakpoints)
+        for a in (False, True)
+    )
+    assert arrow.successful
+    assert arrow.status is full.status
+    assert arrow.iterations == full.iterations
+    assert arrow.evaluations == full.evaluations
+    np.testing.assert_allclose(arrow.theta, full.theta, rtol=1e-7, atol=1e-8)
+
+
 def test_saddle_points_are_left():
     start = np.zeros(11)
 

@@ -1,12 +1,23 @@
 """Several runs: what they share, what is their own, initial states that are estimated, and what all this costs."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import switchfit as sf
-from switchfit.evaluate import evaluator_of
+from switchfit.batch.program import Layout, _total
+from switchfit.cli import app
+from switchfit.estimate import minimized
+from switchfit.evaluate import derivatives, evaluator_of
+from switchfit.io.errors import InputError
+from switchfit.io.problem_file import load_problem
+from switchfit.mesh import common_lengths, padded_length
+from switchfit.refine import _steps, initial_state
+from switchfit.simulate import _block, _terminal
 
 METHODS = ("auto", "forward", "discrete-adjoint", "autodiff")
 TIMES = np.linspace(0.0, 2.0, 12)
@@ -259,3 +270,376 @@ def test_a_run_of_a_map_may_have_a_vector_and_a_fixed_parameter():
     found = sf.evaluate(problem)
     assert found.cost == pytest.approx(np.exp(-0.4) + np.exp(-0.6), rel=1e-8)
     np.testing.assert_allclose(found.gradient, -np.exp(-0.6) * np.ones(3), rtol=1e-7)
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("given", [["k"], {"k": 1}, {1: "k"}, "k"])
+def test_a_map_that_is_none(given):
+    with pytest.raises(TypeError, match="parameter_map must be a dict of the model's name -> the problem's name"):
+        run(parameter_map=given)
+
+
+def test_a_map_to_a_parameter_that_does_not_exist():
+    message = (
+        "parameter_map of experiment run2 gives the model's 'k' as the unknown parameter 'k_3'; the problem has k, b"
+    )
+    with pytest.raises(ValueError, match=message):
+        sf.Problem(SWING, [run(), run(parameter_map={"k": "k_3"})], GUESS)
+
+
+def test_a_parameter_that_neither_map_nor_problem_has():
+    lacking = {name: value for name, value in GUESS.items() if name != "b"}
+    with pytest.raises(ValueError, match="mode 'sway' asks for the parameter 'b', which the problem lacks; it has k"):
+        sf.Problem(SWING, run(parameter_map={"k": "k_2"}), lacking)
+
+
+def test_a_name_of_a_map_with_another_shape():
+    with pytest.raises(ValueError, match=r"mode 'swing': .* raised IndexError"):
+        sf.Problem(SWING, run(parameter_map={"k": "b"}), GUESS)
+
+
+@pytest.mark.parametrize(
+    ("start", "message"),
+    [
+        ([sf.Parameter(1.0), "v"], "initial_state must have a number or an sf.Parameter for each state; got 'v'"),
+        (
+            [sf.Parameter([1.0, 2.0]), 0.0],
+            r"one sf.Parameter of one number for each state; got an entry of shape \(2,\)",
+        ),
+        (sf.Parameter(1.0), r"initial_state must have shape \(n,\), one entry for each state; got shape \(\)"),
+    ],
+)
+def test_an_initial_state_that_is_none(start, message):
+    with pytest.raises(ValueError, match=message):
+        run(initial_state=start)
+    with pytest.raises(ValueError, match=message):
+        sf.HybridSystem({"swing": swing}, start)
+
+
+def test_an_initial_state_of_another_length():
+    three = [sf.Parameter(1.0), 2.0, 3.0]
+    with pytest.raises(
+        ValueError, match="initial_state of experiment 2 must have 2 entries, as the system's has; got 3"
+    ):
+        sf.Problem(SWING, [run(), run(initial_state=three)], GUESS)
+    with pytest.raises(ValueError, match="state_names must have one entry for each of the 3 states"):
+        sf.HybridSystem({"swing": swing}, three, state_names=("q", "v"))
+
+
+def test_an_unknown_that_is_called_like_an_initial_state():
+    with pytest.raises(ValueError, match=r"Two unknowns share a name: q\(t0\)"):
+        sf.Problem(SWING, run(initial_state=[UNKNOWN[0], 0.9]), GUESS | {"q(t0)": 1.0})
+
+
+# --- fits -------------------------------------------------------------------------------------------------------------
+
+TRUTH = {"k": 1.3, "c": 0.25}
+GROWTH = (0.7, 0.4)
+
+
+def fall(t, x, p):
+    return -p["k"] * x + p["c"]
+
+
+def rise(t, x, p):
+    return p["r"] * jnp.ones(1)
+
+
+def height(t, x, p):
+    return x
+
+
+TANK = sf.HybridSystem({"fall": fall, "rise": rise}, [0.0], state_names=("h",), state_units=("m",))
+
+
+def level(t, tau, x0, r, k=TRUTH["k"], c=TRUTH["c"]):
+    """x' = c - k x, then x' = r: the closed form."""
+    falling = c / k + (x0 - c / k) * np.exp(-k * np.minimum(t, tau))
+    return falling + r * np.maximum(t - tau, 0.0)
+
+
+def tank(e, samples=25, sigma=0.02, seed=0, names=None, **given):
+    """A tank that falls and then rises: of each run its own are tau, x(0) and, by its map, r."""
+    times = np.linspace(0.0, 4.0, samples)
+    x0, r, tau = 2.0 + e, GROWTH[e % 2], 1.93 + 0.2 * (e % 3)
+    values = level(times, tau, x0, r) + sigma * np.random.default_rng([seed, e]).normal(size=samples)
+    data = sf.Measurements(times, values, observe=height, sigma=sigma)
+    own = {"r": f"r_{e}"} if names is None else names
+    start = [sf.Parameter(1.5 + e, lower=0.0, upper=20.0)]
+    return sf.Experiment(
+        data, ("fall", "rise"), (2.0,), 0.0, 4.0, initial_state=start, parameter_map=own, name=f"tank{e}", **given
+    )
+
+
+def tanks(count, samples=None, **given):
+    guess = {"k": 1.0, "c": 0.2} | {f"r_{e}": sf.Parameter(0.5, lower=0.0, upper=3.0) for e in range(count)}
+    runs = [tank(e, samples=25 if samples is None else samples[e], **given) for e in range(count)]
+    return sf.Problem(TANK, runs, guess)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return sf.estimate(tanks(2))
+
+
+def test_the_truth_is_found(fitted):
+    assert fitted.success
+    assert fitted.theta_names == (
+        "tank0.tau_1", "tank1.tau_1", "k", "c", "r_0", "r_1", "tank0.h(t0)", "tank1.h(t0)",
+    )  # fmt: skip
+    truth = [1.93, 2.13, *TRUTH.values(), *GROWTH, 2.0, 3.0]
+    assert np.all(np.abs(fitted.theta - truth) < 3.5 * fitted.standard_errors)
+    assert [x.tolist() for x in fitted.initial_state] == [[fitted.theta[6]], [fitted.theta[7]]]
+
+
+def test_covariance_of_the_closed_form(fitted):
+    """Hessian of the least-squares cost written with the closed form, differentiated by JAX alone."""
+    measured = [run.data[0] for run in fitted.problem.experiments]
+
+    def cost(theta):
+        total = 0.0
+        for e, item in enumerate(measured):
+            t = jnp.asarray(item.times)
+            tau, (k, c), r, x0 = theta[e], theta[2:4], theta[4 + e], theta[6 + e]
+            falling = c / k + (x0 - c / k) * jnp.exp(-k * jnp.where(t < tau, t, tau))
+            model = falling + r * jnp.where(t < tau, 0.0, t - tau)
+            total += 0.5 * jnp.sum(((model - item.values[:, 0]) / item.sigma) ** 2)
+        return total
+
+    with jax.enable_x64(True):
+        H = np.asarray(jax.hessian(cost)(jnp.asarray(fitted.theta)))
+        J = float(cost(jnp.asarray(fitted.theta)))
+    assert fitted.cost == pytest.approx(J, rel=1e-7)
+    np.testing.assert_allclose(fitted.hessian, H, rtol=1e-5, atol=1e-5 * np.abs(H).max())
+    np.testing.assert_allclose(fitted.covariance, np.linalg.inv(H), rtol=1e-4, atol=1e-9)
+
+
+def test_runs_that_share_nothing_are_fits_of_their_own():
+    own = [{"k": f"k_{e}", "c": f"c_{e}", "r": f"r_{e}"} for e in range(2)]
+    guess = {name: 0.5 for e in range(2) for name in own[e].values()}
+    runs = [tank(e, names=own[e]) for e in range(2)]
+    joint = sf.estimate(sf.Problem(TANK, runs, guess))
+    alone = [sf.estimate(sf.Problem(TANK, run, guess_of(run, guess))) for run in runs]
+    assert joint.cost == pytest.approx(sum(fit.cost for fit in alone), rel=1e-10)
+    for e, fit in enumerate(alone):
+        for name, value, error in zip(fit.theta_names, fit.theta, fit.standard_errors, strict=True):
+            in_joint = name if "_" in name and "tau" not in name else f"tank{e}.{name}"
+            k = joint.theta_names.index(in_joint)
+            assert joint.theta[k] == pytest.approx(value, rel=1e-7)
+            assert joint.standard_errors[k] == pytest.approx(error, rel=1e-5)
+
+
+def guess_of(run, guess):
+    return {name: guess[name] for name in run.parameter_map.values()}
+
+
+def test_by_blocks_a_fit_is_the_same():
+    problem = tanks(6)
+    evaluator = evaluator_of(problem)
+    full, blocks = (minimized(evaluator, problem.initial_theta, "exact", 1e-7, 200, by_blocks=b) for b in (False, True))
+    assert blocks.successful
+    np.testing.assert_allclose(blocks.theta, full.theta, rtol=1e-8, atol=1e-9)
+    at, arrow = evaluator(full.theta), evaluator.arrow(full.theta)
+    assert arrow.cost == at.cost
+    np.testing.assert_allclose(arrow.gradient, at.gradient, rtol=1e-14, atol=1e-10)
+    np.testing.assert_allclose(arrow.hessian.dense(), at.hessian, rtol=1e-12, atol=1e-10)
+
+
+def test_all_that_is_done_with_a_fit(fitted, tmp_path):
+    """Report, figure, file, and back."""
+    text = str(fitted)
+    for expected in ("tank0.h(t0)", "r_1", "tank1.tau_1", "fall -> rise"):
+        assert expected in text
+    line = next(line for line in text.splitlines() if line.strip().startswith("tank1.h(t0)"))
+    assert float(line.split()[1]) == pytest.approx(fitted.theta[7], abs=1e-3)
+    assert " m " in line
+    assert len(fitted.plot().axes) >= 2
+    fitted.save(tmp_path / "fit.json")
+    loaded = sf.Estimate.load(tmp_path / "fit.json")
+    assert loaded.theta_names == fitted.theta_names
+    for there, here in zip(loaded.initial_state, fitted.initial_state, strict=True):
+        np.testing.assert_array_equal(there, here)
+    assert str(loaded) == text
+
+
+@pytest.mark.parametrize("kind", ["block-diagonal", "gauss-newton", "none"])
+def test_other_quadratic_terms(kind, fitted):
+    found = sf.estimate(tanks(2), hessian=kind, start=fitted.theta * 1.001, max_iterations=400)
+    assert found.cost <= sf.evaluate(tanks(2), fitted.theta * 1.001).cost
+    if kind == "gauss-newton":
+        np.testing.assert_allclose(found.theta, fitted.theta, rtol=1e-4)
+
+
+def test_batches(fitted):
+    """Every kind of them has the unknowns of every kind; runs that are alike go through one program."""
+    problem = tanks(2)
+    study = sf.monte_carlo(problem, 40, theta=fitted.theta, seed=1)
+    assert study.success.all()
+    np.testing.assert_allclose(study.standard_deviation, fitted.standard_errors, rtol=0.5)
+    with pytest.raises(ValueError, match=r"there are none for k, c: give sf.Parameter"):
+        sf.multistart(problem, 4)
+    bounded = {"k": sf.Parameter(1.0, lower=0.5, upper=2.0), "c": sf.Parameter(0.2, lower=0.0, upper=0.5)}
+    several = sf.multistart(sf.Problem(TANK, problem.experiments, dict(problem.parameters) | bounded), 8)
+    assert several.best.cost == pytest.approx(fitted.cost, rel=1e-8)
+    low = [0.0, 0.0]
+    assert np.all(several.start[:, 6:] >= low)
+    assert np.ptp(several.start[:, 6]) > 5.0
+    many = sf.estimate_many([problem, tanks(2, seed=5)])
+    np.testing.assert_allclose(many.theta[0], fitted.theta, rtol=1e-7)
+    other = sf.estimate(tanks(2, seed=5))
+    np.testing.assert_allclose(many.theta[1], other.theta, rtol=1e-7)
+
+
+def test_a_batch_of_runs_with_times_that_are_known():
+    """In the loop over runs that are alike, known transition times are not mixed up with those of others."""
+    known = sf.Parameter(1.9, fixed=True)
+    given = tanks(2)
+    runs = [replace(run, transition_times=(known,), name=f"known{e}") for e, run in enumerate(given.experiments)]
+    problem = sf.Problem(TANK, [*given.experiments, *runs], given.parameters)
+    evaluator, theta = evaluator_of(problem), problem.initial_theta + 0.1
+    places = tuple(tuple(where.tolist()) for where in problem.places)
+    for lockstep in (False, True):
+        layout = Layout(problem.structures, places, (), lockstep, 1e-7, 10)
+        times = tuple(run.initial_times for run in problem.experiments)
+        with jax.enable_x64(True):
+            found = jax.jit(lambda theta, f=layout, t=times: _total(f, tuple(evaluator.arguments), t, theta))(theta)
+        expected = evaluator(theta)
+        for one, other in zip(found, (expected.cost, expected.gradient, expected.hessian), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-8)
+
+
+PROGRAMS = (derivatives, _block, _terminal, _steps, initial_state)
+
+
+def test_one_program_for_ten_runs_of_different_lengths():
+    """One of each kind: for the first of them, and nothing for the others, nor for the ten together."""
+    samples = [29, 37, 31, 42, 51, 38, 49, 54, 59, 33]
+
+    def compiled(call):
+        before = [program._cache_size() for program in PROGRAMS]
+        call()
+        return [program._cache_size() - b for program, b in zip(PROGRAMS, before, strict=True)]
+
+    def blank(t, x, p):
+        return fall(t, x, p)
+
+    global TANK  # new functions, which nothing has compiled before
+    before = TANK
+    try:
+        TANK = sf.HybridSystem({"fall": blank, "rise": rise}, [0.0], state_names=("h",))
+        problem = tanks(10, samples)
+        assert len(set(problem.structures)) == 1
+        found = compiled(lambda: evaluated(problem))
+        assert found == [1, 1, 1, 1, 1]
+        assert compiled(lambda: evaluated(tanks(10, samples[::-1]))) == [0, 0, 0, 0, 0]
+        assert compiled(lambda: evaluated(tanks(12, [*samples, 40, 45]))) == [0, 0, 0, 0, 0]
+    finally:
+        TANK = before
+
+
+def evaluated(problem):
+    sf.evaluate(problem)
+    sf.estimate(problem, max_iterations=1)
+
+
+def test_common_lengths():
+    """Few distinct lengths, and none more than twice what is needed."""
+    assert common_lengths([29, 59, 41]) == [64, 64, 64]
+    assert common_lengths([100]) == [padded_length(100)]
+    lengths = list(range(1, 3000, 17))
+    common = common_lengths(lengths)
+    assert all(length <= there <= 2 * padded_length(length) for length, there in zip(lengths, common, strict=True))
+    assert len(set(common)) <= 11
+
+
+# --- problem files ----------------------------------------------------------------------------------------------------
+
+FILE = """
+model = "tank.py:tank"
+[parameters]
+k = 1.0
+c = 0.2
+r_0 = { value = 0.5, lower = 0.0 }
+r_1 = 0.5
+[[experiments]]
+name = "first"
+mode_sequence = ["fall", "rise"]
+transition_times = [2.0]
+initial_state = [{ value = 1.5, lower = 0.0, upper = 9.0, unit = "cm" }, 0.5]
+parameter_map = { r = "r_0" }
+data = { file = "log.csv", time = "t", columns = ["h"], observe = ["h"], sigma = 0.02 }
+[[experiments]]
+mode_sequence = ["fall", "rise"]
+transition_times = [2.0]
+initial_state = [2.5, { value = 3.5, fixed = true }]
+parameter_map = { r = "r_1" }
+data = { file = "log.csv", time = "t", columns = ["h"], observe = ["h"], sigma = 0.02 }
+"""
+
+MODEL = """
+import jax.numpy as jnp
+import switchfit as sf
+tank = sf.HybridSystem(
+    {"fall": lambda t, x, p: p["c"] - p["k"] * x, "rise": lambda t, x, p: p["r"] * jnp.ones(2)},
+    [0.0, 0.0], state_names=("h", "g"),
+)
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    times = np.linspace(0.0, 4.0, 25)
+    rows = [f"{t},{h}" for t, h in zip(times, level(times, 1.93, 2.0, 0.7), strict=True)]
+    (tmp_path / "log.csv").write_text("\n".join(["t,h", *rows]))
+    (tmp_path / "tank.py").write_text(MODEL)
+    (tmp_path / "p.toml").write_text(FILE)
+    return tmp_path
+
+
+def test_problem_files_say_it_too(folder):
+    problem = load_problem(folder / "p.toml").problem
+    assert problem.theta_names == ("first.tau_1", "run2.tau_1", "k", "c", "r_0", "r_1", "first.h(t0)")
+    assert problem.unknowns.units[-1] == "cm"
+    assert (problem.unknowns.lower[-1], problem.unknowns.upper[-1], problem.initial_theta[-1]) == (0.0, 9.0, 1.5)
+    assert problem.experiments[1].parameter_map == {"r": "r_1"}
+    np.testing.assert_array_equal(problem.experiments[1].initial_state, [2.5, 3.5])
+    assert sf.simulate(problem).states[0].tolist() == [1.5, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "lower = 0.0, upper = 9.0",
+            "lowr = 0.0",
+            r"'experiments\[1\]\.initial_state\[1\]\.lowr'; did you mean 'lower'",
+        ),
+        ("upper = 9.0", "upper = 1.0", r"experiments\[1\]: Parameter value 1.5 lies outside its bounds \[0.0, 1.0\]"),
+        (
+            '{ r = "r_0" }',
+            '{ r = "r_9" }',
+            "gives the model's 'r' as the unknown parameter 'r_9'; the problem has k, c",
+        ),
+        ('{ r = "r_0" }', "{ r = 1 }", r"'experiments\[1\]\.parameter_map.*' must be a string; got 1"),
+        ("[2.5, {", '["x", {', r"'experiments\[2\]\.initial_state\[1\]' must be a table; got 'x'"),
+    ],
+)
+def test_problem_files_that_are_wrong(folder, old, new, message):
+    assert old in FILE
+    (folder / "p.toml").write_text(FILE.replace(old, new, 1))
+    with pytest.raises(InputError, match=message):
+        load_problem(folder / "p.toml")
+
+
+def test_command_line(folder):
+    """Fitted and simulated by ``switchfit``."""
+    main = CliRunner()
+    done = main.invoke(app, ["fit", str(folder / "p.toml"), "--out", str(folder / "out"), "--no-figures"])
+    assert done.exit_code == 0, done.output
+    assert "first.h(t0)" in done.output
+    assert sf.Estimate.load(folder / "out" / "estimate.json").theta_names[-1] == "first.h(t0)"
+    done = main.invoke(app, ["simulate", str(folder / "p.toml"), "--out", str(folder / "path.csv")])
+    assert done.exit_code == 0, done.output
+    assert (folder / "path.csv").read_text().splitlines()[1] == "first,0.0,fall,1.5,0.5"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -86,7 +86,7 @@ class Structure:
         """Number of transitions."""
         return len(self.reset_maps)
 
-    @property
+    @cached_property
     def M(self) -> int:
         """Length of p: the free scalar parameters, then the unknown entries of the initial state."""
         return sum(int(np.prod(shape)) for _, shape, free in self.parameters if free) + len(self.unknown_states)
@@ -561,11 +561,17 @@ def checked_functions(structure: Structure, others: frozenset[str] = frozenset()
     asked: set[str] = set()
     try:
         _call_functions(structure, partial(_Asking, others=others, asked=asked))
+        return frozenset(asked)
     except Exception:
         shown = tuple(q for q in structure.parameters if q[0] not in others)
+    try:
         _call_functions(replace(structure, parameters=shown), Model)
-        return frozenset(name for name, _, _ in shown)
-    return frozenset(asked)
+    except ValueError:
+        if not others:
+            raise
+        shown = structure.parameters  # one of the others may be asked for; if not, this says what is wrong
+        _call_functions(structure, Model)
+    return frozenset(name for name, _, _ in shown)
 
 
 def _call_functions(structure: Structure, model_of: Callable[[Structure, Arguments], Model]) -> None:

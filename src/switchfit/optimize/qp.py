@@ -202,8 +202,13 @@ def solve_qp(gradient: FloatArray, matrix: FloatArray, normals: FloatArray, offs
 class Factor(Protocol):
     """A factorisation B = D L Lᵀ D, of a matrix whatever its shape."""
 
-    def whiten(self, vectors: FloatArray) -> FloatArray: ...
-    def unwhiten(self, vector: FloatArray) -> FloatArray: ...
+    def whiten(self, vectors: FloatArray) -> FloatArray:
+        """L⁻¹ D⁻¹ v for a vector or each of the rows v."""
+        ...
+
+    def unwhiten(self, vector: FloatArray) -> FloatArray:
+        """D⁻¹ L⁻ᵀ v."""
+        ...
 
 
 class Matrix(Protocol):

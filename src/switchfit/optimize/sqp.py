@@ -901,7 +901,8 @@ def _escape(oracle: _Oracle, state: _State) -> _Accepted | None:
     """A step along negative curvature: on the face of the pressing constraints first, then of all active ones."""
     problem = oracle.problem
     pressing = np.flatnonzero(state.point.multipliers > max(problem.tolerance, 1e-10 * state.gradient_scale))
-    for rows in (pressing, state.point.active):
+    active = state.point.active
+    for rows in (pressing,) if np.array_equal(pressing, active) else (pressing, active):
         curvature = _curvature(problem, state, rows)
         if not curvature.smallest < NEGATIVE_CURVATURE:
             continue
