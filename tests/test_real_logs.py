@@ -254,6 +254,7 @@ def test_priors_and_scales_in_batches_and_files(tmp_path):
     alone = sf.estimate(this)
     many = sf.estimate_many([this, this])
     np.testing.assert_allclose(many.theta, [alone.theta] * 2, rtol=1e-8)
+    assert many.message.tolist() == ["", ""], "they were not settled by the compiled program"
     np.testing.assert_allclose(many.cost, alone.cost, rtol=1e-10)
     np.testing.assert_allclose(many.hessian[0], alone.hessian, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(many.confidence_intervals()[0], alone.confidence_intervals(), rtol=1e-6)
