@@ -143,7 +143,7 @@ def test_state_names_are_counted_where_the_initial_state_is_a_function():
         (lambda: samples(sigma=-1.0), ValueError, ["sigma must be positive and finite", "-1.0"]),
         (lambda: samples(sigma=math.nan), ValueError, ["sigma must be positive and finite", "nan"]),
         (lambda: samples(sigma=math.inf), ValueError, ["sigma must be positive and finite", "inf"]),
-        (lambda: samples(sigma="x"), ValueError, ["sigma must be a number or an array of numbers; got 'x'"]),
+        (lambda: samples(sigma={"x": 1}), ValueError, ["sigma must be a number or an array of numbers; got {'x': 1}"]),
         (lambda: samples(sigma=[1.0, 2.0]), ValueError, ["sigma must be", "of shape (1,) (one a channel)", "(2,)"]),
         (lambda: samples(names=("a", "b")), ValueError, ["names must have one entry for each of the 1 channels"]),
         (lambda: samples(names=3), TypeError, ["names must be a sequence of strings", "got 3"]),
@@ -559,3 +559,95 @@ def test_the_trajectory_of_several_experiments(fit):
 def test_a_reset_map_that_is_not_there():
     structure = GOOD.structures[0]
     refused(lambda: Model(structure, None).reset(0), ValueError, "transition 1 has no reset map")
+
+
+# Noise, losses, priors, delays, scales
+
+
+def noisy(sigma, more=None, **settings):
+    data = sf.Measurements(TIMES, np.ones(5), observe=first_state, sigma=sigma, **settings)
+    return problem(experiment(data=data), parameters={"k": 1.0} | (more or {}))
+
+
+POSITIVE = sf.Parameter(0.1, lower=0.01)
+PRIOR = {"k": sf.Parameter(1.0, prior=sf.Normal(1.0, 0.1))}
+
+
+@pytest.mark.parametrize(
+    ("build", "error", "said"),
+    [
+        (lambda: samples(sigma=["s", 1.0]), ValueError, ["sigma must have one entry for each of the 1 channels"]),
+        (
+            lambda: samples(values=[[1.0, 2.0]], sigma=["s", None]),
+            ValueError,
+            ["sigma of one channel cannot be left out (None)", "['s', None]"],
+        ),
+        (lambda: samples(values=[[1.0, 2.0]], sigma=["s", -1.0]), ValueError, ["sigma must be positive and finite"]),
+        (lambda: samples(loss="Huber"), ValueError, ["one of linear, soft_l1, huber, cauchy; got 'Huber'"]),
+        (lambda: samples(sigma=1.0, loss="huber", loss_scale=0.0), ValueError, ["loss_scale must be positive", "0.0"]),
+        (lambda: samples(loss="huber"), ValueError, ["loss='huber' counts residuals in units of sigma", "left out"]),
+        (lambda: samples(sigma="s", loss="cauchy"), ValueError, ["needs a loss_scale above 1", "got 1.0"]),
+        (lambda: samples(delay=math.nan), ValueError, ["delay must be finite; got nan"]),
+        (lambda: samples(delay=[1.0, 2.0]), ValueError, ["delay (a number, or the name of a parameter) must be a"]),
+        (lambda: noisy("s"), ValueError, ["sigma names the parameter 's', which the problem lacks; it has k"]),
+        (lambda: noisy("s", {"s": 0.1}), ValueError, ["must be one number that stays positive", "lower bound -inf"]),
+        (
+            lambda: noisy("s", {"s": sf.Parameter(0.1, lower=0.0)}),
+            ValueError,
+            ["a lower bound above 0, or scale='log'"],
+        ),
+        (lambda: noisy("s", {"s": sf.Parameter(0.0, fixed=True)}), ValueError, ["one number that stays positive"]),
+        (lambda: noisy("s", {"s": sf.Parameter([0.1], lower=0.01)}), ValueError, ["one number", "got shape (1,)"]),
+        (
+            lambda: problem(
+                experiment(data=[samples(observe=first_state), samples(observe=first_state, sigma="s")]),
+                parameters={"k": 1.0, "s": POSITIVE},
+            ),
+            ValueError,
+            ["sigma is left out in some Measurements, and a parameter", "Name a parameter for it there too"],
+        ),
+        (lambda: noisy(None, PRIOR), ValueError, ["a prior is weighed against the noise", "sigma is left out"]),
+        (lambda: noisy(0.1, delay="late"), ValueError, ["delay names 'late', which must be a parameter of one number"]),
+        (lambda: noisy(0.1, {"d": 0.0}, delay="d"), ValueError, ["may lie in [-inf, inf]", "only from 0 to 0 are all"]),
+        (
+            lambda: noisy(0.1, {"d": sf.Parameter(0.1, 0.0, 0.3)}, delay="d"),
+            ValueError,
+            ["the delay 'd' may lie in [0.0, 0.3]", "give it narrower bounds, move t0 or tf, or leave out samples"],
+        ),
+        (lambda: noisy(0.1, delay=0.1), ValueError, ["Measurements times less the delay of 0.1 must lie inside"]),
+        (
+            lambda: sf.evaluate(
+                problem(
+                    experiment(data=sf.Measurements([0.5], [1.0], observe=first_state, sigma=1.0, delay="d")),
+                    parameters={"k": 1.0, "d": sf.Parameter(0.1, 0.0, 0.3)},
+                ),
+                [0.4, 1.0, 0.6],
+            ),
+            ValueError,
+            ["theta has delays with which samples are of moments from -0.1 to -0.1, outside (t0, tf) = (0.0, 1.0)"],
+        ),
+        (lambda: sf.Parameter(1.0, scale="ln"), ValueError, ["Parameter scale must be 'linear' or 'log'; got 'ln'"]),
+        (lambda: sf.Parameter(0.0, scale="log"), ValueError, ["with scale='log' must be positive", "the value 0.0"]),
+        (lambda: sf.Parameter(1.0, -1.0, scale="log"), ValueError, ["its lower bound 0 or more", "lower bound -1.0"]),
+        (lambda: experiment(transition_times=(sf.Parameter(0.4, scale="log"),)), ValueError, ["leave out scale='log'"]),
+        (lambda: sf.Parameter(1.0, prior=0.1), TypeError, ["must be an sf.Normal or an sf.LogNormal; got 0.1"]),
+        (lambda: sf.Parameter(1.0, prior=sf.Normal([1, 2], 1)), ValueError, ["does not fit a value of shape ()"]),
+        (
+            lambda: sf.Parameter(1.0, prior=sf.LogNormal(1.0, 0.1)),
+            ValueError,
+            ["must stay positive", "lower bound -inf"],
+        ),
+        (lambda: sf.Normal(0.0, 0.0), ValueError, ["Normal sd must be positive; got 0.0"]),
+        (lambda: sf.Normal("a", 1.0), ValueError, ["Normal mean must be a number or an array of numbers; got 'a'"]),
+        (lambda: sf.Normal(0.0, math.inf), ValueError, ["Normal sd must be finite; got inf"]),
+        (lambda: sf.LogNormal(0.0, 1.0), ValueError, ["LogNormal median must be positive; got 0.0"]),
+    ],
+)
+def test_noise_losses_priors_delays_and_scales(build, error, said):
+    refused(build, error, *said)
+
+
+def test_starts_of_a_logarithm_need_a_lower_bound_above_0():
+    this = problem(parameters={"k": sf.Parameter(1.0, upper=2.0, scale="log")})
+    with pytest.raises(ValueError, match="multistart draws starts between bounds, but there are none for k"):
+        sf.multistart(this, 4)

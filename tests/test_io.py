@@ -219,6 +219,34 @@ def test_sigma_from_a_column(folder):
     np.testing.assert_array_equal(data.sigma[:, 0], [0.1, 0.1, 0.2, 0.1, 0.1, 0.1, 0.1])
 
 
+def test_sigma_from_parameters(folder):
+    sigma = ("cooling = 0.05", "cooling = 0.05\ns = { value = 0.1, scale = 'log' }")
+    for given in ('"s"', '["s"]'):
+        data = changed(folder, sigma, ("sigma = 0.1", f"sigma = {given}")).problem.experiments[0].data[0]
+        assert data.sigma == ("s",)
+
+
+def test_loss_delay_priors_and_scales(folder):
+    problem = changed(
+        folder,
+        ("sigma = 0.1", 'sigma = 0.1\nloss = "huber"\nloss_scale = 1.5\ndelay = "d"\nwindow = [1, 5]'),
+        ("cooling = 0.05", 'd = { value = 0.1, lower = 0.0, upper = 0.5 }\ncooling = { value = 0.05, scale = "log" }'),
+        ("value = 0.3, lower = 0.0", "value = 0.3, lower = 0.0, prior = { mean = 0.4, sd = 0.1 }"),
+        ("value = 3.0, lower = 1.0", "value = 3.0, prior = { median = 3.0, log_sd = 0.2 }, lower = 1.0"),
+    ).problem
+    data = problem.experiments[0].data[0]
+    assert (data.loss, data.loss_scale, data.delay) == ("huber", 1.5, "d")
+    names = problem.theta_names
+    priors = dict(zip(names, problem.unknowns.priors.texts(), strict=True))
+    assert priors == {"tau_1": "log-normal(3, 0.2)", "heating": "normal(0.4, 0.1)", "d": "", "cooling": ""}
+    assert problem.unknowns.log_names == ("cooling",)
+    text = describe(problem)
+    assert "late by d" in text
+    assert "loss huber (1.5 sigma)" in text
+    assert "prior: normal(0.4, 0.1)" in text
+    assert "(log scale)" in text
+
+
 def test_observe_by_a_function(folder):
     data = changed(folder, ('observe = ["T"]', 'observe = "room.py:fahrenheit"')).problem.experiments[0].data[0]
     assert data.observe(0.0, np.array([10.0]), {}) == 50.0
@@ -321,6 +349,12 @@ def test_examples_load(path):
         ("sigma = 0.1", "sigma = -0.1", r"experiments\[1\]\.data\[1\]: sigma must be positive and finite; got .*-0\.1"),
         ("sigma = 0.1", "lowpass_hz = 1.0", r"lowpass_hz belongs to kind = 'reference'; measurements have sigma"),
         ("sigma = 0.1", 'sigma = 0.1\nkind = "reference"', r"sigma belongs to kind = 'measurements'; a reference has"),
+        ("sigma = 0.1", 'loss = "huber"\nkind = "reference"', "loss belongs to kind = 'measurements', not to a ref"),
+        ("sigma = 0.1", 'delay = 0.1\nkind = "reference"', "delay belongs to kind = 'measurements', not to a refe"),
+        ("sigma = 0.1", 'sigma = ["sd", 0.1]', r"sigma must name columns of the file alone, or parameters and numb"),
+        ("sigma = 0.1", 'loss = "L1"', r"\.loss' must be 'linear', 'soft_l1', 'huber' or 'cauchy'; got 'L1'"),
+        ("value = 0.3,", "value = 0.3, prior = { mean = 1.0 },", r"prior needs mean and sd \(normal\), or median"),
+        ("value = 0.3,", "value = 0.3, prior = { mena = 1.0 },", r"heating\.prior\.mena'; did you mean 'mean'\?"),
         ("sigma = 0.1", 'kind = "samples"', r"kind' must be 'measurements' or 'reference'; got 'samples'"),
         ("[options]", "[option]", r"unknown key 'option'; did you mean 'options'\?"),
         ("rtol = 1e-7", "rtol = -1.0", r"'options\.rtol' must be greater than 0; got -1\.0"),

@@ -14,6 +14,7 @@ from switchfit.guards import GuardedEvaluation, evaluate_on_guards
 from switchfit.identifiability import Direction, Identifiability, identifiability
 from switchfit.optimize import Status
 from switchfit.prediction import Prediction, predict
+from switchfit.priors import LogNormal, Normal
 from switchfit.problem import Problem
 from switchfit.profile import Profile, profile
 from switchfit.residuals import ChannelResiduals, ResidualDiagnostics
@@ -41,9 +42,11 @@ __all__ = [
     "HybridSystem",
     "Identifiability",
     "Input",
+    "LogNormal",
     "Measurements",
     "MonteCarlo",
     "Multistart",
+    "Normal",
     "Parameter",
     "Prediction",
     "Problem",

@@ -116,8 +116,8 @@ def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, seed:
     ----------
     problem : Problem
     theta : (d,) array_like, optional
-        The initial guess if left out. Transition times that lie on a node of the mesh are moved off it, since
-        derivatives jump there.
+        The initial guess if left out. Transition times that lie on a node of the mesh, or on what a late sample sees,
+        are moved off it, since derivatives jump there.
     seed : int, optional
         Of the random direction.
 
@@ -164,20 +164,39 @@ def _scales(base: Evaluation, theta: FloatArray) -> FloatArray:
 def _off_nodes(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     """theta with each transition time in the middle of the cell it is in, where J is smooth for longest."""
     moved = theta.copy()
+    late = _late_times(evaluator, theta)
     for i, nodes in enumerate(evaluator.breakpoints()):
         if len(nodes):
+            nodes = np.union1d(nodes, late[i]) if i in late else nodes
             k = int(np.clip(np.searchsorted(nodes, theta[i], side="right") - 1, 0, len(nodes) - 2))
             moved[i] = 0.5 * (nodes[k] + nodes[k + 1])
     return moved
 
 
 def _room(evaluator: Evaluator, theta: FloatArray, direction: FloatArray) -> float:
-    """Largest step that leaves every transition time in its cell, and every unknown near its size."""
+    """Largest step that leaves every transition time in its cell, and every unknown near its size.
+
+    No transition may pass what a late sample sees, either, which moves with the delay.
+    """
     room = 1e-2 * np.min(np.where(theta != 0, np.abs(theta), 1.0) / np.abs(direction))
     for i, nodes in enumerate(evaluator.breakpoints()):
         if len(nodes):
             room = min(room, 0.9 * np.min(np.abs(nodes - theta[i])) / abs(direction[i]))
+    late, moved = _late_times(evaluator, theta), _late_times(evaluator, theta + direction)
+    for i, moments in late.items():
+        closing = np.maximum(np.abs(moved[i] - moments - direction[i]), 1e-300)
+        room = min(room, 0.9 * np.min(np.abs(moments - theta[i]) / closing))
     return float(room)
+
+
+def _late_times(evaluator: Evaluator, theta: FloatArray) -> dict[int, FloatArray]:
+    """For each transition time in theta the moments that late samples of its run see, if there are any."""
+    problem = evaluator.problem
+    found: dict[int, FloatArray] = {}
+    for e, where in enumerate(problem.unknowns.times):
+        moments = problem.late_times(theta, e)
+        found |= {int(i): moments for i in where[where >= 0] if len(moments)}
+    return found
 
 
 def _remainders(

@@ -6,12 +6,14 @@ so that the integrator never steps across one and inside a step the signal is on
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from switchfit.losses import LOSSES
 
 FloatArray = NDArray[np.float64]
 Observe = Callable[..., Any]
@@ -234,6 +236,10 @@ class ReferenceSignal:
 class Measurements:
     """Discrete noisy samples: adds ``1/2 sum ((y_k - h(t_k, x(t_k), p)) / sigma)**2`` to J.
 
+    With a sigma that is a parameter, ``sum log sigma`` over the samples it belongs to is added too, so that J is the
+    negative logarithm of the likelihood up to a constant. With a robust loss, ``1/2 C**2 rho((r / sigma)**2 / C**2)``
+    stands in place of each ``1/2 (r / sigma)**2``, C being the `loss_scale` (`switchfit.losses`).
+
     Parameters
     ----------
     times : (K,) array_like
@@ -243,17 +249,26 @@ class Measurements:
     observe : callable ``h(t, x, p) -> (q,)``, optional
         Left out, the whole state is measured. At a transition with a reset map the sample is of the state
         just before the jump.
-    sigma : float, (q,) or (K, q) array_like, optional
-        Standard deviation of the noise, for all, for each channel or for each sample. Left out it is
+    sigma : float, (q,) or (K, q) array_like, str, or list of float and str, optional
+        Standard deviation of the noise, for all, for each channel or for each sample. A string names the parameter
+        that it is, for all channels; in a list of q entries, for one of them. Left out it is
         unknown: all samples weigh 1 and the covariance is scaled by the residual variance.
     names : sequence of str, optional
         One for each channel.
+    loss : {"linear", "soft_l1", "huber", "cauchy"}, optional
+        As in `scipy.optimize.least_squares`; all but the first count outliers for less.
+    loss_scale : float, optional
+        C, in units of sigma: residuals beyond it are outliers.
+    delay : float or str, optional
+        By how much (s) the sensor is late: a sample stamped t_k is of the state at ``t_k - delay``, and `observe` is
+        called with that time. A string names the parameter that it is. Give channels of different delays as several
+        `Measurements`.
 
     Raises
     ------
     ValueError
-        For times that do not increase, shapes that do not match, no sample at all, infinite values, or a
-        sigma that is not positive.
+        For times that do not increase, shapes that do not match, no sample at all, infinite values, a
+        sigma that is not positive, or a loss that is not known or has no scale to be measured by.
     """
 
     times: Any
@@ -261,6 +276,9 @@ class Measurements:
     observe: Observe | None = None
     sigma: Any = None
     names: tuple[str, ...] | None = None
+    loss: Literal["linear", "soft_l1", "huber", "cauchy"] = "linear"
+    loss_scale: float = 1.0
+    delay: float | str = 0.0
 
     def __post_init__(self) -> None:
         times, values = _samples(self.times, self.values, "Measurements", at_least=1)
@@ -275,13 +293,57 @@ class Measurements:
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "sigma", _checked_sigma(self.sigma, values.shape))
         object.__setattr__(self, "names", _channel_names(self.names, values.shape[1]))
+        self._check_loss()
+        if not isinstance(self.delay, str):
+            delay = as_number(self.delay, "delay (a number, or the name of a parameter)")
+            if not np.isfinite(delay):
+                raise ValueError(f"delay must be finite; got {self.delay}.")
+            object.__setattr__(self, "delay", delay)
+
+    @property
+    def seen_times(self) -> FloatArray:
+        """Times of the states that were seen, (K,): with a delay that is a parameter, as if there were none."""
+        return self.times if isinstance(self.delay, str) or self.delay == 0.0 else self.times - self.delay
+
+    def _check_loss(self) -> None:
+        if self.loss not in LOSSES:
+            raise ValueError(f"loss must be one of {', '.join(LOSSES)}; got {self.loss!r}.")
+        scale = as_number(self.loss_scale, "loss_scale")
+        if not (np.isfinite(scale) and scale > 0):
+            raise ValueError(f"loss_scale must be positive and finite; got {self.loss_scale}.")
+        object.__setattr__(self, "loss_scale", scale)
+        if self.loss != "linear" and self.sigma is None:
+            raise ValueError(
+                f"loss={self.loss!r} counts residuals in units of sigma, which is left out: give sigma a number, or "
+                "the name of a parameter to estimate it."
+            )
+        if self.loss == "cauchy" and self.sigma_names and scale <= 1:
+            raise ValueError(
+                "loss='cauchy' with a sigma that is a parameter needs a loss_scale above 1, otherwise J falls without "
+                f"end as sigma vanishes; got {scale}."
+            )
+
+    @property
+    def sigma_names(self) -> tuple[str | None, ...]:
+        """The parameter that is the sigma of each channel, None where it is a number; empty if all are."""
+        if not isinstance(self.sigma, tuple):
+            return ()
+        return tuple(entry if isinstance(entry, str) else None for entry in self.sigma)
+
+    def noise(self, parameters: Mapping[str, Any]) -> FloatArray | None:
+        """Standard deviation of each sample, a (K, q) array, given the model's parameters; None where it is unknown."""
+        if self.sigma is None:
+            return None
+        sigma = self.sigma
+        if isinstance(sigma, tuple):
+            sigma = np.array([float(parameters[s]) if isinstance(s, str) else s for s in sigma])
+        return np.broadcast_to(sigma, self.values.shape).copy()
 
     @property
     def weights(self) -> FloatArray:
-        """``1 / sigma**2`` (1 where sigma is unknown), 0 where a sample is missing: a ``(K, q)`` array."""
-        inverse = (
-            np.ones(self.values.shape) if self.sigma is None else np.broadcast_to(self.sigma**-2.0, self.values.shape)
-        )
+        """``1 / sigma**2`` (1 where sigma is unknown or a parameter), 0 where a sample is missing: (K, q)."""
+        sigma = self.noise(dict.fromkeys(filter(None, self.sigma_names), 1.0))
+        inverse = np.ones(self.values.shape) if sigma is None else sigma**-2.0
         return np.where(np.isnan(self.values), 0.0, inverse)
 
     @property
@@ -348,9 +410,13 @@ def _require_finite(values: FloatArray, what: str) -> None:
         raise ValueError(f"{what} must be finite; got {values[tuple(where)]} at index {where}.")
 
 
-def _checked_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | None:
+def _checked_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | tuple[str | float, ...] | None:
     if sigma is None:
         return None
+    if isinstance(sigma, str):
+        return (sigma,) * shape[1]
+    if isinstance(sigma, (list, tuple)) and any(isinstance(entry, str) for entry in sigma):
+        return _sigma_of_channels(sigma, shape[1])
     sigma = as_numbers(sigma, "sigma")
     if sigma.shape not in ((), (shape[1],), shape):
         raise ValueError(
@@ -360,6 +426,21 @@ def _checked_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | None:
     if not np.all(sigma > 0) or not np.all(np.isfinite(sigma)):
         raise ValueError(f"sigma must be positive and finite; got a smallest value of {sigma.min()}.")
     return sigma
+
+
+def _sigma_of_channels(sigma: Sequence[Any], channels: int) -> tuple[str | float, ...]:
+    """Names of parameters and numbers, one a channel."""
+    if len(sigma) != channels:
+        raise ValueError(f"sigma must have one entry for each of the {channels} channels; got {list(sigma)}.")
+    if any(entry is None for entry in sigma):
+        raise ValueError(
+            "sigma of one channel cannot be left out (None) where that of another is a parameter: name a parameter for "
+            f"it too; got {list(sigma)}."
+        )
+    numbers = [as_number(entry, "sigma of a channel") for entry in sigma if not isinstance(entry, str)]
+    if not all(np.isfinite(number) and number > 0 for number in numbers):
+        raise ValueError(f"sigma must be positive and finite; got {list(sigma)}.")
+    return tuple(entry if isinstance(entry, str) else float(entry) for entry in sigma)
 
 
 def _channel_names(names: Sequence[str] | None, channels: int) -> tuple[str, ...] | None:

@@ -33,7 +33,7 @@ from switchfit.residuals import ResidualDiagnostics, diagnose
 from switchfit.result import Certificate, Fit
 from switchfit.sensitivity import Sensitivity, gauss_newton_of, sample_derivatives, sensitivity
 from switchfit.simulate import compare
-from switchfit.solve import constraints_of, minimized, sigma_known, with_names
+from switchfit.solve import constraints_of, least_squares, minimized, plain, sigma_known, smallest_cost, with_names
 
 HESSIANS = get_args(HessianKind)
 
@@ -77,7 +77,7 @@ class Estimate(Fit):
         """The Gauss-Newton matrix ``sum (D h / sigma)' (D h / sigma)``: (d, d); None where it is not known."""
         if self.saved_gauss_newton is not None or self.sigma_known is None or self.problem is None:
             return self.saved_gauss_newton
-        if self._sensitivities_fit():
+        if plain(self.problem) and self._sensitivities_fit():
             return gauss_newton_of(sample_derivatives(self.problem, self.sensitivities))
         return self.evaluator_at_solution()(self.theta, matrix="gauss-newton").hessian
 
@@ -218,7 +218,8 @@ def estimate(
         steepest descent until it is positive definite, then equation (3), as the paper does it (Section II-A);
         equation (4); the Gauss-Newton matrix; or none (steepest descent).
     tolerance : float
-        On the KKT residual, the norm of the gradient where no constraint is active.
+        On the KKT residual, the norm of the gradient where no constraint is active. An unknown on a logarithmic scale
+        counts by its logarithm, one whose first guess is below 1e-3 or above 1e3 in units of (about) that guess.
     max_iterations : int
     callback : callable, optional
         Called with each `IterationRecord`; a true return value stops the fit. Ctrl-C does as well; both
@@ -268,7 +269,7 @@ def estimate(
         theta = result.theta
         fine_cost, trajectories, comparisons = compare(problem, theta, [mesh.divided() for mesh in evaluator.meshes])
         first_cost = abs(history[0].cost) if history else 0.0
-        error = abs(fine_cost - result.cost) / max(abs(fine_cost), PERFECT_FIT * first_cost, 1e-300)
+        error = abs(fine_cost - result.cost) / max(abs(fine_cost), PERFECT_FIT * first_cost, smallest_cost(problem))
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
         done = result.status in (Status.INTERRUPTED, Status.NONFINITE_START) or attempt == REFINEMENTS
         if done or not excess > 1:
@@ -370,6 +371,9 @@ def _estimate(
         kinks=tuple((unknowns.names[i], left, right) for i, left, right in result.kinks),
         free_basis=result.free_basis,
         sigma_known=sigma_known(problem),
+        priors={name: text for name, text in zip(unknowns.names, unknowns.priors.texts(), strict=True) if text},
+        log_scaled=unknowns.log_names,
+        least_squares=least_squares(problem),
         hessian_kind=hessian,
         tolerance=tolerance,
         problem=problem,

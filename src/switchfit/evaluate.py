@@ -103,6 +103,7 @@ class Evaluator:
         self.meshes = problem.with_common_lengths(given)
         self.arguments = [problem.arguments(e, mesh) for e, mesh in enumerate(self.meshes)]
         self._compiled: set[tuple[Method, Matrix]] = set()
+        self._priors = problem.unknowns.priors if problem.unknowns.priors.any else None
         self._places = [(own, places[own]) for places in problem.places for own in [np.flatnonzero(places >= 0)]]
 
     def divided(self, parts: int = 2) -> Evaluator:
@@ -124,6 +125,9 @@ class Evaluator:
             # Two names of the model may mean one parameter: its place then stands twice, and both count.
             np.add.at(gradient, mine, g[own])
             np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
+        if self._priors is not None:
+            J, g, h = self._priors.evaluate(theta, gauss_newton=matrix == "gauss-newton")
+            total, gradient, hessian = total + float(J), gradient + g, hessian + np.diag(h)
         return Evaluation(total, gradient, hessian)
 
     def constrained(
@@ -159,7 +163,11 @@ class Evaluator:
             part = np.zeros((size, size))
             np.add.at(part, (slots[:, None], slots), H[own[:, None], own])
             parts.append(part)
-        return ArrowEvaluation(total, gradient, Arrow.of_runs(self.layout, parts))
+        arrow = Arrow.of_runs(self.layout, parts)
+        if self._priors is not None:
+            J, g, h = self._priors.evaluate(theta, gauss_newton=matrix == "gauss-newton")
+            total, gradient, arrow = total + float(J), gradient + g, arrow.plus_diagonal(h)
+        return ArrowEvaluation(total, gradient, arrow)
 
     @cached_property
     def layout(self) -> ArrowLayout:

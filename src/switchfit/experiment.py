@@ -114,6 +114,8 @@ class Experiment:
                 f"transition_times must be one fewer than the {len(self.mode_sequence)} modes of mode_sequence; "
                 f"got {len(self.transition_times)}, needed {needed}."
             )
+        if any(tau.scale != "linear" for tau in self.transition_times):
+            raise ValueError("transition_times are estimated as they are; leave out scale='log'.")
         if any(tau.shape != () for tau in self.transition_times):
             shapes = [tau.shape for tau in self.transition_times]
             raise ValueError(f"transition_times must be single numbers or Parameters of one; got the shapes {shapes}.")
@@ -127,7 +129,9 @@ class Experiment:
     def _check_data_inside(self) -> None:
         for item in self.data:
             if isinstance(item, Measurements):
-                _require_inside(item.times, self.t0, self.tf, "Measurements")
+                if not isinstance(item.delay, str):  # otherwise its bounds decide, which the Problem knows
+                    late = f" less the delay of {item.delay:g}" if item.delay else ""
+                    _require_inside(item.seen_times, self.t0, self.tf, f"Measurements times{late}")
             elif isinstance(item, ReferenceSignal):
                 first, last = item.signal.knots[[0, -1]]
                 if first > self.t0 or last < self.tf:
@@ -195,6 +199,6 @@ def _require_inside(times: FloatArray, t0: float, tf: float, what: str) -> None:
     outside = (times < t0) | (times > tf)
     if outside.any():
         raise ValueError(
-            f"{what} times must lie inside [t0, tf] = [{t0}, {tf}]; {outside.sum()} of {len(times)} do not, "
+            f"{what} must lie inside [t0, tf] = [{t0}, {tf}]; {outside.sum()} of {len(times)} do not, "
             f"the first is {times[outside][0]}."
         )

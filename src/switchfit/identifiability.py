@@ -24,9 +24,11 @@ import scipy.special
 
 from switchfit.data import FloatArray, Measurements
 from switchfit.evaluate import Evaluator, evaluator_of
+from switchfit.hidden import refuse_hidden_switches
 from switchfit.problem import Problem
 from switchfit.result import Fit, scaled_spectrum
 from switchfit.simulate import compare
+from switchfit.solve import least_squares
 
 WEAK = 0.05
 """Scaled eigenvalues below this are told: standard errors along them are 4.5 times those of each unknown alone."""
@@ -152,6 +154,8 @@ def identifiability(subject: Any) -> Identifiability:
     ------
     TypeError
         For anything else.
+    ValueError
+        If a parameter of the problem changes the cost while its derivative is zero: a switch hidden in a function.
     """
     if isinstance(subject, Problem):
         return _before(subject)
@@ -194,11 +198,13 @@ def _before(problem: Problem) -> Identifiability:
     """At the first guess, with the data that it would itself produce, where they are Measurements."""
     theta, unknowns = problem.initial_theta, problem.unknowns
     own = evaluator_of(problem)
+    refuse_hidden_switches(own, theta, own(theta).gradient)
     items = [item for run in problem.experiments for item in run.data]
     if all(isinstance(item, Measurements) for item in items):
         clean = _noise_free(problem, own)
         evaluator = Evaluator(clean, meshes=own.meshes)
-        hessian = evaluator(theta).hessian
+        # Where sigma is a parameter J has no minimum without noise; its expected Hessian is Gauss-Newton's.
+        hessian = evaluator(theta, matrix="exact" if least_squares(problem) else "gauss-newton").hessian
         if all(item.sigma is not None for item in items):
             rise, meaning = 0.5 * float(scipy.special.ndtri(0.975)) ** 2, HIDDEN
         else:

@@ -28,6 +28,7 @@ from switchfit.data import (
     TerminalCost,
 )
 from switchfit.experiment import Experiment, Parameter, guards_of, initial_state_of, reset_maps_of, signals_of
+from switchfit.losses import influence, robust
 from switchfit.mesh import Mesh
 from switchfit.rungekutta import Density, Field, Tableau, tableau_of
 from switchfit.system import HybridSystem
@@ -38,6 +39,23 @@ Array = jax.Array
 def float64() -> Any:
     """Context in which JAX computes in float64; the user's setting is back in force afterwards."""
     return jax.enable_x64(True)
+
+
+class Sensor(NamedTuple):
+    """What of one `Measurements` shapes the program: functions, names and the loss."""
+
+    observe: Observe | None
+    channels: int
+    sigma: tuple[str | None, ...]  # the parameter that is the sigma of each channel; empty where all are numbers
+    loss: str
+    loss_scale: float
+    delay: str | None  # the parameter that is the delay; None where it is a number, which is in the times
+
+    @classmethod
+    def of(cls, item: Measurements) -> Sensor:
+        """That of one of the data."""
+        delay = item.delay if isinstance(item.delay, str) else None
+        return cls(item.observe, item.values.shape[1], item.sigma_names, item.loss, item.loss_scale, delay)
 
 
 @dataclass(frozen=True)
@@ -54,7 +72,7 @@ class Structure:
     parameters: tuple[tuple[str, tuple[int, ...], bool], ...]  # the model's name, shape, free
     running: tuple[Callable[..., Any], ...]
     references: tuple[tuple[Observe | None, int], ...]  # observe, channels
-    measurements: tuple[tuple[Observe | None, int], ...]  # observe, channels
+    measurements: tuple[Sensor, ...]
     terminal: tuple[Callable[..., Any], ...]
     guards: tuple[Callable[..., Any] | None, ...]
     terminal_constraints: tuple[Callable[..., Any], ...]
@@ -250,14 +268,46 @@ class Model:
 
     def sample_residual(self, k: int, sample: Samples, x: Array, p: Array) -> Array:
         """``h - y`` of one sample of the k-th Measurements, 0 where it is missing: (q,)."""
-        observe, channels = self.structure.measurements[k]
-        h = self.observed(observe, sample.time, x, p, channels)
+        sensor = self.structure.measurements[k]
+        h = self.observed(sensor.observe, sample.time, x, p, sensor.channels)
         return jnp.where(sample.weight > 0, h - sample.value, 0.0)
 
+    def seen_at(self, k: int, sample: Samples, p: Array) -> Samples:
+        """A late sample with the time of the state that it is of, ``t - delay``, in place of its own."""
+        delay = self.structure.measurements[k].delay
+        return sample if delay is None else sample._replace(time=sample.time - self.parameters(p)[delay])
+
+    def log_sigma(self, k: int, sample: Samples, p: Array) -> Array:
+        """Logarithm of the sigma of each channel that is a parameter and has a value in this sample, else 0: (q,)."""
+        named = self.structure.measurements[k].sigma
+        parameters = self.parameters(p)
+        sigma = [jnp.ones(()) if name is None else parameters[name] for name in named]
+        return jnp.where(sample.weight > 0, jnp.log(jnp.stack(sigma)), 0.0)
+
     def sample_cost(self, k: int, sample: Samples, x: Array, p: Array) -> Array:
-        """``1/2 sum ((h - y) / sigma)**2`` of one sample."""
+        """``1/2 sum C**2 rho(((h - y) / sigma)**2 / C**2) + sum log sigma`` of one sample.
+
+        Without a robust loss rho is the identity; log sigma is there where sigma is a parameter.
+        """
+        sensor = self.structure.measurements[k]
         r = self.sample_residual(k, sample, x, p)
-        return 0.5 * jnp.sum(sample.weight * r * r)
+        u = sample.weight * r * r
+        if not sensor.sigma:
+            return 0.5 * jnp.sum(robust(sensor.loss, sensor.loss_scale, u, jnp))
+        log_sigma = self.log_sigma(k, sample, p)
+        u = u * jnp.exp(-2.0 * log_sigma)
+        return jnp.sum(0.5 * robust(sensor.loss, sensor.loss_scale, u, jnp) + log_sigma)
+
+    def sample_information(self, k: int, sample: Samples, x: Array, p: Array) -> Array:
+        """Weight of each channel of one sample in the Gauss-Newton matrix, ``rho' / sigma**2``: (q,)."""
+        sensor = self.structure.measurements[k]
+        weight = sample.weight
+        if sensor.sigma:
+            weight = weight * jnp.exp(-2.0 * self.log_sigma(k, sample, p))
+        if sensor.loss == "linear":
+            return weight
+        r = self.sample_residual(k, sample, x, p)
+        return weight * influence(sensor.loss, sensor.loss_scale, weight * r * r, jnp)
 
     def terminal(self, x: Array, p: Array) -> Array:
         """Sum of the terminal costs."""
@@ -483,7 +533,7 @@ def structure_of(
         parameters=tuple((name, q.shape, not q.fixed) for name, q in meant.items()),
         running=tuple(item.ell for item in of_kind(RunningCost)),
         references=tuple((item.observe, item.signal.channels) for item in of_kind(ReferenceSignal)),
-        measurements=tuple((item.observe, item.values.shape[1]) for item in of_kind(Measurements)),
+        measurements=tuple(map(Sensor.of, of_kind(Measurements))),
         terminal=tuple(item.phi for item in of_kind(TerminalCost)),
         guards=guards_of(system, experiment.mode_sequence),
         terminal_constraints=tuple(item.psi for item in of_kind(TerminalConstraint)),
@@ -580,8 +630,10 @@ def _call_functions(structure: Structure, model_of: Callable[[Structure, Argumen
         if structure.terminal_constraints:
             jax.eval_shape(model.terminal_constraint, x, p)
         jax.eval_shape(model.density(piece), t, x, p)
-        for observe, q in structure.measurements:
-            jax.eval_shape(partial(model.observed, observe, channels=q), t, x, p)
+        for k, sensor in enumerate(structure.measurements):
+            row = jax.ShapeDtypeStruct((sensor.channels,), jnp.float64)
+            sample: Any = Samples(jax.ShapeDtypeStruct((), jnp.int64), t, row, row)  # type: ignore[arg-type]  # shapes
+            jax.eval_shape(lambda s, x, p, k=k: model.sample_cost(k, model.seen_at(k, s, p), x, p), sample, x, p)
         jax.eval_shape(model.terminal, x, p)
         jax.eval_shape(model.initial_state, p)
 
@@ -632,8 +684,8 @@ def _padded_samples(item: Measurements, length: int, mesh: Mesh) -> Samples:
     extra = length - len(item.times)
     rows = ((0, extra), (0, 0))
     return Samples(
-        np.pad(mesh.cell_ending_at(item.times), (0, extra), mode="edge"),  # type: ignore[arg-type]  # made jax arrays
-        np.pad(item.times, (0, extra), mode="edge"),  # type: ignore[arg-type]
+        np.pad(mesh.cell_ending_at(item.seen_times), (0, extra), mode="edge"),  # type: ignore[arg-type]  # made jax arrays
+        np.pad(item.seen_times, (0, extra), mode="edge"),  # type: ignore[arg-type]
         np.pad(np.nan_to_num(item.values), rows),  # type: ignore[arg-type]
         np.pad(item.weights, rows),  # type: ignore[arg-type]
     )

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+
+from switchfit.priors import LogNormal, Normal, Prior, PriorTerms
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,11 +24,18 @@ class Parameter:
         For the report.
     fixed : bool, optional
         A fixed parameter is not estimated.
+    prior : Normal or LogNormal, optional
+        What is known beforehand: it adds to the cost. Numbers of the prior are broadcast to the shape of `value`; that
+        of a fixed parameter counts for nothing.
+    scale : {"linear", "log"}, optional
+        "log": the optimiser works in log p, and confidence intervals are made there, so that they are positive. All
+        that is given and returned, bounds, priors, theta and covariance too, is p itself.
 
     Raises
     ------
     ValueError
-        If a value is not finite, bounds cross, or the guess lies outside them.
+        If a value is not finite, bounds cross, the guess lies outside them, a prior does not fit, or the scale or the
+        prior is logarithmic and p not confined to positive numbers.
     """
 
     value: Any
@@ -34,6 +43,8 @@ class Parameter:
     upper: Any = np.inf
     unit: str = ""
     fixed: bool = False
+    prior: Prior | None = None
+    scale: Literal["linear", "log"] = "linear"
 
     def __post_init__(self) -> None:
         try:
@@ -52,8 +63,48 @@ class Parameter:
             raise ValueError(f"Parameter bounds must satisfy lower <= upper; got [{self.lower}, {self.upper}].")
         if not (np.all(lower <= value) and np.all(value <= upper)):
             raise ValueError(f"Parameter value {self.value} lies outside its bounds [{self.lower}, {self.upper}].")
+        if self.scale not in ("linear", "log"):
+            raise ValueError(f"Parameter scale must be 'linear' or 'log'; got {self.scale!r}.")
+        if self.scale == "log":
+            lower = np.where(np.isneginf(lower), 0.0, lower)
+            if not (np.all(value > 0) and np.all(lower >= 0)):
+                raise ValueError(
+                    "Parameter with scale='log' must be positive, and its lower bound 0 or more; got the value "
+                    f"{self.value} and the lower bound {self.lower}."
+                )
         for name, array in (("value", value), ("lower", lower), ("upper", upper)):
             object.__setattr__(self, name, array)
+        self._check_prior()
+
+    def _check_prior(self) -> None:
+        if self.prior is None:
+            return
+        if not isinstance(self.prior, (Normal, LogNormal)):
+            raise TypeError(f"Parameter prior must be an sf.Normal or an sf.LogNormal; got {self.prior!r}.")
+        try:
+            PriorTerms.of(self.prior, self.shape)
+        except ValueError as error:
+            raise ValueError(f"Parameter prior does not fit a value of shape {self.shape}: {error}.") from error
+        if isinstance(self.prior, LogNormal) and not (self.positive or self.fixed):
+            raise ValueError(
+                "Parameter with a LogNormal prior must stay positive: give it a lower bound above 0, or scale='log'; "
+                f"got the lower bound {self.lower}."
+            )
+
+    @property
+    def positive(self) -> bool:
+        """Whether it can take positive values alone."""
+        return self.scale == "log" or bool(np.all(self.lower > 0))
+
+    def entries(self) -> tuple[Parameter, ...]:
+        """A scalar `Parameter` for each entry, in their order."""
+        terms = PriorTerms.of(self.prior, self.shape)
+        priors: list[Prior | None] = []
+        for center, precision, log in zip(*terms, strict=True):
+            kind = LogNormal if log else Normal
+            priors.append(kind(np.exp(center) if log else center, precision**-0.5) if precision > 0 else None)
+        each = zip(self.value.ravel(), self.lower.ravel(), self.upper.ravel(), priors, strict=True)
+        return tuple(Parameter(x, low, high, self.unit, self.fixed, prior, self.scale) for x, low, high, prior in each)
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.data import FloatArray, Measurements, as_numbers
+from switchfit.data import FloatArray, Measurements, ReferenceSignal, as_numbers
 from switchfit.mesh import Mesh
 from switchfit.problem import Problem
 from switchfit.result import Fit
@@ -153,13 +153,18 @@ def _errors(derivative: FloatArray, covariance: FloatArray) -> FloatArray:
 def _noise(fit: Fit, problem: Problem, e: int, times: FloatArray) -> FloatArray:
     """Standard deviation of one sample of each output at each time: (K, q)."""
     columns = [np.full((len(times), q), np.nan) for _, q in problem.structures[e].references]
-    for item in problem.experiments[e].data:
+    for item, comparison in zip(_compared(problem, e), fit.comparisons[e], strict=True):
         if isinstance(item, Measurements):
             # Weights are 1 where sigma is unknown; a known one beside an unknown one is scaled like it.
             unknown = 1.0 if fit.sigma_known else np.sqrt(fit.residual_variance)
-            sigma = np.broadcast_to(1.0 if item.sigma is None else item.sigma, item.values.shape) * unknown
+            sigma = np.broadcast_to(1.0 if comparison.sigma is None else comparison.sigma, item.values.shape) * unknown
             columns.append(sigma[np.abs(times[:, None] - item.times[None]).argmin(1)])
     return np.concatenate([np.zeros((len(times), 0)), *columns], axis=1)
+
+
+def _compared(problem: Problem, e: int) -> list[Any]:
+    """The data of experiment e that have a comparison, in its order."""
+    return [item for item in problem.experiments[e].data if isinstance(item, (Measurements, ReferenceSignal))]
 
 
 def _near(fit: Fit, problem: Problem, e: int, times: FloatArray) -> NDArray[np.bool_]:

@@ -19,7 +19,9 @@ from switchfit.data import FloatArray, Measurements, as_number, as_numbers
 from switchfit.experiment import Experiment, initial_state_of, run_names
 from switchfit.mesh import Mesh, common_lengths
 from switchfit.model import Arguments, Structure, arguments_of, structure_of, terminal_constraint_count
+from switchfit.optimize.variables import Variables
 from switchfit.parameter import Parameter, as_parameter
+from switchfit.priors import PriorTerms
 from switchfit.system import HybridSystem
 
 SMALLEST_RTOL = 1e-13
@@ -40,6 +42,8 @@ class Unknowns:
         estimated: (n,) int arrays; (0,) where it is a function
     A, b : ordering and minimum durations as ``A theta >= b``, (m, d) and (m,)
     constraint_names : what each row means when it is active
+    priors : PriorTerms
+    log : (d,) bool, whether an unknown is estimated on a logarithmic scale
     """
 
     names: tuple[str, ...]
@@ -53,6 +57,21 @@ class Unknowns:
     A: FloatArray
     b: FloatArray
     constraint_names: tuple[str, ...]
+    priors: PriorTerms
+    log: NDArray[np.bool_]
+
+    @cached_property
+    def variables(self) -> Variables:
+        """What the optimiser works with: transition times as they are, other unknowns scaled or their logarithms."""
+        is_time = np.zeros(len(self.names), dtype=bool)
+        for where in self.times:
+            is_time[where[where >= 0]] = True
+        return Variables.of(self.initial, self.lower, self.upper, self.log, keep=is_time)
+
+    @property
+    def log_names(self) -> tuple[str, ...]:
+        """Names of the unknowns that are estimated on a logarithmic scale."""
+        return tuple(name for name, log in zip(self.names, self.log, strict=True) if log)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +139,8 @@ class Problem:
         self._check_maps()
         self._check_states()
         object.__setattr__(self, "unknowns", _unknowns(self.system, experiments, parameters, dwell))
+        self._check_noise()
+        self._check_delays()
         targets = frozenset(name for e in experiments for name in e.parameter_map.values())
         structures = tuple(structure_of(self.system, e, parameters, self.solver, targets) for e in experiments)
         for structure in structures:
@@ -137,6 +158,57 @@ class Problem:
                     raise ValueError(
                         f"parameter_map of experiment {name} gives the model's {here!r} as the unknown parameter "
                         f"{target!r}; the problem has {', '.join(self.parameters) or 'none'}."
+                    )
+
+    def _check_noise(self) -> None:
+        """Parameters that are a sigma, and whether the noise is known where something is weighed against it."""
+        items = [(e, item) for e in self.experiments for item in e.data if isinstance(item, Measurements)]
+        for experiment, item in items:
+            for name in filter(None, item.sigma_names):
+                parameter = self.parameters.get(experiment.parameter_map.get(name, name))
+                if parameter is None:
+                    raise ValueError(
+                        f"sigma names the parameter {name!r}, which the problem lacks; it has "
+                        f"{', '.join(self.parameters) or 'none'}."
+                    )
+                if parameter.shape != () or not (parameter.positive or (parameter.fixed and parameter.value > 0)):
+                    raise ValueError(
+                        f"sigma names the parameter {name!r}, which must be one number that stays positive: give it a "
+                        f"lower bound above 0, or scale='log'; got shape {parameter.shape}, lower bound "
+                        f"{parameter.lower.tolist()}."
+                    )
+        unknown = any(item.sigma is None for _, item in items)
+        if unknown and any(item.sigma_names or item.loss != "linear" for _, item in items):
+            raise ValueError(
+                "sigma is left out in some Measurements, and a parameter or measured against by a robust loss in "
+                "others: their costs are then not in the same units. Name a parameter for it there too."
+            )
+        if unknown and self.unknowns.priors.any:
+            raise ValueError(
+                "a prior is weighed against the noise of the Measurements, whose sigma is left out: give sigma a "
+                "number, or the name of a parameter to estimate it."
+            )
+
+    def _check_delays(self) -> None:
+        """Parameters that are a delay: within their bounds all samples must be of moments inside the horizon."""
+        for experiment in self.experiments:
+            for item in experiment.data:
+                if not (isinstance(item, Measurements) and isinstance(item.delay, str)):
+                    continue
+                parameter = self.parameters.get(experiment.parameter_map.get(item.delay, item.delay))
+                if parameter is None or parameter.shape != ():
+                    raise ValueError(
+                        f"delay names {item.delay!r}, which must be a parameter of one number; the problem has "
+                        f"{', '.join(self.parameters) or 'none'}."
+                    )
+                low, high = item.times[-1] - experiment.tf, item.times[0] - experiment.t0
+                least, most = (parameter.value,) * 2 if parameter.fixed else (parameter.lower, parameter.upper)
+                if not low <= least <= most <= high:
+                    raise ValueError(
+                        f"the delay {item.delay!r} may lie in [{least}, {most}] (its bounds, if it is not fixed), but "
+                        f"only from {low:.6g} to {high:.6g} are all samples of moments inside (t0, tf) = "
+                        f"({experiment.t0}, {experiment.tf}): give it narrower bounds, move t0 or tf, or leave out "
+                        "samples at the ends."
                     )
 
     def _check_states(self) -> None:
@@ -239,6 +311,19 @@ class Problem:
                 padded[e] = meshes[e] if len(group) == 1 else meshes[e].padded_to(length)
         return padded
 
+    def named(self, theta: FloatArray, e: int) -> dict[str, FloatArray]:
+        """The parameters of experiment e under the names that the model has for them."""
+        own = self.split(theta)[1]
+        mapped = self.experiments[e].parameter_map
+        return own | {name: own[target] for name, target in mapped.items()}
+
+    def late_times(self, theta: FloatArray, e: int) -> FloatArray:
+        """Moments of which the samples of experiment e are whose delay is a parameter: (K,), in no order."""
+        items = [item for item in self.experiments[e].data if isinstance(item, Measurements)]
+        late = [(item.times, item.delay) for item in items if isinstance(item.delay, str)]
+        named = self.named(theta, e) if late else {}
+        return np.concatenate([np.zeros(0), *(times - named[delay] for times, delay in late)])
+
     def checked_theta(self, theta: ArrayLike | None) -> FloatArray:
         """`theta`, or the initial guess for None, as a ``(d,)`` array; ValueError where shape or order is wrong."""
         if theta is None:
@@ -258,7 +343,17 @@ class Problem:
                     f"The transition times in theta must not decrease inside (t0, tf) = ({experiment.t0}, "
                     f"{experiment.tf}); got {times.tolist()}."
                 )
+        self._check_delays_inside(checked)
         return checked
+
+    def _check_delays_inside(self, theta: FloatArray) -> None:
+        for e, experiment in enumerate(self.experiments):
+            seen = self.late_times(theta, e)
+            if seen.size and (seen.min() < experiment.t0 or seen.max() > experiment.tf):
+                raise ValueError(
+                    f"theta has delays with which samples are of moments from {seen.min():.6g} to {seen.max():.6g}, "
+                    f"outside (t0, tf) = ({experiment.t0}, {experiment.tf})."
+                )
 
     def split(self, theta: FloatArray) -> tuple[list[FloatArray], dict[str, FloatArray]]:
         """All transition times, one ``(N,)`` array an experiment, and all parameters by name, fixed ones included."""
@@ -324,9 +419,11 @@ def _unknowns(
         twice = sorted({name for name in names if names.count(name) > 1})
         raise ValueError(f"Two unknowns share a name: {', '.join(twice)}; rename the parameter or the experiment.")
     flat = {key: np.concatenate([getattr(q, key).ravel() for q in pieces]) for key in ("value", "lower", "upper")}
+    priors = PriorTerms.joined([PriorTerms.of(q.prior, q.shape) for q in pieces])
+    log = np.concatenate([np.full(q.value.size, q.scale == "log") for q in pieces])
     A, b, rows = _ordering(experiments, where, len(names), dwell)
     vectors = flat["value"], flat["lower"], flat["upper"]
-    return Unknowns(tuple(names), tuple(units), *vectors, tuple(where), spans, tuple(states), A, b, rows)
+    return Unknowns(tuple(names), tuple(units), *vectors, tuple(where), spans, tuple(states), A, b, rows, priors, log)
 
 
 def _index(k: tuple[int, ...]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -10,8 +11,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from switchfit.mesh import Rows, row_ending_cell, rows
-from switchfit.model import Model, Piece
-from switchfit.rungekutta import combine, stages
+from switchfit.model import Model, Piece, Samples
+from switchfit.rungekutta import combine, stages, step
 
 Array = jax.Array
 
@@ -121,6 +122,45 @@ def sample_costs(model: Model, path: Path, p: Array) -> Array:
     """Sum of the costs of all discrete samples."""
     total = jnp.zeros(())
     for k, samples in enumerate(model.arguments.samples):
-        x = path.at_samples(samples.cell)
+        if model.structure.measurements[k].delay is None:
+            x = path.at_samples(samples.cell)
+        else:
+            _, segment, piece, start, before = row_holding(model, path, k, p)
+            late = jax.vmap(partial(seen_late, model, k), in_axes=(0, 0, 0, 0, 0, None))
+            samples, x = late(samples, segment, piece, start, before, p)
         total = total + jax.vmap(lambda s, x, k=k: model.sample_cost(k, s, x, p))(samples, x).sum()
     return total
+
+
+def row_holding(model: Model, path: Path, k: int, p: Array) -> tuple[Array, Array, Piece, Array, Array]:
+    """The rows with ``start < t - delay <= end`` for the samples of the k-th Measurements, which is late.
+
+    Returns
+    -------
+    row, segment : (K,) int
+    piece : Piece, of K rows
+    start, x : (K,), (K, n), start of the row and the state there
+    """
+    layout = path.layout
+    samples = model.arguments.samples[k]
+    times = lax.stop_gradient(jax.vmap(lambda s: model.seen_at(k, s, p).time)(samples))
+    ends = lax.stop_gradient(by_row(layout.end))
+    row = jnp.minimum(jnp.searchsorted(ends, times), ends.shape[0] - 1)
+    piece = Piece(by_row(path.pieces.origin)[row], by_row(path.pieces.coefficients)[row])
+    segment = layout.segment[row // layout.start.shape[1]]
+    return row, segment, piece, by_row(layout.start)[row], by_row(path.before)[row]
+
+
+def seen_late(
+    model: Model, k: int, sample: Samples, segment: Array, piece: Piece, start: Array, x: Array, p: Array
+) -> tuple[Samples, Array]:
+    """One late sample with the time of the state that it is of, and that state, one step from `start`: (n,)."""
+    there = model.seen_at(k, sample, p)
+
+    def through(mode: int) -> Callable[..., Array]:
+        def state(time: Array, start: Array, x: Array) -> Array:
+            return step(model.tableau, model.field(mode, piece), None, start, time, x, p)[0]
+
+        return state
+
+    return there, by_mode(model, segment, through, there.time, start, x)

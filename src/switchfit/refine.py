@@ -41,7 +41,7 @@ def fixed_nodes(experiment: Experiment) -> FloatArray:
     """Moments that must be nodes: t0, tf, sample times, knots of inputs and reference signals inside the horizon."""
     t0, tf = experiment.t0, experiment.tf
     times = [np.array([t0, tf])]
-    times += [item.times for item in experiment.data if isinstance(item, Measurements)]
+    times += [item.seen_times for item in experiment.data if isinstance(item, Measurements)]
     times += [signal.knots for signal in signals_of(experiment)]
     nodes = np.unique(np.concatenate(times))
     return nodes[(nodes >= t0) & (nodes <= tf)]

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
 import scipy.special
+from numpy.typing import NDArray
 
 from switchfit.data import FloatArray
 from switchfit.optimize import IterationRecord, Status
@@ -132,6 +133,12 @@ class Fit:
         Guards and terminal constraints. With them the Hessian is that of J plus multipliers times constraints.
     saved_gauss_newton : (d, d) or None
         The Gauss-Newton matrix of the samples, where it has been evaluated.
+    priors : dict of name -> str
+        The prior of each unknown that has one, in words.
+    log_scaled : tuple of str
+        Unknowns that were estimated on a logarithmic scale.
+    least_squares : bool
+        Whether what measurements and priors add to J is half a sum of squares: no sigma is a parameter, no loss robust.
     """
 
     theta_names: tuple[str, ...]
@@ -163,6 +170,9 @@ class Fit:
     seconds: float
     constraints: tuple[tuple[str, float, float], ...] = ()
     saved_gauss_newton: FloatArray | None = None
+    priors: Mapping[str, str] = field(default_factory=dict)
+    log_scaled: tuple[str, ...] = ()
+    least_squares: bool = True
 
     @property
     def success(self) -> bool:
@@ -188,24 +198,31 @@ class Fit:
 
     @property
     def residual_variance(self) -> float:
-        """``2 J / (samples - free unknowns)``: near 1 where sigma is right; NaN without measurements."""
-        return 2 * self.cost / self.freedom if self.sigma_known is not None and self.freedom > 0 else np.nan
+        """``2 J / (samples + priors - free unknowns)``: near 1 where sigma is right.
+
+        NaN without measurements, and where J is no sum of squares (`least_squares`).
+        """
+        freedom = self.freedom
+        judged = self.sigma_known is not None and self.least_squares and freedom > 0
+        return 2 * self.cost / freedom if judged else np.nan
 
     @property
     def freedom(self) -> int:
-        """Degrees of freedom of the residuals: values less unknowns that no constraint holds."""
-        return self.samples - self.free_basis.shape[1]
+        """Degrees of freedom: measured values, and priors, which count as such, less free unknowns."""
+        return self.samples + len(self.priors) - self.free_basis.shape[1]
 
     @property
     def gauss_newton(self) -> FloatArray | None:
-        """The Gauss-Newton matrix ``sum (D h / sigma)' (D h / sigma)``: (d, d); None where it is not known."""
+        """The Gauss-Newton matrix of the samples and priors: (d, d); None where it is not known."""
         return self.saved_gauss_newton
 
     @cached_property
     def covariance(self) -> FloatArray:
         """Covariance of theta from the exact Hessian on the free directions: (d, d).
 
-        ``Z (Z' H Z)^-1 Z'``, times the residual variance where sigma is unknown. An unknown held by a bound, a
+        ``Z (Z' H Z)^-1 Z'``, times the residual variance where sigma is unknown. With priors it is the covariance of
+        the posterior (Laplace's approximation); with a robust loss, that of noise whose negative log-likelihood the
+        loss is; a sigma that is a parameter is an unknown like others. An unknown held by a bound, a
         collapsed mode or a kink has variance 0 here. NaN where the cost has no noise model (anything but
         `Measurements`), the Hessian is not positive definite, or there are too few samples.
         """
@@ -259,6 +276,7 @@ class Fit:
     def confidence_intervals(self, level: float = 0.95, *, hessian: CovarianceKind = "exact") -> FloatArray:
         """Intervals theta +- quantile x standard error, cut off at the bounds: (d, 2).
 
+        Of unknowns on a logarithmic scale theta times or by exp(quantile x relative standard error).
         NaN for an unknown that is held by a bound, a collapsed mode or a kink: the quadratic approximation knows no
         interval there. `profile` does.
 
@@ -270,8 +288,9 @@ class Fit:
             As of `covariance_from`.
         """
         half = self.quantile(level) * np.sqrt(np.diag(self.covariance_from(hessian)))
-        half = np.where(half > 0, half, np.nan)
-        return np.stack([np.maximum(self.theta - half, self.lower), np.minimum(self.theta + half, self.upper)], axis=1)
+        log = np.isin(self.theta_names, self.log_scaled)
+        low, high = interval(self.theta, np.where(half > 0, half, np.nan), log).T
+        return np.stack([np.maximum(low, self.lower), np.minimum(high, self.upper)], axis=1)
 
 
 def correlation_of(covariance: FloatArray) -> FloatArray:
@@ -322,6 +341,13 @@ def disagreement(fit: Fit) -> Disagreement | None:
     k = int(np.argmax(changes))
     factor = float(np.sqrt(max(ratios[-1], 1 / ratios[0])))
     return Disagreement(factor, fit.theta_names[k], float(errors[0][k]), float(errors[1][k]))
+
+
+def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_]) -> FloatArray:
+    """``theta -+ half``, or where `log` ``theta exp(-+ half / theta)``: (..., 2)."""
+    size = np.where(log, theta, 1.0)
+    factor = np.exp(np.where(log, half / size, 0.0))
+    return np.stack([np.where(log, theta / factor, theta - half), np.where(log, theta * factor, theta + half)], axis=-1)
 
 
 def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:

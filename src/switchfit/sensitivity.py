@@ -244,7 +244,7 @@ def _block_along(
 
     def outputs(t: jax.Array, x: jax.Array, X: jax.Array) -> tuple[jax.Array, jax.Array]:
         def seen(x: jax.Array, p: jax.Array) -> jax.Array:
-            sensors = (*structure.references, *structure.measurements)
+            sensors = (*structure.references, *((s.observe, s.channels) for s in structure.measurements))
             return jnp.concatenate([jnp.zeros(0), *(model.observed(h, t, x, p, q) for h, q in sensors)])
 
         y, linear = jax.linearize(seen, x, p)

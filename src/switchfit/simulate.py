@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.cache import compilation_cache
 from switchfit.data import FloatArray, Measurements, ReferenceSignal
-from switchfit.mesh import CHUNK, Mesh, rows
+from switchfit.losses import robust
+from switchfit.mesh import CHUNK, Mesh, Rows, rows
 from switchfit.model import Arguments, Model, Piece, Structure, float64
 from switchfit.problem import Problem
 from switchfit.refine import after_reset, initial_state, refined_mesh
@@ -67,6 +68,8 @@ class Comparison:
     sigma : (K, q) or None where unknown
     curve_times, curve : (L,), (L, q)
         The fitted output at all nodes, for plots.
+    downweighted : (K, q) of bool, or None
+        Where a robust loss counts a residual as an outlier, one larger than its `loss_scale`; None without such a loss.
     """
 
     kind: str
@@ -77,6 +80,7 @@ class Comparison:
     sigma: FloatArray | None
     curve_times: FloatArray
     curve: FloatArray
+    downweighted: NDArray[np.bool_] | None = None
 
     @property
     def residuals(self) -> FloatArray:
@@ -129,7 +133,8 @@ def compare(
         trajectory = _trajectory(problem, e, run)
         total += run.cost
         trajectories.append(trajectory)
-        comparisons.append(_comparisons(problem, e, run, trajectory))
+        comparisons.append(_comparisons(problem, e, theta, run, trajectory))
+    total += float(problem.unknowns.priors.evaluate(theta)[0])
     return total, tuple(trajectories), tuple(comparisons)
 
 
@@ -157,12 +162,16 @@ class Segment(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One simulation: its cost, its segments, the cells of the mesh in which these begin (N + 1,), and the mesh."""
+    """One simulation: its cost, its segments, the cells of the mesh in which these begin (N + 1,), and the mesh.
+
+    `seen` is what each of the Measurements sees at its samples, (K, q) arrays.
+    """
 
     cost: float
     segments: list[Segment]
     first_cell: NDArray[np.intp]
     mesh: Mesh
+    seen: tuple[FloatArray, ...] = ()
 
     def at_cells(self, cells: NDArray[np.intp], channels: slice) -> FloatArray:
         """Outputs at the ends of cells (K,), before a jump; at t0 for cell -1: (K, q)."""
@@ -198,12 +207,84 @@ def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> Run:
         cost += float(_terminal(arguments, x, p, structure=structure.functions))
     run = Run(cost, segments, np.asarray(layout.first_cell), mesh)
     first = sum(q for _, q in structure.references)
-    for samples, (_, q) in zip(whole.samples, structure.measurements, strict=True):
-        seen = run.at_cells(np.asarray(samples.cell), slice(first, first + q))
-        residuals = np.where(samples.weight > 0, seen - samples.value, 0.0)
-        cost += 0.5 * float(np.sum(samples.weight * residuals**2))
-        first += q
-    return replace(run, cost=cost)
+    named = problem.named(theta, e)
+    all_seen = []
+    for k, (samples, sensor) in enumerate(zip(whole.samples, structure.measurements, strict=True)):
+        if sensor.delay is None:
+            seen = run.at_cells(np.asarray(samples.cell), slice(first, first + sensor.channels))
+        else:
+            seen = _late_outputs(structure, whole, run, layout, k, named, p)
+        all_seen.append(seen)
+        there = np.asarray(samples.weight) > 0
+        u = samples.weight * np.where(there, seen - samples.value, 0.0) ** 2
+        if sensor.sigma:
+            sigma = np.array([1.0 if name is None else float(named[name]) for name in sensor.sigma])
+            u = u / sigma**2
+            cost += float(np.sum(there * np.log(sigma)))
+        cost += 0.5 * float(np.sum(robust(sensor.loss, sensor.loss_scale, u)))
+        first += sensor.channels
+    return replace(run, cost=cost, seen=tuple(all_seen))
+
+
+def _late_outputs(
+    structure: Structure,
+    whole: Arguments,
+    run: Run,
+    layout: Rows,
+    k: int,
+    named: Mapping[str, FloatArray],
+    p: FloatArray,
+) -> FloatArray:
+    """What the k-th Measurements sees at its samples, which are late by a parameter: (K, q)."""
+    sensor, samples = structure.measurements[k], whole.samples[k]
+    times = np.asarray(samples.time) - float(named[sensor.delay or ""])
+    start, end, before = (
+        np.concatenate([getattr(part, a) for part in run.segments]) for a in ("start", "end", "before")
+    )
+    row = np.minimum(np.searchsorted(end, times), len(end) - 1)
+    mode = np.repeat(structure.mode_of_segment, [len(part.start) for part in run.segments])[row]
+    flat = np.concatenate(
+        [np.arange(len(part.start)) + c for part, c in zip(run.segments, run.first_cell, strict=True)]
+    )
+    cell = flat[row]
+    rows = (times, mode, start[row], before[row], whole.nodes[cell], whole.signals[cell])
+    count = len(times)
+    padded = [np.concatenate([a, np.repeat(a[-1:], -count % BLOCK, axis=0)]) for a in rows]
+    parts = []
+    with float64(), compilation_cache():
+        for first in range(0, len(padded[0]), BLOCK):
+            block = [a[first : first + BLOCK] for a in padded]
+            found = _late_block(whole.without_mesh(), *block, p, structure=structure.functions, k=k)
+            parts.append(np.asarray(found))
+    return np.concatenate(parts)[:count]
+
+
+@partial(jax.jit, static_argnames=("structure", "k"))
+def _late_block(
+    arguments: Arguments,
+    times: jax.Array,
+    mode: jax.Array,
+    start: jax.Array,
+    x: jax.Array,
+    origin: jax.Array,
+    coefficients: jax.Array,
+    p: jax.Array,
+    *,
+    structure: Structure,
+    k: int,
+) -> jax.Array:
+    """Outputs of the k-th Measurements at times inside rows, a step from the start of each: (BLOCK, q)."""
+    model = Model(structure, arguments)
+    sensor = structure.measurements[k]
+
+    def one(time: jax.Array, mode: jax.Array, start: jax.Array, x: jax.Array, piece: Piece) -> jax.Array:
+        steps = [
+            lambda x, m=m: step(model.tableau, model.field(m, piece), None, start, time, x, p)[0]
+            for m in range(len(structure.modes))
+        ]
+        return model.observed(sensor.observe, time, lax.switch(mode, steps, x), p, sensor.channels)
+
+    return jax.vmap(one)(times, mode, start, x, Piece(origin, coefficients))
 
 
 def _segment(
@@ -263,7 +344,7 @@ def _block(
     costs, before, after = modes[0](x) if len(modes) == 1 else lax.switch(mode, modes, x)
 
     def outputs(t: jax.Array, x: jax.Array) -> jax.Array:
-        seen = (*structure.references, *structure.measurements)
+        seen = (*structure.references, *((sensor.observe, sensor.channels) for sensor in structure.measurements))
         return jnp.concatenate([jnp.zeros(0), *(model.observed(observe, t, x, p, q) for observe, q in seen)])
 
     over_rows = jax.vmap(outputs)
@@ -295,13 +376,15 @@ def _shown(part: Segment, before: FloatArray, after: FloatArray) -> FloatArray:
     return np.concatenate([before[:1], after[part.end > part.start]])
 
 
-def _comparisons(problem: Problem, e: int, run: Run, trajectory: Trajectory) -> tuple[Comparison, ...]:
+def _comparisons(
+    problem: Problem, e: int, theta: FloatArray, run: Run, trajectory: Trajectory
+) -> tuple[Comparison, ...]:
     """Measured against fitted for each reference signal and each Measurements."""
     data, times = problem.experiments[e].data, trajectory.times
     curves = np.concatenate([_shown(part, part.y_before, part.y_after) for part in run.segments])
     comparisons = []
     items = [d for d in data if isinstance(d, ReferenceSignal)] + [d for d in data if isinstance(d, Measurements)]
-    first = 0
+    first = measured = 0
     for item in items:
         q = item.signal.channels if isinstance(item, ReferenceSignal) else item.values.shape[1]
         channels = slice(first, first + q)
@@ -312,8 +395,15 @@ def _comparisons(problem: Problem, e: int, run: Run, trajectory: Trajectory) -> 
         if isinstance(item, ReferenceSignal):
             here = Comparison("reference", label, times, item.signal(times), curve, None, times, curve)
         else:
-            fitted = run.at_cells(run.mesh.cell_ending_at(item.times), channels)
-            sigma = None if item.sigma is None else np.broadcast_to(item.sigma, item.values.shape).copy()
-            here = Comparison("measurements", label, item.times, item.values, fitted, sigma, times, curve)
+            named = problem.named(theta, e)
+            fitted = run.seen[measured][: len(item.times)]
+            measured += 1
+            delay = float(named[item.delay]) if isinstance(item.delay, str) else item.delay
+            sigma = item.noise(named)
+            beyond = None
+            if item.loss != "linear" and sigma is not None:
+                beyond = np.abs(np.nan_to_num(item.values - fitted)) > item.loss_scale * sigma
+            shown = times + delay  # as the sensor says it
+            here = Comparison("measurements", label, item.times, item.values, fitted, sigma, shown, curve, beyond)
         comparisons.append(here)
     return tuple(comparisons)

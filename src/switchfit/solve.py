@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from switchfit.data import FloatArray, Measurements, TerminalConstraint
 from switchfit.evaluate import ArrowEvaluation, Evaluation, Evaluator
+from switchfit.hidden import refuse_hidden_switches
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, minimize
+from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.sqp import HessianKind
+from switchfit.optimize.variables import Variables
 from switchfit.problem import Problem
 
 MANY_RUNS = 16
@@ -57,30 +60,82 @@ def minimized(
     """
     problem = evaluator.problem
 
+    unknowns = problem.unknowns
     matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
     if by_blocks is None:
         by_blocks = len(problem.experiments) >= MANY_RUNS and 2 * len(evaluator.layout.shared) < len(theta)
+    variables = unknowns.variables
+    constraints = constraints_of(problem) if constraints is None else constraints
+    identity = variables.identity
+    seen: list[bool] = []
 
-    def evaluate(theta: Any, side: int) -> Evaluation | ArrowEvaluation | CostAndGradient:
+    def evaluate_theta(theta: Any, side: int) -> Evaluation | ArrowEvaluation | CostAndGradient:
         if hessian not in ("none", "descent-first") and by_blocks:
             return evaluator.arrow(theta, side, matrix)
         here = evaluator(theta, side, matrix=matrix)
         return CostAndGradient(here.cost, here.gradient) if hessian == "none" else here
 
+    def evaluate(z: Any, side: int) -> Any:
+        theta = z if identity else _outward(variables, constraints, z)
+        here = evaluate_theta(theta, side)
+        if not seen:
+            seen.append(True)
+            refuse_hidden_switches(evaluator, theta, here.gradient)
+        return here if identity else _inward(variables, theta, here)
+
     is_time = np.zeros(len(theta), dtype=int)
     for where in problem.unknowns.times:
         is_time[where[where >= 0]] = 1
-    return minimize(
+    told = callback
+    if callback is not None and not identity:
+        told = lambda record: callback(_told(variables, constraints, record))  # noqa: E731
+    result = minimize(
         evaluate,
-        theta,
-        constraints=constraints_of(problem) if constraints is None else constraints,
+        theta if identity else variables.inward(np.asarray(theta)),
+        constraints=constraints if identity else _constraints_inward(variables, constraints),
         breakpoints=evaluator.breakpoints(),
         hessian=hessian,
         blocks=is_time,
         tolerance=tolerance,
         max_iterations=max_iterations,
-        callback=callback,
+        callback=told,
     )
+    return result if identity else _result_outward(variables, constraints, result)
+
+
+def _outward(variables: Variables, constraints: LinearConstraints, z: FloatArray) -> FloatArray:
+    """theta at z, inside its bounds whatever the rounding."""
+    return np.asarray(np.clip(variables.outward(z), constraints.lower, constraints.upper))
+
+
+def _inward(variables: Variables, theta: FloatArray, here: Any) -> Any:
+    """An evaluation at theta as one of the optimiser's variables."""
+    if here.hessian is None:
+        return CostAndGradient(here.cost, variables.slopes(theta)[0] * here.gradient)
+    if isinstance(here.hessian, Arrow):
+        D, E = variables.slopes(theta)
+        hessian = here.hessian.scaled(1.0 / D).plus_diagonal(E * here.gradient)
+        return ArrowEvaluation(here.cost, D * here.gradient, hessian)
+    return Evaluation(here.cost, *variables.derivatives_inward(theta, here.gradient, here.hessian))
+
+
+def _constraints_inward(variables: Variables, constraints: LinearConstraints) -> LinearConstraints:
+    """Bounds of the optimiser's variables; the rows join transition times alone, which are not changed."""
+    lower, upper = variables.inward(constraints.lower), variables.inward(constraints.upper)
+    return replace(constraints, lower=lower, upper=upper)
+
+
+def _told(variables: Variables, constraints: LinearConstraints, record: IterationRecord) -> IterationRecord:
+    """A record of the optimiser's with theta in place of its own variables."""
+    return replace(record, theta=_outward(variables, constraints, record.theta))
+
+
+def _result_outward(variables: Variables, constraints: LinearConstraints, result: Result) -> Result:
+    """The optimiser's result in theta; its optimality and its eigenvalues stay those of its own variables."""
+    theta = _outward(variables, constraints, result.theta)
+    gradient, hessian = variables.derivatives_outward(theta, result.gradient, result.hessian)
+    history = tuple(_told(variables, constraints, record) for record in result.history)
+    return replace(result, theta=theta, gradient=gradient, hessian=hessian, history=history)
 
 
 def with_names(message: str, names: tuple[str, ...]) -> str:
@@ -88,8 +143,33 @@ def with_names(message: str, names: tuple[str, ...]) -> str:
     return re.sub(r"theta\[(\d+)\]", lambda match: names[int(match.group(1))], message)
 
 
+def smallest_cost(problem: Problem) -> float:
+    """A cost below which an error is not measured against it.
+
+    The negative logarithm of a likelihood may be anything, 0 too; its parts are of the size of half the samples.
+    """
+    items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
+    return 1e-300 if least_squares(problem) else 0.5 * sum(item.count for item in items)
+
+
+def least_squares(problem: Problem) -> bool:
+    """Whether J is half a sum of squares: no loss is robust, no sigma a parameter."""
+    items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
+    return not any(item.sigma_names or item.loss != "linear" for item in items)
+
+
+def plain(problem: Problem) -> bool:
+    """Whether J is half a sum of squares of the samples alone, each of the moment at which it was taken."""
+    items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
+    delayed = any(isinstance(item.delay, str) for item in items)
+    return least_squares(problem) and not problem.unknowns.priors.any and not delayed
+
+
 def sigma_known(problem: Problem) -> bool | None:
-    """Whether sigma is known for all measurements; None where the cost is not made of measurements alone."""
+    """Whether sigma is known for all measurements, as a number or as a parameter beside the others.
+
+    None where the cost is not made of measurements alone.
+    """
     items = [item for run in problem.experiments for item in run.data if not isinstance(item, TerminalConstraint)]
     if not items or not all(isinstance(item, Measurements) for item in items):
         return None

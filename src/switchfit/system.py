@@ -120,8 +120,7 @@ def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ..
     if isinstance(value, Parameter):
         if len(value.shape) != 1:
             raise ValueError(f"{name} must have shape (n,), one entry for each state; got shape {value.shape}.")
-        bounds = zip(value.value, value.lower, value.upper, strict=True)
-        return tuple(Parameter(x, low, high, value.unit, value.fixed) for x, low, high in bounds)
+        return value.entries()
     if isinstance(value, (list, tuple)) and any(isinstance(entry, Parameter) for entry in value):
         return tuple(_as_entry(entry, name) for entry in value)
     try:

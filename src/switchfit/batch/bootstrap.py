@@ -50,6 +50,7 @@ from switchfit.report.batch import plot_bootstrap, table_of_bootstrap
 from switchfit.residuals import autocorrelation
 from switchfit.result import inverse_on
 from switchfit.sensitivity import sample_derivatives
+from switchfit.solve import plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -224,6 +225,11 @@ def _check_data(problem: Problem) -> None:
                 raise ValueError(
                     f"a bootstrap resamples Measurements; this problem has a {type(item).__name__} as well."
                 )
+    if not plain(problem):
+        raise ValueError(
+            "a bootstrap takes least squares alone: no sigma and no delay that is a parameter, no robust loss and no "
+            "prior. sf.monte_carlo draws from the noise that was fitted."
+        )
 
 
 def _acceleration(estimate: Estimate, *, by_run: bool) -> FloatArray:

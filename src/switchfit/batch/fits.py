@@ -19,6 +19,7 @@ from switchfit.data import FloatArray, Measurements
 from switchfit.optimize import Status
 from switchfit.problem import Problem
 from switchfit.progress import reporting
+from switchfit.result import interval
 from switchfit.solve import sigma_known
 
 
@@ -50,6 +51,8 @@ class Fits:
         Measured values that are not missing.
     sigma_known : bool or None
         Whether the noise of the measurements is known; None where the cost has no noise model.
+    log_scaled : tuple of str
+        Unknowns that were estimated on a logarithmic scale.
     seconds : float
         Wall time of all.
     """
@@ -72,6 +75,7 @@ class Fits:
     covariance: FloatArray
     samples: NDArray[np.int64]
     sigma_known: bool | None
+    log_scaled: tuple[str, ...]
     seconds: float
 
     def __len__(self) -> int:
@@ -96,13 +100,13 @@ class Fits:
             return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
     def confidence_intervals(self, level: float = 0.95) -> FloatArray:
-        """Symmetric intervals of each fit: (R, d, 2); see `Estimate.confidence_intervals`."""
+        """Intervals of each fit: (R, d, 2); see `Estimate.confidence_intervals`."""
         if not 0 < level < 1:
             raise ValueError(f"level must lie between 0 and 1; got {level}.")
         freedom, tail = np.maximum(self.samples - self.free, 1), 0.5 + level / 2
         quantile = scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail)
         half = np.reshape(quantile, (-1, 1)) * self.standard_errors
-        return np.stack([self.theta - half, self.theta + half], axis=2)
+        return interval(self.theta, half, np.isin(self.theta_names, self.log_scaled))
 
     def __str__(self) -> str:
         return "\n".join(self._summary())
@@ -184,6 +188,7 @@ def _fields(
         "requested": requested,
         "runs": runs,
         "sigma_known": known,
+        "log_scaled": problem.unknowns.log_names,
         "seconds": seconds,
         **found,
     }

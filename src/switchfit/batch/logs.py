@@ -20,7 +20,7 @@ from switchfit.optimize import Status
 from switchfit.problem import Problem
 from switchfit.result import inverse_on
 from switchfit.simulate import compare
-from switchfit.solve import sigma_known
+from switchfit.solve import sigma_known, smallest_cost
 
 
 def estimate_many(
@@ -116,7 +116,8 @@ class _Work:
         theta, cost = arrays["theta"][k], arrays["cost"][k]
         meshes = [mesh.divided() for mesh in evaluator_of(problem).meshes]
         fine = compare(problem, theta, meshes)[0]
-        if abs(fine - cost) <= max(LARGEST_INTEGRATION_ERROR, problem.rtol) * abs(fine):
+        size = max(abs(fine), smallest_cost(problem))
+        if abs(fine - cost) <= max(LARGEST_INTEGRATION_ERROR, problem.rtol) * size:
             return
         again = estimate(problem, tolerance=self.tolerance, max_iterations=self.max_iterations, start=theta)
         for name in ("theta", "cost", "gradient", "hessian", "optimality"):
@@ -133,7 +134,7 @@ class _Work:
         parts: list[Any] = ["logs", len(self.problems), self.tolerance, self.max_iterations]
         for problem in self.problems:
             leaves = jax.tree.leaves(tuple(evaluator_of(problem).arguments))
-            parts += [problem.theta_names, problem.initial_theta, *map(np.asarray, leaves)]
+            parts += [problem.theta_names, problem.initial_theta, *problem.unknowns.priors, *map(np.asarray, leaves)]
         first = self.problems[0]
         parts.append(compare(first, first.initial_theta, evaluator_of(first).meshes)[0])  # stands for the functions
         return fingerprint(*parts)
@@ -145,6 +146,7 @@ def _kind(problem: Problem) -> Any:
     shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(tuple(evaluator.arguments)))
     unknowns = problem.unknowns
     numbers = [unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, *problem.places]
+    numbers += [*unknowns.priors, *unknowns.variables]
     times = [experiment.initial_times for experiment in problem.experiments]
     fixed = [np.where(where < 0, t, 0.0) for where, t in zip(unknowns.times, times, strict=True)]
     return problem.structures, shapes, tuple(np.asarray(a).tobytes() for a in (*numbers, *fixed))

@@ -24,6 +24,7 @@ from switchfit.problem import Problem
 from switchfit.refine import refined_mesh
 from switchfit.report.batch import plot_monte_carlo, table_of_monte_carlo
 from switchfit.simulate import compare
+from switchfit.solve import smallest_cost
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -202,7 +203,7 @@ def _clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray | None]]
                 inside = (times >= experiment.t0) & (times <= experiment.tf)
                 if not inside.all():
                     raise ValueError("A ReferenceSignal with samples outside the horizon cannot be simulated.")
-                items.append(Measurements(times, np.nan_to_num(values), item.observe))
+                items.append(Measurements(times, np.nan_to_num(values), item.observe, sigma=1.0))
             else:
                 continue
             kept.append(k)
@@ -233,7 +234,7 @@ def _meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tuple[lis
         evaluator = Evaluator(problem, meshes=[refined_mesh(problem, e, *thetas, finer=finer) for e in indices])
         fine = compare(problem, truth, [mesh.divided() for mesh in evaluator.meshes])[0]
         # Without noise J vanishes at the truth; then the error is measured against J where the fits begin.
-        size = max(abs(fine), PERFECT_FIT * abs(evaluator(start).cost), 1e-300)
+        size = max(abs(fine), PERFECT_FIT * abs(evaluator(start).cost), smallest_cost(problem))
         error = abs(evaluator(truth).cost - fine) / size
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
         if not excess > 1 or attempt == REFINEMENTS:
@@ -271,18 +272,18 @@ class _Work:
         """Values of the k-th data of experiment e, in one run."""
         rng = np.random.default_rng([self.seed, run])
         return {
-            (e, k): self._drawn(rng, clean, self.problem.experiments[e].data[k])
+            (e, k): self._drawn(rng, clean, self.problem.experiments[e].data[k], e)
             for e, items in enumerate(self.clean)
             for k, clean in enumerate(items)
             if clean is not None
         }
 
-    def _drawn(self, rng: np.random.Generator, clean: FloatArray, item: Any) -> FloatArray:
+    def _drawn(self, rng: np.random.Generator, clean: FloatArray, item: Any, e: int) -> FloatArray:
         if callable(self.noise):
             return np.asarray(self.noise(rng, clean.copy(), item), dtype=np.float64)
         sigma = self.noise
         if sigma is None:
-            sigma = item.sigma if isinstance(item, Measurements) else None
+            sigma = item.noise(self.problem.named(self.truth, e)) if isinstance(item, Measurements) else None
             if sigma is None:
                 raise ValueError(
                     "noise must be given, since the data have no sigma from which to draw: a standard deviation, one "
@@ -352,7 +353,7 @@ class _Work:
         data = [np.asarray(values) for items in self.clean for values in items if values is not None]
         drawn = list(self._noisy(0).values())  # stands for the noise, which may be a function
         settings = self.seed, self.tolerance, self.max_iterations, unknowns.names, self.problem.solver
-        bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b
+        bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
         nodes = [mesh.nodes for mesh in self.meshes]
         return fingerprint("monte carlo", settings, self.truth, self.start, *bounds, *nodes, *data, *drawn)
 

@@ -145,7 +145,7 @@ class _Work:
 
     def fingerprint(self) -> str:
         unknowns = self.problem.unknowns
-        bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b
+        bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
         leaves = jax.tree.leaves([self.problem.arguments(e, mesh) for e, mesh in enumerate(self.meshes)])
         first = compare(self.problem, self.starts[0], self.meshes)[0]  # stands for the functions of the model
         settings = self.tolerance, self.max_iterations, unknowns.names, first
@@ -177,6 +177,7 @@ def _drawn(problem: Problem, count: int, seed: int) -> FloatArray:
     for where in unknowns.times:
         is_time[where[where >= 0]] = True
     unbounded = ~is_time & ~(np.isfinite(unknowns.lower) & np.isfinite(unknowns.upper))
+    unbounded |= unknowns.log & (unknowns.lower <= 0)
     if unbounded.any():
         names = ", ".join(np.array(unknowns.names)[unbounded])
         raise ValueError(
@@ -187,6 +188,8 @@ def _drawn(problem: Problem, count: int, seed: int) -> FloatArray:
     cube = sobol.random(1 << max(count - 1, 0).bit_length())[:count]
     low, high = np.where(is_time, 0.0, unknowns.lower), np.where(is_time, 1.0, unknowns.upper)
     points = low + cube * (high - low)
+    log = unknowns.log
+    points[:, log] = low[log] * (high[log] / low[log]) ** cube[:, log]
     for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
         for begin, end, group in _stretches(experiment, where):
             # Sorted uniform numbers are uniform over all ordered times; the room that minimum durations take is added.

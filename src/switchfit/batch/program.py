@@ -29,6 +29,8 @@ from switchfit.mesh import Mesh
 from switchfit.model import Arguments, Structure, float64
 from switchfit.optimize import Status
 from switchfit.optimize.traced import Constraints, Outcome, minimize_traced
+from switchfit.optimize.variables import Variables
+from switchfit.priors import PriorTerms
 from switchfit.problem import Problem
 from switchfit.result import inverse_on
 from switchfit.solve import minimized, with_names
@@ -64,6 +66,26 @@ class Layout:
     lockstep: bool
     tolerance: float
     max_iterations: int
+
+
+class Unscaled(NamedTuple):
+    """What is known about theta itself, in whose place the optimiser has variables of its own.
+
+    Attributes
+    ----------
+    variables : Variables
+    priors : PriorTerms
+    lower, upper : (d,), bounds of theta
+    """
+
+    variables: Variables
+    priors: PriorTerms
+    lower: Any
+    upper: Any
+
+    def theta(self, z: Any) -> Any:
+        """theta at z: (d,)."""
+        return jnp.clip(self.variables.outward(z, jnp), self.lower, self.upper)
 
 
 class Chunk(NamedTuple):
@@ -144,14 +166,16 @@ def fit_chunk(
     count = len(starts)
     size = max(count, chunk_size(lockstep))
     evaluator = Evaluator(problem, meshes=meshes)
-    constraints = (unknowns.A, unknowns.b, unknowns.lower, unknowns.upper)
+    variables = unknowns.variables
+    constraints = (unknowns.A, unknowns.b, variables.inward(unknowns.lower), variables.inward(unknowns.upper))
     with float64():
         given = (
             tuple(evaluator.arguments),
             tuple(_padded(value, size) for value in varying.values),
             tuple(experiment.initial_times for experiment in problem.experiments),
             Constraints(*map(jnp.asarray, constraints)),
-            _padded(starts, size),
+            Unscaled(variables, unknowns.priors, unknowns.lower, unknowns.upper),
+            _padded(variables.inward(np.asarray(starts)), size),
             count,
         )
         with _compiling(layout, given):
@@ -196,6 +220,7 @@ def _fits(
     values: tuple[jax.Array, ...],
     times: tuple[jax.Array, ...],
     constraints: Constraints,
+    unscaled: Unscaled,
     starts: jax.Array,
     count: jax.Array,
     *,
@@ -206,11 +231,15 @@ def _fits(
     def fit(own: tuple[jax.Array, ...], start: jax.Array) -> Outcome:
         here = replaced(arguments, layout.varying, own)
 
-        def evaluate(theta: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-            return _total(layout, here, times, theta)
+        def evaluate(z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+            theta = unscaled.theta(z)
+            J, g, H = _total(layout, here, times, theta)
+            prior, prior_g, prior_h = unscaled.priors.evaluate(theta, jnp)
+            given = unscaled.variables.derivatives_inward(theta, g + prior_g, H + jnp.diag(prior_h), jnp)
+            return J + prior, *given
 
         def piece(theta: jax.Array) -> jax.Array:
-            """The cell in which each free transition time lies."""
+            """The cell in which each free transition time lies; these are not scaled."""
             cells = [
                 jnp.searchsorted(a.nodes, theta[place], side="right")
                 for a, structure, places in zip(here, layout.structures, layout.places, strict=True)
@@ -219,9 +248,12 @@ def _fits(
             ]
             return jnp.stack([*cells, jnp.zeros((), int)])
 
-        return minimize_traced(
+        found = minimize_traced(
             evaluate, start, constraints, piece, tolerance=layout.tolerance, max_iterations=layout.max_iterations
         )
+        theta = unscaled.theta(found.theta)
+        gradient, hessian = unscaled.variables.derivatives_outward(theta, found.gradient, found.hessian, jnp)
+        return found._replace(theta=theta, gradient=gradient, hessian=hessian)
 
     if layout.lockstep:
         return jax.vmap(fit)(values, starts)

@@ -55,6 +55,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
+from switchfit.derivatives.delayed import anchors, late_state_derivatives
 from switchfit.mesh import row_ending_cell
 from switchfit.model import Model, Piece
 from switchfit.propagate import Path, at_cells, by_mode, path_cost, propagate
@@ -363,28 +364,29 @@ def backward_sweep(
     Dp_x_before, Dp_x_after = Dp_x
     final, total = point_cost(model.terminal, path.after[-1, -1], Dp_x_after[-1, -1], p)
     at_t0, jumps, sampled = sample_jumps(model, path, Dp_x_before, Dp_x_after, p)
-    total = add(total, sampled)
+    late, sampled_late = late_jumps(model, path, Dp_x_before, p)
+    total = add(total, add(sampled, sampled_late))
 
     def row(now: tuple[Adjoints, Quadratures], given: Any) -> tuple[tuple[Adjoints, Quadratures], None]:
         adjoints, total = now
-        start, end, d, jump = given
+        start, end, d, jump, *late = given
         states, adjoints = linear_step(model.tableau, adjoint_rate, start - end, d, add(adjoints, jump))
         rates = jax.vmap(integrands)(d, states)
         b = jnp.asarray(model.tableau.b)
         total = jax.tree.map(lambda a, r: a + (end - start) * jnp.tensordot(b, r, 1), total, rates)
-        return (adjoints, total), None
+        return (add(adjoints, late[0]) if late else adjoints, total), None
 
     def chunk(now: tuple[Adjoints, Quadratures], given: Any) -> tuple[tuple[Adjoints, Quadratures], Adjoints]:
-        segment, opens, jump, start, end, *trajectory = given
+        segment, opens, jump, late, start, end, *trajectory = given
         d = along_rows(model, segment, p, start, end, *trajectory)
-        (opened, total), _ = lax.scan(row, now, (start, end, d, jump), reverse=True)
+        (opened, total), _ = lax.scan(row, now, (start, end, d, jump, *late), reverse=True)
         return (before_reset(transitions, segment, opens, opened, pick(Dp_minus, segment)), total), opened
 
     layout = path.layout
     minus = [Dp_x_after[layout.first_chunk[i + 1] - 1, -1] for i in range(len(transitions))]
     Dp_minus = jnp.stack([jnp.zeros_like(Dp_x_before[0, 0]), *minus])
     rows = (layout.start, layout.end, path.pieces, path.before, path.after, Dp_x_before, Dp_x_after)
-    given = (layout.segment, layout.opens, jumps, *rows)
+    given = (layout.segment, layout.opens, jumps, late, *rows)
     (start, total), opened = lax.scan(chunk, (final, total), given, reverse=True)
     return add(start, at_t0), opened, total
 
@@ -459,6 +461,8 @@ def sample_jumps(
     jumps = Adjoints(jnp.zeros((Q * C + 1, n)), jnp.zeros((Q * C + 1, n, n)), jnp.zeros((Q * C + 1, n, M)))
     total = Quadratures(jnp.zeros(M), jnp.zeros((M, M)))
     for k, samples in enumerate(model.arguments.samples):
+        if model.structure.measurements[k].delay is not None:
+            continue
 
         def one(sample: Any, x: Array, Dp_x: Array, k: int = k) -> tuple[Adjoints, Quadratures]:
             return point_cost(lambda x, p: model.sample_cost(k, sample, x, p), x, Dp_x, p)
@@ -470,6 +474,28 @@ def sample_jumps(
         total = add(total, jax.tree.map(lambda a: a.sum(0), added))
     at_rows = jax.tree.map(lambda a: a[1:].reshape((Q, C, *a.shape[1:])), jumps)
     return pick(jumps, 0), at_rows, total
+
+
+def late_jumps(model: Model, path: Path, Dp_x_before: Array, p: Array) -> tuple[tuple[Adjoints, ...], Quadratures]:
+    """Jumps of the adjoints at the start of each row by samples that are seen late, and what these add to (9), (14).
+
+    A late sample is a cost of the state at the start of the row that holds ``t - delay``. The jumps are one tuple of
+    (Q, C, ...) arrays, or none where nothing is late.
+    """
+    Q, C, n = path.before.shape
+    M = p.shape[0]
+    jumps = Adjoints(jnp.zeros((Q * C, n)), jnp.zeros((Q * C, n, n)), jnp.zeros((Q * C, n, M)))
+    total = Quadratures(jnp.zeros(M), jnp.zeros((M, M)))
+    which = [k for k, sensor in enumerate(model.structure.measurements) if sensor.delay is not None]
+    for k in which:
+        samples = model.arguments.samples[k]
+        at = anchors(model, path, Dp_x_before, k, p)
+        (Dell, Dpell), ((D2ell, DpD1ell), (D1Dpell, DpDpell)) = late_state_derivatives(model, at, k, samples, p)
+        jump = Adjoints(Dell, D2ell, D2ell @ at.x_d + DpD1ell)
+        jumps = jax.tree.map(lambda a, b, row=at.row: a.at[row].add(b), jumps, jump)
+        total = add(total, Quadratures(Dpell.sum(0), (DpDpell + D1Dpell @ at.x_d).sum(0)))
+    at_rows = jax.tree.map(lambda a: a.reshape((Q, C, *a.shape[1:])), jumps)
+    return (at_rows,) if which else (), total
 
 
 def before_reset(

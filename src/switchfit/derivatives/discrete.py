@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from switchfit.derivatives.delayed import anchors, late_costates, late_curvature, late_gauss_newton
 from switchfit.derivatives.first_order import (
     FirstOrder,
     Tangents,
@@ -87,8 +88,9 @@ def adjoint_hessian(model: Model, first: FirstOrder, tau: Array, p: Array, weigh
 def gauss_newton_hessian(model: Model, first: FirstOrder, p: Array) -> Array:
     """Hessian without the second derivatives of the trajectory and of the observations: (D, D).
 
-    For Measurements and ReferenceSignal this is the Gauss-Newton matrix; a RunningCost or TerminalCost
-    contributes its own second derivative in (x, p).
+    For Measurements and ReferenceSignal this is the Gauss-Newton matrix, a robust loss weighing each residual by rho',
+    which is never negative; a sigma that is a parameter contributes its Fisher information. A RunningCost or
+    TerminalCost contributes its own second derivative in (x, p).
     """
     path, X = first.path, first.tangents
     P = parameter_directions(model)
@@ -131,15 +133,22 @@ def costates(
     path, jacobians, resets = first.path, first.jacobians, first.resets
     Q, C, n = path.after.shape
     jumps = jnp.zeros((Q * C + 1, n))  # the first entry is that of samples at t0
+    late = jnp.zeros((Q * C, n))  # at the starts of rows
+    any_late = any(sensor.delay is not None for sensor in model.structure.measurements)
     for k, samples in enumerate(model.arguments.samples):
+        if model.structure.measurements[k].delay is not None:
+            at = anchors(model, path, first.tangents.before, k, p)
+            late = late.at[at.row].add(late_costates(model, at, k, samples, p))
+            continue
         where = row_ending_cell(path.layout, samples.cell) + 1
         jumps = jumps.at[where].add(sample_gradients(model, path, k, samples, p)[1])
 
     def row(psi: Array, given: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
-        h, f_x, jump, *l_x = given
+        h, f_x, jump, *more = given
         psi = psi + jump
-        w, mu, before = stage_adjoints(model.tableau, h, f_x, l_x[0] if l_x else jnp.zeros(f_x.shape[:2]), psi)
-        return before, (psi, w, mu)
+        l_x = more[0] if model.has_running_cost else jnp.zeros(f_x.shape[:2])
+        w, mu, before = stage_adjoints(model.tableau, h, f_x, l_x, psi)
+        return before + more[-1] if any_late else before, (psi, w, mu)
 
     def chunk(psi: Array, given: tuple[Array, Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
         segment, opens, operands = given
@@ -157,7 +166,8 @@ def costates(
     if final_constraint is not None:
         final = final + jax.grad(final_constraint)(path.after[-1, -1], p)
     of_ell = (jacobians.l_x,) if model.has_running_cost else ()
-    operands = (layout.end - layout.start, jacobians.f_x, jumps[1:].reshape(Q, C, n), *of_ell)
+    of_late = (late.reshape(Q, C, n),) if any_late else ()
+    operands = (layout.end - layout.start, jacobians.f_x, jumps[1:].reshape(Q, C, n), *of_ell, *of_late)
     psi, columns = lax.scan(chunk, final, (layout.segment, layout.opens, operands), reverse=True)
     return Costates(psi + jumps[0], *columns)
 
@@ -302,13 +312,21 @@ def sample_curvature(
 ) -> Array:
     """Second derivative of the costs of the k-th Measurements: (D, D)."""
     P = parameter_directions(model)
+    if model.structure.measurements[k].delay is not None:
+        of_late = late_gauss_newton if gauss_newton else late_curvature
+        return of_late(model, anchors(model, path, X.before, k, p), k, samples, p, P)
 
     def one(given: tuple[Samples, Array, Array]) -> Array:
         sample, x, x_d = given
         if not gauss_newton:
             return _second(lambda x, p: model.sample_cost(k, sample, x, p), (x, p), (x_d, P))
         r_d = _columns(lambda x, p: model.sample_residual(k, sample, x, p), (x, p), (x_d, P))
-        return r_d.T @ (sample.weight[:, None] * r_d)
+        H = r_d.T @ (model.sample_information(k, sample, x, p)[:, None] * r_d)
+        if model.structure.measurements[k].sigma:
+            # Fisher's information of normal noise: 2 of log sigma, none between sigma and the rest.
+            s_d = _columns(lambda p: model.log_sigma(k, sample, p), (p,), (P,))
+            H = H + 2.0 * s_d.T @ s_d
+        return H
 
     def block(H: Array, given: Any) -> tuple[Array, None]:
         return H + jax.vmap(one)(given).sum(0), None

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from switchfit.derivatives.delayed import anchors, late_gradient
 from switchfit.mesh import Rows
 from switchfit.model import Model, Piece, Samples
 from switchfit.propagate import Path, at_cells, by_mode, by_row, propagate
@@ -97,6 +98,11 @@ def first_order(model: Model, tau: Array, p: Array, side: Array) -> FirstOrder:
     P = parameter_directions(model)
     cost, gradient = running_cost_gradient(model, path, jacobians, X)
     for k, samples in enumerate(model.arguments.samples):
+        if model.structure.measurements[k].delay is not None:
+            at = anchors(model, path, X.before, k, p)
+            value, g = late_gradient(model, at, k, samples, p, P)
+            cost, gradient = cost + value, gradient + g
+            continue
         value, g_x, g_p = sample_gradients(model, path, k, samples, p)
         cost = cost + value.sum()
         gradient = gradient + jnp.einsum("kn,knd->d", g_x, X.at_samples(path.layout, samples.cell)) + g_p.sum(0) @ P

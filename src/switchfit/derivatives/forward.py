@@ -21,9 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from switchfit.derivatives.delayed import anchors, late_costates, late_curvature
 from switchfit.derivatives.first_order import FirstOrder, parameter_directions, time_directions
 from switchfit.model import Model, Piece, Samples
-from switchfit.propagate import at_cells, by_mode
+from switchfit.propagate import at_cells, by_mode, by_row
 from switchfit.rungekutta import step
 
 Array = jax.Array
@@ -124,6 +125,11 @@ def sample_second(model: Model, first: FirstOrder, second: Second, k: int, p: Ar
     """Second derivative of the costs of the k-th Measurements: (B,)."""
     P = parameter_directions(model)
     samples = model.arguments.samples[k]
+    if model.structure.measurements[k].delay is not None:
+        at = anchors(model, first.path, first.tangents.before, k, p)
+        i, j = pairs(P.shape[1])
+        through_state = jnp.einsum("kn,knb->b", late_costates(model, at, k, samples, p), by_row(second.before)[at.row])
+        return through_state + late_curvature(model, at, k, samples, p, P)[i, j]
 
     def one(sample: Samples, x: Array, x_d: Array, x_tt: Array) -> Array:
         def cost(x: Array, p: Array) -> Array:

@@ -26,6 +26,7 @@ from switchfit.io.csv import read_columns
 from switchfit.io.errors import InputError
 from switchfit.io.python_file import call, load_object, located, user_place
 from switchfit.models import BUILT_IN
+from switchfit.priors import LogNormal, Normal, Prior
 from switchfit.problem import Problem
 from switchfit.system import HybridSystem
 
@@ -101,6 +102,17 @@ def _table_as_list(given: Any) -> Any:
     return [given] if isinstance(given, dict) else given
 
 
+class PriorTable(_Table):
+    """What is known of an unknown: normal with mean and sd, or log-normal with median and log_sd."""
+
+    mean: float | None = Field(default=None, description="mean of a normal prior")
+    sd: float | None = Field(default=None, description="standard deviation of a normal prior")
+    median: float | None = Field(default=None, description="median of a log-normal prior")
+    log_sd: float | None = Field(
+        default=None, description="standard deviation of the logarithm, for a log-normal prior"
+    )
+
+
 class ParameterTable(_Table):
     """A guess and what is known about it; a bare number is a guess without bounds."""
 
@@ -109,6 +121,10 @@ class ParameterTable(_Table):
     upper: float = Field(default=np.inf, description="upper bound")
     unit: str = Field(default="", description="unit, for the report")
     fixed: bool = Field(default=False, description="true if it is known and not to be estimated")
+    prior: PriorTable | None = Field(
+        default=None, description="what is known of it: { mean, sd } or { median, log_sd }"
+    )
+    scale: Literal["linear", "log"] = Field(default="linear", description="'log': estimated as its logarithm")
 
 
 class TransitionTable(_Table):
@@ -118,6 +134,9 @@ class TransitionTable(_Table):
     lower: float = Field(default=-np.inf, description="earliest time (s)")
     upper: float = Field(default=np.inf, description="latest time (s)")
     fixed: bool = Field(default=False, description="true if the time is known and not to be estimated")
+    prior: PriorTable | None = Field(
+        default=None, description="what is known of it: { mean, sd } or { median, log_sd }"
+    )
 
 
 class StateTable(_Table):
@@ -128,6 +147,10 @@ class StateTable(_Table):
     upper: float = Field(default=np.inf, description="upper bound")
     unit: str = Field(default="", description="unit, for the report; left out, that of the state")
     fixed: bool = Field(default=False, description="true if it is known and not to be estimated")
+    prior: PriorTable | None = Field(
+        default=None, description="what is known of it: { mean, sd } or { median, log_sd }"
+    )
+    scale: Literal["linear", "log"] = Field(default="linear", description="'log': estimated as its logarithm")
 
 
 class LogTable(_Table):
@@ -154,10 +177,17 @@ class DataTable(LogTable):
         description="the state that each column measures, by name, or 'file.py:function' with h(t, x, p); left out, "
         "the columns are the whole state",
     )
-    sigma: float | list[float] | list[str] | None = Field(
+    sigma: float | str | list[float | str] | None = Field(
         default=None,
-        description="standard deviation of the noise: a number, one a column, or the names of columns that hold it; "
-        "left out, it is unknown (measurements only)",
+        description="standard deviation of the noise: a number, one a column, the names of columns that hold it, or "
+        "of parameters that it is; left out, it is unknown (measurements only)",
+    )
+    loss: Literal["linear", "soft_l1", "huber", "cauchy"] = Field(
+        default="linear", description="what outliers cost (measurements only)"
+    )
+    loss_scale: float = Field(default=1.0, gt=0, description="size of a residual, in sigmas, beyond which it is one")
+    delay: float | str = Field(
+        default=0.0, description="by how much the sensor is late (s), or the parameter that it is (measurements only)"
     )
     lowpass_hz: float | None = Field(
         default=None, gt=0, description="cut-off of a low-pass filter (Hz; reference only)"
@@ -368,10 +398,10 @@ def _from_tables(path: Path, contents: Contents) -> Problem:
     experiments = []
     for k, table in enumerate(contents.experiments, start=1):
         where = f"{path}: experiments[{k}]"
-        experiments.append(_explained(where, _experiment, path.parent, table, system, where))
+        known = frozenset(contents.parameters) | frozenset(table.parameter_map)
+        experiments.append(_explained(where, _experiment, path.parent, table, system, where, known))
     parameters = {
-        name: _explained(f"{path}: parameters.{name}", Parameter, **table.model_dump())
-        for name, table in contents.parameters.items()
+        name: _explained(f"{path}: parameters.{name}", _parameter, table) for name, table in contents.parameters.items()
     }
     options = contents.options.model_dump(include={"min_duration", "solver", "rtol", "atol"}, exclude_none=True)
     return _explained(f"{path}", Problem, system, experiments, parameters, **options)
@@ -424,16 +454,34 @@ def _accepted(factory: Callable[..., Any], table: ModelTable, what: str) -> dict
     return table.arguments
 
 
-def _experiment(folder: Path, table: ExperimentTable, system: HybridSystem, where: str) -> Experiment:
+def _parameter(table: ParameterTable | TransitionTable | StateTable, **more: Any) -> Parameter:
+    """The unknown that a table describes."""
+    given = table.model_dump(exclude={"prior"})
+    return Parameter(**given, prior=None if table.prior is None else _prior(table.prior), **more)
+
+
+def _prior(table: PriorTable) -> Prior:
+    given = table.model_dump(exclude_none=True)
+    if set(given) == {"mean", "sd"}:
+        return Normal(**given)
+    if set(given) == {"median", "log_sd"}:
+        return LogNormal(**given)
+    raise ValueError(f"prior needs mean and sd (normal), or median and log_sd (log-normal); got {given}.")
+
+
+def _experiment(
+    folder: Path, table: ExperimentTable, system: HybridSystem, where: str, parameters: frozenset[str]
+) -> Experiment:
     places = [f"{where}.data[{k}]" for k in range(1, len(table.data) + 1)]
     data = [
-        _explained(place, _data, folder, item, system, place) for place, item in zip(places, table.data, strict=True)
+        _explained(place, _data, folder, item, system, place, parameters)
+        for place, item in zip(places, table.data, strict=True)
     ]
-    spans = [item.times if isinstance(item, Measurements) else item.signal.knots for item in data]
+    spans = [item.seen_times if isinstance(item, Measurements) else item.signal.knots for item in data]
     return Experiment(
         data=data,
         mode_sequence=tuple(table.mode_sequence),
-        transition_times=tuple(Parameter(unit="s", **tau.model_dump()) for tau in table.transition_times),
+        transition_times=tuple(_parameter(tau, unit="s") for tau in table.transition_times),
         t0=min(span[0] for span in spans) if table.t0 is None else table.t0,
         tf=max(span[-1] for span in spans) if table.tf is None else table.tf,
         inputs=None if table.inputs is None else _explained(f"{where}.inputs", _input, folder, table.inputs),
@@ -449,15 +497,20 @@ def _initial_state(table: ExperimentTable) -> list[Parameter] | list[float] | No
         return None
     if all(entry.fixed for entry in table.initial_state):
         return [entry.value for entry in table.initial_state]
-    return [Parameter(**entry.model_dump()) for entry in table.initial_state]
+    return [_parameter(entry) for entry in table.initial_state]
 
 
-def _data(folder: Path, table: DataTable, system: HybridSystem, where: str) -> Measurements | ReferenceSignal:
+def _data(
+    folder: Path, table: DataTable, system: HybridSystem, where: str, parameters: frozenset[str]
+) -> Measurements | ReferenceSignal:
     observe = _observe(folder, table, system, where)
     names = tuple(table.observe) if isinstance(table.observe, list) else tuple(table.columns)
     if table.kind == "reference":
         if table.sigma is not None:
             raise ValueError("sigma belongs to kind = 'measurements'; a reference has weights.")
+        for key, default in (("loss", "linear"), ("delay", 0.0)):
+            if getattr(table, key) != default:
+                raise ValueError(f"{key} belongs to kind = 'measurements', not to a reference.")
         times, values = _log(folder, table)
         return ReferenceSignal.from_samples(
             times, values, observe=observe, lowpass_hz=table.lowpass_hz, weights=table.weights, names=names
@@ -465,11 +518,34 @@ def _data(folder: Path, table: DataTable, system: HybridSystem, where: str) -> M
     for key in ("lowpass_hz", "weights"):
         if getattr(table, key) is not None:
             raise ValueError(f"{key} belongs to kind = 'reference'; measurements have sigma.")
-    sigma_columns = [name for name in (table.sigma if isinstance(table.sigma, list) else []) if isinstance(name, str)]
+    sigma_columns = _sigma_columns(table, parameters)
     times, values = _log(folder, table, sigma_columns)
     q = len(table.columns)
     sigma = values[:, q:] if sigma_columns else table.sigma
-    return Measurements(times, values[:, :q], observe=observe, sigma=sigma, names=names)
+    return Measurements(
+        times,
+        values[:, :q],
+        observe=observe,
+        sigma=sigma,
+        names=names,
+        loss=table.loss,
+        loss_scale=table.loss_scale,
+        delay=table.delay,
+    )
+
+
+def _sigma_columns(table: DataTable, parameters: frozenset[str]) -> list[str]:
+    """The columns that hold sigma; none where it is numbers, or names of parameters."""
+    given = table.sigma if isinstance(table.sigma, list) else []
+    named = [entry for entry in given if isinstance(entry, str)]
+    if not named or all(name in parameters for name in named):
+        return []
+    if len(named) < len(given) or any(name in parameters for name in named):
+        raise ValueError(
+            f"sigma must name columns of the file alone, or parameters and numbers; got {table.sigma}, and the "
+            f"parameters are {', '.join(sorted(parameters)) or 'none'}."
+        )
+    return named
 
 
 def _input(folder: Path, table: InputTable) -> Input:

@@ -23,11 +23,13 @@ def describe(problem: Problem) -> str:
     unknowns = problem.unknowns
     width = max(len(name) for name in unknowns.names)
     lines.append("Unknowns, first guess and bounds")
-    columns = (unknowns.names, unknowns.units, unknowns.initial, unknowns.lower, unknowns.upper)
-    for name, unit, value, lower, upper in zip(*columns, strict=True):
+    numbers = (unknowns.initial, unknowns.lower, unknowns.upper)
+    columns = (unknowns.names, unknowns.units, *numbers, unknowns.priors.texts(), unknowns.log)
+    for name, unit, value, lower, upper, prior, log in zip(*columns, strict=True):
         unit = "" if unit == "1" else f" {unit}"
         bounds = "" if np.isinf(lower) and np.isinf(upper) else f"   in [{lower:.6g}, {upper:.6g}]"
-        lines.append(f"  {name:<{width}}  {value:.6g}{unit}{bounds}")
+        known = f"   prior: {prior}" if prior else ""
+        lines.append(f"  {name:<{width}}  {value:.6g}{unit}{bounds}{known}{'   (log scale)' if log else ''}")
     return "\n".join(lines)
 
 
@@ -41,7 +43,7 @@ def _experiment_lines(experiment: Experiment) -> list[str]:
             lines.append(
                 f"{len(item.times)} samples of {_names(item.names, item.values.shape[1])}, "
                 f"{item.times[0]:.6g} to {item.times[-1]:.6g} s, typically {step:.4g} s apart, {missing} values missing"
-                f"{', noise unknown' if item.sigma is None else ''}"
+                f"{_sensor(item)}"
             )
         elif isinstance(item, ReferenceSignal):
             knots = item.signal.knots
@@ -50,6 +52,18 @@ def _experiment_lines(experiment: Experiment) -> list[str]:
         else:
             lines.append(type(item).__name__)
     return lines
+
+
+def _sensor(item: Measurements) -> str:
+    """What is to be said of delay, noise and loss, where there is anything."""
+    named = sorted({name for name in item.sigma_names if name})
+    said = [
+        f"late by {item.delay}" if item.delay else "",
+        "noise unknown" if item.sigma is None else "",
+        f"sigma: {', '.join(named)}" if named else "",
+        f"loss {item.loss} ({item.loss_scale:g} sigma)" if item.loss != "linear" else "",
+    ]
+    return "".join(f", {text}" for text in said if text)
 
 
 def _names(names: tuple[str, ...] | None, channels: int) -> str:

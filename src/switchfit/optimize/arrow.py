@@ -165,10 +165,13 @@ class Arrow:
         pairs = self._pairs(scaling, 1.0)
         return Arrow(self.layout, *(part / (a * b) for part, (a, b) in zip(self._parts, pairs, strict=True)))
 
-    def plus_diagonal(self, value: float) -> Arrow:
-        """H + value I."""
+    def plus_diagonal(self, value: float | FloatArray) -> Arrow:
+        """H + value I, or H + diag(value) for a value (d,)."""
         k, s = self.borders.shape[1:]
-        return replace(self, blocks=self.blocks + value * np.eye(k), corner=self.corner + value * np.eye(s))
+        if not isinstance(value, np.ndarray):
+            return replace(self, blocks=self.blocks + value * np.eye(k), corner=self.corner + value * np.eye(s))
+        own, shared = self.layout.split(value)
+        return replace(self, blocks=self.blocks + own[:, :, None] * np.eye(k), corner=self.corner + np.diag(shared))
 
     def held(self, free: NDArray[np.bool_]) -> Arrow:
         """The matrix with rows and columns of the identity for the unknowns that are not free."""

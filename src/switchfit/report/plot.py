@@ -129,6 +129,7 @@ def plot_comparison(comparison: Comparison, trajectory: Trajectory, channel: int
     measured = comparison.measured[:, channel]
     if comparison.kind == "measurements":
         ax.plot(comparison.times, measured, label="measured", zorder=3, **_dots(len(measured)))
+        _mark_outliers(comparison, measured, channel, ax)
     else:
         ax.plot(comparison.times, measured, "--", color=REFERENCE, linewidth=1.5, label="reference signal", zorder=3)
     times, curve = _broken(comparison.curve_times, comparison.curve[:, channel], trajectory)
@@ -156,6 +157,7 @@ def plot_residuals(comparison: Comparison, trajectory: Trajectory, channel: int,
     ax.axhline(0.0, color=FIT, linewidth=1.0, zorder=2)
     if comparison.kind == "measurements":
         ax.plot(comparison.times, residual, zorder=3, **_dots(len(residual)))
+        _mark_outliers(comparison, residual, channel, ax)
     else:
         times, line = _broken(comparison.times, residual, trajectory)
         ax.plot(times, line, "-", color=REFERENCE, linewidth=1.0, zorder=3)
@@ -436,6 +438,17 @@ def _dots(count: int) -> dict[str, Any]:
         "alpha": 0.8 if count <= 400 else 0.5,
         "rasterized": count > 5000,
     }
+
+
+def _mark_outliers(comparison: Comparison, values: FloatArray, channel: int, ax: Axes) -> None:
+    """Circles round the samples that a robust loss weighs down."""
+    if comparison.downweighted is None or not comparison.downweighted[:, channel].any():
+        return
+    there = comparison.downweighted[:, channel]
+    style: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 8, "markerfacecolor": "none"}
+    ax.plot(
+        comparison.times[there], values[there], color=FIT, markeredgewidth=1.0, zorder=5, label="weighed down", **style
+    )
 
 
 def _broken(times: FloatArray, values: FloatArray, trajectory: Trajectory) -> tuple[FloatArray, FloatArray]:

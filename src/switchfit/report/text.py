@@ -215,6 +215,8 @@ def _data(comparison: Comparison) -> str:
         return f"{names}: reference signal"
     missing = int(np.isnan(comparison.measured).sum())
     note = f", {missing} of {comparison.measured.size} values missing" if missing else ""
+    if comparison.downweighted is not None:
+        note += f", {_count(int(comparison.downweighted.sum()), 'outlier')} weighed down by the loss"
     return f"{names}: {_count(len(comparison.times), 'sample')}{note}"
 
 
@@ -235,7 +237,8 @@ def _quality(fit: Fit) -> Iterator[str]:
         yield from _row(name, f"{value:.1e}   (multiplier {multiplier:.6g})")
     variance, unknowns = fit.residual_variance, _count(fit.free_basis.shape[1], "free unknown")
     if np.isfinite(variance):
-        origin = f"2 J / ({fit.samples} values - {unknowns})"
+        priors = f" + {_count(len(fit.priors), 'prior')}" if fit.priors else ""
+        origin = f"2 J / ({fit.samples} values{priors} - {unknowns})"
         if fit.sigma_known:
             yield from _row("reduced chi-square", f"{variance:.4g}   ({origin}; near 1 where sigma is right)")
         else:
@@ -282,7 +285,8 @@ def _unknowns(fit: Fit) -> list[str]:
     rows = [["", "value", "std. error", "", "", "first guess", ""]]
     for i, name in enumerate(fit.theta_names):
         value, error, relative = rounded(fit.theta[i], errors[i])
-        notes = [joins.get(i, ""), _mark(fit, i)]
+        prior = f"prior: {fit.priors[name]}" if name in fit.priors else ""
+        notes = [joins.get(i, ""), prior, _on_log_scale(fit, i), _mark(fit, i)]
         note = ", ".join(note for note in notes if note)
         rows.append(
             [name, value, error, relative, _shown_unit(fit.theta_units[i]), f"{fit.initial_theta[i]:.6g}", note]
@@ -299,6 +303,14 @@ def _beside(fit: Fit) -> str:
     if found is None:
         return ""
     return f"; Gauss-Newton's are within {100 * (found.factor - 1):.2g} % of them" if found.factor < DIFFERENT else ""
+
+
+def _on_log_scale(fit: Fit, i: int) -> str:
+    """The interval of an unknown on a logarithmic scale, which its standard error does not say."""
+    if fit.theta_names[i] not in fit.log_scaled:
+        return ""
+    low, high = fit.confidence_intervals()[i]
+    return f"95 % in [{low:.4g}, {high:.4g}]" if low < high else ""
 
 
 def _mark(fit: Fit, i: int) -> str:
@@ -430,7 +442,7 @@ def _noise(fit: Fit) -> Iterator[str]:
     variance = fit.residual_variance
     if not (fit.success and fit.sigma_known and np.isfinite(variance)):
         return
-    freedom = fit.samples - fit.free_basis.shape[1]
+    freedom = fit.freedom
     below, above = scipy.special.chdtr(freedom, 2 * fit.cost), scipy.special.chdtrc(freedom, 2 * fit.cost)
     if 2 * min(below, above) > UNLIKELY or abs(variance - 1) < 0.1:
         return

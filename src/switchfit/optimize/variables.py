@@ -1,0 +1,74 @@
+"""The variables in which the optimiser works: unknowns of any size made to be of size one, or their logarithms.
+
+    theta = s z,  or  theta = exp(z):      d theta / dz = D,    g_z = D g,    H_z = D H D + diag(E g),
+
+with E = d^2 theta / dz^2, 0 or theta. What is near one as it is stays as it is: s = 1.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+ORDINARY = (1e-3, 1e3)
+"""Sizes of an unknown between which it is not scaled; the tolerance on the gradient is then that of theta itself."""
+
+
+class Variables(NamedTuple):
+    """The change of variables: ``size`` (d,), powers of 2, and ``log`` (d,) of bool."""
+
+    size: Any
+    log: Any
+
+    @classmethod
+    def of(
+        cls, theta: FloatArray, lower: FloatArray, upper: FloatArray, log: NDArray[np.bool_], keep: NDArray[np.bool_]
+    ) -> Variables:
+        """Variables for unknowns of the size of a first guess, or of the bounds where that is 0.
+
+        Parameters
+        ----------
+        theta, lower, upper : (d,)
+        log : (d,) of bool
+        keep : (d,) of bool, what is not to be scaled
+        """
+        bounds = np.maximum(
+            np.where(np.isfinite(lower), np.abs(lower), 0), np.where(np.isfinite(upper), np.abs(upper), 0)
+        )
+        typical = np.where(theta != 0.0, np.abs(theta), bounds)
+        outside = (typical > 0) & ((typical < ORDINARY[0]) | (typical > ORDINARY[1])) & ~keep & ~log
+        # A power of 2, so that scaling rounds nothing.
+        return cls(2.0 ** np.round(np.log2(np.where(outside, typical, 1.0))), log)
+
+    @property
+    def identity(self) -> bool:
+        """Whether nothing changes."""
+        return not self.log.any() and bool(np.all(self.size == 1.0))
+
+    def outward(self, z: Any, xp: Any = np) -> Any:
+        """theta at z: (d,)."""
+        return xp.where(self.log, xp.exp(xp.where(self.log, z, 0.0)), self.size * z)
+
+    def inward(self, theta: Any, xp: Any = np) -> Any:
+        """z at theta (d,): a bound of 0 becomes one of minus infinity for a logarithm."""
+        positive = xp.where(self.log & (theta > 0), theta, 1.0)
+        return xp.where(self.log, xp.where(theta > 0, xp.log(positive), -xp.inf), theta / self.size)
+
+    def slopes(self, theta: Any, xp: Any = np) -> tuple[Any, Any]:
+        """D and E at theta: (d,) each."""
+        return xp.where(self.log, theta, self.size), xp.where(self.log, theta, 0.0)
+
+    def derivatives_outward(self, theta: Any, gradient: Any, hessian: Any, xp: Any = np) -> tuple[Any, Any]:
+        """Gradient and Hessian in theta from those in z."""
+        D, E = self.slopes(theta, xp)
+        gradient = gradient / D
+        return gradient, (hessian - xp.diag(E * gradient)) / xp.outer(D, D)
+
+    def derivatives_inward(self, theta: Any, gradient: Any, hessian: Any, xp: Any = np) -> tuple[Any, Any]:
+        """Gradient and Hessian in z from those in theta."""
+        D, E = self.slopes(theta, xp)
+        return D * gradient, hessian * xp.outer(D, D) + xp.diag(E * gradient)

@@ -1,0 +1,141 @@
+"""Hard moments: transitions at samples, at each other and at the ends; switches that a function hides."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import switchfit as sf
+from switchfit.identifiability import identifiability
+
+TIMES = np.linspace(0.5, 4.0, 8)
+A, B, C = 0.7, 0.2, 1.1
+
+
+def decay(rate):
+    return lambda t, x, p: -rate * x
+
+
+SYSTEM = sf.HybridSystem({"a": decay(A), "b": decay(B), "c": decay(C)}, [1.0])
+VALUES = np.cos(TIMES)
+
+
+def problem():
+    data = sf.Measurements(TIMES, VALUES, sigma=1.0)
+    return sf.Problem(SYSTEM, sf.Experiment(data, ("a", "b", "c"), (1.1, 2.9), 0.0, 4.0), rtol=1e-11, atol=1e-13)
+
+
+@pytest.fixture(scope="module")
+def this():
+    return problem()
+
+
+def exponent(tau, side):
+    """Exponent of x at the samples, and which samples feel each transition move to one side."""
+    t1, t2 = tau
+    s = np.minimum(TIMES, t1) * A + np.clip(TIMES - t1, 0, max(t2 - t1, 0)) * B + np.clip(TIMES - t2, 0, None) * C
+    last = TIMES[-1]  # tf: nothing moves beyond it
+    after = [t < TIMES if side > 0 and t < last else t <= TIMES for t in tau]
+    return s, np.array([(A - B) * after[0], (B - C) * after[1]])
+
+
+def expected(tau, side):
+    s, slopes = exponent(tau, side)
+    x = np.exp(-s)
+    r, x_d = x - VALUES, -x * slopes
+    gradient = x_d @ r
+    hessian = x_d @ x_d.T + np.einsum("k,ik,jk->ij", r * x, slopes, slopes)
+    return 0.5 * r @ r, gradient, hessian
+
+
+EPS = np.finfo(float).eps
+MOMENTS = {
+    "at a sample": (1.5, 2.9),
+    "a rounding below a sample": (1.5 * (1 - EPS), 2.9),
+    "a rounding above a sample": (1.5 * (1 + EPS), 2.9),
+    "a few roundings above a sample": (1.5 * (1 + 8 * EPS), 2.9),
+    "equal": (2.2, 2.2),
+    "equal, at a sample": (2.0, 2.0),
+    "at t0": (0.0, 2.9),
+    "at tf, which is a sample": (1.1, 4.0),
+    "both at t0": (0.0, 0.0),
+    "both at tf": (4.0, 4.0),
+    "at both ends": (0.0, 4.0),
+}
+
+
+@pytest.mark.parametrize("method", ["forward", "discrete-adjoint", "adjoint", "autodiff"])
+@pytest.mark.parametrize("where", MOMENTS)
+def test_derivatives_at_hard_moments_are_those_of_the_closed_form(this, where, method):
+    """One-sided where they jump: for increasing times, as `evaluate` says."""
+    tau = MOMENTS[where]
+    found = sf.evaluate(this, tau, method=method)
+    cost, gradient, hessian = expected(tau, 1)
+    assert found.cost == pytest.approx(cost, rel=1e-7)
+    np.testing.assert_allclose(found.gradient, gradient, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found.hessian, hessian, rtol=0, atol=1e-4)
+
+
+def test_the_other_side_of_a_sample(this):
+    found = sf.evaluate(this, (1.5, 2.9))
+    assert abs(found.gradient[0] - expected((1.5, 2.9), -1)[1][0]) > 0.01
+
+
+@pytest.mark.parametrize("where", MOMENTS)
+def test_a_fit_may_begin_at_a_hard_moment(this, where):
+    found = sf.estimate(this, start=MOMENTS[where])
+    assert found.status.successful or found.status is sf.Status.SINGULAR
+    assert found.cost <= expected(MOMENTS[where], 1)[0]
+
+
+# A switch hidden in a function
+
+
+def hiding(t, x, p):
+    return jnp.where(t < p["t_on"], p["k"] * (1.0 - x), -p["k"] * x)
+
+
+def hidden_problem(mode=hiding, observe=None, **more):
+    system = sf.HybridSystem({"m": mode}, [0.1])
+    data = sf.Measurements(TIMES, np.exp(-TIMES), sigma=0.1, observe=observe)
+    return sf.Problem(system, sf.Experiment(data, ("m",), (), 0.0, 4.0), {"k": 1.0, "t_on": 1.7} | more)
+
+
+SAYS = r"the cost changes with t_on, but its derivative is zero .* make it a transition time: a mode for a and a mode"
+
+
+def test_a_switch_hidden_in_a_mode_is_refused():
+    this = hidden_problem()
+    with pytest.raises(ValueError, match=SAYS):
+        sf.estimate(this)
+    with pytest.raises(ValueError, match=SAYS):
+        sf.estimate(this, hessian="none")
+    with pytest.raises(ValueError, match=SAYS):
+        sf.monte_carlo(this, 2, theta=[1.0, 1.5])
+    with pytest.raises(ValueError, match=SAYS):
+        identifiability(this)
+
+
+def test_a_hidden_switch_that_is_fixed_is_none_of_ours():
+    assert sf.estimate(hidden_problem(t_on=sf.Parameter(1.7, fixed=True))).success
+
+
+def smooth(t, x, p):
+    """Fourth order at the guess: gradient and Hessian are zero there, and further away are not."""
+    return -p["k"] * x + (p["t_on"] - 1.7) ** 4
+
+
+def idle(t, x, p):
+    return -p["k"] * x + 0.0 * p["t_on"]
+
+
+@pytest.mark.parametrize("mode", [smooth, idle])
+def test_a_derivative_that_is_zero_for_another_reason_is_no_hidden_switch(mode):
+    assert isinstance(sf.estimate(hidden_problem(mode)).status, sf.Status)
+
+
+def test_a_hidden_switch_at_zero_is_found_between_its_bounds():
+    def mode(t, x, p):
+        return jnp.where(t - 1.7 < p["t_on"], 1.0 - x, -p["k"] * x)
+
+    with pytest.raises(ValueError, match=SAYS):
+        sf.estimate(hidden_problem(mode, t_on=sf.Parameter(0.0, -1.0, 1.0)))

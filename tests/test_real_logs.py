@@ -1,0 +1,426 @@
+"""Costs and unknowns of real logs: noise as a parameter, robust losses, priors, delays, scales.
+
+One oscillator that is damped from tau on; its derivatives are checked for each feature by Taylor remainders of three
+orders and by four methods that agree.
+"""
+
+import re
+import textwrap
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import switchfit as sf
+from switchfit.evaluate import derivatives, evaluator_of
+from switchfit.losses import LOSSES, influence, robust
+from switchfit.model import float64
+from switchfit.optimize.variables import Variables
+from switchfit.priors import PriorTerms
+from switchfit.simulate import compare
+
+
+def free(t, x, p):
+    return jnp.array([x[1], -p["k"] * x[0] + 0.1 * x[0] * jnp.sin(t)])
+
+
+def damped(t, x, p):
+    return free(t, x, p) - p["damping"] * x
+
+
+def position(t, x, p):
+    return jnp.array([x[0] + 0.1 * t * x[1], x[1] * x[0]])
+
+
+SYSTEM = sf.HybridSystem({"free": free, "damped": damped}, [1.0, 0.0], state_names=("x", "v"))
+TIMES = np.linspace(0.15, 3.2, 24)
+TRUTH = {"k": 2.1, "damping": 0.35}
+
+
+def clean(delay=0.0):
+    blank = sf.Measurements(TIMES, np.zeros((24, 2)), observe=position, delay=delay, sigma=1.0)
+    run = sf.Experiment(blank, ("free", "damped"), (1.23,), 0.0, 3.3)
+    problem = sf.Problem(SYSTEM, run, TRUTH)
+    return compare(problem, problem.initial_theta, evaluator_of(problem).meshes)[2][0][0].fitted
+
+
+CLEAN = clean()
+
+
+def problem(*, sigma=0.02, noise=0.02, outliers=0, seed=0, values=None, more=None, k=2.0, tau=1.1, start=None, **data):
+    rng = np.random.default_rng(seed)
+    values = (CLEAN if values is None else values) + noise * rng.normal(size=CLEAN.shape)
+    values[rng.permutation(24)[:outliers], 0] += 1.0
+    values[4, 1] = np.nan
+    data = sf.Measurements(TIMES, values, observe=position, sigma=sigma, **data)
+    run = sf.Experiment(data, ("free", "damped"), (tau,), 0.0, 3.3, initial_state=start)
+    return sf.Problem(SYSTEM, run, {"k": k, "damping": 0.3} | (more or {}))
+
+
+NOISE = {"s": sf.Parameter(0.05, lower=1e-3)}
+DELAY = {"d": sf.Parameter(0.043, lower=-0.05, upper=0.1)}
+CASES = {
+    "noise": lambda: problem(sigma="s", more=NOISE),
+    "noise of one channel": lambda: problem(sigma=["s", 0.03], more=NOISE),
+    "huber": lambda: problem(loss="huber", loss_scale=1.5, outliers=4),
+    "soft_l1": lambda: problem(loss="soft_l1", outliers=4),
+    "cauchy": lambda: problem(loss="cauchy", loss_scale=2.0, outliers=4),
+    "cauchy, noise": lambda: problem(loss="cauchy", loss_scale=2.0, outliers=4, sigma="s", more=NOISE),
+    "priors": lambda: problem(
+        k=sf.Parameter(2.0, lower=0.1, prior=sf.LogNormal(1.8, 0.02)),
+        tau=sf.Parameter(1.1, prior=sf.Normal(1.3, 0.02)),
+        start=[sf.Parameter(1.1, prior=sf.Normal(1.0, 0.01)), 0.0],
+    ),
+    "delay": lambda: problem(delay="d", more=DELAY),
+    "delay, noise, huber": lambda: problem(
+        delay="d", sigma=["s", "s2"], loss="huber", loss_scale=1.5, outliers=4, more=DELAY | NOISE | {"s2": NOISE["s"]}
+    ),
+}
+
+
+@pytest.fixture(scope="module", params=CASES)
+def case(request):
+    return CASES[request.param]()
+
+
+def test_taylor_remainders_have_orders_1_2_3_and_the_papers_equations_agree(case):
+    check = sf.check_derivatives(case)
+    np.testing.assert_allclose(check.observed_orders, [1.0, 2.0, 3.0], atol=0.1)
+    assert max(check.gradient_gap, check.hessian_gap) < 1e-6
+    assert check.passed
+
+
+def test_methods_agree(case):
+    expected = sf.evaluate(case, method="autodiff")
+    assert np.abs(np.diag(expected.hessian)).min() > 1e-3, "an unknown is not tested"
+    for method in ("forward", "discrete-adjoint"):
+        found = sf.evaluate(case, method=method)
+        assert found.cost == pytest.approx(expected.cost, rel=1e-12)
+        for a, b in ((found.gradient, expected.gradient), (found.hessian, expected.hessian)):
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * np.abs(b).max())
+
+
+def test_the_simulated_cost_is_the_evaluated_one(case):
+    assert compare(case, case.initial_theta, evaluator_of(case).meshes)[0] == pytest.approx(
+        sf.evaluate(case).cost, rel=1e-12
+    )
+
+
+def test_gauss_newton_is_never_negative_and_reaches_the_same_minimum(case):
+    for theta in (case.initial_theta, case.initial_theta * 1.05):
+        matrix = evaluator_of(case)(theta, matrix="gauss-newton").hessian
+        scale = np.sqrt(np.diag(matrix))
+        assert np.linalg.eigvalsh(matrix / np.outer(scale, scale)).min() > 0
+    exact = sf.estimate(case)
+    assert exact.success
+    again = sf.estimate(case, hessian="gauss-newton", start=exact.theta * (1 + 1e-4 * np.arange(len(exact.theta))))
+    assert again.success
+    np.testing.assert_allclose(again.theta, exact.theta, rtol=1e-6)
+
+
+# Noise as a parameter
+
+
+def test_estimated_sigma_is_the_root_mean_square_of_the_residuals():
+    """... of the channel it belongs to; at the minimum J is 1/2 of each value and the sum of log sigma."""
+    found = sf.estimate(problem(sigma=["s", "s2"], more=NOISE | {"s2": sf.Parameter(0.1, scale="log")}))
+    residuals = found.comparisons[0][0].residuals
+    expected = np.sqrt(np.nanmean(residuals**2, axis=0))
+    np.testing.assert_allclose([found.parameters["s"], found.parameters["s2"]], expected, rtol=1e-7)
+    assert found.cost == pytest.approx(47 / 2 + 24 * np.log(expected[0]) + 23 * np.log(expected[1]), rel=1e-9)
+    np.testing.assert_array_equal(found.comparisons[0][0].sigma[0], [found.parameters["s"], found.parameters["s2"]])
+
+
+def test_with_sigma_estimated_the_covariance_is_the_inverse_hessian():
+    found = sf.estimate(problem(sigma="s", more=NOISE))
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(found.hessian), rtol=1e-9)
+    error = found.standard_errors[found.theta_names.index("s")]
+    assert error == pytest.approx(found.parameters["s"] / np.sqrt(2 * 47), rel=0.05)
+    assert np.isnan(found.residual_variance)
+    assert "reduced chi-square" not in str(found)
+    scaled = sf.estimate(problem(sigma=None))
+    np.testing.assert_allclose(found.theta[:3], scaled.theta, rtol=1e-6)
+    np.testing.assert_allclose(found.standard_errors[:3], scaled.standard_errors, rtol=0.05)
+
+
+def test_a_sigma_by_another_name_in_each_run():
+    runs = [
+        sf.Experiment(
+            sf.Measurements(TIMES, CLEAN + s * np.random.default_rng(7).normal(size=CLEAN.shape), position, "noise"),
+            ("free", "damped"), (1.1,), 0.0, 3.3, parameter_map={"noise": name},
+        )
+        for name, s in (("s1", 0.01), ("s2", 0.05))
+    ]  # fmt: skip
+    sigmas = {name: sf.Parameter(0.02, scale="log") for name in ("s1", "s2")}
+    together = sf.Problem(SYSTEM, runs, {"k": 2.0, "damping": 0.3} | sigmas)
+    assert together.structures[0] == together.structures[1]
+    found = sf.estimate(together)
+    assert found.parameters["s2"] / found.parameters["s1"] == pytest.approx(5.0, rel=0.3)
+    assert found.comparisons[1][0].sigma[0, 0] == found.parameters["s2"]
+
+
+# Robust losses
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_losses_are_those_of_scipy(loss):
+    from scipy.optimize import least_squares
+
+    r, scale = np.array([0.0, 0.3, 1.4, 1.6, 40.0]), 1.5
+    ours = 0.5 * robust(loss, scale, r**2).sum()
+    theirs = least_squares(lambda z: r + 0.0 * z, [1.0], loss=loss, f_scale=scale, max_nfev=1)
+    assert ours == pytest.approx(theirs.cost, rel=1e-13)
+    with float64():
+        u = jnp.asarray(r**2)
+        slope = jax.vmap(jax.grad(lambda u: robust(loss, scale, u, jnp)))(u)
+    np.testing.assert_allclose(influence(loss, scale, r**2), slope, rtol=1e-12)
+    assert np.isfinite(slope).all()
+
+
+def test_robust_fit_stays_where_outliers_pull_the_other_away():
+    plain = sf.estimate(problem())
+    pulled, held = sf.estimate(problem(outliers=5)), sf.estimate(problem(outliers=5, loss="cauchy", loss_scale=2.0))
+    errors = plain.standard_errors
+    assert np.max(np.abs(pulled.theta - plain.theta) / errors) > 5
+    assert np.max(np.abs(held.theta - plain.theta) / errors) < 1.5
+    comparison = held.comparisons[0][0]
+    assert comparison.downweighted.dtype == bool
+    assert 5 <= comparison.downweighted.sum() <= 9
+    assert f"{comparison.downweighted.sum()} outliers weighed down by the loss" in " ".join(str(held).split())
+    assert "weighed down" in [text.get_text() for text in held.plot().legends[0].get_texts()]
+
+
+def test_covariance_of_a_robust_fit_is_the_inverse_of_its_hessian():
+    found = sf.estimate(problem(outliers=5, loss="huber", loss_scale=1.5))
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(found.hessian), rtol=1e-9)
+    assert np.isnan(found.residual_variance)
+
+
+def test_where_rho_bends_down_the_exact_hessian_is_indefinite_and_the_fit_converges():
+    far = problem(k=3.5, loss="cauchy", loss_scale=1.0)
+    assert np.linalg.eigvalsh(sf.evaluate(far).hessian).min() < 0
+    assert sf.estimate(far).status.successful
+
+
+# Priors
+
+
+def test_a_prior_is_one_more_measurement():
+    """Of an unknown of which the data say nothing the posterior is the prior; others are not touched."""
+    both = sf.estimate(problem(start=[1.0, 0.0], more={"free": sf.Parameter(3.0, prior=sf.Normal(4.0, 0.5))}))
+    alone = sf.estimate(problem(start=[1.0, 0.0]))
+    np.testing.assert_allclose(both.theta[:3], alone.theta, rtol=1e-9)
+    assert both.parameters["free"] == pytest.approx(4.0, rel=1e-9)
+    assert both.standard_errors[3] == pytest.approx(0.5, rel=1e-9)
+    assert both.freedom == alone.freedom
+    assert both.residual_variance == pytest.approx(alone.residual_variance, rel=1e-9)
+    assert both.priors == {"free": "normal(4, 0.5)"}
+    assert "prior: normal(4, 0.5)" in str(both)
+    assert "values + 1 prior - 4 free unknowns" in str(both)
+
+
+def test_a_tight_prior_wins_and_a_wide_one_does_not():
+    without = sf.estimate(problem())
+    tight = sf.estimate(problem(tau=sf.Parameter(1.1, prior=sf.Normal(1.5, 1e-6))))
+    wide = sf.estimate(problem(tau=sf.Parameter(1.1, prior=sf.Normal(1.5, 1e6))))
+    assert tight.theta[0] == pytest.approx(1.5, abs=1e-6)
+    np.testing.assert_allclose(wide.theta, without.theta, rtol=1e-8)
+
+
+@pytest.mark.parametrize("log", [False, True])
+def test_prior_terms_are_derivatives_of_their_cost(log):
+    terms = PriorTerms(np.array([0.3, 0.0]), np.array([4.0, 0.0]), np.array([log, False]))
+    with float64():
+        at = jnp.array([1.7, -2.0])
+        J, g, h = terms.evaluate(at, jnp)
+
+        def cost(theta):
+            return terms.evaluate(theta, jnp)[0]
+
+        expected = 2.0 * ((np.log(1.7) if log else 1.7) - 0.3) ** 2
+        assert float(J) == pytest.approx(expected, rel=1e-14)
+        np.testing.assert_allclose(g, jax.grad(cost)(at), rtol=1e-13)
+        np.testing.assert_allclose(np.diag(h), jax.hessian(cost)(at), rtol=1e-13)
+
+
+def test_priors_and_scales_in_batches_and_files(tmp_path):
+    """The compiled program of batches, `estimate` and a saved file say the same."""
+    this = problem(
+        k=sf.Parameter(2.0, lower=0.5, upper=8.0, scale="log", prior=sf.LogNormal(2.3, 0.02)),
+        sigma="s", more={"s": sf.Parameter(0.05, lower=1e-3, upper=1.0, scale="log")},
+    )  # fmt: skip
+    alone = sf.estimate(this)
+    many = sf.estimate_many([this, this])
+    np.testing.assert_allclose(many.theta, [alone.theta] * 2, rtol=1e-8)
+    assert many.message.tolist() == ["", ""], "they were not settled by the compiled program"
+    np.testing.assert_allclose(many.cost, alone.cost, rtol=1e-10)
+    np.testing.assert_allclose(many.hessian[0], alone.hessian, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(many.confidence_intervals()[0], alone.confidence_intervals(), rtol=1e-6)
+    starts = np.array([alone.theta * 1.02, alone.theta * 0.98])
+    assert sf.multistart(this, starts).best.cost == pytest.approx(alone.cost, rel=1e-10)
+    study = sf.monte_carlo(this, 4, theta=alone.theta)
+    assert study.success.all()
+    assert np.abs(study.theta[:, 3] / alone.theta[3] - 1).max() < 0.5, "noise is drawn with the sigma of the truth"
+    alone.save(tmp_path / "fit.json")
+    loaded = sf.Estimate.load(tmp_path / "fit.json")
+    assert str(loaded) == str(alone)
+    assert loaded.priors == {"k": "log-normal(2.3, 0.02)"}
+    np.testing.assert_array_equal(loaded.confidence_intervals(), alone.confidence_intervals())
+
+
+def test_priors_and_scales_in_a_joint_fit_of_many_runs():
+    """Where the Hessian has the shape of an arrow."""
+    data = [sf.Measurements(TIMES, CLEAN, observe=position, sigma=0.02)] * 8
+    runs = [sf.Experiment(item, ("free", "damped"), (1.1,), 0.0, 3.3) for item in data]
+    k = sf.Parameter(2.0, scale="log", prior=sf.LogNormal(2.3, 0.02))
+    damping = sf.Parameter(0.3, prior=sf.Normal(0.3, 0.01))
+    together = sf.Problem(SYSTEM, runs, {"k": k, "damping": damping})
+    found = sf.estimate(together)
+    dense = sf.evaluate(together, found.theta)
+    np.testing.assert_allclose(found.hessian, dense.hessian, rtol=1e-5, atol=1e-6 * np.abs(dense.hessian).max())
+    assert found.cost == pytest.approx(dense.cost, rel=1e-7)
+    k_prior, damping_prior = sf.LogNormal(2.3, 0.02 * np.sqrt(8)), sf.Normal(0.3, 0.01 * np.sqrt(8))
+    one = sf.Problem(
+        SYSTEM, runs[0],
+        {"k": sf.Parameter(2.0, scale="log", prior=k_prior), "damping": sf.Parameter(0.3, prior=damping_prior)},
+    )  # fmt: skip
+    np.testing.assert_allclose(found.theta[-3:], sf.estimate(one).theta, rtol=1e-7)
+
+
+# Delays
+
+
+def test_a_known_delay_shifts_the_samples():
+    moved = sf.Measurements(TIMES, CLEAN, observe=position, sigma=0.02, delay=0.1)
+    np.testing.assert_array_equal(moved.seen_times, TIMES - 0.1)
+    late = problem(values=clean(0.1), delay=0.1, noise=0.0)
+    assert sf.estimate(late).theta == pytest.approx([1.23, 2.1, 0.35], rel=1e-6)
+    as_parameter = problem(values=clean(0.1), delay="d", noise=0.0, more={"d": sf.Parameter(0.1, fixed=True)})
+    assert sf.evaluate(as_parameter).cost == pytest.approx(sf.evaluate(late).cost, rel=1e-6)
+
+
+def test_an_unknown_delay_is_found():
+    found = sf.estimate(problem(values=clean(0.07), delay="d", noise=0.0, more=DELAY))
+    assert found.success
+    np.testing.assert_allclose(found.theta, [1.23, 2.1, 0.35, 0.07], rtol=1e-6)
+    comparison = found.comparisons[0][0]
+    np.testing.assert_array_equal(comparison.times, TIMES)
+    assert comparison.rmse.max() < 1e-7
+    np.testing.assert_allclose(comparison.curve_times - found.trajectory.times, 0.07, rtol=1e-6)
+
+
+@pytest.mark.parametrize("tau", [TIMES[5], TIMES[5] - 0.043, TIMES[5] - 0.044, 0.0, 3.3])
+def test_late_samples_and_transitions_at_hard_moments(tau):
+    """tau at a sample, at what a sample sees, shortly before that, at t0 and at tf."""
+    this = CASES["delay"]()
+    theta = this.initial_theta
+    theta[0] = tau
+    expected = sf.evaluate(this, theta, method="autodiff")
+    for method in ("forward", "discrete-adjoint"):
+        found = sf.evaluate(this, theta, method=method)
+        np.testing.assert_allclose(
+            found.gradient, expected.gradient, rtol=0, atol=1e-10 * np.abs(expected.gradient).max()
+        )
+        np.testing.assert_allclose(found.hessian, expected.hessian, rtol=0, atol=1e-10 * np.abs(expected.hessian).max())
+
+
+def test_the_check_of_derivatives_keeps_transitions_off_what_late_samples_see():
+    this = CASES["delay"]()
+    theta = this.initial_theta
+    theta[0] = TIMES[5] - 0.043
+    check = sf.check_derivatives(this, theta)
+    assert np.abs(check.theta[0] - this.late_times(theta, 0)).min() > 1e-4
+    np.testing.assert_allclose(check.observed_orders, [1.0, 2.0, 3.0], atol=0.1)
+
+
+def test_nothing_compiles_anew_as_delay_and_noise_move(case):
+    sf.evaluate(case)
+    before = derivatives._cache_size()
+    sf.evaluate(case, case.initial_theta * 1.01)
+    assert derivatives._cache_size() == before
+
+
+# Scales
+
+
+def test_variables_there_and_back():
+    """Against JAX: gradient and Hessian in z of a cost that is given in theta."""
+    variables = Variables(np.array([1.0, 2.0**-20, 1.0]), np.array([False, False, True]))
+    with float64():
+        theta = jnp.array([0.3, 3e-6, 40.0])
+
+        def cost(theta):
+            return jnp.sin(theta[0] * theta[1] * 1e6) + theta[2] ** 1.5 * theta[0]
+
+        z = variables.inward(theta, jnp)
+        np.testing.assert_allclose(variables.outward(z, jnp), theta, rtol=1e-14)
+
+        def through(z):
+            return cost(variables.outward(z, jnp))
+
+        g, H = variables.derivatives_inward(theta, jax.grad(cost)(theta), jax.hessian(cost)(theta), jnp)
+        np.testing.assert_allclose(g, jax.grad(through)(z), rtol=1e-12)
+        np.testing.assert_allclose(H, jax.hessian(through)(z), rtol=1e-11)
+        g, H = variables.derivatives_outward(theta, g, H, jnp)
+        np.testing.assert_allclose(g, jax.grad(cost)(theta), rtol=1e-12)
+        np.testing.assert_allclose(H, jax.hessian(cost)(theta), rtol=1e-9, atol=1e-12 * np.abs(H).max())
+
+
+def scaled(a, b):
+    """The same problem with k in units of a, damping in units of b."""
+
+    def rescaled(mode):
+        return lambda t, x, p: mode(t, x, {"k": p["k"] / a, "damping": p["damping"] / b})
+
+    system = sf.HybridSystem({"free": rescaled(free), "damped": rescaled(damped)}, [1.0, 0.0])
+    run = problem().experiments[0]
+    return sf.Problem(system, run, {"k": 2.0 * a, "damping": 0.3 * b})
+
+
+def test_nine_decades_between_parameters_change_nothing():
+    one, other = sf.estimate(scaled(1.0, 1.0)), sf.estimate(scaled(1e-6, 1e4))
+    assert one.success
+    assert other.status is one.status
+    assert other.iterations == one.iterations
+    units = np.array([1.0, 1e-6, 1e4])
+    np.testing.assert_allclose(other.theta, one.theta * units, rtol=1e-9)
+    np.testing.assert_allclose(other.standard_errors, one.standard_errors * units, rtol=1e-6)
+    np.testing.assert_allclose(other.history[2].theta, one.history[2].theta * units, rtol=1e-6)
+    many = sf.estimate_many([scaled(1e-6, 1e4)])
+    np.testing.assert_allclose(many.theta[0], other.theta, rtol=1e-8)
+    assert many.status[0] == "CONVERGED"
+
+
+def test_a_logarithmic_scale_changes_the_path_and_the_intervals_alone():
+    plain, log = sf.estimate(problem()), sf.estimate(problem(k=sf.Parameter(2.0, scale="log")))
+    np.testing.assert_allclose(log.theta, plain.theta, rtol=1e-8)
+    np.testing.assert_allclose(log.covariance, plain.covariance, rtol=1e-5)
+    assert log.history[0].theta[1] == pytest.approx(2.0, rel=1e-15)
+    low, high = log.confidence_intervals()[1]
+    assert low * high == pytest.approx(log.theta[1] ** 2, rel=1e-12)
+    assert np.log(high / log.theta[1]) == pytest.approx(1.959964 * log.standard_errors[1] / log.theta[1], rel=1e-6)
+    np.testing.assert_allclose(log.confidence_intervals()[0], plain.confidence_intervals()[0], rtol=1e-6)
+    assert f"95 % in [{low:.4g}, {high:.4g}]" in str(log)
+
+
+def test_a_logarithmic_scale_stays_positive_and_bounds_hold():
+    found = sf.estimate(problem(k=sf.Parameter(2.0, lower=0.1, upper=2.05, scale="log")))
+    assert found.theta[1] == 2.05
+    assert found.active == ("k at its upper bound 2.05",)
+    assert found.standard_errors[1] == 0.0
+    far = sf.estimate(problem(k=sf.Parameter(0.01, scale="log")), max_iterations=3)
+    assert all(record.theta[1] > 0 for record in far.history)
+
+
+def test_the_examples_of_the_page_run():
+    """Every indented block of docs/real-logs.md, one after the other."""
+    page = (Path(__file__).parent.parent / "docs" / "real-logs.md").read_text()
+    blocks = re.findall(r"(?:^    .*\n|^\n(?=    ))+", page, re.M)
+    assert len(blocks) >= 5
+    names = {}
+    for block in blocks:
+        exec(compile(textwrap.dedent(block), "real-logs.md", "exec"), names)
+    assert names["robust"].success
+    assert names["late"].success
