@@ -33,8 +33,8 @@ SAME_COST = 1e-6
 """Two ends are one minimum if their costs differ by less than this part of them, and ..."""
 
 SAME_PLACE = 1e-3
-"""... each parameter by less than this part of the spread of the starts (of its own size where they do not differ), each
-transition time by less than this part of the horizon. Modes that have collapsed (shorter than that) do not count: where
+"""... each parameter by less than this part of the spread of the starts (of its own size where they do not differ),
+each transition time by less than this part of the horizon. Modes that have collapsed (shorter than that) do not count: where
 they sit is arbitrary."""
 
 
