@@ -17,7 +17,7 @@ import switchfit as sf
 
 SETTINGS = ((0, 0), (100, 0), (100, 50), (5, 50), (5, 80), (70, 80), (70, 10))  # % of heaters 1 and 2, in order
 MODES = tuple(f"{first}/{second}" for first, second in SETTINGS)
-GUESS = (22.0, 85.0, 215.0, 285.0, 415.0, 515.0)  # s, read off the curves; 12 to 15 s from the recorded times
+GUESS = (22.0, 85.0, 215.0, 285.0, 415.0, 515.0)  # s, placed 12 to 15 s from the recorded times
 
 KELVIN = 273.15
 CAPACITY = 0.004 * 500.0  # J/K, mass times specific heat of a heater

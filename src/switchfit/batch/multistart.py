@@ -33,9 +33,9 @@ SAME_COST = 1e-6
 """Two ends are one minimum if their costs differ by less than this part of them, and ..."""
 
 SAME_PLACE = 1e-3
-"""... each parameter by less than this part of the spread of the starts (of its own size where they do not differ),
-each transition time by less than this part of the horizon. Modes that have collapsed (shorter than that) do not count: where
-they sit is arbitrary."""
+"""... each parameter by less than this part of the spread of the starts, or of its size where they do not differ in it,
+each transition time by less than this part of the horizon. Modes that have collapsed (shorter than that) do not count:
+where they sit is arbitrary."""
 
 
 @dataclass(frozen=True, eq=False)
