@@ -5,12 +5,13 @@ from importlib.metadata import version as installed_version
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
-import paper_figures  # these stand beside this file
+import heaters_figures  # these stand beside this file
+import paper_figures
 import speed_figures
 import tosses_figures
 import uncertainty_figures
 
-for pictures in (paper_figures, speed_figures, tosses_figures, uncertainty_figures):
+for pictures in (heaters_figures, paper_figures, speed_figures, tosses_figures, uncertainty_figures):
     pictures.draw(Path(__file__).parent / "_figures")
 
 project = "switchfit"

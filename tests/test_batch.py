@@ -492,6 +492,14 @@ def test_nothing_is_compiled_for_other_data_or_another_number_of_runs():
     assert jax.config.jax_log_compiles is before
 
 
+def test_starts_that_differ_in_the_transition_time_alone_end_in_one_minimum():
+    noisy = 0.4 + 0.05 * np.random.default_rng(2).standard_normal(24) + 0.3 * (np.abs(TIMES - 2.5) < 1.5)
+    study = sf.multistart(room(sf.Measurements(TIMES, noisy, sigma=0.05)), [[tau, 1.0] for tau in (2.9, 3.0, 3.1)])
+    assert study.success.all()
+    assert np.ptp(study.theta[:, 1]) > 0  # to rounding
+    assert study.clusters.tolist() == [0, 0, 0]
+
+
 @pytest.mark.filterwarnings("ignore")
 def test_a_cluster_that_loses_a_worker_in_the_middle(tmp_path):
     """Two worker processes, one of which is killed after the first chunk: nothing is missing, nothing differs."""

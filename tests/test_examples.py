@@ -77,3 +77,26 @@ def test_a_toss_from_release_has_its_impacts_where_they_are_seen():
     assert np.all(estimate.comparisons[0][0].rmse < 2.5e-4)
     # The residuals are no noise, and the report says so.
     assert "Neighbouring residuals are correlated" in str(estimate)
+
+
+def test_heaters_were_switched_when_the_log_says():
+    module = runpy.run_path(str(EXAMPLES / "heaters" / "heaters.py"))
+    recorded = module["read"]()[2]
+    np.testing.assert_allclose(recorded, [10.006, 100.028, 200.229, 300.269, 400.439, 500.682], atol=1e-3)
+    assert np.abs(module["GUESS"] - recorded).min() > 10.0
+    balance, power = (sf.estimate(module["make_problem"](model)) for model in ("balance", "power"))
+    assert balance.success
+    assert power.success
+    # The energy balance is wrong by up to 44 s, says that it is sure, and its residuals say that it should not be.
+    away = np.abs(balance.transition_times[0] - recorded)
+    assert np.sum(away > 10.0) == 5
+    assert np.all(balance.standard_errors[:6] < 1.0)
+    assert not any(channel.white for channel in balance.residuals.channels)
+    assert min(channel.correlation for channel in balance.residuals.channels) > 0.9
+    # The better model is near, and its residuals are near noise, but not noise.
+    assert power.cost < balance.cost / 15
+    assert np.all(np.abs(power.transition_times[0] - recorded) < 3.0)
+    assert max(channel.rms for channel in power.residuals.channels) < 1.4
+    assert not power.residuals.passed
+    # One supply feeds both heaters.
+    assert power.parameters["P2"][0] < 0.6 * power.parameters["P2"][1]

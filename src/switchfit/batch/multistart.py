@@ -33,8 +33,9 @@ SAME_COST = 1e-6
 """Two ends are one minimum if their costs differ by less than this part of them, and ..."""
 
 SAME_PLACE = 1e-3
-"""... each parameter by less than this part of the spread of the starts, each transition time by less than this part of
-the horizon. Modes that have collapsed (shorter than that) do not count: where they sit is arbitrary."""
+"""... each parameter by less than this part of the spread of the starts, or of its size where they do not differ in it,
+each transition time by less than this part of the horizon. Modes that have collapsed (shorter than that) do not count:
+where they sit is arbitrary."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +227,9 @@ def _clusters(problem: Problem, fits: Fits) -> NDArray[np.int64]:
     unknowns = problem.unknowns
     times = np.concatenate(unknowns.times)
     places = np.setdiff1d(np.arange(len(unknowns.names)), times).tolist()
-    spread = np.maximum(np.ptp(fits.start, axis=0), 1e-12 * (1 + np.max(np.abs(fits.start), axis=0)))[places]
+    spread = np.ptp(fits.start, axis=0)
+    size = np.max(np.abs(fits.theta[fits.success]), axis=0, initial=1e-9)
+    spread = np.where(spread > 1e-12 * (1 + np.max(np.abs(fits.start), axis=0)), spread, size)[places]
     found: list[tuple[float, FloatArray, list[Any]]] = []
     for k in np.argsort(fits.cost, kind="stable"):
         if not fits.success[k]:
