@@ -5,11 +5,12 @@ from importlib.metadata import version as installed_version
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
-import paper_figures  # these stand beside this file
+import covid_figures  # these stand beside this file
+import paper_figures
 import speed_figures
 import uncertainty_figures
 
-for pictures in (paper_figures, speed_figures, uncertainty_figures):
+for pictures in (covid_figures, paper_figures, speed_figures, uncertainty_figures):
     pictures.draw(Path(__file__).parent / "_figures")
 
 project = "switchfit"
