@@ -75,14 +75,18 @@ def read():
 
 
 def make_problem(*, until=52, adaptation=ADAPTATION):
-    """The fit; t is the day of March on which people are infected, DELAY before they are counted."""
-    days, counts = (column[: until - 1] for column in read())
+    """The fit; t is the day of March on which people are infected, DELAY before they are counted.
+
+    Counts after day `until` are left out; day 52 of March is 21 April.
+    """
+    days, counts = read()
+    used = np.where(days <= until, counts, np.nan)
     noon = days + 0.5 - DELAY
     run = sf.Experiment(
-        sf.Measurements(noon, np.sqrt(counts), observe=root_of_count, names=("root of count",)),
+        sf.Measurements(noon, np.sqrt(used), observe=root_of_count, names=("root of count",)),
         mode_sequence=tuple(GERMANY.modes),
         transition_times=[
-            sf.Parameter(PUBLISHED[f"tau_{k}"], lower=-4.0, upper=noon[-1] - 3.0, unit="d") for k in (1, 2, 3)
+            sf.Parameter(PUBLISHED[f"tau_{k}"], lower=-4.0, upper=until - DELAY - 2.5, unit="d") for k in (1, 2, 3)
         ],
         t0=noon[0] - 0.5,
         tf=noon[-1] + 0.5,
@@ -215,9 +219,8 @@ def main(folder=None):
         other = sf.multistart(make_problem(**changed), 96).best
         dates = ", ".join(date(t) for t in other.transition_times[0])
         rate = other.parameters["lambda"][3]
-        print(
-            f"  {what:<22} {dates} ({date(*other.profile('tau_3').interval())}), lambda[3] {rate:.3f}, J = {other.cost:.1f}"
-        )
+        third = date(*other.profile("tau_3").interval())
+        print(f"  {what:<22} {dates} ({third}), lambda[3] {rate:.3f}, J = {other.cost:.1f}")
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         figure = plot(estimate, intervals[1])
