@@ -5,13 +5,15 @@ from importlib.metadata import version as installed_version
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
-import heaters_figures  # these stand beside this file
+import covid_figures  # these stand beside this file
+import heaters_figures
 import paper_figures
 import speed_figures
 import tosses_figures
 import uncertainty_figures
 
-for pictures in (heaters_figures, paper_figures, speed_figures, tosses_figures, uncertainty_figures):
+DRAWN_HERE = (covid_figures, heaters_figures, paper_figures, speed_figures, tosses_figures, uncertainty_figures)
+for pictures in DRAWN_HERE:
     pictures.draw(Path(__file__).parent / "_figures")
 
 project = "switchfit"

@@ -100,3 +100,53 @@ def test_heaters_were_switched_when_the_log_says():
     assert not power.residuals.passed
     # One supply feeds both heaters.
     assert power.parameters["P2"][0] < 0.6 * power.parameters["P2"][1]
+
+
+@pytest.fixture(scope="module")
+def covid():
+    """The example and its fit."""
+    module = runpy.run_path(str(EXAMPLES / "covid" / "covid.py"))
+    return module, sf.estimate(module["make_problem"]())
+
+
+def test_covid_finds_the_rates_and_the_first_two_dates_that_were_published(covid):
+    module, estimate = covid
+    days, counts = module["read"]()
+    assert (days[0], days[-1], counts[0], counts.sum()) == (2, 52, 29, 148291 - 130)
+    assert estimate.success
+    assert estimate.cost < 551.2  # the lowest of 64 starts
+    dates, rates = estimate.transition_times[0], estimate.parameters["lambda"]
+    published, other = module["PUBLISHED"], module["LEAST_SQUARES"]
+    assert np.all(np.abs(dates - [published[f"tau_{k}"] + 0.5 for k in (1, 2, 3)]) < [1.0, 2.0, 4.5])
+    np.testing.assert_allclose(rates, [published[f"lambda[{k}]"] for k in range(4)], rtol=0.12)
+    assert np.all(np.diff(rates) < 0)
+    assert rates[2] > module["RECOVERY"] > rates[3]  # it grows until the third change
+
+    profiles = {f"tau_{k}": estimate.profile(f"tau_{k}").interval() for k in (1, 2, 3)}
+    # A published date is a day; the third lies outside, which the days from Easter on bring about.
+    meets = {name: low < other[name] + 1 and high > other[name] for name, (low, high) in profiles.items()}
+    assert meets == {"tau_1": True, "tau_2": True, "tau_3": False}
+    within = dict(zip(estimate.theta_names, estimate.confidence_intervals(), strict=True))
+    for name in ("lambda[0]", "lambda[1]"):
+        assert within[name][0] < other[name] < within[name][1]
+    early = sf.estimate(module["make_problem"](until=40))
+    assert early.success
+    assert abs(early.transition_times[0][2] - published["tau_3"]) < 2.0
+
+    channel = estimate.residuals.channels[0]
+    assert channel.white
+    assert channel.normal
+    assert len(module["plot"](estimate, profiles).axes) == 2
+
+
+def test_covid_sees_a_day_at_its_noon_to_half_a_percent(covid):
+    """Infections of whole days, by Gauss's rule, against those at noon, along the fit."""
+    module, estimate = covid
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    noon = module["read"]()[0] + 0.5 - module["DELAY"]
+
+    def infections(times):
+        return module["infections"](estimate.predict(times).states.T)
+
+    whole = infections((noon[:, None] + nodes / 2).ravel()).reshape(len(noon), -1) @ weights / 2
+    np.testing.assert_allclose(whole, infections(noon), rtol=5e-3)
