@@ -6,6 +6,7 @@ orders and by four methods that agree.
 
 import re
 import textwrap
+import types
 from pathlib import Path
 
 import jax
@@ -20,6 +21,7 @@ from switchfit.model import float64
 from switchfit.optimize.variables import Variables
 from switchfit.priors import PriorTerms
 from switchfit.simulate import compare
+from switchfit.solve import message_of
 
 
 def free(t, x, p):
@@ -424,3 +426,18 @@ def test_the_examples_of_the_page_run():
         exec(compile(textwrap.dedent(block), "real-logs.md", "exec"), names)
     assert names["robust"].success
     assert names["late"].success
+
+
+def test_a_line_search_that_failed_tells_of_a_delay_that_is_estimated():
+    system = sf.HybridSystem({"on": lambda t, x, p: p["k"] - x, "off": lambda t, x, p: -x}, [0.0])
+
+    def problem(delay):
+        data = sf.Measurements([1.0, 2.0], [0.5, 0.2], sigma=0.1, delay=delay)
+        unknowns = {"k": 1.0, "d": sf.Parameter(0.1, lower=0.0, upper=0.5)}
+        return sf.Problem(system, sf.Experiment(data, ("on", "off"), (1.0,), 0.0, 3.0), unknowns)
+
+    failed = types.SimpleNamespace(status=sf.Status.LINE_SEARCH_FAILED, message="theta[0] stops.")
+    assert message_of(failed, problem("d")).startswith("tau_1 stops. A delay is estimated here: J has a kink")
+    assert message_of(failed, problem(0.1)) == "tau_1 stops."
+    done = types.SimpleNamespace(status=sf.Status.CONVERGED, message="theta[1] is fine.")
+    assert message_of(done, problem("d")) == "k is fine."

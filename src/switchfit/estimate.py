@@ -33,7 +33,7 @@ from switchfit.residuals import ResidualDiagnostics, diagnose
 from switchfit.result import Certificate, Fit
 from switchfit.sensitivity import Sensitivity, gauss_newton_of, sample_derivatives, sensitivity
 from switchfit.simulate import compare
-from switchfit.solve import constraints_of, least_squares, minimized, plain, sigma_known, smallest_cost, with_names
+from switchfit.solve import constraints_of, least_squares, message_of, minimized, plain, sigma_known, smallest_cost
 
 HESSIANS = get_args(HessianKind)
 
@@ -365,7 +365,7 @@ def _estimate(
         optimality=result.optimality,
         iterations=max(len(history) - 1, 0),
         status=result.status,
-        message=with_names(result.message, unknowns.names),
+        message=message_of(result, problem),
         history=tuple(history),
         active=result.active,
         kinks=tuple((unknowns.names[i], left, right) for i, left, right in result.kinks),

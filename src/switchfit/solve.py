@@ -12,7 +12,7 @@ import numpy as np
 from switchfit.data import FloatArray, Measurements, TerminalConstraint
 from switchfit.evaluate import ArrowEvaluation, Evaluation, Evaluator
 from switchfit.hidden import refuse_hidden_switches
-from switchfit.optimize import IterationRecord, LinearConstraints, Result, minimize
+from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
 from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.sqp import HessianKind
 from switchfit.optimize.variables import Variables
@@ -138,9 +138,17 @@ def _result_outward(variables: Variables, constraints: LinearConstraints, result
     return replace(result, theta=theta, gradient=gradient, hessian=hessian, history=history)
 
 
-def with_names(message: str, names: tuple[str, ...]) -> str:
-    """The optimiser's message with the unknowns called by their names."""
-    return re.sub(r"theta\[(\d+)\]", lambda match: names[int(match.group(1))], message)
+def message_of(result: Result, problem: Problem) -> str:
+    """The optimiser's message with the unknowns called by their names, and what a delay may have to do with it."""
+    names = problem.unknowns.names
+    message = re.sub(r"theta\[(\d+)\]", lambda match: names[int(match.group(1))], result.message)
+    data = [item for run in problem.experiments for item in run.data]
+    if result.status is Status.LINE_SEARCH_FAILED and any(isinstance(getattr(d, "delay", None), str) for d in data):
+        message += (
+            " A delay is estimated here: J has a kink where a transition meets the moment of which a late sample "
+            "is, and the fit may have ended at one. Fix the delay at its estimate to see."
+        )
+    return message
 
 
 def smallest_cost(problem: Problem) -> float:

@@ -33,7 +33,7 @@ from switchfit.optimize.variables import Variables
 from switchfit.priors import PriorTerms
 from switchfit.problem import Problem
 from switchfit.result import inverse_on
-from switchfit.solve import minimized, with_names
+from switchfit.solve import message_of, minimized
 
 CHUNK = 32
 """Fits that one call of the program takes on a CPU."""
@@ -344,7 +344,7 @@ def _finished(
         found["iterations"][k] = result.iterations
         found["evaluations"][k] += result.evaluations
         status[k] = result.status.name
-        message[k] = with_names(result.message, problem.unknowns.names)
+        message[k] = message_of(result, problem)
         free[k] = result.free_basis.shape[1]
         covariance[k] = inverse_on(result.free_basis, result.hessian)
     return Chunk(**found, status=status.astype(str), message=message.astype(str), free=free, covariance=covariance)
