@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any, get_args
 
@@ -237,33 +237,21 @@ def estimate(
     ValueError
         For a bad setting, or a guess at which the model cannot be integrated.
     """
-    if hessian not in HESSIANS:
-        raise ValueError(f"hessian must be one of {', '.join(HESSIANS)}; got {hessian!r}.")
-    if not tolerance > 0:
-        raise ValueError(f"tolerance must be positive; got {tolerance}.")
-    if max_iterations < 0:
-        raise ValueError(f"max_iterations must not be negative; got {max_iterations}.")
-    if problem.constraint_names and hessian != "exact":
-        raise ValueError(f"with guards or terminal constraints hessian must be 'exact'; got {hessian!r}.")
+    _check_settings(problem, hessian, tolerance, max_iterations)
     began = time.perf_counter()
-    theta = problem.checked_theta(start)
-    evaluator = evaluator_of(problem) if start is None else Evaluator(problem, theta)
-    if any(structure.guarded for structure in problem.structures):
-        with suppress(ValueError):  # if there is no such point nearby, the optimiser may find one farther off
-            theta = on_guards(evaluator, theta)
-            evaluator = Evaluator(problem, theta)
+    theta, evaluator = _beginning(problem, start)
     held: tuple[tuple[str, float, float], ...] = ()
     history: list[IterationRecord] = []
     evaluations = 0
     for attempt in range(REFINEMENTS + 1):
-        numbered = partial(_numbered_on, after=history[-1] if history else None)
-        told = None if callback is None else lambda record, on=numbered: callback(on(record))
+        last = history[-1] if history else None
+        told = None if callback is None else lambda record, last=last: callback(record.counted_on(last))
         left = max_iterations - max(len(history) - 1, 0)
         if problem.constraint_names:
             result, held = _minimized_with_constraints(evaluator, theta, tolerance, max(left, 0), told)
         else:
             result = minimized(evaluator, theta, hessian, tolerance, max(left, 0), told)
-        records = [numbered(record) for record in result.history]
+        records = [record.counted_on(last) for record in result.history]
         history += records[1:] if history else records
         evaluations += result.evaluations
         theta = result.theta
@@ -290,6 +278,28 @@ def estimate(
         seconds=time.perf_counter() - began,
         constraints=held,
     )
+
+
+def _check_settings(problem: Problem, hessian: HessianKind, tolerance: float, max_iterations: int) -> None:
+    if hessian not in HESSIANS:
+        raise ValueError(f"hessian must be one of {', '.join(HESSIANS)}; got {hessian!r}.")
+    if not tolerance > 0:
+        raise ValueError(f"tolerance must be positive; got {tolerance}.")
+    if max_iterations < 0:
+        raise ValueError(f"max_iterations must not be negative; got {max_iterations}.")
+    if problem.constraint_names and hessian != "exact":
+        raise ValueError(f"with guards or terminal constraints hessian must be 'exact'; got {hessian!r}.")
+
+
+def _beginning(problem: Problem, start: ArrayLike | None) -> tuple[FloatArray, Evaluator]:
+    """Where a fit begins (d,), guarded transitions on their guards if that is near, and the meshes for it."""
+    theta = problem.checked_theta(start)
+    evaluator = evaluator_of(problem) if start is None else Evaluator(problem, theta)
+    if any(structure.guarded for structure in problem.structures):
+        with suppress(ValueError):  # if there is no such point nearby, the optimiser may find one farther off
+            theta = on_guards(evaluator, theta)
+            evaluator = Evaluator(problem, theta)
+    return theta, evaluator
 
 
 def _minimized_with_constraints(
@@ -325,15 +335,6 @@ def _refined(evaluator: Evaluator, start: FloatArray, theta: FloatArray, excess:
     if excess <= 2**ORDER:
         return evaluator.divided()
     return Evaluator(problem, meshes=[refined_mesh(problem, e, start, theta) for e in range(len(problem.experiments))])
-
-
-def _numbered_on(record: IterationRecord, after: IterationRecord | None) -> IterationRecord:
-    """`record` of a fit that was resumed, counted on from the last record before."""
-    if after is None:
-        return record
-    return replace(
-        record, iteration=record.iteration + after.iteration, evaluations=record.evaluations + after.evaluations
-    )
 
 
 def _estimate(

@@ -20,10 +20,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
-import scipy.linalg
-from numpy.typing import NDArray
 
-from switchfit.optimize.qp import FloatArray, diagonal_scaling
+from switchfit.optimize.qp import FloatArray, diagonal_scaling, split_space
 from switchfit.optimize.sqp import Callback, IterationRecord, Result, Status, minimize
 
 #: The first penalty, in units of the curvature of J along the constraints.
@@ -133,10 +131,10 @@ def minimize_constrained(
             theta,
             tolerance=tolerance,
             max_iterations=max(max_iterations - (done.iteration if done else 0), 0),
-            callback=None if callback is None else lambda record, done=done: callback(_numbered(record, done)),  # type: ignore[misc]
+            callback=None if callback is None else lambda record, done=done: callback(record.counted_on(done)),  # type: ignore[misc]
             **settings,
         )
-        numbered = [_numbered(record, done) for record in result.history]
+        numbered = [record.counted_on(done) for record in result.history]
         history += numbered[1:] if history else numbered
         evaluations += result.evaluations
         theta = result.theta
@@ -169,7 +167,8 @@ def _finished(
     """The last minimisation's result in terms of J."""
     side = 1
     here = evaluate(result.theta, side, multipliers, np.zeros(len(names)))
-    free = result.free_basis @ _null_space(here.jacobian @ result.free_basis)
+    left = here.jacobian @ result.free_basis
+    free = result.free_basis @ split_space(left)[0] if np.isfinite(left).all() else result.free_basis
     scaling = diagonal_scaling(here.hessian, np.zeros(d)) if np.isfinite(here.hessian).all() else np.ones(d)
     basis = np.linalg.qr(free * scaling[:, None])[0] if free.shape[1] else free
     values, vectors = np.linalg.eigh(basis.T @ (here.hessian / np.outer(scaling, scaling)) @ basis)
@@ -210,19 +209,3 @@ def _lengths(rows: FloatArray) -> FloatArray:
     """Norm of each row, 1 where it vanishes: (m,)."""
     norms = np.linalg.norm(rows, axis=1)
     return np.where(np.isfinite(norms) & (norms > 0.0), norms, 1.0)
-
-
-def _null_space(matrix: FloatArray) -> NDArray[np.float64]:
-    """Orthonormal basis of the directions (k, r) that rows (m, k) leave."""
-    if matrix.shape[1] == 0 or not np.isfinite(matrix).all():
-        return np.eye(matrix.shape[1])
-    return np.asarray(scipy.linalg.null_space(matrix))
-
-
-def _numbered(record: IterationRecord, after: IterationRecord | None) -> IterationRecord:
-    """A record of a later minimisation, counted on from the last one before."""
-    if after is None:
-        return record
-    return replace(
-        record, iteration=record.iteration + after.iteration, evaluations=record.evaluations + after.evaluations
-    )

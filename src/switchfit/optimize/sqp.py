@@ -151,6 +151,12 @@ class IterationRecord:
     theta: FloatArray
     evaluations: int
 
+    def counted_on(self, last: IterationRecord | None) -> IterationRecord:
+        """This record of a minimisation that was resumed, counted on from the last record before; None: the first."""
+        if last is None:
+            return self
+        return replace(self, iteration=self.iteration + last.iteration, evaluations=self.evaluations + last.evaluations)
+
 
 Callback = Callable[[IterationRecord], object]
 Evaluate = Callable[[FloatArray, int], Evaluation]

@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Mapping
 from importlib.metadata import version
+from io import BytesIO
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, cast
@@ -122,9 +123,6 @@ def _earlier(path: Path) -> dict[str, Any]:
 
 def _save(figure: Any, path: Path) -> None:
     """A figure as a file that is whole or not there."""
-    temporary = path.with_name(f".{path.name}")
-    try:
-        figure.savefig(temporary, dpi=200, format=path.suffix[1:])
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    content = BytesIO()
+    figure.savefig(content, dpi=200, format=path.suffix[1:])
+    write_atomically(content.getvalue(), path)
