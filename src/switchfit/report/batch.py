@@ -7,10 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from switchfit.data import FloatArray
+
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from switchfit.batch.bootstrap import Bootstrap
+    from switchfit.batch.fits import Fits
     from switchfit.batch.monte_carlo import MonteCarlo
     from switchfit.batch.multistart import Multistart
 
@@ -88,19 +92,12 @@ def plot_bootstrap(study: Bootstrap) -> Figure:
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     theta, intervals = study.theta[study.success], study.intervals()
     for ax, k in zip(axes, shown, strict=False):
-        middle = np.percentile(theta[:, k], [0.5, 99.5])
-        reach = max(float(np.ptp(middle)), 1e-12 * abs(study.estimate[k]), np.finfo(float).tiny)
-        limits = (middle[0] - 0.25 * reach, middle[1] + 0.25 * reach)
+        limits = _limits(theta[:, k], study.estimate[k])
         ax.hist(theta[:, k], bins=40, range=limits, color=ESTIMATE, alpha=0.7, label=f"{len(theta)} estimates")
         ax.axvline(study.estimate[k], color=TRUTH, linewidth=1.4, label="estimate")
         for side, edge in enumerate(intervals[k]):
             ax.axvline(edge, color=NORMAL, linestyle=":", linewidth=1.2, label="" if side else "95 % interval (BCa)")
-        unit = study.theta_units[k]
-        ax.set_xlabel(study.theta_names[k] + (f" ({unit})" if unit and unit != "1" else ""))
-        ax.set_xlim(limits)
-        ax.set_yticks([])
-        ax.ticklabel_format(axis="x", useOffset=False)
-        ax.locator_params(axis="x", nbins=4)
+        _histogram_axis(study, int(k), limits, ax)
     for ax in axes[len(shown) :]:
         ax.set_visible(False)
     axes[0].set_ylabel("fits")
@@ -109,6 +106,23 @@ def plot_bootstrap(study: Bootstrap) -> Figure:
         handles, labels, loc="outside upper center", ncols=3, frameon=False, title=BOOTSTRAP_TITLES[study.resample]
     )
     return figure
+
+
+def _limits(values: FloatArray, centre: float) -> tuple[float, float]:
+    """What a histogram of estimates shows: all but the farthest hundredth, with a margin."""
+    middle = np.percentile(values, [0.5, 99.5])
+    reach = max(float(np.ptp(middle)), 1e-12 * abs(centre), np.finfo(float).tiny)
+    return float(middle[0] - 0.25 * reach), float(middle[1] + 0.25 * reach)
+
+
+def _histogram_axis(study: Fits, k: int, limits: tuple[float, float], ax: Axes) -> None:
+    """Name and unit of unknown k along the axis, and few ticks."""
+    unit = study.theta_units[k]
+    ax.set_xlabel(study.theta_names[k] + (f" ({unit})" if unit and unit != "1" else ""))
+    ax.set_xlim(limits)
+    ax.set_yticks([])
+    ax.ticklabel_format(axis="x", useOffset=False)
+    ax.locator_params(axis="x", nbins=4)
 
 
 def plot_monte_carlo(study: MonteCarlo) -> Figure:
@@ -128,9 +142,7 @@ def plot_monte_carlo(study: MonteCarlo) -> Figure:
             ax.set_visible(False)
             continue
         values = theta[:, k]
-        middle = np.percentile(values, [0.5, 99.5])
-        reach = max(float(np.ptp(middle)), 1e-12 * abs(study.truth[k]), np.finfo(float).tiny)
-        limits = (middle[0] - 0.25 * reach, middle[1] + 0.25 * reach)
+        limits = _limits(values, study.truth[k])
         ax.hist(
             values, bins=40, range=limits, density=True, color=ESTIMATE, alpha=0.7, label=f"{len(values)} estimates"
         )
@@ -139,12 +151,7 @@ def plot_monte_carlo(study: MonteCarlo) -> Figure:
             normal = np.exp(-0.5 * ((x - study.truth[k]) / errors[k]) ** 2) / (np.sqrt(2 * np.pi) * errors[k])
             ax.plot(x, normal, color=NORMAL, linewidth=1.2, label="normal, reported error")
         ax.axvline(study.truth[k], color=TRUTH, linestyle="--", linewidth=1.4, label="truth")
-        unit = study.theta_units[k]
-        ax.set_xlabel(study.theta_names[k] + (f" ({unit})" if unit and unit != "1" else ""))
-        ax.set_xlim(limits)
-        ax.set_yticks([])
-        ax.ticklabel_format(axis="x", useOffset=False)
-        ax.locator_params(axis="x", nbins=4)
+        _histogram_axis(study, k, limits, ax)
     axes[0].set_ylabel("density")
     handles, labels = axes[0].get_legend_handles_labels()
     failed = int((~study.success).sum())
