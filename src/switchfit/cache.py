@@ -35,9 +35,9 @@ def folder() -> Path | None:
 @contextmanager
 def compilation_cache() -> Iterator[None]:
     """Context in which JAX reads and writes compiled programs in `folder`; everything is as before afterwards."""
-    path = folder()
+    path = usable_folder()
     before = {name: getattr(jax.config, name) for name in SETTINGS}
-    if path is None or before["jax_compilation_cache_dir"] or not _writable(path):
+    if path is None or before["jax_compilation_cache_dir"]:
         yield
         return
     settings = {**SETTINGS, "jax_compilation_cache_dir": str(path)}
@@ -52,9 +52,13 @@ def compilation_cache() -> Iterator[None]:
         jax_cache.reset_cache()
 
 
-def _writable(path: Path) -> bool:
+def usable_folder() -> Path | None:
+    """`folder`, made if it is not there; None where nothing can be written to it."""
+    path = folder()
+    if path is None:
+        return None
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError:
-        return False
-    return os.access(path, os.W_OK)
+        return None
+    return path if os.access(path, os.W_OK) else None

@@ -22,6 +22,7 @@ from switchfit.derivatives.first_order import first_order
 from switchfit.derivatives.forward import forward_hessian
 from switchfit.mesh import Mesh
 from switchfit.model import Arguments, Model, Structure, float64
+from switchfit.native.program import NativeExperiment, native_experiment
 from switchfit.optimize.arrow import Arrow, ArrowLayout
 from switchfit.problem import Problem
 from switchfit.propagate import path_cost, propagate
@@ -103,6 +104,7 @@ class Evaluator:
         self.meshes = problem.with_common_lengths(given)
         self.arguments = [problem.arguments(e, mesh) for e, mesh in enumerate(self.meshes)]
         self._compiled: set[tuple[Method, Matrix]] = set()
+        self._native: dict[Matrix, list[NativeExperiment | None]] = {}
         self._priors = problem.unknowns.priors if problem.unknowns.priors.any else None
         self._places = [(own, places[own]) for places in problem.places for own in [np.flatnonzero(places >= 0)]]
 
@@ -118,13 +120,16 @@ class Evaluator:
         `matrix` asks for the Gauss-Newton matrix in place of the Hessian, or for none (it is NaN then).
         """
         d = len(theta)
-        total, gradient, hessian = 0.0, np.zeros(d), np.zeros((d, d))
         results = self._results(theta, side, method, matrix)
-        for (J, g, H), (own, mine) in zip(results, self._places, strict=True):
-            total += float(J)
-            # Two names of the model may mean one parameter: its place then stands twice, and both count.
-            np.add.at(gradient, mine, g[own])
-            np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
+        if self._one_to_one:
+            total, gradient, hessian = float(results[0][0]), results[0][1], results[0][2]
+        else:
+            total, gradient, hessian = 0.0, np.zeros(d), np.zeros((d, d))
+            for (J, g, H), (own, mine) in zip(results, self._places, strict=True):
+                total += float(J)
+                # Two names of the model may mean one parameter: its place then stands twice, and both count.
+                np.add.at(gradient, mine, g[own])
+                np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
         if self._priors is not None:
             J, g, h = self._priors.evaluate(theta, gauss_newton=matrix == "gauss-newton")
             total, gradient, hessian = total + float(J), gradient + g, hessian + np.diag(h)
@@ -178,8 +183,32 @@ class Evaluator:
     def _slots(self) -> list[NDArray[np.intp]]:
         return [self.layout.slots(e, mine) for e, (_, mine) in enumerate(self._places)]
 
+    @cached_property
+    def _one_to_one(self) -> bool:
+        """Whether theta is what the program of a single experiment takes."""
+        places = self.problem.places
+        return len(places) == 1 and np.array_equal(places[0], np.arange(len(self.problem.theta_names)))
+
+    def replace_arguments(self, arguments: Sequence[Arguments]) -> None:
+        """Work with other numbers from now on, on the meshes that they have."""
+        self.arguments = list(arguments)
+        self.meshes = [Mesh.from_times(np.asarray(own.nodes)) for own in arguments]
+        self._native.clear()
+
+    def _natives(self, matrix: Matrix) -> list[NativeExperiment | None]:
+        """What evaluates each experiment in machine code, None where nothing does."""
+        if matrix not in self._native:
+            given = zip(self.problem.structures, self.arguments, self.meshes, strict=True)
+            self._native[matrix] = [native_experiment(s, a, mesh.times, matrix == "exact") for s, a, mesh in given]
+        return self._native[matrix]
+
     def _results(self, theta: FloatArray, side: int, method: Method, matrix: Matrix) -> list[Any]:
         """Cost, gradient and Hessian of each experiment in its own unknowns, as NumPy arrays."""
+        if method == "auto" and matrix != "gauss-newton":
+            natives = self._natives(matrix)
+            vectors = [self.problem.vectors(theta, e) for e in range(len(natives))]
+            if all(native is not None for native in natives):
+                return [native(*given, side) for native, given in zip(natives, vectors, strict=True)]
         compiled = (method, matrix) in self._compiled
         with float64(), nullcontext() if compiled else compilation_cache():
             results = [

@@ -334,8 +334,7 @@ def _finished(
     for k in np.flatnonzero(~settled):
         values = tuple(value[k] for value in varying.values)
         with float64():
-            evaluator.arguments = list(replaced(base, varying.places, [jnp.asarray(value) for value in values]))
-        evaluator.meshes = [Mesh.from_times(np.asarray(own.nodes)) for own in evaluator.arguments]
+            evaluator.replace_arguments(replaced(base, varying.places, [jnp.asarray(value) for value in values]))
         left = max(max_iterations - int(found["iterations"][k]), 0)
         result = minimized(evaluator, found["theta"][k], "exact", tolerance, left, None)
         for name in ("theta", "cost", "gradient", "hessian", "optimality"):

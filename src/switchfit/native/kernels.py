@@ -1,0 +1,478 @@
+"""The functions of a model with their derivatives, and one step of the discretised system, as straight lines.
+
+The mathematics is that of `switchfit.derivatives.discrete`, backward in second order. For one row with stages
+``X_j = x + h sum_l a_jl K_l``, ``K_j = f(t_j, X_j, p)``:
+
+forward    x and its derivative Z along theta, a vector an entry: ``X_j' = Z + h' (..) + h sum_l a_jl K_l'``,
+           ``K_j' = D_1 f X_j' + D_2 f t_j' + D_p f p'``;
+backward   ``w_j = h b_j psi + h sum_l a_lj mu_l``, ``mu_j = D_x (w_j . f + h b_j ell)``, ``psi_before = psi + sum mu_j``,
+           and the Hessian gains ``Z_j' D^2 (w_j . f + h b_j ell) Z_j`` at every stage.
+
+Only rows that open or close a mode have a length and times that depend on theta: these *end rows* have their own form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from switchfit.model import Arguments, Model, Piece, Samples, Structure
+from switchfit.native.llvm import Module
+from switchfit.native.scalars import Graph, Node, Objects, Template
+from switchfit.native.trace import traced
+from switchfit.rungekutta import EXPLICIT
+
+a, b, c = EXPLICIT.a.tolist(), EXPLICIT.b.tolist(), EXPLICIT.c.tolist()
+STAGES = len(b)
+
+Shape = tuple[int, ...]
+Store = tuple[str, int, Node]
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What a program depends on beside the structure.
+
+    Attributes
+    ----------
+    n, N, M : states, transitions, entries of p
+    signals : channels of all signals
+    constants : shapes of all that is given and no signal: fixed parameters, weights of references, initial state
+    """
+
+    n: int
+    N: int
+    M: int
+    signals: int
+    constants: tuple[Shape, ...]
+
+    @classmethod
+    def of(cls, structure: Structure, arguments: Arguments) -> Sizes:
+        """Those of one experiment."""
+        constants = tuple(np.shape(a) for a in constants_of(arguments))
+        return cls(structure.n, structure.N, structure.M, arguments.signals.shape[2], constants)
+
+    @property
+    def D(self) -> int:
+        """Unknowns: all transition times, then p."""
+        return self.N + self.M
+
+    @property
+    def width(self) -> int:
+        """Entries of a vector: even, so that vector instructions of the processor fit."""
+        return self.D if self.D == 1 else self.D + self.D % 2
+
+
+def constants_of(arguments: Arguments) -> list[Any]:
+    """What functions of the model look at beside t, x, p and signals."""
+    return [*arguments.fixed, *arguments.weights, arguments.initial_state]
+
+
+class Kernels:
+    """Writes the functions of one structure into a module.
+
+    Every pointer means the same wherever its name stands:
+
+        c, p            constants, parameters
+        row, signal     (start, end, first node of the cell), coefficients (4, S) of the signals there
+        x, Z            state and its derivative: before a row, at a sample, at a transition
+        x_after, Z_after  the same behind a row or a reset map
+        X, XZ           at the stages of a row: (s, n), (s, n, width)
+        opens, closes   derivatives of the start and the end of a row: two vectors
+        psi, jump       costate; what samples at the end of a row add to it
+        J, g, H         cost, gradient (width,), Hessian (D, width): sums
+        entries         second derivatives at the stages of a row, (s, count); Zt: derivative of the stage's time
+    """
+
+    def __init__(self, structure: Structure, sizes: Sizes, second: bool) -> None:
+        self.structure, self.sizes, self.second = structure, sizes, second
+        self.module = Module(sizes.width)
+        self.has_samples = bool(structure.measurements)
+
+    # The functions of the model, traced
+
+    def model(self, constants: tuple[Any, ...]) -> Model:
+        """The model with traced constants."""
+        fixed = sum(not free for _, _, free in self.structure.parameters)
+        arguments = Arguments(
+            nodes=jnp.zeros(2),
+            signals=jnp.zeros((1, 4, self.sizes.signals)),
+            fixed=tuple(constants[:fixed]),
+            initial_state=constants[-1],
+            samples=(),
+            weights=tuple(constants[fixed:-1]),
+        )
+        return Model(self.structure, arguments)
+
+    def at_stage(self, mode: int) -> Template:
+        """f, ell and their derivatives, those of ``w . f + hb ell`` among them: see `Stage`."""
+        n, M, S = self.sizes.n, self.sizes.M, self.sizes.signals
+
+        def stage(t: Any, x: Any, p: Any, w: Any, hb: Any, origin: Any, coefficients: Any, *constants: Any) -> Any:
+            model = self.model(constants)
+            piece = Piece(origin, coefficients)
+            f, ell = model.field(mode, piece), model.density(piece)
+            zero = jnp.zeros(())
+            slope = (f(t, x, p), *jax.jacfwd(f, argnums=(0, 1, 2))(t, x, p))
+            cost = (zero, zero, jnp.zeros(n), jnp.zeros(M))
+            if model.has_running_cost:
+                value, gradient = jax.value_and_grad(ell, argnums=(0, 1, 2))(t, x, p)
+                cost = (value, *gradient)
+
+            def weighted(t: Any, x: Any, p: Any) -> Any:
+                return w @ f(t, x, p) + (hb * ell(t, x, p) if model.has_running_cost else 0.0)
+
+            return [*slope, *cost, *_first_and_second(weighted, t, x, p)]
+
+        return traced(stage, (), (n,), (M,), (n,), (), (), (4, S), *self.sizes.constants)
+
+    def at_sample(self, k: int) -> Template:
+        """Cost of a sample and its derivatives along (t, x, p), that along t being nothing."""
+        q = self.structure.measurements[k].channels
+
+        def sample(time: Any, value: Any, weight: Any, x: Any, p: Any, *constants: Any) -> Any:
+            model = self.model(constants)
+            given = Samples(jnp.zeros((), int), time, value, weight)
+            cost = lambda t, x, p: model.sample_cost(k, given, x, p)  # noqa: E731
+            return [cost(time, x, p), *_first_and_second(cost, time, x, p)]
+
+        return traced(sample, (), (q,), (q,), (self.sizes.n,), (self.sizes.M,), *self.sizes.constants)
+
+    def at_end(self) -> Template:
+        """The terminal costs and their derivatives."""
+
+        def end(x: Any, p: Any, *constants: Any) -> Any:
+            model = self.model(constants)
+            cost = lambda t, x, p: model.terminal(x, p)  # noqa: E731
+            return [cost(0.0, x, p), *_first_and_second(cost, jnp.zeros(()), x, p)]
+
+        return traced(end, (self.sizes.n,), (self.sizes.M,), *self.sizes.constants)
+
+    def at_reset(self, i: int) -> Template:
+        """The reset map of transition i, its Jacobians, and the derivatives of ``w . R``."""
+
+        def reset(t: Any, x: Any, p: Any, w: Any, *constants: Any) -> Any:
+            R = self.model(constants).reset(i)
+            jacobians = jax.jacfwd(R, argnums=(0, 1, 2))(t, x, p)
+            return [R(t, x, p), *jacobians, *_first_and_second(lambda t, x, p: w @ R(t, x, p), t, x, p)]
+
+        n = self.sizes.n
+        return traced(reset, (), (n,), (self.sizes.M,), (n,), *self.sizes.constants)
+
+    def at_start(self) -> Template:
+        """x(t0), its Jacobian (n, M) in p, and the derivatives of ``w . x(t0)``: (M,) and (M, M)."""
+
+        def start(p: Any, w: Any, *constants: Any) -> Any:
+            x0 = self.model(constants).initial_state
+            weighted = lambda p: w @ x0(p)  # noqa: E731
+            return [x0(p), jax.jacfwd(x0)(p), jax.grad(weighted)(p), jax.jacfwd(jax.grad(weighted))(p)]
+
+        return traced(start, (self.sizes.M,), (self.sizes.n,), *self.sizes.constants)
+
+    # Straight lines
+
+    def inputs(self, graph: Graph) -> tuple[Objects, list[Objects]]:
+        """p and the constants."""
+        p, offset, constants = graph.loads("p", self.sizes.M), 0, []
+        for shape in self.sizes.constants:
+            count = int(np.prod(shape))
+            constants.append(graph.loads("c", count, offset))
+            offset += count
+        return p, constants
+
+    def units(self, graph: Graph) -> list[Node]:
+        """Derivatives of p along theta."""
+        return [graph.unit(self.sizes.N + k) for k in range(self.sizes.M)]
+
+    def forward_row(self, name: str, stage: Template, end_row: bool) -> None:
+        """One row: states at its stages and behind it, their derivatives, and what it costs."""
+        graph, n = Graph(), self.sizes.n
+        p, constants = self.inputs(graph)
+        start, end, origin = graph.loads("row", 3)
+        signal = graph.loads("signal", 4 * self.sizes.signals)
+        h = end - start
+        x, nothing = graph.loads("x", n), graph.constant(0.0)
+        w = np.full(n, nothing, dtype=object)
+        Z = graph.loads("Z", n, vector=True)
+        units = self.units(graph)
+        start_d, end_d = (graph.load(name, 0, vector=True) for name in ("opens", "closes"))
+        h_d = end_d - start_d
+        K: list[Objects] = []
+        K_d: list[Objects] = []
+        stores: list[Store] = []
+        cost = nothing
+        for j in range(STAGES):
+            X_j = x + h * _combined(a[j], K) if any(a[j]) else x
+            t_j = start + c[j] * h
+            f, f_t, f_x, f_p, ell = stage(
+                graph, t_j, X_j, p, w, nothing, origin, signal, *constants, only=(F, F_T, F_X, F_P, ELL)
+            )
+            stores += _stored("X", j * n, X_j)
+            cost = cost + b[j] * ell.item()
+            if self.second:
+                X_d = Z + h * _combined(a[j], K_d) if any(a[j]) else Z
+                if end_row:
+                    X_d = X_d + h_d * _combined(a[j], K) if any(a[j]) else X_d
+                slope_d = f_x @ X_d + _along(f_p, units)
+                if end_row:
+                    slope_d = slope_d + f_t * (start_d + c[j] * h_d)
+                stores += _stored("XZ", j * n, X_d)
+                K_d.append(slope_d)
+            K.append(f)
+        stores += _stored("x_after", 0, x + h * _combined(b, K))
+        if self.second:
+            after_d = Z + h * _combined(b, K_d)
+            stores += _stored("Z_after", 0, after_d + h_d * _combined(b, K) if end_row else after_d)
+        if self.structure.running or self.structure.references:
+            stores.append(("J", 0, graph.load("J", 0) + h * cost))
+        self.module.straight(name, FORWARD, stores)
+
+    def backward_row(self, name: str, stage: Template, end_row: bool) -> list[tuple[int, int]]:
+        """One row: the costate before it, its part of the gradient, and second derivatives for `curvature`.
+
+        Returns which entries of the second derivative along (t, x, p) these are.
+        """
+        graph, n, M = Graph(), self.sizes.n, self.sizes.M
+        p, constants = self.inputs(graph)
+        start, end, origin = graph.loads("row", 3)
+        signal = graph.loads("signal", 4 * self.sizes.signals)
+        h = end - start
+        units = self.units(graph)
+        start_d, end_d = (graph.load(name, 0, vector=True) for name in ("opens", "closes"))
+        h_d = end_d - start_d
+        psi = graph.loads("psi", n)
+        if self.has_samples:
+            psi = psi + graph.loads("jump", n)
+        nothing = graph.constant(0.0)
+        mu: list[Objects] = [np.full(n, nothing, dtype=object)] * STAGES
+        gradient = np.full(M, nothing, dtype=object)
+        gradient_t = [nothing] * STAGES
+        found: list[dict[tuple[int, int], Node]] = [{}] * STAGES
+        slopes: list[list[Objects]] = [[]] * STAGES
+        for j in reversed(range(STAGES)):
+            X_j, t_j = graph.loads("X", n, j * n), start + c[j] * h
+            w = h * (b[j] * psi + _combined([row[j] for row in a], mu))
+            given = (t_j, X_j, p, w, h * b[j], origin, signal, *constants)
+            g_t, mu[j], g_p, *second = stage(graph, *given, only=GRADIENT + (SECOND if self.second else ()))
+            gradient = gradient + g_p
+            gradient_t[j] = g_t.item()
+            if self.second:
+                found[j] = _entries(second, with_time=end_row)
+            if end_row:
+                slopes[j] = stage(graph, *given, only=SLOPES)
+        stores = _stored("psi", 0, psi + sum(mu[1:], mu[0]))
+        g = graph.load("g", 0, vector=True) + _along(gradient, units)
+        if end_row:
+            # Derivatives in the times of the stages, and in the length of the row, which multiplies slopes.
+            K, ell = [s[0] for s in slopes], [s[4].item() for s in slopes]
+            by_length = sum(b[j] * (psi @ K[j] + ell[j]) + (mu[j] * _combined(a[j], K)).sum() for j in range(STAGES))
+            times_d = [start_d + c[j] * h_d for j in range(STAGES)]
+            g = g + by_length * h_d + sum(gradient_t[j] * times_d[j] for j in range(STAGES))
+            if self.second:
+                K_d, ell_d = [], []
+                for j in range(STAGES):
+                    _, f_t, f_x, f_p, _, l_t, l_x, l_p = slopes[j]
+                    X_d = graph.loads("XZ", n, j * n, vector=True)
+                    K_d.append(f_x @ X_d + _along(f_p, units) + f_t * times_d[j])
+                    ell_d.append(l_x @ X_d + _along(l_p, units) + l_t.item() * times_d[j])
+                total = sum(b[j] * (psi @ K_d[j] + ell_d[j]) + (mu[j] * _combined(a[j], K_d)).sum() for j in range(STAGES))
+                stores.append(("length", 0, _as_vector(graph, total)))
+        stores.append(("g", 0, _as_vector(graph, g)))
+        chosen = sorted({key for at in found for key, node in at.items() if node.number != 0.0})
+        for j in range(STAGES):
+            values = [found[j][key] for key in chosen]
+            stores += [("entries", j * len(chosen) + k, node) for k, node in enumerate(values)]
+        self.module.straight(name, BACKWARD, stores)
+        return chosen
+
+    def curvature_function(self, name: str, chosen: list[tuple[int, int]]) -> None:
+        """H gains ``Z' S Z`` at one stage; `chosen` are the entries of S, whose values it is given."""
+        graph = Graph()
+        second = {key: graph.load("entries", k) for k, key in enumerate(chosen)}
+        zt = [graph.load("Zt", d) for d in range(self.sizes.D)]
+        at = [(graph.load("Zt", 0, vector=True), zt), *self.state_directions(graph, "Z")]
+        self.module.straight(name, CURVATURE, self.curved(graph, second, at))
+
+    def length_function(self) -> None:
+        """H gains the products of a row's length with what `backward_row` stored for it."""
+        graph = Graph()
+        start_d, end_d, along = (graph.load(name, 0, vector=True) for name in ("opens", "closes", "length"))
+        stores = []
+        for d in range(self.sizes.D):
+            h_d = graph.load("closes", d) - graph.load("opens", d)
+            row = graph.load("H", d, vector=True) + h_d * along + graph.load("length", d) * (end_d - start_d)
+            stores.append(("H", d, row))
+        self.module.straight("length", LENGTH, stores)
+
+    def stage_time_function(self, j: int) -> None:
+        """Derivative along theta of the time of a stage of an end row."""
+        graph = Graph()
+        start_d, end_d = (graph.load(name, 0, vector=True) for name in ("opens", "closes"))
+        self.module.straight(f"stage_time_{j}", STAGE_TIME, [("Zt", 0, start_d + c[j] * (end_d - start_d))])
+
+    def state_directions(self, graph: Graph, pointer: str) -> list[tuple[Node, list[Node]]]:
+        """The derivative of each entry of x along theta: as a vector and entry by entry."""
+        n, D, width = self.sizes.n, self.sizes.D, self.sizes.width
+        return [
+            (graph.load(pointer, k, vector=True), [graph.load(pointer, k * width + d) for d in range(D)])
+            for k in range(n)
+        ]
+
+    def curved(
+        self, graph: Graph, second: dict[tuple[int, int], Node], along: list[tuple[Node, list[Node]]]
+    ) -> list[Store]:
+        """Stores of H with ``Z' S Z`` added, S given by its lower half along (t, x, p); `along` is Z of t and x."""
+        n, N, D = self.sizes.n, self.sizes.N, self.sizes.D
+        vectors = [vector for vector, _ in along] + self.units(graph)
+        product: dict[int, Any] = {}
+        for (k, m), value in second.items():
+            for one, other in {(k, m), (m, k)}:
+                product[one] = product.get(one, 0.0) + value * vectors[other]
+        stores = []
+        for d in range(D):
+            row = graph.load("H", d, vector=True)
+            for k, entries in enumerate(entries for _, entries in along):
+                if k in product:
+                    row = row + entries[d] * product[k]
+            if 1 + n + d - N in product and d >= N:
+                row = row + product[1 + n + d - N]
+            stores.append(("H", d, row))
+        return [store for store in stores if store[2].op != "load"]
+
+    def cost_function(self, name: str, pointers: tuple[str, ...], at: Callable[..., list[Objects]], jump: str) -> None:
+        """A cost of (x, p) at one moment: J, g and H grow, and the costate by its derivative."""
+        graph = Graph()
+        p, constants = self.inputs(graph)
+        x = graph.loads("x", self.sizes.n)
+        cost, _, g_x, g_p, *second = at(graph, x, p, constants)
+        stores = [("J", 0, graph.load("J", 0) + cost.item())]
+        stores += _stored(jump, 0, graph.loads(jump, self.sizes.n) + g_x)
+        g = graph.load("g", 0, vector=True) + _along(g_p, self.units(graph))
+        stores.append(("g", 0, g))
+        if self.second:
+            none = graph.constant(0.0)
+            along = [(none, [none] * self.sizes.D), *self.state_directions(graph, "Z")]
+            stores += self.curved(graph, _entries(second, with_time=False), along)
+        self.module.straight(name, pointers, stores)
+
+    def reset_functions(self, i: int) -> None:
+        """A reset map, forward and backward."""
+        template = self.at_reset(i)
+        graph, n = Graph(), self.sizes.n
+        p, constants = self.inputs(graph)
+        x, t = graph.loads("x", n), graph.load("tau", i)
+        none = np.full(n, graph.constant(0.0), dtype=object)
+        after, R_t, R_x, R_p = template(graph, t, x, p, none, *constants, only=range(4))
+        stores = _stored("x_after", 0, after)
+        if self.second:
+            Z = graph.loads("Z", n, vector=True)
+            Z_after = R_x @ Z + _along(R_p, self.units(graph)) + R_t * graph.unit(i)
+            stores += [("Z_after", k, _as_vector(graph, v)) for k, v in enumerate(Z_after)]
+        self.module.straight(f"reset_{i}", RESET, stores)
+
+        graph = Graph()
+        p, constants = self.inputs(graph)
+        x, t, psi = graph.loads("x", n), graph.load("tau", i), graph.loads("psi", n)
+        g_t, g_x, g_p, *second = template(graph, t, x, p, psi, *constants, only=range(4, 13))
+        g = graph.load("g", 0, vector=True) + _along(g_p, self.units(graph)) + g_t.item() * graph.unit(i)
+        stores = [*_stored("psi", 0, g_x), ("g", 0, g)]
+        if self.second:
+            numbers = [graph.constant(float(d == i)) for d in range(self.sizes.D)]
+            along = [(graph.unit(i), numbers), *self.state_directions(graph, "Z")]
+            stores += self.curved(graph, _entries(second, with_time=True), along)
+        self.module.straight(f"reset_back_{i}", RESET_BACK, stores)
+
+    def start_functions(self) -> None:
+        """The initial state, forward and backward."""
+        template, n, N = self.at_start(), self.sizes.n, self.sizes.N
+        graph = Graph()
+        p, constants = self.inputs(graph)
+        none = np.full(n, graph.constant(0.0), dtype=object)
+        x, x_p = template(graph, p, none, *constants, only=(0, 1))
+        stores = _stored("x", 0, x)
+        if self.second:
+            Z = _along(x_p, self.units(graph))
+            stores += [("Z", k, _as_vector(graph, v)) for k, v in enumerate(Z)]
+        self.module.straight("start", ("c", "p", "x", "Z"), stores)
+
+        graph = Graph()
+        p, constants = self.inputs(graph)
+        psi = graph.loads("psi", n)
+        if self.has_samples:
+            psi = psi + graph.loads("jump", n)
+        g_p, g_pp = template(graph, p, psi, *constants, only=(2, 3))
+        units = self.units(graph)
+        stores = [("g", 0, graph.load("g", 0, vector=True) + _along(g_p, units))]
+        if self.second:
+            rows = [(N + k, graph.load("H", N + k, vector=True), _along(g_pp[k], units)) for k in range(len(units))]
+            stores += [("H", d, row + more) for d, row, more in rows]
+        self.module.straight("start_back", ("c", "p", "psi", "jump", "g", "H"), stores)
+
+
+FORWARD = ("c", "p", "row", "signal", "opens", "closes", "x", "Z", "X", "XZ", "x_after", "Z_after", "J")
+BACKWARD = ("c", "p", "row", "signal", "opens", "closes", "psi", "jump", "X", "XZ", "g", "entries", "length")
+LENGTH = ("opens", "closes", "length", "H")
+STAGE_TIME = ("opens", "closes", "Zt")
+CURVATURE = ("entries", "Zt", "Z", "H")
+RESET = ("c", "p", "tau", "x", "Z", "x_after", "Z_after")
+RESET_BACK = ("c", "p", "tau", "x", "Z", "psi", "g", "H")
+SAMPLE = ("c", "p", "time", "value", "weight", "x", "Z", "jump", "J", "g", "H")
+END = ("c", "p", "x", "Z", "psi", "J", "g", "H")
+
+F, F_T, F_X, F_P, ELL = range(5)
+SLOPES = tuple(range(8))
+"""f, D_2 f, D_1 f, D_p f, ell and its derivatives in t, x and p: places in what `Kernels.at_stage` returns."""
+
+GRADIENT = (8, 9, 10)
+SECOND = tuple(range(11, 17))
+"""Of ``w . f + hb ell``: first derivatives in t, x and p; second in tt, xt, xx, pt, px, pp."""
+
+
+def _first_and_second(value: Callable[..., Any], *at: Any) -> list[Any]:
+    """First derivatives of a scalar in t, x, p, and second in tt, xt, xx, pt, px, pp."""
+    gradient = jax.grad(value, argnums=(0, 1, 2))
+    (tt, _, _), (xt, xx, _), (pt, px, pp) = jax.jacfwd(gradient, argnums=(0, 1, 2))(*at)
+    return [*gradient(*at), tt, xt, xx, pt, px, pp]
+
+
+def _entries(second: list[Objects], with_time: bool) -> dict[tuple[int, int], Node]:
+    """The lower half of a second derivative along (t, x, p), as entries of one matrix; zeros are left out."""
+    tt, xt, xx, pt, px, pp = second
+    n, M = len(xt), len(pt)
+    entries = {(1 + i, 1 + j): xx[i, j] for i in range(n) for j in range(i + 1)}
+    entries |= {(1 + n + k, 1 + i): px[k, i] for k in range(M) for i in range(n)}
+    entries |= {(1 + n + k, 1 + n + m): pp[k, m] for k in range(M) for m in range(k + 1)}
+    if with_time:
+        entries |= {(0, 0): tt.item()} | {(1 + i, 0): xt[i] for i in range(n)}
+        entries |= {(1 + n + k, 0): pt[k] for k in range(M)}
+    return entries
+
+
+def _combined(weights: list[float], terms: list[Any]) -> Any:
+    """Weighted sum of arrays of nodes."""
+    parts = [weight * term for weight, term in zip(weights, terms, strict=False) if weight != 0.0]
+    return sum(parts[1:], parts[0]) if parts else 0.0
+
+
+def _along(derivatives: Objects, units: list[Node]) -> Any:
+    """``sum_k derivatives[..., k] units[k]``: of shape (...)."""
+    total = 0.0 if derivatives.ndim == 1 else np.zeros(derivatives.shape[:-1])
+    for k, unit in enumerate(units):
+        total = total + derivatives[..., k] * unit
+    return total
+
+
+def _as_vector(graph: Graph, value: Any) -> Node:
+    """A vector node, also where the value turned out to be zero."""
+    if isinstance(value, Node) and value.vector:
+        return value
+    return graph.zeros()
+
+
+def _stored(pointer: str, offset: int, values: Any) -> list[Store]:
+    return [(pointer, offset + k, node) for k, node in enumerate(values)]

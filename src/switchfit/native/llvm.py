@@ -1,0 +1,245 @@
+"""Straight-line graphs as LLVM functions, and LLVM modules as machine code.
+
+What was compiled once is kept in the folder of `switchfit.cache` and read from there by the next process.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import ctypes.util
+import hashlib
+import os
+import struct
+import sys
+import tempfile
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import llvmlite
+import llvmlite.binding as llvm
+
+from switchfit.cache import usable_folder
+from switchfit.native.scalars import CONDITIONS, Node, needed
+
+INTRINSICS = {
+    "sqrt": "sqrt",
+    "abs": "fabs",
+    "floor": "floor",
+    "ceil": "ceil",
+    "max": "maximum",
+    "min": "minimum",
+}
+"""Operations that are instructions of the processor."""
+
+BINARY = {"add": "fadd contract", "sub": "fsub contract", "mul": "fmul contract", "div": "fdiv"}
+COMPARISONS = {"lt": "fcmp olt", "le": "fcmp ole", "eq": "fcmp oeq", "ne": "fcmp une"}
+FROM_LIBM = {
+    **{op: op for op in ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "asinh")},
+    **{op: op for op in ("acosh", "atanh", "exp", "log", "pow", "expm1", "log1p", "cbrt", "exp2", "erf", "erfc")},
+}
+"""Functions of the C library."""
+
+
+def literal(number: float) -> str:
+    """A double, exactly."""
+    return f"0x{struct.unpack('<Q', struct.pack('<d', number))[0]:016X}"
+
+
+class Module:
+    """The text of an LLVM module, function by function.
+
+    Parameters
+    ----------
+    width : int
+        Entries of a vector.
+    """
+
+    def __init__(self, width: int) -> None:
+        self.width = width
+        self.vector = f"<{width} x double>"
+        self.functions: list[str] = []
+        self._declared: dict[str, str] = {}
+
+    def straight(self, name: str, pointers: Sequence[str], stores: Sequence[tuple[str, int, Node]]) -> None:
+        """A function of pointers that loads, computes and stores: ``(pointer, offset, what)``.
+
+        Everything is loaded before anything is stored. Offsets count doubles, those of vectors vectors.
+        """
+        writer = _Writer(self)
+        values = [writer.value(node) for node in needed([node for _, _, node in stores])]
+        del values
+        for pointer, offset, node in stores:
+            writer.store(pointer, offset, node)
+        arguments = ", ".join(f"ptr %{pointer}" for pointer in pointers)
+        body = "\n".join(writer.lines)
+        self.functions.append(f"define internal void @{name}({arguments}) {{\n{body}\n  ret void\n}}\n")
+
+    def add(self, text: str) -> None:
+        """A function written by hand."""
+        self.functions.append(text)
+
+    def declare(self, name: str, signature: str) -> None:
+        """A function from elsewhere."""
+        self._declared[name] = signature
+
+    @property
+    def text(self) -> str:
+        """The whole module."""
+        return "\n".join([*self._declared.values(), *self.functions])
+
+
+class _Writer:
+    """One function: a line an operation."""
+
+    def __init__(self, module: Module) -> None:
+        self.module = module
+        self.lines: list[str] = []
+        self.names: dict[int, str] = {}
+        self.splats: dict[int, str] = {}
+
+    def emit(self, text: str) -> str:
+        name = f"%v{len(self.lines)}"
+        self.lines.append(f"  {name} = {text}")
+        return name
+
+    def value(self, node: Node) -> str:
+        """The name under which the value of a node is known, or a literal."""
+        name = self.names.get(node.index)
+        if name is None:
+            name = self.names[node.index] = self._written(node)
+        return name
+
+    def _written(self, node: Node) -> str:
+        op, args = node.op, node.args
+        if op == "const":
+            return str(args[0]).lower() if isinstance(args[0], bool) else literal(args[0])
+        if op == "load":
+            return self.emit(f"load {self._type(node)}, ptr {self.address(*args, node.vector)}, align 8")
+        if op == "unit":
+            entries = (f"double {literal(float(k == args[0]))}" for k in range(self.module.width))
+            return "<" + ", ".join(entries) + ">"
+        if op == "zeros":
+            return "zeroinitializer"
+        kind = self._type(node)
+        a = [self._as(argument, node.vector) for argument in args]
+        if op in BINARY:
+            return self.emit(f"{BINARY[op]} {kind} {a[0]}, {a[1]}")
+        if op == "neg":
+            return self.emit(f"fneg {kind} {a[0]}")
+        if op in COMPARISONS:
+            return self.emit(f"{COMPARISONS[op]} double {a[0]}, {a[1]}")
+        if op in ("and", "or"):
+            return self.emit(f"{op} i1 {a[0]}, {a[1]}")
+        if op == "not":
+            return self.emit(f"xor i1 {a[0]}, true")
+        if op == "select":
+            kind = "i1" if all(x.op in CONDITIONS or isinstance(x.number, bool) for x in args[1:]) else kind
+            return self.emit(f"select i1 {self.value(args[0])}, {kind} {a[1]}, {kind} {a[2]}")
+        given = ", ".join(f"double {x}" for x in a)
+        if op in INTRINSICS:
+            name = f"llvm.{INTRINSICS[op]}.f64"
+        else:
+            name = FROM_LIBM[op]
+        types = ", ".join("double" for _ in a)
+        memory = "" if op in INTRINSICS else " memory(none) nounwind willreturn"
+        self.module.declare(name, f"declare double @{name}({types}){memory}")
+        return self.emit(f"call double @{name}({given})")
+
+    def store(self, pointer: str, offset: int, node: Node) -> None:
+        value, address = self.value(node), self.address(pointer, offset, node.vector)
+        self.lines.append(f"  store {self._type(node)} {value}, ptr {address}, align 8")
+
+    def address(self, pointer: str, offset: int, vector: bool) -> str:
+        if offset == 0:
+            return f"%{pointer}"
+        unit = self.module.width if vector else 1
+        return self.emit(f"getelementptr inbounds double, ptr %{pointer}, i64 {offset * unit}")
+
+    def _type(self, node: Node) -> str:
+        return self.module.vector if node.vector else "double"
+
+    def _as(self, node: Node, vector: bool) -> str:
+        """A value as an operand of an operation on vectors, or on scalars."""
+        if not vector or node.vector:
+            return self.value(node)
+        name = self.splats.get(node.index)
+        if name is None:
+            one = self.emit(f"insertelement {self.module.vector} poison, double {self.value(node)}, i64 0")
+            zeros = f"<{self.module.width} x i32> zeroinitializer"
+            name = self.emit(f"shufflevector {self.module.vector} {one}, {self.module.vector} poison, {zeros}")
+            self.splats[node.index] = name
+        return name
+
+
+class Program:
+    """Machine code of a module, alive as long as this object."""
+
+    def __init__(self, engine: Any) -> None:
+        self._engine = engine
+
+    def function(self, name: str, *types: Any) -> Any:
+        """One of its functions that return nothing, to be called from Python."""
+        return ctypes.CFUNCTYPE(None, *types)(self._engine.get_function_address(name))
+
+
+def compiled(text: str) -> Program:
+    """Machine code for this processor, from the cache if it is there."""
+    _start()
+    key = hashlib.sha256("\n".join([text, llvmlite.__version__, *_processor()]).encode()).hexdigest()
+    name, features = _processor()
+    machine = llvm.Target.from_default_triple().create_target_machine(cpu=name, features=features, opt=2)
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(text), machine)
+    folder = usable_folder()
+    if folder is not None:
+        path = folder / f"native-{key}"
+        engine.set_object_cache(lambda _, code: _write(path, code), lambda _: _read(path))
+    engine.finalize_object()
+    return Program(engine)
+
+
+def _write(path: Path, code: bytes) -> None:
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent)
+        with os.fdopen(handle, "wb") as file:
+            file.write(code)
+        os.replace(name, path)
+    except OSError:
+        pass  # a cache that cannot be written is no reason to stop
+
+
+def _read(path: Path) -> bytes | None:
+    try:
+        return path.read_bytes()
+    except OSError:
+        return None
+
+
+@cache
+def _processor() -> tuple[str, str]:
+    return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+
+
+@cache
+def _start() -> None:
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    for name in (*FROM_LIBM.values(), "sincos"):
+        address = _address(name)
+        if address is not None:
+            llvm.add_symbol(name, address)
+
+
+@cache
+def _library() -> Any:
+    if sys.platform == "win32":
+        return ctypes.CDLL("ucrtbase")
+    return ctypes.CDLL(ctypes.util.find_library("m"))
+
+
+def _address(name: str) -> int | None:
+    function = getattr(_library(), name, None)
+    return None if function is None else ctypes.cast(function, ctypes.c_void_p).value
+
+

@@ -1,0 +1,266 @@
+"""Arithmetic on scalars and vectors as a graph, simplified while it grows; and straight-line programs made of it.
+
+A node is an operation on earlier nodes. Equal operations are one node; sums with zero, products with zero and one are
+gone before they exist, so that structural zeros of Jacobians and Hessians cost nothing. A node is a scalar or a vector
+with one entry for each unknown (the derivative of some scalar along theta); a scalar beside a vector stands for all its
+entries.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Objects = NDArray[np.object_]
+
+FOLDED: dict[str, Callable[..., Any]] = {
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "div": lambda a, b: np.float64(a) / b,
+    "neg": lambda a: -a,
+    "lt": lambda a, b: a < b,
+    "le": lambda a, b: a <= b,
+    "eq": lambda a, b: a == b,
+    "ne": lambda a, b: a != b,
+    "and": lambda a, b: a and b,
+    "or": lambda a, b: a or b,
+    "not": lambda a: not a,
+    "select": lambda c, a, b: a if c else b,
+    "max": np.maximum,
+    "min": np.minimum,
+    "abs": abs,
+    "floor": np.floor,
+    "ceil": np.ceil,
+    "sqrt": np.sqrt,
+    "exp": np.exp,
+    "log": np.log,
+    "pow": np.float_power,
+    "sin": np.sin,
+    "cos": np.cos,
+    "tan": np.tan,
+    "asin": np.arcsin,
+    "acos": np.arccos,
+    "atan": np.arctan,
+    "atan2": np.arctan2,
+    "sinh": np.sinh,
+    "cosh": np.cosh,
+    "tanh": np.tanh,
+    "asinh": np.arcsinh,
+    "acosh": np.arccosh,
+    "atanh": np.arctanh,
+    "expm1": np.expm1,
+    "log1p": np.log1p,
+    "cbrt": np.cbrt,
+    "exp2": np.exp2,
+    "erf": math.erf,
+    "erfc": math.erfc,
+}
+"""Every operation, with its value for numbers."""
+
+CONDITIONS = ("lt", "le", "eq", "ne", "and", "or", "not")
+COMMUTATIVE = ("add", "mul", "eq", "ne", "and", "or", "max", "min")
+
+
+class Node:
+    """One operation of a graph; arithmetic with nodes and numbers makes further ones.
+
+    Attributes
+    ----------
+    index : its place in the graph, after those of its arguments
+    op : an operation of `FOLDED`, "const" or "load"
+    args : its arguments; the number of a constant; (pointer, offset) of what is loaded
+    vector : whether it is a vector
+    """
+
+    __slots__ = ("args", "graph", "index", "op", "vector")
+
+    def __init__(self, graph: Graph, index: int, op: str, args: tuple[Any, ...], vector: bool) -> None:
+        self.graph, self.index, self.op, self.args, self.vector = graph, index, op, args, vector
+
+    @property
+    def number(self) -> Any:
+        """The number that a constant is; None for everything else."""
+        return self.args[0] if self.op == "const" else None
+
+    def __add__(self, other: Any) -> Any:
+        return self._with("add", self, other)
+
+    def __radd__(self, other: Any) -> Any:
+        return self._with("add", other, self)
+
+    def __sub__(self, other: Any) -> Any:
+        return self._with("sub", self, other)
+
+    def __rsub__(self, other: Any) -> Any:
+        return self._with("sub", other, self)
+
+    def __mul__(self, other: Any) -> Any:
+        return self._with("mul", self, other)
+
+    def __rmul__(self, other: Any) -> Any:
+        return self._with("mul", other, self)
+
+    def __truediv__(self, other: Any) -> Any:
+        return self._with("div", self, other)
+
+    def __rtruediv__(self, other: Any) -> Any:
+        return self._with("div", other, self)
+
+    def _with(self, op: str, one: Any, other: Any) -> Any:
+        if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
+            return NotImplemented  # NumPy then does it entry by entry
+        return self.graph.apply(op, one, other)
+
+    def __neg__(self) -> Node:
+        return self.graph.apply("neg", self)
+
+
+class Graph:
+    """Nodes in the order in which they can be computed."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Node] = []
+        self._known: dict[tuple[Any, ...], Node] = {}
+
+    def constant(self, number: Any) -> Node:
+        """A number, or a truth value."""
+        number = bool(number) if isinstance(number, bool | np.bool_) else float(number)
+        return self._node("const", (number,), False, key=("const", type(number), number, math.copysign(1.0, number)))
+
+    def load(self, pointer: str, offset: int, vector: bool = False) -> Node:
+        """What is found in memory."""
+        return self._node("load", (pointer, offset), vector)
+
+    def loads(self, pointer: str, count: int, offset: int = 0, vector: bool = False) -> Objects:
+        """Neighbours in memory: (count,)."""
+        return as_objects([self.load(pointer, offset + k, vector) for k in range(count)])
+
+    def unit(self, position: int) -> Node:
+        """The vector with one 1."""
+        return self._node("unit", (position,), True)
+
+    def zeros(self) -> Node:
+        """The vector of zeros."""
+        return self._node("zeros", (), True)
+
+    def apply(self, op: str, *given: Any) -> Node:
+        """The node of an operation; it may be an older or a simpler one."""
+        args = tuple(a if isinstance(a, Node) else self.constant(a) for a in given)
+        if all(a.op == "const" for a in args):
+            with np.errstate(all="ignore"):
+                return self.constant(FOLDED[op](*(a.args[0] for a in args)))
+        simpler = self._simpler(op, args)
+        if simpler is not None:
+            return simpler
+        if op in COMMUTATIVE and args[0].index > args[1].index:
+            args = args[::-1]
+        return self._node(op, args, any(a.vector for a in args))
+
+    def _simpler(self, op: str, args: tuple[Node, ...]) -> Node | None:
+        a, b = args[0], args[-1]
+        if op in ("add", "sub"):
+            if b.number == 0.0:
+                return a
+            if a.number == 0.0:
+                return b if op == "add" else self.apply("neg", b)
+            if b.op == "neg":
+                return self.apply("sub" if op == "add" else "add", a, b.args[0])
+            if a.op == "neg" and op == "add":
+                return self.apply("sub", b, a.args[0])
+        elif op == "mul":
+            for this, other in ((a, b), (b, a)):
+                if this.number == 0.0:
+                    return this
+                if this.number == 1.0:
+                    return other
+                if this.number == -1.0:
+                    return self.apply("neg", other)
+                if this.op == "neg":
+                    return self.apply("neg", self.apply("mul", this.args[0], other))
+        elif op == "div":
+            if a.number == 0.0 or b.number == 1.0:
+                return a
+            if b.number is not None and math.frexp(b.number)[0] in (0.5, -0.5):
+                return self.apply("mul", a, 1.0 / b.number)
+        elif op == "neg" and a.op == "neg":
+            return a.args[0]
+        elif op == "select":
+            if args[0].number is not None:
+                return args[1] if args[0].number else args[2]
+            if args[1] is args[2]:
+                return args[1]
+        return None
+
+    def _node(self, op: str, args: tuple[Any, ...], vector: bool, key: tuple[Any, ...] | None = None) -> Node:
+        key = key or (op, vector, *((a.index if isinstance(a, Node) else a) for a in args))
+        node = self._known.get(key)
+        if node is None:
+            node = Node(self, len(self.nodes), op, args, vector)
+            self._known[key] = node
+            self.nodes.append(node)
+        return node
+
+
+def as_objects(values: Sequence[Any]) -> Objects:
+    """An array (len,) of nodes and numbers."""
+    array = np.empty(len(values), dtype=object)
+    for k, value in enumerate(values):
+        array[k] = value
+    return array
+
+
+def needed(outputs: Sequence[Node]) -> list[Node]:
+    """All nodes that some outputs depend on, in order."""
+    if not outputs:
+        return []
+    graph = outputs[0].graph
+    wanted = np.zeros(len(graph.nodes), bool)
+    for node in outputs:
+        wanted[node.index] = True
+    for node in reversed(graph.nodes):
+        if wanted[node.index]:
+            for a in node.args:
+                if isinstance(a, Node):
+                    wanted[a.index] = True
+    return [graph.nodes[k] for k in np.flatnonzero(wanted)]
+
+
+class Template:
+    """A function of scalars that can be put into graphs: inputs and outputs are lists of arrays.
+
+    Parameters
+    ----------
+    inputs : list of arrays of nodes, which are loads from pointers "0", "1", ...
+    outputs : list of arrays of nodes and numbers
+    """
+
+    def __init__(self, outputs: Sequence[Objects]) -> None:
+        self.shapes = [np.shape(a) for a in outputs]
+        self._flat = [list(np.asarray(a, dtype=object).reshape(-1)) for a in outputs]
+        self._needed: dict[tuple[int, ...], list[Node]] = {}
+
+    def __call__(self, graph: Graph, *inputs: Any, only: Sequence[int] | None = None) -> list[Objects]:
+        """The outputs (or `only` some, in the order asked for) for given inputs, arrays of nodes."""
+        chosen = tuple(range(len(self._flat)) if only is None else only)
+        if chosen not in self._needed:
+            self._needed[chosen] = needed([v for k in chosen for v in self._flat[k] if isinstance(v, Node)])
+        given = [np.asarray(a, dtype=object).reshape(-1) for a in inputs]
+        made: dict[int, Node] = {}
+        for node in self._needed[chosen]:
+            if node.op == "load":
+                value = given[int(node.args[0])][node.args[1]]
+                made[node.index] = value if isinstance(value, Node) else graph.constant(value)
+            elif node.op == "const":
+                made[node.index] = graph.constant(node.args[0])
+            else:
+                made[node.index] = graph.apply(node.op, *(made[a.index] for a in node.args))
+        results = []
+        for k in chosen:
+            values = [made[v.index] if isinstance(v, Node) else graph.constant(v) for v in self._flat[k]]
+            results.append(as_objects(values).reshape(self.shapes[k]))
+        return results
