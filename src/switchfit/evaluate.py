@@ -105,6 +105,7 @@ class Evaluator:
         self.arguments = [problem.arguments(e, mesh) for e, mesh in enumerate(self.meshes)]
         self._compiled: set[tuple[Method, Matrix]] = set()
         self._native: dict[Matrix, list[NativeExperiment | None]] = {}
+        self._on_device: list[Arguments] | None = None
         self._priors = problem.unknowns.priors if problem.unknowns.priors.any else None
         self._places = [(own, places[own]) for places in problem.places for own in [np.flatnonzero(places >= 0)]]
 
@@ -194,12 +195,13 @@ class Evaluator:
         self.arguments = list(arguments)
         self.meshes = [Mesh.from_times(np.asarray(own.nodes)) for own in arguments]
         self._native.clear()
+        self._on_device = None
 
     def _natives(self, matrix: Matrix) -> list[NativeExperiment | None]:
         """What evaluates each experiment in machine code, None where nothing does."""
         if matrix not in self._native:
             given = zip(self.problem.structures, self.arguments, self.meshes, strict=True)
-            self._native[matrix] = [native_experiment(s, a, mesh.times, matrix == "exact") for s, a, mesh in given]
+            self._native[matrix] = [native_experiment(s, a, mesh.times, 2 if matrix == "exact" else 1) for s, a, mesh in given]
         return self._native[matrix]
 
     def _results(self, theta: FloatArray, side: int, method: Method, matrix: Matrix) -> list[Any]:
@@ -228,9 +230,12 @@ class Evaluator:
 
     def _each(self, theta: FloatArray) -> list[tuple[Structure, Arguments, FloatArray, FloatArray]]:
         theta = np.asarray(theta, dtype=np.float64)
+        if self._on_device is None:
+            with float64():
+                self._on_device = jax.device_put(self.arguments)
         return [
             (structure, arguments, *self.problem.vectors(theta, e))
-            for e, (structure, arguments) in enumerate(zip(self.problem.structures, self.arguments, strict=True))
+            for e, (structure, arguments) in enumerate(zip(self.problem.structures, self._on_device, strict=True))
         ]
 
 

@@ -85,6 +85,11 @@ class Structure:
         return tableau_of(self.solver)
 
     @property
+    def outputs(self) -> tuple[tuple[Observe | None, int], ...]:
+        """What sees the state, reference signals first, then the Measurements: function and channels of each."""
+        return (*self.references, *((sensor.observe, sensor.channels) for sensor in self.measurements))
+
+    @property
     def N(self) -> int:
         """Number of transitions."""
         return len(self.reset_maps)
@@ -554,7 +559,7 @@ def arguments_of(
     mesh: Mesh,
     sample_lengths: Sequence[int],
 ) -> Arguments:
-    """The arrays of one experiment on a mesh that holds all its sample times and knots as nodes.
+    """The arrays (NumPy's) of one experiment on a mesh that holds all its sample times and knots as nodes.
 
     The samples of each of its Measurements are padded to the given lengths.
     """
@@ -565,9 +570,7 @@ def arguments_of(
     samples = tuple(_padded_samples(*given, mesh) for given in zip(measurements, sample_lengths, strict=True))
     weights = tuple(_compact(item.weights) for item in _of_kind(experiment.data, ReferenceSignal))
     x0 = np.zeros(structure.n) if callable(initial) else initial_values(initial)
-    arrays = (mesh.nodes, _signals_by_cell(experiment, mesh), fixed, x0, samples, weights)
-    with float64():
-        return Arguments(*jax.device_put(arrays))
+    return Arguments(mesh.nodes, _signals_by_cell(experiment, mesh), fixed, x0, samples, weights)  # type: ignore[arg-type]
 
 
 def initial_values(initial: Any) -> FloatArray:

@@ -103,7 +103,7 @@ def _graded(ends: FloatArray, steps: _Steps, pieces: int) -> FloatArray:
 def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -> FloatArray:
     """All times at which the adaptive solver stopped, from t0 to tf, strictly increasing."""
     experiment, structure = problem.experiments[e], problem.structures[e]
-    whole = jax.tree.map(np.asarray, problem.arguments(e, coarse))
+    whole = problem.arguments(e, coarse)
     arguments, signals = whole.without_mesh(), whole.signals
     tau, p = problem.vectors(theta, e)
     ends = np.concatenate([[experiment.t0], tau, [experiment.tf]])

@@ -112,7 +112,7 @@ def sensitivity(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> Sens
     """
     structure = problem.structures[e]
     tau, p = problem.vectors(theta, e)
-    whole = jax.tree.map(np.asarray, problem.arguments(e, mesh))
+    whole = problem.arguments(e, mesh)
     arguments = whole.without_mesh()
     layout = rows(mesh.nodes, tau, 1.0, np)
     cell, start, end = (np.reshape(a, -1) for a in (layout.cell, layout.start, layout.end))

@@ -18,6 +18,7 @@ from switchfit.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.losses import robust
 from switchfit.mesh import CHUNK, Mesh, Rows, rows
 from switchfit.model import Arguments, Model, Piece, Structure, float64
+from switchfit.native.program import NativeExperiment, native_experiment
 from switchfit.problem import Problem
 from switchfit.refine import after_reset, initial_state, refined_mesh
 from switchfit.rungekutta import step
@@ -188,23 +189,14 @@ def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> Run:
     """Integrate experiment e over the rows of a mesh, mode by mode."""
     structure = problem.structures[e]
     tau, p = problem.vectors(theta, e)
-    whole = jax.tree.map(np.asarray, problem.arguments(e, mesh))
-    arguments = whole.without_mesh()
+    whole = problem.arguments(e, mesh)
     layout = rows(mesh.nodes, tau, 1.0, np)
-    cell, start, end = (np.reshape(a, -1) for a in (layout.cell, layout.start, layout.end))
-    segments, cost = [], 0.0
     with float64(), compilation_cache():
-        x = np.asarray(initial_state(arguments, p, structure=structure.functions))
-        for i, mode in enumerate(structure.mode_of_segment):
-            if i > 0 and structure.reset_maps[i - 1] is not None:
-                x = np.asarray(after_reset(arguments, tau[i - 1], x, p, structure=structure, i=i - 1))
-            span = slice(layout.first_chunk[i] * CHUNK, layout.last_row[i] + 1)
-            pieces = Piece(whole.nodes[cell[span]], whole.signals[cell[span]])
-            part, added = _segment(structure, arguments, mode, x, p, start[span], end[span], pieces)
-            x = part.after[-1]
-            segments.append(part)
-            cost += added
-        cost += float(_terminal(arguments, x, p, structure=structure.functions))
+        native = native_experiment(structure, whole, mesh.times, order=0)
+        if native is not None:
+            cost, segments = _natively(structure, native, mesh.times, tau, p)
+        else:
+            cost, segments = _by_blocks(structure, whole, layout, tau, p)
     run = Run(cost, segments, np.asarray(layout.first_cell), mesh)
     first = sum(q for _, q in structure.references)
     named = problem.named(theta, e)
@@ -224,6 +216,45 @@ def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> Run:
         cost += 0.5 * float(np.sum(robust(sensor.loss, sensor.loss_scale, u)))
         first += sensor.channels
     return replace(run, cost=cost, seen=tuple(all_seen))
+
+
+def _natively(
+    structure: Structure, native: NativeExperiment, nodes: FloatArray, tau: FloatArray, p: FloatArray
+) -> tuple[float, list[Segment]]:
+    """Running and terminal costs, and all segments, by machine code."""
+    found = native.simulated(tau, p)
+    bounds = np.concatenate([nodes[:1], tau, nodes[-1:]])
+    lasts = [*found.first_cell[1:].tolist(), len(nodes) - 2]
+    segments = []
+    for i, (first, last) in enumerate(zip(found.first_cell.tolist(), lasts, strict=True)):
+        times = np.concatenate([bounds[i : i + 1], nodes[first + 1 : last + 1], bounds[i + 1 : i + 2]])
+        states, outputs = (a[first + i : last + i + 2] for a in (found.states, found.outputs))
+        before, y_before = states[:-1], outputs[:-1]
+        if i - 1 in structure.resets:
+            before = np.concatenate([found.reset_states[i - 1 : i], before[1:]])
+            y_before = np.concatenate([found.reset_outputs[i - 1 : i], y_before[1:]])
+        segments.append(Segment(times[:-1], times[1:], before, states[1:], y_before, outputs[1:]))
+    return found.cost, segments
+
+
+def _by_blocks(
+    structure: Structure, whole: Arguments, layout: Rows, tau: FloatArray, p: FloatArray
+) -> tuple[float, list[Segment]]:
+    """The same by JAX, some rows at a time."""
+    arguments = whole.without_mesh()
+    cell, start, end = (np.reshape(a, -1) for a in (layout.cell, layout.start, layout.end))
+    segments, cost = [], 0.0
+    x = np.asarray(initial_state(arguments, p, structure=structure.functions))
+    for i, mode in enumerate(structure.mode_of_segment):
+        if i > 0 and structure.reset_maps[i - 1] is not None:
+            x = np.asarray(after_reset(arguments, tau[i - 1], x, p, structure=structure, i=i - 1))
+        span = slice(layout.first_chunk[i] * CHUNK, layout.last_row[i] + 1)
+        pieces = Piece(whole.nodes[cell[span]], whole.signals[cell[span]])
+        part, added = _segment(structure, arguments, mode, x, p, start[span], end[span], pieces)
+        x = part.after[-1]
+        segments.append(part)
+        cost += added
+    return cost + float(_terminal(arguments, x, p, structure=structure.functions)), segments
 
 
 def _late_outputs(
@@ -344,8 +375,8 @@ def _block(
     costs, before, after = modes[0](x) if len(modes) == 1 else lax.switch(mode, modes, x)
 
     def outputs(t: jax.Array, x: jax.Array) -> jax.Array:
-        seen = (*structure.references, *((sensor.observe, sensor.channels) for sensor in structure.measurements))
-        return jnp.concatenate([jnp.zeros(0), *(model.observed(observe, t, x, p, q) for observe, q in seen)])
+        seen = [model.observed(observe, t, x, p, q) for observe, q in structure.outputs]
+        return jnp.concatenate([jnp.zeros(0), *seen])
 
     over_rows = jax.vmap(outputs)
     return costs.sum(), before, after, over_rows(start, before), over_rows(end, after)

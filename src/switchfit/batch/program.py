@@ -27,6 +27,7 @@ from switchfit.data import FloatArray
 from switchfit.evaluate import Evaluator, derivatives
 from switchfit.mesh import Mesh
 from switchfit.model import Arguments, Structure, float64
+from switchfit.native.foreign import foreign_derivatives
 from switchfit.optimize import Status
 from switchfit.optimize.traced import Constraints, Outcome, minimize_traced
 from switchfit.optimize.variables import Variables
@@ -290,6 +291,9 @@ def _total(
             given: tuple[Arguments, jax.Array, jax.Array], structure: Structure = structure
         ) -> tuple[jax.Array, jax.Array, jax.Array]:
             own, tau, p = given
+            natively = None if layout.lockstep else foreign_derivatives(structure, own, tau, p)
+            if natively is not None:
+                return natively
             return derivatives(own, tau, p, jnp.ones(()), structure=structure, method="discrete-adjoint")
 
         operands = (given, tau, extended[where[:, N:]])

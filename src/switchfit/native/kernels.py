@@ -86,11 +86,13 @@ class Kernels:
         opens, closes   derivatives of the start and the end of a row: two vectors
         psi, jump       costate; what samples at the end of a row add to it
         J, g, H         cost, gradient (width,), Hessian (D, width): sums
+        time, y         a moment, and what the sensors see then
         entries         second derivatives at the stages of a row, (s, count); Zt: derivative of the stage's time
     """
 
-    def __init__(self, structure: Structure, sizes: Sizes, second: bool) -> None:
-        self.structure, self.sizes, self.second = structure, sizes, second
+    def __init__(self, structure: Structure, sizes: Sizes, order: int) -> None:
+        self.structure, self.sizes, self.order = structure, sizes, order
+        self.second = order == 2
         self.module = Module(sizes.width)
         self.has_samples = bool(structure.measurements)
 
@@ -118,6 +120,9 @@ class Kernels:
             piece = Piece(origin, coefficients)
             f, ell = model.field(mode, piece), model.density(piece)
             zero = jnp.zeros(())
+            if self.order == 0:
+                nothing = [zero] * 3
+                return [f(t, x, p), *nothing, ell(t, x, p)]
             slope = (f(t, x, p), *jax.jacfwd(f, argnums=(0, 1, 2))(t, x, p))
             cost = (zero, zero, jnp.zeros(n), jnp.zeros(M))
             if model.has_running_cost:
@@ -149,6 +154,8 @@ class Kernels:
         def end(x: Any, p: Any, *constants: Any) -> Any:
             model = self.model(constants)
             cost = lambda t, x, p: model.terminal(x, p)  # noqa: E731
+            if self.order == 0:
+                return [cost(0.0, x, p)]
             return [cost(0.0, x, p), *_first_and_second(cost, jnp.zeros(()), x, p)]
 
         return traced(end, (self.sizes.n,), (self.sizes.M,), *self.sizes.constants)
@@ -158,6 +165,8 @@ class Kernels:
 
         def reset(t: Any, x: Any, p: Any, w: Any, *constants: Any) -> Any:
             R = self.model(constants).reset(i)
+            if self.order == 0:
+                return [R(t, x, p)]
             jacobians = jax.jacfwd(R, argnums=(0, 1, 2))(t, x, p)
             return [R(t, x, p), *jacobians, *_first_and_second(lambda t, x, p: w @ R(t, x, p), t, x, p)]
 
@@ -169,6 +178,8 @@ class Kernels:
 
         def start(p: Any, w: Any, *constants: Any) -> Any:
             x0 = self.model(constants).initial_state
+            if self.order == 0:
+                return [x0(p)]
             weighted = lambda p: w @ x0(p)  # noqa: E731
             return [x0(p), jax.jacfwd(x0)(p), jax.grad(weighted)(p), jax.jacfwd(jax.grad(weighted))(p)]
 
@@ -209,12 +220,13 @@ class Kernels:
         for j in range(STAGES):
             X_j = x + h * _combined(a[j], K) if any(a[j]) else x
             t_j = start + c[j] * h
-            f, f_t, f_x, f_p, ell = stage(
-                graph, t_j, X_j, p, w, nothing, origin, signal, *constants, only=(F, F_T, F_X, F_P, ELL)
-            )
-            stores += _stored("X", j * n, X_j)
+            given = (t_j, X_j, p, w, nothing, origin, signal, *constants)
+            f, ell = stage(graph, *given, only=(F, ELL))
+            if self.order > 0:
+                stores += _stored("X", j * n, X_j)
             cost = cost + b[j] * ell.item()
             if self.second:
+                f_t, f_x, f_p = stage(graph, *given, only=(F_T, F_X, F_P))
                 X_d = Z + h * _combined(a[j], K_d) if any(a[j]) else Z
                 if end_row:
                     X_d = X_d + h_d * _combined(a[j], K) if any(a[j]) else X_d
@@ -349,8 +361,12 @@ class Kernels:
         graph = Graph()
         p, constants = self.inputs(graph)
         x = graph.loads("x", self.sizes.n)
-        cost, _, g_x, g_p, *second = at(graph, x, p, constants)
+        cost, *derivatives = at(graph, x, p, constants)
         stores = [("J", 0, graph.load("J", 0) + cost.item())]
+        if self.order == 0:
+            self.module.straight(name, pointers, stores)
+            return
+        _, g_x, g_p, *second = derivatives
         stores += _stored(jump, 0, graph.loads(jump, self.sizes.n) + g_x)
         g = graph.load("g", 0, vector=True) + _along(g_p, self.units(graph))
         stores.append(("g", 0, g))
@@ -367,13 +383,16 @@ class Kernels:
         p, constants = self.inputs(graph)
         x, t = graph.loads("x", n), graph.load("tau", i)
         none = np.full(n, graph.constant(0.0), dtype=object)
-        after, R_t, R_x, R_p = template(graph, t, x, p, none, *constants, only=range(4))
+        (after,) = template(graph, t, x, p, none, *constants, only=(0,))
         stores = _stored("x_after", 0, after)
         if self.second:
+            R_t, R_x, R_p = template(graph, t, x, p, none, *constants, only=(1, 2, 3))
             Z = graph.loads("Z", n, vector=True)
             Z_after = R_x @ Z + _along(R_p, self.units(graph)) + R_t * graph.unit(i)
             stores += [("Z_after", k, _as_vector(graph, v)) for k, v in enumerate(Z_after)]
         self.module.straight(f"reset_{i}", RESET, stores)
+        if self.order == 0:
+            return
 
         graph = Graph()
         p, constants = self.inputs(graph)
@@ -393,12 +412,15 @@ class Kernels:
         graph = Graph()
         p, constants = self.inputs(graph)
         none = np.full(n, graph.constant(0.0), dtype=object)
-        x, x_p = template(graph, p, none, *constants, only=(0, 1))
+        (x,) = template(graph, p, none, *constants, only=(0,))
         stores = _stored("x", 0, x)
         if self.second:
+            (x_p,) = template(graph, p, none, *constants, only=(1,))
             Z = _along(x_p, self.units(graph))
             stores += [("Z", k, _as_vector(graph, v)) for k, v in enumerate(Z)]
-        self.module.straight("start", ("c", "p", "x", "Z"), stores)
+        self.module.straight("start", START, stores)
+        if self.order == 0:
+            return
 
         graph = Graph()
         p, constants = self.inputs(graph)
@@ -411,7 +433,21 @@ class Kernels:
         if self.second:
             rows = [(N + k, graph.load("H", N + k, vector=True), _along(g_pp[k], units)) for k in range(len(units))]
             stores += [("H", d, row + more) for d, row, more in rows]
-        self.module.straight("start_back", ("c", "p", "psi", "jump", "g", "H"), stores)
+        self.module.straight("start_back", START_BACK, stores)
+
+    def output_function(self) -> None:
+        """What all sensors see: references first, then Measurements."""
+
+        def outputs(t: Any, x: Any, p: Any, *constants: Any) -> Any:
+            model = self.model(constants)
+            seen = [model.observed(observe, t, x, p, q) for observe, q in self.structure.outputs]
+            return [jnp.concatenate([jnp.zeros(0), *seen])]
+
+        template = traced(outputs, (), (self.sizes.n,), (self.sizes.M,), *self.sizes.constants)
+        graph = Graph()
+        p, constants = self.inputs(graph)
+        (y,) = template(graph, graph.load("time", 0), graph.loads("x", self.sizes.n), p, *constants)
+        self.module.straight("outputs", OUTPUTS, _stored("y", 0, y))
 
 
 FORWARD = ("c", "p", "row", "signal", "opens", "closes", "x", "Z", "X", "XZ", "x_after", "Z_after", "J")
@@ -419,6 +455,9 @@ BACKWARD = ("c", "p", "row", "signal", "opens", "closes", "psi", "jump", "X", "X
 LENGTH = ("opens", "closes", "length", "H")
 STAGE_TIME = ("opens", "closes", "Zt")
 CURVATURE = ("entries", "Zt", "Z", "H")
+START = ("c", "p", "x", "Z")
+START_BACK = ("c", "p", "psi", "jump", "g", "H")
+OUTPUTS = ("c", "p", "time", "x", "y")
 RESET = ("c", "p", "tau", "x", "Z", "x_after", "Z_after")
 RESET_BACK = ("c", "p", "tau", "x", "Z", "psi", "g", "H")
 SAMPLE = ("c", "p", "time", "value", "weight", "x", "Z", "jump", "J", "g", "H")

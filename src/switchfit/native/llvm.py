@@ -174,14 +174,24 @@ class _Writer:
 
 
 class Program:
-    """Machine code of a module, alive as long as this object."""
+    """Machine code of a module, alive as long as this object.
 
-    def __init__(self, engine: Any) -> None:
-        self._engine = engine
+    Attributes
+    ----------
+    key : str
+        Different for every module, the same in every process.
+    """
+
+    def __init__(self, engine: Any, key: str) -> None:
+        self._engine, self.key = engine, key
+
+    def address(self, name: str) -> int:
+        """Where one of its functions is."""
+        return int(self._engine.get_function_address(name))
 
     def function(self, name: str, *types: Any) -> Any:
         """One of its functions that return nothing, to be called from Python."""
-        return ctypes.CFUNCTYPE(None, *types)(self._engine.get_function_address(name))
+        return ctypes.CFUNCTYPE(None, *types)(self.address(name))
 
 
 def compiled(text: str) -> Program:
@@ -196,7 +206,7 @@ def compiled(text: str) -> Program:
         path = folder / f"native-{key}"
         engine.set_object_cache(lambda _, code: _write(path, code), lambda _: _read(path))
     engine.finalize_object()
-    return Program(engine)
+    return Program(engine, key)
 
 
 def _write(path: Path, code: bytes) -> None:

@@ -1,0 +1,279 @@
+"""The loops around the straight lines of `switchfit.native.kernels`, in LLVM's language, written by hand.
+
+Rows are numbered by ``cell + segment``: each transition cuts one cell in two.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from switchfit.model import Structure
+from switchfit.native.kernels import (
+    BACKWARD,
+    CURVATURE,
+    END,
+    FORWARD,
+    LENGTH,
+    OUTPUTS,
+    RESET,
+    RESET_BACK,
+    SAMPLE,
+    STAGE_TIME,
+    STAGES,
+    START,
+    START_BACK,
+    Sizes,
+)
+
+POINTERS = (
+    *("nodes", "signals", "c", "p", "tau", "first_cell", "states", "tangents", "stages", "stage_tangents", "jumps"),
+    *("units", "psi", "J", "g", "H", "reset_states", "reset_tangents", "entries", "length", "times", "y"),
+)
+"""What the driver finds in its table of pointers; then four for each Measurements: cell, time, value, weight."""
+
+
+class Driver:
+    """The loops around the straight lines, written by hand."""
+
+    def __init__(self, structure: Structure, sizes: Sizes, order: int) -> None:
+        self.structure, self.sizes, self.order = structure, sizes, order
+        self.lines: list[str] = []
+        self.count = 0
+
+    def line(self, text: str) -> None:
+        self.lines.append(f"  {text}")
+
+    def let(self, text: str) -> str:
+        self.count += 1
+        self.line(f"%t{self.count} = {text}")
+        return f"%t{self.count}"
+
+    def at(self, pointer: str, *factors: Any) -> str:
+        """Address of ``pointer[product of the factors]``, in doubles."""
+        offset = str(factors[0])
+        for factor in factors[1:]:
+            offset = self.let(f"mul i64 {offset}, {factor}")
+        return self.let(f"getelementptr inbounds double, ptr {pointer}, i64 {offset}")
+
+    def pointers(self) -> dict[str, str]:
+        """All pointers of the table, loaded."""
+        found = {}
+        for k, name in enumerate(POINTERS):
+            found[name] = self.let(f"load ptr, ptr {self.at('%table', k)}")
+        return found
+
+    def into(self, pointer: str, offset: int) -> str:
+        """Address of a byte behind a pointer."""
+        return self.let(f"getelementptr inbounds i8, ptr {pointer}, i64 {offset}")
+
+    def call(self, name: str, order: tuple[str, ...], given: dict[str, str]) -> None:
+        self.line(f"call void @{name}({', '.join(f'ptr {given[key]}' for key in order)})")
+
+    def finished(self, signature: str) -> str:
+        text = f"define {signature} {{\nentry:\n" + "\n".join(self.lines) + "\n  ret void\n}\n"
+        self.lines, self.count = [], 0
+        return text
+
+    def _row(self, found: dict[str, str], cell: str) -> dict[str, str]:
+        """Times, signals and directions of the row of a segment in a cell, and whether it is an end row."""
+        N, S, width = self.sizes.N, self.sizes.signals, self.sizes.width
+        first, last = self.let(f"icmp eq i64 {cell}, %first"), self.let(f"icmp eq i64 {cell}, %last")
+        here = self.let(f"load double, ptr {self.at(found['nodes'], cell)}")
+        after = self.let(f"add i64 {cell}, 1")
+        there = self.let(f"load double, ptr {self.at(found['nodes'], after)}")
+        start = self.let(f"select i1 {first}, double %begins, double {here}")
+        end = self.let(f"select i1 {last}, double %finishes, double {there}")
+        for k, value in enumerate((start, end, here)):
+            self.line(f"store double {value}, ptr {self.at('%row', k)}")
+        later, earlier = self.let("icmp sgt i64 %segment, 0"), self.let(f"icmp slt i64 %segment, {N}")
+        opens, closes = self.let(f"and i1 {first}, {later}"), self.let(f"and i1 {last}, {earlier}")
+        next_ = self.let("add i64 %segment, 1")
+        opening, closing = (
+            self.at(found["units"], self.let(f"select i1 {flag}, i64 {index}, i64 0"), width)
+            for flag, index in ((opens, "%segment"), (closes, next_))
+        )
+        return {
+            "row": "%row",
+            "signal": self.at(found["signals"], cell, 4 * S),
+            "opens": opening,
+            "closes": closing,
+            "first": first,
+            "end row": self.let(f"or i1 {opens}, {closes}"),
+        }
+
+    def _at_row(self, found: dict[str, str], row: str) -> dict[str, str]:
+        n, width = self.sizes.n, self.sizes.width
+        return {
+            "X": self.at(found["stages"], row, STAGES * n),
+            "XZ": self.at(found["stage_tangents"], row, STAGES * n * width),
+        }
+
+    def forward_segment(self, mode: int) -> str:
+        """All rows of a segment, forward."""
+        n, width = self.sizes.n, self.sizes.width
+        self.line("%row = alloca [3 x double]")
+        found = self.pointers()
+        self.line("br label %loop")
+        self.lines.append("loop:")
+        self.line("%cell = phi i64 [%first, %entry], [%more, %next]")
+        place = self._row(found, "%cell")
+        row = self.let("add i64 %cell, %segment")
+        after = self.let(f"add i64 {row}, 1")
+        x = self.let(f"select i1 {place['first']}, ptr %x, ptr {self.at(found['states'], row, n)}")
+        Z = self.let(f"select i1 {place['first']}, ptr %Z, ptr {self.at(found['tangents'], row, n * width)}")
+        given = found | place | self._at_row(found, row) | {"x": x, "Z": Z}
+        given |= {
+            "x_after": self.at(found["states"], after, n),
+            "Z_after": self.at(found["tangents"], after, n * width),
+        }
+        self.line(f"br i1 {place['end row']}, label %is_end, label %is_inner")
+        self.lines.append("is_end:")
+        self.call(f"forward_end_{mode}", FORWARD, given)
+        self.line("br label %next")
+        self.lines.append("is_inner:")
+        self.call(f"forward_inner_{mode}", FORWARD, given)
+        self.line("br label %next")
+        self.lines.append("next:")
+        self.line("%more = add i64 %cell, 1")
+        self.line("%done = icmp sgt i64 %more, %last")
+        self.line("br i1 %done, label %out, label %loop")
+        self.lines.append("out:")
+        return self.finished(f"internal void @forward_{mode}({SEGMENT}, ptr %x, ptr %Z)")
+
+    def backward_segment(self, mode: int, inner: int, end: int) -> str:
+        """All rows of a segment, backward; with the numbers of entries of the second derivatives."""
+        n, width = self.sizes.n, self.sizes.width
+        self.line("%row = alloca [3 x double]")
+        self.line(f"%Zt = alloca [{width} x double]")
+        found = self.pointers()
+        self.line("br label %loop")
+        self.lines.append("loop:")
+        self.line("%cell = phi i64 [%last, %entry], [%less, %next]")
+        place = self._row(found, "%cell")
+        row = self.let("add i64 %cell, %segment")
+        after = self.let(f"add i64 {row}, 1")
+        given = found | place | self._at_row(found, row) | {"jump": self.at(found["jumps"], after, n), "Zt": "%Zt"}
+        self.line(f"br i1 {place['end row']}, label %is_end, label %is_inner")
+        for kind, count in (("end", end), ("inner", inner)):
+            self.lines.append(f"is_{kind}:")
+            self.call(f"backward_{kind}_{mode}", BACKWARD, given)
+            if self.order == 2:
+                if kind == "end":
+                    self.call("length", LENGTH, given)
+                for j in range(STAGES):
+                    at_stage = {
+                        "entries": self.at(found["entries"], j * count),
+                        "Z": self.at(given["XZ"], j * n * width),
+                    }
+                    if kind == "end":
+                        self.call(f"stage_time_{j}", STAGE_TIME, given)
+                    self.call(f"curvature_{kind}_{mode}", CURVATURE, given | at_stage)
+            self.line("br label %next")
+        self.lines.append("next:")
+        self.line("%less = sub i64 %cell, 1")
+        self.line("%done = icmp slt i64 %less, %first")
+        self.line("br i1 %done, label %out, label %loop")
+        self.lines.append("out:")
+        return self.finished(f"internal void @backward_{mode}({SEGMENT})")
+
+    def samples(self, k: int, q: int) -> str:
+        """All samples of the k-th Measurements."""
+        n, N, width = self.sizes.n, self.sizes.N, self.sizes.width
+        found = self.pointers()
+        place = len(POINTERS) + 4 * k
+        cells, times, values, weights = (self.let(f"load ptr, ptr {self.at('%table', place + m)}") for m in range(4))
+        begins = [self.let(f"load i64, ptr {self.at(found['first_cell'], i)}") for i in range(1, N + 1)]
+        self.line("br label %loop")
+        self.lines.append("loop:")
+        self.line("%sample = phi i64 [0, %entry], [%more, %loop]")
+        cell = self.let(f"load i64, ptr {self.at(cells, '%sample')}")
+        state = self.let(f"add i64 {cell}, 1")
+        for begin in begins:
+            beyond = self.let(f"icmp sge i64 {cell}, {begin}")
+            state = self.let(f"add i64 {state}, {self.let(f'zext i1 {beyond} to i64')}")
+        given = found | {
+            "x": self.at(found["states"], state, n),
+            "Z": self.at(found["tangents"], state, n * width),
+            "jump": self.at(found["jumps"], state, n),
+            "time": self.at(times, "%sample"),
+            "value": self.at(values, "%sample", q),
+            "weight": self.at(weights, "%sample", q),
+        }
+        self.call(f"sample_{k}", SAMPLE, given)
+        self.line("%more = add i64 %sample, 1")
+        self.line("%done = icmp sge i64 %more, %count")
+        self.line("br i1 %done, label %out, label %loop")
+        self.lines.append("out:")
+        return self.finished(f"internal void @samples_{k}(ptr %table, i64 %count)")
+
+    def whole(self) -> str:
+        """Everything, in order."""
+        structure, n, N, width = self.structure, self.sizes.n, self.sizes.N, self.sizes.width
+        found = self.pointers()
+        taus = [self.let(f"load double, ptr {self.at(found['tau'], i)}") for i in range(N)]
+        bounds = ["%t0", *taus, "%tf"]
+        firsts = [self.let(f"load i64, ptr {self.at(found['first_cell'], i)}") for i in range(N + 1)]
+        lasts = [*firsts[1:], self.let("sub i64 %cells, 1")]
+        spans = [
+            f"ptr %table, i64 {i}, i64 {firsts[i]}, i64 {lasts[i]}, double {bounds[i]}, double {bounds[i + 1]}"
+            for i in range(N + 1)
+        ]
+        befores = [{"x": found["states"], "Z": found["tangents"]}]
+        for i in range(N):
+            state = self.let(f"add i64 {lasts[i]}, {i + 1}")
+            befores.append(
+                {"x": self.at(found["states"], state, n), "Z": self.at(found["tangents"], state, n * width)}
+            )
+        self.call("start", START, found | befores[0])
+        for i, mode in enumerate(structure.mode_of_segment):
+            x, Z = befores[i]["x"], befores[i]["Z"]
+            if i - 1 in structure.resets:
+                behind = {
+                    "x_after": self.at(found["reset_states"], (i - 1) * n),
+                    "Z_after": self.at(found["reset_tangents"], (i - 1) * n * width),
+                }
+                self.call(f"reset_{i - 1}", RESET, found | befores[i] | behind)
+                x, Z = behind["x_after"], behind["Z_after"]
+            self.line(f"call void @forward_{mode}({spans[i]}, ptr {x}, ptr {Z})")
+        for k in range(len(structure.measurements) if self.order > 0 else 0):
+            self.line(f"call void @samples_{k}(ptr %table, i64 %count_{k})")
+        if structure.terminal:
+            state = self.let(f"add i64 %cells, {N}")
+            last = {"x": self.at(found["states"], state, n), "Z": self.at(found["tangents"], state, n * width)}
+            self.call("end", END, found | last)
+        if self.order == 0:
+            self.line("call void @all_outputs(ptr %table, i64 %cells)")
+        else:
+            for i, mode in reversed(list(enumerate(structure.mode_of_segment))):
+                self.line(f"call void @backward_{mode}({spans[i]})")
+                if i - 1 in structure.resets:
+                    self.call(f"reset_back_{i - 1}", RESET_BACK, found | befores[i])
+            self.call("start_back", START_BACK, found | {"jump": found["jumps"]})
+        counts = "".join(f", i64 %count_{k}" for k in range(len(structure.measurements)))
+        return self.finished(f"void @evaluate(ptr %table, i64 %cells, double %t0, double %tf{counts})")
+
+    def outputs(self) -> str:
+        """Outputs at all states: those behind rows, then those behind reset maps."""
+        n, N = self.sizes.n, self.sizes.N
+        q = sum(channels for _, channels in self.structure.outputs)
+        found = self.pointers()
+        count = self.let(f"add i64 %cells, {2 * N + 1}")
+        self.line("br label %loop")
+        self.lines.append("loop:")
+        self.line("%k = phi i64 [0, %entry], [%more, %loop]")
+        given = {
+            "time": self.at(found["times"], "%k"),
+            "x": self.at(found["states"], "%k", n),
+            "y": self.at(found["y"], "%k", q),
+        }
+        self.call("outputs", OUTPUTS, found | given)
+        self.line("%more = add i64 %k, 1")
+        self.line(f"%done = icmp sge i64 %more, {count}")
+        self.line("br i1 %done, label %out, label %loop")
+        self.lines.append("out:")
+        return self.finished("internal void @all_outputs(ptr %table, i64 %cells)")
+
+
+SEGMENT = "ptr %table, i64 %segment, i64 %first, i64 %last, double %begins, double %finishes"
+
+
