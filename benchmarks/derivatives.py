@@ -10,16 +10,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import vehicle
 from benchmarks.report import Report
 from benchmarks.timing import ms, take_turns
 from switchfit.evaluate import Evaluator
-from switchfit.model import Model, float64
-from switchfit.propagate import path_cost, propagate
+from switchfit.native.program import native_experiment
 
 COARSE = 58
 """Cells of the coarse mesh: with the two rows that the transitions add, 60 rows."""
@@ -38,7 +35,8 @@ def run(report: Report, quick: bool) -> None:
     report.section(
         "Exact J, gradient and Hessian of the vehicle",
         "One core. `call`: theta in, NumPy arrays out. `program`: the compiled program alone, its arguments already in "
-        "place (CasADi: through its buffers). The ratio is CasADi's fastest program to switchfit's call.",
+        "place (CasADi: through its buffers). `in JAX`: the same equations as XLA compiles them, as in batches on a GPU. "
+        "The ratio is CasADi's fastest program to switchfit's call.",
     )
     cases: list[tuple[str, Any, int | None, bool]] = [
         ("no reference, 60 rows", vehicle.without_reference(), COARSE, False),
@@ -70,10 +68,11 @@ def compare(
     evaluator = vehicle.evaluator_with(problem, cells)
     theta = problem.initial_theta
     rows = vehicle.table_of_rows(evaluator, theta)
-    ours = evaluator(theta, method="discrete-adjoint")
+    ours = evaluator(theta)
     calls: dict[str, Any] = {
-        "switchfit call": lambda: evaluator(theta, method="discrete-adjoint"),
-        "switchfit program": compiled_program(evaluator, theta),
+        "switchfit call": lambda: evaluator(theta),
+        "switchfit program": machine_code(evaluator, theta),
+        "switchfit in JAX": lambda: evaluator(theta, method="discrete-adjoint"),
     }
     build_seconds, gaps = {}, {}
     chosen = forms or (casadi_forms.QUICK if quick else list(casadi_forms.FORMS))
@@ -92,7 +91,7 @@ def compare(
     if compiled is not None:
         calls["casadi C"] = partial(casadi_forms.Timed(compiled), theta)
     timings = take_turns(calls, repetitions)
-    exact = evaluator.divided(4)(theta, method="discrete-adjoint").cost
+    exact = evaluator.divided(4).cost(theta)
     return {
         "rows": len(rows),
         "cost error": abs(ours.cost - exact) / abs(exact),
@@ -109,34 +108,14 @@ def gap(ours: Any, J: float, g: np.ndarray, H: np.ndarray) -> float:
     return max(float(np.max(np.abs(np.subtract(a, b))) / np.max(np.abs(a))) for a, b in pairs)
 
 
-def compiled_program(evaluator: Evaluator, theta: np.ndarray) -> Any:
-    """The program behind `Evaluator.__call__`, with its arguments in place already."""
-    from switchfit.evaluate import derivatives
-
+def machine_code(evaluator: Evaluator, theta: np.ndarray) -> Any:
+    """What `Evaluator.__call__` calls, without what Python does before and after."""
     structure, arguments = evaluator.problem.structures[0], evaluator.arguments[0]
-    N = structure.N
-    settings = {"structure": structure, "method": "discrete-adjoint", "matrix": "exact"}
-    with float64():
-        at = (arguments, jnp.asarray(theta[:N]), jnp.asarray(theta[N:]), jnp.ones(()))
-        program = derivatives.lower(*at, **settings).compile()
-    return lambda: jax.block_until_ready(program(*at))
-
-
-def compiled_cost(evaluator: Evaluator) -> Any:
-    """The cost alone as a function of theta (N transition times, then parameters): for optimisers that ask no more."""
-    structure, arguments = evaluator.problem.structures[0], evaluator.arguments[0]
-
-    @jax.jit
-    def cost(arguments: Any, theta: Any) -> Any:
-        model = Model(structure, arguments)
-        tau, p = theta[: structure.N], theta[structure.N :]
-        return path_cost(model, propagate(model, tau, p, jnp.ones(())), p)
-
-    def of_theta(theta: np.ndarray) -> float:
-        with float64():
-            return float(cost(arguments, theta))
-
-    return of_theta
+    native = native_experiment(structure, arguments, evaluator.meshes[0].times, 2)
+    if native is None:
+        raise RuntimeError("the problem has no machine code")
+    tau, p = evaluator.problem.vectors(theta, 0)
+    return native.program_at(tau, p)
 
 
 def compiled_c(function: Any) -> Any:
@@ -159,7 +138,7 @@ def _show(report: Report, name: str, found: dict[str, Any]) -> None:
     ours = found["switchfit call"]["median"]
     report.note(f"**{name}** ({found['rows']} rows, J in error by {found['cost error']:.1e})")
     rows = []
-    for form in ("switchfit call", "switchfit program", "casadi call", "casadi C"):
+    for form in ("switchfit call", "switchfit program", "switchfit in JAX", "casadi call", "casadi C"):
         if form in found:
             rows.append((form, found[form], "", ""))
     for form, timing in sorted(found["casadi"].items(), key=lambda item: item[1]["median"]):

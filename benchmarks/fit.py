@@ -15,7 +15,6 @@ import scipy.optimize
 
 import switchfit as sf
 from benchmarks import vehicle
-from benchmarks.derivatives import compiled_cost
 from benchmarks.report import Report
 from benchmarks.timing import ms, take_turns
 from switchfit.evaluate import Evaluator, evaluator_of
@@ -42,7 +41,7 @@ def run(report: Report, quick: bool) -> None:
     def excess(result: Any) -> float:
         return evaluator(found_theta(result)).cost - lowest
 
-    cost = compiled_cost(evaluator)
+    cost = evaluator.cost
     rivals: dict[str, tuple[Any, str | bool]] = {
         SOLVE_IVP: (CostBySciPy(problem), "2-point"),
         OWN_COST: (cost, "2-point"),

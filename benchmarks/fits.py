@@ -18,7 +18,6 @@ import numpy as np
 
 import switchfit as sf
 from benchmarks import models, problems, vehicle
-from benchmarks.derivatives import compiled_cost
 from benchmarks.fit import CostBySciPy, _tuned, slsqp
 from benchmarks.report import Report
 from benchmarks.timing import ms, turns_within
@@ -164,7 +163,7 @@ def vehicle_task(count: int, quick: bool) -> Task:
         return sf.Problem(system, run, {"mu": sf.Parameter(theta[2], lower=0.05, upper=2.0)})
 
     start = problem.initial_theta
-    judge = compiled_cost(Evaluator(again(np.array([*vehicle.TRUTH, vehicle.MU_TRUTH]))).divided(2))
+    judge = Evaluator(again(np.array([*vehicle.TRUTH, vehicle.MU_TRUTH]))).divided(2).cost
     by_scipy = Precise(problem)
     sides = {
         "switchfit": lambda theta: sf.estimate(again(theta)).theta,
@@ -190,7 +189,7 @@ def fishing_task(count: int, quick: bool) -> Task:
 
     case = problems.case("fishing")
     start, best = np.array(models.FISHING_START), np.array(models.FISHING_BEST)
-    judge = compiled_cost(Evaluator(case.problem(best, rtol=1e-10, atol=1e-12)))
+    judge = Evaluator(case.problem(best, rtol=1e-10, atol=1e-12)).cost
     by_scipy = cost_of(case.model, 1e-10)
     sides = {
         "switchfit": lambda theta: sf.estimate(case.problem(theta)).theta,

@@ -21,6 +21,16 @@ from switchfit.mesh import Mesh
 NODES = (500, 1000, 2000, 4000, 8000)
 HORIZON = 10.0
 METHODS = ("forward", "discrete-adjoint")
+"""Second order in JAX, whose crossover is looked for."""
+
+SHOWN = {
+    "auto": "auto (machine code)",
+    "discrete-adjoint": "discrete-adjoint (JAX)",
+    "forward": "forward (JAX)",
+    "adjoint": "the paper's equations (JAX)",
+}
+"""All methods, and what the tables call them."""
+
 GROWING = {
     "states": ((2, 2, 2), (4, 2, 2), (8, 2, 2), (16, 2, 2), (32, 2, 2)),
     "transitions": ((4, 1, 2), (4, 5, 2), (4, 10, 2), (4, 20, 2)),
@@ -46,24 +56,23 @@ def growing(report: Report, what: str, cases: tuple[tuple[int, int, int], ...]) 
     rows = []
     for states, transitions, parameters in cases:
         problem = oscillators(transitions, parameters, states)
-        calls = {method: _call(problem, 200, method) for method in (*METHODS, "adjoint")}
+        calls = {method: _call(problem, 200, method) for method in SHOWN}
         timings = take_turns(calls, 15, block=3)
         of = {method: timing.minimum for method, timing in timings.items()}
-        ours = of["discrete-adjoint"]
-        times = [ms(of[method]) for method in ("discrete-adjoint", "forward", "adjoint")]
-        ratios = [f"{of[method] / ours:.2f}" for method in ("forward", "adjoint")]
+        times = [ms(of[method]) for method in SHOWN]
+        ratios = [f"{of[method] / of['auto']:.1f}" for method in SHOWN if method != "auto"]
         rows.append((states, transitions, parameters, *times, *ratios))
         report.data[f"{what} {(states, transitions, parameters)}"] = {m: vars(t) for m, t in timings.items()}
     report.section(f"Hessian against {what}: 200 cells (minima)")
-    header = ("states", "transitions", "parameters", "discrete-adjoint", "forward", "the paper's equations")
-    report.table((*header, "forward / discrete-adjoint", "the paper's / discrete-adjoint"), rows)
+    ratios = [f"{name.partition(' (')[0]} / auto" for method, name in SHOWN.items() if method != "auto"]
+    report.table(("states", "transitions", "parameters", *SHOWN.values(), *ratios), rows)
 
 
 def memory(report: Report, quick: bool) -> None:
     """Long logs, each in a process of its own."""
     rows = []
     sizes = (10_000,) if quick else (10_000, 30_000, 100_000)
-    for method in ("discrete-adjoint",) if quick else ("discrete-adjoint", "forward", "adjoint"):
+    for method in ("auto",) if quick else SHOWN:
         for size in sizes:
             command = [sys.executable, "-m", "benchmarks.memory", str(size), method]
             root = Path(__file__).parent.parent
@@ -71,8 +80,8 @@ def memory(report: Report, quick: bool) -> None:
             found = json.loads(done.stdout)
             report.data[f"memory {method} {size}"] = found
             of_all = f"{found['largest']:.0f} MB", f"{found['before']:.0f} MB"
-            rows.append((method, size, f"{found['seconds']:.3f} s", f"{found['first']:.1f} s", *of_all))
-            if method == "discrete-adjoint" and size == sizes[-1] and not quick:
+            rows.append((SHOWN[method], size, f"{found['seconds']:.3f} s", f"{found['first']:.1f} s", *of_all))
+            if method == "auto" and size == sizes[-1] and not quick:
                 report.target(f"(J, g, H) on {size} samples", 1.0, found["seconds"], "s")
                 report.target(f"memory of (J, g, H) on {size} samples", 1000.0, found["largest"], "MB")
     report.section("(J, g, H) of long logs: 5 states, 5 transitions, 5 parameters, a step a sample")
@@ -111,11 +120,11 @@ def with_nodes(report: Report, quick: bool) -> None:
     """20 unknown transitions, 10 parameters, meshes of more and more nodes."""
     problem = oscillators(20, 10)
     sizes = NODES[:3:2] if quick else NODES
-    calls = {str(size): _call(problem, size - 1, "discrete-adjoint") for size in sizes}
+    calls = {str(size): _call(problem, size - 1, "auto") for size in sizes}
     timings = take_turns(calls, 5 if quick else 30, block=3)
     least = np.array([timings[str(size)].minimum for size in sizes])
     exponent, _ = np.polyfit(np.log(sizes), np.log(least), 1)
-    report.section("Hessian against nodes: 20 transitions, 10 parameters, 4 states, discrete-adjoint")
+    report.section("Hessian against nodes: 20 transitions, 10 parameters, 4 states")
     report.table(
         ("nodes", "median", "minimum", "a node"),
         [

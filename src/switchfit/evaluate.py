@@ -104,7 +104,7 @@ class Evaluator:
         self.meshes = problem.with_common_lengths(given)
         self.arguments = [problem.arguments(e, mesh) for e, mesh in enumerate(self.meshes)]
         self._compiled: set[tuple[Method, Matrix]] = set()
-        self._native: dict[Matrix, list[NativeExperiment | None]] = {}
+        self._native: dict[int, list[NativeExperiment | None]] = {}
         self._on_device: list[Arguments] | None = None
         self._priors = problem.unknowns.priors if problem.unknowns.priors.any else None
         self._places = [(own, places[own]) for places in problem.places for own in [np.flatnonzero(places >= 0)]]
@@ -197,20 +197,29 @@ class Evaluator:
         self._native.clear()
         self._on_device = None
 
-    def _natives(self, matrix: Matrix) -> list[NativeExperiment | None]:
-        """What evaluates each experiment in machine code, None where nothing does."""
-        if matrix not in self._native:
+    def cost(self, theta: FloatArray) -> float:
+        """J alone."""
+        natives = self._natives(0)
+        if any(native is None for native in natives):
+            return self(theta, matrix="none").cost
+        prior = 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0])
+        vectors = [self.problem.vectors(theta, e) for e in range(len(natives))]
+        return prior + sum(native.cost(*given) for native, given in zip(natives, vectors, strict=True) if native)
+
+    def _natives(self, order: int) -> list[NativeExperiment | None]:
+        """What evaluates each experiment in machine code, None where nothing does; with derivatives up to an order."""
+        if order not in self._native:
             given = zip(self.problem.structures, self.arguments, self.meshes, strict=True)
-            self._native[matrix] = [native_experiment(s, a, mesh.times, 2 if matrix == "exact" else 1) for s, a, mesh in given]
-        return self._native[matrix]
+            with compilation_cache():
+                self._native[order] = [native_experiment(s, a, mesh.times, order) for s, a, mesh in given]
+        return self._native[order]
 
     def _results(self, theta: FloatArray, side: int, method: Method, matrix: Matrix) -> list[Any]:
         """Cost, gradient and Hessian of each experiment in its own unknowns, as NumPy arrays."""
         if method == "auto" and matrix != "gauss-newton":
-            natives = self._natives(matrix)
-            vectors = [self.problem.vectors(theta, e) for e in range(len(natives))]
-            if all(native is not None for native in natives):
-                return [native(*given, side) for native, given in zip(natives, vectors, strict=True)]
+            natives = [native for native in self._natives(2 if matrix == "exact" else 1) if native is not None]
+            if len(natives) == len(self.arguments):
+                return [native(*self.problem.vectors(theta, e), side) for e, native in enumerate(natives)]
         compiled = (method, matrix) in self._compiled
         with float64(), nullcontext() if compiled else compilation_cache():
             results = [

@@ -200,7 +200,7 @@ def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> Run:
     run = Run(cost, segments, np.asarray(layout.first_cell), mesh)
     first = sum(q for _, q in structure.references)
     named = problem.named(theta, e)
-    all_seen = []
+    all_seen, of_samples = [], 0.0
     for k, (samples, sensor) in enumerate(zip(whole.samples, structure.measurements, strict=True)):
         if sensor.delay is None:
             seen = run.at_cells(np.asarray(samples.cell), slice(first, first + sensor.channels))
@@ -212,16 +212,16 @@ def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> Run:
         if sensor.sigma:
             sigma = np.array([1.0 if name is None else float(named[name]) for name in sensor.sigma])
             u = u / sigma**2
-            cost += float(np.sum(there * np.log(sigma)))
-        cost += 0.5 * float(np.sum(robust(sensor.loss, sensor.loss_scale, u)))
+            of_samples += float(np.sum(there * np.log(sigma)))
+        of_samples += 0.5 * float(np.sum(robust(sensor.loss, sensor.loss_scale, u)))
         first += sensor.channels
-    return replace(run, cost=cost, seen=tuple(all_seen))
+    return replace(run, cost=cost if native is not None else cost + of_samples, seen=tuple(all_seen))
 
 
 def _natively(
     structure: Structure, native: NativeExperiment, nodes: FloatArray, tau: FloatArray, p: FloatArray
 ) -> tuple[float, list[Segment]]:
-    """Running and terminal costs, and all segments, by machine code."""
+    """J and all segments, by machine code."""
     found = native.simulated(tau, p)
     bounds = np.concatenate([nodes[:1], tau, nodes[-1:]])
     lasts = [*found.first_cell[1:].tolist(), len(nodes) - 2]
@@ -240,7 +240,7 @@ def _natively(
 def _by_blocks(
     structure: Structure, whole: Arguments, layout: Rows, tau: FloatArray, p: FloatArray
 ) -> tuple[float, list[Segment]]:
-    """The same by JAX, some rows at a time."""
+    """Running and terminal costs, and all segments, by JAX, some rows at a time."""
     arguments = whole.without_mesh()
     cell, start, end = (np.reshape(a, -1) for a in (layout.cell, layout.start, layout.end))
     segments, cost = [], 0.0

@@ -235,15 +235,13 @@ class Driver:
                 self.call(f"reset_{i - 1}", RESET, found | befores[i] | behind)
                 x, Z = behind["x_after"], behind["Z_after"]
             self.line(f"call void @forward_{mode}({spans[i]}, ptr {x}, ptr {Z})")
-        for k in range(len(structure.measurements) if self.order > 0 else 0):
+        for k in range(len(structure.measurements)):
             self.line(f"call void @samples_{k}(ptr %table, i64 %count_{k})")
         if structure.terminal:
             state = self.let(f"add i64 %cells, {N}")
             last = {"x": self.at(found["states"], state, n), "Z": self.at(found["tangents"], state, n * width)}
             self.call("end", END, found | last)
-        if self.order == 0:
-            self.line("call void @all_outputs(ptr %table, i64 %cells)")
-        else:
+        if self.order > 0:
             for i, mode in reversed(list(enumerate(structure.mode_of_segment))):
                 self.line(f"call void @backward_{mode}({spans[i]})")
                 if i - 1 in structure.resets:
@@ -253,7 +251,7 @@ class Driver:
         return self.finished(f"void @evaluate(ptr %table, i64 %cells, double %t0, double %tf{counts})")
 
     def outputs(self) -> str:
-        """Outputs at all states: those behind rows, then those behind reset maps."""
+        """Outputs at all states that `whole` has found: those behind rows, then those behind reset maps."""
         n, N = self.sizes.n, self.sizes.N
         q = sum(channels for _, channels in self.structure.outputs)
         found = self.pointers()
@@ -271,7 +269,7 @@ class Driver:
         self.line(f"%done = icmp sge i64 %more, {count}")
         self.line("br i1 %done, label %out, label %loop")
         self.lines.append("out:")
-        return self.finished("internal void @all_outputs(ptr %table, i64 %cells)")
+        return self.finished("void @all_outputs(ptr %table, i64 %cells)")
 
 
 SEGMENT = "ptr %table, i64 %segment, i64 %first, i64 %last, double %begins, double %finishes"

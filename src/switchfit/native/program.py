@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import threading
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -38,7 +39,7 @@ def program_of(structure: Structure, sizes: Sizes, order: int) -> Program | None
 
 @lru_cache(maxsize=64)
 def _program_of(structure: Structure, sizes: Sizes, order: int) -> Program | None:
-    late = order > 0 and any(sensor.delay is not None for sensor in structure.measurements)
+    late = any(sensor.delay is not None for sensor in structure.measurements)
     if structure.tableau is not EXPLICIT or late or sizes.D == 0:
         return None
     try:
@@ -65,7 +66,7 @@ def _text(structure: Structure, sizes: Sizes, order: int) -> str:
         kernels.module.add(driver.forward_segment(mode))
         if order > 0:
             kernels.module.add(driver.backward_segment(mode, *counts))
-    for k in range(len(structure.measurements) if order > 0 else 0):
+    for k in range(len(structure.measurements)):
         template = kernels.at_sample(k)
         q = structure.measurements[k].channels
 
@@ -108,7 +109,7 @@ class Simulated(NamedTuple):
 
     Attributes
     ----------
-    cost : running and terminal costs
+    cost : J
     first_cell : (N + 1,) int, cell in which each segment begins
     states, outputs : (R + 1, n), (R + 1, q)
         Of R = cells + N rows: at t0, then at the end of each row, before a jump.
@@ -136,7 +137,7 @@ class NativeExperiment:
     times : (G + 1,) array
         The nodes without the padding.
     order : int
-        Of the derivatives: 0 for `simulated`, 1 and 2 for calls.
+        Of the derivatives: 0 for `cost` and `simulated`, 1 and 2 for calls.
     """
 
     def __init__(
@@ -156,6 +157,7 @@ class NativeExperiment:
         types = [ctypes.c_void_p, ctypes.c_int64, ctypes.c_double, ctypes.c_double, *[ctypes.c_int64] * len(counts)]
         self._program = program  # whose code must not go away
         self._evaluate = program.function("evaluate", *types)
+        self._all_outputs = program.function("all_outputs", *types[:2]) if order == 0 else None
         self._times = times
         self._scalars = (cells, float(times[0]), float(times[-1]), *counts)
         constants = [np.ravel(np.asarray(a, dtype=np.float64)) for a in constants_of(arguments)]
@@ -206,6 +208,16 @@ class NativeExperiment:
         hessian = H.copy() if self.order == 2 else np.full(H.shape, np.nan)
         return float(self._sums[self.sizes.n]), g.copy(), hessian
 
+    def program_at(self, tau: FloatArray, p: FloatArray) -> Callable[[], object]:
+        """The machine code alone, to be measured."""
+        self(tau, p, 1.0)
+        return lambda: self._evaluate(self._address, *self._scalars)
+
+    def cost(self, tau: FloatArray, p: FloatArray) -> float:
+        """J alone."""
+        self._run(tau, p, 1.0)
+        return float(self._sums[self.sizes.n])
+
     def simulated(self, tau: FloatArray, p: FloatArray) -> Simulated:
         """States and outputs at all ends of rows."""
         cells = self._scalars[0]
@@ -221,6 +233,8 @@ class NativeExperiment:
         )
         self._moments[rows + 1 :] = tau
         self._run(tau, p, 1.0)
+        if self._all_outputs is not None:
+            self._all_outputs(self._address, cells)
         of_states, of_outputs = ((a[: rows + 1].copy(), a[rows + 1 :].copy()) for a in (self._states, self._outputs))
         return Simulated(
             float(self._sums[self.sizes.n]),
