@@ -255,14 +255,16 @@ def estimate(
         history += records[1:] if history else records
         evaluations += result.evaluations
         theta = result.theta
-        fine_cost, trajectories, comparisons = compare(problem, theta, [mesh.divided() for mesh in evaluator.meshes])
+        fine = evaluator.divided()
+        fine_cost = fine.cost(theta)
         first_cost = abs(history[0].cost) if history else 0.0
         error = abs(fine_cost - result.cost) / max(abs(fine_cost), PERFECT_FIT * first_cost, smallest_cost(problem))
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
         done = result.status in (Status.INTERRUPTED, Status.NONFINITE_START) or attempt == REFINEMENTS
         if done or not excess > 1:
             break
-        evaluator = _refined(evaluator, problem.checked_theta(start), theta, excess)
+        evaluator = _refined(fine, problem.checked_theta(start), theta, excess)
+    _, trajectories, comparisons = compare(problem, theta, fine.meshes, fine.arguments)
     return _estimate(
         problem,
         evaluator,
@@ -326,14 +328,14 @@ def _minimized_with_constraints(
     return found.result, tuple(zip(names, values, multipliers, strict=True))
 
 
-def _refined(evaluator: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:
+def _refined(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:
     """The problem on finer meshes: cells cut in two, or, where that is not enough, refined at the start and at theta.
 
     A mode that has come to be active in another part of the horizon may find cells there that are far too long for it.
     """
-    problem = evaluator.problem
+    problem = fine.problem
     if excess <= 2**ORDER:
-        return evaluator.divided()
+        return fine
     return Evaluator(problem, meshes=[refined_mesh(problem, e, start, theta) for e in range(len(problem.experiments))])
 
 

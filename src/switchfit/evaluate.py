@@ -27,6 +27,7 @@ from switchfit.optimize.arrow import Arrow, ArrowLayout
 from switchfit.problem import Problem
 from switchfit.propagate import path_cost, propagate
 from switchfit.refine import refined_mesh
+from switchfit.simulate import compare
 
 Method = Literal["auto", "forward", "discrete-adjoint", "adjoint", "autodiff"]
 Matrix = Literal["exact", "gauss-newton", "none"]
@@ -201,7 +202,7 @@ class Evaluator:
         """J alone."""
         natives = self._natives(0)
         if any(native is None for native in natives):
-            return self(theta, matrix="none").cost
+            return compare(self.problem, theta, self.meshes, self.arguments)[0]
         prior = 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0])
         vectors = [self.problem.vectors(theta, e) for e in range(len(natives))]
         return prior + sum(native.cost(*given) for native, given in zip(natives, vectors, strict=True) if native)
@@ -210,8 +211,7 @@ class Evaluator:
         """What evaluates each experiment in machine code, None where nothing does; with derivatives up to an order."""
         if order not in self._native:
             given = zip(self.problem.structures, self.arguments, self.meshes, strict=True)
-            with compilation_cache():
-                self._native[order] = [native_experiment(s, a, mesh.times, order) for s, a, mesh in given]
+            self._native[order] = [native_experiment(s, a, mesh.times, order) for s, a, mesh in given]
         return self._native[order]
 
     def _results(self, theta: FloatArray, side: int, method: Method, matrix: Matrix) -> list[Any]:

@@ -706,6 +706,9 @@ def by_cell(signal: PiecewisePolynomial, mesh: Mesh) -> FloatArray:
     middles = 0.5 * (mesh.nodes[:-1] + mesh.nodes[1:])
     k = signal.interval(middles)
     s = (starts - signal.knots[k])[:, None]
-    c0, c1, c2, c3 = np.moveaxis(signal.coefficients[k], 1, 0)
-    shifted = [c0 + s * (c1 + s * (c2 + s * c3)), c1 + s * (2 * c2 + 3 * s * c3), c2 + 3 * s * c3, c3]
-    return np.stack(shifted, axis=1)
+    shifted = signal.coefficients[k]
+    c1, c2, c3 = shifted[:, 1].copy(), shifted[:, 2].copy(), shifted[:, 3]
+    shifted[:, 0] += s * (c1 + s * (c2 + s * c3))
+    shifted[:, 1] += s * (2 * c2 + 3 * s * c3)
+    shifted[:, 2] += 3 * s * c3
+    return shifted

@@ -125,12 +125,15 @@ def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: in
 
 
 def compare(
-    problem: Problem, theta: FloatArray, meshes: Sequence[Mesh]
+    problem: Problem, theta: FloatArray, meshes: Sequence[Mesh], arguments: Sequence[Arguments] | None = None
 ) -> tuple[float, tuple[Trajectory, ...], tuple[tuple[Comparison, ...], ...]]:
-    """Total cost, trajectories and measured against fitted of all experiments at theta, on given meshes."""
+    """Total cost, trajectories and measured against fitted of all experiments at theta, on given meshes.
+
+    The problem's `arguments` on these meshes are found where they are not given.
+    """
     total, trajectories, comparisons = 0.0, [], []
     for e, mesh in enumerate(meshes):
-        run = _simulated(problem, e, theta, mesh)
+        run = _simulated(problem, e, theta, mesh, None if arguments is None else arguments[e])
         trajectory = _trajectory(problem, e, run)
         total += run.cost
         trajectories.append(trajectory)
@@ -185,17 +188,19 @@ class Run:
         return values
 
 
-def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> Run:
+def _simulated(
+    problem: Problem, e: int, theta: FloatArray, mesh: Mesh, arguments: Arguments | None = None
+) -> Run:
     """Integrate experiment e over the rows of a mesh, mode by mode."""
     structure = problem.structures[e]
     tau, p = problem.vectors(theta, e)
-    whole = problem.arguments(e, mesh)
+    whole = problem.arguments(e, mesh) if arguments is None else arguments
     layout = rows(mesh.nodes, tau, 1.0, np)
-    with float64(), compilation_cache():
-        native = native_experiment(structure, whole, mesh.times, order=0)
-        if native is not None:
-            cost, segments = _natively(structure, native, mesh.times, tau, p)
-        else:
+    native = native_experiment(structure, whole, mesh.times, order=0)
+    if native is not None:
+        cost, segments = _natively(structure, native, mesh.times, tau, p)
+    else:
+        with float64(), compilation_cache():
             cost, segments = _by_blocks(structure, whole, layout, tau, p)
     run = Run(cost, segments, np.asarray(layout.first_cell), mesh)
     first = sum(q for _, q in structure.references)

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -117,7 +118,7 @@ class LinearConstraints:
         """Number of unknowns, d."""
         return self.lower.size
 
-    @property
+    @cached_property
     def normals(self) -> FloatArray:
         """Inward normals of rows, lower and upper bounds, shape (m + 2 d, d)."""
         identity = np.eye(self.size)
@@ -127,6 +128,8 @@ class LinearConstraints:
         """The normals at the given places, shape (k, d)."""
         m, d = self.b.size, self.size
         chosen = np.zeros((index.size, d))
+        if index.size == 0:
+            return chosen
         in_A = index < m
         chosen[in_A] = self.A[index[in_A]]
         bounds = np.flatnonzero(~in_A)
@@ -186,7 +189,7 @@ def solve_qp(gradient: FloatArray, matrix: FloatArray, normals: FloatArray, offs
         If B is not positive definite or c is positive somewhere.
     """
     offsets = np.asarray(offsets, dtype=float)
-    if np.any(offsets > 0.0):
+    if (offsets > 0.0).any():
         raise ValueError(f"the zero step violates row {int(np.argmax(offsets))} by {offsets.max()}; c must be <= 0")
     multipliers = np.zeros(offsets.size)
     if gradient.size == 0 or not np.any(gradient):
@@ -194,7 +197,7 @@ def solve_qp(gradient: FloatArray, matrix: FloatArray, normals: FloatArray, offs
     factor = _Factor.of(matrix)
     step = -factor.solve(gradient)
     step -= factor.solve(gradient + matrix @ step)
-    if np.all(normals @ step >= offsets):
+    if (normals @ step >= offsets).all():
         return QPSolution(step, multipliers)
     return QPSolution(*solve_whitened(gradient, matrix, factor, normals, offsets))
 
@@ -443,16 +446,17 @@ def diagonal_scaling(hessian: FloatArray, floor: FloatArray | None = None) -> Fl
         Diagonal entries too small to matter, below which D² does not go.
     """
     size = np.abs(hessian)
-    square = np.diag(size).copy()
+    square = size.diagonal().copy()
     if floor is not None:
         square = np.maximum(square, floor)
     empty = square <= 0.0
-    square[empty] = np.max(size, axis=1, initial=0.0)[empty]
-    square[square <= 0.0] = 1.0
+    if empty.any():
+        square[empty] = size.max(axis=1, initial=0.0)[empty]
+        square[square <= 0.0] = 1.0
     scaling = np.sqrt(square)
     for _ in range(20):
-        largest = np.max(size / np.outer(scaling, scaling), axis=1, initial=0.0)
-        if np.all(largest <= 1.0 + 1e-9):
+        largest = (size / (scaling[:, None] * scaling)).max(axis=1, initial=0.0)
+        if (largest <= 1.0 + 1e-9).all():
             break
         scaling = scaling * np.sqrt(np.maximum(largest, 1.0))
     return scaling
@@ -461,6 +465,8 @@ def diagonal_scaling(hessian: FloatArray, floor: FloatArray | None = None) -> Fl
 def split_space(normals: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Orthonormal bases of the null space, shape (d, d - r), and of the row space, shape (d, r), of the normals."""
     d = normals.shape[1]
+    if normals.shape[0] == 0:
+        return np.eye(d), np.zeros((d, 0))
     lengths = np.linalg.norm(normals, axis=1)
     rows = normals[lengths > 0.0] / lengths[lengths > 0.0, None]
     if rows.shape[0] == 0:
@@ -494,7 +500,7 @@ def convexify(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None
     if hessian.size == 0:
         return hessian
     scaling = diagonal_scaling(hessian, floor)
-    weight = np.outer(scaling, scaling)
+    weight = scaling[:, None] * scaling
     scaled = hessian / weight
     if not dpotrf(scaled - EIGENVALUE_FLOOR * np.eye(scaled.shape[0]))[1]:
         return hessian
@@ -542,9 +548,11 @@ def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tupl
     residual : float
     multipliers : array, shape (k,)
     """
+    if normals.shape[0] == 0:
+        return float(np.linalg.norm(low if low is high else np.clip(0.0, low, high))), np.zeros(0)
     size = float(max(np.max(np.abs(low), initial=0.0), np.max(np.abs(high), initial=0.0)))
-    if normals.shape[0] == 0 or size == 0.0:
-        return float(np.linalg.norm(np.clip(0.0, low, high))), np.zeros(normals.shape[0])
+    if size == 0.0:
+        return 0.0, np.zeros(normals.shape[0])
     wide = np.flatnonzero(high > low)
     lengths = np.linalg.norm(normals, axis=1)
     lengths = np.where(lengths > 0.0, lengths, 1.0)

@@ -292,6 +292,7 @@ class _Point:
     optimality: float
     multipliers: FloatArray  # shape (m + 2 d,)
     downhill: NDArray[np.int_]  # like side, and for each kink the side to descend to, 0 to hold it
+    curvatures: dict[bytes, _Curvature] = field(default_factory=dict)  # found already, by the constraints' places
 
     @property
     def cost(self) -> float:
@@ -848,6 +849,14 @@ def _genuine_kinks(state: _State) -> NDArray[np.bool_]:
 
 def _curvature(problem: _Problem, state: _State, rows: NDArray[np.intp]) -> _Curvature:
     """Curvature of J, unmodified, in the null space of the given constraints and off the kinks."""
+    known = state.point.curvatures
+    key = rows.tobytes()
+    if key not in known:
+        known[key] = _curvature_on(problem, state, rows)
+    return known[key]
+
+
+def _curvature_on(problem: _Problem, state: _State, rows: NDArray[np.intp]) -> _Curvature:
     point = state.point
     d = point.theta.size
     held = _genuine_kinks(state) | ~(problem.constraints.lower < problem.constraints.upper)
