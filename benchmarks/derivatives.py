@@ -35,7 +35,7 @@ def run(report: Report, quick: bool) -> None:
     report.section(
         "Exact J, gradient and Hessian of the vehicle",
         "One core. `call`: theta in, NumPy arrays out. `program`: the compiled program alone, its arguments already in "
-        "place (CasADi: through its buffers). `in JAX`: the same equations as XLA compiles them, as in batches on a GPU. "
+        "place (CasADi: through its buffers). `in JAX`: the same equations as XLA compiles them. "
         "The ratio is CasADi's fastest program to switchfit's call.",
     )
     cases: list[tuple[str, Any, int | None, bool]] = [

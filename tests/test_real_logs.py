@@ -20,7 +20,7 @@ from switchfit.losses import LOSSES, influence, robust
 from switchfit.model import float64
 from switchfit.optimize.variables import Variables
 from switchfit.priors import PriorTerms
-from switchfit.simulate import compare
+from switchfit.simulate import compared, runs_of
 from switchfit.solve import message_of
 
 
@@ -45,7 +45,8 @@ def clean(delay=0.0):
     blank = sf.Measurements(TIMES, np.zeros((24, 2)), observe=position, delay=delay, sigma=1.0)
     run = sf.Experiment(blank, ("free", "damped"), (1.23,), 0.0, 3.3)
     problem = sf.Problem(SYSTEM, run, TRUTH)
-    return compare(problem, problem.initial_theta, evaluator_of(problem).meshes)[2][0][0].fitted
+    theta = problem.initial_theta
+    return compared(problem, theta, runs_of(problem, theta, evaluator_of(problem).meshes))[1][0][0].fitted
 
 
 CLEAN = clean()
@@ -105,7 +106,7 @@ def test_methods_agree(case):
 
 
 def test_the_simulated_cost_is_the_evaluated_one(case):
-    assert compare(case, case.initial_theta, evaluator_of(case).meshes)[0] == pytest.approx(
+    assert evaluator_of(case).cost(case.initial_theta) == pytest.approx(
         sf.evaluate(case).cost, rel=1e-12
     )
 

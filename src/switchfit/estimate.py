@@ -32,7 +32,7 @@ from switchfit.report.uncertainty import plot_diagnostics
 from switchfit.residuals import ResidualDiagnostics, diagnose
 from switchfit.result import Certificate, Fit
 from switchfit.sensitivity import Sensitivity, gauss_newton_of, sample_derivatives, sensitivity
-from switchfit.simulate import compare
+from switchfit.simulate import compared, cost_of, runs_of
 from switchfit.solve import constraints_of, least_squares, message_of, minimized, plain, sigma_known, smallest_cost
 
 HESSIANS = get_args(HessianKind)
@@ -256,7 +256,8 @@ def estimate(
         evaluations += result.evaluations
         theta = result.theta
         fine = evaluator.divided()
-        fine_cost = fine.cost(theta)
+        runs = runs_of(problem, theta, fine.meshes, fine.arguments)
+        fine_cost = cost_of(problem, theta, runs)
         first_cost = abs(history[0].cost) if history else 0.0
         error = abs(fine_cost - result.cost) / max(abs(fine_cost), PERFECT_FIT * first_cost, smallest_cost(problem))
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
@@ -264,7 +265,7 @@ def estimate(
         if done or not excess > 1:
             break
         evaluator = _refined(fine, problem.checked_theta(start), theta, excess)
-    _, trajectories, comparisons = compare(problem, theta, fine.meshes, fine.arguments)
+    trajectories, comparisons = compared(problem, theta, runs)
     return _estimate(
         problem,
         evaluator,

@@ -27,7 +27,7 @@ from switchfit.optimize.arrow import Arrow, ArrowLayout
 from switchfit.problem import Problem
 from switchfit.propagate import path_cost, propagate
 from switchfit.refine import refined_mesh
-from switchfit.simulate import compare
+from switchfit.simulate import cost_of, runs_of
 
 Method = Literal["auto", "forward", "discrete-adjoint", "adjoint", "autodiff"]
 Matrix = Literal["exact", "gauss-newton", "none"]
@@ -108,7 +108,6 @@ class Evaluator:
         self._native: dict[int, list[NativeExperiment | None]] = {}
         self._on_device: list[Arguments] | None = None
         self._priors = problem.unknowns.priors if problem.unknowns.priors.any else None
-        self._places = [(own, places[own]) for places in problem.places for own in [np.flatnonzero(places >= 0)]]
 
     def divided(self, parts: int = 2) -> Evaluator:
         """The same problem with every cell of its meshes cut into equal parts."""
@@ -123,11 +122,11 @@ class Evaluator:
         """
         d = len(theta)
         results = self._results(theta, side, method, matrix)
-        if self._one_to_one:
+        if self.problem.one_to_one:
             total, gradient, hessian = float(results[0][0]), results[0][1], results[0][2]
         else:
             total, gradient, hessian = 0.0, np.zeros(d), np.zeros((d, d))
-            for (J, g, H), (own, mine) in zip(results, self._places, strict=True):
+            for (J, g, H), (own, mine) in zip(results, self.problem.own_places, strict=True):
                 total += float(J)
                 # Two names of the model may mean one parameter: its place then stands twice, and both count.
                 np.add.at(gradient, mine, g[own])
@@ -146,7 +145,7 @@ class Evaluator:
         cost, value, gradient, slope, hessian = 0.0, 0.0, np.zeros(d), np.zeros(d), np.zeros((d, d))
         jacobian, c = np.zeros((count, d)), np.zeros(count)
         last = 0
-        for e, ((s, a, tau, p), (own, mine)) in enumerate(zip(self._each(theta), self._places, strict=True)):
+        for e, ((s, a, tau, p), (own, mine)) in enumerate(zip(self._each(theta), self.problem.own_places, strict=True)):
             here = slice(last, last := last + self.problem.constraint_counts[e])
             with float64(), compilation_cache():
                 found = constrained_derivatives(a, tau, p, float(side), multipliers[here], penalty[here], structure=s)
@@ -164,7 +163,7 @@ class Evaluator:
         total, gradient, parts = 0.0, np.zeros(len(theta)), []
         size = self.layout.own.shape[1] + len(self.layout.shared)
         results = self._results(theta, side, "auto", matrix)
-        for (J, g, H), (own, mine), slots in zip(results, self._places, self._slots, strict=True):
+        for (J, g, H), (own, mine), slots in zip(results, self.problem.own_places, self._slots, strict=True):
             total += float(J)
             np.add.at(gradient, mine, g[own])
             part = np.zeros((size, size))
@@ -183,13 +182,7 @@ class Evaluator:
 
     @cached_property
     def _slots(self) -> list[NDArray[np.intp]]:
-        return [self.layout.slots(e, mine) for e, (_, mine) in enumerate(self._places)]
-
-    @cached_property
-    def _one_to_one(self) -> bool:
-        """Whether theta is what the program of a single experiment takes."""
-        places = self.problem.places
-        return len(places) == 1 and np.array_equal(places[0], np.arange(len(self.problem.theta_names)))
+        return [self.layout.slots(e, mine) for e, (_, mine) in enumerate(self.problem.own_places)]
 
     def replace_arguments(self, arguments: Sequence[Arguments]) -> None:
         """Work with other numbers from now on, on the meshes that they have."""
@@ -202,7 +195,7 @@ class Evaluator:
         """J alone."""
         natives = self._natives(0)
         if any(native is None for native in natives):
-            return compare(self.problem, theta, self.meshes, self.arguments)[0]
+            return cost_of(self.problem, theta, runs_of(self.problem, theta, self.meshes, self.arguments))
         prior = 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0])
         vectors = [self.problem.vectors(theta, e) for e in range(len(natives))]
         return prior + sum(native.cost(*given) for native, given in zip(natives, vectors, strict=True) if native)

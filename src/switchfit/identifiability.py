@@ -27,7 +27,7 @@ from switchfit.evaluate import Evaluator, evaluator_of
 from switchfit.hidden import refuse_hidden_switches
 from switchfit.problem import Problem
 from switchfit.result import Fit, scaled_spectrum
-from switchfit.simulate import compare
+from switchfit.simulate import compared, runs_of
 from switchfit.solve import least_squares
 
 WEAK = 0.05
@@ -232,7 +232,8 @@ def _before(problem: Problem) -> Identifiability:
 
 def _noise_free(problem: Problem, evaluator: Evaluator) -> Problem:
     """The problem with the values that its first guess produces; missing ones stay missing."""
-    comparisons = compare(problem, problem.initial_theta, evaluator.meshes)[2]
+    theta = problem.initial_theta
+    comparisons = compared(problem, theta, runs_of(problem, theta, evaluator.meshes, evaluator.arguments))[1]
     experiments = []
     for experiment, found in zip(problem.experiments, comparisons, strict=True):
         data = [

@@ -270,9 +270,21 @@ class Problem:
             found.append(np.concatenate(parts).astype(np.intp))
         return tuple(found)
 
+    @cached_property
+    def own_places(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+        """For each experiment which entries of what its programs take are unknowns, and their positions in theta."""
+        return [(own, places[own]) for places in self.places for own in [np.flatnonzero(places >= 0)]]
+
+    @cached_property
+    def one_to_one(self) -> bool:
+        """Whether theta is what the programs of a single experiment take."""
+        return len(self.places) == 1 and np.array_equal(self.places[0], np.arange(len(self.theta_names)))
+
     def vectors(self, theta: FloatArray, e: int) -> tuple[FloatArray, FloatArray]:
         """What the compiled programs of experiment e take: its transition times (N,) and its p (M,)."""
         places, N = self.places[e], self.structures[e].N
+        if self.one_to_one:
+            return theta[:N], theta[N:]
         where = places[:N]
         tau = self.experiments[e].initial_times
         tau[where >= 0] = theta[where[where >= 0]]
@@ -305,6 +317,8 @@ class Problem:
     def with_common_lengths(self, meshes: Sequence[Mesh]) -> list[Mesh]:
         """The meshes of all experiments, those of experiments that are alike padded to common lengths."""
         padded = list(meshes)
+        if len(padded) == 1:
+            return padded
         for group in self.alike:
             lengths = common_lengths([meshes[e].cells for e in group])
             for e, length in zip(group, lengths, strict=True):

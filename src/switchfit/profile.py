@@ -39,7 +39,6 @@ from switchfit.progress import Progress, reporting
 from switchfit.refine import refined_mesh
 from switchfit.report.uncertainty import plot_profile, profile_text
 from switchfit.result import Fit
-from switchfit.simulate import compare
 from switchfit.solve import constraints_of, minimized
 
 if TYPE_CHECKING:
@@ -429,11 +428,10 @@ class Trace:
 
     def integration_error(self, threshold: float) -> float:
         """Largest error of zeta^2 by the integration where it crosses the threshold, by halving all steps."""
-        meshes = [mesh.divided() for mesh in self.evaluator.meshes]
-        problem = self.evaluator.problem
-        base = compare(problem, self.centre.theta, meshes)[0] - self.centre.cost
+        fine = self.evaluator.divided()
+        base = fine.cost(self.centre.theta) - self.centre.cost
         ends = self.edges(threshold)
-        return max(abs(compare(problem, q.theta, meshes)[0] - q.cost - base) * 2 / self.scale for q in ends)
+        return max(abs(fine.cost(q.theta) - q.cost - base) * 2 / self.scale for q in ends)
 
     def add_kinks(self, times: FloatArray, threshold: float) -> None:
         """Points at the sample times up to the threshold, where the slope may jump, unless there are many."""

@@ -104,7 +104,7 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
     """All times at which the adaptive solver stopped, from t0 to tf, strictly increasing."""
     experiment, structure = problem.experiments[e], problem.structures[e]
     whole = problem.arguments(e, coarse)
-    arguments, signals = whole.without_mesh(), whole.signals
+    arguments, signals = whole.without_mesh(), np.asarray(whole.signals)
     tau, p = problem.vectors(theta, e)
     ends = np.concatenate([[experiment.t0], tau, [experiment.tf]])
     inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times

@@ -121,25 +121,30 @@ def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: in
         raise ValueError(f"experiment must lie in 0..{len(problem.experiments) - 1}; got {experiment}.")
     checked = problem.checked_theta(theta)
     mesh = refined_mesh(problem, experiment, checked)
-    return _trajectory(problem, experiment, _simulated(problem, experiment, checked, mesh))
+    run = _simulated(problem, experiment, checked, mesh, problem.arguments(experiment, mesh))
+    return _trajectory(problem, experiment, run)
 
 
-def compare(
+def runs_of(
     problem: Problem, theta: FloatArray, meshes: Sequence[Mesh], arguments: Sequence[Arguments] | None = None
-) -> tuple[float, tuple[Trajectory, ...], tuple[tuple[Comparison, ...], ...]]:
-    """Total cost, trajectories and measured against fitted of all experiments at theta, on given meshes.
+) -> list[Run]:
+    """All experiments at theta on given meshes, with the problem's `arguments` there if they are known already."""
+    found = [problem.arguments(e, mesh) for e, mesh in enumerate(meshes)] if arguments is None else arguments
+    return [_simulated(problem, e, theta, mesh, found[e]) for e, mesh in enumerate(meshes)]
 
-    The problem's `arguments` on these meshes are found where they are not given.
-    """
-    total, trajectories, comparisons = 0.0, [], []
-    for e, mesh in enumerate(meshes):
-        run = _simulated(problem, e, theta, mesh, None if arguments is None else arguments[e])
-        trajectory = _trajectory(problem, e, run)
-        total += run.cost
-        trajectories.append(trajectory)
-        comparisons.append(_comparisons(problem, e, theta, run, trajectory))
-    total += float(problem.unknowns.priors.evaluate(theta)[0])
-    return total, tuple(trajectories), tuple(comparisons)
+
+def cost_of(problem: Problem, theta: FloatArray, runs: Sequence[Run]) -> float:
+    """Total cost, priors included."""
+    return sum((run.cost for run in runs), float(problem.unknowns.priors.evaluate(theta)[0]))
+
+
+def compared(
+    problem: Problem, theta: FloatArray, runs: Sequence[Run]
+) -> tuple[tuple[Trajectory, ...], tuple[tuple[Comparison, ...], ...]]:
+    """Trajectories and measured against fitted of all experiments."""
+    trajectories = tuple(_trajectory(problem, e, run) for e, run in enumerate(runs))
+    pairs = enumerate(zip(runs, trajectories, strict=True))
+    return trajectories, tuple(_comparisons(problem, e, theta, run, trajectory) for e, (run, trajectory) in pairs)
 
 
 BLOCK = 64
@@ -188,13 +193,10 @@ class Run:
         return values
 
 
-def _simulated(
-    problem: Problem, e: int, theta: FloatArray, mesh: Mesh, arguments: Arguments | None = None
-) -> Run:
+def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh, whole: Arguments) -> Run:
     """Integrate experiment e over the rows of a mesh, mode by mode."""
     structure = problem.structures[e]
     tau, p = problem.vectors(theta, e)
-    whole = problem.arguments(e, mesh) if arguments is None else arguments
     layout = rows(mesh.nodes, tau, 1.0, np)
     native = native_experiment(structure, whole, mesh.times, order=0)
     if native is not None:

@@ -19,7 +19,6 @@ from switchfit.evaluate import evaluator_of
 from switchfit.optimize import Status
 from switchfit.problem import Problem
 from switchfit.result import inverse_on
-from switchfit.simulate import compare
 from switchfit.solve import sigma_known, smallest_cost
 
 
@@ -114,8 +113,7 @@ class _Work:
     def _check(self, problem: Problem, k: int, arrays: Arrays) -> None:
         """Do a fit again by `estimate` if its integration error is too large."""
         theta, cost = arrays["theta"][k], arrays["cost"][k]
-        meshes = [mesh.divided() for mesh in evaluator_of(problem).meshes]
-        fine = compare(problem, theta, meshes)[0]
+        fine = evaluator_of(problem).divided().cost(theta)
         size = max(abs(fine), smallest_cost(problem))
         if abs(fine - cost) <= max(LARGEST_INTEGRATION_ERROR, problem.rtol) * size:
             return
@@ -136,7 +134,7 @@ class _Work:
             leaves = jax.tree.leaves(tuple(evaluator_of(problem).arguments))
             parts += [problem.theta_names, problem.initial_theta, *problem.unknowns.priors, *map(np.asarray, leaves)]
         first = self.problems[0]
-        parts.append(compare(first, first.initial_theta, evaluator_of(first).meshes)[0])  # stands for the functions
+        parts.append(evaluator_of(first).cost(first.initial_theta))  # stands for the functions
         return fingerprint(*parts)
 
 

@@ -23,7 +23,7 @@ from switchfit.model import by_cell
 from switchfit.problem import Problem
 from switchfit.refine import refined_mesh
 from switchfit.report.batch import plot_monte_carlo, table_of_monte_carlo
-from switchfit.simulate import compare
+from switchfit.simulate import compared, runs_of
 from switchfit.solve import smallest_cost
 
 if TYPE_CHECKING:
@@ -213,7 +213,7 @@ def _clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray | None]]
         which.append(kept)
     simulated = replace(problem, experiments=sampled)
     meshes = Evaluator(simulated, truth).meshes
-    _, _, comparisons = compare(simulated, truth, [mesh.divided() for mesh in meshes])
+    _, comparisons = compared(simulated, truth, runs_of(simulated, truth, [mesh.divided() for mesh in meshes]))
     clean: list[list[FloatArray | None]] = [[None] * len(experiment.data) for experiment in problem.experiments]
     for e, (kept, found) in enumerate(zip(which, comparisons, strict=True)):
         for k, comparison in zip(kept, found, strict=True):
@@ -232,7 +232,7 @@ def _meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tuple[lis
     for attempt in range(REFINEMENTS + 1):
         indices = range(len(problem.experiments))
         evaluator = Evaluator(problem, meshes=[refined_mesh(problem, e, *thetas, finer=finer) for e in indices])
-        fine = compare(problem, truth, [mesh.divided() for mesh in evaluator.meshes])[0]
+        fine = evaluator.divided().cost(truth)
         # Without noise J vanishes at the truth; then the error is measured against J where the fits begin.
         size = max(abs(fine), PERFECT_FIT * abs(evaluator(start).cost), smallest_cost(problem))
         error = abs(evaluator(truth).cost - fine) / size

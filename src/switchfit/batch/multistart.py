@@ -18,12 +18,11 @@ from switchfit.batch.fits import Fits, repeat, sample_count
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
 from switchfit.data import FloatArray, as_numbers
 from switchfit.estimate import Estimate, estimate
-from switchfit.evaluate import evaluator_of
+from switchfit.evaluate import Evaluator, evaluator_of
 from switchfit.mesh import Mesh
 from switchfit.optimize.qp import solve_qp
 from switchfit.problem import Problem
 from switchfit.report.batch import plot_waterfall
-from switchfit.simulate import compare
 from switchfit.solve import constraints_of
 
 if TYPE_CHECKING:
@@ -148,7 +147,9 @@ class _Work:
         unknowns = self.problem.unknowns
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
         leaves = jax.tree.leaves([self.problem.arguments(e, mesh) for e, mesh in enumerate(self.meshes)])
-        first = compare(self.problem, self.starts[0], self.meshes)[0]  # stands for the functions of the model
+        first = Evaluator(self.problem, meshes=self.meshes).cost(
+            self.starts[0]
+        )  # stands for the functions of the model
         settings = self.tolerance, self.max_iterations, unknowns.names, first
         return fingerprint("multistart", settings, self.starts, *bounds, *map(np.asarray, leaves))
 

@@ -18,7 +18,6 @@ from switchfit.native.kernels import (
     RESET,
     RESET_BACK,
     SAMPLE,
-    STAGE_TIME,
     STAGES,
     START,
     START_BACK,
@@ -144,7 +143,6 @@ class Driver:
         """All rows of a segment, backward; with the numbers of entries of the second derivatives."""
         n, width = self.sizes.n, self.sizes.width
         self.line("%row = alloca [3 x double]")
-        self.line(f"%Zt = alloca [{width} x double]")
         found = self.pointers()
         self.line("br label %loop")
         self.lines.append("loop:")
@@ -152,21 +150,19 @@ class Driver:
         place = self._row(found, "%cell")
         row = self.let("add i64 %cell, %segment")
         after = self.let(f"add i64 {row}, 1")
-        given = found | place | self._at_row(found, row) | {"jump": self.at(found["jumps"], after, n), "Zt": "%Zt"}
+        given = found | place | self._at_row(found, row) | {"jump": self.at(found["jumps"], after, n)}
         self.line(f"br i1 {place['end row']}, label %is_end, label %is_inner")
-        for kind, count in (("end", end), ("inner", inner)):
+        for kind, count in (("end", end + 1), ("inner", inner)):
             self.lines.append(f"is_{kind}:")
             self.call(f"backward_{kind}_{mode}", BACKWARD, given)
             if self.order == 2:
                 if kind == "end":
                     self.call("length", LENGTH, given)
-                for j in range(STAGES):
+                for j in range(0, STAGES, self.sizes.stages_at_once):
                     at_stage = {
                         "entries": self.at(found["entries"], j * count),
-                        "Z": self.at(given["XZ"], j * n * width),
+                        "XZ": self.at(given["XZ"], j * n * width),
                     }
-                    if kind == "end":
-                        self.call(f"stage_time_{j}", STAGE_TIME, given)
                     self.call(f"curvature_{kind}_{mode}", CURVATURE, given | at_stage)
             self.line("br label %next")
         self.lines.append("next:")
@@ -221,9 +217,7 @@ class Driver:
         befores = [{"x": found["states"], "Z": found["tangents"]}]
         for i in range(N):
             state = self.let(f"add i64 {lasts[i]}, {i + 1}")
-            befores.append(
-                {"x": self.at(found["states"], state, n), "Z": self.at(found["tangents"], state, n * width)}
-            )
+            befores.append({"x": self.at(found["states"], state, n), "Z": self.at(found["tangents"], state, n * width)})
         self.call("start", START, found | befores[0])
         for i, mode in enumerate(structure.mode_of_segment):
             x, Z = befores[i]["x"], befores[i]["Z"]
@@ -273,5 +267,3 @@ class Driver:
 
 
 SEGMENT = "ptr %table, i64 %segment, i64 %first, i64 %last, double %begins, double %finishes"
-
-

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import jax
@@ -17,7 +17,7 @@ from switchfit.native.llvm import Program
 from switchfit.native.program import program_of
 
 
-@lru_cache(maxsize=None)  # what is registered must stay
+@cache  # what is registered must stay
 def _registered(structure: Structure, sizes: Sizes) -> tuple[str, Program] | None:
     """Name of the operation for a structure; None where JAX has to do its work."""
     program = program_of(structure, sizes, 2)
@@ -41,7 +41,7 @@ def foreign_derivatives(structure: Structure, arguments: Arguments, tau: Any, p:
     if registered is None:
         return None
     name, _ = registered
-    n, N, D, width = sizes.n, sizes.N, sizes.D, sizes.width
+    n, D, width = sizes.n, sizes.D, sizes.width
     nodes = arguments.nodes
     cells = nodes.shape[0] - 1
     real_cells = jnp.sum(nodes[1:] > nodes[:-1])

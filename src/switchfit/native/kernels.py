@@ -5,8 +5,8 @@ The mathematics is that of `switchfit.derivatives.discrete`, backward in second 
 
 forward    x and its derivative Z along theta, a vector an entry: ``X_j' = Z + h' (..) + h sum_l a_jl K_l'``,
            ``K_j' = D_1 f X_j' + D_2 f t_j' + D_p f p'``;
-backward   ``w_j = h b_j psi + h sum_l a_lj mu_l``, ``mu_j = D_x (w_j . f + h b_j ell)``, ``psi_before = psi + sum mu_j``,
-           and the Hessian gains ``Z_j' D^2 (w_j . f + h b_j ell) Z_j`` at every stage.
+backward   ``w_j = h b_j psi + h sum_l a_lj mu_l``, ``mu_j = D_x (w_j . f + h b_j ell)``,
+           ``psi_before = psi + sum mu_j``, and the Hessian gains ``Z_j' D^2 (w_j . f + h b_j ell) Z_j`` at every stage.
 
 Only rows that open or close a mode have a length and times that depend on theta: these *end rows* have their own form.
 """
@@ -67,6 +67,15 @@ class Sizes:
         """Entries of a vector: even, so that vector instructions of the processor fit."""
         return self.D if self.D == 1 else self.D + self.D % 2
 
+    @property
+    def stages_at_once(self) -> int:
+        """Stages that one function adds to the Hessian: all of a row, unless the function became too long."""
+        return STAGES if self.n * self.D <= SHORT else 1
+
+
+SHORT = 100
+"""Products of a row with a vector that are written out for each stage."""
+
 
 def constants_of(arguments: Arguments) -> list[Any]:
     """What functions of the model look at beside t, x, p and signals."""
@@ -87,7 +96,7 @@ class Kernels:
         psi, jump       costate; what samples at the end of a row add to it
         J, g, H         cost, gradient (width,), Hessian (D, width): sums
         time, y         a moment, and what the sensors see then
-        entries         second derivatives at the stages of a row, (s, count); Zt: derivative of the stage's time
+        entries         second derivatives at the stages of a row, (s, count)
     """
 
     def __init__(self, structure: Structure, sizes: Sizes, order: int) -> None:
@@ -247,9 +256,10 @@ class Kernels:
         self.module.straight(name, FORWARD, stores)
 
     def backward_row(self, name: str, stage: Template, end_row: bool) -> list[tuple[int, int]]:
-        """One row: the costate before it, its part of the gradient, and second derivatives for `curvature`.
+        """One row: the costate before it, its part of the gradient, and second derivatives for `curvature_function`.
 
-        Returns which entries of the second derivative along (t, x, p) these are.
+        Returns which entries of the second derivative along (t, x, p) these are; behind them, for an end row, stands
+        c_j.
         """
         graph, n, M = Graph(), self.sizes.n, self.sizes.M
         p, constants = self.inputs(graph)
@@ -294,23 +304,35 @@ class Kernels:
                     X_d = graph.loads("XZ", n, j * n, vector=True)
                     K_d.append(f_x @ X_d + _along(f_p, units) + f_t * times_d[j])
                     ell_d.append(l_x @ X_d + _along(l_p, units) + l_t.item() * times_d[j])
-                total = sum(b[j] * (psi @ K_d[j] + ell_d[j]) + (mu[j] * _combined(a[j], K_d)).sum() for j in range(STAGES))
+                total = sum(
+                    b[j] * (psi @ K_d[j] + ell_d[j]) + (mu[j] * _combined(a[j], K_d)).sum() for j in range(STAGES)
+                )
                 stores.append(("length", 0, _as_vector(graph, total)))
         stores.append(("g", 0, _as_vector(graph, g)))
         chosen = sorted({key for at in found for key, node in at.items() if node.number != 0.0})
-        for j in range(STAGES):
-            values = [found[j][key] for key in chosen]
-            stores += [("entries", j * len(chosen) + k, node) for k, node in enumerate(values)]
+        for j in range(STAGES if self.second else 0):
+            values = [found[j][key] for key in chosen] + [graph.constant(c[j])] * end_row
+            stores += [("entries", j * len(values) + k, node) for k, node in enumerate(values)]
         self.module.straight(name, BACKWARD, stores)
         return chosen
 
-    def curvature_function(self, name: str, chosen: list[tuple[int, int]]) -> None:
-        """H gains ``Z' S Z`` at one stage; `chosen` are the entries of S, whose values it is given."""
-        graph = Graph()
-        second = {key: graph.load("entries", k) for k, key in enumerate(chosen)}
-        zt = [graph.load("Zt", d) for d in range(self.sizes.D)]
-        at = [(graph.load("Zt", 0, vector=True), zt), *self.state_directions(graph, "Z")]
-        self.module.straight(name, CURVATURE, self.curved(graph, second, at))
+    def curvature_function(self, name: str, chosen: list[tuple[int, int]], end_row: bool) -> None:
+        """H gains ``Z' S Z`` at `stages_at_once` stages; `chosen` are the entries of S, whose values it is given."""
+        graph, n, D = Graph(), self.sizes.n, self.sizes.D
+        H = [graph.load("H", d, vector=True) for d in range(D)]
+        rows = H
+        size = len(chosen) + end_row
+        for j in range(self.sizes.stages_at_once):
+            second = {key: graph.load("entries", j * size + k) for k, key in enumerate(chosen)}
+            of_time = graph.constant(0.0), [graph.constant(0.0)] * D
+            if end_row:
+                c_j = graph.load("entries", j * size + len(chosen))
+                start_d, end_d = (graph.load(name, 0, vector=True) for name in ("opens", "closes"))
+                starts, ends = ([graph.load(name, d) for d in range(D)] for name in ("opens", "closes"))
+                entries = [one + c_j * (other - one) for one, other in zip(starts, ends, strict=True)]
+                of_time = start_d + c_j * (end_d - start_d), entries
+            rows = self.curved(graph, rows, second, [of_time, *self.state_directions(graph, "XZ", j * n)])
+        self.module.straight(name, CURVATURE, _changed(H, rows))
 
     def length_function(self) -> None:
         """H gains the products of a row's length with what `backward_row` stored for it."""
@@ -323,40 +345,40 @@ class Kernels:
             stores.append(("H", d, row))
         self.module.straight("length", LENGTH, stores)
 
-    def stage_time_function(self, j: int) -> None:
-        """Derivative along theta of the time of a stage of an end row."""
-        graph = Graph()
-        start_d, end_d = (graph.load(name, 0, vector=True) for name in ("opens", "closes"))
-        self.module.straight(f"stage_time_{j}", STAGE_TIME, [("Zt", 0, start_d + c[j] * (end_d - start_d))])
-
-    def state_directions(self, graph: Graph, pointer: str) -> list[tuple[Node, list[Node]]]:
+    def state_directions(self, graph: Graph, pointer: str, first: int = 0) -> list[tuple[Node, list[Node]]]:
         """The derivative of each entry of x along theta: as a vector and entry by entry."""
         n, D, width = self.sizes.n, self.sizes.D, self.sizes.width
         return [
             (graph.load(pointer, k, vector=True), [graph.load(pointer, k * width + d) for d in range(D)])
-            for k in range(n)
+            for k in range(first, first + n)
         ]
 
     def curved(
-        self, graph: Graph, second: dict[tuple[int, int], Node], along: list[tuple[Node, list[Node]]]
-    ) -> list[Store]:
-        """Stores of H with ``Z' S Z`` added, S given by its lower half along (t, x, p); `along` is Z of t and x."""
-        n, N, D = self.sizes.n, self.sizes.N, self.sizes.D
+        self, graph: Graph, H: list[Node], second: dict[tuple[int, int], Node], along: list[tuple[Node, list[Node]]]
+    ) -> list[Node]:
+        """Rows of H with ``Z' S Z`` added, S given by its lower half along (t, x, p); `along` is Z of t and x."""
+        n, N = self.sizes.n, self.sizes.N
         vectors = [vector for vector, _ in along] + self.units(graph)
         product: dict[int, Any] = {}
         for (k, m), value in second.items():
             for one, other in {(k, m), (m, k)}:
                 product[one] = product.get(one, 0.0) + value * vectors[other]
-        stores = []
-        for d in range(D):
-            row = graph.load("H", d, vector=True)
+        rows = []
+        for d, row in enumerate(H):
             for k, entries in enumerate(entries for _, entries in along):
                 if k in product:
                     row = row + entries[d] * product[k]
             if 1 + n + d - N in product and d >= N:
                 row = row + product[1 + n + d - N]
-            stores.append(("H", d, row))
-        return [store for store in stores if store[2].op != "load"]
+            rows.append(row)
+        return rows
+
+    def curved_once(
+        self, graph: Graph, second: dict[tuple[int, int], Node], along: list[tuple[Node, list[Node]]]
+    ) -> list[Store]:
+        """Stores of H with ``Z' S Z`` added."""
+        H = [graph.load("H", d, vector=True) for d in range(self.sizes.D)]
+        return _changed(H, self.curved(graph, H, second, along))
 
     def cost_function(self, name: str, pointers: tuple[str, ...], at: Callable[..., list[Objects]], jump: str) -> None:
         """A cost of (x, p) at one moment: J, g and H grow, and the costate by its derivative."""
@@ -375,7 +397,7 @@ class Kernels:
         if self.second:
             none = graph.constant(0.0)
             along = [(none, [none] * self.sizes.D), *self.state_directions(graph, "Z")]
-            stores += self.curved(graph, _entries(second, with_time=False), along)
+            stores += self.curved_once(graph, _entries(second, with_time=False), along)
         self.module.straight(name, pointers, stores)
 
     def reset_functions(self, i: int) -> None:
@@ -405,7 +427,7 @@ class Kernels:
         if self.second:
             numbers = [graph.constant(float(d == i)) for d in range(self.sizes.D)]
             along = [(graph.unit(i), numbers), *self.state_directions(graph, "Z")]
-            stores += self.curved(graph, _entries(second, with_time=True), along)
+            stores += self.curved_once(graph, _entries(second, with_time=True), along)
         self.module.straight(f"reset_back_{i}", RESET_BACK, stores)
 
     def start_functions(self) -> None:
@@ -455,8 +477,7 @@ class Kernels:
 FORWARD = ("c", "p", "row", "signal", "opens", "closes", "x", "Z", "X", "XZ", "x_after", "Z_after", "J")
 BACKWARD = ("c", "p", "row", "signal", "opens", "closes", "psi", "jump", "X", "XZ", "g", "entries", "length")
 LENGTH = ("opens", "closes", "length", "H")
-STAGE_TIME = ("opens", "closes", "Zt")
-CURVATURE = ("entries", "Zt", "Z", "H")
+CURVATURE = ("entries", "opens", "closes", "XZ", "H")
 START = ("c", "p", "x", "Z")
 START_BACK = ("c", "p", "psi", "jump", "g", "H")
 OUTPUTS = ("c", "p", "time", "x", "y")
@@ -506,6 +527,10 @@ def _along(derivatives: Objects, units: list[Node]) -> Any:
     for k, unit in enumerate(units):
         total = total + derivatives[..., k] * unit
     return total
+
+
+def _changed(H: list[Node], rows: list[Node]) -> list[Store]:
+    return [("H", d, row) for d, (old, row) in enumerate(zip(H, rows, strict=True)) if row is not old]
 
 
 def _as_vector(graph: Graph, value: Any) -> Node:

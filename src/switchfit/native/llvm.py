@@ -116,7 +116,8 @@ class _Writer:
         if op == "const":
             return str(args[0]).lower() if isinstance(args[0], bool) else literal(args[0])
         if op == "load":
-            return self.emit(f"load {self._type(node)}, ptr {self.address(*args, node.vector)}, align 8")
+            pointer, offset = args
+            return self.emit(f"load {self._type(node)}, ptr {self.address(pointer, offset, node.vector)}, align 8")
         if op == "unit":
             entries = (f"double {literal(float(k == args[0]))}" for k in range(self.module.width))
             return "<" + ", ".join(entries) + ">"
@@ -138,10 +139,7 @@ class _Writer:
             kind = "i1" if all(x.op in CONDITIONS or isinstance(x.number, bool) for x in args[1:]) else kind
             return self.emit(f"select i1 {self.value(args[0])}, {kind} {a[1]}, {kind} {a[2]}")
         given = ", ".join(f"double {x}" for x in a)
-        if op in INTRINSICS:
-            name = f"llvm.{INTRINSICS[op]}.f64"
-        else:
-            name = FROM_LIBM[op]
+        name = f"llvm.{INTRINSICS[op]}.f64" if op in INTRINSICS else FROM_LIBM[op]
         types = ", ".join("double" for _ in a)
         memory = "" if op in INTRINSICS else " memory(none) nounwind willreturn"
         self.module.declare(name, f"declare double @{name}({types}){memory}")
@@ -184,6 +182,7 @@ class Program:
 
     def __init__(self, engine: Any, key: str) -> None:
         self._engine, self.key = engine, key
+        self._functions: dict[str, Any] = {}
 
     def address(self, name: str) -> int:
         """Where one of its functions is."""
@@ -191,7 +190,9 @@ class Program:
 
     def function(self, name: str, *types: Any) -> Any:
         """One of its functions that return nothing, to be called from Python."""
-        return ctypes.CFUNCTYPE(None, *types)(self.address(name))
+        if name not in self._functions:
+            self._functions[name] = ctypes.CFUNCTYPE(None, *types)(self.address(name))
+        return self._functions[name]
 
 
 def compiled(text: str) -> Program:
@@ -251,5 +252,3 @@ def _library() -> Any:
 def _address(name: str) -> int | None:
     function = getattr(_library(), name, None)
     return None if function is None else ctypes.cast(function, ctypes.c_void_p).value
-
-

@@ -19,7 +19,7 @@ from switchfit.data import FloatArray
 from switchfit.model import Arguments, Samples, Structure, float64
 from switchfit.native.driver import POINTERS, Driver
 from switchfit.native.frame import handler
-from switchfit.native.kernels import SAMPLE, STAGES, Kernels, Sizes, constants_of
+from switchfit.native.kernels import END, SAMPLE, STAGES, Kernels, Sizes, constants_of
 from switchfit.native.llvm import Program, compiled
 from switchfit.native.trace import Unsupported
 from switchfit.rungekutta import EXPLICIT
@@ -62,7 +62,7 @@ def _text(structure: Structure, sizes: Sizes, order: int) -> str:
                 chosen = kernels.backward_row(f"backward_{kind}_{mode}", stage, kind == "end")
                 counts.append(len(chosen))
             if order == 2:
-                kernels.curvature_function(f"curvature_{kind}_{mode}", chosen)
+                kernels.curvature_function(f"curvature_{kind}_{mode}", chosen, kind == "end")
         kernels.module.add(driver.forward_segment(mode))
         if order > 0:
             kernels.module.add(driver.backward_segment(mode, *counts))
@@ -84,8 +84,6 @@ def _text(structure: Structure, sizes: Sizes, order: int) -> str:
     kernels.start_functions()
     if order == 2:
         kernels.length_function()
-        for j in range(STAGES):
-            kernels.stage_time_function(j)
     if order == 0:
         kernels.output_function()
         kernels.module.add(driver.outputs())
@@ -197,7 +195,7 @@ class NativeExperiment:
         for samples, count in zip(arguments.samples, counts, strict=True):
             for values, kind in zip(samples, (np.int64, float, float, float), strict=True):
                 self._arrays.append(np.ascontiguousarray(np.asarray(values)[:count], dtype=kind))
-        self._table = np.array([array.ctypes.data for array in self._arrays], dtype=np.uintp)
+        self._table = np.array([a.__array_interface__["data"][0] for a in self._arrays], dtype=np.uintp)
         self._address = self._table.ctypes.data
         self._result = self._sums[n + 1 : n + 1 + D], self._sums[n + 1 + width :].reshape(D, width)[:, :D]
 

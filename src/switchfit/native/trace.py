@@ -171,10 +171,12 @@ MOVES: dict[str, Callable[..., Any]] = {
 """Operations that only move entries about."""
 
 NUMPY: dict[str, Callable[..., Any]] = {
-    "iota": lambda params: np.arange(params["shape"][params["dimension"]]).reshape(
-        [-1 if k == params["dimension"] else 1 for k in range(len(params["shape"]))]
-    )
-    + np.zeros(params["shape"], int),
+    "iota": lambda params: (
+        np.arange(params["shape"][params["dimension"]]).reshape(
+            [-1 if k == params["dimension"] else 1 for k in range(len(params["shape"]))]
+        )
+        + np.zeros(params["shape"], int)
+    ),
     "convert_element_type": lambda params, a: a,
     "add": lambda params, a, b: a + b,
     "sub": lambda params, a, b: a - b,
@@ -310,9 +312,11 @@ ARRAYS: dict[str, Callable[..., Any]] = {
     "reduce_min": _reduced(lambda graph: partial(graph.apply, "min")),
     "reduce_and": _reduced(lambda graph: partial(graph.apply, "and")),
     "reduce_or": _reduced(lambda graph: partial(graph.apply, "or")),
-    "cumsum": lambda graph, params, a: np.flip(np.cumsum(np.flip(a, params["axis"]), params["axis"]), params["axis"])
-    if params["reverse"]
-    else np.cumsum(a, params["axis"]),
+    "cumsum": lambda graph, params, a: (
+        np.flip(np.cumsum(np.flip(a, params["axis"]), params["axis"]), params["axis"])
+        if params["reverse"]
+        else np.cumsum(a, params["axis"])
+    ),
 }
 """Operations on whole arrays."""
 

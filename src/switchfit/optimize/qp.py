@@ -119,6 +119,11 @@ class LinearConstraints:
         return self.lower.size
 
     @cached_property
+    def movable(self) -> NDArray[np.bool_]:
+        """Which unknowns their bounds leave any room, shape (d,)."""
+        return np.asarray(self.lower < self.upper)
+
+    @cached_property
     def normals(self) -> FloatArray:
         """Inward normals of rows, lower and upper bounds, shape (m + 2 d, d)."""
         identity = np.eye(self.size)

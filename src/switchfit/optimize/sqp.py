@@ -596,9 +596,11 @@ def _solve_on_sides(
     point, constraints = state.point, problem.constraints
     gradient, hessian = point.derivatives(sides)
     lower, upper = np.minimum(low - point.theta, 0.0), np.maximum(high - point.theta, 0.0)
-    lower[point.kink & (sides > 0)] = 0.0
-    upper[point.kink & (sides < 0)] = 0.0
-    free = ~(point.kink & (sides == 0)) & (constraints.lower < constraints.upper)
+    free = constraints.movable
+    if point.kink.any():
+        lower[point.kink & (sides > 0)] = 0.0
+        upper[point.kink & (sides < 0)] = 0.0
+        free = ~(point.kink & (sides == 0)) & free
     m, k = constraints.b.size, int(np.count_nonzero(free))
     if isinstance(hessian, Arrow) and problem.uses_hessian:
         return _solve_arrow(problem, state, gradient, hessian, free, lower, upper)
@@ -607,14 +609,18 @@ def _solve_on_sides(
     rows = slice(None) if k == free.size else np.concatenate([np.ones(m, dtype=bool), free, free])
     matrix = _model_matrix(problem, state, hessian, part)
     slack = np.maximum(constraints.A @ point.theta - constraints.b, 0.0)
-    slack[point.active[point.active < m]] = 0.0
+    if point.active.size:
+        slack[point.active[point.active < m]] = 0.0
     lower, upper = lower[part], upper[part]
     offsets = np.concatenate([-slack, lower, -upper])
     solution = solve_qp(gradient[part], matrix[part][:, part], constraints.normals[rows][:, part], offsets)
-    # A bound that presses is reached exactly, whatever rounding did to the step: kinks depend on it.
-    at_lower, at_upper = solution.multipliers[m : m + k] > 0.0, solution.multipliers[m + k :] > 0.0
+    found = solution.step
+    if solution.multipliers.any():
+        # A bound that presses is reached exactly, whatever rounding did to the step: kinks depend on it.
+        at_lower, at_upper = solution.multipliers[m : m + k] > 0.0, solution.multipliers[m + k :] > 0.0
+        found = np.where(at_lower, lower, np.where(at_upper, upper, found))
     step = np.zeros(free.size)
-    step[part] = np.clip(np.where(at_lower, lower, np.where(at_upper, upper, solution.step)), lower, upper)
+    step[part] = np.minimum(np.maximum(found, lower), upper)
     slope, curved = float(gradient @ step), matrix @ step
     force = constraints.A.T @ solution.multipliers[:m] - curved
     return _Direction(step, slope, -(slope + 0.5 * float(step @ curved))), force
@@ -781,7 +787,7 @@ def _move(problem: _Problem, theta: FloatArray, step: FloatArray) -> FloatArray:
     """theta + step, feasible, and bit for bit on a bound or breakpoint that it reaches up to rounding."""
     lower, upper = problem.constraints.lower, problem.constraints.upper
     moved = theta + step
-    near = np.where(step != 0.0, 8 * EPS * np.maximum(np.maximum(np.abs(theta), np.abs(step)), np.abs(moved)), 0.0)
+    near = 8 * EPS * (step != 0.0) * np.maximum(np.maximum(np.abs(theta), np.abs(step)), np.abs(moved))
     pinned = np.zeros(theta.size, dtype=bool)
     for i, points in problem.breakpoints:
         mark = _nearest(points, moved[i])
