@@ -258,8 +258,8 @@ def test_collapsed_ordering_is_exact_and_named():
     assert result.status is Status.CONVERGED
     assert result.active == ("tau_1 <= tau_2 (mode 'slip' collapsed)",)
     assert "collapsed" in result.message
-    assert result.theta[1] - result.theta[0] == pytest.approx(0.0, abs=1e-15)
-    assert result.theta[1] >= result.theta[0]
+    # How many units in the last place it takes to be feasible depends on how the processor's BLAS rounds the step.
+    assert 0.0 <= result.theta[1] - result.theta[0] <= 4 * np.spacing(result.theta[1])
     assert result.multipliers[0] > 0.1
     assert_feasible(result, constraints)
     assert result.free_basis.shape == (3, 2)

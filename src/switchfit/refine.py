@@ -4,8 +4,8 @@ The adaptive solve has the same order as the fixed steps that follow. It also in
 they are resolved as well. Its steps are turned into a refinement of the intervals between the nodes that have to be
 there anyway; the mesh then stays as it is while theta moves.
 
-Explicit solves take SciPy's RK45 step by step, in a compiled loop: a hundred steps cost a tenth of a millisecond there,
-ten in Python. SciPy itself solves stiff modes, and says what is wrong where a solve fails.
+Explicit solves take SciPy's RK45 step by step, in machine code where there is any: a hundred steps cost less than a
+tenth of a millisecond there, ten in Python. SciPy itself solves all else, and says what is wrong where a solve fails.
 """
 
 from __future__ import annotations
@@ -19,16 +19,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.integrate
-from jax import lax
-from scipy.integrate import RK45
 
 from switchfit.cache import compilation_cache
 from switchfit.data import FloatArray, Measurements
 from switchfit.experiment import Experiment, signals_of
 from switchfit.mesh import Mesh
 from switchfit.model import Arguments, Model, Piece, Structure, float64
+from switchfit.native.kernels import Adaptive
+from switchfit.native.program import NativeExperiment, native_experiment
 from switchfit.problem import Problem
-from switchfit.rungekutta import combine
 
 MAX_STEPS = 200_000
 """Adaptive steps in one mode before it is called stiff."""
@@ -109,22 +108,28 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
     ends = np.concatenate([[experiment.t0], tau, [experiment.tf]])
     inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
     steps = [np.array([experiment.t0])]
+    native = native_experiment(structure, whole, coarse.times, order=0)
     with float64(), compilation_cache():
         x = _finite(
-            initial_state(arguments, p, structure=structure.functions),
+            initial_state(arguments, p, structure=structure.functions) if native is None else native.initial_state(p),
             f"initial_state at p = {_rounded(problem.split(theta)[1])}",
         )
         for i, mode in enumerate(structure.mode_of_segment):
             if i > 0 and structure.reset_maps[i - 1] is not None:
                 names = tuple(experiment.mode_sequence[i - 1 : i + 1])
-                value = after_reset(arguments, ends[i], x, p, structure=structure, i=i - 1)
+                if native is None:
+                    value = after_reset(arguments, ends[i], x, p, structure=structure, i=i - 1)
+                else:
+                    value = native.after_reset(i - 1, ends[i], x, p)
                 x = _finite(value, f"reset map {names} at t = {ends[i]:.6g}, x = {x.tolist()}")
             knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
             stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
             for start, end in pairwise(stops.tolist()):
                 if end > start:
-                    solve = _solve_compiled if problem.solver == "explicit" else _solve
-                    accepted, x = solve(problem, structure, arguments, signals, coarse, mode, start, end, x, p)
+                    found = None if native is None else _solve_natively(problem, native, mode, start, end, x, p)
+                    if found is None:
+                        found = _solve(problem, structure, arguments, signals, coarse, mode, start, end, x, p)
+                    accepted, x = found
                     steps.append(accepted)
     return np.concatenate(steps)
 
@@ -183,115 +188,41 @@ STEPS_AT_ONCE = 256
 """Steps of the compiled solver in one call."""
 
 
-def _solve_compiled(
-    problem: Problem,
-    structure: Structure,
-    arguments: Arguments,
-    signals: FloatArray,
-    coarse: Mesh,
-    mode: int,
-    start: float,
-    end: float,
-    x: FloatArray,
-    p: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """The same as `_solve` for the explicit method, which takes over where this one fails."""
-    if signals.shape[2]:
-        length = 1 << (len(coarse.nodes) - 1).bit_length()  # few shapes, few programs
-        nodes = np.concatenate([coarse.nodes, np.repeat(coarse.nodes[-1:], length - len(coarse.nodes))])
-        cells = np.concatenate([signals, np.repeat(signals[-1:], length - 1 - len(signals), axis=0)])
-    else:
-        nodes, cells = np.asarray(arguments.nodes), np.asarray(arguments.signals)
+def _solve_natively(
+    problem: Problem, native: NativeExperiment, mode: int, start: float, end: float, x: FloatArray, p: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
+    """The same as `_solve` for the explicit method; None where it fails."""
+    y, at = np.append(x, 0.0), Adaptive()
+    state = np.zeros(at.size)
+    state[at.t], state[at.end], state[at.rtol], state[at.atol] = start, end, problem.rtol, problem.atol
+    state[at.low], state[at.high] = np.nextafter(start, end), np.nextafter(end, start)
+    with np.errstate(all="ignore"):
+        state[at.h] = _first_step(problem, native, mode, start, end, y, p)
     accepted = np.array([start])
-    t, y, h = np.asarray(start), np.append(x, 0.0), np.asarray(np.nan)
-    while t < end and not _too_many(accepted, end):
-        now = (t, start, end, y, h, p, problem.rtol, problem.atol)
-        result = _steps(arguments, nodes, cells, mode, *now, structure=structure.functions)
-        times, count, t, y, h = (np.asarray(value) for value in result)
-        accepted = np.append(accepted, times[:count])
-        if count < STEPS_AT_ONCE:
+    while state[at.t] < end and not _too_many(accepted, end):
+        times = native.adaptive_steps(mode, state, y, p, STEPS_AT_ONCE)
+        accepted = np.append(accepted, times)
+        if len(times) < STEPS_AT_ONCE:
             break
-    if t < end or not np.isfinite(y).all():
-        return _solve(problem, structure, arguments, signals, coarse, mode, start, end, x, p)
-    return accepted[1:], y[:-1]
+    return None if state[at.t] < end or not np.isfinite(y).all() else (accepted[1:], y[:-1])
 
 
-@partial(jax.jit, static_argnames=("structure",))
-def _steps(
-    arguments: Arguments,
-    nodes: jax.Array,
-    signals: jax.Array,
-    mode: jax.Array,
-    t: jax.Array,
-    start: jax.Array,
-    end: jax.Array,
-    y: jax.Array,
-    h: jax.Array,
-    p: jax.Array,
-    rtol: jax.Array,
-    atol: jax.Array,
-    *,
-    structure: Structure,
-) -> tuple[jax.Array, ...]:
-    """Up to `STEPS_AT_ONCE` accepted steps of SciPy's RK45 from t: their ends, their number, t, y, and the next step.
+def _first_step(
+    problem: Problem, native: NativeExperiment, mode: int, start: float, end: float, y: FloatArray, p: FloatArray
+) -> float:
+    """Hairer, Norsett and Wanner I, section II.4, as SciPy has it."""
 
-    NaN for h asks for a first step. A step that would be too short to change t ends the loop.
-    """
-    model = Model(structure, arguments)
-    A, B, C, E = RK45.A, RK45.B, RK45.C, RK45.E
-    tiny = jnp.finfo(float).eps
+    def size(error: FloatArray) -> float:
+        return float(np.sqrt(np.mean((error / (problem.atol + problem.rtol * np.abs(y))) ** 2)))
 
-    def f(t: jax.Array, y: jax.Array) -> jax.Array:
-        inside = jnp.clip(t, jnp.nextafter(start, end), jnp.nextafter(end, start))
-        cell = jnp.clip(jnp.searchsorted(nodes, inside, side="right") - 1, 0, len(signals) - 1)
-        piece = Piece(nodes[cell], signals[cell])
-        cost = model.density(piece)(t, y[:-1], p) if model.has_running_cost else jnp.zeros(())
-        fields = [model.field(k, piece) for k in range(len(structure.modes))]
-        slope = fields[0](t, y[:-1], p) if len(fields) == 1 else lax.switch(mode, fields, t, y[:-1], p)
-        return jnp.append(slope, cost)
-
-    def size(error: jax.Array, y: jax.Array, other: jax.Array) -> jax.Array:
-        """Error in units of the tolerance: root mean square."""
-        scale = atol + rtol * jnp.maximum(jnp.abs(y), jnp.abs(other))
-        return jnp.sqrt(jnp.mean((error / scale) ** 2))
-
-    def first_step() -> jax.Array:
-        """Hairer, Norsett and Wanner I, section II.4, as SciPy has it."""
-        slope = f(t, y)
-        of_state, of_slope = size(y, y, y), size(slope, y, y)
-        small = (of_state < 1e-5) | (of_slope < 1e-5)
-        guess = jnp.minimum(jnp.where(small, 1e-6, 0.01 * of_state / of_slope), end - t)
-        bend = size(f(t + guess, y + guess * slope) - slope, y, y) / guess
-        flat = (of_slope <= 1e-15) & (bend <= 1e-15)
-        other = jnp.where(flat, jnp.maximum(1e-6, guess * 1e-3), (0.01 / jnp.maximum(of_slope, bend)) ** 0.2)
-        return jnp.minimum(jnp.minimum(100 * guess, other), end - t)
-
-    def turn(state: Any) -> Any:
-        t, y, h, times, count, refused, stuck = state
-        h = jnp.where(t + h >= end, end - t, h)
-        K = [f(t, y)]
-        for row, c in zip(A[1:], C[1:], strict=True):
-            K.append(f(t + c * h, y + h * combine(row[: len(K)], K)))
-        after = y + h * combine(B, K)
-        K.append(f(t + h, after))
-        error = size(h * combine(E, K), y, after)
-        accepted = error < 1
-        factor = jnp.where(error == 0, 10.0, jnp.clip(0.9 * error**-0.2, 0.2, 10.0))
-        factor = jnp.where(jnp.isnan(error), 0.2, jnp.where(accepted & refused, jnp.minimum(1.0, factor), factor))
-        reached = jnp.where(h == end - t, end, t + h)
-        times = times.at[count].set(jnp.where(accepted, reached, times[count]))
-        stuck = jnp.minimum(h, h * factor) <= 10 * tiny * jnp.abs(t)
-        t, y = jnp.where(accepted, reached, t), jnp.where(accepted, after, y)
-        return t, y, h * factor, times, count + accepted, ~accepted, stuck
-
-    def goes_on(state: Any) -> jax.Array:
-        t, _, _, _, count, _, stuck = state
-        return (t < end) & (count < STEPS_AT_ONCE) & ~stuck
-
-    none = jnp.zeros((), bool)
-    begin = (t, y, jnp.where(jnp.isnan(h), first_step(), h), jnp.zeros(STEPS_AT_ONCE), jnp.zeros((), int), none, none)
-    t, y, h, times, count, _, _ = lax.while_loop(goes_on, turn, begin)
-    return times, count, t, y, h
+    slope = native.slope(mode, start, y, p)
+    of_state, of_slope = size(y), size(slope)
+    guess = min(1e-6 if of_state < 1e-5 or of_slope < 1e-5 else 0.01 * of_state / of_slope, end - start)
+    ahead = min(start + guess, float(np.nextafter(end, start)))
+    bend = size(native.slope(mode, ahead, y + guess * slope, p) - slope) / guess
+    flat = of_slope <= 1e-15 and bend <= 1e-15
+    other = max(1e-6, guess * 1e-3) if flat else (0.01 / max(of_slope, bend)) ** 0.2
+    return min(100 * guess, other, end - start)
 
 
 def _too_many(accepted: Sequence[float] | FloatArray, end: float) -> bool:
@@ -301,7 +232,7 @@ def _too_many(accepted: Sequence[float] | FloatArray, end: float) -> bool:
     return len(accepted) + PACE * (end - accepted[-1]) / (accepted[-1] - accepted[-PACE - 1]) > MAX_STEPS
 
 
-def _finite(value: jax.Array, what: str) -> FloatArray:
+def _finite(value: jax.Array | FloatArray, what: str) -> FloatArray:
     state = np.asarray(value)
     if not np.isfinite(state).all():
         raise ValueError(f"{what} returned {state.tolist()}, which is not finite: use a better guess.")

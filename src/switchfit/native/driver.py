@@ -7,8 +7,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from scipy.integrate import RK45
+
 from switchfit.model import Structure
 from switchfit.native.kernels import (
+    ADAPTIVE,
     BACKWARD,
     CURVATURE,
     END,
@@ -18,11 +21,14 @@ from switchfit.native.kernels import (
     RESET,
     RESET_BACK,
     SAMPLE,
+    SLOPE,
     STAGES,
     START,
     START_BACK,
+    Adaptive,
     Sizes,
 )
+from switchfit.native.llvm import literal
 
 POINTERS = (
     *("nodes", "signals", "c", "p", "tau", "first_cell", "states", "tangents", "stages", "stage_tangents", "jumps"),
@@ -201,6 +207,86 @@ class Driver:
         self.line("br i1 %done, label %out, label %loop")
         self.lines.append("out:")
         return self.finished(f"internal void @samples_{k}(ptr %table, i64 %count)")
+
+    def slope_at(self, mode: int) -> str:
+        """Slope of one mode at any time: in the cell that holds it, or would if it were between `low` and `high`."""
+        S, at = self.sizes.signals, Adaptive()
+        self.line("%moment = alloca [2 x double]")
+        found = self.pointers()
+        self.line("store double %time, ptr %moment")
+        if S:
+            low, high = (self.let(f"load double, ptr {self.at('%state', k)}") for k in (at.low, at.high))
+            above = self.let(f"fcmp olt double %time, {low}")
+            later = self.let(f"select i1 {above}, double {low}, double %time")
+            below = self.let(f"fcmp ogt double {later}, {high}")
+            inside = self.let(f"select i1 {below}, double {high}, double {later}")
+            self.line("br label %search")
+            self.lines.append("search:")  # the first node of the cell is at or before the time, the one at %right after
+            self.line("%left = phi i64 [0, %entry], [%left_next, %halve]")
+            self.line("%right = phi i64 [%cells, %entry], [%right_next, %halve]")
+            self.line("%width = sub i64 %right, %left")
+            self.line("%many = icmp sgt i64 %width, 1")
+            self.line("br i1 %many, label %halve, label %found")
+            self.lines.append("halve:")
+            self.line("%sum = add i64 %left, %right")
+            self.line("%middle = lshr i64 %sum, 1")
+            node = self.let(f"load double, ptr {self.at(found['nodes'], '%middle')}")
+            self.line(f"%before = fcmp ole double {node}, {inside}")
+            self.line("%left_next = select i1 %before, i64 %middle, i64 %left")
+            self.line("%right_next = select i1 %before, i64 %right, i64 %middle")
+            self.line("br label %search")
+            self.lines.append("found:")
+            origin = self.let(f"load double, ptr {self.at(found['nodes'], '%left')}")
+            self.line(f"store double {origin}, ptr {self.at('%moment', 1)}")
+            found["signals"] = self.at(found["signals"], "%left", 4 * S)
+        given = found | {"moment": "%moment", "signal": found["signals"], "y": "%y", "K": "%K"}
+        self.call(f"slope_{mode}", SLOPE, given)
+        signature = f"internal void @slope_at_{mode}(ptr %table, i64 %cells, ptr %state, double %time, ptr %y, ptr %K)"
+        return self.finished(signature)
+
+    def adaptive(self, mode: int) -> str:
+        """Adaptive steps in one mode until its end, or `most` of them: the moments reached, and how many."""
+        size, at = self.sizes.n + 1, Adaptive()
+        given = {name: f"%{name}" for name in ADAPTIVE}
+        self.line(f"%argument = alloca [{size} x double]")
+        self.line(f"%K = alloca [{(len(RK45.C) + 1) * size} x double]")
+        self.line("br label %loop")
+        self.lines.append("loop:")
+        self.line("%done = phi i64 [0, %entry], [%more, %next]")
+        t = self.let(f"load double, ptr {self.at('%state', at.t)}")
+        end = self.let(f"load double, ptr {self.at('%state', at.end)}")
+        stuck = self.let(f"load double, ptr {self.at('%state', at.stuck)}")
+        flags = [self.let(f"fcmp olt double {t}, {end}"), self.let(f"fcmp oeq double {stuck}, 0.0")]
+        flags.append(self.let("icmp slt i64 %done, %most"))
+        goes_on = self.let(f"and i1 {self.let(f'and i1 {flags[0]}, {flags[1]}')}, {flags[2]}")
+        self.line(f"br i1 {goes_on}, label %try, label %out")
+        self.lines.append("try:")
+        self.call("adaptive_begin", ADAPTIVE, given)
+        step = self.let(f"load double, ptr {self.at('%state', at.step)}")
+        slope = f"call void @slope_at_{mode}(ptr %table, i64 %cells, ptr %state"
+        self.line(f"{slope}, double {t}, ptr %y, ptr %K)")
+        for j, c in enumerate([*RK45.C.tolist()[1:], 1.0], start=1):
+            self.call(f"adaptive_{j}" if j < len(RK45.C) else "adaptive_after", ADAPTIVE, given)
+            ahead = self.let(f"fmul double {step}, {literal(c)}")
+            time = self.let(f"fadd double {t}, {ahead}")
+            self.line(f"{slope}, double {time}, ptr %argument, ptr {self.at('%K', j * size)})")
+        self.call("adaptive_judge", ADAPTIVE, given)
+        refused = self.let(f"load double, ptr {self.at('%state', at.refused)}")
+        accepted = self.let(f"fcmp oeq double {refused}, 0.0")
+        self.line(f"br i1 {accepted}, label %keep, label %next")
+        self.lines.append("keep:")
+        reached = self.let(f"load double, ptr {self.at('%state', at.t)}")
+        self.line(f"store double {reached}, ptr {self.at('%times', '%done')}")
+        self.line("br label %next")
+        self.lines.append("next:")
+        self.line(f"%more = add i64 %done, {self.let(f'zext i1 {accepted} to i64')}")
+        self.line("br label %loop")
+        self.lines.append("out:")
+        self.line("store i64 %done, ptr %count")
+        return self.finished(
+            f"void @adaptive_{mode}_steps"
+            "(ptr %table, i64 %cells, ptr %state, ptr %y, ptr %times, i64 %most, ptr %count)"
+        )
 
     def whole(self) -> str:
         """Everything, in order."""

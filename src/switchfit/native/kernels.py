@@ -15,15 +15,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.integrate import RK45
 
 from switchfit.model import Arguments, Model, Piece, Samples, Structure
 from switchfit.native.llvm import Module
-from switchfit.native.scalars import Graph, Node, Objects, Template
+from switchfit.native.scalars import Graph, Node, Objects, Template, as_objects
 from switchfit.native.trace import traced
 from switchfit.rungekutta import EXPLICIT
 
@@ -82,6 +83,32 @@ def constants_of(arguments: Arguments) -> list[Any]:
     return [*arguments.fixed, *arguments.weights, arguments.initial_state]
 
 
+class Adaptive(NamedTuple):
+    """Places in the state of the adaptive solver.
+
+    t, h : where it is, and how long a step it will try; `step` is what it tries, which may be cut by the `end`
+    rtol, atol : tolerances
+    refused, stuck : 1 if the last step was refused; if the next would not change t
+    low, high : between which moments the field may be asked
+    """
+
+    t: int = 0
+    h: int = 1
+    end: int = 2
+    rtol: int = 3
+    atol: int = 4
+    refused: int = 5
+    stuck: int = 6
+    low: int = 7
+    high: int = 8
+    step: int = 9
+
+    @property
+    def size(self) -> int:
+        """Number of places."""
+        return len(self)
+
+
 class Kernels:
     """Writes the functions of one structure into a module.
 
@@ -96,6 +123,7 @@ class Kernels:
         psi, jump       costate; what samples at the end of a row add to it
         J, g, H         cost, gradient (width,), Hessian (D, width): sums
         time, y         a moment, and what the sensors see then
+        moment          (t, first node of the cell), for the adaptive solver; its y is (x, running cost)
         entries         second derivatives at the stages of a row, (s, count)
     """
 
@@ -414,7 +442,7 @@ class Kernels:
             Z = graph.loads("Z", n, vector=True)
             Z_after = R_x @ Z + _along(R_p, self.units(graph)) + R_t * graph.unit(i)
             stores += [("Z_after", k, _as_vector(graph, v)) for k, v in enumerate(Z_after)]
-        self.module.straight(f"reset_{i}", RESET, stores)
+        self.module.straight(f"reset_{i}", RESET, stores, seen=True)
         if self.order == 0:
             return
 
@@ -442,7 +470,7 @@ class Kernels:
             (x_p,) = template(graph, p, none, *constants, only=(1,))
             Z = _along(x_p, self.units(graph))
             stores += [("Z", k, _as_vector(graph, v)) for k, v in enumerate(Z)]
-        self.module.straight("start", START, stores)
+        self.module.straight("start", START, stores, seen=True)
         if self.order == 0:
             return
 
@@ -458,6 +486,76 @@ class Kernels:
             rows = [(N + k, graph.load("H", N + k, vector=True), _along(g_pp[k], units)) for k in range(len(units))]
             stores += [("H", d, row + more) for d, row, more in rows]
         self.module.straight("start_back", START_BACK, stores)
+
+    def slope_function(self, name: str, stage: Template) -> None:
+        """f and ell at one moment, for the adaptive solver: derivatives of y = (x, running cost so far)."""
+        graph, n = Graph(), self.sizes.n
+        p, constants = self.inputs(graph)
+        t, origin = graph.loads("moment", 2)
+        signal = graph.loads("signal", 4 * self.sizes.signals)
+        none = np.full(n, graph.constant(0.0), dtype=object)
+        given = (t, graph.loads("y", n), p, none, graph.constant(0.0), origin, signal, *constants)
+        f, ell = stage(graph, *given, only=(F, ELL))
+        self.module.straight(name, SLOPE, _stored("K", 0, [*f, ell.item()]), seen=True)
+
+    def adaptive_functions(self) -> None:
+        """What the adaptive solver does between its slopes: SciPy's RK45, with the same control of its steps.
+
+        Of its state, which lies in memory, `Adaptive` says the places.
+        """
+        size = self.sizes.n + 1
+        A, B, E = RK45.A, RK45.B, RK45.E
+        at = Adaptive()
+
+        def begun() -> tuple[Graph, Objects, Objects]:
+            graph = Graph()
+            return graph, graph.loads("state", at.size), graph.loads("y", size)
+
+        graph, state, _ = begun()
+        t, h, end = state[at.t], state[at.h], state[at.end]
+        step = graph.apply("select", graph.apply("le", end, t + h), end - t, h)
+        self.module.straight("adaptive_begin", ADAPTIVE, [("state", at.step, step)])
+        for j in range(1, len(A)):
+            graph, state, y = begun()
+            K = [graph.loads("K", size, k * size) for k in range(j)]
+            argument = y + state[at.step] * _combined(A[j].tolist(), K)
+            self.module.straight(f"adaptive_{j}", ADAPTIVE, _stored("argument", 0, argument))
+        graph, state, y = begun()
+        K = [graph.loads("K", size, k * size) for k in range(len(B))]
+        after = y + state[at.step] * _combined(B.tolist(), K)
+        self.module.straight("adaptive_after", ADAPTIVE, _stored("argument", 0, after))
+
+        graph, state, y = begun()
+        after = graph.loads("argument", size)
+        K = [graph.loads("K", size, k * size) for k in range(len(E))]
+        t, step, end = state[at.t], state[at.step], state[at.end]
+        error = step * _combined(E.tolist(), K)
+        sizes = ((graph.apply("abs", old), graph.apply("abs", new)) for old, new in zip(y, after, strict=True))
+        larger = as_objects([graph.apply("max", old, new) for old, new in sizes])
+        relative = error / (state[at.atol] + state[at.rtol] * larger)
+        norm = graph.apply("sqrt", (relative * relative).sum() / size)
+        accepted = graph.apply("lt", norm, 1.0)
+        factor = 0.9 * graph.apply("pow", norm, -0.2)
+        factor = graph.apply("min", graph.apply("max", factor, 0.2), 10.0)
+        factor = graph.apply("select", graph.apply("eq", norm, 0.0), 10.0, factor)
+        again = graph.apply("and", accepted, graph.apply("ne", state[at.refused], 0.0))
+        factor = graph.apply("select", again, graph.apply("min", factor, 1.0), factor)
+        factor = graph.apply("select", graph.apply("ne", norm, norm), 0.2, factor)
+        reached = graph.apply("select", graph.apply("eq", step, end - t), end, t + step)
+        shortest = graph.apply("min", step, step * factor)
+        stuck = graph.apply("le", shortest, 10 * np.finfo(float).eps * graph.apply("abs", t))
+        number = {name: graph.apply("select", flag, 1.0, 0.0) for name, flag in (("yes", accepted), ("stuck", stuck))}
+        stores = [
+            ("state", at.t, graph.apply("select", accepted, reached, t)),
+            ("state", at.h, step * factor),
+            ("state", at.refused, 1.0 - number["yes"]),
+            ("state", at.stuck, number["stuck"]),
+        ]
+        stores += [
+            ("y", k, graph.apply("select", accepted, new, old))
+            for k, (new, old) in enumerate(zip(after, y, strict=True))
+        ]
+        self.module.straight("adaptive_judge", ADAPTIVE, stores)
 
     def output_function(self) -> None:
         """What all sensors see: references first, then Measurements."""
@@ -478,6 +576,8 @@ FORWARD = ("c", "p", "row", "signal", "opens", "closes", "x", "Z", "X", "XZ", "x
 BACKWARD = ("c", "p", "row", "signal", "opens", "closes", "psi", "jump", "X", "XZ", "g", "entries", "length")
 LENGTH = ("opens", "closes", "length", "H")
 CURVATURE = ("entries", "opens", "closes", "XZ", "H")
+SLOPE = ("c", "p", "moment", "signal", "y", "K")
+ADAPTIVE = ("state", "y", "argument", "K")
 START = ("c", "p", "x", "Z")
 START_BACK = ("c", "p", "psi", "jump", "g", "H")
 OUTPUTS = ("c", "p", "time", "x", "y")

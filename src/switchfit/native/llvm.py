@@ -62,10 +62,13 @@ class Module:
         self.functions: list[str] = []
         self._declared: dict[str, str] = {}
 
-    def straight(self, name: str, pointers: Sequence[str], stores: Sequence[tuple[str, int, Node]]) -> None:
+    def straight(
+        self, name: str, pointers: Sequence[str], stores: Sequence[tuple[str, int, Node]], seen: bool = False
+    ) -> None:
         """A function of pointers that loads, computes and stores: ``(pointer, offset, what)``.
 
-        Everything is loaded before anything is stored. Offsets count doubles, those of vectors vectors.
+        Everything is loaded before anything is stored. Offsets count doubles, those of vectors vectors. Only what is
+        `seen` can be called from Python.
         """
         writer = _Writer(self)
         values = [writer.value(node) for node in needed([node for _, _, node in stores])]
@@ -74,7 +77,8 @@ class Module:
             writer.store(pointer, offset, node)
         arguments = ", ".join(f"ptr %{pointer}" for pointer in pointers)
         body = "\n".join(writer.lines)
-        self.functions.append(f"define internal void @{name}({arguments}) {{\n{body}\n  ret void\n}}\n")
+        linkage = "" if seen else "internal "
+        self.functions.append(f"define {linkage}void @{name}({arguments}) {{\n{body}\n  ret void\n}}\n")
 
     def add(self, text: str) -> None:
         """A function written by hand."""

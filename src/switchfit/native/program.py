@@ -19,7 +19,7 @@ from switchfit.data import FloatArray
 from switchfit.model import Arguments, Samples, Structure, float64
 from switchfit.native.driver import POINTERS, Driver
 from switchfit.native.frame import handler
-from switchfit.native.kernels import END, SAMPLE, STAGES, Kernels, Sizes, constants_of
+from switchfit.native.kernels import END, RESET, SAMPLE, SLOPE, STAGES, START, Kernels, Sizes, constants_of
 from switchfit.native.llvm import Program, compiled
 from switchfit.native.trace import Unsupported
 from switchfit.rungekutta import EXPLICIT
@@ -64,6 +64,10 @@ def _text(structure: Structure, sizes: Sizes, order: int) -> str:
             if order == 2:
                 kernels.curvature_function(f"curvature_{kind}_{mode}", chosen, kind == "end")
         kernels.module.add(driver.forward_segment(mode))
+        if order == 0:
+            kernels.slope_function(f"slope_{mode}", stage)
+            kernels.module.add(driver.slope_at(mode))
+            kernels.module.add(driver.adaptive(mode))
         if order > 0:
             kernels.module.add(driver.backward_segment(mode, *counts))
     for k in range(len(structure.measurements)):
@@ -86,6 +90,7 @@ def _text(structure: Structure, sizes: Sizes, order: int) -> str:
         kernels.length_function()
     if order == 0:
         kernels.output_function()
+        kernels.adaptive_functions()
         kernels.module.add(driver.outputs())
     kernels.module.add(driver.whole())
     if order == 2:
@@ -191,6 +196,7 @@ class NativeExperiment:
             "times": self._moments,
             "y": self._outputs,
         }
+        self._named: dict[str, Any] = arrays
         self._arrays = [arrays[name] for name in POINTERS]
         for samples, count in zip(arguments.samples, counts, strict=True):
             for values, kind in zip(samples, (np.int64, float, float, float), strict=True):
@@ -242,6 +248,53 @@ class NativeExperiment:
             of_states[1],
             of_outputs[1],
         )
+
+    def initial_state(self, p: FloatArray) -> FloatArray:
+        """x(t0): (n,)."""
+        self._theta[self.sizes.N :] = p
+        self._call("start", START, {"x": self._states})
+        return self._states[0].copy()
+
+    def after_reset(self, i: int, t: float, x: FloatArray, p: FloatArray) -> FloatArray:
+        """State after the reset map of transition i (from 0): (n,)."""
+        self._theta[i], self._theta[self.sizes.N :] = t, p
+        before, after = np.array(x, dtype=float), np.zeros(self.sizes.n)
+        self._call(f"reset_{i}", RESET, {"x": before, "x_after": after})
+        return after
+
+    def slope(self, mode: int, t: float, y: FloatArray, p: FloatArray) -> FloatArray:
+        """f and ell at t, y = (x, running cost so far): (n + 1,). At a knot that of the signal from there on."""
+        self._theta[self.sizes.N :] = p
+        cell = min(max(int(self._times.searchsorted(t, "right")) - 1, 0), len(self._times) - 2)
+        moment, slope = np.array([t, self._times[cell]]), np.zeros(len(y))
+        signal = self._named["signals"][cell]
+        self._call(f"slope_{mode}", SLOPE, {"moment": moment, "signal": signal, "y": y, "K": slope})
+        return slope
+
+    def adaptive_steps(self, mode: int, state: FloatArray, y: FloatArray, p: FloatArray, most: int) -> FloatArray:
+        """Up to `most` steps of SciPy's RK45, from `state` and y, which change: the moments reached.
+
+        Parameters
+        ----------
+        state : array
+            See `Adaptive`.
+        y : (n + 1,) array
+            State and running cost so far.
+        """
+        self._theta[self.sizes.N :] = p
+        times, count = np.zeros(most), np.zeros(1, dtype=np.int64)
+        pointer, number = ctypes.c_void_p, ctypes.c_int64
+        types = [pointer, number, pointer, pointer, pointer, number, pointer]
+        solve = self._program.function(f"adaptive_{mode}_steps", *types)
+        addresses = [a.ctypes.data for a in (state, y, times, count)]
+        solve(self._address, self._scalars[0], *addresses[:3], most, addresses[3])
+        return times[: count[0]]
+
+    def _call(self, name: str, order: tuple[str, ...], given: dict[str, FloatArray]) -> None:
+        """One of the straight lines; what is not given it finds where the driver does."""
+        arrays = [given[key] if key in given else self._named.get(key) for key in order]
+        addresses = [None if a is None else a.ctypes.data for a in arrays]
+        self._program.function(name, *[ctypes.c_void_p] * len(order))(*addresses)
 
     def _run(self, tau: FloatArray, p: FloatArray, side: float) -> None:
         N = self.sizes.N
