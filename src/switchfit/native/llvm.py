@@ -38,6 +38,7 @@ COMPARISONS = {"lt": "fcmp olt", "le": "fcmp ole", "eq": "fcmp oeq", "ne": "fcmp
 FROM_LIBM = {
     **{op: op for op in ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "asinh")},
     **{op: op for op in ("acosh", "atanh", "exp", "log", "pow", "expm1", "log1p", "cbrt", "exp2", "erf", "erfc")},
+    "rem": "fmod",
 }
 """Functions of the C library."""
 

@@ -47,6 +47,7 @@ FOLDED: dict[str, Callable[..., Any]] = {
     "acos": np.arccos,
     "atan": np.arctan,
     "atan2": np.arctan2,
+    "rem": np.fmod,
     "sinh": np.sinh,
     "cosh": np.cosh,
     "tanh": np.tanh,

@@ -66,9 +66,15 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
         if hasattr(inner, "consts"):
             return _run(graph, inner.jaxpr, inner.consts, args)
         return _run(graph, inner, (), args)
+    if name == "scan":
+        return _scan(graph, params, args)
+    if name == "cond":
+        return _cond(graph, params, args)
     if name in MOVES:
         result = MOVES[name](params, *args)
         return result if name in ("split", "unstack") else [result]
+    if name in INDEXED and args[1].dtype != object:
+        return [np.asarray(INDEXED[name](equation, *args), dtype=object)]
     if all(a.dtype != object for a in args):
         if name in NUMPY:
             shape, dtype = equation.outvars[0].aval.shape, equation.outvars[0].aval.dtype
@@ -81,9 +87,47 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
         return [np.asarray(np.frompyfunc(meaning, len(args), 1)(*args), dtype=object)]
     if name in ARRAYS:
         return [np.asarray(ARRAYS[name](graph, params, *args), dtype=object)]
-    if name in INDEXED and all(a.dtype != object for a in args[1:2]):
-        return [INDEXED[name](graph, equation, *args)]
     raise Unsupported(f"jax.lax.{name}")
+
+
+def _scan(graph: Graph, params: Any, args: list[Any]) -> list[Any]:
+    """A loop of known length, one turn after another."""
+    fixed, carried, length = params["num_consts"], params["num_carry"], params["length"]
+    consts, carry, columns = args[:fixed], args[fixed : fixed + carried], args[fixed + carried :]
+    made: list[list[Any]] = []
+    for k in reversed(range(length)) if params["reverse"] else range(length):
+        results = _run(
+            graph, params["jaxpr"].jaxpr, params["jaxpr"].consts, [*consts, *carry, *(c[k] for c in columns)]
+        )
+        carry = results[:carried]
+        made.append(results[carried:])
+        if len(graph.nodes) > MOST_NODES:
+            raise Unsupported(f"more than {MOST_NODES} operations")
+    rows = made[::-1] if params["reverse"] else made
+    return [*carry, *(np.stack(column) for column in zip(*rows, strict=True))]
+
+
+def _cond(graph: Graph, params: Any, args: list[Any]) -> list[Any]:
+    """All branches, and a choice among their results."""
+    which, *operands = args
+    branches = [_run(graph, branch.jaxpr, branch.consts, operands) for branch in params["branches"]]
+    choice = which.item()
+    if not isinstance(choice, Choice):
+        return branches[int(np.clip(choice, 0, len(branches) - 1))]
+    select = np.frompyfunc(partial(graph.apply, "select", choice.condition), 2, 1)
+    return [np.asarray(select(yes, no), dtype=object) for no, yes in zip(*branches, strict=True)]
+
+
+class Choice:
+    """A condition as a number that picks a branch: it can do nothing else."""
+
+    def __init__(self, condition: Node) -> None:
+        self.condition = condition
+
+    def __float__(self) -> float:
+        raise Unsupported("arithmetic with integers that depend on the state")
+
+    __int__ = __bool__ = __index__ = __float__  # type: ignore[assignment]
 
 
 CALLS = {
@@ -161,6 +205,7 @@ MOVES: dict[str, Callable[..., Any]] = {
     "concatenate": lambda params, *a: np.concatenate(a, axis=params["dimension"]),
     "pad": _pad,
     "rev": lambda params, a: np.flip(a, params["dimensions"]),
+    "tile": lambda params, a: np.tile(a, params["reps"]),
     "split": _split,
     "stack": lambda params, *a: np.stack(a, axis=params["axis"]),
     "unstack": lambda params, a: list(np.moveaxis(a, params["axis"], 0)),
@@ -206,6 +251,8 @@ def _convert(graph: Graph, params: Any) -> Callable[[Any], Any]:
     kind = np.dtype(params["new_dtype"])
 
     def convert(a: Any) -> Any:
+        if kind == np.int32 and isinstance(a, Node) and _is_condition(a):
+            return Choice(a)
         if kind != np.float64:
             raise Unsupported(f"numbers of type {kind}")
         return graph.apply("select", a, 1.0, 0.0) if isinstance(a, Node) and _is_condition(a) else a
@@ -321,29 +368,51 @@ ARRAYS: dict[str, Callable[..., Any]] = {
 """Operations on whole arrays."""
 
 
-def _moved(graph: Graph, equation: Any, a: Any, *rest: Any) -> Objects:
-    """What a linear operation on the first and the last of its arguments, with known indices between, does to nodes.
+def _windows(equation: Any, shape: tuple[int, ...], indices: Any, many: Any) -> Any:
+    """Pairs of places: a window of an array of a shape, and where it stands among `many` windows.
 
-    It is found by letting it move the numbers of entries.
+    As `jax.lax.gather` and `jax.lax.scatter` have it, for known indices.
     """
-    bind = partial(equation.primitive.bind, **equation.params)
-    operands = [a, *rest]
-    places = [0] if len(operands) == 2 else [0, 2]
-    shape = equation.outvars[0].aval.shape
-    total = np.full(shape, 0.0, dtype=object)
-    for place in places:
-        flat = operands[place].astype(object).reshape(-1)
-        for k, value in enumerate(flat):
-            if not isinstance(value, Node) and value == 0.0:
-                continue
-            one = [np.zeros(o.shape) if j in places else o for j, o in enumerate(operands)]
-            one[place].reshape(-1)[k] = 1.0
-            with jax.ensure_compile_time_eval():
-                landed = np.asarray(bind(*one))
-            for at in zip(*np.nonzero(landed), strict=True):
-                total[at] = total[at] + landed[at] * value
-    return total
+    numbers, params = equation.params["dimension_numbers"], equation.params
+    if equation.primitive.name == "gather":
+        inside, dropped, starts = numbers.offset_dims, numbers.collapsed_slice_dims, numbers.start_index_map
+        batched = numbers.operand_batching_dims
+        sizes = params["slice_sizes"]
+    else:
+        inside, dropped = numbers.update_window_dims, numbers.inserted_window_dims
+        starts, batched = numbers.scatter_dims_to_operand_dims, numbers.operand_batching_dims
+        lengths = iter([many[k] for k in inside])
+        sizes = [1 if k in (*dropped, *batched) else next(lengths) for k in range(len(shape))]
+    if batched:
+        raise Unsupported("indices in batches")
+    outside = [k for k in range(len(many)) if k not in inside]
+    for place in np.ndindex(*indices.shape[:-1]):
+        first = [0] * len(shape)
+        for axis, start in zip(starts, indices[place], strict=True):
+            first[axis] = int(start)
+        if any(f < 0 or f + size > n for f, size, n in zip(first, sizes, shape, strict=True)):
+            raise Unsupported("an index out of range")
+        window = tuple(f if k in dropped else slice(f, f + sizes[k]) for k, f in enumerate(first))
+        among: list[Any] = [slice(None)] * len(many)
+        for axis, k in zip(outside, place, strict=True):
+            among[axis] = k
+        yield window, tuple(among)
 
 
-INDEXED: dict[str, Callable[..., Any]] = {"gather": _moved, "scatter-add": _moved, "scatter": _moved}
+def _gather(equation: Any, a: Any, indices: Any) -> Any:
+    result = np.empty(equation.outvars[0].aval.shape, dtype=object)
+    for window, among in _windows(equation, a.shape, indices, result.shape):
+        result[among] = a[window]
+    return result
+
+
+def _scatter(equation: Any, a: Any, indices: Any, updates: Any) -> Any:
+    result = a.astype(object)
+    for window, among in _windows(equation, a.shape, indices, updates.shape):
+        added = equation.primitive.name == "scatter-add"
+        result[window] = result[window] + updates[among] if added else updates[among]
+    return result
+
+
+INDEXED: dict[str, Callable[..., Any]] = {"gather": _gather, "scatter-add": _scatter, "scatter": _scatter}
 """Operations at known indices."""
