@@ -1,7 +1,7 @@
 """How states and outputs depend on theta along a trajectory: exact first derivatives of the discretised system.
 
-A sweep forward carries x and its derivative X in theta from row to row, in blocks of rows, mode by mode, as
-`switchfit.simulate` carries x alone: one small program a model, whatever the mesh and the number of samples.
+Machine code has x and its derivative X in theta at the ends of all rows. Where there is none, JAX carries them from row
+to row, in blocks of rows, mode by mode: one small program a model, whatever the mesh and the number of samples.
 
 The derivative of x at a *fixed* time t jumps where a transition time passes t. With X^i the jump of the vector field,
 equation (8), it is 0 in tau_i just before the transition and -X^i just after. At a transition both are given, one with
@@ -25,6 +25,7 @@ from switchfit.cache import compilation_cache
 from switchfit.data import FloatArray, Measurements
 from switchfit.mesh import CHUNK, Mesh, rows
 from switchfit.model import Arguments, Model, Piece, Structure, float64
+from switchfit.native.program import native_experiment
 from switchfit.problem import Problem
 from switchfit.refine import initial_state
 from switchfit.rungekutta import step
@@ -113,6 +114,48 @@ def sensitivity(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> Sens
     structure = problem.structures[e]
     tau, p = problem.vectors(theta, e)
     whole = problem.arguments(e, mesh)
+    found = _natively(structure, whole, mesh, tau, p)
+    segments, first_cell = _by_blocks(structure, whole, mesh, tau, p) if found is None else found
+    placed = [_placed(part, problem.places[e], len(theta)) for part in segments]
+    return Sensitivity(placed, first_cell, mesh)
+
+
+def _natively(
+    structure: Structure, whole: Arguments, mesh: Mesh, tau: FloatArray, p: FloatArray
+) -> tuple[list[Segment], NDArray[np.intp]] | None:
+    """All segments by machine code, and the cells in which they begin; None where there is none.
+
+    Its derivatives are those at the ends of rows, which move where they are transitions. At the time at which such an
+    end is they are less dx/dt.
+    """
+    native = native_experiment(structure, whole, mesh.times, order=2)
+    fields = native_experiment(structure, whole, mesh.times, order=0)
+    if native is None or fields is None:
+        return None
+    found = native.simulated(tau, p)
+    N, cells = structure.N, len(mesh.times) - 1
+    lasts = [*found.first_cell[1:].tolist(), cells - 1]
+    segments = []
+    for i, (first, last) in enumerate(zip(found.first_cell.tolist(), lasts, strict=True)):
+        here = slice(first + i, last + i + 2)
+        times, states, tangents = (a[here].copy() for a in (found.times, found.states, found.tangents))
+        if i - 1 in structure.resets:
+            states[0], tangents[0] = found.reset_states[i - 1], found.reset_tangents[i - 1]
+        mode = structure.mode_of_segment[i]
+        for k, transition in ((0, i - 1), (-1, i)):
+            if 0 <= transition < N:
+                slope = fields.slope(mode, times[k], np.append(states[k], 0.0), p, first if k == 0 else last)[:-1]
+                tangents[k, :, transition] -= slope
+        points = Points(times, states, tangents, *native.outputs(times, states, p, tangents))
+        before = Points(*(column[:-1] for column in points))
+        segments.append(Segment(times[:-1], times[1:], before, Points(*(column[1:] for column in points))))
+    return segments, found.first_cell.astype(np.intp)
+
+
+def _by_blocks(
+    structure: Structure, whole: Arguments, mesh: Mesh, tau: FloatArray, p: FloatArray
+) -> tuple[list[Segment], NDArray[np.intp]]:
+    """The same by JAX, some rows at a time."""
     arguments = whole.without_mesh()
     layout = rows(mesh.nodes, tau, 1.0, np)
     cell, start, end = (np.reshape(a, -1) for a in (layout.cell, layout.start, layout.end))
@@ -130,8 +173,7 @@ def sensitivity(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> Sens
             given = (start[span], end[span], starts_d[span], ends_d[span], pieces)
             x, X, part = _segment(structure, arguments, mode, x, X, p, given)
             segments.append(part)
-    placed = [_placed(part, problem.places[e], len(theta)) for part in segments]
-    return Sensitivity(placed, np.asarray(layout.first_cell), mesh)
+    return segments, np.asarray(layout.first_cell)
 
 
 def _placed(part: Segment, places: NDArray[np.intp], d: int) -> Segment:
@@ -244,8 +286,7 @@ def _block_along(
 
     def outputs(t: jax.Array, x: jax.Array, X: jax.Array) -> tuple[jax.Array, jax.Array]:
         def seen(x: jax.Array, p: jax.Array) -> jax.Array:
-            sensors = (*structure.references, *((s.observe, s.channels) for s in structure.measurements))
-            return jnp.concatenate([jnp.zeros(0), *(model.observed(h, t, x, p, q) for h, q in sensors)])
+            return jnp.concatenate([jnp.zeros(0), *(model.observed(h, t, x, p, q) for h, q in structure.outputs)])
 
         y, linear = jax.linearize(seen, x, p)
         return y, jax.vmap(linear, in_axes=(1, 1), out_axes=1)(X, P)

@@ -230,16 +230,17 @@ def _natively(
 ) -> tuple[float, list[Segment]]:
     """J and all segments, by machine code."""
     found = native.simulated(tau, p)
+    y, reset_y = native.outputs(found.times, found.states, p)[0], native.outputs(tau, found.reset_states, p)[0]
     bounds = np.concatenate([nodes[:1], tau, nodes[-1:]])
     lasts = [*found.first_cell[1:].tolist(), len(nodes) - 2]
     segments = []
     for i, (first, last) in enumerate(zip(found.first_cell.tolist(), lasts, strict=True)):
         times = np.concatenate([bounds[i : i + 1], nodes[first + 1 : last + 1], bounds[i + 1 : i + 2]])
-        states, outputs = (a[first + i : last + i + 2] for a in (found.states, found.outputs))
+        states, outputs = (a[first + i : last + i + 2] for a in (found.states, y))
         before, y_before = states[:-1], outputs[:-1]
         if i - 1 in structure.resets:
             before = np.concatenate([found.reset_states[i - 1 : i], before[1:]])
-            y_before = np.concatenate([found.reset_outputs[i - 1 : i], y_before[1:]])
+            y_before = np.concatenate([reset_y[i - 1 : i], y_before[1:]])
         segments.append(Segment(times[:-1], times[1:], before, states[1:], y_before, outputs[1:]))
     return found.cost, segments
 

@@ -32,7 +32,7 @@ from switchfit.native.llvm import literal
 
 POINTERS = (
     *("nodes", "signals", "c", "p", "tau", "first_cell", "states", "tangents", "stages", "stage_tangents", "jumps"),
-    *("units", "psi", "J", "g", "H", "reset_states", "reset_tangents", "entries", "length", "times", "y"),
+    *("units", "psi", "J", "g", "H", "reset_states", "reset_tangents", "entries", "length"),
 )
 """What the driver finds in its table of pointers; then four for each Measurements: cell, time, value, weight."""
 
@@ -331,25 +331,26 @@ class Driver:
         return self.finished(f"void @evaluate(ptr %table, i64 %cells, double %t0, double %tf{counts})")
 
     def outputs(self) -> str:
-        """Outputs at all states that `whole` has found: those behind rows, then those behind reset maps."""
-        n, N = self.sizes.n, self.sizes.N
+        """Outputs of any states, at moments."""
+        n, width = self.sizes.n, self.sizes.width
         q = sum(channels for _, channels in self.structure.outputs)
         found = self.pointers()
-        count = self.let(f"add i64 %cells, {2 * N + 1}")
         self.line("br label %loop")
         self.lines.append("loop:")
         self.line("%k = phi i64 [0, %entry], [%more, %loop]")
         given = {
-            "time": self.at(found["times"], "%k"),
-            "x": self.at(found["states"], "%k", n),
-            "y": self.at(found["y"], "%k", q),
+            "time": self.at("%times", "%k"),
+            "x": self.at("%x", "%k", n),
+            "Z": self.at("%Z", "%k", n * width),
+            "y": self.at("%y", "%k", q),
+            "Y": self.at("%Y", "%k", q * width),
         }
         self.call("outputs", OUTPUTS, found | given)
         self.line("%more = add i64 %k, 1")
-        self.line(f"%done = icmp sge i64 %more, {count}")
+        self.line("%done = icmp sge i64 %more, %count")
         self.line("br i1 %done, label %out, label %loop")
         self.lines.append("out:")
-        return self.finished("void @all_outputs(ptr %table, i64 %cells)")
+        return self.finished("void @all_outputs(ptr %table, i64 %count, ptr %times, ptr %x, ptr %Z, ptr %y, ptr %Y)")
 
 
 SEGMENT = "ptr %table, i64 %segment, i64 %first, i64 %last, double %begins, double %finishes"

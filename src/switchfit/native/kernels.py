@@ -122,7 +122,7 @@ class Kernels:
         opens, closes   derivatives of the start and the end of a row: two vectors
         psi, jump       costate; what samples at the end of a row add to it
         J, g, H         cost, gradient (width,), Hessian (D, width): sums
-        time, y         a moment, and what the sensors see then
+        time, y, Y      a moment, what the sensors see then, and its derivative
         moment          (t, first node of the cell), for the adaptive solver; its y is (x, running cost)
         entries         second derivatives at the stages of a row, (s, count)
     """
@@ -558,18 +558,27 @@ class Kernels:
         self.module.straight("adaptive_judge", ADAPTIVE, stores)
 
     def output_function(self) -> None:
-        """What all sensors see: references first, then Measurements."""
+        """What all sensors see, references first, then Measurements; in second order with its derivatives."""
 
         def outputs(t: Any, x: Any, p: Any, *constants: Any) -> Any:
             model = self.model(constants)
-            seen = [model.observed(observe, t, x, p, q) for observe, q in self.structure.outputs]
-            return [jnp.concatenate([jnp.zeros(0), *seen])]
+
+            def seen(x: Any, p: Any) -> Any:
+                each = [model.observed(observe, t, x, p, q) for observe, q in self.structure.outputs]
+                return jnp.concatenate([jnp.zeros(0), *each])
+
+            return [seen(x, p), *(jax.jacfwd(seen, argnums=(0, 1))(x, p) if self.second else ())]
 
         template = traced(outputs, (), (self.sizes.n,), (self.sizes.M,), *self.sizes.constants)
         graph = Graph()
         p, constants = self.inputs(graph)
-        (y,) = template(graph, graph.load("time", 0), graph.loads("x", self.sizes.n), p, *constants)
-        self.module.straight("outputs", OUTPUTS, _stored("y", 0, y))
+        y, *jacobians = template(graph, graph.load("time", 0), graph.loads("x", self.sizes.n), p, *constants)
+        stores = _stored("y", 0, y)
+        if self.second:
+            h_x, h_p = jacobians
+            y_d = h_x @ graph.loads("Z", self.sizes.n, vector=True) + _along(h_p, self.units(graph))
+            stores += [("Y", k, _as_vector(graph, value)) for k, value in enumerate(y_d)]
+        self.module.straight("outputs", OUTPUTS, stores)
 
 
 FORWARD = ("c", "p", "row", "signal", "opens", "closes", "x", "Z", "X", "XZ", "x_after", "Z_after", "J")
@@ -580,7 +589,7 @@ SLOPE = ("c", "p", "moment", "signal", "y", "K")
 ADAPTIVE = ("state", "y", "argument", "K")
 START = ("c", "p", "x", "Z")
 START_BACK = ("c", "p", "psi", "jump", "g", "H")
-OUTPUTS = ("c", "p", "time", "x", "y")
+OUTPUTS = ("c", "p", "time", "x", "Z", "y", "Y")
 RESET = ("c", "p", "tau", "x", "Z", "x_after", "Z_after")
 RESET_BACK = ("c", "p", "tau", "x", "Z", "psi", "g", "H")
 SAMPLE = ("c", "p", "time", "value", "weight", "x", "Z", "jump", "J", "g", "H")

@@ -89,8 +89,9 @@ def _text(structure: Structure, sizes: Sizes, order: int) -> str:
     if order == 2:
         kernels.length_function()
     if order == 0:
-        kernels.output_function()
         kernels.adaptive_functions()
+    if order != 1:
+        kernels.output_function()
         kernels.module.add(driver.outputs())
     kernels.module.add(driver.whole())
     if order == 2:
@@ -108,23 +109,25 @@ def native_experiment(
 
 
 class Simulated(NamedTuple):
-    """States and outputs of a simulation.
+    """A simulation: R = cells + N rows, one after the other.
 
     Attributes
     ----------
     cost : J
     first_cell : (N + 1,) int, cell in which each segment begins
-    states, outputs : (R + 1, n), (R + 1, q)
-        Of R = cells + N rows: at t0, then at the end of each row, before a jump.
-    reset_states, reset_outputs : (N, n), (N, q), behind the reset maps; meaningless where there is none
+    times, states, tangents : (R + 1,), (R + 1, n), (R + 1, n, D)
+        At t0, then at the end of each row, before a jump. The tangents, in second order, are derivatives at an end that
+        moves with theta where it is a transition.
+    reset_states, reset_tangents : (N, n), (N, n, D), behind the reset maps; meaningless where there is none
     """
 
     cost: float
     first_cell: NDArray[np.int64]
+    times: FloatArray
     states: FloatArray
-    outputs: FloatArray
     reset_states: FloatArray
-    reset_outputs: FloatArray
+    tangents: FloatArray
+    reset_tangents: FloatArray
 
 
 class NativeExperiment:
@@ -155,23 +158,21 @@ class NativeExperiment:
         self.sizes, self.order = sizes, order
         n, N, D, width, cells = sizes.n, sizes.N, sizes.D, sizes.width, len(times) - 1
         rows = cells + N
-        q = sum(channels for _, channels in structure.outputs)
+        self._channels = sum(channels for _, channels in structure.outputs)
         counts = [_count(samples) for samples in arguments.samples]
         types = [ctypes.c_void_p, ctypes.c_int64, ctypes.c_double, ctypes.c_double, *[ctypes.c_int64] * len(counts)]
         self._program = program  # whose code must not go away
         self._evaluate = program.function("evaluate", *types)
-        self._all_outputs = program.function("all_outputs", *types[:2]) if order == 0 else None
         self._times = times
         self._scalars = (cells, float(times[0]), float(times[-1]), *counts)
         constants = [np.ravel(np.asarray(a, dtype=np.float64)) for a in constants_of(arguments)]
         units = np.zeros((D + 1, width))
         units[1:, :D] = np.eye(D)
-        seen, first, second = (rows if kept else 0 for kept in (order == 0, order > 0, order == 2))
+        first, second = (rows if kept else 0 for kept in (order > 0, order == 2))
         self._theta, self._first_cell = np.zeros(D), np.zeros(N + 1, dtype=np.int64)
         self._sums = np.zeros(n + 1 + width + D * width)
         self._states = np.zeros((rows + 1 + N, n))
         self._jumps = np.zeros((first + 1) * n if counts else n)
-        self._moments, self._outputs = np.zeros(seen + 1 + N), np.zeros((seen + 1 + N, q))
         arrays: dict[str, Any] = {
             "nodes": np.ascontiguousarray(times),
             "signals": np.ascontiguousarray(np.asarray(arguments.signals)[:cells]),
@@ -193,8 +194,6 @@ class NativeExperiment:
             "reset_tangents": np.zeros(N * n * width),
             "entries": np.zeros(STAGES * (1 + n + sizes.M) ** 2),
             "length": np.zeros(width),
-            "times": self._moments,
-            "y": self._outputs,
         }
         self._named: dict[str, Any] = arrays
         self._arrays = [arrays[name] for name in POINTERS]
@@ -223,31 +222,42 @@ class NativeExperiment:
         return float(self._sums[self.sizes.n])
 
     def simulated(self, tau: FloatArray, p: FloatArray) -> Simulated:
-        """States and outputs at all ends of rows."""
-        cells = self._scalars[0]
-        rows = cells + self.sizes.N
-        self._place(tau, 1.0)
-        ends = np.append(self._first_cell[1:], cells - 1)
-        self._moments[: rows + 1] = np.concatenate(
-            [self._times[:1]]
-            + [
-                np.append(self._times[first + 1 : last + 1], end)
-                for first, last, end in zip(self._first_cell, ends, [*tau, self._times[-1]], strict=True)
-            ]
-        )
-        self._moments[rows + 1 :] = tau
+        """States at all ends of rows, in second order with their derivatives."""
         self._run(tau, p, 1.0)
-        if self._all_outputs is not None:
-            self._all_outputs(self._address, cells)
-        of_states, of_outputs = ((a[: rows + 1].copy(), a[rows + 1 :].copy()) for a in (self._states, self._outputs))
-        return Simulated(
-            float(self._sums[self.sizes.n]),
-            self._first_cell.copy(),
-            of_states[0],
-            of_outputs[0],
-            of_states[1],
-            of_outputs[1],
+        n, N, D, cells = self.sizes.n, self.sizes.N, self.sizes.D, self._scalars[0]
+        firsts, lasts = self._first_cell.tolist(), [*self._first_cell[1:].tolist(), cells - 1]
+        ends = zip(firsts, lasts, [*tau.tolist(), self._times[-1]], strict=True)
+        inside = [np.append(self._times[first + 1 : last + 1], end) for first, last, end in ends]
+        rows = cells + N
+        tangents, behind = (
+            self._named[name].reshape(-1, n, self.sizes.width) for name in ("tangents", "reset_tangents")
         )
+        return Simulated(
+            float(self._sums[n]),
+            self._first_cell.copy(),
+            np.concatenate([self._times[:1], *inside]),
+            self._states[: rows + 1].copy(),
+            self._states[rows + 1 :].copy(),
+            tangents[..., :D].copy(),
+            behind[..., :D].copy(),
+        )
+
+    def outputs(
+        self, times: FloatArray, states: FloatArray, p: FloatArray, tangents: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """What all sensors see, (L, q), and, where the derivatives (L, n, D) of the states are given, its own."""
+        count, (n, D, width) = len(times), (self.sizes.n, self.sizes.D, self.sizes.width)
+        y, Y = np.zeros((count, self._channels)), np.zeros((count, self._channels, width))
+        Z = np.zeros((count, n, width) if tangents is not None else 0)
+        if tangents is not None:
+            Z[..., :D] = tangents
+        if count:
+            self._theta[self.sizes.N :] = p
+            pointer = ctypes.c_void_p
+            function = self._program.function("all_outputs", pointer, ctypes.c_int64, *[pointer] * 5)
+            given = [np.ascontiguousarray(times), np.ascontiguousarray(states), Z, y, Y]
+            function(self._address, count, *(a.ctypes.data for a in given))
+        return y, Y[..., :D]
 
     def initial_state(self, p: FloatArray) -> FloatArray:
         """x(t0): (n,)."""
@@ -262,10 +272,14 @@ class NativeExperiment:
         self._call(f"reset_{i}", RESET, {"x": before, "x_after": after})
         return after
 
-    def slope(self, mode: int, t: float, y: FloatArray, p: FloatArray) -> FloatArray:
-        """f and ell at t, y = (x, running cost so far): (n + 1,). At a knot that of the signal from there on."""
+    def slope(self, mode: int, t: float, y: FloatArray, p: FloatArray, cell: int | None = None) -> FloatArray:
+        """f and ell at t, y = (x, running cost so far): (n + 1,).
+
+        With the signals of a cell; left out, of the one that holds t, or begins there.
+        """
         self._theta[self.sizes.N :] = p
-        cell = min(max(int(self._times.searchsorted(t, "right")) - 1, 0), len(self._times) - 2)
+        if cell is None:
+            cell = min(max(int(self._times.searchsorted(t, "right")) - 1, 0), len(self._times) - 2)
         moment, slope = np.array([t, self._times[cell]]), np.zeros(len(y))
         signal = self._named["signals"][cell]
         self._call(f"slope_{mode}", SLOPE, {"moment": moment, "signal": signal, "y": y, "K": slope})

@@ -127,7 +127,7 @@ class Choice:
     def __float__(self) -> float:
         raise Unsupported("arithmetic with integers that depend on the state")
 
-    __int__ = __bool__ = __index__ = __float__  # type: ignore[assignment]
+    __int__ = __bool__ = __index__ = __float__
 
 
 CALLS = {
