@@ -619,26 +619,23 @@ def checked_functions(structure: Structure, others: frozenset[str] = frozenset()
 
 
 def _call_functions(structure: Structure, model_of: Callable[[Structure, Arguments], Model]) -> None:
-    arguments = _no_arguments(structure)
-    with float64():
+    def call_all(arguments: Arguments, t: Array, x: Array, p: Array, samples: list[Samples]) -> list[Array]:
         model = model_of(structure, arguments)
-        piece = Piece(jnp.zeros(()), arguments.signals[0])
-        t, x, p = (jax.ShapeDtypeStruct(shape, jnp.float64) for shape in ((), (structure.n,), (structure.M,)))
-        for mode in range(len(structure.modes)):
-            jax.eval_shape(model.field(mode, piece), t, x, p)
-        for i in structure.resets:
-            jax.eval_shape(model.reset(i), t, x, p)
-        for i in structure.guarded:
-            jax.eval_shape(model.guard(i), t, x, p)
+        piece = Piece(t, arguments.signals[0])
+        values = [model.field(mode, piece)(t, x, p) for mode in range(len(structure.modes))]
+        values += [model.reset(i)(t, x, p) for i in structure.resets]
+        values += [model.guard(i)(t, x, p) for i in structure.guarded]
         if structure.terminal_constraints:
-            jax.eval_shape(model.terminal_constraint, x, p)
-        jax.eval_shape(model.density(piece), t, x, p)
-        for k, sensor in enumerate(structure.measurements):
-            row = jax.ShapeDtypeStruct((sensor.channels,), jnp.float64)
-            sample: Any = Samples(jax.ShapeDtypeStruct((), jnp.int64), t, row, row)  # type: ignore[arg-type]  # shapes
-            jax.eval_shape(lambda s, x, p, k=k: model.sample_cost(k, model.seen_at(k, s, p), x, p), sample, x, p)
-        jax.eval_shape(model.terminal, x, p)
-        jax.eval_shape(model.initial_state, p)
+            values.append(model.terminal_constraint(x, p))
+        values.append(model.density(piece)(t, x, p))
+        values += [model.sample_cost(k, model.seen_at(k, s, p), x, p) for k, s in enumerate(samples)]
+        return [*values, model.terminal(x, p), model.initial_state(p)]
+
+    with float64():
+        t, x, p = (jax.ShapeDtypeStruct(shape, jnp.float64) for shape in ((), (structure.n,), (structure.M,)))
+        rows = [jax.ShapeDtypeStruct((sensor.channels,), jnp.float64) for sensor in structure.measurements]
+        samples: Any = [Samples(jax.ShapeDtypeStruct((), jnp.int64), t, row, row) for row in rows]  # type: ignore[arg-type]
+        jax.eval_shape(call_all, _shapes_of_arguments(structure), t, x, p, samples)
 
 
 @lru_cache(maxsize=256)
@@ -646,24 +643,30 @@ def terminal_constraint_count(structure: Structure) -> int:
     """Number of terminal constraints, m."""
     if not structure.terminal_constraints:
         return 0
-    model = Model(structure, _no_arguments(structure))
+
+    def constraint(arguments: Arguments, x: Array, p: Array) -> Array:
+        return Model(structure, arguments).terminal_constraint(x, p)
+
     with float64():
         x, p = (jax.ShapeDtypeStruct((size,), jnp.float64) for size in (structure.n, structure.M))
-        return int(jax.eval_shape(model.terminal_constraint, x, p).shape[0])
+        return int(jax.eval_shape(constraint, _shapes_of_arguments(structure), x, p).shape[0])
 
 
-def _no_arguments(structure: Structure) -> Arguments:
-    """Arguments with zeros, of the shapes that functions of the model look at."""
+def _shapes_of_arguments(structure: Structure) -> Arguments:
+    """Arguments on a mesh of one cell: shapes alone."""
     channels = sum(q for _, q in structure.references) + int(np.prod(structure.input_shape or ()))
-    with float64():
-        return Arguments(
-            nodes=jnp.zeros(2),
-            signals=jnp.zeros((1, 4, channels)),
-            fixed=tuple(jnp.zeros(shape) for _, shape, free in structure.parameters if not free),
-            initial_state=jnp.zeros(structure.n),
-            samples=(),
-            weights=tuple(jnp.ones(q) for _, q in structure.references),
-        )
+
+    def shaped(*shape: int) -> Any:
+        return jax.ShapeDtypeStruct(shape, jnp.float64)
+
+    return Arguments(
+        nodes=shaped(2),
+        signals=shaped(1, 4, channels),
+        fixed=tuple(shaped(*shape) for _, shape, free in structure.parameters if not free),
+        initial_state=shaped(structure.n),
+        samples=(),
+        weights=tuple(shaped(q) for _, q in structure.references),
+    )
 
 
 def _of_kind(data: tuple[Any, ...], kind: type) -> list[Any]:

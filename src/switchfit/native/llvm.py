@@ -206,11 +206,15 @@ def compiled(text: str) -> Program:
     key = hashlib.sha256("\n".join([text, llvmlite.__version__, *_processor()]).encode()).hexdigest()
     name, features = _processor()
     machine = llvm.Target.from_default_triple().create_target_machine(cpu=name, features=features, opt=2)
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(text), machine)
     folder = usable_folder()
-    if folder is not None:
-        path = folder / f"native-{key}"
-        engine.set_object_cache(lambda _, code: _write(path, code), lambda _: _read(path))
+    path = None if folder is None else folder / f"native-{key}"
+    code = None if path is None else _read(path)
+    if code is None:
+        code = machine.emit_object(llvm.parse_assembly(text))
+        if path is not None:
+            _write(path, code)
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     return Program(engine, key)
 
