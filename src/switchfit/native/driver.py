@@ -46,9 +46,11 @@ class Driver:
         self.count = 0
 
     def line(self, text: str) -> None:
+        """One more line."""
         self.lines.append(f"  {text}")
 
     def let(self, text: str) -> str:
+        """One more line with a value: its name."""
         self.count += 1
         self.line(f"%t{self.count} = {text}")
         return f"%t{self.count}"
@@ -72,9 +74,11 @@ class Driver:
         return self.let(f"getelementptr inbounds i8, ptr {pointer}, i64 {offset}")
 
     def call(self, name: str, order: tuple[str, ...], given: dict[str, str]) -> None:
+        """Call a straight line with its pointers in order."""
         self.line(f"call void @{name}({', '.join(f'ptr {given[key]}' for key in order)})")
 
     def finished(self, signature: str) -> str:
+        """The lines since the last function as a function."""
         text = f"define {signature} {{\nentry:\n" + "\n".join(self.lines) + "\n  ret void\n}\n"
         self.lines, self.count = [], 0
         return text

@@ -110,7 +110,7 @@ class Adaptive(NamedTuple):
 
 
 class Kernels:
-    """Writes the functions of one structure into a module.
+    """Writes the functions of one structure into a module, with derivatives up to an order.
 
     Every pointer means the same wherever its name stands:
 
@@ -127,10 +127,9 @@ class Kernels:
         entries         second derivatives at the stages of a row, (s, count)
     """
 
-    def __init__(self, structure: Structure, sizes: Sizes, order: int) -> None:
-        self.structure, self.sizes, self.order = structure, sizes, order
+    def __init__(self, structure: Structure, sizes: Sizes, order: int, module: Module) -> None:
+        self.structure, self.sizes, self.order, self.module = structure, sizes, order, module
         self.second = order == 2
-        self.module = Module(sizes.width)
         self.has_samples = bool(structure.measurements)
 
     # The functions of the model, traced

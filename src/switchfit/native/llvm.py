@@ -9,6 +9,7 @@ import ctypes
 import ctypes.util
 import hashlib
 import os
+import re
 import struct
 import sys
 import tempfile
@@ -55,10 +56,16 @@ class Module:
     ----------
     width : int
         Entries of a vector.
+
+    Attributes
+    ----------
+    prefix : str
+        With which the names of all functions begin that are written from now on.
     """
 
     def __init__(self, width: int) -> None:
         self.width = width
+        self.prefix = ""
         self.vector = f"<{width} x double>"
         self.functions: list[str] = []
         self._declared: dict[str, str] = {}
@@ -79,11 +86,11 @@ class Module:
         arguments = ", ".join(f"ptr %{pointer}" for pointer in pointers)
         body = "\n".join(writer.lines)
         linkage = "" if seen else "internal "
-        self.functions.append(f"define {linkage}void @{name}({arguments}) {{\n{body}\n  ret void\n}}\n")
+        self.functions.append(f"define {linkage}void @{self.prefix}{name}({arguments}) {{\n{body}\n  ret void\n}}\n")
 
     def add(self, text: str) -> None:
-        """A function written by hand."""
-        self.functions.append(text)
+        """A function written by hand, which calls none but those of the same prefix, and LLVM's."""
+        self.functions.append(re.sub(r"@(?!llvm\.)(\w+)\(", rf"@{self.prefix}\1(", text))
 
     def declare(self, name: str, signature: str) -> None:
         """A function from elsewhere."""

@@ -20,38 +20,46 @@ from switchfit.model import Arguments, Samples, Structure, float64
 from switchfit.native.driver import POINTERS, Driver
 from switchfit.native.frame import handler
 from switchfit.native.kernels import END, RESET, SAMPLE, SLOPE, STAGES, START, Kernels, Sizes, constants_of
-from switchfit.native.llvm import Program, compiled
+from switchfit.native.llvm import Module, Program, compiled
 from switchfit.native.trace import Unsupported
 from switchfit.rungekutta import EXPLICIT
 
 _one_at_a_time = threading.Lock()
 
 
+PREFIX = {0: "plain_", 1: "first_", 2: ""}
+"""What the names of functions begin with, by the order of their derivatives."""
+
+
 def program_of(structure: Structure, sizes: Sizes, order: int) -> Program | None:
-    """Machine code for a structure, with derivatives up to an order of 2; None where JAX has to do its work.
+    """Machine code for a structure, with derivatives of an order; None where JAX has to do its work.
 
     That is so for implicit steps, for delays that are estimated, and for functions that cannot be written as a straight
-    line of scalars.
+    line of scalars. A fit needs simulations and second derivatives: they are one program.
     """
     with _one_at_a_time:
-        return _program_of(structure, sizes, order)
+        return _program_of(structure, sizes, (1,) if order == 1 else (0, 2))
 
 
 @lru_cache(maxsize=64)
-def _program_of(structure: Structure, sizes: Sizes, order: int) -> Program | None:
+def _program_of(structure: Structure, sizes: Sizes, orders: tuple[int, ...]) -> Program | None:
     late = any(sensor.delay is not None for sensor in structure.measurements)
     if structure.tableau is not EXPLICIT or late or sizes.D == 0:
         return None
+    module = Module(sizes.width)
     try:
         with float64():
-            text = _text(structure, sizes, order)
+            for order in orders:
+                module.prefix = PREFIX[order]
+                _write(module, structure, sizes, order)
     except Unsupported:
         return None
-    return compiled(text)
+    return compiled(module.text)
 
 
-def _text(structure: Structure, sizes: Sizes, order: int) -> str:
-    kernels = Kernels(structure, sizes, order)
+def _write(module: Module, structure: Structure, sizes: Sizes, order: int) -> None:
+    """All functions of a structure with derivatives of an order."""
+    kernels = Kernels(structure, sizes, order, module)
     driver = Driver(structure, sizes, order)
     for mode in range(len(structure.modes)):
         stage = kernels.at_stage(mode)
@@ -63,13 +71,13 @@ def _text(structure: Structure, sizes: Sizes, order: int) -> str:
                 counts.append(len(chosen))
             if order == 2:
                 kernels.curvature_function(f"curvature_{kind}_{mode}", chosen, kind == "end")
-        kernels.module.add(driver.forward_segment(mode))
+        module.add(driver.forward_segment(mode))
         if order == 0:
             kernels.slope_function(f"slope_{mode}", stage)
-            kernels.module.add(driver.slope_at(mode))
-            kernels.module.add(driver.adaptive(mode))
+            module.add(driver.slope_at(mode))
+            module.add(driver.adaptive(mode))
         if order > 0:
-            kernels.module.add(driver.backward_segment(mode, *counts))
+            module.add(driver.backward_segment(mode, *counts))
     for k in range(len(structure.measurements)):
         template = kernels.at_sample(k)
         q = structure.measurements[k].channels
@@ -79,7 +87,7 @@ def _text(structure: Structure, sizes: Sizes, order: int) -> str:
             return template(graph, *given, x, p, *constants)
 
         kernels.cost_function(f"sample_{k}", SAMPLE, sample, "jump")
-        kernels.module.add(driver.samples(k, q))
+        module.add(driver.samples(k, q))
     if structure.terminal:
         end = kernels.at_end()
         kernels.cost_function("end", END, lambda graph, x, p, constants: end(graph, x, p, *constants), "psi")
@@ -92,11 +100,10 @@ def _text(structure: Structure, sizes: Sizes, order: int) -> str:
         kernels.adaptive_functions()
     if order != 1:
         kernels.output_function()
-        kernels.module.add(driver.outputs())
-    kernels.module.add(driver.whole())
+        module.add(driver.outputs())
+    module.add(driver.whole())
     if order == 2:
-        kernels.module.add(handler(driver))
-    return kernels.module.text
+        module.add(handler(driver))
 
 
 def native_experiment(
@@ -156,13 +163,14 @@ class NativeExperiment:
         order: int,
     ) -> None:
         self.sizes, self.order = sizes, order
+        self._prefix = PREFIX[order]
         n, N, D, width, cells = sizes.n, sizes.N, sizes.D, sizes.width, len(times) - 1
         rows = cells + N
         self._channels = sum(channels for _, channels in structure.outputs)
         counts = [_count(samples) for samples in arguments.samples]
         types = [ctypes.c_void_p, ctypes.c_int64, ctypes.c_double, ctypes.c_double, *[ctypes.c_int64] * len(counts)]
         self._program = program  # whose code must not go away
-        self._evaluate = program.function("evaluate", *types)
+        self._evaluate = program.function(f"{self._prefix}evaluate", *types)
         self._times = times
         self._scalars = (cells, float(times[0]), float(times[-1]), *counts)
         constants = [np.ravel(np.asarray(a, dtype=np.float64)) for a in constants_of(arguments)]
@@ -254,7 +262,7 @@ class NativeExperiment:
         if count:
             self._theta[self.sizes.N :] = p
             pointer = ctypes.c_void_p
-            function = self._program.function("all_outputs", pointer, ctypes.c_int64, *[pointer] * 5)
+            function = self._program.function(f"{self._prefix}all_outputs", pointer, ctypes.c_int64, *[pointer] * 5)
             given = [np.ascontiguousarray(times), np.ascontiguousarray(states), Z, y, Y]
             function(self._address, count, *(a.ctypes.data for a in given))
         return y, Y[..., :D]
@@ -299,7 +307,7 @@ class NativeExperiment:
         times, count = np.zeros(most), np.zeros(1, dtype=np.int64)
         pointer, number = ctypes.c_void_p, ctypes.c_int64
         types = [pointer, number, pointer, pointer, pointer, number, pointer]
-        solve = self._program.function(f"adaptive_{mode}_steps", *types)
+        solve = self._program.function(f"{self._prefix}adaptive_{mode}_steps", *types)
         addresses = [a.ctypes.data for a in (state, y, times, count)]
         solve(self._address, self._scalars[0], *addresses[:3], most, addresses[3])
         return times[: count[0]]
@@ -308,7 +316,7 @@ class NativeExperiment:
         """One of the straight lines; what is not given it finds where the driver does."""
         arrays = [given[key] if key in given else self._named.get(key) for key in order]
         addresses = [None if a is None else a.ctypes.data for a in arrays]
-        self._program.function(name, *[ctypes.c_void_p] * len(order))(*addresses)
+        self._program.function(f"{self._prefix}{name}", *[ctypes.c_void_p] * len(order))(*addresses)
 
     def _run(self, tau: FloatArray, p: FloatArray, side: float) -> None:
         N = self.sizes.N
