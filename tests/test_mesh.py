@@ -14,8 +14,9 @@ import switchfit as sf
 from switchfit.evaluate import Evaluator
 from switchfit.mesh import CHUNK, Mesh, chunk_count, padded_length, row_ending_cell, rows
 from switchfit.model import Model, float64
+from switchfit.native.program import native_experiment
 from switchfit.propagate import path_cost, propagate
-from switchfit.refine import _solve, _solve_compiled, fixed_nodes, refined_mesh
+from switchfit.refine import _solve, _solve_natively, fixed_nodes, refined_mesh
 
 # Rows
 
@@ -334,11 +335,12 @@ def test_the_compiled_solver_takes_the_steps_of_scipy():
     run = sf.Experiment(data, ("a", "b", "a"), (1.7, 2.9), 0.0, 6.0, inputs=inputs)
     problem = sf.Problem(system, run)
     coarse = Mesh.from_times(fixed_nodes(run))
-    arguments = jax.tree.map(np.asarray, problem.arguments(0, coarse))
+    arguments = problem.arguments(0, coarse)
+    native = native_experiment(problem.structures[0], arguments, coarse.times, 0)
     given = (problem, problem.structures[0], arguments.without_mesh(), arguments.signals, coarse)
     for mode, start, end, x in ((0, 0.0, 1.7, [0.0, 0.0]), (1, 1.7, 2.5, [0.4, 1.0]), (0, 2.9, 6.0, [0.1, -0.2])):
         with float64():
-            steps, after = _solve_compiled(*given, mode, start, end, np.array(x), np.zeros(0))
+            steps, after = _solve_natively(problem, native, mode, start, end, np.array(x), np.zeros(0))
             expected, state = _solve(*given, mode, start, end, np.array(x), np.zeros(0))
         assert len(steps) == len(expected) > 10
         np.testing.assert_allclose(steps, expected, rtol=0, atol=1e-4 * (end - start))

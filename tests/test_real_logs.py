@@ -106,9 +106,7 @@ def test_methods_agree(case):
 
 
 def test_the_simulated_cost_is_the_evaluated_one(case):
-    assert evaluator_of(case).cost(case.initial_theta) == pytest.approx(
-        sf.evaluate(case).cost, rel=1e-12
-    )
+    assert evaluator_of(case).cost(case.initial_theta) == pytest.approx(sf.evaluate(case).cost, rel=1e-12)
 
 
 def test_gauss_newton_is_never_negative_and_reaches_the_same_minimum(case):

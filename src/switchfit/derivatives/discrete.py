@@ -352,13 +352,15 @@ def _second(
 
     With `P_last` the last of `along` is that of p, [0 | I], whose product need not be computed.
     """
+    D = along[0].shape[-1]
+    if D == 0:
+        return jnp.zeros((0, 0))
     gradient = jax.grad(value, argnums=tuple(range(len(at))))
 
     def column(*direction: Array) -> tuple[Array, ...]:
         return jax.jvp(gradient, at, direction)[1]
 
     columns = jax.vmap(column, in_axes=-1, out_axes=-1)(*along)
-    D = along[0].shape[-1]
     pairs = [(a.reshape(a.size // D, D), c.reshape(a.size // D, D)) for a, c in zip(along, columns, strict=True)]
     of_p = jnp.zeros((D, D))
     if P_last:

@@ -29,6 +29,7 @@ INTRINSICS = {
     "abs": "fabs",
     "floor": "floor",
     "ceil": "ceil",
+    "rint": "rint",
     "max": "maximum",
     "min": "minimum",
 }
@@ -230,17 +231,20 @@ def _write(path: Path, code: bytes) -> None:
     try:
         handle, name = tempfile.mkstemp(dir=path.parent)
         with os.fdopen(handle, "wb") as file:
-            file.write(code)
+            file.write(hashlib.sha256(code).digest() + code)
         os.replace(name, path)
     except OSError:
         pass  # a cache that cannot be written is no reason to stop
 
 
 def _read(path: Path) -> bytes | None:
+    """The code in a file; None where there is none, or a damaged one, which would end the process."""
     try:
-        return path.read_bytes()
+        content = path.read_bytes()
     except OSError:
         return None
+    check, code = content[:32], content[32:]
+    return code if hashlib.sha256(code).digest() == check else None
 
 
 @cache

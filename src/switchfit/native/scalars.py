@@ -36,6 +36,7 @@ FOLDED: dict[str, Callable[..., Any]] = {
     "abs": abs,
     "floor": np.floor,
     "ceil": np.ceil,
+    "rint": np.rint,
     "sqrt": np.sqrt,
     "exp": np.exp,
     "log": np.log,

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from switchfit.native.scalars import FOLDED, Graph, Node, Objects, Template, as_objects
+from switchfit.native.scalars import CONDITIONS, FOLDED, Graph, Node, Objects, Template, as_objects
 
 
 class Unsupported(Exception):  # noqa: N818  # says what is not there, is no error: something else then does the work
@@ -260,8 +260,26 @@ def _convert(graph: Graph, params: Any) -> Callable[[Any], Any]:
     return convert
 
 
-def _is_condition(a: Node) -> bool:
-    return a.op in ("lt", "le", "eq", "ne", "and", "or", "not") or isinstance(a.number, bool)
+def _is_condition(a: Any) -> bool:
+    if isinstance(a, Node):
+        return a.op in CONDITIONS or isinstance(a.number, bool)
+    return isinstance(a, bool | np.bool_)
+
+
+def _equal(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
+    """Of numbers, or of truth values."""
+
+    def meaning(graph: Graph, params: Any) -> Callable[..., Any]:
+        def compare(a: Any, b: Any) -> Any:
+            if not (_is_condition(a) and _is_condition(b)):
+                return graph.apply(op, a, b)
+            either, both = graph.apply("or", a, b), graph.apply("and", a, b)
+            differ = graph.apply("and", either, graph.apply("not", both))
+            return differ if op == "ne" else graph.apply("not", differ)
+
+        return compare
+
+    return meaning
 
 
 def _integer_power(graph: Graph, params: Any) -> Callable[[Any], Any]:
@@ -288,6 +306,14 @@ def _select(graph: Graph, params: Any) -> Callable[..., Any]:
     return select
 
 
+def _round(graph: Graph, params: Any) -> Callable[[Any], Any]:
+    """To the nearest integer; of two the even one, or the one farther from zero."""
+    if params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN:
+        return partial(graph.apply, "rint")
+    sign = _sign(graph, params)
+    return lambda a: sign(a) * graph.apply("floor", graph.apply("abs", a) + 0.5)
+
+
 def _sign(graph: Graph, params: Any) -> Callable[[Any], Any]:
     def sign(a: Any) -> Any:
         negative = graph.apply("select", graph.apply("lt", a, 0.0), -1.0, a)  # 0 and nan stay what they are
@@ -300,6 +326,8 @@ MEANINGS: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
     **{op: _simply(op) for op in FOLDED if op not in ("select", "not", "lt", "le", "abs")},
     "abs": _simply("abs"),
     "add_any": _simply("add"),
+    "eq": _equal("eq"),
+    "ne": _equal("ne"),
     "lt": _simply("lt"),
     "le": _simply("le"),
     "gt": _swapped("lt"),
@@ -313,6 +341,7 @@ MEANINGS: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
     "logistic": lambda graph, params: lambda a: 1.0 / (1.0 + graph.apply("exp", -a)),
     "select_n": _select,
     "sign": _sign,
+    "round": _round,
     "clamp": lambda graph, params: lambda low, a, high: graph.apply("min", graph.apply("max", a, low), high),
     "is_finite": lambda graph, params: lambda a: graph.apply("eq", a - a, 0.0),
 }

@@ -1,0 +1,480 @@
+"""Machine code against JAX: functions as scalars, derivatives, simulations, sensitivities, batches, fall-backs."""
+
+from __future__ import annotations
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from systems import KINDS, NODES, P0, case, problem_of, weighted
+
+import switchfit as sf
+from switchfit.evaluate import Evaluator, evaluator_of
+from switchfit.model import float64
+from switchfit.native import kernels, llvm
+from switchfit.native.foreign import foreign_derivatives
+from switchfit.native.program import _program_of, native_experiment
+from switchfit.native.scalars import Graph, Node
+from switchfit.native.trace import Unsupported, traced
+from switchfit.sensitivity import _by_blocks as sensitivities_by_blocks
+from switchfit.sensitivity import _natively as sensitivities_natively
+from switchfit.simulate import runs_of
+
+# Functions as scalars
+
+INDEX = jnp.array([2, 0, 2])
+
+FUNCTIONS = {
+    "arithmetic": lambda x, A: [
+        x + 2 * x[::-1] - 1 / x,
+        -x * 3.0,
+        x**3,
+        x**-2,
+        x**0.5,
+        x // 0.3,
+        x % 0.4,
+        jnp.round(3 * x),
+    ],
+    "elementary": lambda x, A: [
+        *(f(x) for f in (jnp.sin, jnp.cos, jnp.tan, jnp.exp, jnp.log, jnp.sqrt, jnp.tanh, jnp.sinh, jnp.cosh)),
+        *(f(x) for f in (jnp.arctan, jnp.arcsinh, jnp.expm1, jnp.log1p, jnp.cbrt, jnp.exp2, jnp.square, jnp.sinc)),
+        *(f(x / 2) for f in (jnp.arcsin, jnp.arccos, jnp.arctanh)),
+        jnp.arccosh(1 + x),
+        jnp.arctan2(x, x[::-1]),
+        jnp.hypot(x, 2 * x),
+        jax.scipy.special.erf(x),
+        jax.scipy.special.erfc(x),
+        jax.nn.sigmoid(x),
+        jax.nn.softplus(x),
+        jnp.logaddexp(x, 2 * x),
+        jax.lax.rsqrt(x),
+    ],
+    "decisions": lambda x, A: [
+        jnp.where(x > 0.7, x, 0.0),
+        jnp.sign(x - 0.8),
+        jnp.abs(x - 0.9),
+        jnp.clip(x, 0.5, 1.0),
+        jnp.maximum(x, 0.8),
+        jnp.minimum(x, 0.8),
+        jnp.floor(3 * x),
+        jnp.ceil(3 * x),
+        jnp.heaviside(x - 0.8, 0.5),
+        jnp.any(x > 1) * x,
+        jnp.all(x > 0.1) * x,
+        jnp.where(jnp.isfinite(x) & ~(x > 1) | (x >= 1.2), x, 2 * x),
+        jax.lax.cond(x[0] > 0.8, lambda x: 2 * x, jnp.sin, x),
+        jax.lax.switch(1, [jnp.sin, jnp.cos], x),
+    ],
+    "matrices": lambda x, A: [
+        A @ x,
+        A.T @ A,
+        jnp.einsum("ij,kj->ik", A, A),
+        jnp.einsum("bi,bj->bij", A, A),
+        jnp.linalg.norm(A),
+        jnp.outer(x, x),
+        jnp.cumsum(x),
+        jax.lax.cumsum(x, reverse=True),
+        A.sum(0),
+        A.max(1),
+        A.min(),
+        jnp.prod(x),
+        x.mean(),
+        x.var(),
+        jnp.trace(A[:, :3]),
+        jnp.cross(x[:3], x[1:]),
+    ],
+    "places": lambda x, A: [
+        x[INDEX],
+        A[:, jnp.array([1, 0])],
+        A[1, 2:],
+        x.at[jnp.array([1])].set(5.0),
+        x.at[1].add(x[0]),
+        x.at[INDEX].add(1.0),
+        jnp.roll(x, 1),
+        jnp.stack([x, x], 1),
+        jnp.concatenate([x, 2 * x]),
+        jnp.tile(x, 2),
+        jnp.repeat(x, 2),
+        jnp.diag(x),
+        jnp.pad(x, (1, 2), constant_values=3.0),
+        A.T.reshape(2, 6),
+        jnp.flip(A, 0),
+        jax.lax.dynamic_slice(x, (1,), (2,)),
+        jax.lax.dynamic_update_slice(x, x[:2], (2,)),
+        *jnp.split(x, 2),
+        jnp.eye(4) * x,
+    ],
+    "loops": lambda x, A: [
+        jax.lax.fori_loop(0, 3, lambda i, y: y * x + i, x),
+        jax.lax.scan(lambda c, a: (c + a, c * a), x[0], x, reverse=True)[1],
+        jax.vmap(lambda row: row @ x)(A),
+        jnp.polyval(x, x[0]),
+    ],
+    "derivatives": lambda x, A: [
+        jax.grad(lambda x: (x[INDEX] ** 2).sum())(x),
+        jax.grad(lambda x: jnp.sum(jax.lax.fori_loop(0, 3, lambda i, y: y * x, x)))(x),
+        jax.hessian(lambda x: jnp.sum(jnp.where(x > 0.8, jnp.sin(x), x**2) * x[0]))(x),
+        jax.hessian(lambda x: jnp.linalg.norm(A @ x))(x),
+        jax.jacfwd(lambda x: jax.nn.softplus(x) / jnp.sum(x))(x),
+    ],
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_functions_as_scalars(name):
+    """By folding constants, and by machine code."""
+    random = np.random.default_rng(0)
+    x, A = random.uniform(0.3, 1.5, 4), random.uniform(0.3, 1.5, (3, 4))
+    with float64():
+        flat = lambda x, A: [jnp.asarray(value, jnp.float64) for value in FUNCTIONS[name](x, A)]  # noqa: E731
+        template = traced(flat, x.shape, A.shape)
+        expected = [np.asarray(value) for value in flat(jnp.asarray(x), jnp.asarray(A))]
+    folded = template(Graph(), x, A)
+    graph = Graph()
+    outputs = template(graph, graph.loads("x", 4), graph.loads("A", 12))
+    sizes = np.cumsum([0, *(value.size for value in outputs)]).tolist()
+    stores = [
+        ("y", first + k, node)
+        for first, output in zip(sizes, outputs, strict=False)
+        for k, node in enumerate(output.reshape(-1))
+    ]
+    module = llvm.Module(4)
+    module.straight("f", ("x", "A", "y"), stores, seen=True)
+    program, y = llvm.compiled(module.text), np.full(sizes[-1], np.nan)
+    program.function("f", *[llvm.ctypes.c_void_p] * 3)(x.ctypes.data, A.ctypes.data, y.ctypes.data)
+    for k, value in enumerate(expected):
+        numbers = np.array([node.number for node in folded[k].reshape(-1)], dtype=float).reshape(value.shape)
+        np.testing.assert_allclose(numbers, value, rtol=1e-13, atol=1e-14, err_msg=f"folded, {name} {k}")
+        compiled = y[sizes[k] : sizes[k + 1]].reshape(value.shape)
+        np.testing.assert_allclose(compiled, value, rtol=1e-13, atol=1e-14, err_msg=f"compiled, {name} {k}")
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: jnp.linalg.solve(jnp.outer(x, x) + jnp.eye(4), x),
+        jnp.sort,
+        lambda x: x[jnp.argmax(x)],
+        lambda x: x[(x[0] > 0.5).astype(int)],
+        lambda x: jnp.sum(x > 0.5) * x,
+        lambda x: jax.lax.while_loop(lambda y: y[0] < 9.0, lambda y: 2 * y, x),
+        lambda x: jax.lax.fori_loop(0, 60_000, lambda i, y: y * x, x),
+    ],
+    ids=["solve", "sort", "argmax", "index", "count", "while", "long"],
+)
+def test_what_has_no_scalar_form_says_so(function):
+    with float64(), pytest.raises(Unsupported):
+        traced(lambda x: [jnp.asarray(function(x), jnp.float64)], (4,))
+
+
+def test_structural_zeros_and_repetitions_are_gone():
+    graph = Graph()
+    x, y = graph.load("x", 0), graph.load("x", 1)
+    assert (x * 0.0).number == 0.0
+    assert x * 1.0 is x
+    assert x + 0.0 is x
+    assert x * y is y * x
+    assert (-x) * y is -(x * y)
+    assert graph.apply("neg", -x) is x
+    assert x - (-y) is x + y
+    before = len(graph.nodes)
+    assert x * y + x * y is x * y + x * y
+    assert len(graph.nodes) == before + 1
+    assert (graph.unit(0) * 0.0).number == 0.0
+    assert isinstance(graph.unit(0) * x, Node)
+    assert (graph.unit(0) * x).vector
+
+
+# Derivatives
+
+INSIDE = {"plain": [0.613, 1.287], "resets": [0.413, 0.791, 1.336]}
+
+
+def natively(this, arguments, tau, p, side=1, order=2):
+    nodes = np.asarray(arguments.nodes)
+    native = native_experiment(this.structure, arguments, np.unique(nodes), order)
+    return native(np.asarray(tau, float), np.asarray(p, float), side)
+
+
+def assert_close(found, expected, relative=2e-12):
+    assert found[0] == pytest.approx(expected.cost, rel=relative)
+    np.testing.assert_allclose(found[1], expected.gradient, rtol=0, atol=relative * np.abs(expected.gradient).max())
+    if np.isfinite(found[2]).all():
+        np.testing.assert_allclose(found[2], expected.hessian, rtol=0, atol=relative * np.abs(expected.hessian).max())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", INSIDE)
+def test_machine_code_against_automatic_differentiation(name, kind):
+    this = case(name)
+    at = this.arguments(kind), np.array(INSIDE[name]), P0
+    expected = this.autodiff(*at)
+    assert np.abs(expected.hessian).min() > 1e-6, "an entry is not tested"
+    assert_close(natively(this, *at), expected)
+    assert_close(natively(this, *at, order=1), expected)
+    assert np.isnan(natively(this, *at, order=1)[2]).all()
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("tau", [NODES[[5, 9, 14]], NODES[[4, 4, 13]], NODES[[4, 4, 4]], [0.413, 0.413, 1.287]])
+def test_transitions_on_nodes_and_samples_and_on_one_another(tau, side):
+    this = case("resets")
+    at = this.arguments(), np.array(tau), P0, side
+    assert_close(natively(this, *at), this.autodiff(*at))
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    times=st.lists(st.floats(0.0, 2.0), min_size=3, max_size=3),
+    p=st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
+    side=st.sampled_from([-1, 1]),
+)
+def test_machine_code_anywhere(times, p, side):
+    this = case("resets")
+    at = this.arguments(), np.sort(times), np.array(p), side
+    found, expected = natively(this, *at), this.discrete(*at)
+    scale = max(1.0, np.abs(expected.hessian).max())
+    np.testing.assert_allclose(found[2], expected.hessian, rtol=0.0, atol=1e-11 * scale)
+
+
+def test_stages_one_at_a_time(monkeypatch):
+    """As where functions would become too long."""
+    monkeypatch.setattr(kernels, "SHORT", 0)
+    _program_of.cache_clear()
+    this = case("resets")
+    at = this.arguments(), np.array(INSIDE["resets"]), P0
+    assert_close(natively(this, *at), this.discrete(*at))
+    _program_of.cache_clear()
+
+
+def both(problem, relative=1e-11):
+    """Cost, gradient and Hessian by machine code and by JAX at the guess, which must agree; J alone as well."""
+    theta = problem.initial_theta
+    evaluator = evaluator_of(problem)
+    assert all(native is not None for native in evaluator._natives(2)), "no machine code"
+    found = evaluator(theta)
+    expected = evaluator(theta, method="discrete-adjoint")
+    assert_close((found.cost, found.gradient, found.hessian), expected, relative)
+    assert evaluator.cost(theta) == pytest.approx(expected.cost, rel=relative)
+    first = evaluator(theta, matrix="none")
+    assert_close((first.cost, first.gradient, first.hessian), expected, relative)
+    return expected
+
+
+def swing(t, x, p):
+    return jnp.array([x[1], -p["k"] * jnp.sin(x[0]) - p["c"][0] * x[1] + p["c"][1] * jnp.cos(t)])
+
+
+def fall(t, x, p):
+    return jnp.array([x[1], -p["g"] - p["c"][0] * x[1] * jnp.abs(x[1])])
+
+
+PENDULUM = sf.HybridSystem({"swing": swing, "fall": fall}, [0.4, 0.1])
+FREE = {"k": sf.Parameter(2.0, 0.1, 9.0), "c": [0.2, 0.3], "g": 1.3}
+TIMES = np.linspace(0.3, 3.0, 10)
+VALUES = np.stack([np.sin(TIMES), np.cos(TIMES)], 1)
+
+
+def test_losses_sigma_as_a_parameter_missing_values_and_several_sensors():
+    missing = VALUES.copy()
+    missing[3, 0] = missing[7] = np.nan
+    data = [
+        sf.Measurements(TIMES, missing, sigma=["s", 0.3]),
+        sf.Measurements(TIMES[::2], VALUES[::2, 0], observe=lambda t, x, p: x[0] * p["k"], sigma=0.1, loss="huber"),
+        sf.RunningCost(lambda t, x, p: 0.1 * p["k"] * x[0] ** 2),
+        sf.TerminalCost(lambda x, p: p["c"] @ x),
+    ]
+    run = sf.Experiment(data, ("swing", "fall", "swing"), (1.1, 2.0), 0.0, 3.0)
+    expected = both(sf.Problem(PENDULUM, run, {**FREE, "s": sf.Parameter(0.5, 0.01, 2.0)}))
+    assert np.abs(expected.gradient).min() > 1e-6
+
+
+@pytest.mark.parametrize("kind", ["hold", "linear", "cubic"])
+def test_inputs_unknown_initial_states_and_full_weights(kind):
+    system = sf.HybridSystem(
+        {"a": lambda t, x, p, u: jnp.array([x[1], u[0] - p["k"] * x[0]]), "b": lambda t, x, p, u: -p["k"] * x * u[1]},
+        [sf.Parameter(0.4), 0.1],
+    )
+    inputs = sf.Input(np.linspace(0.0, 3.0, 7), np.random.default_rng(1).normal(size=(7, 2)), kind=kind)
+    signal = sf.ReferenceSignal.from_samples(TIMES, VALUES, weights=[[2.0, 0.3], [0.3, 1.0]])
+    run = sf.Experiment(signal, ("a", "b"), (1.234,), 0.3, 3.0, inputs=inputs)
+    expected = both(sf.Problem(system, run, {"k": sf.Parameter(1.1)}))
+    assert np.abs(expected.gradient).min() > 1e-6
+
+
+def fixed(value):
+    return sf.Parameter(value, fixed=True)
+
+
+def test_one_unknown_and_none_in_an_experiment():
+    """Vectors of one entry; an experiment without unknowns of its own is left to JAX, and the others with it."""
+    data = sf.Measurements(TIMES, VALUES, sigma=1.0)
+    both(sf.Problem(PENDULUM, sf.Experiment(data, ("fall",), (), 0.0, 3.0), {"g": 1.0, "c": fixed([0.1, 0.2])}))
+    runs = [
+        sf.Experiment(data, ("fall",), (), 0.0, 3.0),
+        sf.Experiment(data, ("swing",), (), 0.0, 3.0, parameter_map={"k": "other"}),
+    ]
+    problem = sf.Problem(PENDULUM, runs, {"g": fixed(1.0), "c": fixed([0.1, 0.2]), "other": sf.Parameter(2.0)})
+    evaluator = evaluator_of(problem)
+    theta = problem.initial_theta
+    assert evaluator._natives(2)[0] is None
+    assert evaluator(theta).cost == pytest.approx(evaluator(theta, method="discrete-adjoint").cost, rel=1e-12)
+    assert evaluator.cost(theta) == pytest.approx(evaluator(theta).cost, rel=1e-12)
+
+
+def test_runs_with_shared_and_mapped_parameters():
+    data = sf.Measurements(TIMES, VALUES, sigma=1.0)
+    runs = [
+        sf.Experiment(data, ("swing", "fall"), (1.1 + k,), 0.0, 3.0, parameter_map={"k": f"k{k}"}) for k in range(2)
+    ]
+    both(sf.Problem(PENDULUM, runs, {"k0": sf.Parameter(2.0), "k1": sf.Parameter(1.5), "c": FREE["c"], "g": 1.0}))
+
+
+def test_results_of_one_evaluation_survive_the_next():
+    evaluator = evaluator_of(problem_of("plain"))
+    theta = evaluator.problem.initial_theta
+    first = evaluator(theta)
+    kept = first.gradient.copy(), first.hessian.copy()
+    evaluator(theta + 0.01)
+    np.testing.assert_array_equal(first.gradient, kept[0])
+    np.testing.assert_array_equal(first.hessian, kept[1])
+
+
+def test_other_numbers_on_the_same_meshes():
+    problem = problem_of("plain")
+    evaluator = Evaluator(problem)
+    theta = problem.initial_theta
+    before = evaluator(theta).cost
+    evaluator.replace_arguments([weighted(evaluator.arguments[0], "samples")])
+    assert evaluator(theta).cost != before
+    assert evaluator(theta).cost == pytest.approx(evaluator(theta, method="discrete-adjoint").cost, rel=1e-12)
+
+
+# What falls back to JAX
+
+
+def test_a_model_that_has_no_scalar_form():
+    def stiffness(t, x, p):
+        return jnp.linalg.solve(jnp.eye(2) + jnp.outer(x, x), jnp.array([x[1], -p["k"] * x[0]]))
+
+    data = sf.Measurements(TIMES, VALUES, sigma=1.0)
+    run = sf.Experiment(data, ("a", "b"), (1.1,), 0.0, 3.0)
+    problem = sf.Problem(sf.HybridSystem({"a": stiffness, "b": fall}, [0.4, 0.1]), run, FREE)
+    evaluator = evaluator_of(problem)
+    assert evaluator._natives(2) == [None]
+    theta = problem.initial_theta
+    found, expected = evaluator(theta), evaluator(theta, method="forward")
+    np.testing.assert_allclose(found.hessian, expected.hessian, rtol=1e-9, atol=1e-9)
+    assert evaluator.cost(theta) == pytest.approx(found.cost, rel=1e-12)
+    assert sf.estimate(problem, max_iterations=2).iterations == 2
+
+
+@pytest.mark.parametrize("change", [{"solver": "stiff"}, {"delay": "d"}], ids=["stiff", "delay"])
+def test_implicit_steps_and_delays_that_are_estimated(change):
+    data = sf.Measurements(TIMES, VALUES, sigma=1.0, delay=change.get("delay", 0.0))
+    run = sf.Experiment(data, ("swing", "fall"), (1.1,), 0.0, 3.0)
+    problem = sf.Problem(
+        PENDULUM, run, {**FREE, "d": sf.Parameter(0.1, 0.0, 0.2)}, solver=change.get("solver", "explicit")
+    )
+    assert evaluator_of(problem)._natives(2) == [None]
+
+
+# Simulations, sensitivities, batches
+
+
+@pytest.fixture
+def by_jax(monkeypatch):
+    """Simulations by JAX."""
+
+    def switch():
+        monkeypatch.setattr(sys.modules["switchfit.simulate"], "native_experiment", lambda *_, **__: None)
+
+    return switch
+
+
+@pytest.mark.parametrize("name", INSIDE)
+def test_simulations_are_those_of_jax(name, by_jax):
+    problem = problem_of(name)
+    evaluator = evaluator_of(problem)
+    theta = problem.initial_theta
+    (found,) = runs_of(problem, theta, evaluator.meshes)
+    by_jax()
+    (expected,) = runs_of(problem, theta, evaluator.meshes)
+    assert found.cost == pytest.approx(expected.cost, rel=1e-12)
+    for one, other in zip(found.segments, expected.segments, strict=True):
+        shown = other.end > other.start  # JAX's last segment has rows of padding
+        for column in one._fields:
+            np.testing.assert_allclose(
+                getattr(one, column), getattr(other, column)[shown], rtol=1e-12, atol=1e-13, err_msg=column
+            )
+    for one, other in zip(found.seen, expected.seen, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", INSIDE)
+def test_sensitivities_are_those_of_jax(name):
+    problem = problem_of(name)
+    (mesh,) = evaluator_of(problem).meshes
+    given = problem.structures[0], problem.arguments(0, mesh), mesh, *problem.vectors(problem.initial_theta, 0)
+    found, first = sensitivities_natively(*given)
+    expected, expected_first = sensitivities_by_blocks(*given)
+    np.testing.assert_array_equal(first, expected_first)
+    for one, other in zip(found, expected, strict=True):
+        shown = other.end > other.start
+        for side in ("before", "after"):
+            for column in one.before._fields:
+                a, b = getattr(getattr(one, side), column), getattr(getattr(other, side), column)[shown]
+                np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12, err_msg=f"{side} {column}")
+
+
+def test_inside_a_program_of_jax():
+    """The operation that batches use, alone and in a loop, on a padded mesh."""
+    this = case("resets")
+    arguments, tau = this.arguments(), np.array(INSIDE["resets"])
+    expected = this.discrete(arguments, tau, P0)
+    with float64():
+        one = jax.jit(lambda a, tau, p: foreign_derivatives(this.structure, a, tau, p))
+        assert_close(tuple(map(np.asarray, one(arguments, tau, P0))), expected)
+        many = jax.jit(lambda a, taus, p: jax.lax.map(lambda t: foreign_derivatives(this.structure, a, t, p), taus))
+        J, g, H = map(np.asarray, many(arguments, np.stack([tau, tau + 0.01]), P0))
+    assert_close((J[0], g[0], H[0]), expected)
+    assert_close((J[1], g[1], H[1]), this.discrete(arguments, tau + 0.01, P0))
+
+
+# The cache
+
+
+def test_machine_code_is_kept_and_read_again(tmp_path, monkeypatch):
+    monkeypatch.setenv("SWITCHFIT_CACHE", str(tmp_path))
+    module = llvm.Module(2)
+    graph = Graph()
+    module.straight("f", ("x",), [("x", 1, graph.load("x", 0) * 3.0)], seen=True)
+
+    def tripled():
+        x = np.array([2.0, 0.0])
+        program = llvm.compiled(module.text)
+        program.function("f", llvm.ctypes.c_void_p)(x.ctypes.data)
+        return x[1]
+
+    assert tripled() == 6.0
+    (file,) = tmp_path.glob("native-*")
+    monkeypatch.setattr(llvm.llvm, "parse_assembly", _only_empty(llvm.llvm.parse_assembly))
+    assert tripled() == 6.0, "read, not compiled again"
+    monkeypatch.undo()
+    monkeypatch.setenv("SWITCHFIT_CACHE", str(tmp_path))
+    file.write_bytes(file.read_bytes()[:-100])
+    assert tripled() == 6.0, "a damaged file is compiled anew"
+    monkeypatch.setenv("SWITCHFIT_CACHE", "off")
+    assert tripled() == 6.0
+
+
+def _only_empty(parse):
+    def checked(text):
+        assert text == ""
+        return parse(text)
+
+    return checked
