@@ -18,7 +18,8 @@ COLOURS = {
     "SciPy": "#777777",
 }
 METHODS = {
-    "discrete-adjoint": ("backward sweep (default)", "#b2182b", "-o"),
+    "auto": ("machine code (default)", "#b2182b", "-o"),
+    "discrete-adjoint": ("backward sweep in JAX", "#5c9e5c", "-D"),
     "forward": ("second order forward", "#4a7fb5", "--s"),
     "adjoint": ("the paper's equations", "#777777", ":^"),
 }
@@ -61,7 +62,7 @@ def growth(results: dict) -> Figure:
     figure = Figure(figsize=(9.0, 2.9), layout="constrained")
     axes = figure.subplots(1, 4, sharey=False)
     nodes = sorted((int(name), entry["minimum"]) for name, entry in results["nodes"].items() if name.isdigit())
-    label, colour, style = METHODS["discrete-adjoint"]
+    label, colour, style = METHODS["auto"]
     axes[0].plot([n for n, _ in nodes], [1e3 * t for _, t in nodes], style, color=colour, markersize=4)
     axes[0].set_xlabel("nodes")
     for ax, (index, what) in zip(axes[1:], enumerate(("states", "transitions", "parameters")), strict=True):

@@ -260,8 +260,9 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     method : {"auto", "forward", "discrete-adjoint", "adjoint", "autodiff"}
         "forward" and "discrete-adjoint" are exact for the discretised cost, second order forward and backward, in JAX.
         "auto" is the latter in machine code of its own, which takes a tenth of the time, and in JAX where a function
-        of the model cannot be written as a straight line of scalars, or steps are implicit. "adjoint" evaluates the paper's equations (6)-(17), which agree with
-        them to the integration error. "autodiff" leaves everything to JAX; slow, an independent check.
+        of the model cannot be written as a straight line of scalars, or steps are implicit. "adjoint" evaluates the
+        paper's equations (6)-(17), which agree with them to the integration error. "autodiff" leaves everything to
+        JAX; slow, an independent check.
 
     Returns
     -------
