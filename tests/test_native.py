@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -342,6 +343,17 @@ def test_results_of_one_evaluation_survive_the_next():
     evaluator(theta + 0.01)
     np.testing.assert_array_equal(first.gradient, kept[0])
     np.testing.assert_array_equal(first.hessian, kept[1])
+
+
+def test_threads_do_not_disturb_one_another():
+    evaluator = evaluator_of(problem_of("resets"))
+    thetas = [evaluator.problem.initial_theta + 1e-3 * k for k in range(40)]
+    expected = [evaluator(theta) for theta in thetas]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(evaluator, thetas * 5))
+    for one, other in zip(found, expected * 5, strict=True):
+        assert one.cost == other.cost
+        np.testing.assert_array_equal(one.hessian, other.hessian)
 
 
 def test_other_numbers_on_the_same_meshes():

@@ -164,6 +164,7 @@ class NativeExperiment:
     ) -> None:
         self.sizes, self.order = sizes, order
         self._prefix = PREFIX[order]
+        self._lock = threading.Lock()  # the workspace is one, and machine code runs beside other threads
         n, N, D, width, cells = sizes.n, sizes.N, sizes.D, sizes.width, len(times) - 1
         rows = cells + N
         self._channels = sum(channels for _, channels in structure.outputs)
@@ -214,10 +215,11 @@ class NativeExperiment:
 
     def __call__(self, tau: FloatArray, p: FloatArray, side: float) -> tuple[float, FloatArray, FloatArray]:
         """J, its gradient (D,) and its Hessian (D, D), NaN without it; as in `switchfit.evaluate.derivatives`."""
-        self._run(tau, p, side)
-        g, H = self._result
-        hessian = H.copy() if self.order == 2 else np.full(H.shape, np.nan)
-        return float(self._sums[self.sizes.n]), g.copy(), hessian
+        with self._lock:
+            self._run(tau, p, side)
+            g, H = self._result
+            hessian = H.copy() if self.order == 2 else np.full(H.shape, np.nan)
+            return float(self._sums[self.sizes.n]), g.copy(), hessian
 
     def program_at(self, tau: FloatArray, p: FloatArray) -> Callable[[], object]:
         """The machine code alone, to be measured."""
@@ -226,11 +228,16 @@ class NativeExperiment:
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """J alone."""
-        self._run(tau, p, 1.0)
-        return float(self._sums[self.sizes.n])
+        with self._lock:
+            self._run(tau, p, 1.0)
+            return float(self._sums[self.sizes.n])
 
     def simulated(self, tau: FloatArray, p: FloatArray) -> Simulated:
         """States at all ends of rows, in second order with their derivatives."""
+        with self._lock:
+            return self._simulated(tau, p)
+
+    def _simulated(self, tau: FloatArray, p: FloatArray) -> Simulated:
         self._run(tau, p, 1.0)
         n, N, D, cells = self.sizes.n, self.sizes.N, self.sizes.D, self._scalars[0]
         firsts, lasts = self._first_cell.tolist(), [*self._first_cell[1:].tolist(), cells - 1]
