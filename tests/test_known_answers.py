@@ -85,7 +85,8 @@ def test_collapsed_modes_are_named():
     found = sf.estimate(fishing_problem(times))
     assert found.success
     assert found.optimality < 1e-7
-    collapsed = np.flatnonzero(np.diff(found.transition_times[0]) == 0)
+    tau = found.transition_times[0]
+    collapsed = np.flatnonzero(np.diff(tau) <= 4 * np.spacing(tau[1:]))  # feasible up to units in the last place
     assert len(collapsed)
     for i in collapsed:
         assert any(f"mode {i + 2} (" in name and "has collapsed" in name for name in found.active)
