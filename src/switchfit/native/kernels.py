@@ -148,7 +148,7 @@ class Kernels:
         return Model(self.structure, arguments)
 
     def at_stage(self, mode: int) -> Template:
-        """f, ell and their derivatives, those of ``w . f + hb ell`` among them: see `Stage`."""
+        """f, ell, their derivatives and those of ``w . f + hb ell``; `F` and what follows it say the places."""
         n, M, S = self.sizes.n, self.sizes.M, self.sizes.signals
 
         def stage(t: Any, x: Any, p: Any, w: Any, hb: Any, origin: Any, coefficients: Any, *constants: Any) -> Any:

@@ -1,7 +1,7 @@
-"""One experiment's cost, gradient and Hessian as one function of machine code.
+"""Machine code for a structure, and what evaluates and simulates one experiment on one mesh with it.
 
-Rows are numbered by ``cell + segment``: each transition cuts one cell in two. The driver goes through the segments
-forward, then through samples and terminal costs, then backward. Whatever lies between calls lies in one workspace.
+The driver goes through the segments forward, then through samples and terminal costs, then backward. Whatever lies
+between the parts of an evaluation lies in one workspace, which is made once a mesh.
 """
 
 from __future__ import annotations
