@@ -25,6 +25,7 @@ from benchmarks.problems import Case
 from benchmarks.report import Report
 from benchmarks.timing import ms, turns_within
 from switchfit.evaluate import Evaluator
+from switchfit.native.program import forget_programs
 
 QUANTITIES = ("cost", "gradient", "hessian")
 ACCURACY = (1e-8, 1e-7, 1e-6)
@@ -184,8 +185,9 @@ def chosen(side: str, case: Case, reference: tuple[Any, ...]) -> Found:
     by_differences = side == "SciPy"
     theta = case.model.theta
     ladder, build = builder(side, case)
-    with _nothing_compiled(side):
+    with _no_files(side):
         for setting in ladder:
+            _forget(side)
             began = time.perf_counter()
             functions = build(setting)
             built = time.perf_counter() - began
@@ -212,13 +214,23 @@ def error_of(value: Any, exact: Any) -> float:
     return float(np.max(np.abs(np.subtract(value, exact))) / np.max(np.abs(exact)))
 
 
-@contextmanager
-def _nothing_compiled(side: str) -> Iterator[None]:
-    """Without what switchfit and heyoka keep of what they compiled, in files and in this process."""
+def _forget(side: str) -> None:
+    """Let go of what switchfit and heyoka keep in this process of what they compiled."""
     if side == "heyoka":
         from heyoka import llvm_state
 
         llvm_state.clear_memcache()
+    elif side == "switchfit":
+        jax.clear_caches()
+        forget_programs()
+
+
+@contextmanager
+def _no_files(side: str) -> Iterator[None]:
+    """Without what switchfit and heyoka keep in files of what they compiled."""
+    if side == "heyoka":
+        from heyoka import llvm_state
+
         enabled = llvm_state.get_diskcache_enabled()
         llvm_state.set_diskcache_enabled(False)
         yield
@@ -229,7 +241,6 @@ def _nothing_compiled(side: str) -> Iterator[None]:
         return
     before = os.environ.get("SWITCHFIT_CACHE")
     os.environ["SWITCHFIT_CACHE"] = "off"
-    jax.clear_caches()
     try:
         yield
     finally:

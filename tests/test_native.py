@@ -18,7 +18,7 @@ from switchfit.evaluate import Evaluator, evaluator_of
 from switchfit.model import float64
 from switchfit.native import kernels, llvm
 from switchfit.native.foreign import foreign_derivatives
-from switchfit.native.program import _program_of, native_experiment
+from switchfit.native.program import forget_programs, native_experiment
 from switchfit.native.scalars import Graph, Node
 from switchfit.native.trace import Unsupported, traced
 from switchfit.sensitivity import _by_blocks as sensitivities_by_blocks
@@ -245,11 +245,11 @@ def test_machine_code_anywhere(times, p, side):
 def test_stages_one_at_a_time(monkeypatch):
     """As where functions would become too long."""
     monkeypatch.setattr(kernels, "SHORT", 0)
-    _program_of.cache_clear()
+    forget_programs()
     this = case("resets")
     at = this.arguments(), np.array(INSIDE["resets"]), P0
     assert_close(natively(this, *at), this.discrete(*at))
-    _program_of.cache_clear()
+    forget_programs()
 
 
 def both(problem, relative=1e-11):

@@ -57,6 +57,12 @@ def _program_of(structure: Structure, sizes: Sizes, orders: tuple[int, ...]) -> 
     return compiled(module.text)
 
 
+def forget_programs() -> None:
+    """Let go of all machine code that nothing works with."""
+    with _one_at_a_time:
+        _program_of.cache_clear()
+
+
 def _write(module: Module, structure: Structure, sizes: Sizes, order: int) -> None:
     """All functions of a structure with derivatives of an order."""
     kernels = Kernels(structure, sizes, order, module)
