@@ -13,6 +13,7 @@ import re
 import struct
 import sys
 import tempfile
+import threading
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -20,6 +21,7 @@ from typing import Any
 
 import llvmlite
 import llvmlite.binding as llvm
+import numpy as np
 
 from switchfit.cache import usable_folder
 from switchfit.native.scalars import CONDITIONS, Node, needed
@@ -184,6 +186,25 @@ class _Writer:
         return name
 
 
+class Workspace:
+    """Memory that calls of a program work in, one after the other: one piece for all, which stays in the caches.
+
+    Attributes
+    ----------
+    lock : held during a call, since machine code runs beside other threads
+    memory : array of doubles
+    """
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.memory = np.zeros(0)
+
+    def reserve(self, size: int) -> None:
+        """Make sure that it has a size; what was in it may be gone."""
+        if len(self.memory) < size:
+            self.memory = np.zeros(size)
+
+
 class Program:
     """Machine code of a module, alive as long as this object.
 
@@ -191,10 +212,12 @@ class Program:
     ----------
     key : str
         Different for every module, the same in every process.
+    workspace : Workspace
     """
 
     def __init__(self, engine: Any, key: str) -> None:
         self._engine, self.key = engine, key
+        self.workspace = Workspace()
         self._functions: dict[str, Any] = {}
 
     def address(self, name: str) -> int:

@@ -170,7 +170,7 @@ class NativeExperiment:
     ) -> None:
         self.sizes, self.order = sizes, order
         self._prefix = PREFIX[order]
-        self._lock = threading.Lock()  # the workspace is one, and machine code runs beside other threads
+        self._workspace = program.workspace
         n, N, D, width, cells = sizes.n, sizes.N, sizes.D, sizes.width, len(times) - 1
         rows = cells + N
         self._channels = sum(channels for _, channels in structure.outputs)
@@ -186,8 +186,23 @@ class NativeExperiment:
         first, second = (rows if kept else 0 for kept in (order > 0, order == 2))
         self._theta, self._first_cell = np.zeros(D), np.zeros(N + 1, dtype=np.int64)
         self._sums = np.zeros(n + 1 + width + D * width)
-        self._states = np.zeros((rows + 1 + N, n))
-        self._jumps = np.zeros((first + 1) * n if counts else n)
+        lengths = {
+            "states": (rows + 1) * n,
+            "reset_states": N * n,  # behind the states
+            "tangents": (second + 1) * n * width,
+            "reset_tangents": N * n * width,
+            "stages": first * STAGES * n,
+            "stage_tangents": second * STAGES * n * width,
+            "jumps": (first + 1) * n if counts else n,
+            "entries": STAGES * (1 + n + sizes.M) ** 2,
+            "length": width,
+        }
+        ends = np.cumsum(list(lengths.values())).tolist()
+        self._spans = {
+            name: slice(end - length, end) for (name, length), end in zip(lengths.items(), ends, strict=True)
+        }
+        self._size = ends[-1]
+        self._memory = np.zeros(0)  # the workspace that the table points to
         arrays: dict[str, Any] = {
             "nodes": np.ascontiguousarray(times),
             "signals": np.ascontiguousarray(np.asarray(arguments.signals)[:cells]),
@@ -195,23 +210,14 @@ class NativeExperiment:
             "p": self._theta[N:],
             "tau": self._theta,
             "first_cell": self._first_cell,
-            "states": self._states,
-            "tangents": np.zeros((second + 1) * n * width),
-            "stages": np.zeros(first * STAGES * n),
-            "stage_tangents": np.zeros(second * STAGES * n * width),
-            "jumps": self._jumps,
             "units": units,
             "psi": self._sums,
             "J": self._sums[n:],
             "g": self._sums[n + 1 :],
             "H": self._sums[n + 1 + width :],
-            "reset_states": self._states[rows + 1 :],
-            "reset_tangents": np.zeros(N * n * width),
-            "entries": np.zeros(STAGES * (1 + n + sizes.M) ** 2),
-            "length": np.zeros(width),
         }
         self._named: dict[str, Any] = arrays
-        self._arrays = [arrays[name] for name in POINTERS]
+        self._arrays = [arrays.get(name, self._memory) for name in POINTERS]
         for samples, count in zip(arguments.samples, counts, strict=True):
             for values, kind in zip(samples, (np.int64, float, float, float), strict=True):
                 self._arrays.append(np.ascontiguousarray(np.asarray(values)[:count], dtype=kind))
@@ -221,7 +227,7 @@ class NativeExperiment:
 
     def __call__(self, tau: FloatArray, p: FloatArray, side: float) -> tuple[float, FloatArray, FloatArray]:
         """J, its gradient (D,) and its Hessian (D, D), NaN without it; as in `switchfit.evaluate.derivatives`."""
-        with self._lock:
+        with self._workspace.lock:
             self._run(tau, p, side)
             g, H = self._result
             hessian = H.copy() if self.order == 2 else np.full(H.shape, np.nan)
@@ -234,22 +240,21 @@ class NativeExperiment:
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """J alone."""
-        with self._lock:
+        with self._workspace.lock:
             self._run(tau, p, 1.0)
             return float(self._sums[self.sizes.n])
 
     def simulated(self, tau: FloatArray, p: FloatArray) -> Simulated:
         """States at all ends of rows, in second order with their derivatives."""
-        with self._lock:
+        with self._workspace.lock:
             return self._simulated(tau, p)
 
     def _simulated(self, tau: FloatArray, p: FloatArray) -> Simulated:
         self._run(tau, p, 1.0)
-        n, N, D, cells = self.sizes.n, self.sizes.N, self.sizes.D, self._scalars[0]
+        n, D, cells = self.sizes.n, self.sizes.D, self._scalars[0]
         firsts, lasts = self._first_cell.tolist(), [*self._first_cell[1:].tolist(), cells - 1]
         ends = zip(firsts, lasts, [*tau.tolist(), self._times[-1]], strict=True)
         inside = [np.append(self._times[first + 1 : last + 1], end) for first, last, end in ends]
-        rows = cells + N
         tangents, behind = (
             self._named[name].reshape(-1, n, self.sizes.width) for name in ("tangents", "reset_tangents")
         )
@@ -257,8 +262,8 @@ class NativeExperiment:
             float(self._sums[n]),
             self._first_cell.copy(),
             np.concatenate([self._times[:1], *inside]),
-            self._states[: rows + 1].copy(),
-            self._states[rows + 1 :].copy(),
+            self._named["states"].reshape(-1, n).copy(),
+            self._named["reset_states"].reshape(-1, n).copy(),
             tangents[..., :D].copy(),
             behind[..., :D].copy(),
         )
@@ -283,8 +288,9 @@ class NativeExperiment:
     def initial_state(self, p: FloatArray) -> FloatArray:
         """x(t0): (n,)."""
         self._theta[self.sizes.N :] = p
-        self._call("start", START, {"x": self._states})
-        return self._states[0].copy()
+        x = np.zeros(self.sizes.n)
+        self._call("start", START, {"x": x})
+        return x
 
     def after_reset(self, i: int, t: float, x: FloatArray, p: FloatArray) -> FloatArray:
         """State after the reset map of transition i (from 0): (n,)."""
@@ -336,9 +342,20 @@ class NativeExperiment:
         self._theta[:N] = tau
         self._theta[N:] = p
         self._place(tau, side)
+        self._workspace.reserve(self._size)
+        if self._memory is not self._workspace.memory:
+            self._bind(self._workspace.memory)
         self._sums[:] = 0.0
-        self._jumps[:] = 0.0
+        self._named["jumps"][:] = 0.0
         self._evaluate(self._address, *self._scalars)
+
+    def _bind(self, memory: FloatArray) -> None:
+        """Let the table point to another workspace."""
+        self._memory = memory
+        for name, span in self._spans.items():
+            self._named[name] = memory[span]
+            if name in POINTERS:
+                self._table[POINTERS.index(name)] = memory.ctypes.data + 8 * span.start
 
     def _place(self, tau: FloatArray, side: float) -> None:
         """The cells in which segments begin, as in `switchfit.mesh.rows`."""
