@@ -20,8 +20,8 @@ COLOURS = {
 METHODS = {
     "auto": ("machine code (default)", "#b2182b", "-o"),
     "discrete-adjoint": ("backward sweep in JAX", "#5c9e5c", "-D"),
-    "forward": ("second order forward", "#4a7fb5", "--s"),
-    "adjoint": ("the paper's equations", "#777777", ":^"),
+    "forward": ("second order forward in JAX", "#4a7fb5", "--s"),
+    "adjoint": ("the paper's equations in JAX", "#777777", ":^"),
 }
 
 
@@ -82,11 +82,11 @@ def growth(results: dict) -> Figure:
         ax.set_xticks(sizes, [plain(size) for size in sizes], fontsize=8)
         ax.yaxis.set_major_formatter(lambda value, _: plain(value))
         ax.minorticks_off()
-    axes[0].set_yticks([20, 50, 100, 200])
+    axes[0].set_yticks([2, 5, 10, 20])
     axes[0].minorticks_off()
     axes[0].set_ylabel("Hessian (ms)")
     handles, labels = axes[1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False, fontsize=8)
+    figure.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False, fontsize=8)
     return figure
 
 
