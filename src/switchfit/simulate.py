@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.cache import compilation_cache
 from switchfit.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.losses import robust
-from switchfit.mesh import CHUNK, Mesh, Rows, rows
+from switchfit.mesh import CHUNK, Mesh, rows
 from switchfit.model import Arguments, Model, Piece, Structure, float64
 from switchfit.native.program import NativeExperiment, native_experiment
 from switchfit.problem import Problem
@@ -135,7 +135,8 @@ def runs_of(
 
 def cost_of(problem: Problem, theta: FloatArray, runs: Sequence[Run]) -> float:
     """Total cost, priors included."""
-    return sum((run.cost for run in runs), float(problem.unknowns.priors.evaluate(theta)[0]))
+    priors = problem.unknowns.priors
+    return sum((run.cost for run in runs), float(priors.evaluate(theta)[0]) if priors.any else 0.0)
 
 
 def compared(
@@ -197,14 +198,13 @@ def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh, whole: A
     """Integrate experiment e over the rows of a mesh, mode by mode."""
     structure = problem.structures[e]
     tau, p = problem.vectors(theta, e)
-    layout = rows(mesh.nodes, tau, 1.0, np)
     native = native_experiment(structure, whole, mesh.times, order=0)
     if native is not None:
-        cost, segments = _natively(structure, native, mesh.times, tau, p)
+        cost, segments, first_cell = _natively(structure, native, mesh.times, tau, p)
     else:
         with float64(), compilation_cache():
-            cost, segments = _by_blocks(structure, whole, layout, tau, p)
-    run = Run(cost, segments, np.asarray(layout.first_cell), mesh)
+            cost, segments, first_cell = _by_blocks(structure, whole, tau, p)
+    run = Run(cost, segments, first_cell, mesh)
     first = sum(q for _, q in structure.references)
     named = problem.named(theta, e)
     all_seen, of_samples = [], 0.0
@@ -212,7 +212,7 @@ def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh, whole: A
         if sensor.delay is None:
             seen = run.at_cells(np.asarray(samples.cell), slice(first, first + sensor.channels))
         else:
-            seen = _late_outputs(structure, whole, run, layout, k, named, p)
+            seen = _late_outputs(structure, whole, run, k, named, p)
         all_seen.append(seen)
         there = np.asarray(samples.weight) > 0
         u = samples.weight * np.where(there, seen - samples.value, 0.0) ** 2
@@ -227,10 +227,11 @@ def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh, whole: A
 
 def _natively(
     structure: Structure, native: NativeExperiment, nodes: FloatArray, tau: FloatArray, p: FloatArray
-) -> tuple[float, list[Segment]]:
-    """J and all segments, by machine code."""
+) -> tuple[float, list[Segment], NDArray[np.intp]]:
+    """J, all segments and the cells in which they begin, by machine code."""
     found = native.simulated(tau, p)
-    y, reset_y = native.outputs(found.times, found.states, p)[0], native.outputs(tau, found.reset_states, p)[0]
+    y = native.outputs(found.times, found.states, p)[0]
+    reset_y = native.outputs(tau, found.reset_states, p)[0] if structure.resets else y
     bounds = np.concatenate([nodes[:1], tau, nodes[-1:]])
     lasts = [*found.first_cell[1:].tolist(), len(nodes) - 2]
     segments = []
@@ -242,14 +243,15 @@ def _natively(
             before = np.concatenate([found.reset_states[i - 1 : i], before[1:]])
             y_before = np.concatenate([reset_y[i - 1 : i], y_before[1:]])
         segments.append(Segment(times[:-1], times[1:], before, states[1:], y_before, outputs[1:]))
-    return found.cost, segments
+    return found.cost, segments, found.first_cell.astype(np.intp)
 
 
 def _by_blocks(
-    structure: Structure, whole: Arguments, layout: Rows, tau: FloatArray, p: FloatArray
-) -> tuple[float, list[Segment]]:
-    """Running and terminal costs, and all segments, by JAX, some rows at a time."""
+    structure: Structure, whole: Arguments, tau: FloatArray, p: FloatArray
+) -> tuple[float, list[Segment], NDArray[np.intp]]:
+    """Running and terminal costs, all segments and the cells in which they begin, by JAX, some rows at a time."""
     arguments = whole.without_mesh()
+    layout = rows(whole.nodes, tau, 1.0, np)
     cell, start, end = (np.reshape(a, -1) for a in (layout.cell, layout.start, layout.end))
     segments, cost = [], 0.0
     x = np.asarray(initial_state(arguments, p, structure=structure.functions))
@@ -262,14 +264,14 @@ def _by_blocks(
         x = part.after[-1]
         segments.append(part)
         cost += added
-    return cost + float(_terminal(arguments, x, p, structure=structure.functions)), segments
+    cost += float(_terminal(arguments, x, p, structure=structure.functions))
+    return cost, segments, np.asarray(layout.first_cell)
 
 
 def _late_outputs(
     structure: Structure,
     whole: Arguments,
     run: Run,
-    layout: Rows,
     k: int,
     named: Mapping[str, FloatArray],
     p: FloatArray,
