@@ -240,6 +240,7 @@ def estimate(
     _check_settings(problem, hessian, tolerance, max_iterations)
     began = time.perf_counter()
     theta, evaluator = _beginning(problem, start)
+    constraints = constraints_of(problem)
     held: tuple[tuple[str, float, float], ...] = ()
     history: list[IterationRecord] = []
     evaluations = 0
@@ -250,7 +251,7 @@ def estimate(
         if problem.constraint_names:
             result, held = _minimized_with_constraints(evaluator, theta, tolerance, max(left, 0), told)
         else:
-            result = minimized(evaluator, theta, hessian, tolerance, max(left, 0), told)
+            result = minimized(evaluator, theta, hessian, tolerance, max(left, 0), told, constraints)
         records = [record.counted_on(last) for record in result.history]
         history += records[1:] if history else records
         evaluations += result.evaluations

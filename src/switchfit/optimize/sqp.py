@@ -32,6 +32,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import cached_property
 from itertools import product
 from typing import Literal, Protocol, get_args
 
@@ -300,7 +301,13 @@ class _Point:
 
     @property
     def largest_derivative(self) -> float:
-        return float(max(np.max(np.abs(self.plus.gradient)), np.max(np.abs(self.minus.gradient))))
+        return float(self.largest_slopes.max())
+
+    @cached_property
+    def largest_slopes(self) -> FloatArray:
+        """Larger of the two one-sided derivatives of each unknown, in size: (d,)."""
+        right = np.abs(self.plus.gradient)
+        return right if self.plus is self.minus else np.maximum(right, np.abs(self.minus.gradient))
 
     def derivatives(self, sides: NDArray[np.int_]) -> tuple[FloatArray, FloatArray | Arrow]:
         """Gradient and Hessian on the given sides (+1, -1; 0 for their mean).
@@ -671,10 +678,8 @@ def _model_matrix(problem: _Problem, state: _State, hessian: FloatArray | Arrow,
 
 def _floor(state: _State) -> FloatArray:
     """Curvature below which an unknown's counts as none: where J is nearly linear in it, its step is limited too."""
-    point = state.point
-    gradient = np.maximum(np.abs(point.plus.gradient), np.abs(point.minus.gradient))
     size = np.where(state.scale > 0.0, state.scale, 1.0)
-    return np.maximum(_flatness(state), gradient / (LONGEST_STEP * size))
+    return np.maximum(_flatness(state), state.point.largest_slopes / (LONGEST_STEP * size))
 
 
 def _is_positive_definite(matrix: FloatArray) -> bool:
@@ -749,7 +754,7 @@ def _attempt(oracle: _Oracle, state: _State, direction: _Direction, alpha: float
     """
     point = state.point
     theta = _move(oracle.problem, point.theta, alpha * direction.step)
-    if np.array_equal(theta, point.theta):
+    if (theta == point.theta).all():
         return None
     first = oracle.first(theta)
     noise = NOISE * abs(point.cost)
