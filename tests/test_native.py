@@ -260,6 +260,9 @@ def both(problem, relative=1e-11):
     found = evaluator(theta)
     expected = evaluator(theta, method="discrete-adjoint")
     assert_close((found.cost, found.gradient, found.hessian), expected, relative)
+    for own in (found, expected):
+        assert own.gradient.flags.writeable
+        assert own.hessian.flags.writeable
     assert evaluator.cost(theta) == pytest.approx(expected.cost, rel=relative)
     first = evaluator(theta, matrix="none")
     assert_close((first.cost, first.gradient, first.hessian), expected, relative)

@@ -220,7 +220,7 @@ class Evaluator:
                 for s, a, tau, p in self._each(theta)
             ]
         self._compiled.add((method, matrix))
-        return [tuple(map(np.asarray, result)) for result in results]
+        return [tuple(map(np.array, result)) for result in results]  # copies: what JAX owns cannot be written to
 
     def breakpoints(self) -> list[FloatArray]:
         """For each entry of theta the nodes at which derivatives may jump: none for parameters."""

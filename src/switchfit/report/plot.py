@@ -399,7 +399,7 @@ def _head(fit: Fit, figure: Figure, shown: int, colours: Mapping[str, str]) -> N
     drawn = {mode for trajectory in fit.trajectories[:shown] for mode, a, b in trajectory.mode_spans if b > a}
     for mode in (mode for mode in colours if mode in drawn - named):  # too short for a name
         handles[mode] = Patch(facecolor=colours[mode], edgecolor=TRANSITION, linewidth=0.5)
-    ncols = min(len(handles), max(3, int(figure.get_figwidth() / 1.6)))
+    ncols = min(len(handles), max(3, int(figure.get_figwidth() / 2.0)))
     figure.legend(handles.values(), handles.keys(), loc="outside upper right", ncols=ncols, frameon=False)
     notes = [] if fit.success else [f"Not a minimum: {fit.status.name.lower().replace('_', ' ')}"]
     if shown < len(fit.trajectories):
