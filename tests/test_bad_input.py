@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.model import Model, checked_vector, float64
+from switchfit.functions import checked_vector
+from switchfit.model import Model, float64
 
 
 def grow(t, x, p):

@@ -144,20 +144,6 @@ def test_another_number_of_transitions_compiles_one_program_another_number_of_sa
 ROOM = sf.HybridSystem({"on": lambda t, x, p: p["k"] * (1.0 - x), "off": lambda t, x, p: -p["k"] * x}, [0.3])
 
 
-def test_building_a_problem_calls_every_function_once_and_not_again_for_other_data():
-    calls = []
-
-    def falling(t, x, p):
-        calls.append(1)
-        return -p["k"] * x
-
-    system = sf.HybridSystem({"fall": falling}, [1.0])
-    for end in (1.0, 2.0):
-        data = sf.Measurements([0.5, end], [0.6, 0.4], sigma=0.1)
-        sf.Problem(system, sf.Experiment(data, ("fall",), (), 0.0, end), {"k": end})
-    assert len(calls) == 1
-
-
 def test_the_mesh_is_made_once(compiled):
     assert evaluator_of(compiled) is evaluator_of(compiled)
 

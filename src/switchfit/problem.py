@@ -18,11 +18,14 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.data import FloatArray, Measurements, as_number, as_numbers
 from switchfit.experiment import Experiment, initial_state_of, run_names
 from switchfit.mesh import Mesh, common_lengths
-from switchfit.model import Arguments, Structure, arguments_of, structure_of, terminal_constraint_count
+from switchfit.model import Arguments, Functions, Structure, arguments_of, structure_of
 from switchfit.optimize.variables import Variables
 from switchfit.parameter import Parameter, as_parameter
 from switchfit.priors import PriorTerms
 from switchfit.system import HybridSystem
+
+GIVEN = ("system", "experiments", "parameters", "min_duration", "solver", "rtol", "atol")
+"""What a `Problem` is built from."""
 
 SMALLEST_RTOL = 1e-13
 """Local errors below this part of the state are rounding."""
@@ -142,14 +145,30 @@ class Problem:
         self._check_noise()
         self._check_delays()
         targets = frozenset(name for e in experiments for name in e.parameter_map.values())
-        structures = tuple(structure_of(self.system, e, parameters, self.solver, targets) for e in experiments)
+        functions = Functions(parameters, targets)
+        structures = tuple(structure_of(self.system, e, functions, self.solver) for e in experiments)
         for structure in structures:
             self.system.check_labels_of(structure.n)
         object.__setattr__(self, "structures", structures)
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is pickled: not the meshes and programs that were made for it."""
-        return {key: value for key, value in self.__dict__.items() if key != "evaluator"}
+        """What is pickled: the user's functions, and of their traces what identifies them."""
+        state = {name: getattr(self, name) for name in GIVEN}
+        return state | {"digests": [structure.digests for structure in self.structures]}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Build the problem again; ValueError if a function does something else than when the problem was built."""
+        for name in GIVEN:
+            object.__setattr__(self, name, state[name])
+        self.__post_init__()
+        for structure, digests in zip(self.structures, state["digests"], strict=True):
+            changed = [name for name, digest in structure.digests.items() if digests.get(name) != digest]
+            if changed:
+                raise ValueError(
+                    f"{', '.join(changed)} does something else in this process, or now, than when the problem was "
+                    "built: it reads something that has changed since. Then build the problem anew before it is sent "
+                    "to other processes."
+                )
 
     def _check_maps(self) -> None:
         for name, experiment in zip(run_names(self.experiments), self.experiments, strict=True):
@@ -243,13 +262,13 @@ class Problem:
             for i in structure.guarded:
                 before, after = experiment.mode_sequence[i : i + 2]
                 names.append(f"{prefix}guard of tau_{i + 1} ({before} -> {after})")
-            names += [f"{prefix}terminal constraint {k + 1}" for k in range(terminal_constraint_count(structure))]
+            names += [f"{prefix}terminal constraint {k + 1}" for k in range(structure.terminal_constraint_count)]
         return tuple(names)
 
     @cached_property
     def constraint_counts(self) -> tuple[int, ...]:
         """Number of constraints of each experiment."""
-        return tuple(len(s.guarded) + terminal_constraint_count(s) for s in self.structures)
+        return tuple(len(s.guarded) + s.terminal_constraint_count for s in self.structures)
 
     @property
     def _prefixes(self) -> list[str]:

@@ -286,7 +286,7 @@ def _block_along(
 
     def outputs(t: jax.Array, x: jax.Array, X: jax.Array) -> tuple[jax.Array, jax.Array]:
         def seen(x: jax.Array, p: jax.Array) -> jax.Array:
-            return jnp.concatenate([jnp.zeros(0), *(model.observed(h, t, x, p, q) for h, q in structure.outputs)])
+            return jnp.concatenate([jnp.zeros(0), *(model.observed(h, t, x, p) for h, _ in structure.outputs)])
 
         y, linear = jax.linearize(seen, x, p)
         return y, jax.vmap(linear, in_axes=(1, 1), out_axes=1)(X, P)

@@ -323,7 +323,7 @@ def _late_block(
             lambda x, m=m: step(model.tableau, model.field(m, piece), None, start, time, x, p)[0]
             for m in range(len(structure.modes))
         ]
-        return model.observed(sensor.observe, time, lax.switch(mode, steps, x), p, sensor.channels)
+        return model.observed(sensor.observe, time, lax.switch(mode, steps, x), p)
 
     return jax.vmap(one)(times, mode, start, x, Piece(origin, coefficients))
 
@@ -385,7 +385,7 @@ def _block(
     costs, before, after = modes[0](x) if len(modes) == 1 else lax.switch(mode, modes, x)
 
     def outputs(t: jax.Array, x: jax.Array) -> jax.Array:
-        seen = [model.observed(observe, t, x, p, q) for observe, q in structure.outputs]
+        seen = [model.observed(observe, t, x, p) for observe, _ in structure.outputs]
         return jnp.concatenate([jnp.zeros(0), *seen])
 
     over_rows = jax.vmap(outputs)

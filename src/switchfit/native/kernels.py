@@ -563,7 +563,7 @@ class Kernels:
             model = self.model(constants)
 
             def seen(x: Any, p: Any) -> Any:
-                each = [model.observed(observe, t, x, p, q) for observe, q in self.structure.outputs]
+                each = [model.observed(observe, t, x, p) for observe, _ in self.structure.outputs]
                 return jnp.concatenate([jnp.zeros(0), *each])
 
             return [seen(x, p), *(jax.jacfwd(seen, argnums=(0, 1))(x, p) if self.second else ())]
