@@ -24,7 +24,7 @@ import llvmlite.binding as llvm
 import numpy as np
 
 from switchfit.cache import usable_folder
-from switchfit.native.scalars import CONDITIONS, Node, needed
+from switchfit.native.scalars import LOGIC, Node, needed
 
 INTRINSICS = {
     "sqrt": "sqrt",
@@ -32,6 +32,7 @@ INTRINSICS = {
     "floor": "floor",
     "ceil": "ceil",
     "rint": "rint",
+    "round": "round",
     "max": "maximum",
     "min": "minimum",
 }
@@ -146,12 +147,9 @@ class _Writer:
             return self.emit(f"fneg {kind} {a[0]}")
         if op in COMPARISONS:
             return self.emit(f"{COMPARISONS[op]} double {a[0]}, {a[1]}")
-        if op in ("and", "or"):
-            return self.emit(f"{op} i1 {a[0]}, {a[1]}")
-        if op == "not":
-            return self.emit(f"xor i1 {a[0]}, true")
+        if op in LOGIC:
+            return self.emit(f"xor i1 {a[0]}, true" if op == "not" else f"{op} i1 {a[0]}, {a[1]}")
         if op == "select":
-            kind = "i1" if all(x.op in CONDITIONS or isinstance(x.number, bool) for x in args[1:]) else kind
             return self.emit(f"select i1 {self.value(args[0])}, {kind} {a[1]}, {kind} {a[2]}")
         given = ", ".join(f"double {x}" for x in a)
         name = f"llvm.{INTRINSICS[op]}.f64" if op in INTRINSICS else FROM_LIBM[op]
@@ -161,6 +159,8 @@ class _Writer:
         return self.emit(f"call double @{name}({given})")
 
     def store(self, pointer: str, offset: int, node: Node) -> None:
+        if node.truth:
+            raise TypeError(f"a truth value cannot be stored at {pointer}[{offset}], which is a double")
         value, address = self.value(node), self.address(pointer, offset, node.vector)
         self.lines.append(f"  store {self._type(node)} {value}, ptr {address}, align 8")
 
@@ -171,7 +171,7 @@ class _Writer:
         return self.emit(f"getelementptr inbounds double, ptr %{pointer}, i64 {offset * unit}")
 
     def _type(self, node: Node) -> str:
-        return self.module.vector if node.vector else "double"
+        return self.module.vector if node.vector else "i1" if node.truth else "double"
 
     def _as(self, node: Node, vector: bool) -> str:
         """A value as an operand of an operation on vectors, or on scalars."""
