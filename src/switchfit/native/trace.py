@@ -210,7 +210,7 @@ def _meaning(graph: Graph, name: str, params: Any, dtype: np.dtype[Any]) -> Call
     table = tables[dtype.kind]
     if name in table:
         return table[name](graph, params)
-    if dtype.kind == "i" and name in MEANINGS:
+    if dtype.kind == "i":
         raise Unsupported(f"does integer arithmetic ({name}) with what depends on the state")
     raise Unsupported(f"calls {OTHER_NAMES.get(name, f'jax.lax.{name}')}")
 
@@ -282,6 +282,7 @@ CALLS = {
     "closed_call": "call_jaxpr",
     "core_call": "call_jaxpr",
     "remat": "jaxpr",
+    "remat2": "jaxpr",
     "checkpoint": "jaxpr",
     "custom_jvp_call": "call_jaxpr",
     "custom_vjp_call": "call_jaxpr",
@@ -306,19 +307,15 @@ def _slice(params: Any, a: Any) -> Any:
 
 
 def _pad(params: Any, a: Any, value: Any) -> Any:
+    """Entries between and around those of an array; a negative number at an end cuts entries off."""
     config = params["padding_config"]
-    if any(low < 0 or high < 0 for low, high, _ in config):
-        raise Unsupported("calls jax.lax.pad with negative padding")
-    shape = [low + high + n + max(n - 1, 0) * inner for n, (low, high, inner) in zip(a.shape, config, strict=True)]
-    result = np.empty(shape, dtype=object)
-    result[...] = value.item() if value.dtype != object else value.reshape(-1)[0]
-    result[
-        tuple(
-            slice(low, low + n + max(n - 1, 0) * inner, inner + 1)
-            for n, (low, _, inner) in zip(a.shape, config, strict=True)
-        )
-    ] = a
-    return result if object in (a.dtype, value.dtype) else result.astype(a.dtype)
+    whole = [n + max(n - 1, 0) * inner for n, (_, _, inner) in zip(a.shape, config, strict=True)]
+    shape = [max(low, 0) + n + max(high, 0) for n, (low, high, _) in zip(whole, config, strict=True)]
+    result = np.empty(shape, dtype=object if object in (a.dtype, value.dtype) else a.dtype)
+    result[...] = value.item()
+    spans = zip(whole, config, strict=True)
+    result[tuple(slice(max(low, 0), max(low, 0) + n, inner + 1) for n, (low, _, inner) in spans)] = a
+    return result[tuple(slice(max(-low, 0), n - max(-high, 0)) for n, (low, high, _) in zip(shape, config, strict=True))]
 
 
 def _dynamic_slice(params: Any, a: Any, *starts: Any) -> Any:
@@ -565,6 +562,11 @@ def _whole(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
     return meaning
 
 
+def _clamped(graph: Graph, params: Any) -> Callable[..., Any]:
+    smaller, larger = (OF_INTEGERS[name](graph, params) for name in ("min", "max"))
+    return lambda low, a, high: smaller(larger(a, low), high)
+
+
 def _compared(name: str) -> Callable[[Graph, Any], Callable[..., Any]]:
     def meaning(graph: Graph, params: Any) -> Callable[..., Any]:
         compare = MEANINGS[name](graph, params)
@@ -588,6 +590,7 @@ OF_INTEGERS: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
     **{name: _compared(name) for name in (*COMPARISONS, "gt", "ge")},
     "convert_element_type": _convert_integer,
     "select_n": _select,
+    "clamp": _clamped,
 }
 """Operations on each entry of arrays of integers."""
 
@@ -614,8 +617,8 @@ def _dot(graph: Graph, equation: Any, a: Any, b: Any) -> Any:
 
 
 def _contract(a: Any, b: Any, axes: Any) -> Objects:
-    result = np.tensordot(a.astype(object), b.astype(object), axes=axes)
-    return np.asarray(result, dtype=object)
+    a, b = (np.asarray(each, dtype=object) for each in (a, b))  # NumPy hands out scalars without an array around them
+    return np.asarray(np.tensordot(a, b, axes=axes), dtype=object)
 
 
 def _reduced(name: str) -> Callable[..., Any]:
@@ -645,7 +648,32 @@ def _accumulated(name: str) -> Callable[..., Any]:
     return along
 
 
+def _first(name: str) -> Callable[..., Any]:
+    """Where along an axis the largest (or smallest) entry is, the first of several; a NaN counts as such."""
+
+    def along(graph: Graph, equation: Any, a: Any) -> Any:
+        (axis,), dtype = equation.params["axes"], equation.invars[0].aval.dtype
+        beyond = _meaning(graph, name, {}, dtype)
+
+        def first(row: Any) -> Any:
+            best, found = row[0], 0
+            for k, value in enumerate(row[1:], start=1):
+                better = beyond(value, best)
+                if dtype.kind == "f":
+                    undefined = graph.apply("and", graph.apply("ne", value, value), graph.apply("eq", best, best))
+                    better = graph.apply("or", better, undefined)
+                best, found = _either(graph, better, value, best), _either(graph, better, k, found)
+            return found
+
+        rows = np.moveaxis(a, axis, -1)
+        return as_objects([first(row) for row in rows.reshape(-1, rows.shape[-1])]).reshape(rows.shape[:-1])
+
+    return along
+
+
 ARRAYS: dict[str, Callable[..., Any]] = {
+    "argmax": _first("gt"),
+    "argmin": _first("lt"),
     "dot_general": _dot,
     "reduce_sum": _reduced("add"),
     "reduce_prod": _reduced("mul"),
