@@ -19,6 +19,7 @@ Function = Callable[[Any], Any]
 
 TABLE_T = np.array([-2.0, -0.5, 0.0, 0.7, 1.1, 3.0])
 TABLE_Y = np.array([1.0, 0.3, -0.2, 0.5, 0.9, -1.0])
+AWAY = lax.RoundingMethod.AWAY_FROM_ZERO
 A = np.array([[2.0, 0.3, -0.1], [0.3, 1.5, 0.2], [-0.1, 0.2, 3.0]])
 
 
@@ -94,7 +95,7 @@ ARITHMETIC: dict[str, Function] = {
     "modf": lambda x: jnp.stack(jnp.modf(3 * x)),
     "reciprocal": jnp.reciprocal,
     "square": jnp.square,
-    "negative": lambda x: -(-x),
+    "negative": lambda x: -(1.0 - (-x)),
     "positive": lambda x: +x * 1.0,
     "integer_pow": lambda x: lax.integer_pow(x, 5),
     "fma": lambda x: x * x + x,
@@ -128,7 +129,9 @@ ELEMENTARY: dict[str, Function] = {
 ROUNDING: dict[str, Function] = {
     "round": lambda x: jnp.round(3 * x) * x,
     "round 1 digit": lambda x: jnp.round(x, 1),
-    "round away": lambda x: lax.round(x + np.array([0.5, 0.49999999999999994, -0.5]), lax.RoundingMethod.AWAY_FROM_ZERO),
+    "round away": lambda x: lax.round(
+        x + np.array([0.5, 0.49999999999999994, -0.5]), lax.RoundingMethod.AWAY_FROM_ZERO
+    ),
     "floor": lambda x: jnp.floor(3 * x) * x,
     "ceil": lambda x: jnp.ceil(3 * x) * x,
     "trunc": lambda x: jnp.trunc(3 * x) * x,
@@ -372,7 +375,9 @@ LOOPS: dict[str, Function] = {
     "jacobian inside": lambda x: jax.jacfwd(lambda y: y**2)(x),
     "jvp inside": lambda x: jax.jvp(jnp.sin, (x,), (x,))[1],
     "linearize": lambda x: jax.linearize(jnp.sin, x)[1](x),
-    "custom_root": lambda x: lax.custom_root(lambda y: y**3 + y - x, x, lambda f, y: newton(x), lambda g, y: y / g(jnp.ones(3))),
+    "custom_root": lambda x: lax.custom_root(
+        lambda y: y**3 + y - x, x, lambda f, y: newton(x), lambda g, y: y / g(jnp.ones(3))
+    ),
     "debug print": lambda x: (jax.debug.print("{}", x[0]), x)[1],
     "callback": lambda x: jax.pure_callback(np.sin, jax.ShapeDtypeStruct((3,), np.float64), x),
     "random": lambda x: x + jax.random.normal(jax.random.key(0), (3,)),
@@ -382,11 +387,14 @@ LOOPS: dict[str, Function] = {
 }
 
 SPECIAL: dict[str, Function] = {
-    **{f"nn.{name}": getattr(nn, name) for name in (
-        *("relu", "relu6", "sigmoid", "softplus", "soft_sign", "silu", "log_sigmoid", "leaky_relu", "hard_sigmoid"),
-        *("hard_silu", "hard_tanh", "elu", "celu", "selu", "gelu", "squareplus", "mish", "softmax", "log_softmax"),
-        *("standardize", "logsumexp"),
-    )},
+    **{
+        f"nn.{name}": getattr(nn, name)
+        for name in (
+            *("relu", "relu6", "sigmoid", "softplus", "soft_sign", "silu", "log_sigmoid", "leaky_relu", "hard_sigmoid"),
+            *("hard_silu", "hard_tanh", "elu", "celu", "selu", "gelu", "squareplus", "mish", "softmax", "log_softmax"),
+            *("standardize", "logsumexp"),
+        )
+    },
     "nn.glu": lambda x: nn.glu(jnp.concatenate([x, x[:1]])),
     "nn.one_hot": lambda x: nn.one_hot(1, 3) * x,
     "nn.gelu exact": lambda x: nn.gelu(x, approximate=False),
@@ -440,3 +448,97 @@ FUNCTIONS: dict[str, Function] = {
     for name, function in members.items()
 }
 """All functions by name."""
+
+FALLS_BACK = {
+    "elementary: i0": "calls jnp.i0",
+    "rounding: copysign": "calls jnp.copysign",
+    "rounding: signbit": "calls jnp.signbit",
+    "decisions: mean of booleans": "converts what depends on the state to float32",
+    "decisions: integer division": "calls jnp.floor_divide, which does integer arithmetic (div)",
+    "decisions: integer remainder": "calls jnp.remainder, which does integer arithmetic (rem)",
+    "decisions: bits": "does integer arithmetic (and) with what depends on the state",
+    "decisions: shift": "does integer arithmetic (shift_left) with what depends on the state",
+    "decisions: unsigned integers": "converts what depends on the state to uint32",
+    "decisions: integer powers": "does integer arithmetic (integer_pow) with what depends on the state",
+    "decisions: large integers": "does integer arithmetic with what depends on the state",
+    "decisions: truncated": "converts what depends on the state to int64",
+    "arrays: inv": "calls jnp.linalg.inv",
+    "arrays: solve": "calls jnp.linalg.solve",
+    "arrays: solve with a known matrix": "calls jnp.linalg.solve",
+    "arrays: cholesky": "calls jnp.linalg.cholesky",
+    "arrays: eigh": "calls jnp.linalg.eigh",
+    "arrays: svd": "calls jnp.linalg.svd",
+    "arrays: qr": "calls jnp.linalg.qr",
+    "arrays: expm": "calls jax.scipy.linalg.expm",
+    "arrays: cumlogsumexp": "calls jax.lax.cumlogsumexp",
+    "arrays: convolve": "calls jnp.convolve",
+    "arrays: correlate": "calls jnp.correlate",
+    "arrays: sort": "calls jnp.sort",
+    "arrays: argsort": "calls jnp.argsort, which does integer arithmetic (sort) with what depends on the state",
+    "arrays: argmax": "takes an index that depends on the state",
+    "arrays: median": "calls jnp.median",
+    "arrays: quantile": "calls jnp.quantile",
+    "arrays: top_k": "calls jax.lax.top_k",
+    "arrays: searchsorted": "calls jnp.searchsorted",
+    "arrays: interp": "calls jnp.interp",
+    "arrays: map_coordinates": "calls map_coordinates, which converts what depends on the state to int32",
+    "arrays: fft": "calls jnp.fft, which converts what depends on the state to complex128",
+    "arrays: complex": "converts what depends on the state to complex128",
+    "places: at multiply": "calls jax.lax.scatter-mul",
+    "places: at max": "calls jax.lax.scatter-max",
+    "places: at get with a fill": "takes an index out of range",
+    "places: index out of range": "takes an index out of range",
+    "places: take_along_axis": "calls jnp.take_along_axis, which takes indices in batches",
+    "places: boolean index": "takes an index that depends on the state",
+    "places: dynamic_slice by the state": "takes an index that depends on the state",
+    "loops: known while": "cannot be traced with its derivatives: ValueError",
+    "loops: while": "cannot be traced with its derivatives: ValueError",
+    "loops: fori_loop as long as the state says": "cannot be traced with its derivatives: ValueError",
+    "loops: long": "takes more than 50000 operations",
+    "loops: custom_vjp": "cannot be traced with its derivatives: TypeError",
+    "loops: debug print": "calls jax.lax.debug_print",
+    "loops: callback": "cannot be traced with its derivatives: ValueError",
+    "loops: random by the state": "does integer arithmetic (random_seed) with what depends on the state",
+    "loops: single precision": "converts what depends on the state to float32",
+    "special: erfinv": "calls jax.lax.erf_inv",
+    "special: gammaln": "calls jax.lax.lgamma",
+    "special: gamma": "calls jax.scipy.special.gammasgn",
+    "special: digamma": "calls jax.lax.digamma",
+    "special: betaln": "calls jax.lax.lgamma",
+    "special: beta": "calls jax.scipy.special.gammasgn",
+    "special: factorial": "calls jax.lax.lgamma",
+    "special: gammainc": "calls jax.lax.igamma",
+    "special: betainc": "calls jax.lax.regularized_incomplete_beta",
+    "special: i0e": "calls jax.lax.bessel_i0e",
+    "special: i1": "calls jax.lax.bessel_i1e",
+    "special: zeta": "calls jax.lax.zeta",
+    "special: expi": "calls jax.scipy.special.expi",
+    "special: exp1": "calls jax.scipy.special.expn",
+    "special: hyp1f1": "calls jax.scipy.special.hyp1f1",
+    "special: poch": "calls jax.scipy.special.gammasgn",
+}
+"""Functions that JAX has to evaluate, and why."""
+
+ZERO_TIMES_INFINITY = (
+    "arithmetic: divide",
+    "arithmetic: divide by itself",
+    "arithmetic: overflow",
+    "arithmetic: power of a negative",
+    "arithmetic: power of a state",
+    "arrays: vander",
+    "elementary: arccos",
+    "elementary: arccosh",
+    "elementary: arcsin",
+    "elementary: arctan2",
+    "elementary: arctanh",
+    "elementary: cbrt",
+    "elementary: log",
+    "elementary: log10",
+    "elementary: log2",
+    "elementary: nan_to_num",
+    "elementary: rsqrt",
+    "elementary: sqrt",
+    "elementary: unguarded sqrt",
+    "special: bessel_jn",
+)
+"""Functions of which JAX says NaN for an entry of a derivative that is 0: a tangent of 0 times an infinite slope."""

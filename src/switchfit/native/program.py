@@ -7,6 +7,7 @@ between the parts of an evaluation lies in one workspace, which is made once a m
 from __future__ import annotations
 
 import ctypes
+import logging
 import threading
 from collections.abc import Callable
 from functools import lru_cache
@@ -26,34 +27,48 @@ from switchfit.rungekutta import EXPLICIT
 
 _one_at_a_time = threading.Lock()
 
+log = logging.getLogger("switchfit")
+
 
 PREFIX = {0: "plain_", 1: "first_", 2: ""}
 """What the names of functions begin with, by the order of their derivatives."""
 
 
-def program_of(structure: Structure, sizes: Sizes, order: int) -> Program | None:
-    """Machine code for a structure, with derivatives of an order; None where JAX has to do its work.
+def program_of(structure: Structure, sizes: Sizes, order: int) -> Program | str:
+    """Machine code for a structure, with derivatives of an order; or the reason why JAX has to do its work.
 
     That is so for implicit steps, for delays that are estimated, and for functions that cannot be written as a straight
-    line of scalars. A fit needs simulations and second derivatives: they are one program.
+    line of scalars. A fit needs simulations and second derivatives: they are one program. Whatever else goes wrong is a
+    defect of this package: JAX then does the work as well, and the reason begins with "internal: ".
     """
     with _one_at_a_time:
         return _program_of(structure, sizes, (1,) if order == 1 else (0, 2))
 
 
 @lru_cache(maxsize=64)
-def _program_of(structure: Structure, sizes: Sizes, orders: tuple[int, ...]) -> Program | None:
-    late = any(sensor.delay is not None for sensor in structure.measurements)
-    if structure.tableau is not EXPLICIT or late or sizes.D == 0:
-        return None
-    module = Module(sizes.width)
+def _program_of(structure: Structure, sizes: Sizes, orders: tuple[int, ...]) -> Program | str:
     try:
-        with float64():
-            for order in orders:
-                module.prefix = PREFIX[order]
-                _write(module, structure, sizes, order)
-    except Unsupported:
-        return None
+        return _compiled(structure, sizes, orders)
+    except Unsupported as error:
+        reason, defect = str(error), False
+    except Exception as error:
+        reason, defect = f"internal: {type(error).__name__}: {error}", True
+    log.info("Evaluated by JAX: %s.", reason, exc_info=defect)
+    return reason
+
+
+def _compiled(structure: Structure, sizes: Sizes, orders: tuple[int, ...]) -> Program:
+    if structure.tableau is not EXPLICIT:
+        raise Unsupported(f"solver={structure.solver!r} takes implicit steps")
+    if any(sensor.delay is not None for sensor in structure.measurements):
+        raise Unsupported("a delay is estimated")
+    if sizes.D == 0:
+        raise Unsupported("an experiment has no unknowns")
+    module = Module(sizes.width)
+    with float64():
+        for order in orders:
+            module.prefix = PREFIX[order]
+            _write(module, structure, sizes, order)
     return compiled(module.text)
 
 
@@ -115,10 +130,16 @@ def _write(module: Module, structure: Structure, sizes: Sizes, order: int) -> No
 def native_experiment(
     structure: Structure, arguments: Arguments, times: FloatArray, order: int
 ) -> NativeExperiment | None:
-    """One experiment in machine code, on the mesh with the nodes `times`; None where JAX has to do it."""
+    """One experiment in machine code, on the mesh with the nodes `times`; None if there is a `reason_for_jax`."""
     sizes = Sizes.of(structure, arguments)
     program = program_of(structure, sizes, order)
-    return None if program is None else NativeExperiment(program, structure, sizes, arguments, times, order)
+    return None if isinstance(program, str) else NativeExperiment(program, structure, sizes, arguments, times, order)
+
+
+def reason_for_jax(structure: Structure, arguments: Arguments, order: int) -> str | None:
+    """Why JAX has to evaluate an experiment with derivatives of an order; None if machine code does."""
+    program = program_of(structure, Sizes.of(structure, arguments), order)
+    return program if isinstance(program, str) else None
 
 
 class Simulated(NamedTuple):

@@ -143,7 +143,9 @@ def _is_truth(op: str, args: tuple[Any, ...]) -> bool:
             raise TypeError(f"select of {given}: it takes a truth value, then two cases of one type")
         return cases[0]
     if any(truth != (op in LOGIC) for truth in given):
-        raise TypeError(f"{op} does not take {' and '.join('a truth value' if truth else 'a double' for truth in given)}")
+        raise TypeError(
+            f"{op} does not take {' and '.join('a truth value' if truth else 'a double' for truth in given)}"
+        )
     return op in LOGIC or op in COMPARISONS
 
 

@@ -315,7 +315,9 @@ def _pad(params: Any, a: Any, value: Any) -> Any:
     result[...] = value.item()
     spans = zip(whole, config, strict=True)
     result[tuple(slice(max(low, 0), max(low, 0) + n, inner + 1) for n, (low, _, inner) in spans)] = a
-    return result[tuple(slice(max(-low, 0), n - max(-high, 0)) for n, (low, high, _) in zip(shape, config, strict=True))]
+    return result[
+        tuple(slice(max(-low, 0), n - max(-high, 0)) for n, (low, high, _) in zip(shape, config, strict=True))
+    ]
 
 
 def _dynamic_slice(params: Any, a: Any, *starts: Any) -> Any:
@@ -400,7 +402,7 @@ def _convert_number(graph: Graph, params: Any) -> Callable[[Any], Any]:
     kind = np.dtype(params["new_dtype"])
     if kind == np.float64:
         return lambda a: a
-    if kind == bool:
+    if kind.kind == "b":
         return lambda a: graph.apply("ne", a, 0.0)
     raise Unsupported(f"converts what depends on the state to {kind}")
 
@@ -488,7 +490,7 @@ def _logic(function: Callable[[Callable[..., Any], Any, Any], Any]) -> Callable[
 
 def _convert_truth(graph: Graph, params: Any) -> Callable[[Any], Any]:
     kind = np.dtype(params["new_dtype"])
-    if kind == bool:
+    if kind.kind == "b":
         return lambda a: a
     if kind == np.float64:
         return lambda a: graph.apply("select", a, 1.0, 0.0)
