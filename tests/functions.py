@@ -524,7 +524,6 @@ ZERO_TIMES_INFINITY = (
     "arithmetic: divide by itself",
     "arithmetic: overflow",
     "arithmetic: power of a negative",
-    "arithmetic: power of a state",
     "arrays: vander",
     "elementary: arccos",
     "elementary: arccosh",

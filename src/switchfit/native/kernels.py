@@ -546,7 +546,9 @@ class Kernels:
         factor = graph.apply("select", graph.apply("ne", norm, norm), 0.2, factor)
         reached = graph.apply("select", graph.apply("eq", step, end - t), end, t + step)
         shortest = graph.apply("min", step, step * factor)
-        stuck = graph.apply("le", shortest, 10 * np.finfo(float).eps * graph.apply("abs", t))
+        # Written so that a step which is not a number is stuck as well: it would be tried for ever.
+        goes_on = graph.apply("lt", 10 * np.finfo(float).eps * graph.apply("abs", t), shortest)
+        stuck = graph.apply("not", goes_on)
         number = {name: graph.apply("select", flag, 1.0, 0.0) for name, flag in (("yes", accepted), ("stuck", stuck))}
         stores = [
             ("state", at.t, graph.apply("select", accepted, reached, t)),

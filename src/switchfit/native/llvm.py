@@ -47,6 +47,12 @@ FROM_LIBM = {
 }
 """Functions of the C library."""
 
+EFFORT = {"div": 4, "sqrt": 4, **dict.fromkeys(FROM_LIBM, 20)}
+"""What operations cost where it is not about as much as an addition."""
+
+BUDGET = 2_000_000
+"""Work, in additions, after which a loop returns to Python, so that Ctrl-C is heard: it takes 1 to 20 ms."""
+
 
 def literal(number: float) -> str:
     """A double, exactly."""
@@ -72,6 +78,7 @@ class Module:
         self.prefix = ""
         self.vector = f"<{width} x double>"
         self.functions: list[str] = []
+        self._work: dict[str, int] = {}
         self._declared: dict[str, str] = {}
 
     def straight(
@@ -83,14 +90,23 @@ class Module:
         `seen` can be called from Python.
         """
         writer = _Writer(self)
-        values = [writer.value(node) for node in needed([node for _, _, node in stores])]
-        del values
+        nodes = needed([node for _, _, node in stores])
+        for node in nodes:
+            writer.value(node)
+        self._work[self.prefix + name] = sum(self._effort(node) for node in nodes)
         for pointer, offset, node in stores:
             writer.store(pointer, offset, node)
         arguments = ", ".join(f"ptr %{pointer}" for pointer in pointers)
         body = "\n".join(writer.lines)
         linkage = "" if seen else "internal "
         self.functions.append(f"define {linkage}void @{self.prefix}{name}({arguments}) {{\n{body}\n  ret void\n}}\n")
+
+    def work(self, name: str) -> int:
+        """What a function costs that was written with the prefix of now, in additions."""
+        return self._work[self.prefix + name]
+
+    def _effort(self, node: Node) -> int:
+        return EFFORT.get(node.op, 1) * (1 + self.width // 4 if node.vector else 1)
 
     def add(self, text: str) -> None:
         """A function written by hand, which calls none but those of the same prefix, and LLVM's."""
