@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from switchfit.certificate import certify
 from switchfit.data import FloatArray
+from switchfit.engine import Engine
 from switchfit.evaluate import Evaluator, evaluator_of
 from switchfit.guards import on_guards
 from switchfit.identifiability import Identifiability, identifiability
@@ -49,6 +50,8 @@ the relative error of a cost that vanishes says nothing."""
 
 MOST_SENSITIVITIES = 2**28
 """Bytes that the derivatives of states and outputs at all nodes may take; beyond, figures have no bands."""
+
+GAUSS_NEWTON_ENGINE = Engine("jax", "the Gauss-Newton matrix has no machine code")
 
 ORDER = 5
 """Order of both integrators: what dividing the steps gains."""
@@ -381,6 +384,7 @@ def _estimate(
         least_squares=least_squares(problem),
         hessian_kind=hessian,
         tolerance=tolerance,
+        engine=GAUSS_NEWTON_ENGINE if hessian == "gauss-newton" else evaluator.engine,
         problem=problem,
         evaluator=evaluator,
         **rest,

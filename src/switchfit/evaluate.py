@@ -20,9 +20,10 @@ from switchfit.derivatives.constraints import augmented
 from switchfit.derivatives.discrete import adjoint_hessian, gauss_newton_hessian
 from switchfit.derivatives.first_order import first_order
 from switchfit.derivatives.forward import forward_hessian
+from switchfit.engine import Engine
 from switchfit.mesh import Mesh
 from switchfit.model import Arguments, Model, Structure, float64
-from switchfit.native.program import NativeExperiment, native_experiment
+from switchfit.native.program import NativeExperiment, native_experiment, reason_for_jax
 from switchfit.optimize.arrow import Arrow, ArrowLayout
 from switchfit.problem import Problem
 from switchfit.propagate import path_cost, propagate
@@ -199,6 +200,15 @@ class Evaluator:
         prior = 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0])
         vectors = [self.problem.vectors(theta, e) for e in range(len(natives))]
         return prior + sum(native.cost(*given) for native, given in zip(natives, vectors, strict=True) if native)
+
+    @property
+    def engine(self) -> Engine:
+        """What evaluates cost, gradient and exact Hessian by the method "auto": machine code, or JAX and why."""
+        if self.problem.constraint_names:
+            return Engine("jax", "guards and terminal constraints have no machine code")
+        given = zip(self.problem.structures, self.arguments, strict=True)
+        reasons = (reason_for_jax(structure, arguments, 2) for structure, arguments in given)
+        return Engine.of(next((reason for reason in reasons if reason is not None), None))
 
     def _natives(self, order: int) -> list[NativeExperiment | None]:
         """What evaluates each experiment in machine code, None where nothing does; with derivatives up to an order."""

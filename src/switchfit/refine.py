@@ -168,7 +168,8 @@ def _solve(
         return value
 
     method = scipy.integrate.RK45 if problem.solver == "explicit" else scipy.integrate.Radau
-    solver = method(right_hand_side, start, np.append(x, 0.0), end, rtol=problem.rtol, atol=problem.atol)
+    with np.errstate(all="ignore"):  # a slope of 1e300 is refused in words
+        solver = method(right_hand_side, start, np.append(x, 0.0), end, rtol=problem.rtol, atol=problem.atol)
     accepted = [start]
     while solver.status == "running":
         with np.errstate(over="ignore", invalid="ignore"):  # a state that overflows is refused in words
@@ -185,7 +186,7 @@ def _solve(
 
 
 STEPS_AT_ONCE = 256
-"""Steps of the compiled solver in one call."""
+"""Steps that the compiled solver accepts in one call, at most."""
 
 
 def _solve_natively(
@@ -199,25 +200,30 @@ def _solve_natively(
     with np.errstate(all="ignore"):
         state[at.h] = _first_step(problem, native, mode, start, end, y, p)
     accepted = np.array([start])
-    while state[at.t] < end and not _too_many(accepted, end):
-        times = native.adaptive_steps(mode, state, y, p, STEPS_AT_ONCE)
-        accepted = np.append(accepted, times)
-        if len(times) < STEPS_AT_ONCE:
-            break
+    while state[at.t] < end and not state[at.stuck] and not _too_many(accepted, end):
+        accepted = np.append(accepted, native.adaptive_steps(mode, state, y, p, STEPS_AT_ONCE))
     return None if state[at.t] < end or not np.isfinite(y).all() else (accepted[1:], y[:-1])
 
 
 def _first_step(
     problem: Problem, native: NativeExperiment, mode: int, start: float, end: float, y: FloatArray, p: FloatArray
 ) -> float:
-    """Hairer, Norsett and Wanner I, section II.4, as SciPy has it."""
+    """Hairer, Norsett and Wanner I, section II.4, as SciPy has it.
+
+    NaN if the slope is not finite, 0 if it is too large to be squared: the compiled solver stops at either, and
+    `_solve` says what is wrong, or begins with the shortest step there is.
+    """
 
     def size(error: FloatArray) -> float:
         return float(np.sqrt(np.mean((error / (problem.atol + problem.rtol * np.abs(y))) ** 2)))
 
     slope = native.slope(mode, start, y, p)
+    if not np.isfinite(slope).all():
+        return np.nan
     of_state, of_slope = size(y), size(slope)
     guess = min(1e-6 if of_state < 1e-5 or of_slope < 1e-5 else 0.01 * of_state / of_slope, end - start)
+    if guess == 0.0:
+        return 0.0
     ahead = min(start + guess, float(np.nextafter(end, start)))
     bend = size(native.slope(mode, ahead, y + guess * slope, p) - slope) / guess
     flat = of_slope <= 1e-15 and bend <= 1e-15

@@ -12,6 +12,7 @@ import scipy.special
 from numpy.typing import NDArray
 
 from switchfit.data import FloatArray
+from switchfit.engine import Engine
 from switchfit.optimize import IterationRecord, Status
 from switchfit.simulate import Comparison, Trajectory
 
@@ -139,6 +140,8 @@ class Fit:
         Unknowns that were estimated on a logarithmic scale.
     least_squares : bool
         Whether what measurements and priors add to J is half a sum of squares: no sigma is a parameter, no loss robust.
+    engine : Engine or None
+        What evaluated cost and derivatives: machine code, or JAX and why. None where that is not known.
     """
 
     theta_names: tuple[str, ...]
@@ -173,6 +176,7 @@ class Fit:
     priors: Mapping[str, str] = field(default_factory=dict)
     log_scaled: tuple[str, ...] = ()
     least_squares: bool = True
+    engine: Engine | None = None
 
     @property
     def success(self) -> bool:

@@ -1,6 +1,10 @@
 """The loops around the straight lines of `switchfit.native.kernels`, in LLVM's language, written by hand.
 
 Rows are numbered by ``cell + segment``: each transition cuts one cell in two.
+
+Python hears Ctrl-C only between two calls. Loops therefore stop when a budget is spent, and go on where they stopped
+when they are called again. `PROGRESS` is what they leave in memory between two calls: three integers, the phase of the
+evaluation (-1 at its end), how many turns of the loop in it are done, and what is left of the budget (`llvm.BUDGET`).
 """
 
 from __future__ import annotations
@@ -28,7 +32,7 @@ from switchfit.native.kernels import (
     Adaptive,
     Sizes,
 )
-from switchfit.native.llvm import literal
+from switchfit.native.llvm import BUDGET, Module, literal
 
 POINTERS = (
     *("nodes", "signals", "c", "p", "tau", "first_cell", "states", "tangents", "stages", "stage_tangents", "jumps"),
@@ -40,8 +44,8 @@ POINTERS = (
 class Driver:
     """The loops around the straight lines, written by hand."""
 
-    def __init__(self, structure: Structure, sizes: Sizes, order: int) -> None:
-        self.structure, self.sizes, self.order = structure, sizes, order
+    def __init__(self, structure: Structure, sizes: Sizes, order: int, module: Module) -> None:
+        self.structure, self.sizes, self.order, self.module = structure, sizes, order, module
         self.lines: list[str] = []
         self.count = 0
 
@@ -77,9 +81,32 @@ class Driver:
         """Call a straight line with its pointers in order."""
         self.line(f"call void @{name}({', '.join(f'ptr {given[key]}' for key in order)})")
 
-    def finished(self, signature: str) -> str:
-        """The lines since the last function as a function."""
-        text = f"define {signature} {{\nentry:\n" + "\n".join(self.lines) + "\n  ret void\n}\n"
+    def resumed(self) -> tuple[str, str]:
+        """How many turns of a loop are done, and what is left of the budget, when its function is called."""
+        places = (self.let(f"getelementptr inbounds i64, ptr %progress, i64 {k}") for k in (1, 2))
+        turns, left = (self.let(f"load i64, ptr {place}") for place in places)
+        return turns, left
+
+    def next_turn(self, turns: str, done: str) -> None:
+        """End a turn of a loop: leave it if it is `done`, return if the budget is spent, else start the next one.
+
+        The loop has the label `loop`, this block the label `next`. `%left` is what is left after this turn.
+        """
+        self.line(f"%turns = add i64 {turns}, 1")
+        self.line("%spent = icmp sle i64 %left, 0")
+        self.line(f"%stop = or i1 {done}, %spent")
+        self.line("br i1 %stop, label %out, label %loop")
+        self.lines.append("out:")
+        self.line(f"%place = select i1 {done}, i64 0, i64 %turns")
+        for k, value in ((1, "%place"), (2, "%left")):
+            place = self.let(f"getelementptr inbounds i64, ptr %progress, i64 {k}")
+            self.line(f"store i64 {value}, ptr {place}")
+        self.line(f"ret i1 {done}")
+
+    def finished(self, signature: str, returns: bool = True) -> str:
+        """The lines since the last function as a function, with a return at its end unless it has one."""
+        end = "\n  ret void" if returns else ""
+        text = f"define {signature} {{\nentry:\n" + "\n".join(self.lines) + f"{end}\n}}\n"
         self.lines, self.count = [], 0
         return text
 
@@ -122,9 +149,12 @@ class Driver:
         n, width = self.sizes.n, self.sizes.width
         self.line("%row = alloca [3 x double]")
         found = self.pointers()
+        before, left = self.resumed()
+        self.line(f"%start = add i64 %first, {before}")
         self.line("br label %loop")
         self.lines.append("loop:")
-        self.line("%cell = phi i64 [%first, %entry], [%more, %next]")
+        self.line("%cell = phi i64 [%start, %entry], [%more, %next]")
+        self.line(f"%budget = phi i64 [{left}, %entry], [%left, %next]")
         place = self._row(found, "%cell")
         row = self.let("add i64 %cell, %segment")
         after = self.let(f"add i64 {row}, 1")
@@ -142,29 +172,36 @@ class Driver:
         self.lines.append("is_inner:")
         self.call(f"forward_inner_{mode}", FORWARD, given)
         self.line("br label %next")
+        work = {kind: self.module.work(f"forward_{kind}_{mode}") for kind in ("end", "inner")}
         self.lines.append("next:")
+        self.line(f"%work = phi i64 [{work['end']}, %is_end], [{work['inner']}, %is_inner]")
+        self.line("%left = sub i64 %budget, %work")
         self.line("%more = add i64 %cell, 1")
         self.line("%done = icmp sgt i64 %more, %last")
-        self.line("br i1 %done, label %out, label %loop")
-        self.lines.append("out:")
-        return self.finished(f"internal void @forward_{mode}({SEGMENT}, ptr %x, ptr %Z)")
+        self.next_turn(self.let("sub i64 %cell, %first"), "%done")
+        return self.finished(f"internal i1 @forward_{mode}({SEGMENT}, ptr %x, ptr %Z)", returns=False)
 
     def backward_segment(self, mode: int, inner: int, end: int) -> str:
         """All rows of a segment, backward; with the numbers of entries of the second derivatives."""
         n, width = self.sizes.n, self.sizes.width
         self.line("%row = alloca [3 x double]")
         found = self.pointers()
+        before, left = self.resumed()
+        self.line(f"%start = sub i64 %last, {before}")
         self.line("br label %loop")
         self.lines.append("loop:")
-        self.line("%cell = phi i64 [%last, %entry], [%less, %next]")
+        self.line("%cell = phi i64 [%start, %entry], [%less, %next]")
+        self.line(f"%budget = phi i64 [{left}, %entry], [%left, %next]")
         place = self._row(found, "%cell")
         row = self.let("add i64 %cell, %segment")
         after = self.let(f"add i64 {row}, 1")
         given = found | place | self._at_row(found, row) | {"jump": self.at(found["jumps"], after, n)}
         self.line(f"br i1 {place['end row']}, label %is_end, label %is_inner")
+        work = {}
         for kind, count in (("end", end + 1), ("inner", inner)):
             self.lines.append(f"is_{kind}:")
             self.call(f"backward_{kind}_{mode}", BACKWARD, given)
+            work[kind] = self.module.work(f"backward_{kind}_{mode}")
             if self.order == 2:
                 if kind == "end":
                     self.call("length", LENGTH, given)
@@ -174,13 +211,15 @@ class Driver:
                         "XZ": self.at(given["XZ"], j * n * width),
                     }
                     self.call(f"curvature_{kind}_{mode}", CURVATURE, given | at_stage)
+                    work[kind] += self.module.work(f"curvature_{kind}_{mode}")
             self.line("br label %next")
         self.lines.append("next:")
+        self.line(f"%work = phi i64 [{work['end']}, %is_end], [{work['inner']}, %is_inner]")
+        self.line("%left = sub i64 %budget, %work")
         self.line("%less = sub i64 %cell, 1")
         self.line("%done = icmp slt i64 %less, %first")
-        self.line("br i1 %done, label %out, label %loop")
-        self.lines.append("out:")
-        return self.finished(f"internal void @backward_{mode}({SEGMENT})")
+        self.next_turn(self.let("sub i64 %last, %cell"), "%done")
+        return self.finished(f"internal i1 @backward_{mode}({SEGMENT})", returns=False)
 
     def samples(self, k: int, q: int) -> str:
         """All samples of the k-th Measurements."""
@@ -189,9 +228,11 @@ class Driver:
         place = len(POINTERS) + 4 * k
         cells, times, values, weights = (self.let(f"load ptr, ptr {self.at('%table', place + m)}") for m in range(4))
         begins = [self.let(f"load i64, ptr {self.at(found['first_cell'], i)}") for i in range(1, N + 1)]
+        before, left = self.resumed()
         self.line("br label %loop")
         self.lines.append("loop:")
-        self.line("%sample = phi i64 [0, %entry], [%more, %loop]")
+        self.line(f"%sample = phi i64 [{before}, %entry], [%more, %loop]")
+        self.line(f"%budget = phi i64 [{left}, %entry], [%left, %loop]")
         cell = self.let(f"load i64, ptr {self.at(cells, '%sample')}")
         state = self.let(f"add i64 {cell}, 1")
         for begin in begins:
@@ -206,11 +247,11 @@ class Driver:
             "weight": self.at(weights, "%sample", q),
         }
         self.call(f"sample_{k}", SAMPLE, given)
+        self.line(f"%left = sub i64 %budget, {self.module.work(f'sample_{k}')}")
         self.line("%more = add i64 %sample, 1")
         self.line("%done = icmp sge i64 %more, %count")
-        self.line("br i1 %done, label %out, label %loop")
-        self.lines.append("out:")
-        return self.finished(f"internal void @samples_{k}(ptr %table, i64 %count)")
+        self.next_turn("%sample", "%done")
+        return self.finished(f"internal i1 @samples_{k}(ptr %table, i64 %count, ptr %progress)", returns=False)
 
     def slope_at(self, mode: int) -> str:
         """Slope of one mode at any time: in the cell that holds it, or would if it were between `low` and `high`."""
@@ -249,7 +290,10 @@ class Driver:
         return self.finished(signature)
 
     def adaptive(self, mode: int) -> str:
-        """Adaptive steps in one mode until its end, or `most` of them: the moments reached, and how many."""
+        """Adaptive steps in one mode until its end, `most` of them, or the budget: the moments reached, and how many.
+
+        Steps that are refused count for the budget too.
+        """
         size, at = self.sizes.n + 1, Adaptive()
         given = {name: f"%{name}" for name in ADAPTIVE}
         self.line(f"%argument = alloca [{size} x double]")
@@ -257,12 +301,19 @@ class Driver:
         self.line("br label %loop")
         self.lines.append("loop:")
         self.line("%done = phi i64 [0, %entry], [%more, %next]")
+        self.line("%tried = phi i64 [0, %entry], [%tries, %next]")
         t = self.let(f"load double, ptr {self.at('%state', at.t)}")
         end = self.let(f"load double, ptr {self.at('%state', at.end)}")
         stuck = self.let(f"load double, ptr {self.at('%state', at.stuck)}")
         flags = [self.let(f"fcmp olt double {t}, {end}"), self.let(f"fcmp oeq double {stuck}, 0.0")]
         flags.append(self.let("icmp slt i64 %done, %most"))
-        goes_on = self.let(f"and i1 {self.let(f'and i1 {flags[0]}, {flags[1]}')}, {flags[2]}")
+        steps = (f"adaptive_{j}" for j in range(1, len(RK45.C)))
+        between = sum(map(self.module.work, ("adaptive_begin", *steps, "adaptive_after", "adaptive_judge")))
+        work = (len(RK45.C) + 1) * self.module.work(f"slope_{mode}") + between
+        flags.append(self.let(f"icmp slt i64 %tried, {max(1, BUDGET // work)}"))
+        goes_on = flags[0]
+        for flag in flags[1:]:
+            goes_on = self.let(f"and i1 {goes_on}, {flag}")
         self.line(f"br i1 {goes_on}, label %try, label %out")
         self.lines.append("try:")
         self.call("adaptive_begin", ADAPTIVE, given)
@@ -284,6 +335,7 @@ class Driver:
         self.line("br label %next")
         self.lines.append("next:")
         self.line(f"%more = add i64 %done, {self.let(f'zext i1 {accepted} to i64')}")
+        self.line("%tries = add i64 %tried, 1")
         self.line("br label %loop")
         self.lines.append("out:")
         self.line("store i64 %done, ptr %count")
@@ -308,40 +360,62 @@ class Driver:
         for i in range(N):
             state = self.let(f"add i64 {lasts[i]}, {i + 1}")
             befores.append({"x": self.at(found["states"], state, n), "Z": self.at(found["tangents"], state, n * width)})
-        self.call("start", START, found | befores[0])
-        for i, mode in enumerate(structure.mode_of_segment):
-            x, Z = befores[i]["x"], befores[i]["Z"]
-            if i - 1 in structure.resets:
-                behind = {
-                    "x_after": self.at(found["reset_states"], (i - 1) * n),
-                    "Z_after": self.at(found["reset_tangents"], (i - 1) * n * width),
-                }
-                self.call(f"reset_{i - 1}", RESET, found | befores[i] | behind)
-                x, Z = behind["x_after"], behind["Z_after"]
-            self.line(f"call void @forward_{mode}({spans[i]}, ptr {x}, ptr {Z})")
-        for k in range(len(structure.measurements)):
-            self.line(f"call void @samples_{k}(ptr %table, i64 %count_{k})")
+        afters = list(befores)
+        for i in structure.resets:
+            afters[i + 1] = {
+                "x": self.at(found["reset_states"], i * n),
+                "Z": self.at(found["reset_tangents"], i * n * width),
+            }
+        last = {}
         if structure.terminal:
             state = self.let(f"add i64 %cells, {N}")
             last = {"x": self.at(found["states"], state, n), "Z": self.at(found["tangents"], state, n * width)}
-            self.call("end", END, found | last)
+        # Straight lines, which are called with their pointers, and loops, which say whether they came to their end.
+        phases: list[str | tuple[str, tuple[str, ...], dict[str, str]]] = [("start", START, found | befores[0])]
+        for i, mode in enumerate(structure.mode_of_segment):
+            if i - 1 in structure.resets:
+                behind = {"x_after": afters[i]["x"], "Z_after": afters[i]["Z"]}
+                phases.append((f"reset_{i - 1}", RESET, found | befores[i] | behind))
+            phases.append(f"forward_{mode}({spans[i]}, ptr %progress, ptr {afters[i]['x']}, ptr {afters[i]['Z']})")
+        for k in range(len(structure.measurements)):
+            phases.append(f"samples_{k}(ptr %table, i64 %count_{k}, ptr %progress)")
+        if structure.terminal:
+            phases.append(("end", END, found | last))
         if self.order > 0:
             for i, mode in reversed(list(enumerate(structure.mode_of_segment))):
-                self.line(f"call void @backward_{mode}({spans[i]})")
+                phases.append(f"backward_{mode}({spans[i]}, ptr %progress)")
                 if i - 1 in structure.resets:
-                    self.call(f"reset_back_{i - 1}", RESET_BACK, found | befores[i])
-            self.call("start_back", START_BACK, found | {"jump": found["jumps"]})
+                    phases.append((f"reset_back_{i - 1}", RESET_BACK, found | befores[i]))
+            phases.append(("start_back", START_BACK, found | {"jump": found["jumps"]}))
+        phase = self.let("load i64, ptr %progress")
+        places = " ".join(f"i64 {k}, label %phase_{k}" for k in range(1, len(phases)))
+        self.line(f"switch i64 {phase}, label %phase_0 [{places}]")
+        for k, what in enumerate(phases):
+            self.lines.append(f"phase_{k}:")
+            if isinstance(what, str):
+                self.line(f"%ended_{k} = call i1 @{what}")
+                self.line(f"br i1 %ended_{k}, label %phase_{k + 1}, label %pause_{k}")
+                self.lines.append(f"pause_{k}:")
+                self.line(f"store i64 {k}, ptr %progress")
+                self.line("ret void")
+            else:
+                self.call(*what)
+                self.line(f"br label %phase_{k + 1}")
+        self.lines.append(f"phase_{len(phases)}:")
+        self.line("store i64 -1, ptr %progress")
         counts = "".join(f", i64 %count_{k}" for k in range(len(structure.measurements)))
-        return self.finished(f"void @evaluate(ptr %table, i64 %cells, double %t0, double %tf{counts})")
+        return self.finished(f"void @evaluate(ptr %table, ptr %progress, i64 %cells, double %t0, double %tf{counts})")
 
     def outputs(self) -> str:
         """Outputs of any states, at moments."""
         n, width = self.sizes.n, self.sizes.width
         q = sum(channels for _, channels in self.structure.outputs)
         found = self.pointers()
+        before, left = self.resumed()
         self.line("br label %loop")
         self.lines.append("loop:")
-        self.line("%k = phi i64 [0, %entry], [%more, %loop]")
+        self.line(f"%k = phi i64 [{before}, %entry], [%more, %loop]")
+        self.line(f"%budget = phi i64 [{left}, %entry], [%left, %loop]")
         given = {
             "time": self.at("%times", "%k"),
             "x": self.at("%x", "%k", n),
@@ -350,11 +424,14 @@ class Driver:
             "Y": self.at("%Y", "%k", q * width),
         }
         self.call("outputs", OUTPUTS, found | given)
+        self.line(f"%left = sub i64 %budget, {self.module.work('outputs')}")
         self.line("%more = add i64 %k, 1")
         self.line("%done = icmp sge i64 %more, %count")
-        self.line("br i1 %done, label %out, label %loop")
-        self.lines.append("out:")
-        return self.finished("void @all_outputs(ptr %table, i64 %count, ptr %times, ptr %x, ptr %Z, ptr %y, ptr %Y)")
+        self.line("%phase = select i1 %done, i64 -1, i64 0")
+        self.line("store i64 %phase, ptr %progress")
+        self.next_turn("%k", "%done")
+        pointers = "ptr %times, ptr %x, ptr %Z, ptr %y, ptr %Y"
+        return self.finished(f"i1 @all_outputs(ptr %table, ptr %progress, i64 %count, {pointers})", returns=False)
 
 
-SEGMENT = "ptr %table, i64 %segment, i64 %first, i64 %last, double %begins, double %finishes"
+SEGMENT = "ptr %table, i64 %segment, i64 %first, i64 %last, double %begins, double %finishes, ptr %progress"

@@ -21,7 +21,7 @@ from switchfit.native.program import program_of
 def _registered(structure: Structure, sizes: Sizes) -> tuple[str, Program] | None:
     """Name of the operation for a structure; None where JAX has to do its work."""
     program = program_of(structure, sizes, 2)
-    if program is None:
+    if isinstance(program, str):
         return None
     name = f"switchfit_{program.key[:32]}"
     new_capsule = ctypes.pythonapi.PyCapsule_New

@@ -43,6 +43,7 @@ def handler(driver: Driver) -> str:
     sizes, measurements = driver.sizes, len(driver.structure.measurements)
     n, N, D, width = sizes.n, sizes.N, sizes.D, sizes.width
     driver.line(f"%table = alloca [{len(POINTERS) + 4 * measurements} x i64]")
+    driver.line("%progress = alloca [3 x i64]")
     extension = driver.let(f"load ptr, ptr {driver.into('%frame', EXTENSION)}")
     driver.line(f"br i1 {driver.let(f'icmp eq ptr {extension}, null')}, label %run, label %asked")
     driver.lines.append("asked:")
@@ -92,7 +93,8 @@ def handler(driver: Driver) -> str:
         driver.line(f"call void @llvm.memset.p0.i64(ptr {found[name]}, i8 0, i64 {size}, i1 false)")
     first = driver.let(f"load double, ptr {found['nodes']}")
     last = driver.let(f"load double, ptr {driver.at(found['nodes'], cells)}")
-    driver.line(f"call void @evaluate(ptr %table, i64 {cells}, double {first}, double {last}{counts})")
+    driver.line("store [3 x i64] [i64 0, i64 0, i64 9223372036854775807], ptr %progress")  # all at once
+    driver.line(f"call void @evaluate(ptr %table, ptr %progress, i64 {cells}, double {first}, double {last}{counts})")
     driver.line("ret ptr null")
     text = "\n".join(driver.lines)
     return (

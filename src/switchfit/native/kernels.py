@@ -170,7 +170,9 @@ class Kernels:
 
             return [*slope, *cost, *_first_and_second(weighted, t, x, p)]
 
-        return traced(stage, (), (n,), (M,), (n,), (), (), (4, S), *self.sizes.constants)
+        also = " or a running cost" if self.structure.running or self.structure.references else ""
+        name = f"mode {self.structure.mode_names[mode]!r}{also}"
+        return traced(stage, (), (n,), (M,), (n,), (), (), (4, S), *self.sizes.constants, name=name)
 
     def at_sample(self, k: int) -> Template:
         """Cost of a sample and its derivatives along (t, x, p), that along t being nothing."""
@@ -184,7 +186,8 @@ class Kernels:
                 return [cost(time, x, p)]
             return [cost(time, x, p), *_first_and_second(cost, time, x, p)]
 
-        return traced(sample, (), (q,), (q,), (self.sizes.n,), (self.sizes.M,), *self.sizes.constants)
+        shapes = (), (q,), (q,), (self.sizes.n,), (self.sizes.M,)
+        return traced(sample, *shapes, *self.sizes.constants, name="observe of Measurements")
 
     def at_end(self) -> Template:
         """The terminal costs and their derivatives."""
@@ -196,7 +199,7 @@ class Kernels:
                 return [cost(0.0, x, p)]
             return [cost(0.0, x, p), *_first_and_second(cost, jnp.zeros(()), x, p)]
 
-        return traced(end, (self.sizes.n,), (self.sizes.M,), *self.sizes.constants)
+        return traced(end, (self.sizes.n,), (self.sizes.M,), *self.sizes.constants, name="a terminal cost")
 
     def at_reset(self, i: int) -> Template:
         """The reset map of transition i, its Jacobians, and the derivatives of ``w . R``."""
@@ -208,8 +211,9 @@ class Kernels:
             jacobians = jax.jacfwd(R, argnums=(0, 1, 2))(t, x, p)
             return [R(t, x, p), *jacobians, *_first_and_second(lambda t, x, p: w @ R(t, x, p), t, x, p)]
 
-        n = self.sizes.n
-        return traced(reset, (), (n,), (self.sizes.M,), (n,), *self.sizes.constants)
+        n, structure = self.sizes.n, self.structure
+        name = f"reset map {tuple(structure.mode_names[mode] for mode in structure.mode_of_segment[i : i + 2])}"
+        return traced(reset, (), (n,), (self.sizes.M,), (n,), *self.sizes.constants, name=name)
 
     def at_start(self) -> Template:
         """x(t0), its Jacobian (n, M) in p, and the derivatives of ``w . x(t0)``: (M,) and (M, M)."""
@@ -221,7 +225,7 @@ class Kernels:
             weighted = lambda p: w @ x0(p)  # noqa: E731
             return [x0(p), jax.jacfwd(x0)(p), jax.grad(weighted)(p), jax.jacfwd(jax.grad(weighted))(p)]
 
-        return traced(start, (self.sizes.M,), (self.sizes.n,), *self.sizes.constants)
+        return traced(start, (self.sizes.M,), (self.sizes.n,), *self.sizes.constants, name="initial_state")
 
     # Straight lines
 
@@ -542,7 +546,9 @@ class Kernels:
         factor = graph.apply("select", graph.apply("ne", norm, norm), 0.2, factor)
         reached = graph.apply("select", graph.apply("eq", step, end - t), end, t + step)
         shortest = graph.apply("min", step, step * factor)
-        stuck = graph.apply("le", shortest, 10 * np.finfo(float).eps * graph.apply("abs", t))
+        # Written so that a step which is not a number is stuck as well: it would be tried for ever.
+        goes_on = graph.apply("lt", 10 * np.finfo(float).eps * graph.apply("abs", t), shortest)
+        stuck = graph.apply("not", goes_on)
         number = {name: graph.apply("select", flag, 1.0, 0.0) for name, flag in (("yes", accepted), ("stuck", stuck))}
         stores = [
             ("state", at.t, graph.apply("select", accepted, reached, t)),
@@ -568,7 +574,7 @@ class Kernels:
 
             return [seen(x, p), *(jax.jacfwd(seen, argnums=(0, 1))(x, p) if self.second else ())]
 
-        template = traced(outputs, (), (self.sizes.n,), (self.sizes.M,), *self.sizes.constants)
+        template = traced(outputs, (), (self.sizes.n,), (self.sizes.M,), *self.sizes.constants, name="observe")
         graph = Graph()
         p, constants = self.inputs(graph)
         y, *jacobians = template(graph, graph.load("time", 0), graph.loads("x", self.sizes.n), p, *constants)

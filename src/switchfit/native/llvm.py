@@ -24,7 +24,7 @@ import llvmlite.binding as llvm
 import numpy as np
 
 from switchfit.cache import usable_folder
-from switchfit.native.scalars import CONDITIONS, Node, needed
+from switchfit.native.scalars import LOGIC, Node, needed
 
 INTRINSICS = {
     "sqrt": "sqrt",
@@ -32,6 +32,7 @@ INTRINSICS = {
     "floor": "floor",
     "ceil": "ceil",
     "rint": "rint",
+    "round": "round",
     "max": "maximum",
     "min": "minimum",
 }
@@ -45,6 +46,12 @@ FROM_LIBM = {
     "rem": "fmod",
 }
 """Functions of the C library."""
+
+EFFORT = {"div": 4, "sqrt": 4, **dict.fromkeys(FROM_LIBM, 20)}
+"""What operations cost where it is not about as much as an addition."""
+
+BUDGET = 2_000_000
+"""Work, in additions, after which a loop returns to Python, so that Ctrl-C is heard: it takes 1 to 20 ms."""
 
 
 def literal(number: float) -> str:
@@ -71,6 +78,7 @@ class Module:
         self.prefix = ""
         self.vector = f"<{width} x double>"
         self.functions: list[str] = []
+        self._work: dict[str, int] = {}
         self._declared: dict[str, str] = {}
 
     def straight(
@@ -82,14 +90,23 @@ class Module:
         `seen` can be called from Python.
         """
         writer = _Writer(self)
-        values = [writer.value(node) for node in needed([node for _, _, node in stores])]
-        del values
+        nodes = needed([node for _, _, node in stores])
+        for node in nodes:
+            writer.value(node)
+        self._work[self.prefix + name] = sum(self._effort(node) for node in nodes)
         for pointer, offset, node in stores:
             writer.store(pointer, offset, node)
         arguments = ", ".join(f"ptr %{pointer}" for pointer in pointers)
         body = "\n".join(writer.lines)
         linkage = "" if seen else "internal "
         self.functions.append(f"define {linkage}void @{self.prefix}{name}({arguments}) {{\n{body}\n  ret void\n}}\n")
+
+    def work(self, name: str) -> int:
+        """What a function costs that was written with the prefix of now, in additions."""
+        return self._work[self.prefix + name]
+
+    def _effort(self, node: Node) -> int:
+        return EFFORT.get(node.op, 1) * (1 + self.width // 4 if node.vector else 1)
 
     def add(self, text: str) -> None:
         """A function written by hand, which calls none but those of the same prefix, and LLVM's."""
@@ -146,12 +163,9 @@ class _Writer:
             return self.emit(f"fneg {kind} {a[0]}")
         if op in COMPARISONS:
             return self.emit(f"{COMPARISONS[op]} double {a[0]}, {a[1]}")
-        if op in ("and", "or"):
-            return self.emit(f"{op} i1 {a[0]}, {a[1]}")
-        if op == "not":
-            return self.emit(f"xor i1 {a[0]}, true")
+        if op in LOGIC:
+            return self.emit(f"xor i1 {a[0]}, true" if op == "not" else f"{op} i1 {a[0]}, {a[1]}")
         if op == "select":
-            kind = "i1" if all(x.op in CONDITIONS or isinstance(x.number, bool) for x in args[1:]) else kind
             return self.emit(f"select i1 {self.value(args[0])}, {kind} {a[1]}, {kind} {a[2]}")
         given = ", ".join(f"double {x}" for x in a)
         name = f"llvm.{INTRINSICS[op]}.f64" if op in INTRINSICS else FROM_LIBM[op]
@@ -161,6 +175,8 @@ class _Writer:
         return self.emit(f"call double @{name}({given})")
 
     def store(self, pointer: str, offset: int, node: Node) -> None:
+        if node.truth:
+            raise TypeError(f"a truth value cannot be stored at {pointer}[{offset}], which is a double")
         value, address = self.value(node), self.address(pointer, offset, node.vector)
         self.lines.append(f"  store {self._type(node)} {value}, ptr {address}, align 8")
 
@@ -171,7 +187,7 @@ class _Writer:
         return self.emit(f"getelementptr inbounds double, ptr %{pointer}, i64 {offset * unit}")
 
     def _type(self, node: Node) -> str:
-        return self.module.vector if node.vector else "double"
+        return self.module.vector if node.vector else "i1" if node.truth else "double"
 
     def _as(self, node: Node, vector: bool) -> str:
         """A value as an operand of an operation on vectors, or on scalars."""

@@ -7,6 +7,7 @@ between the parts of an evaluation lies in one workspace, which is made once a m
 from __future__ import annotations
 
 import ctypes
+import logging
 import threading
 from collections.abc import Callable
 from functools import lru_cache
@@ -20,40 +21,55 @@ from switchfit.model import Arguments, Samples, Structure, float64
 from switchfit.native.driver import POINTERS, Driver
 from switchfit.native.frame import handler
 from switchfit.native.kernels import END, RESET, SAMPLE, SLOPE, STAGES, START, Kernels, Sizes, constants_of
-from switchfit.native.llvm import Module, Program, compiled
+from switchfit.native.llvm import BUDGET, Module, Program, compiled
 from switchfit.native.trace import Unsupported
 from switchfit.rungekutta import EXPLICIT
 
 _one_at_a_time = threading.Lock()
+
+log = logging.getLogger("switchfit")
 
 
 PREFIX = {0: "plain_", 1: "first_", 2: ""}
 """What the names of functions begin with, by the order of their derivatives."""
 
 
-def program_of(structure: Structure, sizes: Sizes, order: int) -> Program | None:
-    """Machine code for a structure, with derivatives of an order; None where JAX has to do its work.
+def program_of(structure: Structure, sizes: Sizes, order: int) -> Program | str:
+    """Machine code for a structure, with derivatives of an order; or the reason why JAX has to do its work.
 
     That is so for implicit steps, for delays that are estimated, and for functions that cannot be written as a straight
-    line of scalars. A fit needs simulations and second derivatives: they are one program.
+    line of scalars. A fit needs simulations and second derivatives: they are one program. Whatever else goes wrong is a
+    defect of this package: JAX then does the work as well, and the reason begins with "internal: ".
     """
     with _one_at_a_time:
         return _program_of(structure, sizes, (1,) if order == 1 else (0, 2))
 
 
 @lru_cache(maxsize=64)
-def _program_of(structure: Structure, sizes: Sizes, orders: tuple[int, ...]) -> Program | None:
-    late = any(sensor.delay is not None for sensor in structure.measurements)
-    if structure.tableau is not EXPLICIT or late or sizes.D == 0:
-        return None
-    module = Module(sizes.width)
+def _program_of(structure: Structure, sizes: Sizes, orders: tuple[int, ...]) -> Program | str:
     try:
-        with float64():
-            for order in orders:
-                module.prefix = PREFIX[order]
-                _write(module, structure, sizes, order)
-    except Unsupported:
-        return None
+        return _compiled(structure, sizes, orders)
+    except Unsupported as error:
+        reason = str(error)
+        log.info("Evaluated by JAX: %s.", reason)
+    except Exception as error:
+        reason = f"internal: {type(error).__name__}: {error}"
+        log.info("Evaluated by JAX: %s.", reason, exc_info=True)
+    return reason
+
+
+def _compiled(structure: Structure, sizes: Sizes, orders: tuple[int, ...]) -> Program:
+    if structure.tableau is not EXPLICIT:
+        raise Unsupported(f"solver={structure.solver!r} takes implicit steps")
+    if any(sensor.delay is not None for sensor in structure.measurements):
+        raise Unsupported("a delay is estimated")
+    if sizes.D == 0:
+        raise Unsupported("an experiment has no unknowns")
+    module = Module(sizes.width)
+    with float64():
+        for order in orders:
+            module.prefix = PREFIX[order]
+            _write(module, structure, sizes, order)
     return compiled(module.text)
 
 
@@ -66,7 +82,9 @@ def forget_programs() -> None:
 def _write(module: Module, structure: Structure, sizes: Sizes, order: int) -> None:
     """All functions of a structure with derivatives of an order."""
     kernels = Kernels(structure, sizes, order, module)
-    driver = Driver(structure, sizes, order)
+    driver = Driver(structure, sizes, order, module)
+    if order == 0:
+        kernels.adaptive_functions()
     for mode in range(len(structure.modes)):
         stage = kernels.at_stage(mode)
         counts = []
@@ -102,8 +120,6 @@ def _write(module: Module, structure: Structure, sizes: Sizes, order: int) -> No
     kernels.start_functions()
     if order == 2:
         kernels.length_function()
-    if order == 0:
-        kernels.adaptive_functions()
     if order != 1:
         kernels.output_function()
         module.add(driver.outputs())
@@ -115,10 +131,16 @@ def _write(module: Module, structure: Structure, sizes: Sizes, order: int) -> No
 def native_experiment(
     structure: Structure, arguments: Arguments, times: FloatArray, order: int
 ) -> NativeExperiment | None:
-    """One experiment in machine code, on the mesh with the nodes `times`; None where JAX has to do it."""
+    """One experiment in machine code, on the mesh with the nodes `times`; None if there is a `reason_for_jax`."""
     sizes = Sizes.of(structure, arguments)
     program = program_of(structure, sizes, order)
-    return None if program is None else NativeExperiment(program, structure, sizes, arguments, times, order)
+    return None if isinstance(program, str) else NativeExperiment(program, structure, sizes, arguments, times, order)
+
+
+def reason_for_jax(structure: Structure, arguments: Arguments, order: int) -> str | None:
+    """Why JAX has to evaluate an experiment with derivatives of an order; None if machine code does."""
+    program = program_of(structure, Sizes.of(structure, arguments), order)
+    return program if isinstance(program, str) else None
 
 
 class Simulated(NamedTuple):
@@ -175,7 +197,8 @@ class NativeExperiment:
         rows = cells + N
         self._channels = sum(channels for _, channels in structure.outputs)
         counts = [_count(samples) for samples in arguments.samples]
-        types = [ctypes.c_void_p, ctypes.c_int64, ctypes.c_double, ctypes.c_double, *[ctypes.c_int64] * len(counts)]
+        pointer, number = ctypes.c_void_p, ctypes.c_int64
+        types = [pointer, pointer, number, ctypes.c_double, ctypes.c_double, *[number] * len(counts)]
         self._program = program  # whose code must not go away
         self._evaluate = program.function(f"{self._prefix}evaluate", *types)
         self._times = times
@@ -223,6 +246,7 @@ class NativeExperiment:
                 self._arrays.append(np.ascontiguousarray(np.asarray(values)[:count], dtype=kind))
         self._table = np.array([a.__array_interface__["data"][0] for a in self._arrays], dtype=np.uintp)
         self._address = self._table.ctypes.data
+        self._progress = (ctypes.c_int64 * 3)()
         self._result = self._sums[n + 1 : n + 1 + D], self._sums[n + 1 + width :].reshape(D, width)[:, :D]
 
     def __call__(self, tau: FloatArray, p: FloatArray, side: float) -> tuple[float, FloatArray, FloatArray]:
@@ -236,7 +260,7 @@ class NativeExperiment:
     def program_at(self, tau: FloatArray, p: FloatArray) -> Callable[[], object]:
         """The machine code alone, to be measured."""
         self(tau, p, 1.0)
-        return lambda: self._evaluate(self._address, *self._scalars)
+        return lambda: self._in_pieces(self._evaluate, *self._scalars)
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """J alone."""
@@ -280,9 +304,10 @@ class NativeExperiment:
         if count:
             self._theta[self.sizes.N :] = p
             pointer = ctypes.c_void_p
-            function = self._program.function(f"{self._prefix}all_outputs", pointer, ctypes.c_int64, *[pointer] * 5)
+            types = [pointer, pointer, ctypes.c_int64, *[pointer] * 5]
+            function = self._program.function(f"{self._prefix}all_outputs", *types)
             given = [np.ascontiguousarray(times), np.ascontiguousarray(states), Z, y, Y]
-            function(self._address, count, *(a.ctypes.data for a in given))
+            self._in_pieces(function, count, *(a.ctypes.data for a in given))
         return y, Y[..., :D]
 
     def initial_state(self, p: FloatArray) -> FloatArray:
@@ -314,6 +339,8 @@ class NativeExperiment:
 
     def adaptive_steps(self, mode: int, state: FloatArray, y: FloatArray, p: FloatArray, most: int) -> FloatArray:
         """Up to `most` steps of SciPy's RK45, from `state` and y, which change: the moments reached.
+
+        They may be fewer, even none: after some work that takes milliseconds it returns, to be called again.
 
         Parameters
         ----------
@@ -347,7 +374,15 @@ class NativeExperiment:
             self._bind(self._workspace.memory)
         self._sums[:] = 0.0
         self._named["jumps"][:] = 0.0
-        self._evaluate(self._address, *self._scalars)
+        self._in_pieces(self._evaluate, *self._scalars)
+
+    def _in_pieces(self, function: Callable[..., object], *given: Any) -> None:
+        """Call a function of the driver until it is at its end; Ctrl-C is heard after each call."""
+        progress, address = self._progress, ctypes.addressof(self._progress)
+        progress[0] = progress[1] = 0
+        while progress[0] >= 0:
+            progress[2] = BUDGET
+            function(self._address, address, *given)
 
     def _bind(self, memory: FloatArray) -> None:
         """Let the table point to another workspace."""

@@ -3,7 +3,7 @@
 A node is an operation on earlier nodes. Equal operations are one node; sums with zero, products with zero and one are
 gone before they exist, so that structural zeros of Jacobians and Hessians cost nothing. A node is a scalar or a vector
 with one entry for each unknown (the derivative of some scalar along theta); a scalar beside a vector stands for all its
-entries.
+entries. A scalar is a double or a truth value, which do not mix.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ FOLDED: dict[str, Callable[..., Any]] = {
     "ne": lambda a, b: a != b,
     "and": lambda a, b: a and b,
     "or": lambda a, b: a or b,
+    "xor": lambda a, b: a != b,
     "not": lambda a: not a,
     "select": lambda c, a, b: a if c else b,
     "max": np.maximum,
@@ -37,6 +38,7 @@ FOLDED: dict[str, Callable[..., Any]] = {
     "floor": np.floor,
     "ceil": np.ceil,
     "rint": np.rint,
+    "round": lambda a: np.copysign(np.floor(abs(a)) + (abs(a) - np.floor(abs(a)) >= 0.5), a),
     "sqrt": np.sqrt,
     "exp": np.exp,
     "log": np.log,
@@ -64,8 +66,13 @@ FOLDED: dict[str, Callable[..., Any]] = {
 }
 """Every operation, with its value for numbers."""
 
-CONDITIONS = ("lt", "le", "eq", "ne", "and", "or", "not")
-COMMUTATIVE = ("add", "mul", "eq", "ne", "and", "or", "max", "min")
+COMPARISONS = ("lt", "le", "eq", "ne")
+"""From doubles to a truth value."""
+
+LOGIC = ("and", "or", "xor", "not")
+"""From truth values to a truth value."""
+
+COMMUTATIVE = ("add", "mul", "eq", "ne", "and", "or", "xor", "max", "min")
 
 
 class Node:
@@ -76,13 +83,14 @@ class Node:
     index : its place in the graph, after those of its arguments
     op : an operation of `FOLDED`, "const" or "load"
     args : its arguments; the number of a constant; (pointer, offset) of what is loaded
-    vector : whether it is a vector
+    vector, truth : whether it is a vector; whether it is a truth value, else it is a double or doubles
     """
 
-    __slots__ = ("args", "graph", "index", "op", "vector")
+    __slots__ = ("args", "graph", "index", "op", "truth", "vector")
 
     def __init__(self, graph: Graph, index: int, op: str, args: tuple[Any, ...], vector: bool) -> None:
         self.graph, self.index, self.op, self.args, self.vector = graph, index, op, args, vector
+        self.truth = _is_truth(op, args)
 
     @property
     def number(self) -> Any:
@@ -120,6 +128,25 @@ class Node:
 
     def __neg__(self) -> Node:
         return self.graph.apply("neg", self)
+
+
+def _is_truth(op: str, args: tuple[Any, ...]) -> bool:
+    """Return whether an operation yields a truth value; raise TypeError if its arguments have the wrong type for it."""
+    if op in ("load", "unit", "zeros"):
+        return False
+    if op == "const":
+        return isinstance(args[0], bool)
+    given = [a.truth for a in args]
+    if op == "select":
+        condition, *cases = given
+        if not condition or cases[0] != cases[1]:
+            raise TypeError(f"select of {given}: it takes a truth value, then two cases of one type")
+        return cases[0]
+    if any(truth != (op in LOGIC) for truth in given):
+        raise TypeError(
+            f"{op} does not take {' and '.join('a truth value' if truth else 'a double' for truth in given)}"
+        )
+    return op in LOGIC or op in COMPARISONS
 
 
 class Graph:

@@ -225,6 +225,8 @@ def _course(fit: Fit) -> Iterator[str]:
     yield from _row("method", METHODS.get(fit.hessian_kind, fit.hessian_kind))
     effort = f"{_count(fit.iterations, 'iteration')}, {_count(fit.evaluations, 'evaluation')}, {fit.seconds:.3g} s"
     yield from _row("effort", effort)
+    if fit.engine is not None:
+        yield from _row("", str(fit.engine))
     yield from _row("status", fit.message)
 
 

@@ -1,0 +1,123 @@
+"""What JAX offers, as machine code: value, Jacobian and Hessian of many functions against JAX, or a reason why not."""
+
+from __future__ import annotations
+
+import warnings
+import zlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from functions import FALLS_BACK, FUNCTIONS, ZERO_TIMES_INFINITY
+
+from switchfit.model import float64
+from switchfit.native import llvm
+from switchfit.native.scalars import Graph
+from switchfit.native.trace import Unsupported, traced
+
+OFTEN = (
+    *("arithmetic: mod", "arithmetic: power of a negative", "elementary: guarded log", "rounding: round away"),
+    *("decisions: where of booleans", "decisions: max of booleans", "decisions: xor", "decisions: count"),
+    *("decisions: plus or minus one", "decisions: integer division", "decisions: select", "decisions: cond of several"),
+    *(
+        "decisions: hysteresis",
+        "arrays: einsum of a batch",
+        "arrays: solve",
+        "arrays: sum of nothing",
+        "arrays: interp",
+    ),
+    *("arrays: interp by hand", "arrays: cumprod", "places: optimization_barrier", "places: at add twice"),
+    *("places: negative pad", "loops: scan of length 0", "loops: custom_jvp", "loops: while", "special: ndtr"),
+)
+"""What stands for all in the suite that runs by default."""
+
+LONG = ("special: bessel_jn",)
+"""Recurrences that lose digits, in JAX and in machine code."""
+
+
+def derivatives_of(function):
+    """Value, Jacobian and Hessian of w . f, written as the kernels write them."""
+
+    def all_of(x, w):
+        f = lambda x: jnp.ravel(jnp.asarray(function(x))).astype(jnp.float64)  # noqa: E731
+
+        def weighted(x):
+            value = f(x)
+            return w[: value.size] @ value
+
+        return [f(x), jax.jacfwd(f)(x), jax.jacfwd(jax.grad(weighted))(x)]
+
+    return all_of
+
+
+def machine_code_of(template, count):
+    """A function of (x, w) that returns arrays as the template has them."""
+    graph = Graph()
+    outputs = template(graph, graph.loads("x", 3), graph.loads("w", count))
+    ends = np.cumsum([output.size for output in outputs])
+    nodes = np.concatenate([output.reshape(-1) for output in outputs])
+    module = llvm.Module(4)
+    module.straight("f", ("x", "w", "y"), [("y", k, node) for k, node in enumerate(nodes)], seen=True)
+    program = llvm.compiled(module.text)  # the code is gone with it
+
+    def evaluate(x, w):
+        y = np.full(ends[-1], 7e77)
+        program.function("f", *[llvm.ctypes.c_void_p] * 3)(x.ctypes.data, w.ctypes.data, y.ctypes.data)
+        parts = np.split(y, ends[:-1])
+        return [part.reshape(output.shape) for part, output in zip(parts, outputs, strict=True)]
+
+    return evaluate
+
+
+def points_of(name):
+    """Three points inside, and two at which something happens: zeros of both signs, equal entries, integers, halves."""
+    random = np.random.default_rng(zlib.crc32(name.encode()))
+    inside = [random.uniform(0.3, 1.4, 3), random.uniform(0.3, 1.4, 3), random.uniform(-1.4, 1.4, 3)]
+    return [*inside, np.array([0.0, 0.0, -0.0]), np.array([1.0, -0.5, 1.0])]
+
+
+def assert_same_function(name):
+    weights = np.random.default_rng(0).uniform(0.5, 1.5, 40)
+    both = derivatives_of(FUNCTIONS[name])
+    if name in FALLS_BACK:
+        with float64(), pytest.raises(Unsupported) as caught:
+            traced(both, (3,), (40,))
+        assert str(caught.value).startswith(f"the function {FALLS_BACK[name]}")
+        assert "internal" not in str(caught.value)
+        return
+    with float64(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of JAX, about narrow types and the like
+        evaluate = machine_code_of(traced(both, (3,), (40,)), 40)
+        by_jax = jax.jit(both)
+        pairs = [(x, evaluate(x, weights), by_jax(x, weights)) for x in points_of(name)]
+    relative = 1e-10 if name in LONG else 1e-12
+    undefined = False
+    for x, found, expected in pairs:
+        for what, own, other in zip(("value", "Jacobian", "Hessian"), found, map(np.asarray, expected), strict=True):
+            assert own.shape == other.shape
+            there = np.isfinite(other)
+            size = np.max(np.abs(other[there]), initial=0.0)
+            lost = np.isnan(other) & ~np.isnan(own)
+            if what != "value" and name in ZERO_TIMES_INFINITY:
+                undefined |= bool(lost.any())
+                own, other = own[~lost], other[~lost]
+            message = f"{what} of {name} at {x.tolist()}"
+            np.testing.assert_allclose(own, other, rtol=relative, atol=relative * size + 1e-15, err_msg=message)
+    assert undefined == (name in ZERO_TIMES_INFINITY), "machine code and JAX agree: take it from the list"
+
+
+@pytest.mark.parametrize("name", OFTEN)
+def test_functions_that_models_often_have(name):
+    assert_same_function(name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in FUNCTIONS if name not in OFTEN])
+def test_all_other_functions(name):
+    assert_same_function(name)
+
+
+def test_the_lists_are_of_functions_that_exist():
+    assert set(FALLS_BACK) | set(ZERO_TIMES_INFINITY) | set(OFTEN) | set(LONG) <= set(FUNCTIONS)
+    assert len(FUNCTIONS) >= 160
