@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import weakref
+from collections import OrderedDict
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 import switchfit as sf
+from switchfit import functions
 from switchfit.evaluate import derivatives, evaluator_of
 from switchfit.mesh import padded_length
 from switchfit.native.program import _program_of
@@ -177,7 +179,8 @@ def decay(start=(1.0,)):
     return sf.Problem(system, run, {"k": np.float32(1.5), "offset": offset}, rtol=1e-12, atol=1e-14)
 
 
-def test_everything_is_float64_and_the_setting_as_before(x64):
+def test_everything_is_float64_and_the_setting_as_before(x64, monkeypatch):
+    monkeypatch.setattr(functions, "_traces", OrderedDict())  # the functions are to be called again
     SEEN.clear()
     found = sf.evaluate(decay())
     assert found.cost == pytest.approx(np.exp(-1.5), rel=1e-13)

@@ -195,11 +195,12 @@ class Evaluator:
     def cost(self, theta: FloatArray) -> float:
         """J alone."""
         natives = self._natives(0)
-        if any(native is None for native in natives):
-            return cost_of(self.problem, theta, runs_of(self.problem, theta, self.meshes, self.arguments))
-        prior = 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0])
         vectors = [self.problem.vectors(theta, e) for e in range(len(natives))]
-        return prior + sum(native.cost(*given) for native, given in zip(natives, vectors, strict=True) if native)
+        costs = [None if native is None else native.cost(*at) for native, at in zip(natives, vectors, strict=True)]
+        known = [cost for cost in costs if cost is not None]
+        if len(known) < len(natives):
+            return cost_of(self.problem, theta, runs_of(self.problem, theta, self.meshes, self.arguments))
+        return sum(known, 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0]))
 
     @property
     def engine(self) -> Engine:
@@ -222,7 +223,9 @@ class Evaluator:
         if method == "auto" and matrix != "gauss-newton":
             natives = [native for native in self._natives(2 if matrix == "exact" else 1) if native is not None]
             if len(natives) == len(self.arguments):
-                return [native(*self.problem.vectors(theta, e), side) for e, native in enumerate(natives)]
+                found = [native(*self.problem.vectors(theta, e), side) for e, native in enumerate(natives)]
+                if not any(result is None for result in found):
+                    return found
         compiled = (method, matrix) in self._compiled
         with float64(), nullcontext() if compiled else compilation_cache():
             results = [

@@ -61,14 +61,10 @@ class Function:
 
     def __call__(self, *arguments: Any) -> Array:
         """Value for arguments in the order of the user's function, p being a mapping of names to arrays."""
-        flat: list[Any] = []
-        for argument in arguments:
-            if isinstance(argument, Mapping):
-                flat += [argument[name] for name in self.parameters]
-            else:
-                flat.append(argument)
-        values = jax.core.eval_jaxpr(self._closed.jaxpr, self._closed.consts, *flat)
-        return values[0]
+        flat = [jnp.asarray(a, jnp.float64) for a in arguments if not isinstance(a, Mapping)]
+        named = next(argument for argument in arguments if isinstance(argument, Mapping))
+        given = [*flat, *(named[name] for name in self.parameters)]
+        return jax.core.eval_jaxpr(self._closed.jaxpr, self._closed.consts, *given)[0]
 
     def __hash__(self) -> int:
         return hash(self._key)

@@ -199,8 +199,9 @@ def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh, whole: A
     structure = problem.structures[e]
     tau, p = problem.vectors(theta, e)
     native = native_experiment(structure, whole, mesh.times, order=0)
-    if native is not None:
-        cost, segments, first_cell = _natively(structure, native, mesh.times, tau, p)
+    found = None if native is None else _natively(structure, native, mesh.times, tau, p)
+    if found is not None:
+        cost, segments, first_cell = found
     else:
         with float64(), compilation_cache():
             cost, segments, first_cell = _by_blocks(structure, whole, tau, p)
@@ -222,16 +223,21 @@ def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh, whole: A
             of_samples += float(np.sum(there * np.log(sigma)))
         of_samples += 0.5 * float(np.sum(robust(sensor.loss, sensor.loss_scale, u)))
         first += sensor.channels
-    return replace(run, cost=cost if native is not None else cost + of_samples, seen=tuple(all_seen))
+    return replace(run, cost=cost if found is not None else cost + of_samples, seen=tuple(all_seen))
 
 
 def _natively(
     structure: Structure, native: NativeExperiment, nodes: FloatArray, tau: FloatArray, p: FloatArray
-) -> tuple[float, list[Segment], NDArray[np.intp]]:
-    """J, all segments and the cells in which they begin, by machine code."""
+) -> tuple[float, list[Segment], NDArray[np.intp]] | None:
+    """J, all segments and the cells in which they begin, by machine code; None where it presumed wrongly."""
     found = native.simulated(tau, p)
-    y = native.outputs(found.times, found.states, p)[0]
-    reset_y = native.outputs(tau, found.reset_states, p)[0] if structure.resets else y
+    if found is None:
+        return None
+    seen = native.outputs(found.times, found.states, p)
+    behind = native.outputs(tau, found.reset_states, p) if structure.resets else seen
+    if seen is None or behind is None:
+        return None
+    y, reset_y = seen[0], behind[0]
     bounds = np.concatenate([nodes[:1], tau, nodes[-1:]])
     lasts = [*found.first_cell[1:].tolist(), len(nodes) - 2]
     segments = []
