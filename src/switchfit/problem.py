@@ -92,8 +92,8 @@ class Problem:
         Butcher's explicit Runge-Kutta method of order 5, or Radau IIA of order 5 for stiff modes.
     rtol, atol : float, optional
         Tolerances of the local error by which the mesh is refined. With the defaults J has a relative error of about
-        1e-8, its gradient and its Hessian of about 1e-7. Tolerances that are ten times smaller make these errors at least
-        ten times smaller and take up to 1.6 times as many steps.
+        1e-8, its gradient and its Hessian of about 1e-7. Ten times smaller tolerances make these errors about ten times
+        smaller or better, and take up to 1.6 times as many steps.
 
     Raises
     ------

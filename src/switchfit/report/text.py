@@ -492,7 +492,8 @@ def _integration(fit: Fit) -> Iterator[str]:
     if not fit.integration_error <= LARGE_INTEGRATION_ERROR:
         yield (
             f"The integration error of {fit.integration_error_of} is {fit.integration_error:.1e}, relative: the "
-            "numbers have fewer digits than it seems. Give the Problem a smaller rtol, or solver='stiff' if a mode is stiff."
+            "numbers have fewer digits than it seems. Give the Problem a smaller rtol, or solver='stiff' if a mode is "
+            "stiff."
         )
 
 
