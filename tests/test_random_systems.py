@@ -30,7 +30,7 @@ METHODS = ("discrete-adjoint", "forward", "autodiff", "adjoint")
 RTOL, ATOL = 1e-11, 1e-12
 """Tolerances of the meshes: integration errors are then below the tolerances of the comparison."""
 
-VALUE, GRADIENT, HESSIAN = 1e-10, 1e-9, 2e-7
+VALUE, GRADIENT, HESSIAN = 1e-10, 1e-8, 2e-7
 """Largest error of J and c, of first and of second derivatives: of a block, relative to its largest entry plus 1 % of
 the largest entry of all and of 1. What is left is integration error: of the meshes' tolerance in J, and larger by a
 power of the step's length with each derivative in a transition time, which is the end of a step."""
