@@ -345,8 +345,8 @@ def test_no_trend_where_the_data_is_met_exactly():
 
 
 def test_warning_of_a_large_integration_error():
-    assert only_warning(made(integration_error=3e-5)).startswith("The integration error of the cost is 3.0e-05")
-    assert only_warning(made(integration_error=np.nan)).startswith("The integration error of the cost is nan")
+    assert only_warning(made(integration_error=3e-5)).startswith("The integration error of J is 3.0e-05")
+    assert only_warning(made(integration_error=np.nan)).startswith("The integration error of J is nan")
 
 
 # --- several experiments ----------------------------------------------------------------------------------------------

@@ -226,14 +226,14 @@ def test_a_missing_file(tmp_path):
     [
         (b"", "no valid JSON"),
         (b"PK\x03\x04\xff\xfe", "no valid JSON"),
-        (b'{"format": "switchfit fit", "version": 2, "fit"', "no valid JSON"),
+        (b'{"format": "switchfit fit", "version": 3, "fit"', "no valid JSON"),
         (b'{"format": "switchfit fit", "version": NaN}', "no valid JSON \\(it contains NaN\\)"),
         (b"[" * 100_000, "no valid JSON"),
         (b"[1, 2]", 'no entry "format": "switchfit fit"'),
         (b'{"theta": [1.0]}', 'no entry "format": "switchfit fit"'),
-        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads version 2"),
-        (b'{"format": "switchfit fit", "version": 3}', "of version 3; this switchfit reads version 2"),
-        (b'{"format": "switchfit fit", "version": 2}', "is damaged: fit must be an object; got null"),
+        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads version 3"),
+        (b'{"format": "switchfit fit", "version": 2}', "of version 2; this switchfit reads version 3"),
+        (b'{"format": "switchfit fit", "version": 3}', "is damaged: fit must be an object; got null"),
     ],
 )
 def test_what_is_no_saved_fit(text, message, tmp_path):

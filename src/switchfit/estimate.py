@@ -13,6 +13,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.accuracy import worst_error
 from switchfit.certificate import certify
 from switchfit.data import FloatArray
 from switchfit.engine import Engine
@@ -33,8 +34,8 @@ from switchfit.report.uncertainty import plot_diagnostics
 from switchfit.residuals import ResidualDiagnostics, diagnose
 from switchfit.result import Certificate, Fit
 from switchfit.sensitivity import Sensitivity, gauss_newton_of, sample_derivatives, sensitivity
-from switchfit.simulate import compared, cost_of, runs_of
-from switchfit.solve import constraints_of, least_squares, message_of, minimized, plain, sigma_known, smallest_cost
+from switchfit.simulate import compared, runs_of
+from switchfit.solve import constraints_of, least_squares, message_of, minimized, plain, sigma_known
 
 HESSIANS = get_args(HessianKind)
 
@@ -42,11 +43,8 @@ REFINEMENTS = 2
 """Times the mesh may be refined at the solution and the fit resumed, if the integration error asks for it."""
 
 LARGEST_INTEGRATION_ERROR = 1e-8
-"""Relative error of J (by halving all steps) above which the mesh is refined again, unless rtol allows more."""
-
-PERFECT_FIT = 1e-3
-"""Where J has fallen to less than this part of its first value, the integration error is measured against that part:
-the relative error of a cost that vanishes says nothing."""
+"""Relative error of J, a guard or a terminal constraint (by halving all steps, see `switchfit.accuracy`) above which
+the mesh is refined again, unless rtol allows more."""
 
 MOST_SENSITIVITIES = 2**28
 """Bytes that the derivatives of states and outputs at all nodes may take; beyond, figures have no bands."""
@@ -261,9 +259,14 @@ def estimate(
         theta = result.theta
         fine = evaluator.divided()
         runs = runs_of(problem, theta, fine.meshes, fine.arguments)
-        fine_cost = cost_of(problem, theta, runs)
-        first_cost = abs(history[0].cost) if history else 0.0
-        error = abs(fine_cost - result.cost) / max(abs(fine_cost), PERFECT_FIT * first_cost, smallest_cost(problem))
+        error, output = worst_error(
+            fine,
+            theta,
+            runs,
+            cost=result.cost,
+            first_cost=history[0].cost if history else 0.0,
+            constraints=[value for _, value, _ in held],
+        )
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
         done = result.status in (Status.INTERRUPTED, Status.NONFINITE_START) or attempt == REFINEMENTS
         if done or not excess > 1:
@@ -282,6 +285,7 @@ def estimate(
         trajectories=trajectories,
         comparisons=comparisons,
         integration_error=float(error),
+        integration_error_of=output,
         seconds=time.perf_counter() - began,
         constraints=held,
     )

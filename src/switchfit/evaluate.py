@@ -157,6 +157,10 @@ class Evaluator:
             np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
             np.add.at(jacobian[here].T, mine, A[:, own].T)
             c[here] = c_e
+        if self._priors is not None:
+            J, g, h = self._priors.evaluate(theta)
+            cost, gradient = cost + float(J), gradient + g
+            value, slope, hessian = value + float(J), slope + g, hessian + np.diag(h)
         return ConstrainedEvaluation(cost, gradient, value, slope, hessian, c, jacobian)
 
     def arrow(self, theta: FloatArray, side: int = 1, matrix: Matrix = "exact") -> ArrowEvaluation:

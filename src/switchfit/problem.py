@@ -94,7 +94,9 @@ class Problem:
     solver : {"explicit", "stiff"}, optional
         Butcher's explicit Runge-Kutta method of order 5, or Radau IIA of order 5 for stiff modes.
     rtol, atol : float, optional
-        Tolerances of the local error by which the mesh is refined.
+        Tolerances of the local error by which the mesh is refined. With the defaults J has a relative error of about
+        1e-8, its gradient and its Hessian of about 1e-7. Ten times smaller tolerances make these errors about ten times
+        smaller or better, and take up to 1.6 times as many steps.
 
     Raises
     ------

@@ -37,7 +37,9 @@ class Certificate:
     worst_direction : str
         The worst-determined direction in words.
     integration_error : float
-        ``|J(half the steps) - J|`` relative to J, or to 1e-3 of the first J where that is more.
+        Largest relative change by halving all steps of J, the guards and the terminal constraints: of J relative to J,
+        or to 1e-3 of the first J where that is more; of a constraint relative to what the
+        states make of it as they go through their ranges in the run.
     gradient_gap, hessian_gap : float
         Relative gap between the paper's equations (6)-(17) and the exact derivatives of the discretised cost; NaN
         where that was not checked.
@@ -49,6 +51,8 @@ class Certificate:
         Constraints that hold with equality, collapsed modes and bounds among them, and kinks.
     failures : tuple of str
         What of all this is not as it has to be; nothing: the certificate is good.
+    integration_error_of : str
+        The output that has the `integration_error`: "J", or the name of a guard or terminal constraint.
     """
 
     optimality: float
@@ -62,6 +66,7 @@ class Certificate:
     taylor_orders: tuple[float, ...]
     active: tuple[str, ...]
     failures: tuple[str, ...]
+    integration_error_of: str = "J"
 
     @property
     def passed(self) -> bool:
@@ -75,7 +80,7 @@ class Certificate:
             ("  with unknowns scaled to unit curvature", f"{self.smallest_scaled_eigenvalue:.4g}"),
             ("  condition number of that", f"{self.condition_number:.3g}"),
             ("  worst-determined direction", self.worst_direction),
-            ("integration error of J, relative", f"{self.integration_error:.1e}"),
+            ("largest integration error, relative", f"{self.integration_error:.1e} ({self.integration_error_of})"),
             ("paper's gradient against discretised, relative", _gap(self.gradient_gap)),
             ("paper's Hessian against discretised, relative", _gap(self.hessian_gap)),
             ("Taylor orders of J, with gradient, with Hessian", _orders(self.taylor_orders)),
@@ -125,7 +130,8 @@ class Fit:
     sigma_known : bool or None
         Whether the noise of the measurements is known; None where the cost has no noise model.
     integration_error : float
-        ``|J(half the steps) - J|`` relative to J, or to 1e-3 of the first J where that is more.
+        Largest relative change by halving all steps of J, the guards and the terminal constraints; see
+        `Certificate.integration_error`.
     hessian_kind : str
     tolerance : float
     seconds : float
@@ -142,6 +148,8 @@ class Fit:
         Whether what measurements and priors add to J is half a sum of squares: no sigma is a parameter, no loss robust.
     engine : Engine or None
         What evaluated cost and derivatives: machine code, or JAX and why. None where that is not known.
+    integration_error_of : str
+        The output that has the `integration_error`: "J", or the name of a guard or terminal constraint.
     """
 
     theta_names: tuple[str, ...]
@@ -177,6 +185,7 @@ class Fit:
     log_scaled: tuple[str, ...] = ()
     least_squares: bool = True
     engine: Engine | None = None
+    integration_error_of: str = "J"
 
     @property
     def success(self) -> bool:

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from switchfit.accuracy import cost_error
 from switchfit.batch.chunks import Arrays, fingerprint
 from switchfit.batch.fits import Fits, repeat, sample_count
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
@@ -19,7 +20,7 @@ from switchfit.evaluate import evaluator_of
 from switchfit.optimize import Status
 from switchfit.problem import Problem
 from switchfit.result import inverse_on
-from switchfit.solve import sigma_known, smallest_cost
+from switchfit.solve import sigma_known
 
 
 def estimate_many(
@@ -114,8 +115,7 @@ class _Work:
         """Do a fit again by `estimate` if its integration error is too large."""
         theta, cost = arrays["theta"][k], arrays["cost"][k]
         fine = evaluator_of(problem).divided().cost(theta)
-        size = max(abs(fine), smallest_cost(problem))
-        if abs(fine - cost) <= max(LARGEST_INTEGRATION_ERROR, problem.rtol) * size:
+        if cost_error(problem, fine, cost, 0.0) <= max(LARGEST_INTEGRATION_ERROR, problem.rtol):
             return
         again = estimate(problem, tolerance=self.tolerance, max_iterations=self.max_iterations, start=theta)
         for name in ("theta", "cost", "gradient", "hessian", "optimality"):

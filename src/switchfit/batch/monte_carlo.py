@@ -12,11 +12,12 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.accuracy import cost_error
 from switchfit.batch.chunks import Arrays, fingerprint
 from switchfit.batch.fits import Fits, repeat, sample_count
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
 from switchfit.data import FloatArray, Measurements, ReferenceSignal, as_numbers
-from switchfit.estimate import LARGEST_INTEGRATION_ERROR, ORDER, PERFECT_FIT, REFINEMENTS, estimate
+from switchfit.estimate import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, estimate
 from switchfit.evaluate import Evaluator
 from switchfit.mesh import Mesh
 from switchfit.model import by_cell
@@ -24,7 +25,6 @@ from switchfit.problem import Problem
 from switchfit.refine import refined_mesh
 from switchfit.report.batch import plot_monte_carlo, table_of_monte_carlo
 from switchfit.simulate import compared, runs_of
-from switchfit.solve import smallest_cost
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -234,8 +234,7 @@ def _meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tuple[lis
         evaluator = Evaluator(problem, meshes=[refined_mesh(problem, e, *thetas, finer=finer) for e in indices])
         fine = evaluator.divided().cost(truth)
         # Without noise J vanishes at the truth; then the error is measured against J where the fits begin.
-        size = max(abs(fine), PERFECT_FIT * abs(evaluator(start).cost), smallest_cost(problem))
-        error = abs(evaluator(truth).cost - fine) / size
+        error = cost_error(problem, fine, evaluator(truth).cost, evaluator(start).cost)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
         if not excess > 1 or attempt == REFINEMENTS:
             break

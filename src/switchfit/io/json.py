@@ -1,6 +1,6 @@
 """Fits as JSON files that can be read without switchfit, and back again without losing a bit.
 
-A file holds ``{"format": "switchfit fit", "version": 2, "fit": {...}, "certificate": {...}}`` with the fields of
+A file holds ``{"format": "switchfit fit", "version": 3, "fit": {...}, "certificate": {...}}`` with the fields of
 `Fit` and `Certificate` under their own names:
 
 - numbers are written with as many digits as it takes to read the same float64; JSON has no NaN and no infinities, so
@@ -29,7 +29,7 @@ from switchfit.io.files import write_atomically
 from switchfit.result import Certificate, Fit
 
 FORMAT = "switchfit fit"
-VERSION = 2
+VERSION = 3
 
 
 def save_fit(fit: Fit, certificate: Certificate, path: Path) -> None:

@@ -115,7 +115,11 @@ def _write(module: Module, structure: Structure, sizes: Sizes, order: int) -> No
         module.add(driver.samples(k, q))
     if structure.terminal:
         end = kernels.at_end()
-        kernels.cost_function("end", END, lambda graph, x, p, constants: end(graph, x, p, *constants, checked=True), "psi")
+
+        def at_end(graph: Any, x: Any, p: Any, constants: Any) -> Any:
+            return end(graph, x, p, *constants, checked=True)
+
+        kernels.cost_function("end", END, at_end, "psi")
     for i in structure.resets:
         kernels.reset_functions(i)
     kernels.start_functions()

@@ -246,7 +246,8 @@ def _quality(fit: Fit) -> Iterator[str]:
         else:
             noise = f"so sigma is about {np.sqrt(variance):.4g}"
             yield from _row("residual variance", f"{variance:.4g}   ({origin}, {noise})")
-    yield from _row("integration error", f"{fit.integration_error:.1e}   (of J, relative, by halving all steps)")
+    of = fit.integration_error_of
+    yield from _row("integration error", f"{fit.integration_error:.1e}   (of {of}, relative, by halving all steps)")
 
 
 def _channels(fit: Fit) -> list[str]:
@@ -492,8 +493,9 @@ def _integration(fit: Fit) -> Iterator[str]:
     """A trajectory that is not accurate enough."""
     if not fit.integration_error <= LARGE_INTEGRATION_ERROR:
         yield (
-            f"The integration error of the cost is {fit.integration_error:.1e}, relative: the numbers have fewer "
-            "digits than it seems. Give the Problem a smaller rtol, or solver='stiff' if a mode is stiff."
+            f"The integration error of {fit.integration_error_of} is {fit.integration_error:.1e}, relative: the "
+            "numbers have fewer digits than it seems. Give the Problem a smaller rtol, or solver='stiff' if a mode is "
+            "stiff."
         )
 
 
