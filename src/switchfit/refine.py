@@ -147,7 +147,7 @@ def _solve(
     end: float,
     x: FloatArray,
     p: FloatArray,
-    unit: str,
+    unit: str = "",
 ) -> tuple[FloatArray, FloatArray]:
     """Adaptive solve of one mode from start to end: accepted times (start left out) and the final state."""
     name = structure.mode_names[mode]
