@@ -453,7 +453,7 @@ def test_a_vector_field_that_returns_nan_is_named_with_t_and_x():
 def test_a_state_that_blows_up(call):
     """x' = x**2 from 1 is infinite at t = 1."""
     blowing_up = on_a_long_horizon(lambda t, x, p: x**2)
-    said = ["mode 'grow' cannot be integrated at the guess beyond t = 1, where x = [", "a better guess"]
+    said = ["mode 'grow' cannot be integrated at the guess beyond t = 1 s, where x = [", "a better guess"]
     refused(lambda: call(blowing_up), ValueError, *said)
 
 
@@ -474,7 +474,7 @@ def test_an_initial_state_that_is_nan():
 
 def test_a_reset_map_that_returns_nan():
     nowhere = problem(of=system(reset_maps={("grow", "shrink"): lambda t, x, p: jnp.sqrt(-x)}))
-    refused(lambda: sf.evaluate(nowhere), ValueError, "reset map ('grow', 'shrink') at t = 0.4, x = [1.49", "[nan]")
+    refused(lambda: sf.evaluate(nowhere), ValueError, "reset map ('grow', 'shrink') at t = 0.4 s, x = [1.49", "[nan]")
 
 
 def test_the_explicit_solver_refuses_a_very_stiff_mode_soon_and_names_the_other_solver():
@@ -609,7 +609,11 @@ PRIOR = {"k": sf.Parameter(1.0, prior=sf.Normal(1.0, 0.1))}
         ),
         (lambda: noisy(None, PRIOR), ValueError, ["a prior is weighed against the noise", "sigma is left out"]),
         (lambda: noisy(0.1, delay="late"), ValueError, ["delay names 'late', which must be a parameter of one number"]),
-        (lambda: noisy(0.1, {"d": 0.0}, delay="d"), ValueError, ["may lie in [-inf, inf]", "only from 0 to 0 are all"]),
+        (
+            lambda: noisy(0.1, {"d": 0.0}, delay="d"),
+            ValueError,
+            ["may lie in [-inf, inf]", "only from 0 to 0 s are all"],
+        ),
         (
             lambda: noisy(0.1, {"d": sf.Parameter(0.1, 0.0, 0.3)}, delay="d"),
             ValueError,
@@ -625,7 +629,7 @@ PRIOR = {"k": sf.Parameter(1.0, prior=sf.Normal(1.0, 0.1))}
                 [0.4, 1.0, 0.6],
             ),
             ValueError,
-            ["theta has delays with which samples are of moments from -0.1 to -0.1, outside (t0, tf) = (0.0, 1.0)"],
+            ["theta has delays with which samples are of moments from -0.1 to -0.1 s, outside (t0, tf) = (0.0, 1.0)"],
         ),
         (lambda: sf.Parameter(1.0, scale="ln"), ValueError, ["Parameter scale must be 'linear' or 'log'; got 'ln'"]),
         (lambda: sf.Parameter(0.0, scale="log"), ValueError, ["with scale='log' must be positive", "the value 0.0"]),

@@ -311,7 +311,7 @@ def test_theta_in_its_order():
     fixed, bounded = sf.Parameter(0.3, fixed=True), sf.Parameter(0.6, lower=0.5, upper=0.7, unit="ms")
     problem = sf.Problem(
         system,
-        [run((fixed, bounded), name="city"), run((0.2, 0.8))],
+        [run((fixed, bounded), name="city", time_unit="ms"), run((0.2, 0.8))],
         {
             "z": 7.0,
             "held": sf.Parameter([1.0, 2.0], fixed=True),

@@ -137,18 +137,28 @@ def simulate(
     out: Annotated[Path, typer.Option(metavar="FILE.csv", help="CSV file to write.", show_default=False)],
     debug: Debug = False,
 ) -> None:
-    """Integrate the model at the first guess and write time, mode and states as CSV."""
+    """Integrate the model at the first guess and write time, mode and states as CSV.
+
+    The column of times is called t, or "t (min)" where the experiments' time_unit is "min" and not "s".
+    """
     with _reported(debug):
         loaded = _load(problem)
         import switchfit as sf
 
         runs = [sf.simulate(loaded.problem, experiment=e) for e in range(len(loaded.problem.experiments))]
+        units = {run.time_unit for run in runs}
+        if len(units) > 1:
+            raise ValueError(
+                f"the experiments have times in different units ({', '.join(sorted(units))}), and one column of the "
+                "CSV file would mix them: give each its own problem file."
+            )
+        (unit,) = units
         _make_folder(out.parent)
 
         def save(path: Path) -> None:
             with path.open("w", newline="", encoding="utf-8") as file:
                 table = csv.writer(file)
-                table.writerow(["experiment", "t", "mode", *runs[0].state_names])
+                table.writerow(["experiment", "t" if unit == "s" else f"t ({unit})", "mode", *runs[0].state_names])
                 for k, run in enumerate(runs):
                     name = loaded.problem.experiments[k].name or f"run{k + 1}"
                     for t, mode, x in zip(run.times.tolist(), run.modes, run.states.tolist(), strict=True):

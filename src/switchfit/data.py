@@ -58,7 +58,7 @@ class Input:
     Parameters
     ----------
     times : (K,) array_like
-        Increasing times (s). They must reach over the experiment's ``[t0, tf]``; a held input only has to
+        Increasing times in the experiment's time unit. They must reach over its ``[t0, tf]``; a held input only has to
         start by t0, its last value is kept.
     values : (K,) or (K, q) array_like
         The modes get a scalar u, or a ``(q,)`` array.
@@ -204,14 +204,15 @@ class ReferenceSignal:
         Parameters
         ----------
         times : (K,) array_like
-            Increasing sample times (s), four or more. A time given twice breaks the spline there, as at the
-            transitions of a simulated trajectory; each part then needs four samples.
+            Increasing sample times in the experiment's time unit, four or more. A time given twice breaks the spline
+            there, as at the transitions of a simulated trajectory; each part then needs four samples.
         values : (K,) or (K, q) array_like
             NaN marks a missing value; it is bridged by the interpolation.
         observe : callable ``h(t, x, p) -> (q,)``, optional
         lowpass_hz : float, optional
-            Cut-off (Hz) of a second-order Butterworth filter run forward and backward over the interpolated
-            signal, so that no phase shift remains (the gain at the cut-off is then 1/2).
+            Cut-off, in cycles per time unit of the experiment (Hz only where that is s), of a second-order Butterworth
+            filter run forward and backward over the interpolated signal, so that no phase shift remains (the gain at
+            the cut-off is then 1/2).
         weights : (q,) or (q, q) array_like, optional
         names : sequence of str, optional
 
@@ -243,7 +244,7 @@ class Measurements:
     Parameters
     ----------
     times : (K,) array_like
-        Increasing sample times (s); they may be irregular.
+        Increasing sample times in the experiment's time unit; they may be irregular.
     values : (K,) or (K, q) array_like
         Samples; NaN marks a missing one.
     observe : callable ``h(t, x, p) -> (q,)``, optional
@@ -260,9 +261,9 @@ class Measurements:
     loss_scale : float, optional
         C, in units of sigma: residuals beyond it are outliers.
     delay : float or str, optional
-        By how much (s) the sensor is late: a sample stamped t_k is of the state at ``t_k - delay``, and `observe` is
-        called with that time. A string names the parameter that it is. Give channels of different delays as several
-        `Measurements`.
+        By how much the sensor is late, in the experiment's time unit: a sample stamped t_k is of the state at
+        ``t_k - delay``, and `observe` is called with that time. A string names the parameter that it is. Give channels
+        of different delays as several `Measurements`.
 
     Raises
     ------

@@ -188,7 +188,7 @@ class Estimate(Fit):
         Raises
         ------
         ValueError
-            If the file is not one of switchfit's, or the problem has other unknowns.
+            If the file is not one of switchfit's, or the problem has other unknowns or other time units.
         """
         fit, certificate = load_fit(Path(path))
         if problem is not None and problem.theta_names != fit.theta_names:
@@ -196,6 +196,15 @@ class Estimate(Fit):
                 f"{path} holds the unknowns {', '.join(fit.theta_names)}, the problem has "
                 f"{', '.join(problem.theta_names)}: it is the fit of another problem."
             )
+        if problem is not None:
+            saved = [trajectory.time_unit for trajectory in fit.trajectories]
+            given = [experiment.time_unit for experiment in problem.experiments]
+            if saved != given:
+                raise ValueError(
+                    f"{path} holds times in {', '.join(saved)}, the problem has them in {', '.join(given)}, and times "
+                    "are not converted. Files that were saved before there was a time_unit count as s: if it is one of "
+                    "them, and its times are those of the problem, give the problem's experiments time_unit='s'."
+                )
         own = {f.name: getattr(fit, f.name) for f in fields(Fit)}
         return cls(**own, saved_certificate=certificate, problem=problem)
 

@@ -38,10 +38,10 @@ class Experiment:
     mode_sequence : sequence of str
         Names of the modes in the order in which they are active; a mode may return.
     transition_times : sequence of float or Parameter
-        First guess (s) of each transition, one fewer than modes, strictly increasing inside ``(t0, tf)``;
-        an entry may be a `Parameter` with bounds, or fixed.
+        First guess of each transition, in the experiment's time unit, one fewer than modes, strictly increasing inside
+        ``(t0, tf)``; an entry may be a `Parameter` with bounds, or fixed. Its unit, where given, must be `time_unit`.
     t0, tf : float
-        Horizon (s).
+        Horizon, in the experiment's time unit.
     inputs : Input, optional
         Known input; modes are then called as ``f(t, x, p, u)``.
     initial_state : (n,) array_like or callable ``p -> (n,)``, optional
@@ -52,11 +52,17 @@ class Experiment:
         The model's name of a parameter -> the problem's: with ``{"beta": "beta_run3"}`` the functions of this run find
         the problem's ``beta_run3`` under ``p["beta"]``. Names that are not in it mean themselves, and several names
         may mean one parameter.
+    time_unit : str, optional
+        The unit of all times of this run: of its samples, inputs, t0, tf, transition times and delays. Reports, figures
+        and files print it; nothing is converted.
 
     Raises
     ------
+    TypeError
+        If `time_unit` is not a string.
     ValueError
-        If lengths do not match, times are unordered or outside the horizon, or data lies outside it.
+        If lengths do not match, times are unordered or outside the horizon, data lies outside it, `time_unit` is empty,
+        or a transition time has another unit.
 
     Notes
     -----
@@ -75,6 +81,7 @@ class Experiment:
     initial_state: Any = None
     name: str | None = None
     parameter_map: Any = None
+    time_unit: str = "s"
 
     def __post_init__(self) -> None:
         t0, tf = as_number(self.t0, "t0"), as_number(self.tf, "tf")
@@ -97,6 +104,7 @@ class Experiment:
             object.__setattr__(self, field, value)
         object.__setattr__(self, "data", _checked_data(self.data))
         object.__setattr__(self, "parameter_map", _checked_map(self.parameter_map))
+        self._check_time_unit()
         self._check_times()
         self._check_data_inside()
         if self.inputs is not None:
@@ -106,6 +114,20 @@ class Experiment:
     def initial_times(self) -> FloatArray:
         """Guess of all transition times, fixed ones included: an ``(N,)`` array."""
         return np.array([tau.value for tau in self.transition_times], dtype=np.float64)
+
+    def _check_time_unit(self) -> None:
+        unit = self.time_unit
+        if not isinstance(unit, str):
+            raise TypeError(f"time_unit must be a string such as 's' or 'min'; got {unit!r}.")
+        if not unit.strip():
+            raise ValueError(f"time_unit must name a unit, such as 's' or 'min'; got {unit!r}.")
+        for i, tau in enumerate(self.transition_times, start=1):
+            if tau.unit not in ("", unit):
+                raise ValueError(
+                    f"transition time {i} has the unit {tau.unit!r}, but time_unit of the experiment is {unit!r}, and "
+                    f"times are not converted. If all times of the experiment are in {tau.unit}, give it "
+                    f"time_unit={tau.unit!r}; otherwise give the transition time in {unit}."
+                )
 
     def _check_times(self) -> None:
         needed = len(self.mode_sequence) - 1

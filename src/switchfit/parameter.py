@@ -21,7 +21,7 @@ class Parameter:
     lower, upper : float or array_like, optional
         Bounds; broadcast to the shape of `value`.
     unit : str, optional
-        For the report.
+        For the report. That of a transition time is its experiment's `time_unit`.
     fixed : bool, optional
         A fixed parameter is not estimated.
     prior : Normal or LogNormal, optional
@@ -110,6 +110,11 @@ class Parameter:
     def shape(self) -> tuple[int, ...]:
         """Shape of the parameter, () for a scalar."""
         return tuple(self.value.shape)
+
+
+def unit_suffix(unit: str) -> str:
+    """Return what follows a number in this unit, such as " min"; nothing for "" and for "1", a pure number."""
+    return "" if unit in ("", "1") else f" {unit}"
 
 
 def as_parameter(value: Any, what: str) -> Parameter:

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.data import FloatArray, Measurements, ReferenceSignal, as_numbers
 from switchfit.mesh import Mesh
+from switchfit.parameter import unit_suffix
 from switchfit.problem import Problem
 from switchfit.result import Fit
 from switchfit.sensitivity import Points, Sensitivity, sensitivity
@@ -37,7 +38,7 @@ class Prediction:
 
     Attributes
     ----------
-    times : (K,) array (s)
+    times : (K,) array, in `time_unit`
     states, state_errors : (K, n)
     outputs, output_errors : (K, q)
         What the reference signals see, then the Measurements; their standard errors.
@@ -45,6 +46,8 @@ class Prediction:
         Standard deviation of one sample: sigma (of the sample nearest in time, where it differs), or where that is
         unknown the root of the residual variance; NaN for reference signals.
     state_names, state_units, output_names : tuple of str
+    time_unit : str
+        That of the experiment.
     near_transition : (K,) bool
         Within two standard errors of a transition time: the bands take no account of the other mode there.
     fit : Fit
@@ -59,6 +62,7 @@ class Prediction:
     state_names: tuple[str, ...]
     state_units: tuple[str, ...]
     output_names: tuple[str, ...]
+    time_unit: str
     near_transition: NDArray[np.bool_]
     fit: Fit = field(repr=False)
 
@@ -86,8 +90,8 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
     ----------
     estimate : Estimate
     times : (K,) array_like, optional
-        In any order, inside [t0, tf] (s), at samples or between them; at a transition what is just before it. Left
-        out, all nodes of the mesh, each transition twice: with the state before and after it.
+        In any order, inside [t0, tf], in the experiment's time unit, at samples or between them; at a transition what
+        is just before it. Left out, all nodes of the mesh, each transition twice: with the state before and after it.
     experiment : int, optional
         Which experiment, from 0.
 
@@ -139,6 +143,7 @@ def _prediction(fit: Fit, problem: Problem, e: int, points: Points) -> Predictio
         trajectory.state_names,
         trajectory.state_units,
         tuple(names),
+        trajectory.time_unit,
         _near(fit, problem, e, points.times),
         fit,
     )
@@ -181,5 +186,6 @@ def _checked_times(times: ArrayLike, problem: Problem, e: int) -> FloatArray:
         raise ValueError(f"times must be finite numbers of shape (K,); got shape {asked.shape}.")
     outside = (asked < t0) | (asked > tf)
     if outside.any():
-        raise ValueError(f"times must lie inside [t0, tf] = [{t0}, {tf}]; got {asked[outside][0]}.")
+        unit = unit_suffix(problem.experiments[e].time_unit)
+        raise ValueError(f"times must lie inside [t0, tf] = [{t0}, {tf}]{unit}; got {asked[outside][0]}.")
     return asked

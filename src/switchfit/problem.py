@@ -20,7 +20,7 @@ from switchfit.experiment import Experiment, initial_state_of, run_names
 from switchfit.mesh import Mesh, common_lengths
 from switchfit.model import Arguments, Functions, Structure, arguments_of, structure_of
 from switchfit.optimize.variables import Variables
-from switchfit.parameter import Parameter, as_parameter
+from switchfit.parameter import Parameter, as_parameter, unit_suffix
 from switchfit.priors import PriorTerms
 from switchfit.system import HybridSystem
 
@@ -90,7 +90,8 @@ class Problem:
     parameters : mapping of str to Parameter, number or array
         A bare number is a free parameter without bounds.
     min_duration : float, optional
-        Shortest time (s) a mode may last; 0 lets it vanish, which the result then reports.
+        Shortest time a mode may last, in the time unit that all experiments then share; 0 lets a mode vanish, which
+        the result then reports.
     solver : {"explicit", "stiff"}, optional
         Butcher's explicit Runge-Kutta method of order 5, or Radau IIA of order 5 for stiff modes.
     rtol, atol : float, optional
@@ -101,8 +102,9 @@ class Problem:
     Raises
     ------
     ValueError
-        For unknown modes, unknown parameters in a map, impossible minimum durations, or a vector field, reset map,
-        observation or cost of the wrong shape or dtype.
+        For unknown modes, unknown parameters in a map, impossible minimum durations, a minimum duration or a delay for
+        experiments with different time units, or a vector field, reset map, observation or cost of the wrong shape or
+        dtype.
     """
 
     system: HybridSystem
@@ -222,15 +224,30 @@ class Problem:
                         f"delay names {item.delay!r}, which must be a parameter of one number; the problem has "
                         f"{', '.join(self.parameters) or 'none'}."
                     )
+                self._check_delay_unit(experiment, item.delay)
+                unit = unit_suffix(experiment.time_unit)
                 low, high = item.times[-1] - experiment.tf, item.times[0] - experiment.t0
                 least, most = (parameter.value,) * 2 if parameter.fixed else (parameter.lower, parameter.upper)
                 if not low <= least <= most <= high:
                     raise ValueError(
-                        f"the delay {item.delay!r} may lie in [{least}, {most}] (its bounds, if it is not fixed), but "
-                        f"only from {low:.6g} to {high:.6g} are all samples of moments inside (t0, tf) = "
-                        f"({experiment.t0}, {experiment.tf}): give it narrower bounds, move t0 or tf, or leave out "
-                        "samples at the ends."
+                        f"the delay {item.delay!r} may lie in [{least}, {most}]{unit} (its bounds, if it is not "
+                        f"fixed), but only from {low:.6g} to {high:.6g}{unit} are all samples of moments inside "
+                        f"(t0, tf) = ({experiment.t0}, {experiment.tf}): give it narrower bounds, move t0 or tf, or "
+                        "leave out samples at the ends."
                     )
+
+    def _check_delay_unit(self, experiment: Experiment, delay: str) -> None:
+        """A delay is a time: in the unit of the experiment, and shared by experiments of one time unit alone."""
+        name = experiment.parameter_map.get(delay, delay)
+        unit = self.parameters[name].unit
+        if unit not in ("", experiment.time_unit):
+            raise ValueError(
+                f"the delay {name!r} has the unit {unit!r}, but time_unit of its experiment is "
+                f"{experiment.time_unit!r}, and times are not converted. Give both in the same unit."
+            )
+        runs = zip(run_names(self.experiments), self.experiments, strict=True)
+        units = {run: e.time_unit for run, e in runs if name in _delay_targets(e)}
+        _require_one_time_unit(units, f"the delay {name!r}", "give each run a delay of its own (parameter_map)")
 
     def _check_states(self) -> None:
         """Sizes of initial states that are no functions."""
@@ -386,8 +403,8 @@ class Problem:
             seen = self.late_times(theta, e)
             if seen.size and (seen.min() < experiment.t0 or seen.max() > experiment.tf):
                 raise ValueError(
-                    f"theta has delays with which samples are of moments from {seen.min():.6g} to {seen.max():.6g}, "
-                    f"outside (t0, tf) = ({experiment.t0}, {experiment.tf})."
+                    f"theta has delays with which samples are of moments from {seen.min():.6g} to {seen.max():.6g}"
+                    f"{unit_suffix(experiment.time_unit)}, outside (t0, tf) = ({experiment.t0}, {experiment.tf})."
                 )
 
     def split(self, theta: FloatArray) -> tuple[list[FloatArray], dict[str, FloatArray]]:
@@ -427,7 +444,7 @@ def _unknowns(
             if not tau.fixed:
                 positions[i] = len(names)
                 names.append(f"{prefix}tau_{i + 1}")
-                units.append(tau.unit or "s")
+                units.append(experiment.time_unit)
                 pieces.append(tau)
         where.append(positions)
     spans: dict[str, slice] = {}
@@ -461,6 +478,22 @@ def _unknowns(
     return Unknowns(tuple(names), tuple(units), *vectors, tuple(where), spans, tuple(states), A, b, rows, priors, log)
 
 
+def _delay_targets(experiment: Experiment) -> set[str]:
+    """Names of the problem's parameters that are delays in an experiment."""
+    delays = [item.delay for item in experiment.data if isinstance(item, Measurements)]
+    return {experiment.parameter_map.get(delay, delay) for delay in delays if isinstance(delay, str)}
+
+
+def _require_one_time_unit(units: Mapping[str, str], what: str, otherwise: str) -> None:
+    """Raise ValueError if `what`, one time for several experiments, would have several units; `units` by run's name."""
+    if len(set(units.values())) > 1:
+        shown = ", ".join(f"{name} in {unit}" for name, unit in units.items())
+        raise ValueError(
+            f"{what} is one number for experiments whose times are in different units ({shown}), and times are not "
+            f"converted. Give all times in one unit, as time_unit of each experiment, or {otherwise}."
+        )
+
+
 def _index(k: tuple[int, ...]) -> str:
     return f"[{','.join(map(str, k))}]" if k else ""
 
@@ -473,15 +506,20 @@ def _ordering(
         raise ValueError(f"min_duration must be zero or positive; got {dwell}.")
     rows, bounds, names = [], [], []
     labels = run_names(experiments)
+    if dwell > 0:
+        units = {name: experiment.time_unit for name, experiment in zip(labels, experiments, strict=True)}
+        _require_one_time_unit(units, "min_duration", "leave it out and bound the transition times of each")
     for e, (experiment, positions) in enumerate(zip(experiments, where, strict=True)):
         run = "" if len(experiments) == 1 else f" of {labels[e]}"
         knots = np.concatenate([[experiment.t0], experiment.initial_times, [experiment.tf]])
         ends = np.concatenate([[-1], positions, [-1]])
+        unit = unit_suffix(experiment.time_unit)
         for i, mode in enumerate(experiment.mode_sequence):
             length = knots[i + 1] - knots[i]
             if length < dwell * (1 - 1e-12):
                 raise ValueError(
-                    f"min_duration is {dwell} s, but the guess gives mode {i + 1} ({mode!r}){run} only {length:.6g} s."
+                    f"min_duration is {dwell}{unit}, but the guess gives mode {i + 1} ({mode!r}){run} only "
+                    f"{length:.6g}{unit}."
                 )
             if ends[i] < 0 and ends[i + 1] < 0:
                 continue

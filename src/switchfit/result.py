@@ -135,7 +135,7 @@ class Fit:
     hessian_kind : str
     tolerance : float
     seconds : float
-        Wall time of the estimation.
+        Wall time of the estimation, in seconds whatever the unit of the experiments' times is.
     constraints : tuple of (name, value, multiplier)
         Guards and terminal constraints. With them the Hessian is that of J plus multipliers times constraints.
     saved_gauss_newton : (d, d) or None

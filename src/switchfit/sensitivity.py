@@ -316,7 +316,7 @@ class SampleDerivatives(NamedTuple):
     item, channel : (S,) int
         Which of the experiment's Measurements, and which of its channels.
     time, residual, weight : (S,)
-        Sample time (s), fitted less measured, ``1 / sigma**2`` (1 where sigma is unknown).
+        Sample time in the experiment's time unit, fitted less measured, ``1 / sigma**2`` (1 where sigma is unknown).
     derivative : (S, d)
         Of the fitted value in theta.
     """

@@ -30,14 +30,16 @@ class Trajectory:
 
     Attributes
     ----------
-    times : (K,) array (s)
-        All nodes; each transition time stands twice, with the state before and after it.
+    times : (K,) array
+        All nodes, in `time_unit`; each transition time stands twice, with the state before and after it.
     states : (K, n) array
     modes : (K,) array of str
         The mode that is active.
     segments : (N + 2,) int array
         Entries ``segments[i]:segments[i + 1]`` belong to the i-th entry of the mode sequence.
     state_names, state_units : tuple of str
+    time_unit : str
+        That of the experiment.
     """
 
     times: FloatArray
@@ -46,6 +48,7 @@ class Trajectory:
     segments: NDArray[np.intp]
     state_names: tuple[str, ...]
     state_units: tuple[str, ...]
+    time_unit: str = "s"
 
     @property
     def mode_spans(self) -> list[tuple[str, float, float]]:
@@ -415,7 +418,15 @@ def _trajectory(problem: Problem, e: int, run: Run) -> Trajectory:
     names = system.state_names or tuple(f"x{k + 1}" for k in range(structure.n))
     units = system.state_units or ("",) * structure.n
     segments = np.cumsum([0, *(len(part) for part in times)])
-    return Trajectory(np.concatenate(times), np.concatenate(states), np.concatenate(modes), segments, names, units)
+    return Trajectory(
+        np.concatenate(times),
+        np.concatenate(states),
+        np.concatenate(modes),
+        segments,
+        names,
+        units,
+        problem.experiments[e].time_unit,
+    )
 
 
 def _shown(part: Segment, before: FloatArray, after: FloatArray) -> FloatArray:

@@ -62,6 +62,12 @@ def estimate_many(
                 f"problem {k} differs from the first one in more than its numbers: it has the unknowns "
                 f"{', '.join(problem.theta_names)}, the first one {', '.join(first.theta_names)}. Fit it by itself."
             )
+        units = [[run.time_unit for run in of.experiments] for of in (problem, first)]
+        if units[0] != units[1]:
+            raise ValueError(
+                f"problem {k} has its times in {', '.join(units[0])}, the first one in {', '.join(units[1])}: their "
+                "estimates would stand in one array. Give all logs the same time_unit, with their times in it."
+            )
     began = time.perf_counter()
     work = _Work(problems, tolerance, max_iterations)
     return Fits(**repeat(first, work, len(problems), "Logs", began, client=client, folder=folder, callback=callback))

@@ -21,6 +21,7 @@ from switchfit.estimate import Estimate, estimate
 from switchfit.evaluate import Evaluator, evaluator_of
 from switchfit.mesh import Mesh
 from switchfit.optimize.qp import solve_qp
+from switchfit.parameter import unit_suffix
 from switchfit.problem import Problem
 from switchfit.report.batch import plot_waterfall
 from switchfit.solve import constraints_of
@@ -56,9 +57,8 @@ class Multistart(Fits):
         lines = [*self._summary(), "", f"{int(self.clusters.max(initial=-1)) + 1} minima:"]
         for k in range(min(int(self.clusters.max(initial=-1)) + 1, 10)):
             here = np.flatnonzero(self.clusters == k)
-            place = ", ".join(
-                f"{name} = {value:.6g}" for name, value in zip(self.theta_names, self.theta[here[0]], strict=True)
-            )
+            columns = zip(self.theta_names, self.theta[here[0]], self.theta_units, strict=True)
+            place = ", ".join(f"{name} = {value:.6g}{unit_suffix(unit)}" for name, value, unit in columns)
             lines.append(f"  J = {self.cost[here].min():.9g}  {len(here):>5} starts  {place}")
         return "\n".join(lines)
 

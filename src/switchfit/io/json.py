@@ -27,9 +27,13 @@ from numpy.typing import NDArray
 
 from switchfit.io.files import write_atomically
 from switchfit.result import Certificate, Fit
+from switchfit.simulate import Trajectory
 
 FORMAT = "switchfit fit"
 VERSION = 3
+
+LATER_FIELDS: dict[type, tuple[str, ...]] = {Trajectory: ("time_unit",)}
+"""Fields that files of this version may lack, since earlier releases did not write them: they take their defaults."""
 
 
 def save_fit(fit: Fit, certificate: Certificate, path: Path) -> None:
@@ -165,16 +169,16 @@ def _decoded(hint: Any, value: Any, where: str) -> Any:
 
 
 def _dataclass(kind: type, value: Any, where: str) -> Any:
-    """An instance of a dataclass from a dict with exactly its fields."""
+    """An instance of a dataclass from a dict with its fields and no others."""
     hints = get_type_hints(kind)
     names = [f.name for f in fields(kind)]
     given = _checked(value, dict, where)
     for name in names:
-        if name not in given:
+        if name not in given and name not in LATER_FIELDS.get(kind, ()):
             raise ValueError(f"{where}.{name} is missing")
     if unknown := [name for name in given if name not in names]:
         raise ValueError(f"{where} has the unknown entry {unknown[0]!r}")
-    return kind(**{name: _decoded(hints[name], given[name], f"{where}.{name}") for name in names})
+    return kind(**{name: _decoded(hints[name], given[name], f"{where}.{name}") for name in names if name in given})
 
 
 def _tuple(kinds: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:

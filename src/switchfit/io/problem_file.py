@@ -130,9 +130,10 @@ class ParameterTable(_Table):
 class TransitionTable(_Table):
     """First guess of a transition time, with bounds of its own."""
 
-    value: float = Field(description="first guess of the transition time (s)")
-    lower: float = Field(default=-np.inf, description="earliest time (s)")
-    upper: float = Field(default=np.inf, description="latest time (s)")
+    value: float = Field(description="first guess of the transition time, in the experiment's time_unit")
+    lower: float = Field(default=-np.inf, description="earliest time")
+    upper: float = Field(default=np.inf, description="latest time")
+    unit: str = Field(default="", description="left out or the same as the experiment's time_unit")
     fixed: bool = Field(default=False, description="true if the time is known and not to be estimated")
     prior: PriorTable | None = Field(
         default=None, description="what is known of it: { mean, sd } or { median, log_sd }"
@@ -163,7 +164,7 @@ class LogTable(_Table):
         default=None, description="[from, to]: only rows with the time column in between are used"
     )
     time_offset: float = Field(default=0.0, description="subtracted from the time column")
-    time_scale: float = Field(default=1.0, gt=0, description="then multiplied: 1e-3 if the column is in milliseconds")
+    time_scale: float = Field(default=1.0, gt=0, description="then multiplied: 1e-3 turns ms into s")
 
 
 class DataTable(LogTable):
@@ -187,10 +188,15 @@ class DataTable(LogTable):
     )
     loss_scale: float = Field(default=1.0, gt=0, description="size of a residual, in sigmas, beyond which it is one")
     delay: float | str = Field(
-        default=0.0, description="by how much the sensor is late (s), or the parameter that it is (measurements only)"
+        default=0.0,
+        description="by how much the sensor is late, in the experiment's time_unit, or the parameter that it is "
+        "(measurements only)",
     )
     lowpass_hz: float | None = Field(
-        default=None, gt=0, description="cut-off of a low-pass filter (Hz; reference only)"
+        default=None,
+        gt=0,
+        description="cut-off of a low-pass filter, in cycles per time_unit of the experiment: Hz if that is s "
+        "(reference only)",
     )
     weights: list[float] | None = Field(default=None, description="weight of each column (reference only)")
 
@@ -206,13 +212,16 @@ class ExperimentTable(_Table):
 
     mode_sequence: list[str] = Field(min_length=1, description="names of the modes in the order of their activity")
     transition_times: list[Annotated[TransitionTable, pydantic.BeforeValidator(_number_as_table)]] = Field(
-        description="first guess of each transition time (s), one fewer than modes"
+        description="first guess of each transition time, in time_unit, one fewer than modes"
+    )
+    time_unit: str = Field(
+        default="s", min_length=1, description="unit of all times of the run, for the report; nothing is converted"
     )
     data: Annotated[list[DataTable], pydantic.BeforeValidator(_table_as_list)] = Field(
         min_length=1, description="what the model is compared with; several tables add up"
     )
-    t0: float | None = Field(default=None, description="start of the horizon (s); left out, the first sample")
-    tf: float | None = Field(default=None, description="end of the horizon (s); left out, the last sample")
+    t0: float | None = Field(default=None, description="start of the horizon; left out, the first sample")
+    tf: float | None = Field(default=None, description="end of the horizon; left out, the last sample")
     initial_state: list[Annotated[StateTable, pydantic.BeforeValidator(_known_as_table)]] | None = Field(
         default=None,
         description="state at t0, instead of the model's: a number, or a table where it is to be estimated",
@@ -235,7 +244,9 @@ class ModelTable(_Table):
 class OptionsTable(_Table):
     """How to solve; what is left out has the library's default."""
 
-    min_duration: float | None = Field(default=None, ge=0, description="shortest time a mode may last (s)")
+    min_duration: float | None = Field(
+        default=None, ge=0, description="shortest time a mode may last, in the time_unit of the experiments"
+    )
     solver: Literal["explicit", "stiff"] | None = Field(default=None, description="integrator")
     rtol: float | None = Field(default=None, gt=0, description="relative tolerance of the integrator")
     atol: float | None = Field(default=None, gt=0, description="absolute tolerance of the integrator")
@@ -481,13 +492,14 @@ def _experiment(
     return Experiment(
         data=data,
         mode_sequence=tuple(table.mode_sequence),
-        transition_times=tuple(_parameter(tau, unit="s") for tau in table.transition_times),
+        transition_times=tuple(_parameter(tau) for tau in table.transition_times),
         t0=min(span[0] for span in spans) if table.t0 is None else table.t0,
         tf=max(span[-1] for span in spans) if table.tf is None else table.tf,
         inputs=None if table.inputs is None else _explained(f"{where}.inputs", _input, folder, table.inputs),
         initial_state=_initial_state(table),
         parameter_map=table.parameter_map,
         name=table.name,
+        time_unit=table.time_unit,
     )
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from switchfit.data import FloatArray
 from switchfit.optimize import IterationRecord
-from switchfit.report.text import run_names, standard_errors_of, transitions_of, unit_of
+from switchfit.report.text import run_names, standard_errors_of, time_label, transitions_of, unit_of
 from switchfit.result import Fit
 from switchfit.simulate import Comparison, Trajectory
 
@@ -467,5 +467,5 @@ def _labelled(name: str, trajectory: Trajectory) -> str:
 def _time_axis(ax: Axes, trajectory: Trajectory) -> Axes:
     """The experiment's horizon, labelled."""
     ax.set_xlim(float(trajectory.times[0]), float(trajectory.times[-1]))
-    ax.set_xlabel("time (s)")
+    ax.set_xlabel(time_label(trajectory.time_unit))
     return ax
