@@ -122,9 +122,9 @@ def on_guards(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     else:
         if np.all(np.abs(step[guarded]) <= 1e-10 * np.maximum(np.abs(theta[guarded]), 1.0)):
             return theta
-    names = listed(problem.theta_names[k] for k in guarded)
+    near, names = shown(theta[guarded].round(6)), listed(problem.theta_names[k] for k in guarded)
     raise ValueError(
-        f"No transition times near {shown(theta[guarded].round(6).tolist())} put {names} on their guards: the state does not "
+        f"No transition times near {near} put {names} on their guards: the state does not "
         "reach a guard there, or grazes it. Give transition_times nearer to where the guards vanish (sf.simulate shows "
         "the states), or another mode_sequence."
     )
