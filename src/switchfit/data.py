@@ -29,6 +29,10 @@ from switchfit.validation import (
 FloatArray = NDArray[np.float64]
 MOST_FILTERED = 10**7
 """Points at which a signal may be filtered."""
+OVERFLOW = (
+    "The signal between the samples of an Input or a ReferenceSignal overflows: values must be smaller, or times "
+    "further apart."
+)
 LOWEST_CUTOFF = 1e-6
 """Smallest cut-off of a low-pass filter in cycles a point. At 1e-8 its output is off by 3 %, below that by anything."""
 
@@ -48,6 +52,10 @@ class PiecewisePolynomial:
 
     knots: FloatArray
     coefficients: FloatArray
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.coefficients).all():
+            raise ValueError(OVERFLOW)
 
     @property
     def channels(self) -> int:
@@ -113,7 +121,9 @@ class Input:
         if self.kind == "cubic":
             return _spline(times, values)
         if self.kind == "linear":
-            return _from_powers(times, [values[:-1], np.diff(values, axis=0) / np.diff(times)[:, None]])
+            with np.errstate(all="ignore"):
+                slopes = np.diff(values, axis=0) / np.diff(times)[:, None]
+            return _from_powers(times, [values[:-1], slopes])
         end = max(tf, times[-1] + 1.0)
         return _from_powers(np.append(times, end), [values])
 
@@ -330,6 +340,8 @@ class Measurements:
     def _check_loss(self) -> None:
         object.__setattr__(self, "loss", as_choice(self.loss, "loss", LOSSES))
         scale = as_positive(self.loss_scale, "loss_scale")
+        if not 0 < scale * scale < np.inf:
+            raise ValueError(f"loss_scale must have a square that is neither 0 nor infinite; got {scale}.")
         object.__setattr__(self, "loss_scale", scale)
         if self.loss != "linear" and self.sigma is None:
             raise ValueError(
@@ -433,7 +445,14 @@ def _checked_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | tuple[str
         )
     if not np.all(sigma > 0) or not np.all(np.isfinite(sigma)):
         raise ValueError(f"sigma must be positive and finite; got a smallest value of {sigma.min()}.")
+    _check_inverse_square(sigma)
     return sigma
+
+
+def _check_inverse_square(sigma: Any) -> None:
+    with np.errstate(over="ignore"):
+        if not np.all(np.isfinite(np.asarray(sigma, dtype=np.float64) ** -2.0)):
+            raise ValueError(f"sigma must not be so small that 1 / sigma**2 is infinite; got {shown(sigma)}.")
 
 
 def _sigma_of_channels(sigma: Sequence[Any], channels: int) -> tuple[str | float, ...]:
@@ -451,6 +470,7 @@ def _sigma_of_channels(sigma: Sequence[Any], channels: int) -> tuple[str | float
     ]
     if not all(np.isfinite(entry) and entry > 0 for entry in entries if not isinstance(entry, str)):
         raise ValueError(f"sigma must be positive and finite; got {shown(sigma)}.")
+    _check_inverse_square([entry for entry in entries if not isinstance(entry, str)])
     return tuple(entries)
 
 
@@ -469,11 +489,9 @@ def _weight_matrix(weights: ArrayLike | None, channels: int) -> FloatArray:
     if weights is None:
         return np.eye(channels)
     matrix = as_array(weights, "weights")
-    shape = matrix.shape
-    if matrix.ndim == 1:
-        matrix = np.diag(matrix)
-    if matrix.shape != (channels, channels):
-        raise ValueError(f"weights must have shape ({channels},) or ({channels}, {channels}); got {shape}.")
+    if matrix.shape not in ((channels,), (channels, channels)):
+        raise ValueError(f"weights must have shape ({channels},) or ({channels}, {channels}); got {matrix.shape}.")
+    matrix = np.diag(matrix) if matrix.ndim == 1 else matrix
     if not np.all(np.isfinite(matrix)) or not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
         raise ValueError(f"weights must be finite and symmetric; got {shown(matrix.tolist())}.")
     smallest = np.linalg.eigvalsh(matrix)[0]
@@ -494,7 +512,11 @@ def _spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
     """Not-a-knot cubic spline through ``values`` (K, q)."""
     from scipy.interpolate import CubicSpline  # here, since importing it takes longer than most fits
 
-    spline = CubicSpline(times, values, axis=0)
+    try:
+        with np.errstate(all="ignore"):
+            spline = CubicSpline(times, values, axis=0)
+    except ValueError:  # times and values are finite, but their slopes are not
+        raise ValueError(OVERFLOW) from None
     return PiecewisePolynomial(times, np.moveaxis(spline.c[::-1], 0, 1))
 
 

@@ -90,6 +90,11 @@ class Experiment:
         given = self.transition_times
         several = isinstance(given, Iterable) and getattr(given, "ndim", 1) > 0
         given = as_sequence(given, "transition_times", "a sequence of numbers or sf.Parameter") if several else (given,)
+        if len(given) != len(sequence) - 1:
+            raise ValueError(
+                f"transition_times must be one fewer than the {len(sequence)} modes of mode_sequence; "
+                f"got {len(given)}, needed {len(sequence) - 1}."
+            )
         times = tuple(as_parameter(tau, "a transition time") for tau in given)
         if self.inputs is not None:
             as_instance(self.inputs, "inputs", Input, "an sf.Input")
@@ -112,12 +117,6 @@ class Experiment:
         return np.array([tau.value for tau in self.transition_times], dtype=np.float64)
 
     def _check_times(self) -> None:
-        needed = len(self.mode_sequence) - 1
-        if len(self.transition_times) != needed:
-            raise ValueError(
-                f"transition_times must be one fewer than the {len(self.mode_sequence)} modes of mode_sequence; "
-                f"got {len(self.transition_times)}, needed {needed}."
-            )
         if any(tau.scale != "linear" for tau in self.transition_times):
             raise ValueError("transition_times are estimated as they are; leave out scale='log'.")
         if any(tau.shape != () for tau in self.transition_times):

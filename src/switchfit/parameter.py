@@ -101,8 +101,8 @@ class Parameter:
             PriorTerms.of(self.prior, self.shape)
         except ValueError as error:
             raise ValueError(
-                f"Parameter prior does not fit a value of shape {self.shape}: its numbers have the shapes "
-                f"{' and '.join(str(np.shape(number)) for number in vars(self.prior).values())}."
+                f"Parameter prior does not fit a value of shape {self.shape}: "
+                f"{', '.join(f'{name} has shape {np.shape(number)}' for name, number in vars(self.prior).items())}."
             ) from error
         if isinstance(self.prior, LogNormal) and not (self.positive or self.fixed):
             raise ValueError(

@@ -85,8 +85,12 @@ def _check(prior: Any, center: str, spread: str) -> None:
         if not np.all(np.isfinite(value)):
             raise ValueError(f"{kind} {name} must be finite; got {shown(value)}.")
         object.__setattr__(prior, name, value)
-    if not np.all(getattr(prior, spread) > 0):
-        raise ValueError(f"{kind} {spread} must be positive; got {shown(getattr(prior, spread))}.")
+    deviation = getattr(prior, spread)
+    if not np.all(deviation > 0):
+        raise ValueError(f"{kind} {spread} must be positive; got {shown(deviation)}.")
+    with np.errstate(over="ignore"):
+        if not np.all(np.isfinite(deviation**-2.0)):
+            raise ValueError(f"{kind} {spread} must not be so small that 1 / {spread}**2 is infinite; got {deviation}.")
 
 
 class PriorTerms(NamedTuple):

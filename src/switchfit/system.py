@@ -75,18 +75,12 @@ class HybridSystem:
             _set(self, name, MappingProxyType(_checked_pairs(getattr(self, name), name, self.modes)))
         if not callable(self.initial_state):
             _set(self, "initial_state", as_state(self.initial_state, "initial_state"))
-        for label in ("state_names", "state_units"):
-            self._check_labels(label)
-
-    def _check_labels(self, label: str) -> None:
-        given = getattr(self, label)
-        if given is None:
-            return
         form = "a sequence of strings, one for each state"
-        if label == "state_names":
-            _set(self, label, as_names(given, label, form))
-        else:
-            _set(self, label, tuple(as_text(unit, f"each of {label}") for unit in as_sequence(given, label, form)))
+        if self.state_names is not None:
+            _set(self, "state_names", as_names(self.state_names, "state_names", form))
+        if self.state_units is not None:
+            units = as_sequence(self.state_units, "state_units", form)
+            _set(self, "state_units", tuple(as_text(unit, "each of state_units") for unit in units))
         if not callable(self.initial_state):
             self.check_labels_of(len(self.initial_state))
 

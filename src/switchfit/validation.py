@@ -460,7 +460,7 @@ def as_instance(value: Any, what: str, kind: type[T], form: str) -> T:
 
 
 def as_callable(value: Any, what: str, form: str, *, arguments: int | None = None) -> Callable[..., Any]:
-    """Return a function, which messages call `form`.
+    """Return a function, which messages call `form`; a class is not taken for one.
 
     Parameters
     ----------
@@ -471,8 +471,9 @@ def as_callable(value: Any, what: str, form: str, *, arguments: int | None = Non
     arguments : int, optional
         With how many it is called; checked as far as the signature is known.
     """
-    if not callable(value):
-        raise TypeError(f"{what} must be {form}; got {type(value).__name__}.")
+    if not callable(value) or isinstance(value, type):
+        given = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+        raise TypeError(f"{what} must be {form}; got {given}.")
     if arguments is not None:
         try:
             signature = inspect.signature(value)
