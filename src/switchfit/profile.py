@@ -591,7 +591,7 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     if not isinstance(fit, Fit):
         raise TypeError(f"profile needs the result of sf.estimate; got {type(fit).__name__}. Fit the problem first.")
     if as_name(name, "name") not in fit.theta_names:
-        raise ValueError(f"there is no unknown of the name {shown(name)}; there are {listed(fit.theta_names)}.")
+        raise ValueError(f"there is no unknown {shown(name)}; there are {listed(fit.theta_names)}.")
     level = as_level(level)
     if callback is not None:
         as_callable(callback, "callback", "a function callback(done, total)", arguments=2)

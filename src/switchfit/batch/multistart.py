@@ -115,7 +115,7 @@ def multistart(
     tolerance, max_iterations = checked_settings(tolerance, max_iterations)
     check_long_run(client, folder, callback)
     began = time.perf_counter()
-    several = isinstance(starts, (list, tuple)) or getattr(starts, "ndim", 0) > 0
+    several = hasattr(type(starts), "__len__")
     points = _given(problem, starts) if several else _drawn(problem, starts, seed)
     work = _Work(problem, list(evaluator_of(problem).meshes), points, tolerance, max_iterations)
     found = repeat(problem, work, len(points), "Multistart", began, client=client, folder=folder, callback=callback)
