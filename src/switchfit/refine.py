@@ -217,6 +217,8 @@ def _first_step(
 
     slope = native.slope(mode, start, y, p)
     of_state, of_slope = size(y), size(slope)
+    if not np.isfinite(of_slope):  # the first step then fails, and the caller says of what
+        return min(1e-6, end - start)
     guess = min(1e-6 if of_state < 1e-5 or of_slope < 1e-5 else 0.01 * of_state / of_slope, end - start)
     ahead = min(start + guess, float(np.nextafter(end, start)))
     bend = size(native.slope(mode, ahead, y + guess * slope, p) - slope) / guess
