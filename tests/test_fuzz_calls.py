@@ -335,7 +335,7 @@ def of(name, method):
 
 LONG = {"seed": 0, "tolerance": 1e-7, "max_iterations": 20, "client": None, "folder": None, "callback": stop}
 THETA = {"theta": [0.45, 1.1]}
-THETA_WORDS = {"theta": ("theta", "tau", "transition times", "integrated")}
+THETA_WORDS = {"theta": ("theta", "tau", "transition times", "at the guess", "the guess leads")}
 SYSTEM_WORDS = {
     "modes": ("mode",),
     "reset_maps": ("reset",),
@@ -483,7 +483,7 @@ def catalogue():
             sf.estimate,
             {"problem": GOOD, "hessian": "exact", "tolerance": 1e-7, "max_iterations": 20, "callback": watch}
             | {"start": [0.45, 1.1]},
-            words={"start": ("start", "integrated")},
+            words={"start": ("start", "at the guess", "the guess leads")},
             inside={"start": lambda bad: [0.4, bad]},
         ),
         "estimate_many": Door(
@@ -512,7 +512,7 @@ def catalogue():
         "monte_carlo": Door(
             sf.monte_carlo,
             {"problem": GOOD, "runs": 2, "start": [0.45, 1.1], "noise": 0.1} | THETA | LONG,
-            words=THETA_WORDS | {"start": ("start", "integrated")},
+            words=THETA_WORDS | {"start": ("start", "at the guess", "the guess leads")},
             inside={"noise": lambda bad: [bad, 0.1], "theta": lambda bad: [0.4, bad]},
         ),
         "multistart": Door(
