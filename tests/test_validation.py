@@ -152,7 +152,7 @@ def test_halves_pass_and_tenths_do_not(kind):
     exact = jnp.array([0.5, -3.0, 0.0, np.nan, np.inf], dtype=kind)
     np.testing.assert_array_equal(as_array(exact, "x"), [0.5, -3.0, 0.0, np.nan, np.inf])
     assert as_array(exact, "x").dtype == np.float64
-    with pytest.raises(ValueError, match=r"x is of less than double precision: 0\.1 became 0\.\d+ \(\w*float\d+\)"):
+    with pytest.raises(ValueError, match=r"x must be in double precision: 0\.1 became 0\.\d+ \(\w*float\d+\)"):
         as_array(jnp.array([0.5, 0.1], dtype=kind), "x")
 
 
@@ -364,6 +364,15 @@ def test_paths(given, error):
 
 
 # Messages
+
+
+class Table:
+    def __repr__(self):
+        return "a  b\n1  2"
+
+
+def test_what_messages_show_is_on_one_line():
+    assert shown(Table()) == "a b 1 2"
 
 
 class Loud:

@@ -96,7 +96,7 @@ _SHORT = _Short()
 def shown(value: Any) -> str:
     """Return `value` as a message shows it: at most `LONGEST` characters, whatever it is."""
     try:
-        text = _SHORT.repr(value)
+        text = " ".join(_SHORT.repr(value).split())
     except Exception:  # a __repr__ of somebody else
         text = f"an object of type {type(value).__name__}"
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
@@ -372,7 +372,7 @@ def refuse_single_precision(value: Any, what: str) -> None:
                 "write np.asarray(values, dtype=np.float64)."
             )
             raise ValueError(
-                f"{what} is of less than double precision: {float(meant[k])!r} became {float(wide[here[k]])!r} "
+                f"{what} must be in double precision: {float(meant[k])!r} became {float(wide[here[k]])!r} "
                 f"({given.dtype.name}). {advice}"
             )
 
