@@ -29,6 +29,8 @@ from switchfit.evaluate import Evaluator
 
 SOURCE = str(Path(sf.__file__).parent)
 SECONDS = 20
+SECONDS_WITH_JAX = 120
+"""For calls that JAX compiles a program for: 10 s each where nothing else runs."""
 LONGEST = 600
 
 
@@ -258,14 +260,14 @@ class Door:
     valid : arguments with which it succeeds
     words : for an argument the words of which a message about it has one; its own name if left out
     inside : for an argument a function that puts a bad value inside a good one
-    skip : (argument, bad value) that would be a long run, and no mistake
+    seconds : after which a call hangs
     """
 
     call: Callable[..., Any]
     valid: dict[str, Any]
     words: dict[str, tuple[str, ...]] = field(default_factory=dict)
     inside: dict[str, Callable[[Any], Any]] = field(default_factory=dict)
-    skip: tuple[tuple[str, str], ...] = ()
+    seconds: int = SECONDS
 
 
 def used(built):
@@ -490,6 +492,7 @@ def catalogue():
             sf.estimate_many,
             {"problems": [GOOD]} | {key: value for key, value in LONG.items() if key != "seed"},
             words={"problems": ("problem",)},
+            seconds=SECONDS_WITH_JAX,
             inside={"problems": lambda bad: [GOOD, bad]},
         ),
         "evaluate": Door(
@@ -498,14 +501,18 @@ def catalogue():
             words=THETA_WORDS,
             inside={"theta": lambda bad: [0.4, bad]},
         ),
-        "evaluate_on_guards": Door(sf.evaluate_on_guards, {"problem": GUARDED} | THETA, words=THETA_WORDS),
+        "evaluate_on_guards": Door(
+            sf.evaluate_on_guards, {"problem": GUARDED} | THETA, words=THETA_WORDS, seconds=SECONDS_WITH_JAX
+        ),
         "simulate": Door(
             sf.simulate,
             {"problem": GOOD, "experiment": 0} | THETA,
             words=THETA_WORDS,
             inside={"theta": lambda bad: [bad, 1.0]},
         ),
-        "check_derivatives": Door(sf.check_derivatives, {"problem": GOOD, "seed": 0} | THETA, words=THETA_WORDS),
+        "check_derivatives": Door(
+            sf.check_derivatives, {"problem": GOOD, "seed": 0} | THETA, words=THETA_WORDS, seconds=SECONDS_WITH_JAX
+        ),
         "identifiability": Door(
             sf.identifiability, {"subject": GOOD}, words={"subject": ("identifiability needs an sf.Estimate",)}
         ),
@@ -513,18 +520,21 @@ def catalogue():
             sf.monte_carlo,
             {"problem": GOOD, "runs": 2, "start": [0.45, 1.1], "noise": 0.1} | THETA | LONG,
             words=THETA_WORDS | {"start": ("start", "at the guess", "the guess leads")},
+            seconds=SECONDS_WITH_JAX,
             inside={"noise": lambda bad: [bad, 0.1], "theta": lambda bad: [0.4, bad]},
         ),
         "multistart": Door(
             sf.multistart,
             {"problem": GOOD, "starts": 2} | LONG,
             words={"starts": ("start",)},
+            seconds=SECONDS_WITH_JAX,
             inside={"starts": lambda bad: [[0.4, bad]]},
         ),
         "bootstrap": Door(
             sf.bootstrap,
             {"estimate": made("fit"), "runs": 2, "resample": "blocks", "block": 2} | LONG,
             words={"estimate": ("bootstrap needs the result of sf.estimate",)},
+            seconds=SECONDS_WITH_JAX,
         ),
         "predict": Door(
             sf.predict,
@@ -603,12 +613,12 @@ class HangError(BaseException):
 
 
 @contextmanager
-def no_hang():
+def no_hang(seconds):
     def give_up(number, frame):
         raise HangError
 
     before = signal.signal(signal.SIGALRM, give_up)
-    signal.alarm(SECONDS)
+    signal.alarm(seconds)
     try:
         yield
     finally:
@@ -631,7 +641,7 @@ def raised_by_switchfit(error):
 def complaint(door, given, changed):
     """What is wrong with how a call ended; None for a result, or for an error as it has to be."""
     try:
-        with no_hang():
+        with no_hang(door.seconds):
             door.call(**given)
     except HangError:
         return "hangs"
@@ -662,7 +672,6 @@ def calls_of(doors):
         for argument in door.valid
         for inside in ((False, True) if argument in door.inside else (False,))
         for bad in BAD
-        if (argument, bad) not in door.skip
     ]
 
 
