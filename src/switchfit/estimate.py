@@ -36,6 +36,7 @@ from switchfit.result import Certificate, Fit
 from switchfit.sensitivity import Sensitivity, gauss_newton_of, sample_derivatives, sensitivity
 from switchfit.simulate import compared, runs_of
 from switchfit.solve import constraints_of, least_squares, message_of, minimized, plain, sigma_known
+from switchfit.validation import as_callable, as_choice, as_count, as_flag, as_instance, as_path, as_positive
 
 HESSIANS = get_args(HessianKind)
 
@@ -139,7 +140,7 @@ class Estimate(Fit):
             Of the bands.
         """
         quantile = self.quantile(level)
-        drawn = bands and self.problem is not None and np.isfinite(standard_errors_of(self)).all()
+        drawn = as_flag(bands, "bands") and self.problem is not None and np.isfinite(standard_errors_of(self)).all()
         shown = range(min(len(self.trajectories), LARGEST_FIGURE)) if drawn and self._sensitivities_fit() else range(0)
         return plot_fit(self, [Bands.of(predict(self, experiment=e), quantile, level) for e in shown])
 
@@ -169,7 +170,8 @@ class Estimate(Fit):
 
     def save(self, path: str | Path) -> None:
         """Write everything but the model to a JSON file, atomically; `load` reads it."""
-        save_fit(self.complete(), self.certificate, Path(path))
+        file = as_path(path, "path")
+        save_fit(self.complete(), self.certificate, file)
 
     def complete(self) -> Estimate:
         """The same with everything that is saved, which is the Gauss-Newton matrix."""
@@ -190,7 +192,9 @@ class Estimate(Fit):
         ValueError
             If the file is not one of switchfit's, or the problem has other unknowns or other time units.
         """
-        fit, certificate = load_fit(Path(path))
+        if problem is not None:
+            as_instance(problem, "problem", Problem, "an sf.Problem")
+        fit, certificate = load_fit(as_path(path, "path"))
         if problem is not None and problem.theta_names != fit.theta_names:
             raise ValueError(
                 f"{path} holds the unknowns {', '.join(fit.theta_names)}, the problem has "
@@ -246,8 +250,16 @@ def estimate(
     ------
     ValueError
         For a bad setting, or a guess at which the model cannot be integrated.
+    TypeError
+        If an argument is of the wrong type.
     """
-    _check_settings(problem, hessian, tolerance, max_iterations)
+    as_instance(problem, "problem", Problem, "an sf.Problem; several are what sf.estimate_many takes")
+    hessian = as_choice(hessian, "hessian", HESSIANS)
+    tolerance, max_iterations = checked_settings(tolerance, max_iterations)
+    if callback is not None:
+        as_callable(callback, "callback", "a function callback(record)", arguments=1)
+    if problem.constraint_names and hessian != "exact":
+        raise ValueError(f"with guards or terminal constraints hessian must be 'exact'; got {hessian!r}.")
     began = time.perf_counter()
     theta, evaluator = _beginning(problem, start)
     constraints = constraints_of(problem)
@@ -300,20 +312,14 @@ def estimate(
     )
 
 
-def _check_settings(problem: Problem, hessian: HessianKind, tolerance: float, max_iterations: int) -> None:
-    if hessian not in HESSIANS:
-        raise ValueError(f"hessian must be one of {', '.join(HESSIANS)}; got {hessian!r}.")
-    if not tolerance > 0:
-        raise ValueError(f"tolerance must be positive; got {tolerance}.")
-    if max_iterations < 0:
-        raise ValueError(f"max_iterations must not be negative; got {max_iterations}.")
-    if problem.constraint_names and hessian != "exact":
-        raise ValueError(f"with guards or terminal constraints hessian must be 'exact'; got {hessian!r}.")
+def checked_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:
+    """Return the two settings of every fit, checked."""
+    return as_positive(tolerance, "tolerance"), as_count(max_iterations, "max_iterations")
 
 
 def _beginning(problem: Problem, start: ArrayLike | None) -> tuple[FloatArray, Evaluator]:
     """Where a fit begins (d,), guarded transitions on their guards if that is near, and the meshes for it."""
-    theta = problem.checked_theta(start)
+    theta = problem.checked_theta(start, "start")
     evaluator = evaluator_of(problem) if start is None else Evaluator(problem, theta)
     if any(structure.guarded for structure in problem.structures):
         with suppress(ValueError):  # if there is no such point nearby, the optimiser may find one farther off

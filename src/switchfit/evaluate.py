@@ -29,6 +29,7 @@ from switchfit.problem import Problem
 from switchfit.propagate import path_cost, propagate
 from switchfit.refine import refined_mesh
 from switchfit.simulate import cost_of, runs_of
+from switchfit.validation import as_choice, as_instance
 
 Method = Literal["auto", "forward", "discrete-adjoint", "adjoint", "autodiff"]
 Matrix = Literal["exact", "gauss-newton", "none"]
@@ -290,14 +291,16 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     ------
     ValueError
         For a theta of the wrong shape or with transition times out of order, or an unknown method.
+    TypeError
+        If an argument is of the wrong type.
 
     Notes
     -----
     The mesh is refined once, at the initial guess, so that J is one smooth function of theta. Where a transition
     time sits exactly on a sample time the derivatives are those for increasing it.
     """
-    if method not in METHODS:
-        raise ValueError(f"method must be one of {', '.join(METHODS)}; got {method!r}.")
+    as_instance(problem, "problem", Problem, "an sf.Problem")
+    method = as_choice(method, "method", METHODS)
     return evaluator_of(problem)(problem.checked_theta(theta), method=method)
 
 

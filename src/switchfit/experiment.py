@@ -19,11 +19,11 @@ from switchfit.data import (
     RunningCost,
     TerminalConstraint,
     TerminalCost,
-    as_number,
 )
 from switchfit.parameter import Parameter as Parameter
 from switchfit.parameter import as_parameter
 from switchfit.system import Guard, HybridSystem, ResetMap, as_state
+from switchfit.validation import as_instance, as_name, as_number, as_sequence, shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +58,12 @@ class Experiment:
 
     Raises
     ------
-    TypeError
-        If `time_unit` is not a string.
     ValueError
         If lengths do not match, times are unordered or outside the horizon, data lies outside it, `time_unit` is empty,
         or a transition time has another unit.
+    TypeError
+        If an argument is of the wrong type: times that are not numbers (dates among them), mode names that are no
+        strings, data that are none of the kinds above.
 
     Notes
     -----
@@ -86,18 +87,24 @@ class Experiment:
     def __post_init__(self) -> None:
         t0, tf = as_number(self.t0, "t0"), as_number(self.tf, "tf")
         if not (np.isfinite(t0) and np.isfinite(tf) and t0 < tf):
-            raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got ({self.t0}, {self.tf}).")
-        if isinstance(self.mode_sequence, str):
-            raise TypeError(f"mode_sequence must be a sequence of mode names; got the string {self.mode_sequence!r}.")
-        if not isinstance(self.mode_sequence, Iterable):
-            raise TypeError(f"mode_sequence must be a sequence of mode names; got {self.mode_sequence!r}.")
-        sequence = tuple(self.mode_sequence)
+            raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got ({t0}, {tf}).")
+        modes = as_sequence(self.mode_sequence, "mode_sequence", "a sequence of mode names")
+        sequence = tuple(as_name(mode, "each of mode_sequence", "the name of a mode") for mode in modes)
         if not sequence:
             raise ValueError("mode_sequence is empty; name at least one mode.")
-        given = self.transition_times if isinstance(self.transition_times, Iterable) else (self.transition_times,)
+        given = self.transition_times
+        several = isinstance(given, Iterable) and getattr(given, "ndim", 1) > 0
+        given = as_sequence(given, "transition_times", "a sequence of numbers or sf.Parameter") if several else (given,)
+        if len(given) != len(sequence) - 1:
+            raise ValueError(
+                f"transition_times must be one fewer than the {len(sequence)} modes of mode_sequence; "
+                f"got {len(given)}, needed {len(sequence) - 1}."
+            )
         times = tuple(as_parameter(tau, "a transition time") for tau in given)
-        if self.inputs is not None and not isinstance(self.inputs, Input):
-            raise TypeError(f"inputs must be an sf.Input; got {type(self.inputs).__name__}.")
+        if self.inputs is not None:
+            as_instance(self.inputs, "inputs", Input, "an sf.Input")
+        if self.name is not None:
+            object.__setattr__(self, "name", as_name(self.name, "name of an experiment"))
         if self.initial_state is not None and not callable(self.initial_state):
             object.__setattr__(self, "initial_state", as_state(self.initial_state, "initial_state"))
         for field, value in (("t0", t0), ("tf", tf), ("mode_sequence", sequence), ("transition_times", times)):
@@ -116,11 +123,7 @@ class Experiment:
         return np.array([tau.value for tau in self.transition_times], dtype=np.float64)
 
     def _check_time_unit(self) -> None:
-        unit = self.time_unit
-        if not isinstance(unit, str):
-            raise TypeError(f"time_unit must be a string such as 's' or 'min'; got {unit!r}.")
-        if not unit.strip():
-            raise ValueError(f"time_unit must name a unit, such as 's' or 'min'; got {unit!r}.")
+        unit = as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'")
         for i, tau in enumerate(self.transition_times, start=1):
             if tau.unit not in ("", unit):
                 raise ValueError(
@@ -130,22 +133,18 @@ class Experiment:
                 )
 
     def _check_times(self) -> None:
-        needed = len(self.mode_sequence) - 1
-        if len(self.transition_times) != needed:
-            raise ValueError(
-                f"transition_times must be one fewer than the {len(self.mode_sequence)} modes of mode_sequence; "
-                f"got {len(self.transition_times)}, needed {needed}."
-            )
         if any(tau.scale != "linear" for tau in self.transition_times):
             raise ValueError("transition_times are estimated as they are; leave out scale='log'.")
         if any(tau.shape != () for tau in self.transition_times):
             shapes = [tau.shape for tau in self.transition_times]
-            raise ValueError(f"transition_times must be single numbers or Parameters of one; got the shapes {shapes}.")
+            raise ValueError(
+                f"transition_times must be single numbers or Parameters of one; got the shapes {shown(shapes)}."
+            )
         knots = np.concatenate([[self.t0], self.initial_times, [self.tf]])
         if np.any(np.diff(knots) <= 0):
             raise ValueError(
                 f"transition_times must increase strictly inside (t0, tf) = ({self.t0}, {self.tf}); "
-                f"got {self.initial_times.tolist()}."
+                f"got {shown(self.initial_times)}."
             )
 
     def _check_data_inside(self) -> None:
@@ -198,9 +197,9 @@ def _checked_map(given: Any) -> Mapping[str, str]:
     if not strings:
         raise TypeError(
             "parameter_map must be a dict of the model's name -> the problem's name, such as "
-            f"{{'beta': 'beta_run3'}}; got {given!r}."
+            f"{{'beta': 'beta_run3'}}; got {shown(given)}."
         )
-    return dict(names)
+    return {as_name(here, "parameter_map"): as_name(target, "parameter_map") for here, target in names.items()}
 
 
 def _checked_data(data: Any) -> tuple[Data, ...]:

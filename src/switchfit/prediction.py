@@ -21,12 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.data import FloatArray, Measurements, ReferenceSignal, as_numbers
+from switchfit.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.mesh import Mesh
 from switchfit.parameter import unit_suffix
 from switchfit.problem import Problem
 from switchfit.result import Fit
 from switchfit.sensitivity import Points, Sensitivity, sensitivity
+from switchfit.validation import as_array, as_index
 
 NEAR = 2.0
 """Standard errors of a transition time within which a band is not to be trusted."""
@@ -102,7 +103,7 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
     Raises
     ------
     TypeError
-        If this is no estimate.
+        If this is no estimate, or an argument is of the wrong type.
     ValueError
         For times outside the horizon, an experiment that does not exist, or an estimate without a problem or without
         a covariance.
@@ -112,8 +113,7 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
         raise TypeError(f"predict needs the result of sf.estimate; got {type(fit).__name__}. Fit the problem first.")
     evaluator = estimate.evaluator_at_solution()
     problem: Problem = evaluator.problem
-    if not 0 <= experiment < len(problem.experiments):
-        raise ValueError(f"experiment must lie in 0..{len(problem.experiments) - 1}; got {experiment}.")
+    experiment = as_index(experiment, "experiment", len(problem.experiments))
     if times is None:
         points = estimate.sensitivities[experiment].nodes
     else:
@@ -180,7 +180,7 @@ def _near(fit: Fit, problem: Problem, e: int, times: FloatArray) -> NDArray[np.b
 
 
 def _checked_times(times: ArrayLike, problem: Problem, e: int) -> FloatArray:
-    asked = np.atleast_1d(as_numbers(times, "times"))
+    asked = np.atleast_1d(as_array(times, "times"))
     t0, tf = problem.experiments[e].t0, problem.experiments[e].tf
     if asked.ndim != 1 or asked.size == 0 or not np.isfinite(asked).all():
         raise ValueError(f"times must be finite numbers of shape (K,); got shape {asked.shape}.")

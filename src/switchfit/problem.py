@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.data import FloatArray, Measurements, as_number, as_numbers
+from switchfit.data import FloatArray, Measurements
 from switchfit.experiment import Experiment, initial_state_of, run_names
 from switchfit.mesh import Mesh, common_lengths
 from switchfit.model import Arguments, Functions, Structure, arguments_of, structure_of
@@ -23,6 +23,7 @@ from switchfit.optimize.variables import Variables
 from switchfit.parameter import Parameter, as_parameter, unit_suffix
 from switchfit.priors import PriorTerms
 from switchfit.system import HybridSystem
+from switchfit.validation import as_array, as_choice, as_instance, as_name, as_number, as_positive, listed, shown
 
 GIVEN = ("system", "experiments", "parameters", "min_duration", "solver", "rtol", "atol")
 """What a `Problem` is built from."""
@@ -105,6 +106,8 @@ class Problem:
         For unknown modes, unknown parameters in a map, impossible minimum durations, a minimum duration or a delay for
         experiments with different time units, or a vector field, reset map, observation or cost of the wrong shape or
         dtype.
+    TypeError
+        If an argument is of the wrong type.
     """
 
     system: HybridSystem
@@ -118,31 +121,28 @@ class Problem:
     structures: tuple[Structure, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.system, HybridSystem):
-            raise TypeError(f"system must be an sf.HybridSystem; got {type(self.system).__name__}.")
+        as_instance(self.system, "system", HybridSystem, "an sf.HybridSystem")
         given = self.experiments
         experiments = tuple(given) if isinstance(given, (list, tuple)) else (given,)
         if not experiments or not all(isinstance(e, Experiment) for e in experiments):
-            raise TypeError(f"experiments must be an sf.Experiment or a non-empty list of them; got {given!r}.")
+            raise TypeError(f"experiments must be an sf.Experiment or a non-empty list of them; got {shown(given)}.")
         for experiment in experiments:
             for mode in experiment.mode_sequence:
                 if mode not in self.system.modes:
                     raise ValueError(
-                        f"mode_sequence names the unknown mode {mode!r}; the modes are {', '.join(self.system.modes)}."
+                        f"mode_sequence names the unknown mode {shown(mode)}; the modes are "
+                        f"{listed(self.system.modes)}."
                     )
-        if self.solver not in ("explicit", "stiff"):
-            raise ValueError(f"solver must be 'explicit' or 'stiff'; got {self.solver!r}.")
+        object.__setattr__(self, "solver", as_choice(self.solver, "solver", ("explicit", "stiff")))
         for name in ("rtol", "atol"):
-            value = as_number(getattr(self, name), name)
-            if not (np.isfinite(value) and value > 0):
-                raise ValueError(f"{name} must be positive; got {value}.")
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, name, as_positive(getattr(self, name), name))
         if not SMALLEST_RTOL <= self.rtol < 1:
             raise ValueError(f"rtol must lie between {SMALLEST_RTOL} (rounding) and 1; got {self.rtol}.")
         parameters = _checked_parameters(self.parameters)
         object.__setattr__(self, "experiments", experiments)
         object.__setattr__(self, "parameters", parameters)
         dwell = as_number(self.min_duration, "min_duration")
+        object.__setattr__(self, "min_duration", dwell)
         self._check_maps()
         self._check_states()
         object.__setattr__(self, "unknowns", _unknowns(self.system, experiments, parameters, dwell))
@@ -179,8 +179,8 @@ class Problem:
             for here, target in experiment.parameter_map.items():
                 if target not in self.parameters:
                     raise ValueError(
-                        f"parameter_map of experiment {name} gives the model's {here!r} as the unknown parameter "
-                        f"{target!r}; the problem has {', '.join(self.parameters) or 'none'}."
+                        f"parameter_map of experiment {listed([name])} gives the model's {shown(here)} as the "
+                        f"unknown parameter {shown(target)}; the problem has {listed(self.parameters)}."
                     )
 
     def _check_noise(self) -> None:
@@ -191,8 +191,8 @@ class Problem:
                 parameter = self.parameters.get(experiment.parameter_map.get(name, name))
                 if parameter is None:
                     raise ValueError(
-                        f"sigma names the parameter {name!r}, which the problem lacks; it has "
-                        f"{', '.join(self.parameters) or 'none'}."
+                        f"sigma names the parameter {shown(name)}, which the problem lacks; it has "
+                        f"{listed(self.parameters)}."
                     )
                 if parameter.shape != () or not (parameter.positive or (parameter.fixed and parameter.value > 0)):
                     raise ValueError(
@@ -221,8 +221,8 @@ class Problem:
                 parameter = self.parameters.get(experiment.parameter_map.get(item.delay, item.delay))
                 if parameter is None or parameter.shape != ():
                     raise ValueError(
-                        f"delay names {item.delay!r}, which must be a parameter of one number; the problem has "
-                        f"{', '.join(self.parameters) or 'none'}."
+                        f"delay names {shown(item.delay)}, which must be a parameter of one number; the problem has "
+                        f"{listed(self.parameters)}."
                     )
                 self._check_delay_unit(experiment, item.delay)
                 unit = unit_suffix(experiment.time_unit)
@@ -376,34 +376,40 @@ class Problem:
         named = self.named(theta, e) if late else {}
         return np.concatenate([np.zeros(0), *(times - named[delay] for times, delay in late)])
 
-    def checked_theta(self, theta: ArrayLike | None) -> FloatArray:
-        """`theta`, or the initial guess for None, as a ``(d,)`` array; ValueError where shape or order is wrong."""
+    def checked_theta(self, theta: ArrayLike | None, what: str = "theta") -> FloatArray:
+        """Return `theta`, or the initial guess for None, as a ``(d,)`` array; messages call it `what`.
+
+        Raises
+        ------
+        ValueError
+            Where the shape or the order of transition times is wrong.
+        """
         if theta is None:
             return self.initial_theta
-        checked = as_numbers(theta, "theta")
+        checked = as_array(theta, what)
         if checked.shape != self.unknowns.initial.shape:
             raise ValueError(
-                f"theta must have shape ({len(self.theta_names)},): {', '.join(self.theta_names)}; "
+                f"{what} must have shape ({len(self.theta_names)},): {listed(self.theta_names)}; "
                 f"got shape {checked.shape}."
             )
         if not np.all(np.isfinite(checked)):
-            raise ValueError(f"theta must be finite; got {checked.tolist()}.")
+            raise ValueError(f"{what} must be finite; got {shown(checked)}.")
         for experiment, times in zip(self.experiments, self.split(checked)[0], strict=True):
             knots = np.concatenate([[experiment.t0], times, [experiment.tf]])
             if np.any(np.diff(knots) < 0):
                 raise ValueError(
-                    f"The transition times in theta must not decrease inside (t0, tf) = ({experiment.t0}, "
-                    f"{experiment.tf}); got {times.tolist()}."
+                    f"The transition times in {what} must not decrease inside (t0, tf) = ({experiment.t0}, "
+                    f"{experiment.tf}); got {shown(times)}."
                 )
-        self._check_delays_inside(checked)
+        self._check_delays_inside(checked, what)
         return checked
 
-    def _check_delays_inside(self, theta: FloatArray) -> None:
+    def _check_delays_inside(self, theta: FloatArray, what: str) -> None:
         for e, experiment in enumerate(self.experiments):
             seen = self.late_times(theta, e)
             if seen.size and (seen.min() < experiment.t0 or seen.max() > experiment.tf):
                 raise ValueError(
-                    f"theta has delays with which samples are of moments from {seen.min():.6g} to {seen.max():.6g}"
+                    f"{what} has delays with which samples are of moments from {seen.min():.6g} to {seen.max():.6g}"
                     f"{unit_suffix(experiment.time_unit)}, outside (t0, tf) = ({experiment.t0}, {experiment.tf})."
                 )
 
@@ -422,12 +428,11 @@ class Problem:
 
 
 def _checked_parameters(parameters: Any) -> dict[str, Parameter]:
-    if not isinstance(parameters or {}, Mapping):
-        raise TypeError(f"parameters must be a dict of name -> value or sf.Parameter; got {parameters!r}.")
-    for name in parameters or {}:
-        if not isinstance(name, str):
-            raise TypeError(f"parameter names must be strings; got {name!r}.")
-    return {name: as_parameter(value, f"parameter {name!r}") for name, value in (parameters or {}).items()}
+    if not isinstance(parameters, Mapping | None):
+        raise TypeError(f"parameters must be a dict of name -> value or sf.Parameter; got {shown(parameters)}.")
+    given = {} if parameters is None else parameters
+    names = [as_name(name, "parameter names", "strings") for name in given]
+    return {name: as_parameter(given[name], f"parameter {shown(name)}") for name in names}
 
 
 def _unknowns(
@@ -469,7 +474,7 @@ def _unknowns(
         raise ValueError("Nothing to estimate: every parameter and transition time is fixed.")
     if len(set(names)) != len(names):
         twice = sorted({name for name in names if names.count(name) > 1})
-        raise ValueError(f"Two unknowns share a name: {', '.join(twice)}; rename the parameter or the experiment.")
+        raise ValueError(f"Two unknowns share a name: {listed(twice)}; rename the parameter or the experiment.")
     flat = {key: np.concatenate([getattr(q, key).ravel() for q in pieces]) for key in ("value", "lower", "upper")}
     priors = PriorTerms.joined([PriorTerms.of(q.prior, q.shape) for q in pieces])
     log = np.concatenate([np.full(q.value.size, q.scale == "log") for q in pieces])

@@ -224,6 +224,8 @@ def _first_step(
     if not np.isfinite(slope).all():
         return np.nan
     of_state, of_slope = size(y), size(slope)
+    if not np.isfinite(of_slope):  # the first step then fails, and the caller says of what
+        return min(1e-6, end - start)
     guess = min(1e-6 if of_state < 1e-5 or of_slope < 1e-5 else 0.01 * of_state / of_slope, end - start)
     if guess == 0.0:
         return 0.0

@@ -15,6 +15,7 @@ from switchfit.data import FloatArray
 from switchfit.engine import Engine
 from switchfit.optimize import IterationRecord, Status
 from switchfit.simulate import Comparison, Trajectory
+from switchfit.validation import as_choice, as_level
 
 CovarianceKind = Literal["exact", "gauss-newton"]
 
@@ -257,8 +258,7 @@ class Fit:
             For another kind, or where the Gauss-Newton matrix is not known: the cost is not made of Measurements
             alone, or the estimate was loaded without its problem from a file that lacks it.
         """
-        if hessian not in ("exact", "gauss-newton"):
-            raise ValueError(f"hessian must be 'exact' or 'gauss-newton'; got {hessian!r}.")
+        hessian = as_choice(hessian, "hessian", ("exact", "gauss-newton"))
         matrix = self.hessian if hessian == "exact" else self.gauss_newton
         if matrix is None:
             raise ValueError(
@@ -280,8 +280,7 @@ class Fit:
 
     def quantile(self, level: float) -> float:
         """Two-sided quantile: of Student's t where sigma is unknown, of the normal distribution where it is known."""
-        if not 0 < level < 1:
-            raise ValueError(f"level must lie between 0 and 1; got {level}.")
+        level = as_level(level)
         tail = 0.5 + level / 2
         freedom = max(self.freedom, 1)
         return float(scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail))

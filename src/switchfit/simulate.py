@@ -22,6 +22,7 @@ from switchfit.native.program import NativeExperiment, native_experiment
 from switchfit.problem import Problem
 from switchfit.refine import after_reset, initial_state, refined_mesh
 from switchfit.rungekutta import step
+from switchfit.validation import as_index, as_instance
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,9 +120,11 @@ def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: in
     ValueError
         For a theta of the wrong shape or order, an experiment that does not exist, or a trajectory that
         cannot be integrated.
+    TypeError
+        If an argument is of the wrong type.
     """
-    if not 0 <= experiment < len(problem.experiments):
-        raise ValueError(f"experiment must lie in 0..{len(problem.experiments) - 1}; got {experiment}.")
+    as_instance(problem, "problem", Problem, "an sf.Problem")
+    experiment = as_index(experiment, "experiment", len(problem.experiments))
     checked = problem.checked_theta(theta)
     mesh = refined_mesh(problem, experiment, checked)
     run = _simulated(problem, experiment, checked, mesh, problem.arguments(experiment, mesh))

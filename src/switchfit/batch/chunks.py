@@ -74,11 +74,7 @@ def run_chunks(
     ------
     ValueError
         If the folder holds the chunks of something else.
-    TypeError
-        If the client is none.
     """
-    if client is not None and not hasattr(client, "submit"):
-        raise TypeError(f"client must be a dask.distributed.Client; got {type(client).__name__}.")
     chunks = [range(first, min(first + work.size, count)) for first in range(0, count, work.size)]
     store = None if folder is None else _Store(Path(folder), work.fingerprint(), work.size)
     results: dict[int, Arrays] = {}

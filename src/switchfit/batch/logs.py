@@ -13,14 +13,15 @@ import numpy as np
 
 from switchfit.accuracy import cost_error
 from switchfit.batch.chunks import Arrays, fingerprint
-from switchfit.batch.fits import Fits, repeat, sample_count
+from switchfit.batch.fits import Fits, check_long_run, repeat, sample_count
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
-from switchfit.estimate import LARGEST_INTEGRATION_ERROR, estimate
+from switchfit.estimate import LARGEST_INTEGRATION_ERROR, checked_settings, estimate
 from switchfit.evaluate import evaluator_of
 from switchfit.optimize import Status
 from switchfit.problem import Problem
 from switchfit.result import inverse_on
 from switchfit.solve import sigma_known
+from switchfit.validation import as_instance, as_sequence, listed
 
 
 def estimate_many(
@@ -51,16 +52,21 @@ def estimate_many(
     ------
     ValueError
         If the problems differ in more than their numbers, or the folder holds something else.
+    TypeError
+        If an argument is of the wrong type.
     """
-    problems = list(problems)
+    problems = list(as_sequence(problems, "problems", "a sequence of sf.Problem"))
+    tolerance, max_iterations = checked_settings(tolerance, max_iterations)
+    check_long_run(client, folder, callback)
     if not problems:
         raise ValueError("estimate_many needs one problem or more; got none.")
     first = problems[0]
     for k, problem in enumerate(problems):
+        as_instance(problem, f"problems[{k}]", Problem, "an sf.Problem")
         if problem.theta_names != first.theta_names or sigma_known(problem) is not sigma_known(first):
             raise ValueError(
                 f"problem {k} differs from the first one in more than its numbers: it has the unknowns "
-                f"{', '.join(problem.theta_names)}, the first one {', '.join(first.theta_names)}. Fit it by itself."
+                f"{listed(problem.theta_names)}, the first one {listed(first.theta_names)}. Fit it by itself."
             )
         units = [[run.time_unit for run in of.experiments] for of in (problem, first)]
         if units[0] != units[1]:
