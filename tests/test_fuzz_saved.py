@@ -6,6 +6,7 @@ import copy
 import json
 import random
 import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from test_save import CERTIFICATE, with_everything_odd, without_numbers
 import switchfit as sf
 from switchfit.io.json import save_fit
 
-SIZES = [pytest.param(600, id="short"), pytest.param(12_000, id="long", marks=pytest.mark.slow)]
+SIZES = [pytest.param(250, id="short"), pytest.param(12_000, id="long", marks=pytest.mark.slow)]
 ODD: tuple[Any, ...] = (
     None, True, False, 0, -1, 1, 2, 3, 10**30, -(10**400), 0.0, -0.0, 0.5, 1e308, 1e-320, "nan", "inf", "-inf", "", "a",
     "tau_1", "exact", "\ud800", "\0", "$", [], [[]], [0.0], [1.0, 2.0], [[1.0], [2.0, 3.0]], ["nan"] * 3, {}, {"a": 1},
@@ -87,7 +88,18 @@ def mutate(content: Any, rng: random.Random) -> None:
         holder[key] = rng.choice([value[::-1], value * 2, value.upper()])
 
 
-def use(path: Any, folder: Any) -> None:
+def is_refused(path: Path, number: int) -> bool:
+    """Whether a file is refused; AssertionError if that is not by a ValueError that names it."""
+    try:
+        sf.Estimate.load(path)
+    except Exception as error:
+        if not isinstance(error, ValueError) or not str(error).startswith(f"{path} is "):
+            raise AssertionError(f"damage {number}") from error
+        return True
+    return False
+
+
+def use(path: Path, folder: Path) -> None:
     """Everything that a loaded estimate is for, without its model."""
     estimate = sf.Estimate.load(path)
     assert isinstance(str(estimate), str)
@@ -110,14 +122,9 @@ def test_what_is_loaded_can_be_used(count, tmp_path):
         for _ in range(rng.choice([1, 1, 1, 2, 5])):
             mutate(content, rng)
         path.write_text(json.dumps(content))
-        try:
-            sf.Estimate.load(path)
-        except ValueError as error:
-            assert str(error).startswith(str(path)), number
+        if is_refused(path, number):
             refused += 1
             continue
-        except Exception as error:
-            raise AssertionError(f"mutation {number}") from error
         try:
             with warnings.catch_warnings():
                 # Numbers near the limits of float64 may overflow, which NumPy says; nothing else may be said.
@@ -149,12 +156,5 @@ def test_a_file_with_damaged_bytes_is_refused_or_can_be_used(count, tmp_path):
         else:
             data[a:b] = bytes(b - a)
         path.write_bytes(data)
-        try:
-            sf.Estimate.load(path)
-        except ValueError as error:
-            assert str(error).startswith(str(path)), number
-            continue
-        except Exception as error:
-            raise AssertionError(f"damage {number}") from error
-        if number % 5 == 0:
+        if not is_refused(path, number) and number % 5 == 0:
             use(path, tmp_path)

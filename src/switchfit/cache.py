@@ -94,8 +94,8 @@ def others_may_write(found: os.stat_result) -> str:
 @cache
 def _warn_once(path: Path, reason: str) -> None:
     warnings.warn(
-        f"The cache folder {path} is not used, since what is in it is run: {reason}. Delete it, or name one of your own "
-        "with the environment variable SWITCHFIT_CACHE. Until then everything is compiled anew.",
+        f"The cache folder {path} is not used, since what is in it is run: {reason}. Delete it, or name one of your "
+        "own with the environment variable SWITCHFIT_CACHE. Until then everything is compiled anew.",
         stacklevel=2,
     )
 

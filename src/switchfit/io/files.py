@@ -88,6 +88,22 @@ def _delete_abandoned(folder: Path) -> None:
                 os.unlink(name)
 
 
+def is_regular(path: Path) -> bool:
+    """Whether there is a file of that name; False for names that no file can have."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # too long; a null character
+        return False
+
+
+def is_device(path: Path) -> bool:
+    """Whether it is a device, such as a terminal or ``/dev/zero``, which can be read without end."""
+    try:
+        return path.is_char_device() or path.is_block_device()
+    except (OSError, ValueError):
+        return False
+
+
 def set_aside(path: Path, reason: str, remedy: str) -> None:
     """Rename a damaged file to ``NAME.damaged`` (``.damaged-2``, ... if there is one), and warn.
 
