@@ -144,7 +144,7 @@ def _digest(entry: dict[str, Any]) -> str:
 
 
 def _earlier(path: Path) -> dict[str, Any]:
-    """Results of parts that were run before; none if there are none, or the file is damaged, which is then set aside."""
+    """Results of parts that were run before; none if the file is missing, or damaged and therefore set aside."""
     try:
         earlier = json.loads(path.read_bytes())
     except FileNotFoundError:
