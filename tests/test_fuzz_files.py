@@ -163,7 +163,7 @@ def outcome(*arguments: str) -> str:
         signal.signal(signal.SIGALRM, before)
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         return "".join(traceback.format_exception(result.exception))
-    if result.exit_code not in (0, 1, 2) or "Traceback" in result.stderr:
+    if result.exit_code not in (0, 1, 2) or ("Traceback" in result.stderr and "--debug" not in arguments):
         return f"exit code {result.exit_code}\n{result.stderr}"
     if result.exit_code and not result.stderr.strip():
         return f"exit code {result.exit_code} without a word"
@@ -254,3 +254,26 @@ def test_toml_is_written_as_it_is_read():
     content = {"a": [1, 2.5, 1e30, float("inf"), True, "é\n\x7f", {"b.c": []}]}
     assert tomllib.loads(file_of(content)) == content
     assert np.isnan(tomllib.loads(file_of({"a": float("nan")}))["a"])
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("problem.toml", "a = " + "[" * 5000, "problem.toml is not valid TOML: brackets are nested too deep"),
+        ("problem.toml", "a = 1" + "0" * 5000, "problem.toml is not valid TOML: Exceeds the limit"),
+        ("problem.toml", PROBLEM.replace('"log.csv"', '"/dev/zero"'), "/dev/zero is a device; name a CSV file"),
+        ("problem.toml", PROBLEM.replace('"log.csv"', '"a\\u0000b"'), "is no name of a file"),
+        ("problem.toml", PROBLEM.replace("room.py:room", "x" * 5000 + ".py:room"), "there is no file"),
+        ("log.csv", "t,T\n0,1\n1," + "x" * 200_000, "log.csv, line 3: field larger than field limit"),
+        ("log.csv", "t,T\n0,1\n1,2_0\n", "log.csv, line 3, column 'T': '2_0' is not a number"),
+        ("log.csv", '# a\nt,T\n0,1\n\n1,"2\n2,3"\n3,a\n', "log.csv, line 6, column 'T': '22,3' is not a number"),
+    ],
+)
+def test_what_no_reader_expects(name, content, message, folder):
+    (folder / name).write_text(content)
+    for command in (("check", "problem.toml"), ("check", "problem.toml", "--no-run")):
+        result = CliRunner().invoke(cli.app, command)
+        assert result.exit_code == 2, result.exception
+        assert message in result.stderr
+        assert "Traceback" not in result.stderr
+    assert outcome("check", "/dev/zero") == "2"
