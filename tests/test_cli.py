@@ -279,6 +279,16 @@ def test_ctrl_c_is_an_interrupt_wherever_it_comes(tmp_path):
     assert result.stderr == "switchfit: interrupted before there was anything to write.\n"
 
 
+def test_ctrl_c_that_is_ignored_stays_so(folder, monkeypatch):
+    """As in a background job of a shell script."""
+    monkeypatch.setattr(sf, "check_derivatives", lambda problem: signal.raise_signal(signal.SIGINT) or 1 / 0)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert run("check", folder / "problem.toml").exit_code == 3
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def test_check_without_running_the_model(folder, tmp_path):
     (tmp_path / "log.csv").write_text((folder / "log.csv").read_text())
     (tmp_path / "room.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")

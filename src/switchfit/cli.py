@@ -255,11 +255,12 @@ def _explain(error: BaseException, *, users: bool, debug: bool) -> NoReturn:
 
 @contextlib.contextmanager
 def _handle_interrupt(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-    """Context in which Ctrl-C calls a handler; only the main thread can have one."""
-    if threading.current_thread() is not threading.main_thread():
+    """Context in which Ctrl-C calls a handler; not where it is ignored, nor outside the main thread, which has them."""
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before in (signal.SIG_IGN, None):
         yield
         return
-    before = signal.signal(signal.SIGINT, handler)
+    signal.signal(signal.SIGINT, handler)
     try:
         yield
     finally:
