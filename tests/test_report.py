@@ -104,11 +104,13 @@ def several(count: int, names=None) -> Fit:
         lower=np.full(count + 1, -np.inf),
         upper=np.full(count + 1, np.inf),
         transition_times=tuple(np.array([3.0 + 0.1 * e, 7.0]) for e in range(count)),
+        gradient=np.zeros(count + 1),
         hessian=np.diag(np.linspace(100.0, 400.0, count + 1)),
         free_basis=np.eye(count + 1),
         trajectories=trajectories,
         comparisons=tuple((comparison_of(t, names=("X", "dX")),) for t in trajectories),
         cost=29.0 * count,
+        history=tuple(IterationRecord(k, 900.0 / (k + 1), 10.0**-k, 1.0, theta, k + 1) for k in range(3)),
     )
 
 

@@ -369,7 +369,11 @@ def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:
         return nothing
     reduced = Z.T @ hessian @ Z
     size = 1 / np.sqrt(np.maximum(np.abs(np.diag(reduced)), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(reduced * np.outer(size, size))
+    with np.errstate(over="ignore", invalid="ignore"):
+        scaled = reduced * np.outer(size, size)
+    if not np.isfinite(scaled).all():  # numbers near the limits of float64
+        return nothing
+    values, vectors = np.linalg.eigh(scaled)
     if len(values) and values[0] <= 1e-14:
         return nothing
     root = Z @ (size[:, None] * vectors / np.sqrt(values))

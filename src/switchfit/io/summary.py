@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from switchfit.data import Measurements, ReferenceSignal
@@ -17,10 +19,7 @@ def describe(problem: Problem) -> str:
     ----------
     problem : Problem
     """
-    lines = []
-    for k, experiment in enumerate(problem.experiments, start=1):
-        lines.append(f"Experiment {k}{f' ({experiment.name})' if experiment.name else ''}")
-        lines += [f"  {line}" for line in _experiment_lines(experiment)]
+    lines = [describe_experiments(problem.experiments)]
     unknowns = problem.unknowns
     width = max(len(name) for name in unknowns.names)
     lines.append("Unknowns, first guess and bounds")
@@ -31,6 +30,20 @@ def describe(problem: Problem) -> str:
         bounds = "" if np.isinf(lower) and np.isinf(upper) else f"   in [{lower:.6g}, {upper:.6g}]"
         known = f"   prior: {prior}" if prior else ""
         lines.append(f"  {name:<{width}}  {value:.6g}{unit}{bounds}{known}{'   (log scale)' if log else ''}")
+    return "\n".join(lines)
+
+
+def describe_experiments(experiments: Sequence[Experiment]) -> str:
+    """Modes, horizon and data of experiments as text.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+    """
+    lines = []
+    for k, experiment in enumerate(experiments, start=1):
+        lines.append(f"Experiment {k}{f' ({experiment.name})' if experiment.name else ''}")
+        lines += [f"  {line}" for line in _experiment_lines(experiment)]
     return "\n".join(lines)
 
 
