@@ -1,8 +1,8 @@
-"""Numbers that lost digits in single precision before switchfit saw them.
+"""Numbers in single precision inside the user's functions.
 
 Outside switchfit JAX computes in 32 bits, so that ``K = jnp.array(0.1)`` is 0.10000000149011612: a fit with it is exact
-for another problem. An array of less than double precision passes where nothing was lost, that is where each number is
-the double that its shortest decimal text stands for (0.5, 3.0); everything else is refused with its name.
+for another problem. Constants that a function reads, and numbers that it makes of them, have to pass
+`switchfit.validation.refuse_single_precision`; what depends on t, x or p must not be cast at all.
 """
 
 from __future__ import annotations
@@ -11,39 +11,18 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax._src import source_info_util
 from jax.extend import core as jex
 
 from switchfit.reads import named_values
+from switchfit.validation import is_low_precision, refuse_single_precision
 
 MOVES = frozenset(
     {"slice", "squeeze", "reshape", "broadcast_in_dim", "transpose", "concatenate", "rev", "gather", "stack", "copy"}
     | {"dynamic_slice", "expand_dims", "select_n", "split", "unstack", "stop_gradient", "pad", "tile", "copy_p"}
 )
 """Operations that compute nothing."""
-
-
-def is_short(dtype: Any) -> bool:
-    """Whether numbers of this type have fewer digits than a double."""
-    return bool(jnp.issubdtype(dtype, jnp.floating)) and jnp.finfo(dtype).bits < 64
-
-
-def first_loss(values: Any) -> tuple[str, str] | None:
-    """The first number that lost digits, as it was meant and as it is; None if there is none."""
-    if not isinstance(values, (np.ndarray, np.generic, jax.Array)) or not is_short(values.dtype):
-        return None
-    short = np.asarray(values).reshape(-1)
-    for first in range(0, len(short), 4096):  # most arrays show it at once
-        part = short[first : first + 4096]
-        meant = np.array([str(number) for number in part]).astype(np.float64)
-        there = part.astype(np.float64)
-        lost = np.flatnonzero((meant != there) & np.isfinite(there))
-        if len(lost):
-            k = lost[0]
-            return repr(float(meant[k])), repr(float(there[k]))
-    return None
 
 
 def refuse_single_precision_in(closed: Any, function: Any, what: str) -> None:
@@ -56,28 +35,18 @@ def refuse_single_precision_in(closed: Any, function: Any, what: str) -> None:
     what : str, such as "mode 'slip'"
     """
     for name, value in named_values(function).items():
-        loss = first_loss(value)
-        if loss is not None:
-            raise ValueError(_said(f"{what} uses the constant {name}", value, loss))
+        if isinstance(value, (np.ndarray, np.generic, jax.Array)):
+            refuse_single_precision(value, f"the constant {name} of {what}")
     if _has_short(closed.jaxpr, closed.consts):
         _Walk(what).through(closed.jaxpr, closed.consts, [None] * len(closed.jaxpr.invars))
 
 
-def _said(what: str, number: Any, loss: tuple[str, str]) -> str:
-    meant, there = loss
-    return (
-        f"{what}, which is in single precision ({number.dtype}): {meant} became {there}, and the fit would be exact "
-        "for that. JAX makes such arrays outside switchfit; write constants as Python numbers, lists or NumPy arrays "
-        "(np.array), or make them inside the function."
-    )
-
-
 def _has_short(jaxpr: Any, consts: Sequence[Any]) -> bool:
-    if any(is_short(v.aval.dtype) for v in (*jaxpr.constvars, *jaxpr.invars) if hasattr(v.aval, "dtype")):
+    if any(is_low_precision(v.aval.dtype) for v in (*jaxpr.constvars, *jaxpr.invars) if hasattr(v.aval, "dtype")):
         return True
     for equation in jaxpr.eqns:
         for atom in (*equation.invars, *equation.outvars):
-            if is_short(getattr(atom.aval, "dtype", np.float64)):
+            if is_low_precision(getattr(atom.aval, "dtype", np.float64)):
                 return True
         if any(_has_short(inner.jaxpr, inner.consts) for inner in _inner(equation)):
             return True
@@ -128,7 +97,10 @@ class _Walk:
             for variable, result in zip(equation.outvars, results, strict=True):
                 if result is not None:
                     known[variable] = result
-                if is_short(getattr(variable.aval, "dtype", np.float64)) and equation.primitive.name not in MOVES:
+                if (
+                    is_low_precision(getattr(variable.aval, "dtype", np.float64))
+                    and equation.primitive.name not in MOVES
+                ):
                     if result is not None:
                         self.check(result, _where(equation))
                     elif not inner:
@@ -144,9 +116,7 @@ class _Walk:
 
     def check(self, number: Any, where: str = "") -> None:
         """ValueError if a known number lost digits."""
-        loss = first_loss(number)
-        if loss is not None:
-            raise ValueError(_said(f"{self.what} uses a constant{where}", number, loss))
+        refuse_single_precision(number, f"a constant of {self.what}{where}")
 
     def refuse_cast(self, variable: Any, equation: Any) -> None:
         raise ValueError(

@@ -158,7 +158,12 @@ class Problem:
     def __getstate__(self) -> dict[str, Any]:
         """What is pickled: the user's functions, and of their traces what identifies them."""
         state = {name: getattr(self, name) for name in GIVEN}
-        return state | {"digests": [structure.digests for structure in self.structures]}
+        return state | {"digests": self.digests}
+
+    @property
+    def digests(self) -> list[dict[str, str]]:
+        """What identifies the functions of each experiment in every process."""
+        return [structure.digests for structure in self.structures]
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Build the problem again; ValueError if a function does something else than when the problem was built."""

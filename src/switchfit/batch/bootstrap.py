@@ -352,6 +352,7 @@ class _Runs:
     def fingerprint(self) -> str:
         unknowns = self.problem.unknowns
         settings = self.seed, self.tolerance, self.max_iterations, unknowns.names, self.problem.solver
-        data = [item.values for run in self.problem.experiments for item in run.data]
-        nodes = [mesh.nodes for mesh in self.meshes]
-        return fingerprint("bootstrap of runs", settings, self.start, unknowns.lower, unknowns.upper, *nodes, *data)
+        leaves = jax.tree.leaves([self.problem.arguments(e, mesh) for e, mesh in enumerate(self.meshes)])
+        bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
+        model = self.problem.digests
+        return fingerprint("bootstrap of runs", settings, model, self.start, *bounds, *map(np.asarray, leaves))

@@ -145,8 +145,7 @@ class _Work:
         for problem in self.problems:
             leaves = jax.tree.leaves(tuple(evaluator_of(problem).arguments))
             parts += [problem.theta_names, problem.initial_theta, *problem.unknowns.priors, *map(np.asarray, leaves)]
-        first = self.problems[0]
-        parts.append(evaluator_of(first).cost(first.initial_theta))  # stands for the functions
+            parts.append(problem.digests)
         return fingerprint(*parts)
 
 

@@ -369,9 +369,10 @@ class _Work:
         data = [np.asarray(values) for items in self.clean for values in items if values is not None]
         drawn = list(self._noisy(0).values())  # stands for the noise, which may be a function
         settings = self.seed, self.tolerance, self.max_iterations, unknowns.names, self.problem.solver
+        model = self.problem.digests
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
         nodes = [mesh.nodes for mesh in self.meshes]
-        return fingerprint("monte carlo", settings, self.truth, self.start, *bounds, *nodes, *data, *drawn)
+        return fingerprint("monte carlo", settings, model, self.truth, self.start, *bounds, *nodes, *data, *drawn)
 
 
 def _with_values(item: Any, values: FloatArray) -> Any:

@@ -18,7 +18,7 @@ from switchfit.batch.fits import Fits, check_long_run, repeat, sample_count
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
 from switchfit.data import FloatArray
 from switchfit.estimate import Estimate, checked_settings, estimate
-from switchfit.evaluate import Evaluator, evaluator_of
+from switchfit.evaluate import evaluator_of
 from switchfit.mesh import Mesh
 from switchfit.optimize.qp import solve_qp
 from switchfit.parameter import unit_suffix
@@ -158,10 +158,7 @@ class _Work:
         unknowns = self.problem.unknowns
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
         leaves = jax.tree.leaves([self.problem.arguments(e, mesh) for e, mesh in enumerate(self.meshes)])
-        first = Evaluator(self.problem, meshes=self.meshes).cost(
-            self.starts[0]
-        )  # stands for the functions of the model
-        settings = self.tolerance, self.max_iterations, unknowns.names, first
+        settings = self.tolerance, self.max_iterations, unknowns.names, self.problem.digests
         return fingerprint("multistart", settings, self.starts, *bounds, *map(np.asarray, leaves))
 
 

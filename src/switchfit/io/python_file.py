@@ -61,7 +61,8 @@ def find_object(reference: str, folder: Path, what: str) -> tuple[Path, str]:
 def call(function: Any, what: str, **arguments: Any) -> Any:
     """Call a user's factory; InputError says where it failed."""
     try:
-        return function(**arguments)
+        with _double_precision():
+            return function(**arguments)
     except (InputError, KeyboardInterrupt):
         raise
     except BaseException as error:  # whatever a user's file raises, SystemExit among it
@@ -95,6 +96,13 @@ def user_place(error: BaseException | None) -> str | None:
     return f"{_files[frame.filename]}, line {frame.lineno}{inside}"
 
 
+def _double_precision() -> Any:
+    """Context in which what a file makes with jax.numpy is as precise as what it computes with later."""
+    import jax  # here, since a file that is only read needs none of it
+
+    return jax.enable_x64(True)
+
+
 #: Every file that was run, absolute -> as the user named it.
 _files: dict[str | None, Path] = {}
 
@@ -116,7 +124,8 @@ def _run(path: Path) -> Any:
     sys.modules[module.__name__] = module
     sys.path.insert(0, str(path.parent))
     try:
-        specification.loader.exec_module(module)
+        with _double_precision():
+            specification.loader.exec_module(module)
     except KeyboardInterrupt:
         raise
     except BaseException as error:
