@@ -15,6 +15,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -50,8 +51,8 @@ FROM_LIBM = {
 EFFORT = {"div": 4, "sqrt": 4, **dict.fromkeys(FROM_LIBM, 20)}
 """What operations cost where it is not about as much as an addition."""
 
-BUDGET = 2_000_000
-"""Work, in additions, after which a loop returns to Python, so that Ctrl-C is heard: it takes 1 to 20 ms."""
+BUDGET = 20_000_000
+"""Work, in additions, after which a loop returns to Python, so that Ctrl-C is heard: measured, it takes 2 to 10 ms."""
 
 
 def literal(number: float) -> str:
@@ -257,13 +258,21 @@ def compiled(text: str) -> Program:
     path = None if folder is None else folder / f"native-{key}"
     code = None if path is None else _read(path)
     if code is None:
-        code = machine.emit_object(llvm.parse_assembly(text))
+        code = _object_code(machine, text)
         if path is not None:
             _write(path, code)
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     return Program(engine, key)
+
+
+def _object_code(machine: Any, text: str) -> bytes:
+    """Compile in a thread: long functions take seconds, and the wait for a thread can be ended by Ctrl-C."""
+    executor = ThreadPoolExecutor(1)
+    future = executor.submit(lambda: bytes(machine.emit_object(llvm.parse_assembly(text))))
+    executor.shutdown(wait=False)
+    return future.result()
 
 
 def _write(path: Path, code: bytes) -> None:
