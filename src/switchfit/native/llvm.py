@@ -15,7 +15,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -272,6 +272,8 @@ def _object_code(machine: Any, text: str) -> bytes:
     executor = ThreadPoolExecutor(1)
     future = executor.submit(lambda: bytes(machine.emit_object(llvm.parse_assembly(text))))
     executor.shutdown(wait=False)
+    while not wait([future], timeout=0.1).done:  # on Windows a wait without an end cannot be interrupted
+        pass
     return future.result()
 
 
