@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
+import logging
+import signal
 import sys
+import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -17,6 +22,7 @@ import switchfit as sf
 from switchfit.evaluate import Evaluator, evaluator_of
 from switchfit.model import float64
 from switchfit.native import kernels, llvm
+from switchfit.native import program as program_module
 from switchfit.native.foreign import foreign_derivatives
 from switchfit.native.program import forget_programs, native_experiment
 from switchfit.native.scalars import Graph, Node
@@ -492,3 +498,140 @@ def _only_empty(parse):
         return parse(text)
 
     return checked
+
+
+# Which engine, and why
+
+
+def squared(t, x, p):
+    return -p["k"] * x
+
+
+def sorted_(t, x, p):
+    return -p["k"] * jnp.sort(x)
+
+
+def inner_sorted(t, x, p):
+    return jax.lax.cond(x[0] > 0, lambda x: -p["k"] * jnp.sort(x), lambda x: x, x)
+
+
+def fitted_with(mode, **settings):
+    data = settings.pop("data", sf.Measurements(TIMES, VALUES, sigma=1.0))
+    run = sf.Experiment(data, ("m",), (), 0.0, 3.0)
+    problem = sf.Problem(sf.HybridSystem({"m": mode}, [0.4, 0.1]), run, {"k": sf.Parameter(1.0)}, **settings)
+    return sf.estimate(problem, max_iterations=1)
+
+
+def line_of(function, text):
+    """The line of this file in which a function has a text."""
+    lines, first = inspect.getsourcelines(function)
+    return first + next(k for k, line in enumerate(lines) if text in line)
+
+
+def test_an_estimate_says_that_machine_code_evaluated_it(tmp_path):
+    estimate = fitted_with(squared)
+    assert (estimate.engine.name, estimate.engine.reason) == ("native", None)
+    assert "Evaluated in machine code." in str(estimate)
+    estimate.save(tmp_path / "fit.json")
+    assert sf.Estimate.load(tmp_path / "fit.json").engine == estimate.engine
+
+
+@pytest.mark.parametrize("mode", [sorted_, inner_sorted])
+def test_an_estimate_says_which_line_of_the_model_has_no_machine_code(mode, tmp_path, caplog):
+    forget_programs()
+    with caplog.at_level(logging.INFO, "switchfit"):
+        estimate = fitted_with(mode)
+    reason = f"mode 'm' calls jnp.sort (test_native.py:{line_of(mode, 'jnp.sort')})"
+    assert (estimate.engine.name, estimate.engine.reason) == ("jax", reason)
+    assert " ".join(str(estimate).split()).count(f"Evaluated by JAX: {reason}.") == 1
+    said = [record.getMessage() for record in caplog.records if record.name == "switchfit"]
+    assert said == [f"Evaluated by JAX: {reason}."] * len(said)
+    assert 1 <= len(said) <= 2, "once a program: without derivatives beside them, and with first ones"
+    estimate.save(tmp_path / "fit.json")
+    assert sf.Estimate.load(tmp_path / "fit.json").engine == estimate.engine
+
+
+def test_functions_of_jax_are_named_where_they_are_called():
+    """They are traced once for all callers: what they say of themselves is the line of the first."""
+
+    def first(x):
+        return jnp.sort(x)
+
+    def second(x):
+        return jnp.sort(x)
+
+    for function in (first, second):
+        with (
+            float64(),
+            pytest.raises(Unsupported, match=rf"calls jnp.sort \(test_native.py:{line_of(function, 'sort')}"),
+        ):
+            traced(lambda x, f=function: [f(x)], (4,))
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        ({"solver": "stiff"}, "solver='stiff' takes implicit steps"),
+        ({"data": sf.RunningCost(lambda t, x, p: jnp.median(x) ** 2)}, "mode 'm' or a running cost calls jnp.median"),
+        (
+            {"data": sf.Measurements(TIMES, VALUES, observe=lambda t, x, p: jnp.sort(x), sigma=1.0)},
+            "observe of Measure",
+        ),
+        ({"data": sf.TerminalCost(lambda x, p: jnp.max(jnp.sort(x)))}, "a terminal cost calls jnp.sort"),
+        (
+            {"data": [sf.RunningCost(lambda t, x, p: x @ x), sf.TerminalConstraint(lambda x, p: x[0] - 0.3)]},
+            "guards and terminal constraints have no machine code",
+        ),
+    ],
+    ids=["stiff", "running cost", "observe", "terminal cost", "constraint"],
+)
+def test_other_reasons_for_jax(settings, reason):
+    data = settings.get("data", sf.Measurements(TIMES, VALUES, sigma=1.0))
+    run = sf.Experiment(data, ("m",), (), 0.0, 3.0)
+    solver = settings.get("solver", "explicit")
+    problem = sf.Problem(sf.HybridSystem({"m": squared}, [0.4, 0.1]), run, {"k": sf.Parameter(1.0)}, solver=solver)
+    assert evaluator_of(problem).engine.name == "jax"
+    assert evaluator_of(problem).engine.reason.startswith(reason)
+
+
+@pytest.mark.parametrize("place", ["_write", "compiled"])
+@pytest.mark.parametrize("error", [KeyError("add"), TypeError("truth"), RuntimeError("LLVM IR parsing error")])
+def test_a_defect_of_ours_falls_back_and_says_so(place, error, monkeypatch):
+    def fails(*_):
+        raise error
+
+    forget_programs()
+    monkeypatch.setattr(program_module, place, fails)
+    estimate = fitted_with(squared)
+    assert estimate.engine.name == "jax"
+    assert estimate.engine.reason == f"internal: {type(error).__name__}: {error}"
+    assert estimate.iterations == 1
+    monkeypatch.undo()
+    forget_programs()
+
+
+def test_a_program_that_is_compiled_can_be_interrupted(monkeypatch):
+    """Compiling takes seconds for long functions: the wait for it ends with Ctrl-C."""
+    forget_programs()
+    monkeypatch.setenv("SWITCHFIT_CACHE", "off")
+    begun, done = threading.Event(), []
+    parse = llvm.llvm.parse_assembly
+
+    def slow(text):
+        begun.set()
+        time.sleep(1.5)
+        done.append(True)
+        return parse(text)
+
+    def ctrl_c():
+        begun.wait()
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+    monkeypatch.setattr(llvm.llvm, "parse_assembly", slow)
+    problem = problem_of("plain")
+    threading.Thread(target=ctrl_c).start()
+    with pytest.raises(KeyboardInterrupt):
+        Evaluator(problem)
+    assert not done, "not heard before the code was there"
+    monkeypatch.undo()
+    forget_programs()

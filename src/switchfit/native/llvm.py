@@ -13,6 +13,7 @@ import struct
 import sys
 import threading
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from typing import Any
 
@@ -47,8 +48,8 @@ FROM_LIBM = {
 EFFORT = {"div": 4, "sqrt": 4, **dict.fromkeys(FROM_LIBM, 20)}
 """What operations cost where it is not about as much as an addition."""
 
-BUDGET = 2_000_000
-"""Work, in additions, after which a loop returns to Python, so that Ctrl-C is heard: it takes 1 to 20 ms."""
+BUDGET = 20_000_000
+"""Work, in additions, after which a loop returns to Python, so that Ctrl-C is heard: measured, it takes 2 to 10 ms."""
 
 
 def literal(number: float) -> str:
@@ -254,13 +255,23 @@ def compiled(text: str) -> Program:
     path = None if folder is None else folder / f"native-{key}"
     code = None if path is None else read_code(path)
     if code is None:
-        code = machine.emit_object(llvm.parse_assembly(text))
+        code = _object_code(machine, text)
         if path is not None:
             write_code(path, code)
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     return Program(engine, key)
+
+
+def _object_code(machine: Any, text: str) -> bytes:
+    """Compile in a thread: long functions take seconds, and the wait for a thread can be ended by Ctrl-C."""
+    executor = ThreadPoolExecutor(1)
+    future = executor.submit(lambda: bytes(machine.emit_object(llvm.parse_assembly(text))))
+    executor.shutdown(wait=False)
+    while not wait([future], timeout=0.1).done:  # on Windows a wait without an end cannot be interrupted
+        pass
+    return future.result()
 
 
 @cache

@@ -144,23 +144,24 @@ class Node:
         return self.graph.apply("neg", self)
 
 
+TYPES = {op: (op in LOGIC, op in LOGIC or op in COMPARISONS) for op in FOLDED if op != "select"}
+"""Whether an operation takes truth values, and whether it yields one."""
+
+
 def _is_truth(op: str, args: tuple[Any, ...]) -> bool:
     """Return whether an operation yields a truth value; raise TypeError if its arguments have the wrong type for it."""
-    if op in ("load", "unit", "zeros"):
-        return False
-    if op == "const":
-        return isinstance(args[0], bool)
-    given = [a.truth for a in args]
+    types = TYPES.get(op)
+    if types is not None:
+        for a in args:
+            if a.truth is not types[0]:
+                raise TypeError(f"{op} does not take {'a truth value' if a.truth else 'a double'}")
+        return types[1]
     if op == "select":
-        condition, *cases = given
-        if not condition or cases[0] != cases[1]:
-            raise TypeError(f"select of {given}: it takes a truth value, then two cases of one type")
-        return cases[0]
-    if any(truth != (op in LOGIC) for truth in given):
-        raise TypeError(
-            f"{op} does not take {' and '.join('a truth value' if truth else 'a double' for truth in given)}"
-        )
-    return op in LOGIC or op in COMPARISONS
+        condition, yes, no = args
+        if not condition.truth or yes.truth is not no.truth:
+            raise TypeError("select takes a truth value, then two cases of one type")
+        return bool(yes.truth)
+    return op == "const" and isinstance(args[0], bool)
 
 
 class Graph:
@@ -202,7 +203,7 @@ class Graph:
     def apply(self, op: str, *given: Any) -> Node:
         """The node of an operation; it may be an older or a simpler one."""
         args = tuple(a if isinstance(a, Node) else self.constant(a) for a in given)
-        if all(a.op == "const" for a in args):
+        if args[0].op == "const" and all(a.op == "const" for a in args):
             with np.errstate(all="ignore"):
                 return self.constant(FOLDED[op](*(a.args[0] for a in args)))
         simpler = self._simpler(op, args)

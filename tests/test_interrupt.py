@@ -1,0 +1,189 @@
+"""Ctrl-C is heard while machine code runs, and no loop in it goes on for ever."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from systems import NODES, P0, case, problem_of
+
+import switchfit as sf
+from switchfit.evaluate import evaluator_of
+from switchfit.native import driver, program
+from switchfit.native.program import forget_programs, native_experiment
+from switchfit.refine import refined_mesh
+from switchfit.simulate import runs_of
+
+SLOW = """
+import sys, time
+import jax
+import jax.numpy as jnp
+import numpy as np
+import switchfit as sf
+
+def slow(t, x, p):
+    term = lambda c, k: (jnp.sin(c + p["a"]) * x[0] / k, None)
+    return jnp.stack([jax.lax.scan(term, x[0], jnp.arange(1.0, 25.0))[0]])
+
+times = np.linspace(0.0, 3.0, 500_000)
+data = sf.Measurements(times, np.zeros((len(times), 1)), sigma=1.0)
+problem = sf.Problem(sf.HybridSystem({"slow": slow}, [0.4]), sf.Experiment(data, ("slow",), (), 0.0, 3.0), {"a": 1.0})
+assert sf.evaluate(problem).cost > 0  # everything is compiled now
+began = time.perf_counter()
+sf.evaluate(problem)
+print("seconds", time.perf_counter() - began, flush=True)
+try:
+    while True:
+        print("again", flush=True)
+        sf.WHAT(problem)
+except KeyboardInterrupt:
+    print("heard", time.monotonic(), flush=True)
+"""
+
+
+def next_word(process, word):
+    """The rest of the next line that the process writes, which must begin with a word."""
+    line = process.stdout.readline()
+    if not line.startswith(word):
+        raise AssertionError(f"{line!r}, not {word}: {process.stderr.read()}")
+    return line[len(word) :]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["evaluate", "simulate", "estimate"])
+def test_ctrl_c_is_heard_during_machine_code(what):
+    """One evaluation takes much longer than the delay that is allowed."""
+    script = SLOW.replace("WHAT", what)
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", script], stdout=pipe, stderr=pipe, text=True) as process:
+        assert float(next_word(process, "seconds")) > 1.5
+        next_word(process, "again")
+        time.sleep(0.4)
+        sent = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        heard = float(next_word(process, "heard"))
+        process.kill()
+    assert heard - sent < 0.5
+
+
+@pytest.fixture
+def row_by_row(monkeypatch):
+    """Machine code that returns to Python after each row, sample and step."""
+
+    def switch():
+        forget_programs()
+        monkeypatch.setattr(program, "BUDGET", 1)
+        monkeypatch.setattr(driver, "BUDGET", 1)
+
+    yield switch
+    monkeypatch.undo()
+    forget_programs()
+
+
+@pytest.mark.parametrize("tau", [[0.413, 0.791, 1.336], NODES[[4, 4, 13]]])
+def test_evaluations_row_by_row_are_the_same_bit_by_bit(tau, row_by_row):
+    this = case("resets")
+    arguments = this.arguments()
+    given = np.asarray(tau, float), np.asarray(P0, float)
+    nodes = np.unique(np.asarray(arguments.nodes))
+
+    def found():
+        orders = [native_experiment(this.structure, arguments, nodes, order) for order in (0, 1, 2)]
+        simulated = orders[2].simulated(*given)
+        seen = orders[2].outputs(simulated.times, simulated.states, given[1], simulated.tangents)
+        return [orders[0].cost(*given), *orders[1](*given, 1.0), *orders[2](*given, -1.0), *simulated, *seen]
+
+    expected = found()
+    row_by_row()
+    for one, other in zip(found(), expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_meshes_step_by_step_are_the_same(row_by_row):
+    problem = problem_of("resets")
+    theta = problem.initial_theta
+    expected = refined_mesh(problem, 0, theta)
+    (cost,) = (run.cost for run in runs_of(problem, theta, [expected]))
+    row_by_row()
+    np.testing.assert_array_equal(refined_mesh(problem, 0, theta).times, expected.times)
+    assert [run.cost for run in runs_of(problem, theta, [expected])] == [cost]
+
+
+def test_an_evaluation_that_was_interrupted_leaves_nothing_behind(row_by_row):
+    row_by_row()
+    evaluator = evaluator_of(problem_of("resets"))
+    theta = evaluator.problem.initial_theta
+    expected = evaluator(theta)
+    (native,) = evaluator._natives(2)
+    whole, calls = native._evaluate, []
+
+    def interrupted(*given):
+        calls.append(whole(*given))
+        if len(calls) == 7:
+            raise KeyboardInterrupt
+
+    native._evaluate = interrupted
+    with pytest.raises(KeyboardInterrupt):
+        evaluator(theta + 0.01)
+    native._evaluate = whole
+    again = evaluator(theta)
+    assert again.cost == expected.cost
+    np.testing.assert_array_equal(again.hessian, expected.hessian)
+
+
+WRONG = {
+    "nan": lambda t, x, p: jnp.sqrt(x - 2.0) * p["a"],
+    "infinite": lambda t, x, p: p["a"] / (x - 1.0),
+    "nan later": lambda t, x, p: jnp.where(t < 0.5, -p["a"] * x, jnp.nan),
+    "infinite later": lambda t, x, p: jnp.where(t < 0.5, -p["a"] * x, jnp.inf),
+    "huge": lambda t, x, p: 1e300 * p["a"] * x,
+    "grows": lambda t, x, p: 50.0 * p["a"] * x**3,
+}
+
+NO_SCALAR_FORM = {name: (lambda t, x, p, f=f: jnp.sort(f(t, x, p))) for name, f in WRONG.items()}
+
+SCRIPT = """
+import sys, warnings
+sys.path.insert(0, sys.argv[1])
+warnings.simplefilter("error")
+import switchfit as sf
+import test_interrupt
+modes = getattr(test_interrupt, sys.argv[2])
+for name, mode in modes.items():
+    data = sf.Measurements([0.5, 1.0], [1.0, 1.0], sigma=1.0)
+    try:
+        run = sf.Experiment(data, (name,), (), 0.0, 1.0)
+        sf.simulate(sf.Problem(sf.HybridSystem({name: mode}, [1.0]), run, {"a": 1.0}))
+        print(f"{name}: simulated")
+    except ValueError as error:
+        print(f"{name}: {error}")
+"""
+
+
+@pytest.mark.parametrize("modes", ["WRONG", "NO_SCALAR_FORM"])
+def test_a_wrong_mode_is_refused_in_words(modes, request):
+    """In another process, since a loop that does not end in machine code cannot be stopped."""
+    given = [sys.executable, "-c", SCRIPT, str(request.path.parent), modes]
+    done = subprocess.run(given, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    said = dict(line.split(": ", 1) for line in done.stdout.splitlines())
+    assert list(said) == list(WRONG)
+    for name, message in said.items():
+        assert f"mode '{name}'" in message
+        assert " t = " in message
+        assert "x = [" in message
+    assert "returned [nan] at t = 0, x = [1.0]" in said["nan"]
+    assert "returned [inf] at t = 0, x = [1.0]" in said["infinite"]
+    assert "returned [nan] at t = 0.5" in said["nan later"]
+
+
+def test_a_first_slope_that_is_not_finite_is_refused():
+    run = sf.Experiment(sf.Measurements([1.0], [1.0], sigma=1.0), ("m",), (), 0.0, 1.0)
+    problem = sf.Problem(sf.HybridSystem({"m": WRONG["infinite"]}, [1.0]), run, {"a": 1.0})
+    with pytest.raises(ValueError, match=r"mode 'm' returned \[inf\] at t = 0, x = \[1.0\]"):
+        sf.evaluate(problem)
