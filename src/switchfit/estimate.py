@@ -325,6 +325,7 @@ def _minimized_with_constraints(
         callback=callback,
         constraints=constraints_of(problem),
         breakpoints=evaluator.breakpoints(),
+        size=problem.sizes,
     )
     values, multipliers = found.constraints.tolist(), found.multipliers.tolist()
     return found.result, tuple(zip(names, values, multipliers, strict=True))

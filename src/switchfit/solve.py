@@ -99,6 +99,7 @@ def minimized(
         tolerance=tolerance,
         max_iterations=max_iterations,
         callback=told,
+        size=variables.sizes_inward(problem.sizes),
     )
     return result if identity else _result_outward(variables, constraints, result)
 

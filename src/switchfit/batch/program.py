@@ -168,7 +168,8 @@ def fit_chunk(
     size = max(count, chunk_size(lockstep))
     evaluator = Evaluator(problem, meshes=meshes)
     variables = unknowns.variables
-    constraints = (unknowns.A, unknowns.b, variables.inward(unknowns.lower), variables.inward(unknowns.upper))
+    bounds = variables.inward(unknowns.lower), variables.inward(unknowns.upper)
+    constraints = (unknowns.A, unknowns.b, *bounds, variables.sizes_inward(problem.sizes))
     with float64():
         given = (
             tuple(evaluator.arguments),

@@ -129,6 +129,26 @@ class LinearConstraints:
         identity = np.eye(self.size)
         return np.vstack([self.A, identity, -identity])
 
+    def exact_rows(self, index: NDArray[np.intp]) -> list[tuple[int, int, float]]:
+        """Of the given rows of A those that can hold with equality in floating point.
+
+        ``(i, -1, value)`` for a row that holds where theta_i is the value; ``(i, j, 0.0)`` for ``theta_i >= theta_j``.
+        """
+        return [self._exact[k] for k in index.tolist() if k in self._exact]
+
+    @cached_property
+    def _exact(self) -> dict[int, tuple[int, int, float]]:
+        found = {}
+        for k, (row, bound) in enumerate(zip(self.A, self.b.tolist(), strict=True)):
+            places = np.flatnonzero(row)
+            if np.any(np.abs(row[places]) != 1.0):
+                continue
+            if places.size == 1:
+                found[k] = (int(places[0]), -1, bound * float(row[places[0]]))
+            elif places.size == 2 and bound == 0.0 and row[places].sum() == 0.0:
+                found[k] = (int(np.argmax(row)), int(np.argmin(row)), 0.0)
+        return found
+
     def rows(self, index: NDArray[np.intp]) -> FloatArray:
         """The normals at the given places, shape (k, d)."""
         m, d = self.b.size, self.size

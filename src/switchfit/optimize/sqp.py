@@ -265,6 +265,7 @@ class _Problem:
     labels: FloatArray | None  # of the blocks, where the Hessian is cut into blocks
     tolerance: float
     max_iterations: int
+    size: FloatArray  # typical size of each coordinate, zero where only its values tell
 
     @property
     def uses_hessian(self) -> bool:
@@ -413,7 +414,7 @@ class _Oracle:
                 return None
             minus = other
         constraints = self.problem.constraints
-        rounding = constraints.rounding(np.maximum(scale, np.abs(theta)))
+        rounding = constraints.rounding(np.maximum(np.maximum(scale, self.problem.size), np.abs(theta)))
         active = np.flatnonzero(constraints.slack(theta) <= rounding)
         optimality, values, downhill = _first_order(plus, minus, kink, side, constraints.rows(active))
         multipliers = np.zeros(len(constraints.names))
@@ -789,10 +790,15 @@ def _blind_step(oracle: _Oracle, state: _State, direction: _Direction) -> _Accep
 
 
 def _move(problem: _Problem, theta: FloatArray, step: FloatArray) -> FloatArray:
-    """theta + step, feasible, and bit for bit on a bound or breakpoint that it reaches up to rounding."""
+    """theta + step, feasible, and bit for bit on a bound, breakpoint or row that it reaches up to rounding.
+
+    Rounding is measured by the typical size of an unknown too: a time that is 1e-30 after the start of the horizon is
+    at its start, and no step along it could ever be told from none.
+    """
     lower, upper = problem.constraints.lower, problem.constraints.upper
     moved = theta + step
-    near = 8 * EPS * (step != 0.0) * np.maximum(np.maximum(np.abs(theta), np.abs(step)), np.abs(moved))
+    reach = np.maximum(np.maximum(np.abs(theta), np.abs(step)), np.abs(moved))
+    near = 8 * EPS * np.maximum((step != 0.0) * reach, problem.size)
     pinned = np.zeros(theta.size, dtype=bool)
     for i, points in problem.breakpoints:
         mark = _nearest(points, moved[i])
@@ -801,7 +807,34 @@ def _move(problem: _Problem, theta: FloatArray, step: FloatArray) -> FloatArray:
     moved = np.where(moved - near <= lower, lower, np.where(moved + near >= upper, upper, moved))
     if problem.constraints.b.size == 0:
         return moved
-    return _repair(problem.constraints, moved, pinned | (moved == lower) | (moved == upper))
+    pinned |= (moved == lower) | (moved == upper)
+    return _snap_to_rows(problem, _repair(problem.constraints, moved, pinned), pinned)
+
+
+def _snap_to_rows(problem: _Problem, theta: FloatArray, pinned: NDArray[np.bool_]) -> FloatArray:
+    """theta with the slack of each row that is nothing but rounding removed, where that can be done exactly.
+
+    It can where a row bounds one coordinate, ``+-theta_i >= b``, or keeps two in order, ``theta_i - theta_j >= 0``.
+    """
+    constraints = problem.constraints
+    slack = constraints.A @ theta - constraints.b
+    close = (slack != 0.0) & (np.abs(slack) <= constraints.rounding(problem.size)[: slack.size])
+    if not close.any():
+        return theta
+    snapped, fixed = theta.copy(), pinned.copy()
+    for _ in range(theta.size):  # a coordinate that moved may have left the row before
+        before = snapped.copy()
+        for i, j, bound in constraints.exact_rows(np.flatnonzero(close)):
+            if j < 0:
+                snapped[i], fixed[i] = bound, True
+            elif fixed[i] and not fixed[j]:
+                snapped[j], fixed[j] = snapped[i], True
+            elif not fixed[i]:
+                snapped[i], fixed[i] = snapped[j], fixed[j]
+        if np.array_equal(snapped, before):
+            break
+    snapped = np.clip(snapped, constraints.lower, constraints.upper)
+    return snapped if _violation(constraints, snapped) <= _violation(constraints, theta) else theta
 
 
 def _repair(constraints: LinearConstraints, theta: FloatArray, pinned: NDArray[np.bool_]) -> FloatArray:
@@ -994,6 +1027,7 @@ def minimize(
     tolerance: float = 1e-7,
     max_iterations: int = 200,
     callback: Callback | None = None,
+    size: ArrayLike | None = None,
 ) -> Result:
     """Minimise a piecewise smooth cost under linear constraints; every iterate is feasible.
 
@@ -1023,6 +1057,9 @@ def minimize(
     max_iterations : int
     callback : callable, optional
         Gets an `IterationRecord` after every iteration; a true return value stops with ``INTERRUPTED``.
+    size : array, shape (d,), optional
+        Typical size of each unknown, of which rounding is a part: for a time, the length of the horizon, however
+        small the time itself. Left out, the unknown's own values say it.
 
     Returns
     -------
@@ -1040,7 +1077,7 @@ def minimize(
     breakpoint. The rate is quadratic with the exact Hessian if the second-order sufficient conditions hold.
     """
     start = np.atleast_1d(np.asarray(theta0, dtype=float)).copy()
-    problem = _make_problem(evaluate, start, constraints, breakpoints, hessian, blocks, tolerance, max_iterations)
+    problem = _make_problem(evaluate, start, constraints, breakpoints, hessian, blocks, tolerance, max_iterations, size)
     theta = _feasible_start(problem, start)
     oracle = _Oracle(problem)
     point = oracle.point(theta, np.abs(theta))
@@ -1070,6 +1107,7 @@ def _make_problem(
     blocks: ArrayLike | None,
     tolerance: float,
     max_iterations: int,
+    size: ArrayLike | None,
 ) -> _Problem:
     """The problem with all settings checked."""
     d = constraints.size
@@ -1089,6 +1127,7 @@ def _make_problem(
         labels=_labels(hessian, blocks, d),
         tolerance=tolerance,
         max_iterations=max_iterations,
+        size=np.zeros(d) if size is None else np.broadcast_to(np.asarray(size, dtype=float), (d,)),
     )
 
 

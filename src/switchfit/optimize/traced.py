@@ -37,12 +37,16 @@ TracedEvaluate = Callable[[Array], tuple[Array, Array, Array]]
 
 
 class Constraints(NamedTuple):
-    """``A theta >= b`` and bounds, infinite where there is none: (m, d), (m,), (d,), (d,)."""
+    """``A theta >= b`` and bounds, infinite where there is none: (m, d), (m,), (d,), (d,).
+
+    `size` (d,) is the typical size of each unknown, of which rounding is a part, as of `minimize`.
+    """
 
     A: Array
     b: Array
     lower: Array
     upper: Array
+    size: Array | float = 0.0
 
     def slack(self, theta: Array) -> Array:
         """Of rows, lower and upper bounds: (m + 2 d,)."""
@@ -214,7 +218,7 @@ def _not_begun(start: Array) -> _State:
 
 def _active(constraints: Constraints, theta: Array, scale: Array) -> Array:
     """Which constraints hold with equality up to rounding: (m + 2 d,) bool."""
-    size = jnp.maximum(scale, jnp.abs(theta))
+    size = jnp.maximum(jnp.maximum(scale, constraints.size), jnp.abs(theta))
     rows = 16 * EPS * (jnp.abs(constraints.b) + jnp.abs(constraints.A) @ size)
     return constraints.slack(theta) <= jnp.concatenate([rows, jnp.zeros(2 * theta.shape[0])])
 
