@@ -177,7 +177,7 @@ class Fit:
     @property
     def success(self) -> bool:
         """Whether the fit converged; with `Status.SINGULAR` to a point from which J is flat in some direction."""
-        return self.status.successful or self.status is Status.SINGULAR
+        return self.status.converged
 
     @property
     def trajectory(self) -> Trajectory:

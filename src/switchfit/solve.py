@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from switchfit.collapsed import idle_directions
 from switchfit.data import FloatArray, Measurements, TerminalConstraint
 from switchfit.evaluate import ArrowEvaluation, Evaluation, Evaluator
 from switchfit.hidden import refuse_hidden_switches
@@ -100,6 +101,7 @@ def minimized(
         max_iterations=max_iterations,
         callback=told,
         size=variables.sizes_inward(problem.sizes),
+        idle=lambda z: idle_directions(evaluator, z if identity else _outward(variables, constraints, z)),
     )
     return result if identity else _result_outward(variables, constraints, result)
 

@@ -85,7 +85,7 @@ class Fits:
     @cached_property
     def success(self) -> NDArray[np.bool_]:
         """Which of them converged: (R,)."""
-        good = [status.name for status in Status if status.successful or status is Status.SINGULAR]
+        good = [status.name for status in Status if status.converged]
         return np.isin(self.status, good)
 
     @property

@@ -29,18 +29,23 @@ from switchfit.mesh import Mesh
 from switchfit.model import Arguments, Structure, float64
 from switchfit.native.foreign import foreign_derivatives
 from switchfit.optimize import Status
+from switchfit.optimize.qp import nearest_feasible
 from switchfit.optimize.traced import Constraints, Outcome, minimize_traced
 from switchfit.optimize.variables import Variables
 from switchfit.priors import PriorTerms
 from switchfit.problem import Problem
 from switchfit.result import inverse_on
-from switchfit.solve import message_of, minimized
+from switchfit.solve import constraints_of, message_of, minimized
 
 CHUNK = 32
 """Fits that one call of the program takes on a CPU."""
 
 CHUNK_IN_LOCKSTEP = 1024
 """The same on a GPU, where they go in lockstep."""
+
+
+LONGEST_ERROR = 500
+"""Characters of an error that are listed."""
 
 
 class Varying(NamedTuple):
@@ -100,7 +105,7 @@ class Chunk(NamedTuple):
     status : (R,) str
         Name of the `Status`.
     message : (R,) str
-        Empty where the status is CONVERGED without an active constraint.
+        Empty where the status is CONVERGED without an active constraint; the error of a fit that ended with one.
     free : (R,) int
         Directions that constraints and kinks leave free; the covariance is of these.
     covariance : (R, d, d)
@@ -162,7 +167,7 @@ def fit_chunk(
         varying.places,
         lockstep,
         tolerance,
-        max_iterations,
+        max_iterations // 2,  # what it does not settle has as many left for the optimiser that finishes it
     )
     count = len(starts)
     size = max(count, chunk_size(lockstep))
@@ -180,8 +185,11 @@ def fit_chunk(
             _padded(variables.inward(np.asarray(starts)), size),
             count,
         )
-        with _compiling(layout, given):
-            outcome = jax.tree.map(lambda a: np.asarray(a)[:count], _fits(*given, layout=layout))
+        try:
+            with _compiling(layout, given):
+                outcome = jax.tree.map(lambda a: np.asarray(a)[:count], _fits(*given, layout=layout))
+        except Exception:  # of one fit, as where a function of the model calls back into Python: each by itself, then
+            outcome = _not_begun(np.asarray(starts, dtype=float))
     return _finished(problem, evaluator, varying, outcome, tolerance, max_iterations)
 
 
@@ -317,6 +325,20 @@ def _alike(layout: Layout, arguments: tuple[Arguments, ...]) -> list[list[int]]:
     return list(groups.values())
 
 
+def error_message(error: BaseException) -> str:
+    """What to list for a fit that ended with an error: its type and its first sentences on one line."""
+    text = " ".join(str(error).split())
+    return Status.ERROR.value.format(error=f"{type(error).__name__}: {text[:LONGEST_ERROR]}" if text else repr(error))
+
+
+def _not_begun(starts: FloatArray) -> Outcome:
+    """Outcomes of fits (R, d) that are all left to `minimize`."""
+    R, d = starts.shape
+    nothing, none = np.full(R, np.nan), np.zeros(R, dtype=int)
+    derivatives = np.full((R, d), np.nan), np.full((R, d, d), np.nan)
+    return Outcome(starts, nothing, *derivatives, nothing, none, none, np.zeros(R, dtype=bool))  # type: ignore[arg-type]  # NumPy's
+
+
 def _finished(
     problem: Problem,
     evaluator: Evaluator,
@@ -336,12 +358,19 @@ def _finished(
     base = tuple(evaluator.arguments)
     if settled.any():
         covariance[settled] = np.linalg.inv(found["hessian"][settled])
+    constraints = constraints_of(problem)
     for k in np.flatnonzero(~settled):
-        values = tuple(value[k] for value in varying.values)
-        with float64():
-            evaluator.replace_arguments(replaced(base, varying.places, [jnp.asarray(value) for value in values]))
-        left = max(max_iterations - int(found["iterations"][k]), 0)
-        result = minimized(evaluator, found["theta"][k], "exact", tolerance, left, None)
+        try:
+            values = tuple(value[k] for value in varying.values)
+            with float64():
+                evaluator.replace_arguments(replaced(base, varying.places, [jnp.asarray(value) for value in values]))
+            left = max_iterations - int(found["iterations"][k])
+            start = nearest_feasible(constraints, found["theta"][k])
+            result = minimized(evaluator, start, "exact", tolerance, left, constraints=constraints)
+        except Exception as error:  # whatever it is, it must not end the other fits
+            status[k], message[k] = Status.ERROR.name, error_message(error)
+            free[k] = 0
+            continue
         for name in ("theta", "cost", "gradient", "hessian", "optimality"):
             found[name][k] = getattr(result, name)
         result = replace(result, iterations=int(found["iterations"][k]) + result.iterations)

@@ -181,6 +181,25 @@ class LinearConstraints:
         return np.concatenate([rows, np.zeros(2 * self.size)])
 
 
+def nearest_feasible(constraints: LinearConstraints, theta: FloatArray) -> FloatArray:
+    """The feasible point nearest to theta (d,), up to rounding.
+
+    ``min ||s||²`` subject to ``N s >= -slack`` is a nonnegative least-squares problem ([1]_, chapter 23, section 4).
+    """
+    slack = constraints.slack(theta)
+    if np.all(slack >= 0.0):
+        return theta
+    kept = np.isfinite(slack)
+    normals = constraints.normals[kept]
+    size = float(np.max(-slack))
+    right = np.append(np.zeros(theta.size), 1.0)
+    found = nnls(np.vstack([normals.T, -slack[kept] / size]), right)[0]
+    residual = np.append(normals.T @ found, -slack[kept] @ found / size) - right
+    if not residual[-1] < 0.0:
+        raise ValueError("no point satisfies all the constraints")
+    return np.asarray(np.clip(theta - size * residual[:-1] / residual[-1], constraints.lower, constraints.upper))
+
+
 @dataclass(frozen=True, eq=False)
 class QPSolution:
     """Step d, shape (d,), and multipliers, shape (k,), of a quadratic programme with ``B d + g = Cᵀ multipliers``."""

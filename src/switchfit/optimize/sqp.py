@@ -120,15 +120,25 @@ class Status(Enum):
         "Converged, but the cost is flat to second order along {direction} (scaled eigenvalue "
         "{smallest_eigenvalue:.1e}): these unknowns are not identified. Fix one of them or add data."
     )
-
+    COLLAPSED = (
+        "Converged (optimality {optimality:.1e}), but a mode has no duration: the cost depends neither on where it "
+        "would stand nor on what acts in it alone, which is {idle}. Leave it out of mode_sequence, start elsewhere, or "
+        "give min_duration."
+    )
     INFEASIBLE = (
         "The constraints are not met: {violated}. Start nearer to a point that meets them, or check that one can."
     )
+    ERROR = "The fit ended with an error, and was left where it was. {error}"
 
     @property
     def successful(self) -> bool:
         """Whether the point is a local minimiser as far as second-order conditions can tell."""
         return self in (Status.CONVERGED, Status.CONVERGED_PRECISION, Status.CONVERGED_AT_KINK)
+
+    @property
+    def converged(self) -> bool:
+        """Whether the minimisation ended as it should: also where J is flat in some direction, or a mode collapsed."""
+        return self.successful or self in (Status.SINGULAR, Status.COLLAPSED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +171,7 @@ class IterationRecord:
 
 Callback = Callable[[IterationRecord], object]
 Evaluate = Callable[[FloatArray, int], Evaluation]
+Idle = Callable[[FloatArray], FloatArray]
 Index = NDArray[np.intp] | slice
 
 
@@ -203,6 +214,8 @@ class Result:
         The start and every iteration.
     violated : str
         Equality constraints that are not met, with their values.
+    idle : array, shape (k, d)
+        Directions along which J is constant, as the caller's `idle` says; they are not in `free_basis`.
     """
 
     theta: FloatArray
@@ -224,6 +237,7 @@ class Result:
     tolerance: float
     history: tuple[IterationRecord, ...]
     violated: str = ""
+    idle: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def successful(self) -> bool:
@@ -249,6 +263,7 @@ class Result:
             kinks=kinks,
             direction=direction,
             violated=self.violated,
+            idle=", ".join(f"theta[{i}]" for i in np.flatnonzero(np.any(self.idle != 0.0, axis=0))),
         )
         return sentence + (f" Active: {'; '.join(self.active)}." if self.active else "")
 
@@ -266,6 +281,7 @@ class _Problem:
     tolerance: float
     max_iterations: int
     size: FloatArray  # typical size of each coordinate, zero where only its values tell
+    idle: Idle | None
 
     @property
     def uses_hessian(self) -> bool:
@@ -295,6 +311,7 @@ class _Point:
     multipliers: FloatArray  # shape (m + 2 d,)
     downhill: NDArray[np.int_]  # like side, and for each kink the side to descend to, 0 to hold it
     curvatures: dict[bytes, _Curvature] = field(default_factory=dict)  # found already, by the constraints' places
+    idle: dict[str, FloatArray] = field(default_factory=dict)  # found already
 
     @property
     def cost(self) -> float:
@@ -539,14 +556,17 @@ def _finish(oracle: _Oracle, state: _State, status: Status) -> _State:
     """At a KKT point: leave a saddle if possible, otherwise classify the point by its free curvature."""
     problem = oracle.problem
     if problem.uses_hessian or _is_finite(state.point.plus.hessian):
-        accepted = _escape(oracle, state) if state.iteration < problem.max_iterations else None
-        if accepted is not None:
-            return _advance(problem, state, accepted)
+        if state.iteration < problem.max_iterations:
+            accepted = _close_gaps(oracle, state) or _escape(oracle, state)
+            if accepted is not None:
+                return _advance(problem, state, accepted)
         curvature = _curvature(problem, state, state.point.active)
         if curvature.smallest < NEGATIVE_CURVATURE:
             return replace(state, status=Status.SADDLE)
         if curvature.smallest <= EIGENVALUE_FLOOR:
             return replace(state, status=Status.SINGULAR)
+        if len(_idle(problem, state)):
+            return replace(state, status=Status.COLLAPSED)
     return replace(state, status=Status.CONVERGED_AT_KINK if _genuine_kinks(state).any() else status)
 
 
@@ -811,20 +831,24 @@ def _move(problem: _Problem, theta: FloatArray, step: FloatArray) -> FloatArray:
     return _snap_to_rows(problem, _repair(problem.constraints, moved, pinned), pinned)
 
 
-def _snap_to_rows(problem: _Problem, theta: FloatArray, pinned: NDArray[np.bool_]) -> FloatArray:
-    """theta with the slack of each row that is nothing but rounding removed, where that can be done exactly.
+def _snap_to_rows(
+    problem: _Problem, theta: FloatArray, pinned: NDArray[np.bool_], reach: float = 16 * EPS
+) -> FloatArray:
+    """theta with the slack of each row removed that is at most `reach` of the size of the unknowns that it joins.
 
-    It can where a row bounds one coordinate, ``+-theta_i >= b``, or keeps two in order, ``theta_i - theta_j >= 0``.
+    Only of rows that can hold exactly: that bound one coordinate, ``+-theta_i >= b``, or keep two in order,
+    ``theta_i - theta_j >= 0``.
     """
     constraints = problem.constraints
     slack = constraints.A @ theta - constraints.b
-    close = (slack != 0.0) & (np.abs(slack) <= constraints.rounding(problem.size)[: slack.size])
-    if not close.any():
+    close = np.abs(slack) <= reach * (np.abs(constraints.A) @ problem.size)
+    if not slack[close].any():
         return theta
     snapped, fixed = theta.copy(), pinned.copy()
-    for _ in range(theta.size):  # a coordinate that moved may have left the row before
+    rows = sorted(constraints.exact_rows(np.flatnonzero(close)), key=lambda row: row[1] >= 0)
+    for _ in rows:  # a coordinate that moves may leave a row that held
         before = snapped.copy()
-        for i, j, bound in constraints.exact_rows(np.flatnonzero(close)):
+        for i, j, bound in rows:
             if j < 0:
                 snapped[i], fixed[i] = bound, True
             elif fixed[i] and not fixed[j]:
@@ -911,7 +935,7 @@ def _curvature_on(problem: _Problem, state: _State, rows: NDArray[np.intp]) -> _
             return found
         hessian = hessian.dense()
     free = np.flatnonzero(~held)
-    normals = problem.constraints.rows(rows)[:, free]
+    normals = np.vstack([problem.constraints.rows(rows), _idle(problem, state)])[:, free]
     basis = np.zeros((d, 0)) if free.size == 0 else np.eye(d)[:, free] @ split_space(normals)[0]
     count = basis.shape[1]
     if count == 0 or not np.isfinite(hessian).all():
@@ -927,6 +951,17 @@ def _curvature_on(problem: _Problem, state: _State, rows: NDArray[np.intp]) -> _
     return _Curvature(basis, np.asarray(values, dtype=float), unscaled, lowest / np.linalg.norm(lowest))
 
 
+def _idle(problem: _Problem, state: _State) -> FloatArray:
+    """Directions along which J is constant, (k, d): its curvature there is nothing but the error of its evaluation."""
+    point, d = state.point, state.point.theta.size
+    rows = point.active < problem.constraints.b.size
+    if problem.idle is None or not rows.any():
+        return np.zeros((0, d))
+    if "" not in point.idle:
+        point.idle[""] = np.asarray(problem.idle(point.theta.copy()), dtype=float).reshape(-1, d)
+    return point.idle[""]
+
+
 def _arrow_curvature(
     problem: _Problem, state: _State, rows: NDArray[np.intp], hessian: Arrow, held: NDArray[np.bool_]
 ) -> _Curvature | None:
@@ -935,7 +970,7 @@ def _arrow_curvature(
     None in all other cases, which are rare enough to be left to the algebra of full matrices.
     """
     m, d = problem.constraints.b.size, held.size
-    if np.any(rows < m) or not hessian.finite:
+    if np.any(rows < m) or not hessian.finite or len(_idle(problem, state)):
         return None
     held = held.copy()
     held[(rows - m) % d] = True
@@ -968,6 +1003,22 @@ def _smallest(matrix: Arrow, free: NDArray[np.bool_]) -> tuple[float, FloatArray
 def _reported_sides(point: _Point) -> NDArray[np.int_]:
     """The right-hand side for every coordinate on a breakpoint that has one."""
     return np.where(point.kink, 1, point.side)
+
+
+def _close_gaps(oracle: _Oracle, state: _State) -> _Accepted | None:
+    """The rows that the point misses by less than it is accurate to made to hold, if it stays as good a solution.
+
+    A mode that lasts a part of 1e-13 of the horizon has collapsed. Taken for one that has not, its two ends would be
+    free, and the curvature along them, which is that of J in its duration, may be negative.
+    """
+    problem, point = oracle.problem, state.point
+    theta = _snap_to_rows(problem, point.theta, np.zeros(point.theta.size, dtype=bool), NEGLIGIBLE_STEP)
+    if np.array_equal(theta, point.theta):
+        return None
+    closed = oracle.point(theta, state.scale)
+    if closed is None or closed.cost > point.cost + NOISE * abs(point.cost):
+        return None
+    return None if closed.optimality > max(problem.tolerance, point.optimality) else _Accepted(closed, 1.0)
 
 
 def _escape(oracle: _Oracle, state: _State) -> _Accepted | None:
@@ -1028,6 +1079,7 @@ def minimize(
     max_iterations: int = 200,
     callback: Callback | None = None,
     size: ArrayLike | None = None,
+    idle: Idle | None = None,
 ) -> Result:
     """Minimise a piecewise smooth cost under linear constraints; every iterate is feasible.
 
@@ -1060,6 +1112,9 @@ def minimize(
     size : array, shape (d,), optional
         Typical size of each unknown, of which rounding is a part: for a time, the length of the horizon, however
         small the time itself. Left out, the unknown's own values say it.
+    idle : callable, optional
+        ``idle(theta)`` returns directions (k, d) along which J is constant although derivatives, which have the error
+        of its evaluation, are not zero. It is called at solutions where a row of the constraints is active.
 
     Returns
     -------
@@ -1077,7 +1132,7 @@ def minimize(
     breakpoint. The rate is quadratic with the exact Hessian if the second-order sufficient conditions hold.
     """
     start = np.atleast_1d(np.asarray(theta0, dtype=float)).copy()
-    problem = _make_problem(evaluate, start, constraints, breakpoints, hessian, blocks, tolerance, max_iterations, size)
+    problem = _make_problem(evaluate, start, constraints, breakpoints, hessian, blocks, tolerance, max_iterations, size, idle)
     theta = _feasible_start(problem, start)
     oracle = _Oracle(problem)
     point = oracle.point(theta, np.abs(theta))
@@ -1108,6 +1163,7 @@ def _make_problem(
     tolerance: float,
     max_iterations: int,
     size: ArrayLike | None,
+    idle: Idle | None,
 ) -> _Problem:
     """The problem with all settings checked."""
     d = constraints.size
@@ -1128,6 +1184,7 @@ def _make_problem(
         tolerance=tolerance,
         max_iterations=max_iterations,
         size=np.zeros(d) if size is None else np.broadcast_to(np.asarray(size, dtype=float), (d,)),
+        idle=idle,
     )
 
 
@@ -1159,7 +1216,7 @@ def _feasible_start(problem: _Problem, theta: FloatArray) -> FloatArray:
         raise ValueError(f"theta0 is not finite: {theta}")
     slack = constraints.slack(theta)
     bounds = np.abs(np.concatenate([constraints.lower, constraints.upper]))
-    rows = np.abs(constraints.b) + np.abs(constraints.A) @ np.abs(theta)
+    rows = np.abs(constraints.b) + np.abs(constraints.A) @ np.maximum(np.abs(theta), problem.size)
     size = np.concatenate([rows, np.where(np.isfinite(bounds), bounds, 0.0)])
     violated = np.flatnonzero(slack < -1e-12 * (size + np.finfo(float).tiny))
     if violated.size:
@@ -1216,6 +1273,7 @@ def _result(oracle: _Oracle, state: _State, status: Status, history: tuple[Itera
         flat_direction=curvature.lowest,
         tolerance=problem.tolerance,
         history=history,
+        idle=_idle(problem, state),
     )
 
 

@@ -3,7 +3,7 @@
 It takes the steps of `switchfit.optimize.sqp` wherever these are of the ordinary kind: Newton steps on the exact
 Hessian, made positive definite by the absolute values of its eigenvalues, a quadratic programme where constraints are
 in the way, and Armijo backtracking with the same constants. What is rare it leaves alone: a coordinate held at a kink,
-the escape from a saddle, a face on which the Hessian is indefinite. `Outcome.settled` is True only for a regular
+the escape from a saddle, a face on which the Hessian is indefinite; where it crawls towards a kink it stops. `Outcome.settled` is True only for a regular
 minimum, an interior point with a positive definite Hessian and a negligible next step; everything else is to be
 finished by `minimize`, from `Outcome.theta` on.
 
@@ -28,6 +28,10 @@ Array = jax.Array
 
 MAX_TRIALS = 30
 """Fractions of a step that are tried."""
+
+CRAWLING = (30, 2)
+"""A fit has met a kink once it has refused more fractions of steps than this many, plus this many an iteration: `minimize`
+knows the way on. Fits that settle refuse a dozen at most; at a kink it would go on by hundreds, to no end."""
 
 RIDGE = 1e-14
 """Added to the diagonal of the dual programme, whose rows are of unit length: constraints may depend on one another."""
@@ -160,7 +164,9 @@ def minimize_traced(
         hopeless = unsaid | (trials >= MAX_TRIALS)
         # A search that finds nothing below the tolerance has met rounding: that too is the end.
         stationary = hopeless & (state.optimality <= tolerance)
-        return state._replace(length=length, trials=trials, done=hopeless, stationary=stationary)
+        refused = state.evaluations - state.iterations - 1
+        crawling = refused > CRAWLING[0] + CRAWLING[1] * state.iterations
+        return state._replace(length=length, trials=trials, done=hopeless | crawling, stationary=stationary)
 
     def turn(state: _State) -> _State:
         theta = _moved(constraints, state.theta, state.length * state.step)
