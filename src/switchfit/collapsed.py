@@ -28,20 +28,26 @@ OPENED = 1e-3
 """Part of the horizon for which collapsed modes last where a parameter's effect in them is looked for."""
 
 
-def idle_directions(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
-    """Directions along which J is constant because modes have collapsed: (k, d), with entries 0 and 1.
+def idle_unknowns(evaluator: Evaluator, theta: FloatArray, parameters: bool) -> NDArray[np.bool_]:
+    """Which unknowns may be held because J does not depend on them while the modes that have collapsed stay so: (d,).
 
     Parameters
     ----------
     evaluator : Evaluator
     theta : (d,)
+    parameters : bool
+        Whether to look for parameters as well, with a few evaluations of J for each. Without them it is the first of
+        the transition times that coincide, which leaves the others free to move away from it.
     """
-    problem, d = evaluator.problem, len(theta)
-    found = [np.isin(np.arange(d), group).astype(float) for group in _idle_groups(problem, theta)]
-    opened = _opened(problem, theta)
+    problem = evaluator.problem
+    idle = np.zeros(len(theta), dtype=bool)
+    for group in _idle_groups(problem, theta):
+        idle[group[0]] = True
+    opened = _opened(problem, theta) if parameters else theta
     if not np.array_equal(opened, theta):
-        found += [np.eye(d)[i] for i in _parameters(problem) if _is_idle(evaluator, theta, opened, i)]
-    return np.array(found).reshape(-1, d)
+        for i in _parameters(problem):
+            idle[i] = _is_idle(evaluator, theta, opened, i)
+    return idle
 
 
 def _idle_groups(problem: Problem, theta: FloatArray) -> Iterator[NDArray[np.intp]]:

@@ -171,7 +171,7 @@ class IterationRecord:
 
 Callback = Callable[[IterationRecord], object]
 Evaluate = Callable[[FloatArray, int], Evaluation]
-Idle = Callable[[FloatArray], FloatArray]
+Idle = Callable[[FloatArray, bool], NDArray[np.bool_]]
 Index = NDArray[np.intp] | slice
 
 
@@ -214,8 +214,9 @@ class Result:
         The start and every iteration.
     violated : str
         Equality constraints that are not met, with their values.
-    idle : array, shape (k, d)
-        Directions along which J is constant, as the caller's `idle` says; they are not in `free_basis`.
+    idle : tuple of int
+        Coordinates on which J does not depend at theta, by the word of the caller's `idle`, and those that active rows
+        tie to them; they are not in `free_basis`.
     """
 
     theta: FloatArray
@@ -237,7 +238,7 @@ class Result:
     tolerance: float
     history: tuple[IterationRecord, ...]
     violated: str = ""
-    idle: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    idle: tuple[int, ...] = ()
 
     @property
     def successful(self) -> bool:
@@ -263,7 +264,7 @@ class Result:
             kinks=kinks,
             direction=direction,
             violated=self.violated,
-            idle=", ".join(f"theta[{i}]" for i in np.flatnonzero(np.any(self.idle != 0.0, axis=0))),
+            idle=", ".join(f"theta[{i}]" for i in self.idle),
         )
         return sentence + (f" Active: {'; '.join(self.active)}." if self.active else "")
 
@@ -310,8 +311,8 @@ class _Point:
     optimality: float
     multipliers: FloatArray  # shape (m + 2 d,)
     downhill: NDArray[np.int_]  # like side, and for each kink the side to descend to, 0 to hold it
+    idle: NDArray[np.bool_]  # coordinates that are held because J does not depend on them here
     curvatures: dict[bytes, _Curvature] = field(default_factory=dict)  # found already, by the constraints' places
-    idle: dict[str, FloatArray] = field(default_factory=dict)  # found already
 
     @property
     def cost(self) -> float:
@@ -350,7 +351,12 @@ def _mixed(plus: FloatArray | Arrow, minus: FloatArray | Arrow, sides: NDArray[n
 
 
 def _first_order(
-    plus: _Sample, minus: _Sample, kink: NDArray[np.bool_], side: NDArray[np.int_], normals: FloatArray
+    plus: _Sample,
+    minus: _Sample,
+    kink: NDArray[np.bool_],
+    side: NDArray[np.int_],
+    normals: FloatArray,
+    idle: NDArray[np.bool_],
 ) -> tuple[float, FloatArray, NDArray[np.int_]]:
     """The steepest descent over feasible directions of length one, its multipliers, and the side of each coordinate.
 
@@ -359,6 +365,8 @@ def _first_order(
     KKT residual; that of J' itself is the largest over the choices.
     """
     left, right = minus.gradient, plus.gradient
+    if idle.any():
+        left, right, normals = left * ~idle, right * ~idle, normals * ~idle
     if plus is minus:
         return *kkt_residual(right, right, normals), side
     alone = np.where((left <= 0.0) & (right >= 0.0), 0, np.where(-right >= left, 1, -1))
@@ -424,19 +432,29 @@ class _Oracle:
     def complete(self, theta: FloatArray, first: _Sample, scale: FloatArray) -> _Point | None:
         """The point: the other side is evaluated only if some coordinate is on a breakpoint and has room there."""
         kink, side = self._sides(theta)
+        constraints = self.problem.constraints
+        rounding = constraints.rounding(np.maximum(np.maximum(scale, self.problem.size), np.abs(theta)))
+        active = np.flatnonzero(constraints.slack(theta) <= rounding)
+        idle = self._idle(theta, active)
+        kink &= ~idle
         plus = minus = first
         if kink.any() or ((side < 0).any() and (side > 0).any()):
             other = self.sample(theta, -1)
             if other is None:
                 return None
             minus = other
-        constraints = self.problem.constraints
-        rounding = constraints.rounding(np.maximum(np.maximum(scale, self.problem.size), np.abs(theta)))
-        active = np.flatnonzero(constraints.slack(theta) <= rounding)
-        optimality, values, downhill = _first_order(plus, minus, kink, side, constraints.rows(active))
+        normals = constraints.rows(active)
+        optimality, values, downhill = _first_order(plus, minus, kink, side, normals, idle)
         multipliers = np.zeros(len(constraints.names))
         multipliers[active] = values
-        return _Point(theta, plus, minus, kink, side, active, optimality, multipliers, downhill)
+        return _Point(theta, plus, minus, kink, side, active, optimality, multipliers, downhill, idle)
+
+    def _idle(self, theta: FloatArray, active: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Coordinates on which J does not depend while the rows that are active stay so: (d,)."""
+        idle = self.problem.idle
+        if idle is None or not np.any(active < self.problem.constraints.b.size):
+            return np.zeros(theta.size, dtype=bool)
+        return idle(theta.copy(), False)
 
     def point(self, theta: FloatArray, scale: FloatArray) -> _Point | None:
         first = self.first(theta)
@@ -565,7 +583,7 @@ def _finish(oracle: _Oracle, state: _State, status: Status) -> _State:
             return replace(state, status=Status.SADDLE)
         if curvature.smallest <= EIGENVALUE_FLOOR:
             return replace(state, status=Status.SINGULAR)
-        if len(_idle(problem, state)):
+        if state.point.idle.any() or curvature.idle.any():
             return replace(state, status=Status.COLLAPSED)
     return replace(state, status=Status.CONVERGED_AT_KINK if _genuine_kinks(state).any() else status)
 
@@ -624,7 +642,7 @@ def _solve_on_sides(
     point, constraints = state.point, problem.constraints
     gradient, hessian = point.derivatives(sides)
     lower, upper = np.minimum(low - point.theta, 0.0), np.maximum(high - point.theta, 0.0)
-    free = constraints.movable
+    free = constraints.movable & ~point.idle
     if point.kink.any():
         lower[point.kink & (sides > 0)] = 0.0
         upper[point.kink & (sides < 0)] = 0.0
@@ -902,6 +920,7 @@ class _Curvature:
     eigenvalues: FloatArray
     unscaled: FloatArray
     lowest: FloatArray  # of unit length in theta
+    idle: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))  # coordinates left out as idle
 
     @property
     def smallest(self) -> float:
@@ -926,8 +945,22 @@ def _curvature(problem: _Problem, state: _State, rows: NDArray[np.intp]) -> _Cur
 
 def _curvature_on(problem: _Problem, state: _State, rows: NDArray[np.intp]) -> _Curvature:
     point = state.point
+    held = _genuine_kinks(state) | ~(problem.constraints.lower < problem.constraints.upper) | point.idle
+    found = _curvature_without(problem, state, rows, held)
+    collapsed = problem.idle is not None and np.any(point.active < problem.constraints.b.size)
+    if collapsed and problem.idle is not None and found.smallest <= EIGENVALUE_FLOOR:
+        idle = problem.idle(point.theta.copy(), True) & ~held
+        if idle.any():
+            found = replace(_curvature_without(problem, state, rows, held | idle), idle=idle)
+    return found
+
+
+def _curvature_without(
+    problem: _Problem, state: _State, rows: NDArray[np.intp], held: NDArray[np.bool_]
+) -> _Curvature:
+    """Curvature in the null space of the constraints without the coordinates that are held."""
+    point = state.point
     d = point.theta.size
-    held = _genuine_kinks(state) | ~(problem.constraints.lower < problem.constraints.upper)
     hessian = point.derivatives(_reported_sides(point))[1]
     if isinstance(hessian, Arrow):
         found = _arrow_curvature(problem, state, rows, hessian, held)
@@ -935,7 +968,7 @@ def _curvature_on(problem: _Problem, state: _State, rows: NDArray[np.intp]) -> _
             return found
         hessian = hessian.dense()
     free = np.flatnonzero(~held)
-    normals = np.vstack([problem.constraints.rows(rows), _idle(problem, state)])[:, free]
+    normals = problem.constraints.rows(rows)[:, free]
     basis = np.zeros((d, 0)) if free.size == 0 else np.eye(d)[:, free] @ split_space(normals)[0]
     count = basis.shape[1]
     if count == 0 or not np.isfinite(hessian).all():
@@ -951,15 +984,14 @@ def _curvature_on(problem: _Problem, state: _State, rows: NDArray[np.intp]) -> _
     return _Curvature(basis, np.asarray(values, dtype=float), unscaled, lowest / np.linalg.norm(lowest))
 
 
-def _idle(problem: _Problem, state: _State) -> FloatArray:
-    """Directions along which J is constant, (k, d): its curvature there is nothing but the error of its evaluation."""
-    point, d = state.point, state.point.theta.size
-    rows = point.active < problem.constraints.b.size
-    if problem.idle is None or not rows.any():
-        return np.zeros((0, d))
-    if "" not in point.idle:
-        point.idle[""] = np.asarray(problem.idle(point.theta.copy()), dtype=float).reshape(-1, d)
-    return point.idle[""]
+def _idle_names(problem: _Problem, state: _State) -> tuple[int, ...]:
+    """Coordinates on which J does not depend at the state's point, and those that active rows tie to them."""
+    point = state.point
+    idle = set(np.flatnonzero(point.idle).tolist())
+    ties = [{i, j} for i, j, _ in problem.constraints.exact_rows(point.active) if j >= 0]
+    for _ in ties:
+        idle |= {k for tie in ties if tie & idle for k in tie}
+    return tuple(sorted(idle | set(np.flatnonzero(_curvature(problem, state, point.active).idle).tolist())))
 
 
 def _arrow_curvature(
@@ -970,7 +1002,7 @@ def _arrow_curvature(
     None in all other cases, which are rare enough to be left to the algebra of full matrices.
     """
     m, d = problem.constraints.b.size, held.size
-    if np.any(rows < m) or not hessian.finite or len(_idle(problem, state)):
+    if np.any(rows < m) or not hessian.finite:
         return None
     held = held.copy()
     held[(rows - m) % d] = True
@@ -1113,8 +1145,9 @@ def minimize(
         Typical size of each unknown, of which rounding is a part: for a time, the length of the horizon, however
         small the time itself. Left out, the unknown's own values say it.
     idle : callable, optional
-        ``idle(theta)`` returns directions (k, d) along which J is constant although derivatives, which have the error
-        of its evaluation, are not zero. It is called at solutions where a row of the constraints is active.
+        ``idle(theta, everything)`` says which coordinates, (d,) of bool, may be held at a theta with active rows,
+        because J depends on none of them while these rows are active, whatever derivatives say, which have the error
+        of its evaluation. Where `everything` is false, those that are found at no cost are enough.
 
     Returns
     -------
@@ -1273,7 +1306,7 @@ def _result(oracle: _Oracle, state: _State, status: Status, history: tuple[Itera
         flat_direction=curvature.lowest,
         tolerance=problem.tolerance,
         history=history,
-        idle=_idle(problem, state),
+        idle=_idle_names(problem, state),
     )
 
 
