@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from switchfit.collapsed import idle_unknowns
 from switchfit.data import FloatArray, Measurements, TerminalConstraint
 from switchfit.evaluate import ArrowEvaluation, Evaluation, Evaluator
-from switchfit.hidden import refuse_hidden_switches
+from switchfit.hidden import refuse_hidden_switches, refuse_jumps
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
 from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.sqp import HessianKind
@@ -107,6 +107,8 @@ def minimized(
         size=variables.sizes_inward(problem.sizes),
         idle=idle,
     )
+    if result.status is Status.LINE_SEARCH_FAILED:
+        refuse_jumps(evaluator, result.theta if identity else _outward(variables, constraints, result.theta))
     return result if identity else _result_outward(variables, constraints, result)
 
 

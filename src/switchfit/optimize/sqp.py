@@ -40,6 +40,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.optimize.arrow import Arrow, ArrowFactor, arrow_scaling, convexify_arrow, solve_arrow_qp
+from switchfit.optimize.diagnosis import Finding, find_reason, wrong_slope
 from switchfit.optimize.qp import (
     EIGENVALUE_FLOOR,
     EPS,
@@ -70,6 +71,8 @@ NEGLIGIBLE_STEP = 1e-10
 #: Iterations spent on making the last step negligible once the optimality is below the tolerance.
 EXTRA_ITERATIONS = 5
 MAX_BACKTRACKS = 60
+#: Times a minimisation begins anew from where its line search has failed.
+RESTARTS = 3
 #: All combinations of sides are compared for up to this many concave kinks that constraints couple.
 MANY_CONCAVE_KINKS = 6
 #: Newton steps up to this multiple of the unknowns' size are never shortened by changing the Hessian.
@@ -105,8 +108,8 @@ class Status(Enum):
         "Raise max_iterations, use hessian='exact', or start closer."
     )
     LINE_SEARCH_FAILED = (
-        "The line search found no decrease of the cost along a descent direction (optimality {optimality:.1e}). "
-        "The gradient does not belong to the cost: check the derivatives, or missing breakpoints."
+        "The line search found no decrease of the cost along a descent direction (optimality {optimality:.1e}), nor "
+        "did it after a fresh start from there. {reason}"
     )
     INTERRUPTED = "Interrupted after {iterations} iterations with optimality {optimality:.1e}: the best point so far."
     NONFINITE_START = (
@@ -217,6 +220,8 @@ class Result:
     idle : tuple of int
         Coordinates on which J does not depend at theta, by the word of the caller's `idle`, and those that active rows
         tie to them; they are not in `free_basis`.
+    reason : str
+        What was seen where the line search failed, and what to do.
     """
 
     theta: FloatArray
@@ -239,6 +244,7 @@ class Result:
     history: tuple[IterationRecord, ...]
     violated: str = ""
     idle: tuple[int, ...] = ()
+    reason: str = ""
 
     @property
     def successful(self) -> bool:
@@ -265,6 +271,7 @@ class Result:
             direction=direction,
             violated=self.violated,
             idle=", ".join(f"theta[{i}]" for i in self.idle),
+            reason=self.reason,
         )
         return sentence + (f" Active: {'; '.join(self.active)}." if self.active else "")
 
@@ -497,7 +504,10 @@ class _State:
     cost_scale: float = 0.0  # largest |J| seen
     gradient_scale: float = 0.0  # largest derivative seen
     lowest_cost: float = np.inf
+    restarts: int = 0
+    careful: bool = False  # the next step is taken with the diagonal of the Hessian alone
     status: Status | None = None
+    reason: str = ""  # why it failed, where it did
 
 
 @dataclass(frozen=True, eq=False)
@@ -543,6 +553,7 @@ def _advance(problem: _Problem, state: _State, accepted: _Accepted) -> _State:
         cost_scale=max(state.cost_scale, abs(point.cost)),
         gradient_scale=max(state.gradient_scale, point.largest_derivative),
         lowest_cost=min(state.lowest_cost, point.cost),
+        careful=False,
     )
 
 
@@ -567,7 +578,112 @@ def _stalled(oracle: _Oracle, state: _State, direction: _Direction) -> _State:
     below_rounding = direction.reduction <= 10 * NOISE * state.cost_scale
     if below_rounding and state.point.optimality <= 1e5 * EPS * floor:
         return _finish(oracle, state, Status.CONVERGED_PRECISION)
-    return replace(state, status=Status.LINE_SEARCH_FAILED)
+    if state.restarts < RESTARTS and not state.careful:
+        point = oracle.point(state.point.theta, np.abs(state.point.theta))
+        if point is not None:
+            fresh = _initial_state(point)
+            return replace(fresh, iteration=state.iteration, restarts=state.restarts + 1, careful=True)
+    return replace(state, status=Status.LINE_SEARCH_FAILED, reason=_reason(oracle, state, direction))
+
+
+def _reason(oracle: _Oracle, state: _State, direction: _Direction) -> str:
+    """What J is like along the direction that failed, in words."""
+    problem, theta = oracle.problem, state.point.theta
+    noise = NOISE * max(abs(state.point.cost), 0.01 * state.cost_scale)
+
+    def line(fraction: float) -> tuple[float, float] | None:
+        if fraction == 0.0:
+            return state.point.cost, direction.slope
+        sample = oracle.sample(theta + fraction * direction.step, 1)
+        return None if sample is None else (sample.cost, float(sample.gradient @ direction.step))
+
+    marks = [_next_breakpoint(points, theta[i], direction.step[i]) for i, points in problem.breakpoints]
+    found = find_reason(line, noise, min([*marks, 1.0]))
+    at = theta + found.at * direction.step
+    if found.kind == "wrong slope":
+        return (
+            f"The gradient does not belong to the cost: along that direction it says {found.before:.3g}, differences "
+            f"of the cost say {found.after:.3g}{_wrong_entries(oracle, state, noise)}. Check the derivatives."
+        )
+    if found.kind == "jump":
+        who = _who_jumps(oracle, theta, direction.step, found, noise)
+        return (
+            f"The cost jumps from {found.before:.8g} to {found.after:.8g} where {who}: there is no minimum there in the "
+            "sense of this optimiser, which takes a cost that is continuous."
+        )
+    if found.kind == "kink":
+        where = ", ".join(f"theta[{i}] = {at[i]:.8g}" for i in _who_bends(oracle, theta, direction.step, found))
+        return (
+            f"The derivatives are right, but there is a kink close by, near {where}: along that direction the slope "
+            f"jumps from {found.before:.3g} to {found.after:.3g}. Start elsewhere, or fix what is at the kink there."
+        )
+    if found.kind == "rounding":
+        return (
+            "The derivatives are right, but what the cost can still fall along that direction is less than its rounding "
+            f"error, {noise:.1e}. Scale the unknowns to be of size one, or ask for a larger tolerance."
+        )
+    curvature = _curvature(problem, state, state.point.active).eigenvalues
+    condition = curvature[-1] / curvature[0] if curvature.size and curvature[0] > 0.0 else np.inf
+    return (
+        "The derivatives are right, but the cost has a narrow valley there (condition number of the scaled Hessian "
+        f"{condition:.1e}). Start elsewhere, fix one of the unknowns that trade off, or take hessian='gauss-newton'."
+    )
+
+
+def _next_breakpoint(points: FloatArray, x: float, step: float) -> float:
+    """Fraction of a step of one coordinate up to the next breakpoint that it meets; infinite if it meets none."""
+    if step == 0.0:
+        return np.inf
+    ahead = points[points > x] if step > 0.0 else points[points < x]
+    return float(np.min((ahead - x) / step, initial=np.inf))
+
+
+def _wrong_entries(oracle: _Oracle, state: _State, noise: float) -> str:
+    """The coordinates whose derivative differences of J do not confirm, in words."""
+    theta, problem = state.point.theta, oracle.problem
+    breakpoints = dict(problem.breakpoints)
+    wrong = []
+    for i in np.flatnonzero(problem.constraints.movable):
+        for sign in (1.0, -1.0):
+            unit = np.zeros(theta.size)
+            unit[i] = sign * 0.01 * max(abs(theta[i]), problem.size[i], 1e-3)
+
+            def line(fraction: float, unit: FloatArray = unit) -> tuple[float, float] | None:
+                sample = oracle.sample(theta + fraction * unit, 1)
+                return None if sample is None else (sample.cost, float(sample.gradient @ unit))
+
+            smooth = min(_next_breakpoint(breakpoints.get(int(i), np.zeros(0)), theta[i], unit[i]), 1.0)
+            measured = wrong_slope(line, noise, smooth)
+            if measured is not None:
+                stated = state.point.plus.gradient[i]
+                wrong.append(f"theta[{i}] (derivative {stated:.3g}, differences {measured / unit[i]:.3g})")
+                break
+    return f"; it is wrong in {', '.join(wrong[:4])}" if wrong else ""
+
+
+def _who_bends(oracle: _Oracle, theta: FloatArray, step: FloatArray, found: Finding) -> list[int]:
+    """The coordinates along which the derivative of J jumps at a kink on the line."""
+    width = max(2.0**-40 * found.at, 1e-15)
+    sides = [oracle.sample(theta + (found.at + w) * step, 1) for w in (-width, width)]
+    moving = np.flatnonzero(step).tolist()
+    if sides[0] is None or sides[1] is None:
+        return moving[:4]
+    jumps = np.abs((sides[1].gradient - sides[0].gradient) * step)
+    return [i for i in moving if jumps[i] > 0.1 * jumps.max()][:4]
+
+
+def _who_jumps(oracle: _Oracle, theta: FloatArray, step: FloatArray, found: Finding, noise: float) -> str:
+    """The coordinate whose change by a hair across a jump of J makes it jump, in words."""
+    width = max(2.0**-40 * found.at, 1e-15)
+    before, after = theta + (found.at - width) * step, theta + (found.at + width) * step
+    base = oracle.sample(before, 1)
+    for i in np.flatnonzero(before != after) if base is not None else ():
+        moved = before.copy()
+        moved[i] = after[i]
+        there = oracle.sample(moved, 1)
+        if base is not None and there is not None and abs(there.cost - base.cost) > 0.5 * abs(found.after - found.before):
+            return f"theta[{i}] passes {after[i]:.8g}"
+    return "the step passes " + ", ".join(f"theta[{i}] = {after[i]:.8g}" for i in np.flatnonzero(step)[:4])
 
 
 def _finish(oracle: _Oracle, state: _State, status: Status) -> _State:
@@ -684,7 +800,8 @@ def _solve_arrow(
     """The same for a Hessian in the shape of an arrow; what is held keeps its place, with a step of zero."""
     point, constraints = state.point, problem.constraints
     m, d = constraints.b.size, free.size
-    matrix = hessian if problem.labels is None else hessian.masked(problem.labels)
+    labels = _labels_of(problem, state)
+    matrix = hessian if labels is None else hessian.masked(labels)
     pressed = constraints.rows(np.flatnonzero(point.multipliers > 0.0)) * free
     convex = convexify_arrow(matrix.held(free), pressed[np.any(pressed != 0.0, axis=1)], _floor(state) * free)
     slack = np.maximum(constraints.A @ point.theta - constraints.b, 0.0)
@@ -707,12 +824,18 @@ def _model_matrix(problem: _Problem, state: _State, hessian: FloatArray | Arrow,
     if problem.hessian == "descent-first" and not _is_positive_definite(hessian[free][:, free]):
         return np.eye(point.theta.size) / state.metric
     matrix = hessian.copy()
-    if problem.labels is not None:
-        matrix *= problem.labels[:, None] == problem.labels[None, :]
+    labels = _labels_of(problem, state)
+    if labels is not None:
+        matrix *= labels[:, None] == labels[None, :]
     pressed = problem.constraints.rows(np.flatnonzero(point.multipliers > 0.0))[:, free]
     block = free if isinstance(free, slice) else np.ix_(free, free)
     matrix[block] = convexify(matrix[block], pressed, _floor(state)[free])
     return matrix
+
+
+def _labels_of(problem: _Problem, state: _State) -> FloatArray | None:
+    """Labels of the blocks of the Hessian that count: each unknown by itself for a step after a failed line search."""
+    return np.arange(state.point.theta.size, dtype=float) if state.careful else problem.labels
 
 
 def _floor(state: _State) -> FloatArray:
@@ -1307,6 +1430,7 @@ def _result(oracle: _Oracle, state: _State, status: Status, history: tuple[Itera
         tolerance=problem.tolerance,
         history=history,
         idle=_idle_names(problem, state),
+        reason=state.reason,
     )
 
 
