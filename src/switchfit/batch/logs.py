@@ -13,7 +13,7 @@ import numpy as np
 
 from switchfit.batch.chunks import Arrays, fingerprint
 from switchfit.batch.fits import Fits, repeat, sample_count
-from switchfit.batch.program import Varying, chunk_size, fit_chunk
+from switchfit.batch.program import Varying, chunk_size, error_message, failed_chunk, fit_chunk
 from switchfit.estimate import LARGEST_INTEGRATION_ERROR, estimate
 from switchfit.evaluate import evaluator_of
 from switchfit.optimize import Status
@@ -81,12 +81,17 @@ class _Work:
     def __call__(self, runs: range) -> Arrays:
         """Fits of some of the problems: those whose programs agree go together, and then back into their order."""
         groups: dict[Any, list[int]] = {}
+        errors: dict[int, Exception] = {}
         for k in runs:
-            groups.setdefault(_kind(self.problems[k]), []).append(k)
-        order, parts = [], []
-        for members in groups.values():
-            order += members
-            parts.append(self._group([self.problems[k] for k in members]))
+            try:
+                groups.setdefault(_kind(self.problems[k]), []).append(k)
+            except Exception as error:  # where its guess cannot be integrated, say: listed, as it must not end the others
+                errors[k] = error
+        parts = [self._group([self.problems[k] for k in members]) for members in groups.values()]
+        order = [k for members in groups.values() for k in members]
+        if errors:
+            order += errors
+            parts.append(self._failed(errors))
         place = np.argsort(order)
         return {name: np.concatenate([part[name] for part in parts])[place] for name in parts[0]}
 
@@ -104,11 +109,22 @@ class _Work:
             max_iterations=self.max_iterations,
         )
         arrays = {name: np.array(value) for name, value in found._asdict().items()}
-        arrays["message"] = arrays["message"].astype(object)
+        arrays["message"], arrays["status"] = arrays["message"].astype(object), arrays["status"].astype(object)
         for k, problem in enumerate(problems):
-            self._check(problem, k, arrays)
-        arrays["message"] = arrays["message"].astype(str)
+            if arrays["status"][k] != Status.ERROR.name:
+                try:
+                    self._check(problem, k, arrays)
+                except Exception as error:
+                    arrays["status"][k], arrays["message"][k] = Status.ERROR.name, error_message(error)
+        arrays["message"], arrays["status"] = arrays["message"].astype(str), arrays["status"].astype(str)
         return {**arrays, "start": starts, "samples": np.array([sample_count(problem) for problem in problems])}
+
+    def _failed(self, errors: dict[int, Exception]) -> Arrays:
+        """Arrays for problems that could not be begun."""
+        starts = np.array([self.problems[k].initial_theta for k in errors])
+        found = failed_chunk(starts, dict(enumerate(errors.values())))
+        samples = np.array([sample_count(self.problems[k]) for k in errors])
+        return {**found._asdict(), "start": starts, "samples": samples}
 
     def _check(self, problem: Problem, k: int, arrays: Arrays) -> None:
         """Do a fit again by `estimate` if its integration error is too large."""
@@ -130,12 +146,17 @@ class _Work:
 
     def fingerprint(self) -> str:
         parts: list[Any] = ["logs", len(self.problems), self.tolerance, self.max_iterations]
+        functions = None  # what stands for them: the cost of the first problem that has one
         for problem in self.problems:
-            leaves = jax.tree.leaves(tuple(evaluator_of(problem).arguments))
-            parts += [problem.theta_names, problem.initial_theta, *problem.unknowns.priors, *map(np.asarray, leaves)]
-        first = self.problems[0]
-        parts.append(evaluator_of(first).cost(first.initial_theta))  # stands for the functions
-        return fingerprint(*parts)
+            parts += [problem.theta_names, problem.initial_theta, *problem.unknowns.priors]
+            try:
+                evaluator = evaluator_of(problem)
+                functions = evaluator.cost(problem.initial_theta) if functions is None else functions
+            except Exception as error:  # this one will be listed as failed
+                parts.append(error_message(error))
+            else:
+                parts += map(np.asarray, jax.tree.leaves(tuple(evaluator.arguments)))
+        return fingerprint(*parts, functions)
 
 
 def _kind(problem: Problem) -> Any:

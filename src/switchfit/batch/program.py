@@ -10,7 +10,7 @@ What `minimize_traced` does not treat is finished by `minimize`, as in a single 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -329,6 +329,38 @@ def error_message(error: BaseException) -> str:
     """What to list for a fit that ended with an error: its type and its first sentences on one line."""
     text = " ".join(str(error).split())
     return Status.ERROR.value.format(error=f"{type(error).__name__}: {text[:LONGEST_ERROR]}" if text else repr(error))
+
+
+def with_errors(chunk: Chunk, errors: Mapping[int, BaseException]) -> Chunk:
+    """The chunk with some of its fits listed as failed, which had no data of their own to fit.
+
+    Parameters
+    ----------
+    chunk : Chunk
+    errors : mapping of int to exception
+        By the place of the fit in the chunk.
+    """
+    found = {name: np.array(value) for name, value in chunk._asdict().items()}
+    found["message"] = found["message"].astype(object)
+    found["status"] = found["status"].astype(object)
+    for k, error in errors.items():
+        found["status"][k], found["message"][k] = Status.ERROR.name, error_message(error)
+        for name in ("theta", "cost", "gradient", "hessian", "optimality", "covariance"):
+            found[name][k] = np.nan
+        for name in ("iterations", "evaluations", "free"):
+            found[name][k] = 0
+    return Chunk(**found | {name: found[name].astype(str) for name in ("status", "message")})
+
+
+def failed_chunk(starts: FloatArray, errors: Mapping[int, BaseException]) -> Chunk:
+    """A chunk of fits (R, d) none of which could begin."""
+    R, d = starts.shape
+    nothing, none, blank = np.full(R, np.nan), np.zeros(R, dtype=int), np.full(R, "", dtype=object)
+    square = np.full((R, d, d), np.nan)
+    return with_errors(
+        Chunk(starts.copy(), nothing, np.full((R, d), np.nan), square, nothing, none, none, blank, blank, none, square),
+        errors,
+    )
 
 
 def _not_begun(starts: FloatArray) -> Outcome:

@@ -104,7 +104,8 @@ class Status(Enum):
         "minimiser although no gradient vanishes there; covariances do not apply to such an unknown."
     )
     MAX_ITERATIONS = (
-        "Stopped after {iterations} iterations with optimality {optimality:.1e} above the tolerance {tolerance:.1e}. "
+        "Stopped after {iterations} iterations{earlier} with optimality {optimality:.1e} above the tolerance "
+        "{tolerance:.1e}. "
         "Raise max_iterations, use hessian='exact', or start closer."
     )
     LINE_SEARCH_FAILED = (
@@ -222,6 +223,8 @@ class Result:
         tie to them; they are not in `free_basis`.
     reason : str
         What was seen where the line search failed, and what to do.
+    earlier : int
+        How many of the iterations belong to minimisations before, which this one resumed.
     """
 
     theta: FloatArray
@@ -245,6 +248,7 @@ class Result:
     violated: str = ""
     idle: tuple[int, ...] = ()
     reason: str = ""
+    earlier: int = 0
 
     @property
     def successful(self) -> bool:
@@ -272,6 +276,7 @@ class Result:
             violated=self.violated,
             idle=", ".join(f"theta[{i}]" for i in self.idle),
             reason=self.reason,
+            earlier=f", {self.earlier} of them before the mesh was refined," if self.earlier else "",
         )
         return sentence + (f" Active: {'; '.join(self.active)}." if self.active else "")
 
