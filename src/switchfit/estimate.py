@@ -386,6 +386,7 @@ def _estimate(
         sigma_known=sigma_known(problem),
         priors={name: text for name, text in zip(unknowns.names, unknowns.priors.texts(), strict=True) if text},
         log_scaled=unknowns.log_names,
+        idle=tuple(unknowns.names[i] for i in result.idle),
         least_squares=least_squares(problem),
         hessian_kind=hessian,
         tolerance=tolerance,

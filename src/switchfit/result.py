@@ -137,6 +137,10 @@ class Fit:
         The prior of each unknown that has one, in words.
     log_scaled : tuple of str
         Unknowns that were estimated on a logarithmic scale.
+    idle : tuple of str
+        Unknowns on which J does not depend because modes have collapsed: the transition times of a mode of no duration
+        between two stretches of the same mode, and parameters that act in collapsed modes alone. Their values say
+        nothing, and they are not in `free_basis`.
     least_squares : bool
         Whether what measurements and priors add to J is half a sum of squares: no sigma is a parameter, no loss robust.
     """
@@ -173,10 +177,14 @@ class Fit:
     priors: Mapping[str, str] = field(default_factory=dict)
     log_scaled: tuple[str, ...] = ()
     least_squares: bool = True
+    idle: tuple[str, ...] = ()
 
     @property
     def success(self) -> bool:
-        """Whether the fit converged; with `Status.SINGULAR` to a point from which J is flat in some direction."""
+        """Whether the fit converged; with `Status.SINGULAR` to a point from which J is flat in some direction.
+
+        With `Status.COLLAPSED` J is flat in nothing but what a mode of no duration leaves undetermined.
+        """
         return self.status.converged
 
     @property

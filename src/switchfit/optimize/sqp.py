@@ -125,9 +125,9 @@ class Status(Enum):
         "{smallest_eigenvalue:.1e}): these unknowns are not identified. Fix one of them or add data."
     )
     COLLAPSED = (
-        "Converged (optimality {optimality:.1e}), but a mode has no duration: the cost depends neither on where it "
-        "would stand nor on what acts in it alone, which is {idle}. Leave it out of mode_sequence, start elsewhere, or "
-        "give min_duration."
+        "Converged (optimality {optimality:.1e}), with a mode that has no duration: the cost depends neither on where "
+        "it would stand nor on what acts in it alone ({idle}). Leave it out of mode_sequence, start from another guess, "
+        "or give min_duration."
     )
     INFEASIBLE = (
         "The constraints are not met: {violated}. Start nearer to a point that meets them, or check that one can."
@@ -1076,7 +1076,10 @@ def _curvature_on(problem: _Problem, state: _State, rows: NDArray[np.intp]) -> _
     held = _genuine_kinks(state) | ~(problem.constraints.lower < problem.constraints.upper) | point.idle
     found = _curvature_without(problem, state, rows, held)
     collapsed = problem.idle is not None and np.any(point.active < problem.constraints.b.size)
-    if collapsed and problem.idle is not None and found.smallest <= EIGENVALUE_FLOOR:
+    m = problem.constraints.b.size
+    bounds = point.active[point.active >= m]
+    loose = np.any(point.multipliers[bounds] <= 1e-10 * state.gradient_scale)  # a bound that holds nothing back
+    if collapsed and problem.idle is not None and (found.smallest <= EIGENVALUE_FLOOR or loose):
         idle = problem.idle(point.theta.copy(), True) & ~held
         if idle.any():
             found = replace(_curvature_without(problem, state, rows, held | idle), idle=idle)
