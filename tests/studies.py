@@ -100,7 +100,7 @@ def joint() -> tuple[sf.Problem, np.ndarray]:
         )
         for e in range(3)
     ]
-    problem = sf.Problem(ROOM, runs, {"heat": 1.0, "k": sf.Parameter(0.6, lower=0.05, upper=3.0)})
+    problem = sf.Problem(ROOM, runs, {"heat": sf.Parameter(1.0, lower=0.2, upper=5.0), "k": sf.Parameter(0.6, lower=0.05, upper=3.0)})
     return problem, np.array([1.4, 3.3, 1.9, 4.0, 2.1, 3.2, 1.1, 0.7, 0.8, 0.4, 0.6])
 
 
@@ -119,3 +119,10 @@ def sliding() -> tuple[sf.Problem, np.ndarray]:
     data = sf.Measurements(times, np.zeros(25), observe=lambda t, x, p: x[:1], sigma=0.01)
     run = sf.Experiment(data, ("slide", "stick"), (0.5,), 0.0, 1.0)
     return sf.Problem(SLIDE, run, {"mu": sf.Parameter(0.4, lower=0.01, upper=2.0)}), np.array([0.65, 0.3])
+
+
+MULTISTART = {"fishing": fishing, "linear": linear, "vehicle": vehicle}
+"""Problems without data: every start fits the same."""
+
+MEASURED = {"driven": driven, "thermostat": thermostat, "ramps": ramps, "joint": joint, "sliding": sliding}
+"""Problems with data that are drawn anew for every fit, each with its truth."""

@@ -9,6 +9,7 @@ What `minimize_traced` does not treat is finished by `minimize`, as in a single 
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -46,6 +47,9 @@ CHUNK_IN_LOCKSTEP = 1024
 
 LONGEST_ERROR = 500
 """Characters of an error that are listed."""
+
+RAISED = re.compile(r"\s*[\w.]+(Error|Exception): ")
+"""The line of a traceback that names an exception."""
 
 
 class Varying(NamedTuple):
@@ -326,9 +330,14 @@ def _alike(layout: Layout, arguments: tuple[Arguments, ...]) -> list[list[int]]:
 
 
 def error_message(error: BaseException) -> str:
-    """What to list for a fit that ended with an error: its type and its first sentences on one line."""
-    text = " ".join(str(error).split())
-    return Status.ERROR.value.format(error=f"{type(error).__name__}: {text[:LONGEST_ERROR]}" if text else repr(error))
+    """What to list for a fit that ended with an error, on one line."""
+    text = str(error)
+    if "Traceback" in text:  # as JAX hands on what a callback raised: its last line says what it was
+        raised = [line.strip() for line in text.splitlines() if RAISED.match(line)]
+        text = raised[-1] if raised else text
+    else:
+        text = f"{type(error).__name__}: {text}"
+    return Status.ERROR.value.format(error=" ".join(text.split())[:LONGEST_ERROR])
 
 
 def with_errors(chunk: Chunk, errors: Mapping[int, BaseException]) -> Chunk:

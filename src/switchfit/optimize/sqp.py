@@ -583,6 +583,10 @@ def _stalled(oracle: _Oracle, state: _State, direction: _Direction) -> _State:
     below_rounding = direction.reduction <= 10 * NOISE * state.cost_scale
     if below_rounding and state.point.optimality <= 1e5 * EPS * floor:
         return _finish(oracle, state, Status.CONVERGED_PRECISION)
+    # Near a saddle, where slopes are lost in rounding, its negative curvature still leads away.
+    escaped = _escape(oracle, state) if oracle.problem.uses_hessian and below_rounding else None
+    if escaped is not None:
+        return _advance(oracle.problem, state, escaped)
     if state.restarts < RESTARTS and not state.careful:
         point = oracle.point(state.point.theta, np.abs(state.point.theta))
         if point is not None:
