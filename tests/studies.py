@@ -100,7 +100,9 @@ def joint() -> tuple[sf.Problem, np.ndarray]:
         )
         for e in range(3)
     ]
-    problem = sf.Problem(ROOM, runs, {"heat": sf.Parameter(1.0, lower=0.2, upper=5.0), "k": sf.Parameter(0.6, lower=0.05, upper=3.0)})
+    problem = sf.Problem(
+        ROOM, runs, {"heat": sf.Parameter(1.0, lower=0.2, upper=5.0), "k": sf.Parameter(0.6, lower=0.05, upper=3.0)}
+    )
     return problem, np.array([1.4, 3.3, 1.9, 4.0, 2.1, 3.2, 1.1, 0.7, 0.8, 0.4, 0.6])
 
 

@@ -11,15 +11,15 @@ from typing import Any
 import jax
 import numpy as np
 
+from switchfit.batch.again import adopt, is_resolved
 from switchfit.batch.chunks import Arrays, fingerprint
 from switchfit.batch.fits import Fits, repeat, sample_count
 from switchfit.batch.program import Varying, chunk_size, error_message, failed_chunk, fit_chunk
-from switchfit.estimate import LARGEST_INTEGRATION_ERROR, estimate
+from switchfit.estimate import estimate
 from switchfit.evaluate import evaluator_of
 from switchfit.optimize import Status
 from switchfit.problem import Problem
-from switchfit.result import inverse_on
-from switchfit.solve import sigma_known, smallest_cost
+from switchfit.solve import sigma_known
 
 
 def estimate_many(
@@ -85,7 +85,9 @@ class _Work:
         for k in runs:
             try:
                 groups.setdefault(_kind(self.problems[k]), []).append(k)
-            except Exception as error:  # where its guess cannot be integrated, say: listed, as it must not end the others
+            except (
+                Exception
+            ) as error:  # where its guess cannot be integrated, say: listed, as it must not end the others
                 errors[k] = error
         parts = [self._group([self.problems[k] for k in members]) for members in groups.values()]
         order = [k for members in groups.values() for k in members]
@@ -128,21 +130,11 @@ class _Work:
 
     def _check(self, problem: Problem, k: int, arrays: Arrays) -> None:
         """Do a fit again by `estimate` if its integration error is too large."""
-        theta, cost = arrays["theta"][k], arrays["cost"][k]
-        fine = evaluator_of(problem).divided().cost(theta)
-        size = max(abs(fine), smallest_cost(problem))
-        if abs(fine - cost) <= max(LARGEST_INTEGRATION_ERROR, problem.rtol) * size:
-            return
-        again = estimate(problem, tolerance=self.tolerance, max_iterations=self.max_iterations, start=theta)
-        for name in ("theta", "cost", "gradient", "hessian", "optimality"):
-            arrays[name][k] = getattr(again, name)
-        arrays["iterations"][k] += again.iterations
-        arrays["evaluations"][k] += again.evaluations
-        arrays["status"][k] = again.status.name
-        arrays["free"][k] = again.free_basis.shape[1]
-        arrays["covariance"][k] = inverse_on(again.free_basis, again.hessian)
-        ordinary = again.status is Status.CONVERGED and not again.active
-        arrays["message"][k] = "" if ordinary else again.message
+        theta, cost = arrays["theta"][k], float(arrays["cost"][k])
+        if not is_resolved(problem, evaluator_of(problem).meshes, theta, cost):
+            adopt(
+                arrays, k, estimate(problem, tolerance=self.tolerance, max_iterations=self.max_iterations, start=theta)
+            )
 
     def fingerprint(self) -> str:
         parts: list[Any] = ["logs", len(self.problems), self.tolerance, self.max_iterations]

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.batch.again import redo_unresolved
 from switchfit.batch.chunks import Arrays, fingerprint
 from switchfit.batch.fits import Fits, repeat, sample_count
 from switchfit.batch.program import Varying, chunk_size, fit_chunk, with_errors
@@ -344,6 +345,8 @@ class _Work:
             max_iterations=self.max_iterations,
         )
         found = with_errors(found, errors) if errors else found
+        settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
+        found = redo_unresolved(found, lambda k: self.problem_of(runs[k]), self.meshes, **settings)
         return {**found._asdict(), "start": starts, "samples": np.full(len(runs), sample_count(self.problem))}
 
     def _without_noise(self) -> dict[tuple[int, int], FloatArray]:

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.batch.again import redo_unresolved
 from switchfit.batch.chunks import Arrays, fingerprint
 from switchfit.batch.fits import Fits, repeat, sample_count
 from switchfit.batch.program import Varying, chunk_size, error_message, fit_chunk
@@ -121,7 +122,6 @@ def multistart(
     return Multistart(**found, clusters=_clusters(problem, Fits(**found)), best=best)
 
 
-
 def _best(
     problem: Problem, fits: Fits, tolerance: float, max_iterations: int
 ) -> tuple[Estimate | None, dict[int, Exception]]:
@@ -160,6 +160,8 @@ class _Work:
             tolerance=self.tolerance,
             max_iterations=self.max_iterations,
         )
+        settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
+        found = redo_unresolved(found, lambda k: self.problem, self.meshes, **settings)
         return {**found._asdict(), "start": starts, "samples": np.full(len(runs), sample_count(self.problem))}
 
     def fingerprint(self) -> str:

@@ -690,7 +690,11 @@ def _who_jumps(oracle: _Oracle, theta: FloatArray, step: FloatArray, found: Find
         moved = before.copy()
         moved[i] = after[i]
         there = oracle.sample(moved, 1)
-        if base is not None and there is not None and abs(there.cost - base.cost) > 0.5 * abs(found.after - found.before):
+        if (
+            base is not None
+            and there is not None
+            and abs(there.cost - base.cost) > 0.5 * abs(found.after - found.before)
+        ):
             return f"theta[{i}] passes {after[i]:.8g}"
     return "the step passes " + ", ".join(f"theta[{i}] = {after[i]:.8g}" for i in np.flatnonzero(step)[:4])
 
@@ -1090,9 +1094,7 @@ def _curvature_on(problem: _Problem, state: _State, rows: NDArray[np.intp]) -> _
     return found
 
 
-def _curvature_without(
-    problem: _Problem, state: _State, rows: NDArray[np.intp], held: NDArray[np.bool_]
-) -> _Curvature:
+def _curvature_without(problem: _Problem, state: _State, rows: NDArray[np.intp], held: NDArray[np.bool_]) -> _Curvature:
     """Curvature in the null space of the constraints without the coordinates that are held."""
     point = state.point
     d = point.theta.size
@@ -1300,7 +1302,9 @@ def minimize(
     breakpoint. The rate is quadratic with the exact Hessian if the second-order sufficient conditions hold.
     """
     start = np.atleast_1d(np.asarray(theta0, dtype=float)).copy()
-    problem = _make_problem(evaluate, start, constraints, breakpoints, hessian, blocks, tolerance, max_iterations, size, idle)
+    problem = _make_problem(
+        evaluate, start, constraints, breakpoints, hessian, blocks, tolerance, max_iterations, size, idle
+    )
     theta = _feasible_start(problem, start)
     oracle = _Oracle(problem)
     point = oracle.point(theta, np.abs(theta))
