@@ -300,7 +300,7 @@ def test_too_few_iterations():
 
 
 def test_a_budget_is_that_of_one_mesh():
-    """The fit converges on the first mesh with the last iteration it has, and is resumed on a finer one all the same."""
+    """The fit converges on the first mesh with its last iteration, and is resumed on a finer one all the same."""
     problem = refined_fit().problem
     on_first = minimized(evaluator_of(problem), problem.initial_theta, "exact", 1e-7, 200).iterations
     found = sf.estimate(problem, max_iterations=on_first)

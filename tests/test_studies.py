@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from studies import MEASURED, MULTISTART, thermostat
 
 import switchfit as sf
-from studies import MEASURED, MULTISTART, thermostat
 from switchfit.batch import monte_carlo as module
 
 

@@ -1,8 +1,8 @@
 """Modes that have collapsed: whose two transition times are equal, so that they last no time at all.
 
-Where a mode of no duration stands between two stretches of the same mode, as B in (A, B, A), the cost does not depend on
-where that is: to the integration error J is constant as its two transition times move together. Nor does the cost depend
-on a parameter that acts in collapsed modes alone. Such unknowns are *idle*: no data determine them, and the
+Where a mode of no duration stands between two stretches of the same mode, as B in (A, B, A), the cost does not depend
+on where that is: to the integration error J is constant as its two transition times move together. Nor does the cost
+depend on a parameter that acts in collapsed modes alone. Such unknowns are *idle*: no data determine them, and the
 curvature of J along them is that of the integration error, of either sign.
 """
 

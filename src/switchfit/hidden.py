@@ -71,9 +71,9 @@ def _advice(unknown: str) -> str:
     name = unknown.partition("[")[0]
     return (
         f'a function decides by comparing with it, as in jnp.where(t < p["{name}"], a, b), and derivatives do not see '
-        "where such a switch happens. If it is a moment, make it a transition time: a mode for a and a mode for b, both "
-        "in mode_sequence, and its guess in transition_times; what else it does keeps a parameter of its own. Otherwise "
-        "use something smooth, or fix it."
+        "where such a switch happens. If it is a moment, make it a transition time: a mode for a and a mode for b, "
+        "both in mode_sequence, and its guess in transition_times; what else it does keeps a parameter of its own. "
+        "Otherwise use something smooth, or fix it."
     )
 
 

@@ -137,12 +137,12 @@ class Fit:
         The prior of each unknown that has one, in words.
     log_scaled : tuple of str
         Unknowns that were estimated on a logarithmic scale.
+    least_squares : bool
+        Whether what measurements and priors add to J is half a sum of squares: no sigma is a parameter, no loss robust.
     idle : tuple of str
         Unknowns on which J does not depend because modes have collapsed: the transition times of a mode of no duration
         between two stretches of the same mode, and parameters that act in collapsed modes alone. Their values say
         nothing, and they are not in `free_basis`.
-    least_squares : bool
-        Whether what measurements and priors add to J is half a sum of squares: no sigma is a parameter, no loss robust.
     """
 
     theta_names: tuple[str, ...]

@@ -22,8 +22,8 @@ def redo_unresolved(
 ) -> Chunk:
     """The chunk with fits that failed where the shared meshes are too coarse replaced by those that `estimate` finds.
 
-    A mode that is active elsewhere than where the meshes were refined may find cells there that are far too long for it.
-    What stops the optimiser is then not the model. A fit that fails again is left as it was.
+    A mode that is active elsewhere than where the meshes were refined may find cells there that are far too long for
+    it: what stops the optimiser is then the mesh and not the model. A fit that fails again is left as it was.
 
     Parameters
     ----------

@@ -125,7 +125,7 @@ def multistart(
 def _best(
     problem: Problem, fits: Fits, tolerance: float, max_iterations: int
 ) -> tuple[Estimate | None, dict[int, Exception]]:
-    """A full estimate, resumed at the lowest end that allows one, and the errors of those that do not, by their place."""
+    """A full estimate, resumed at the lowest end that allows one, and the errors of the ends that do not."""
     errors: dict[int, Exception] = {}
     for k in np.lexsort((np.nan_to_num(fits.cost, nan=np.inf), ~fits.success))[:ENDS_TRIED].tolist():
         start = fits.theta[k] if np.isfinite(fits.theta[k]).all() else fits.start[k]

@@ -15,7 +15,7 @@ LENGTHS = 10.0 ** -np.arange(1, 6)
 """Fractions of the step over which differences of J are taken."""
 
 DISAGREES = 0.1
-"""Part of the slope by which a difference of J has to differ from it, beyond its own error, for the slope to be wrong."""
+"""A slope is wrong where differences of J contradict it by more than this part of it, beyond their own error."""
 
 BISECTIONS = 60
 

@@ -126,8 +126,8 @@ class Status(Enum):
     )
     COLLAPSED = (
         "Converged (optimality {optimality:.1e}), with a mode that has no duration: the cost depends neither on where "
-        "it would stand nor on what acts in it alone ({idle}). Leave it out of mode_sequence, start from another guess, "
-        "or give min_duration."
+        "it would stand nor on what acts in it alone ({idle}). Leave it out of mode_sequence, start from another "
+        "guess, or give min_duration."
     )
     INFEASIBLE = (
         "The constraints are not met: {violated}. Start nearer to a point that meets them, or check that one can."
@@ -617,8 +617,8 @@ def _reason(oracle: _Oracle, state: _State, direction: _Direction) -> str:
     if found.kind == "jump":
         who = _who_jumps(oracle, theta, direction.step, found, noise)
         return (
-            f"The cost jumps from {found.before:.8g} to {found.after:.8g} where {who}: there is no minimum there in the "
-            "sense of this optimiser, which takes a cost that is continuous."
+            f"The cost jumps from {found.before:.8g} to {found.after:.8g} where {who}. The optimiser needs a cost that "
+            "is continuous there."
         )
     if found.kind == "kink":
         where = ", ".join(f"theta[{i}] = {at[i]:.8g}" for i in _who_bends(oracle, theta, direction.step, found))
@@ -628,8 +628,8 @@ def _reason(oracle: _Oracle, state: _State, direction: _Direction) -> str:
         )
     if found.kind == "rounding":
         return (
-            "The derivatives are right, but what the cost can still fall along that direction is less than its rounding "
-            f"error, {noise:.1e}. Scale the unknowns to be of size one, or ask for a larger tolerance."
+            "The derivatives are right, but what the cost can still fall along that direction is less than its "
+            f"rounding error, {noise:.1e}. Scale the unknowns to be of size one, or ask for a larger tolerance."
         )
     curvature = _curvature(problem, state, state.point.active).eigenvalues
     condition = curvature[-1] / curvature[0] if curvature.size and curvature[0] > 0.0 else np.inf

@@ -3,9 +3,9 @@
 It takes the steps of `switchfit.optimize.sqp` wherever these are of the ordinary kind: Newton steps on the exact
 Hessian, made positive definite by the absolute values of its eigenvalues, a quadratic programme where constraints are
 in the way, and Armijo backtracking with the same constants. What is rare it leaves alone: a coordinate held at a kink,
-the escape from a saddle, a face on which the Hessian is indefinite; where it crawls towards a kink it stops. `Outcome.settled` is True only for a regular
-minimum, an interior point with a positive definite Hessian and a negligible next step; everything else is to be
-finished by `minimize`, from `Outcome.theta` on.
+the escape from a saddle, a face on which the Hessian is indefinite; where it makes no headway it stops.
+`Outcome.settled` is True only for a regular minimum, an interior point with a positive definite Hessian and a
+negligible next step; everything else is to be finished by `minimize`, from `Outcome.theta` on.
 
 Every function here is for one fit; `jax.lax.map` or `jax.vmap` make many of it. The loop evaluates J once a turn, at
 the point that is to be judged: fits in lockstep then never wait for another one's line search, and the program, which
@@ -30,8 +30,8 @@ MAX_TRIALS = 30
 """Fractions of a step that are tried."""
 
 CRAWLING = (30, 2)
-"""A fit has met a kink once it has refused more fractions of steps than this many, plus this many an iteration: `minimize`
-knows the way on. Fits that settle refuse a dozen at most; at a kink it would go on by hundreds, to no end."""
+"""A fit that has refused more fractions of steps than this, plus this many an iteration, has met a kink and is left to
+`minimize`. Fits that settle refuse a dozen at most; at a kink they would go on by hundreds, to no end."""
 
 RIDGE = 1e-14
 """Added to the diagonal of the dual programme, whose rows are of unit length: constraints may depend on one another."""

@@ -414,8 +414,8 @@ def _idle(fit: Fit) -> Iterator[str]:
         )
     if others:
         yield (
-            f"{', '.join(others)}: acts only in modes that have collapsed. The data say nothing about it, and its value "
-            "above is where the fit left it, not an estimate."
+            f"{', '.join(others)}: acts only in modes that have collapsed. The data say nothing about it, and its "
+            "value above is where the fit left it, not an estimate."
         )
 
 
