@@ -4,6 +4,7 @@ import os
 import pickle
 import signal
 from dataclasses import replace
+from functools import partial
 
 import cloudpickle
 import jax
@@ -19,6 +20,7 @@ from switchfit.batch.program import CHUNK, Varying, fit_chunk
 from switchfit.evaluate import Evaluator, evaluator_of
 from switchfit.model import float64
 from switchfit.optimize import LinearConstraints, minimize
+from switchfit.optimize.qp import nearest_feasible, solve_qp
 from switchfit.optimize.traced import Constraints, minimize_traced, nonnegative_minimum
 from switchfit.solve import minimized
 
@@ -525,3 +527,193 @@ def test_a_cluster_that_loses_a_worker_in_the_middle(tmp_path):
     assert len(study) == 6 * CHUNK
     assert study.success.all()
     np.testing.assert_allclose(study.theta, alone.theta, rtol=0, atol=1e-12)
+
+
+# What one fit raises does not end the others
+
+
+LIMIT = [np.inf]
+"""Largest k that `table` knows."""
+
+
+def look_up(k):
+    if np.any(k > LIMIT[0]):
+        raise ArithmeticError("the table ends below this k")
+    return np.zeros(np.shape(k), np.float32)
+
+
+@jax.custom_jvp
+def table(k):
+    """k itself, by way of a function that JAX cannot see into and that raises an error above a limit."""
+    shape = jax.ShapeDtypeStruct(k.shape, jnp.float32)
+    return k + jax.pure_callback(look_up, shape, k, vmap_method="expand_dims").astype(k.dtype)
+
+
+@table.defjvp
+def _(primals, tangents):
+    return table(*primals), tangents[0]
+
+
+FAILING = sf.HybridSystem({"on": lambda t, x, p: 1.0 - table(p["k"]) * x, "off": cooling}, [0.2])
+
+
+def failing_room(values, guess=(1.7, 1.0)):
+    data = sf.Measurements(TIMES, values, sigma=0.01)
+    run = sf.Experiment(data, ("on", "off"), guess[:1], 0.0, 6.0)
+    return sf.Problem(FAILING, run, {"k": sf.Parameter(guess[1], lower=0.1, upper=9.0)})
+
+
+def measured_room(seed):
+    clean = module._clean(room(), TRUTH)[0][0]
+    return clean + 0.01 * np.random.default_rng(seed).standard_normal(clean.shape)
+
+
+@pytest.fixture
+def limit(monkeypatch):
+    """Sets the largest k that the model's table knows; what JAX logs about callbacks is not of interest."""
+    monkeypatch.setattr("logging.root.disabled", True)
+
+    yield partial(LIMIT.__setitem__, 0)
+    LIMIT[0] = np.inf
+
+
+def test_a_start_that_raises_an_error_is_listed(limit):
+    limit(4.0)
+    study = sf.multistart(failing_room(measured_room(0)), [[2.0, 0.9], [2.0, 5.0], [1.5, 0.7]])
+    assert study.status.tolist() == ["CONVERGED", "ERROR", "CONVERGED"]
+    ((run, message),) = study.failures
+    assert run == 1
+    assert message.endswith("ArithmeticError: the table ends below this k")
+    assert study.clusters.tolist() == [0, -1, 0]
+    assert study.best.success
+
+
+def test_the_lowest_end_may_raise_an_error_when_it_is_fitted_again(monkeypatch):
+    from switchfit.batch import multistart as starts
+
+    problem, calls = room(sf.Measurements(TIMES, measured_room(0), sigma=0.01)), []
+
+    def estimate(problem, **settings):
+        calls.append(settings["start"])
+        if len(calls) == 1:
+            raise ArithmeticError("no")
+        return sf.estimate(problem, **settings)
+
+    monkeypatch.setattr(starts, "estimate", estimate)
+    study = sf.multistart(problem, [[2.0, 0.9], [1.5, 0.7]])
+    assert sorted(study.status.tolist()) == ["CONVERGED", "ERROR"]
+    assert study.best.success
+    monkeypatch.setattr(starts, "estimate", lambda problem, **settings: 1 / 0)
+    study = sf.multistart(problem, [[2.0, 0.9], [1.5, 0.7]])
+    assert study.best is None
+    assert study.status.tolist() == ["ERROR"] * 2
+    assert "ZeroDivisionError: division by zero" in study.failures[1][1]
+
+
+def test_a_replicate_that_raises_an_error_is_listed(limit):
+    found = sf.estimate(failing_room(measured_room(0)))
+    plain = sf.bootstrap(found, 8, seed=1)
+    order = np.sort(plain.theta[:, 1])
+    limit(0.5 * (order[-2] + order[-1]))  # the highest estimate of k is out of reach, the others are not
+    study = sf.bootstrap(found, 8, seed=1)
+    worst = int(np.argmax(plain.theta[:, 1]))
+    assert study.status[worst] == "ERROR"
+    assert study.success.sum() >= 5
+    good = np.flatnonzero(study.success)
+    np.testing.assert_allclose(study.theta[good], plain.theta[good], rtol=1e-8)
+
+
+def test_a_run_whose_noise_raises_an_error_is_listed():
+    def noise(rng, clean, item):
+        values = clean + 0.01 * rng.standard_normal(clean.shape)
+        lucky = rng.random()
+        if lucky < 0.2:
+            raise ArithmeticError("no noise today")
+        return values if lucky < 0.8 else np.full_like(values, np.nan)
+
+    study = sf.monte_carlo(room(), 40, theta=TRUTH, noise=noise, seed=1)
+    assert len(study) == 40
+    assert 4 <= np.sum(study.status == "ERROR") <= 36
+    assert study.success.sum() == 40 - np.sum(study.status == "ERROR")
+    said = [message for _, message in study.failures]
+    assert any("ArithmeticError: no noise today" in message for message in said)
+    assert any("noise must give finite values of shape (24, 1); got shape (24, 1), not all finite" in m for m in said)
+    good = np.flatnonzero(study.success)
+    assert np.isfinite(study.theta[good]).all()
+    assert np.isnan(study.cost[~study.success]).all()
+    with pytest.raises(ArithmeticError, match="never"):
+        sf.monte_carlo(
+            room(), 40, theta=TRUTH, noise=lambda rng, clean, item: (_ for _ in ()).throw(ArithmeticError("never"))
+        )
+
+
+def test_a_log_that_raises_an_error_is_listed(limit, tmp_path):
+    limit(4.0)
+    problems = [
+        failing_room(measured_room(seed), guess) for seed, guess in enumerate([(1.7, 1.0), (1.7, 5.0), (2.0, 0.9)])
+    ]
+    fits = sf.estimate_many(problems, folder=tmp_path)
+    assert fits.status.tolist() == ["CONVERGED", "ERROR", "CONVERGED"]
+    assert "the table ends below this k" in fits.failures[0][1]
+    np.testing.assert_array_equal(fits.start[1], [1.7, 5.0])
+    first = sf.estimate_many([failing_room(measured_room(1), (1.7, 5.0)), problems[0]])
+    assert first.status.tolist() == ["ERROR", "CONVERGED"]
+
+
+# Budgets, and fits that crawl
+
+
+def test_a_fit_that_crawls_towards_a_kink_is_handed_over():
+    from studies import ramps
+
+    problem, truth = ramps()
+    study = sf.monte_carlo(problem, 60, theta=truth, seed=0)
+    assert study.success.all()
+    assert np.sum(study.status == "CONVERGED_AT_KINK") > 15
+    assert study.evaluations.max() < 150
+    assert np.mean(study.evaluations) < 60
+
+
+def test_a_fit_that_is_finished_has_half_the_budget_left(monkeypatch):
+    """Whatever the program of all fits takes, `minimize` is never left with nothing."""
+    from switchfit.batch import program
+
+    budgets = []
+
+    def minimized(evaluator, theta, hessian, tolerance, max_iterations, **settings):
+        budgets.append(max_iterations)
+        return original(evaluator, theta, hessian, tolerance, max_iterations, **settings)
+
+    original = program.minimized
+    monkeypatch.setattr(program, "minimized", minimized)
+    study = sf.monte_carlo(room(), 4, theta=TRUTH, start=[4.0, 3.0], max_iterations=6)
+    assert budgets
+    assert min(budgets) >= 3
+    assert study.iterations.max() <= 6
+
+
+def test_an_end_that_is_out_of_order_by_rounding_is_finished():
+    """What the program of all fits leaves behind may violate a constraint by the error of its quadratic programme."""
+    problem = room(sf.Measurements(TIMES, measured_room(0), sigma=0.01))
+    starts = np.array([[-2.2e-11, 0.9], [6.0 + 1e-9, 0.8], [2.0, 0.8]])
+    meshes = evaluator_of(problem).meshes
+    found = fit_chunk(problem, meshes, Varying((), ()), starts, tolerance=1e-7, max_iterations=200)
+    assert "ERROR" not in found.status.tolist()
+    assert np.all(found.theta[:, 0] >= 0.0)
+    assert np.all(found.theta[:, 0] <= 6.0)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_nearest_feasible_point_is_that_of_the_quadratic_programme(seed):
+    rng = np.random.default_rng(seed)
+    d = int(rng.integers(1, 8))
+    A = np.diff(np.vstack([np.zeros(d), np.eye(d), np.zeros(d)]), axis=0)
+    lower, upper = (np.where(rng.random(d) < 0.3, value, inf) for value, inf in ((1.0, -np.inf), (9.0, np.inf)))
+    constraints = LinearConstraints(A, np.append(np.zeros(d), -10.0), lower, upper, ("",) * (d + 1 + 2 * d))
+    theta = rng.uniform(-2.0, 12.0, d)
+    if seed % 2:
+        theta = np.sort(np.clip(theta, 1.0, 9.0)) - 1e-11 * rng.standard_normal(d)
+    found = nearest_feasible(constraints, theta)
+    inside = np.full(d, 5.0)
+    expected = inside + solve_qp(inside - theta, np.eye(d), constraints.normals, -constraints.slack(inside)).step
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)

@@ -1,6 +1,7 @@
 """estimate(): truth recovered, constraints and kinks named, uncertainties in closed form, all ways to end."""
 
 import time
+from dataclasses import replace
 from functools import cache
 
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ import scipy.stats
 
 import switchfit as sf
 from switchfit.evaluate import evaluator_of
+from switchfit.solve import minimized
 
 # A capacitor that is charged through one resistor and discharged through another one
 
@@ -295,6 +297,100 @@ def test_too_few_iterations():
     assert not found.success
     assert found.iterations == 1
     assert "Raise max_iterations" in found.message
+
+
+def test_a_budget_is_that_of_one_mesh():
+    """The fit converges on the first mesh with its last iteration, and is resumed on a finer one all the same."""
+    problem = refined_fit().problem
+    on_first = minimized(evaluator_of(problem), problem.initial_theta, "exact", 1e-7, 200).iterations
+    found = sf.estimate(problem, max_iterations=on_first)
+    assert found.success
+    assert found.iterations == refined_fit().iterations > on_first
+    np.testing.assert_array_equal(found.theta, refined_fit().theta)
+
+
+def test_a_fit_that_is_out_of_iterations_is_not_resumed_with_none_left():
+    found = sf.estimate(refined_fit().problem, max_iterations=1)
+    assert found.status is sf.Status.MAX_ITERATIONS
+    assert found.iterations == 1
+    assert "Stopped after 1 iterations with" in found.message
+
+
+def test_a_fit_that_is_out_of_iterations_on_a_finer_mesh_says_how_many_there_were():
+    problem = capacitor(voltage(TIMES))
+    result = minimized(evaluator_of(problem), problem.initial_theta, "exact", 1e-7, 1)
+    stopped = replace(result, iterations=12, earlier=9)
+    assert "Stopped after 12 iterations, 9 of them before the mesh was refined, with" in stopped.message
+
+
+def test_times_out_of_order_by_rounding_are_put_in_order():
+    """By a part of 1e-15 of the horizon, the time itself being 0: an end that one fit found is a start for the next."""
+    problem = capacitor(voltage(TIMES))
+    for tau, put in ((-3.8e-14, 0.0), (2.0 + 4e-16, 2.0), (1.6e-30, 1.6e-30)):
+        assert problem.checked_theta([tau, 2.0, 1.0])[0] == put
+        sf.estimate(problem, start=[tau, 2.0, 1.0])
+    with pytest.raises(ValueError, match="must not decrease inside"):
+        problem.checked_theta([-1e-9, 2.0, 1.0])
+    two = sf.Problem(
+        CAPACITOR,
+        sf.Experiment(
+            sf.Measurements(TIMES, voltage(TIMES), sigma=SIGMA),
+            ("charge", "discharge", "charge", "discharge"),
+            (0.5, sf.Parameter(1.0, fixed=True), 1.5),
+            0.0,
+            2.0,
+        ),
+        {"k": GUESS[1:]},
+    )
+    theta = two.checked_theta([1.0 + 4e-16, 1.0 - 4e-16, 2.0, 1.0])
+    np.testing.assert_array_equal(theta, [1.0, 1.0, 2.0, 1.0])
+
+
+# Modes that collapse
+
+
+def drain(t, x, p):
+    return 0.0 * x - p["leak"]
+
+
+def with_a_mode_too_many(sequence, times):
+    system = sf.HybridSystem({"charge": charge, "discharge": discharge, "drain": drain}, [0.0])
+    data = sf.Measurements(TIMES, voltage(TIMES) + noise(1), sigma=SIGMA)
+    parameters = {"k": GUESS[1:], "leak": sf.Parameter(1.0, lower=0.1, upper=5.0)}
+    return sf.Problem(system, sf.Experiment(data, sequence, times, 0.0, 2.0), parameters)
+
+
+def test_a_mode_that_collapses_between_two_of_the_same_is_reported_as_such():
+    found = sf.estimate(with_a_mode_too_many(("charge", "discharge", "drain", "discharge"), (0.6, 1.3, 1.5)))
+    plain = sf.estimate(capacitor(voltage(TIMES) + noise(1), tau=0.6))
+    assert found.status is sf.Status.COLLAPSED
+    assert found.success
+    assert found.idle == ("tau_2", "tau_3", "leak")
+    assert found.theta[1] == found.theta[2]
+    assert found.active == ("mode 3 ('drain') has collapsed to nothing",)
+    # All else is what it is without that mode, and so are the standard errors.
+    known = [found.theta_names.index(name) for name in plain.theta_names]
+    np.testing.assert_allclose(found.theta[known], plain.theta, rtol=1e-6)
+    np.testing.assert_allclose(found.standard_errors[known], plain.standard_errors, rtol=1e-4)
+    text = str(found)
+    for said in (
+        "A MODE HAS COLLAPSED",
+        "Leave it out of mode_sequence",
+        "give min_duration",
+        "leak: acts only in modes",
+    ):
+        assert said in " ".join(text.split())
+    for unsaid in ("not identified", "Fix one of", "add data", "hardly determine", "NOT UNIQUE"):
+        assert unsaid not in " ".join(text.split())
+    assert "because a mode has collapsed" in " ".join(str(found.identifiability).split())
+
+
+def test_a_parameter_that_acts_only_in_a_mode_that_collapsed_at_the_start_is_named():
+    found = sf.estimate(with_a_mode_too_many(("drain", "charge", "discharge"), (0.2, 0.6)))
+    assert found.status is sf.Status.COLLAPSED
+    assert found.theta[0] == 0.0
+    assert found.idle == ("leak",)
+    assert "mode 1 ('drain') has collapsed to nothing" in found.active
 
 
 @pytest.mark.parametrize(("hessian", "iterations"), [("block-diagonal", 500), ("gauss-newton", 200), ("none", 3)])

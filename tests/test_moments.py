@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import switchfit as sf
+from switchfit.hidden import refuse_jumps
 from switchfit.identifiability import identifiability
 
 TIMES = np.linspace(0.5, 4.0, 8)
@@ -139,3 +140,33 @@ def test_a_hidden_switch_at_zero_is_found_between_its_bounds():
 
     with pytest.raises(ValueError, match=SAYS):
         sf.estimate(hidden_problem(mode, t_on=sf.Parameter(0.0, -1.0, 1.0)))
+
+
+@pytest.mark.parametrize("size", [0.1, 1.0, 5.0])
+@pytest.mark.parametrize("guess", [1.0, 1.5, 2.2, 2.8])
+def test_a_parameter_that_is_a_switch_and_smooth_as_well_is_recognised(guess, size):
+    """Its derivative is right between the jumps, and leads to where one of them stands in the way."""
+
+    def mode(t, x, p):
+        return jnp.where(t < p["t_on"], 0.0, p["heat"]) - 0.5 * x + size * 0.1 * (p["t_on"] - 1.7) * jnp.cos(t)
+
+    system = sf.HybridSystem({"m": mode}, [0.2])
+    times = np.linspace(0.1, 4.0, 40)
+    before, after = 0.2 * np.exp(-0.5 * times), 2.0 * (1.0 - np.exp(-0.5 * (times - 1.7)))
+    values = before + np.where(times < 1.7, 0.0, after)
+    parameters = {"t_on": sf.Parameter(guess, 0.2, 3.8), "heat": sf.Parameter(0.8, 0.1, 5.0)}
+    data = sf.Measurements(times, values, sigma=0.02)
+    with pytest.raises(
+        ValueError, match=r"the cost jumps from .* where t_on passes .* make it a transition time: a mode"
+    ):
+        sf.estimate(sf.Problem(system, sf.Experiment(data, ("m",), (), 0.0, 4.0), parameters))
+
+
+def test_a_coarse_mesh_is_no_jump():
+    """A fit whose integration error stays large, for another reason than a switch in a function, is not refused."""
+    system = sf.HybridSystem({"m": lambda t, x, p: -p["k"] * x + jnp.cos(60.0 * p["k"] * t)}, [1.0])
+    data = sf.Measurements(TIMES, np.exp(-TIMES), sigma=0.1)
+    problem = sf.Problem(system, sf.Experiment(data, ("m",), (), 0.0, 4.0), {"k": 1.0}, rtol=1e-2, atol=1e-2)
+    found = sf.estimate(problem)
+    evaluator = found.evaluator_at_solution()
+    refuse_jumps(evaluator, found.theta)

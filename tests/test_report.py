@@ -187,6 +187,8 @@ def test_what_failed_is_said_first():
         Status.NONFINITE_START: "NOT STARTED",
         Status.SADDLE: "NOT A MINIMUM",
         Status.SINGULAR: "NOT UNIQUE",
+        Status.COLLAPSED: "A MODE HAS COLLAPSED",
+        Status.ERROR: "NOT CONVERGED",
         Status.INFEASIBLE: "CONSTRAINTS NOT MET",
     }
     for status in Status:

@@ -643,6 +643,142 @@ def test_line_search_fails_on_a_wrong_gradient():
     assert not result.successful
     np.testing.assert_array_equal(result.theta, [1.0, 1.0])
     assert result.evaluations < 100
+    assert "it says -4, differences of the cost say 4" in result.message
+
+
+def test_the_entry_of_the_gradient_that_is_wrong_is_named():
+    result = minimize(
+        smooth(lambda t: (t @ t, np.array([2.0, -2.0]) * t, 2 * np.eye(2))), [1.0, 1.0], constraints=free(2)
+    )
+    assert result.status is Status.LINE_SEARCH_FAILED
+    assert "it is wrong in theta[1] (derivative -2, differences 2). Check the derivatives." in result.message
+    assert "theta[0]" not in result.message
+
+
+def test_a_kink_that_nobody_named_is_seen_and_the_derivatives_are_not_blamed():
+    def function(theta):
+        x, y = theta
+        cost = 5 * abs(x - 0.3) + (x - 1) ** 2 + (y - x) ** 2
+        return cost, [5 * np.sign(x - 0.3) + 2 * (x - 1) - 2 * (y - x), 2 * (y - x)], [[4.0, -2.0], [-2.0, 2.0]]
+
+    result = minimize(smooth(function), [0.0, 0.0], constraints=free(2))
+    assert result.status is Status.LINE_SEARCH_FAILED
+    assert "derivatives are right, but there is a kink close by, near theta[0] = 0.3:" in result.message
+    assert "check the derivatives" not in result.message.lower()
+
+
+def test_a_jump_of_the_cost_is_seen():
+    def function(theta):
+        x, y = theta
+        cost = 2.0 * (x > 0.3) + (x - 1) ** 2 + (y - x) ** 2
+        return cost, [2 * (x - 1) - 2 * (y - x), 2 * (y - x)], [[4.0, -2.0], [-2.0, 2.0]]
+
+    result = minimize(smooth(function), [0.0, 0.0], constraints=free(2))
+    assert result.status is Status.LINE_SEARCH_FAILED
+    assert "The cost jumps from 0.49 to 2.49 where theta[0] passes 0.3" in result.message
+
+
+def test_a_decrease_below_the_rounding_of_the_cost_is_told_as_such():
+    def function(theta):  # the Hessian promises a step a million times too long, and J is a large constant
+        return 1e12 + 1e-3 * (theta[0] - 1) ** 2, 2e-3 * (theta - 1), np.array([[2e-9]])
+
+    result = minimize(smooth(function), [0.0], constraints=free(1))
+    assert result.status is Status.LINE_SEARCH_FAILED
+    assert "less than its rounding error" in result.message
+
+
+def test_a_line_search_that_failed_begins_anew():
+    """One evaluation gives a cost that is too low: nothing nearby is lower, until that point is evaluated again."""
+    calls = []
+
+    def function(theta):
+        J, g, H = rosenbrock(theta)
+        calls.append(theta)
+        return J - (1.0 if len(calls) == 8 else 0.0), g, H
+
+    result = minimize(smooth(function), [-1.2, 1.0], constraints=free(2))
+    assert result.status is Status.CONVERGED
+    np.testing.assert_allclose(result.theta, 1.0, atol=1e-6)
+
+
+# --- rounding is measured by the size of the unknowns -----------------------------------------------------------------
+
+
+def test_a_time_within_rounding_of_the_start_is_at_the_start():
+    """tau_1 = 1.6e-30 instead of 0, at a breakpoint there, with a kink: no step along it can be told from none."""
+    constraints = LinearConstraints(
+        np.array([[1.0, 0.0], [-1.0, 1.0], [0.0, -1.0]]),
+        np.array([0.0, 0.0, -10.0]),
+        np.full(2, -np.inf),
+        np.full(2, np.inf),
+        ("first", "middle", "last", *(f"bound {k}" for k in range(4))),
+    )
+
+    def function(theta):
+        a, b = theta
+        return 3.0 * a + (b - 4.0) ** 2, [3.0, 2 * (b - 4.0)], [[0.0, 0.0], [0.0, 2.0]]
+
+    nodes = np.linspace(0.0, 10.0, 11)
+    result = minimize(
+        smooth(function), [1.6e-30, 2.5], constraints=constraints, breakpoints=[nodes, nodes], size=[10.0, 10.0]
+    )
+    assert result.status is Status.CONVERGED
+    assert result.theta[0] == 0.0
+    assert result.theta[1] == pytest.approx(4.0)
+    assert result.active == ("first",)
+    # A violation of that size is rounding as well, although tau_1 itself is no larger.
+    again = minimize(smooth(function), [-3.8e-14, 2.5], constraints=constraints, size=[10.0, 10.0])
+    assert again.theta[0] == 0.0
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_coincident_times_are_equal_bit_for_bit(seed):
+    """All of a group that the cost draws to one place end at the same number, whatever rounding did on the way."""
+    rng = np.random.default_rng(seed)
+    d = 5
+    A = np.diff(np.vstack([np.zeros(d), np.eye(d), np.zeros(d)]), axis=0)
+    b = np.append(np.zeros(d), -10.0)
+    names = tuple(f"row {k}" for k in range(d + 1 + 2 * d))
+    constraints = LinearConstraints(A, b, np.full(d, -np.inf), np.full(d, np.inf), names)
+    wanted = 5.0 + rng.normal(size=d)[::-1].cumsum()
+    result = minimize(
+        quadratic(np.eye(d), wanted), np.sort(rng.uniform(0.5, 9.5, d)), constraints=constraints, size=np.full(d, 10.0)
+    )
+    assert result.successful
+    gaps = A @ result.theta - b
+    assert np.all((gaps == 0.0) | (gaps > 1e-9))
+    assert len(result.active) == np.sum(gaps == 0.0)
+
+
+# --- unknowns on which the cost does not depend -----------------------------------------------------------------------
+
+
+def test_what_is_idle_is_held_and_its_curvature_not_asked_for():
+    """J is flat along (1, 1) where both are equal; what it has there is the error of its evaluation, a ripple."""
+    ripple = 1e-9
+
+    def function(theta):
+        a, b, c = theta
+        cost = (b - a) + (c - 1.0) ** 2 + ripple * np.cos(40 * (a + b))
+        s, k = -40 * ripple * np.sin(40 * (a + b)), -1600 * ripple * np.cos(40 * (a + b))
+        return cost, [s - 1.0, s + 1.0, 2 * (c - 1.0)], [[k, k, 0.0], [k, k, 0.0], [0.0, 0.0, 2.0]]
+
+    constraints = rows([[-1.0, 1.0, 0.0]], [0.0])
+
+    def idle(theta, everything):
+        return np.array([theta[0] == theta[1], False, False])
+
+    start = [0.3, 0.62, 3.0]
+    result = minimize(smooth(function), start, constraints=constraints, idle=idle, size=np.ones(3))
+    assert result.status is Status.COLLAPSED
+    assert result.status.converged
+    assert not result.successful
+    assert result.idle == (0, 1)
+    assert result.optimality < 1e-12
+    np.testing.assert_allclose(np.abs(result.free_basis), [[0.0], [0.0], [1.0]], atol=1e-12)
+    assert result.smallest_eigenvalue == pytest.approx(1.0)
+    assert "(theta[0], theta[1])" in result.message
+    assert result.iterations < 10
 
 
 def test_the_limit_of_precision_is_a_success():

@@ -19,6 +19,7 @@ from switchfit.data import FloatArray
 from switchfit.engine import Engine
 from switchfit.evaluate import Evaluator, evaluator_of
 from switchfit.guards import on_guards
+from switchfit.hidden import refuse_jumps
 from switchfit.identifiability import Identifiability, identifiability
 from switchfit.io.json import load_fit, save_fit
 from switchfit.optimize import IterationRecord, Result, Status, minimize_constrained
@@ -46,6 +47,9 @@ REFINEMENTS = 2
 LARGEST_INTEGRATION_ERROR = 1e-8
 """Relative error of J, a guard or a terminal constraint (by halving all steps, see `switchfit.accuracy`) above which
 the mesh is refined again, unless rtol allows more."""
+
+STOPPED = (Status.INTERRUPTED, Status.NONFINITE_START, Status.MAX_ITERATIONS)
+"""Ends after which a fit is not resumed on a finer mesh."""
 
 MOST_SENSITIVITIES = 2**28
 """Bytes that the derivatives of states and outputs at all nodes may take; beyond, figures have no bands."""
@@ -235,6 +239,8 @@ def estimate(
         On the KKT residual, the norm of the gradient where no constraint is active. An unknown on a logarithmic scale
         counts by its logarithm, one whose first guess is below 1e-3 or above 1e3 in units of (about) that guess.
     max_iterations : int
+        Most iterations on one mesh. Where a fit has converged but the integration error asks for a finer mesh, at most
+        twice, it is resumed there with as many again; ``iterations`` counts all of them.
     callback : callable, optional
         Called with each `IterationRecord`; a true return value stops the fit. Ctrl-C does as well; both
         return the best point so far.
@@ -269,11 +275,11 @@ def estimate(
     for attempt in range(REFINEMENTS + 1):
         last = history[-1] if history else None
         told = None if callback is None else lambda record, last=last: callback(record.counted_on(last))
-        left = max_iterations - max(len(history) - 1, 0)
+        earlier = max(len(history) - 1, 0)
         if problem.constraint_names:
-            result, held = _minimized_with_constraints(evaluator, theta, tolerance, max(left, 0), told)
+            result, held = _minimized_with_constraints(evaluator, theta, tolerance, max_iterations, told)
         else:
-            result = minimized(evaluator, theta, hessian, tolerance, max(left, 0), told, constraints)
+            result = minimized(evaluator, theta, hessian, tolerance, max_iterations, told, constraints)
         records = [record.counted_on(last) for record in result.history]
         history += records[1:] if history else records
         evaluations += result.evaluations
@@ -289,15 +295,16 @@ def estimate(
             constraints=[value for _, value, _ in held],
         )
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
-        done = result.status in (Status.INTERRUPTED, Status.NONFINITE_START) or attempt == REFINEMENTS
-        if done or not excess > 1:
+        if result.status in STOPPED or attempt == REFINEMENTS or not excess > 1:
             break
         evaluator = _refined(fine, problem.checked_theta(start), theta, excess)
+    if excess > 1 and result.status.converged and not problem.constraint_names:
+        refuse_jumps(evaluator, theta)  # the error of steps across a jump does not vanish with their length
     trajectories, comparisons = compared(problem, theta, runs)
     return _estimate(
         problem,
         evaluator,
-        result,
+        replace(result, iterations=earlier + result.iterations, earlier=earlier),
         history,
         hessian,
         tolerance,
@@ -347,6 +354,7 @@ def _minimized_with_constraints(
         callback=callback,
         constraints=constraints_of(problem),
         breakpoints=evaluator.breakpoints(),
+        size=problem.sizes,
     )
     values, multipliers = found.constraints.tolist(), found.multipliers.tolist()
     return found.result, tuple(zip(names, values, multipliers, strict=True))
@@ -400,6 +408,7 @@ def _estimate(
         sigma_known=sigma_known(problem),
         priors={name: text for name, text in zip(unknowns.names, unknowns.priors.texts(), strict=True) if text},
         log_scaled=unknowns.log_names,
+        idle=tuple(unknowns.names[i] for i in result.idle),
         least_squares=least_squares(problem),
         hessian_kind=hessian,
         tolerance=tolerance,

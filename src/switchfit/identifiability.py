@@ -85,7 +85,7 @@ class Identifiability:
     without : tuple of str
         Unknowns on which the cost does not depend at all, to second order.
     held : tuple of str
-        Unknowns that a constraint or a kink holds, of which nothing is said.
+        Unknowns that a constraint, a kink or a collapsed mode holds, of which nothing is said.
     directions : tuple of Direction
         The badly determined ones, at most three, and the worst one at any rate.
     rise : float
@@ -93,6 +93,8 @@ class Identifiability:
     meaning : str
         What that rise is, with {} where its size belongs.
     where : str
+    idle : tuple of str
+        Unknowns on which the cost does not depend because modes have collapsed, as in `Fit.idle`.
     """
 
     theta_names: tuple[str, ...]
@@ -104,6 +106,7 @@ class Identifiability:
     rise: float
     meaning: str
     where: str
+    idle: tuple[str, ...] = ()
 
     @property
     def condition_number(self) -> float:
@@ -122,8 +125,14 @@ class Identifiability:
         lines = []
         if self.without:
             lines.append(f"{self.where} the cost does not depend on {', '.join(self.without)}, to second order.")
+        if self.idle:
+            lines.append(
+                f"{self.where} the cost does not depend on {', '.join(self.idle)}, because a mode has collapsed: leave "
+                "it out of mode_sequence."
+            )
         if not count:
-            return f"{self.where} constraints and kinks hold all unknowns."
+            lines.append(f"{self.where} constraints, kinks and collapsed modes hold all unknowns.")
+            return "\n".join(part for line in lines for part in textwrap.wrap(line, WIDTH))
         if self.undetermined == 0:
             lines.append(
                 f"{self.where} the data determine all {count} unknowns; condition number of the scaled Hessian "
@@ -179,7 +188,7 @@ def after(fit: Fit, evaluator: Evaluator | None) -> Identifiability:
         scale = fit.residual_variance if fit.sigma_known is False and fit.freedom > 0 else 1.0
         rise, meaning = 0.5 * scale * fit.quantile(0.95) ** 2, HIDDEN
     cost = None if evaluator is None else lambda theta: evaluator(theta).cost
-    return analyse(
+    found = analyse(
         fit.hessian,
         fit.free_basis,
         fit.theta,
@@ -192,6 +201,7 @@ def after(fit: Fit, evaluator: Evaluator | None) -> Identifiability:
         allowed=None if evaluator is None else _allowed(evaluator.problem),
         base=fit.cost,
     )
+    return replace(found, idle=fit.idle)
 
 
 def _before(problem: Problem) -> Identifiability:

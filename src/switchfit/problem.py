@@ -31,6 +31,9 @@ GIVEN = ("system", "experiments", "parameters", "min_duration", "solver", "rtol"
 SMALLEST_RTOL = 1e-13
 """Local errors below this part of the state are rounding."""
 
+ROUNDING = 1e-12
+"""Transition times that are out of order by less than this part of the horizon are so by rounding."""
+
 
 @dataclass(frozen=True)
 class Unknowns:
@@ -323,6 +326,18 @@ class Problem:
         """Whether theta is what the programs of a single experiment take."""
         return len(self.places) == 1 and np.array_equal(self.places[0], np.arange(len(self.theta_names)))
 
+    @cached_property
+    def sizes(self) -> FloatArray:
+        """Typical size of each unknown, by which rounding is measured: (d,).
+
+        For a transition time it is the length of the horizon, or what the clock reads if that is more: a time that is
+        1e-30 after t0 = 0 is t0.
+        """
+        sizes = np.abs(self.unknowns.initial)
+        for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
+            sizes[where[where >= 0]] = _clock(experiment)
+        return sizes
+
     def vectors(self, theta: FloatArray, e: int) -> tuple[FloatArray, FloatArray]:
         """What the compiled programs of experiment e take: its transition times (N,) and its p (M,)."""
         places, N = self.places[e], self.structures[e].N
@@ -399,13 +414,21 @@ class Problem:
             )
         if not np.all(np.isfinite(checked)):
             raise ValueError(f"{what} must be finite; got {shown(checked)}.")
-        for experiment, times in zip(self.experiments, self.split(checked)[0], strict=True):
+        checked = checked.copy()
+        for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
+            times = experiment.initial_times
+            times[where >= 0] = checked[where[where >= 0]]
             knots = np.concatenate([[experiment.t0], times, [experiment.tf]])
-            if np.any(np.diff(knots) < 0):
+            if np.any(np.diff(knots) < -ROUNDING * _clock(experiment)):
                 raise ValueError(
                     f"The transition times in {what} must not decrease inside (t0, tf) = ({experiment.t0}, "
                     f"{experiment.tf}); got {shown(times)}."
                 )
+            if np.any(np.diff(knots) < 0):  # by rounding: put in order, round the times that are fixed
+                low = np.maximum.accumulate(np.append(experiment.t0, np.where(where < 0, times, -np.inf)))[1:]
+                high = np.minimum.accumulate(np.append(np.where(where < 0, times, np.inf), experiment.tf)[::-1])[::-1]
+                ordered = np.maximum.accumulate(np.clip(times, low, high[:-1]))
+                checked[where[where >= 0]] = ordered[where >= 0]
         self._check_delays_inside(checked, what)
         return checked
 
@@ -430,6 +453,11 @@ class Problem:
             span = self.unknowns.parameters.get(name)
             parameters[name] = parameter.value if span is None else theta[span].reshape(parameter.shape)
         return times, parameters
+
+
+def _clock(experiment: Experiment) -> float:
+    """Size of the times of an experiment, of which rounding is a part: the horizon, or the clock's reading if more."""
+    return max(experiment.tf - experiment.t0, abs(experiment.t0), abs(experiment.tf))
 
 
 def _checked_parameters(parameters: Any) -> dict[str, Parameter]:

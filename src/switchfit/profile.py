@@ -200,7 +200,7 @@ class Trace:
             return None
         # The others are optimal: their change contributes nothing to the derivative.
         slope = float(result.gradient[self.index])
-        good = result.successful or result.status is Status.SINGULAR
+        good = result.status.converged
         return Point(value, result.cost, slope, result.theta, good)
 
     def add(self, value: float, near: Point, before: Point | None = None) -> Point | None:

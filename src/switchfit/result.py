@@ -151,6 +151,10 @@ class Fit:
         What evaluated cost and derivatives: machine code, or JAX and why. None where that is not known.
     integration_error_of : str
         The output that has the `integration_error`: "J", or the name of a guard or terminal constraint.
+    idle : tuple of str
+        Unknowns on which J does not depend because modes have collapsed: the transition times of a mode of no duration
+        between two stretches of the same mode, and parameters that act in collapsed modes alone. Their values say
+        nothing, and they are not in `free_basis`.
     """
 
     theta_names: tuple[str, ...]
@@ -187,11 +191,15 @@ class Fit:
     least_squares: bool = True
     engine: Engine | None = None
     integration_error_of: str = "J"
+    idle: tuple[str, ...] = ()
 
     @property
     def success(self) -> bool:
-        """Whether the fit converged; with `Status.SINGULAR` to a point from which J is flat in some direction."""
-        return self.status.successful or self.status is Status.SINGULAR
+        """Whether the fit converged; with `Status.SINGULAR` to a point from which J is flat in some direction.
+
+        With `Status.COLLAPSED` J is flat in nothing but what a mode of no duration leaves undetermined.
+        """
+        return self.status.converged
 
     @property
     def trajectory(self) -> Trajectory:

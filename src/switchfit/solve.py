@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from switchfit.collapsed import idle_unknowns
 from switchfit.data import FloatArray, Measurements, TerminalConstraint
 from switchfit.evaluate import ArrowEvaluation, Evaluation, Evaluator
-from switchfit.hidden import refuse_hidden_switches
+from switchfit.hidden import refuse_hidden_switches, refuse_jumps
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
 from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.sqp import HessianKind
@@ -83,6 +85,9 @@ def minimized(
             refuse_hidden_switches(evaluator, theta, here.gradient)
         return here if identity else _inward(variables, theta, here)
 
+    def idle(z: FloatArray, everything: bool) -> NDArray[np.bool_]:
+        return idle_unknowns(evaluator, z if identity else _outward(variables, constraints, z), everything)
+
     is_time = np.zeros(len(theta), dtype=int)
     for where in problem.unknowns.times:
         is_time[where[where >= 0]] = 1
@@ -99,7 +104,11 @@ def minimized(
         tolerance=tolerance,
         max_iterations=max_iterations,
         callback=told,
+        size=variables.sizes_inward(problem.sizes),
+        idle=idle,
     )
+    if result.status is Status.LINE_SEARCH_FAILED:
+        refuse_jumps(evaluator, result.theta if identity else _outward(variables, constraints, result.theta))
     return result if identity else _result_outward(variables, constraints, result)
 
 

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from switchfit.batch.chunks import Work, run_chunks
 from switchfit.data import FloatArray, Measurements
+from switchfit.evaluate import evaluator_of
+from switchfit.hidden import refuse_hidden_switches
 from switchfit.optimize import Status
 from switchfit.problem import Problem
 from switchfit.progress import reporting
@@ -86,7 +88,7 @@ class Fits:
     @cached_property
     def success(self) -> NDArray[np.bool_]:
         """Which of them converged: (R,)."""
-        good = [status.name for status in Status if status.successful or status is Status.SINGULAR]
+        good = [status.name for status in Status if status.converged]
         return np.isin(self.status, good)
 
     @property
@@ -164,19 +166,32 @@ def repeat(
     Raises
     ------
     ValueError
-        For a problem with guards or terminal constraints.
+        For a problem with guards or terminal constraints, or one with a switch that is hidden in a function, with which
+        no fit could be right.
     """
     if problem.constraint_names:
         raise ValueError(
             f"{title} takes no guards and no terminal constraints; this problem has {problem.constraint_names[0]!r}. "
             "Call sf.estimate for one fit after the other."
         )
+    _refuse_hidden_switches(problem)
     progress, end = reporting(callback, title)
     try:
         runs, arrays = run_chunks(work, count, client=client, folder=folder, progress=progress)
     finally:
         end()
     return _fields(problem, count, runs, arrays, time.perf_counter() - began)
+
+
+def _refuse_hidden_switches(problem: Problem) -> None:
+    """What `estimate` refuses for the model's sake, before thousands of fits list it one by one."""
+    try:
+        evaluator, theta = evaluator_of(problem), problem.initial_theta
+        gradient = evaluator(theta).gradient
+    except Exception:  # a guess at which the model cannot be evaluated: the fits that begin there will say so
+        return
+    if np.isfinite(gradient).all():
+        refuse_hidden_switches(evaluator, theta, gradient)
 
 
 def _fields(

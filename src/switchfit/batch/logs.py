@@ -11,15 +11,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from switchfit.accuracy import cost_error
+from switchfit.batch.again import adopt, is_resolved
 from switchfit.batch.chunks import Arrays, fingerprint
 from switchfit.batch.fits import Fits, check_long_run, repeat, sample_count
-from switchfit.batch.program import Varying, chunk_size, fit_chunk
-from switchfit.estimate import LARGEST_INTEGRATION_ERROR, checked_settings, estimate
+from switchfit.batch.program import Varying, chunk_size, error_message, failed_chunk, fit_chunk
+from switchfit.estimate import checked_settings, estimate
 from switchfit.evaluate import evaluator_of
 from switchfit.optimize import Status
 from switchfit.problem import Problem
-from switchfit.result import inverse_on
 from switchfit.solve import sigma_known
 from switchfit.validation import as_instance, as_sequence, listed
 
@@ -94,12 +93,19 @@ class _Work:
     def __call__(self, runs: range) -> Arrays:
         """Fits of some of the problems: those whose programs agree go together, and then back into their order."""
         groups: dict[Any, list[int]] = {}
+        errors: dict[int, Exception] = {}
         for k in runs:
-            groups.setdefault(_kind(self.problems[k]), []).append(k)
-        order, parts = [], []
-        for members in groups.values():
-            order += members
-            parts.append(self._group([self.problems[k] for k in members]))
+            try:
+                groups.setdefault(_kind(self.problems[k]), []).append(k)
+            except (
+                Exception
+            ) as error:  # where its guess cannot be integrated, say: listed, as it must not end the others
+                errors[k] = error
+        parts = [self._group([self.problems[k] for k in members]) for members in groups.values()]
+        order = [k for members in groups.values() for k in members]
+        if errors:
+            order += errors
+            parts.append(self._failed(errors))
         place = np.argsort(order)
         return {name: np.concatenate([part[name] for part in parts])[place] for name in parts[0]}
 
@@ -117,35 +123,41 @@ class _Work:
             max_iterations=self.max_iterations,
         )
         arrays = {name: np.array(value) for name, value in found._asdict().items()}
-        arrays["message"] = arrays["message"].astype(object)
+        arrays["message"], arrays["status"] = arrays["message"].astype(object), arrays["status"].astype(object)
         for k, problem in enumerate(problems):
-            self._check(problem, k, arrays)
-        arrays["message"] = arrays["message"].astype(str)
+            if arrays["status"][k] != Status.ERROR.name:
+                try:
+                    self._check(problem, k, arrays)
+                except Exception as error:
+                    arrays["status"][k], arrays["message"][k] = Status.ERROR.name, error_message(error)
+        arrays["message"], arrays["status"] = arrays["message"].astype(str), arrays["status"].astype(str)
         return {**arrays, "start": starts, "samples": np.array([sample_count(problem) for problem in problems])}
+
+    def _failed(self, errors: dict[int, Exception]) -> Arrays:
+        """Arrays for problems that could not be begun."""
+        starts = np.array([self.problems[k].initial_theta for k in errors])
+        found = failed_chunk(starts, dict(enumerate(errors.values())))
+        samples = np.array([sample_count(self.problems[k]) for k in errors])
+        return {**found._asdict(), "start": starts, "samples": samples}
 
     def _check(self, problem: Problem, k: int, arrays: Arrays) -> None:
         """Do a fit again by `estimate` if its integration error is too large."""
-        theta, cost = arrays["theta"][k], arrays["cost"][k]
-        fine = evaluator_of(problem).divided().cost(theta)
-        if cost_error(problem, fine, cost, 0.0) <= max(LARGEST_INTEGRATION_ERROR, problem.rtol):
-            return
-        again = estimate(problem, tolerance=self.tolerance, max_iterations=self.max_iterations, start=theta)
-        for name in ("theta", "cost", "gradient", "hessian", "optimality"):
-            arrays[name][k] = getattr(again, name)
-        arrays["iterations"][k] += again.iterations
-        arrays["evaluations"][k] += again.evaluations
-        arrays["status"][k] = again.status.name
-        arrays["free"][k] = again.free_basis.shape[1]
-        arrays["covariance"][k] = inverse_on(again.free_basis, again.hessian)
-        ordinary = again.status is Status.CONVERGED and not again.active
-        arrays["message"][k] = "" if ordinary else again.message
+        theta, cost = arrays["theta"][k], float(arrays["cost"][k])
+        if not is_resolved(problem, evaluator_of(problem).meshes, theta, cost):
+            adopt(
+                arrays, k, estimate(problem, tolerance=self.tolerance, max_iterations=self.max_iterations, start=theta)
+            )
 
     def fingerprint(self) -> str:
         parts: list[Any] = ["logs", len(self.problems), self.tolerance, self.max_iterations]
         for problem in self.problems:
-            leaves = jax.tree.leaves(tuple(evaluator_of(problem).arguments))
-            parts += [problem.theta_names, problem.initial_theta, *problem.unknowns.priors, *map(np.asarray, leaves)]
-            parts.append(problem.digests)
+            parts += [problem.theta_names, problem.initial_theta, *problem.unknowns.priors, problem.digests]
+            try:
+                evaluator = evaluator_of(problem)
+            except Exception as error:  # this one will be listed as failed
+                parts.append(error_message(error))
+            else:
+                parts += map(np.asarray, jax.tree.leaves(tuple(evaluator.arguments)))
         return fingerprint(*parts)
 
 

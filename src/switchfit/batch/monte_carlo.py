@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.accuracy import cost_error
+from switchfit.batch.again import redo_unresolved
 from switchfit.batch.chunks import Arrays, fingerprint
 from switchfit.batch.fits import Fits, check_long_run, repeat, sample_count
-from switchfit.batch.program import Varying, chunk_size, fit_chunk
+from switchfit.batch.program import Varying, chunk_size, fit_chunk, with_errors
 from switchfit.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.estimate import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, checked_settings, estimate
 from switchfit.evaluate import Evaluator
@@ -29,6 +30,9 @@ from switchfit.validation import as_array, as_callable, as_count, as_instance, a
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+SOUND_AMONG = 3
+"""First runs among which one must be such that its noise can be drawn; what is wrong with a single one is listed."""
 
 Noise = float | ArrayLike | Callable[[np.random.Generator, FloatArray, Any], ArrayLike] | None
 
@@ -199,8 +203,8 @@ def simulated(
         ``time.perf_counter()`` when the call began.
     """
     work = _Work(problem, [], truth, begin, noise, seed, tolerance, max_iterations, _clean(problem, truth))
-    work.check_noise()
-    work.meshes, error = _meshes(work.problem_of(0), truth, begin)
+    work.check_noise(runs)
+    work.meshes, error = _meshes(work.problem_of(work.sound), truth, begin)
     found = repeat(problem, work, runs, title, began, client=client, folder=folder, callback=callback)
     return found, error
 
@@ -272,27 +276,41 @@ class _Work:
     tolerance: float
     max_iterations: int
     clean: list[list[FloatArray | None]]
+    sound: int = 0  # a run whose noise can be drawn
 
     @property
     def size(self) -> int:
         return chunk_size()
 
-    def check_noise(self) -> None:
-        """One draw, for the errors in it."""
-        for (e, k), values in self._noisy(0).items():
-            shape = np.shape(self.clean[e][k])  # type: ignore[arg-type]  # what was drawn has a clean one
-            if values.shape != shape or not np.isfinite(values).all():
-                raise ValueError(f"noise must give finite values of shape {shape}; got shape {values.shape}.")
+    def check_noise(self, count: int) -> None:
+        """Draw until one run can be had: the error of the first one where none of the first few can."""
+        errors = []
+        for run in range(min(count, SOUND_AMONG)):
+            try:
+                self._noisy(run)
+            except Exception as error:  # of this run alone, perhaps
+                errors.append(error)
+            else:
+                self.sound = run
+                return
+        raise errors[0]
 
     def _noisy(self, run: int) -> dict[tuple[int, int], FloatArray]:
         """Values of the k-th data of experiment e, in one run."""
         rng = np.random.default_rng([self.seed, run])
-        return {
-            (e, k): self._drawn(rng, clean, self.problem.experiments[e].data[k], e)
-            for e, items in enumerate(self.clean)
-            for k, clean in enumerate(items)
-            if clean is not None
-        }
+        drawn = {}
+        for e, items in enumerate(self.clean):
+            for k, clean in enumerate(items):
+                if clean is None:
+                    continue
+                values = self._drawn(rng, clean, self.problem.experiments[e].data[k], e)
+                if values.shape != clean.shape or not np.isfinite(values).all():
+                    raise ValueError(
+                        f"noise must give finite values of shape {clean.shape}; got shape {values.shape}"
+                        + (f" in run {run}." if np.isfinite(values).all() else f", not all finite, in run {run}.")
+                    )
+                drawn[e, k] = values
+        return drawn
 
     def _drawn(self, rng: np.random.Generator, clean: FloatArray, item: Any, e: int) -> FloatArray:
         if callable(self.noise):
@@ -325,7 +343,13 @@ class _Work:
         return replace(self.problem, experiments=experiments)
 
     def __call__(self, runs: range) -> Arrays:
-        noisy = [self._noisy(run) for run in runs]
+        noisy, errors = [], {}
+        for place, run in enumerate(runs):
+            try:
+                noisy.append(self._noisy(run))
+            except Exception as error:  # listed: it must not end the other runs
+                noisy.append(self._without_noise())
+                errors[place] = error
         varying = self._varying({key: np.stack([values[key] for values in noisy]) for key in noisy[0]})
         starts = np.repeat(self.start[None], len(runs), axis=0)
         found = fit_chunk(
@@ -336,7 +360,14 @@ class _Work:
             tolerance=self.tolerance,
             max_iterations=self.max_iterations,
         )
+        found = with_errors(found, errors) if errors else found
+        settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
+        found = redo_unresolved(found, lambda k: self.problem_of(runs[k]), self.meshes, **settings)
         return {**found._asdict(), "start": starts, "samples": np.full(len(runs), sample_count(self.problem))}
+
+    def _without_noise(self) -> dict[tuple[int, int], FloatArray]:
+        """What stands for the values of a run that could not be drawn."""
+        return {(e, k): v for e, items in enumerate(self.clean) for k, v in enumerate(items) if v is not None}
 
     def _varying(self, values: dict[tuple[int, int], FloatArray]) -> Varying:
         """Noisy values (R, K, q) of all data as leaves of the arguments."""
@@ -367,7 +398,7 @@ class _Work:
     def fingerprint(self) -> str:
         unknowns = self.problem.unknowns
         data = [np.asarray(values) for items in self.clean for values in items if values is not None]
-        drawn = list(self._noisy(0).values())  # stands for the noise, which may be a function
+        drawn = list(self._noisy(self.sound).values())  # stands for the noise, which may be a function
         settings = self.seed, self.tolerance, self.max_iterations, unknowns.names, self.problem.solver
         model = self.problem.digests
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors

@@ -13,13 +13,15 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.batch.again import redo_unresolved
 from switchfit.batch.chunks import Arrays, fingerprint
 from switchfit.batch.fits import Fits, check_long_run, repeat, sample_count
-from switchfit.batch.program import Varying, chunk_size, fit_chunk
+from switchfit.batch.program import Varying, chunk_size, error_message, fit_chunk
 from switchfit.data import FloatArray
 from switchfit.estimate import Estimate, checked_settings, estimate
 from switchfit.evaluate import evaluator_of
 from switchfit.mesh import Mesh
+from switchfit.optimize import Status
 from switchfit.optimize.qp import solve_qp
 from switchfit.parameter import unit_suffix
 from switchfit.problem import Problem
@@ -32,6 +34,9 @@ if TYPE_CHECKING:
 
 MOST_DRAWN = 2**30
 """Points that SciPy's Sobol sequences have."""
+
+ENDS_TRIED = 10
+"""Ends from which a full estimate is tried, the lowest first."""
 
 SAME_COST = 1e-6
 """Two ends are one minimum if their costs differ by less than this part of them, and ..."""
@@ -50,12 +55,12 @@ class Multistart(Fits):
     ----------
     clusters : (R,) int
         Which minimum each start ended in, 0 being the lowest; -1 where it did not converge.
-    best : Estimate
-        A full estimate, resumed at the lowest end.
+    best : Estimate or None
+        A full estimate, resumed at the lowest end; None where each of the lowest ones raises an error.
     """
 
     clusters: NDArray[np.int64]
-    best: Estimate
+    best: Estimate | None
 
     def __str__(self) -> str:
         lines = [*self._summary(), "", f"{int(self.clusters.max(initial=-1)) + 1} minima:"]
@@ -119,13 +124,27 @@ def multistart(
     points = _given(problem, starts) if several else _drawn(problem, starts, seed)
     work = _Work(problem, list(evaluator_of(problem).meshes), points, tolerance, max_iterations)
     found = repeat(problem, work, len(points), "Multistart", began, client=client, folder=folder, callback=callback)
-    fits = Fits(**found)
-    clusters = _clusters(problem, fits)
-    lowest = np.where(fits.success, fits.cost, np.inf) if fits.success.any() else np.nan_to_num(fits.cost, nan=np.inf)
-    best = estimate(
-        problem, start=fits.theta[int(np.argmin(lowest))], tolerance=tolerance, max_iterations=max_iterations
-    )
-    return Multistart(**found, clusters=clusters, best=best)
+    best, errors = _best(problem, Fits(**found), tolerance, max_iterations)
+    if errors:
+        status, message = found["status"].astype(object), found["message"].astype(object)
+        for k, error in errors.items():
+            status[k], message[k] = Status.ERROR.name, error_message(error)
+        found |= {"status": status.astype(str), "message": message.astype(str)}
+    return Multistart(**found, clusters=_clusters(problem, Fits(**found)), best=best)
+
+
+def _best(
+    problem: Problem, fits: Fits, tolerance: float, max_iterations: int
+) -> tuple[Estimate | None, dict[int, Exception]]:
+    """A full estimate, resumed at the lowest end that allows one, and the errors of the ends that do not."""
+    errors: dict[int, Exception] = {}
+    for k in np.lexsort((np.nan_to_num(fits.cost, nan=np.inf), ~fits.success))[:ENDS_TRIED].tolist():
+        start = fits.theta[k] if np.isfinite(fits.theta[k]).all() else fits.start[k]
+        try:
+            return estimate(problem, start=start, tolerance=tolerance, max_iterations=max_iterations), errors
+        except Exception as error:  # of this end alone: listed
+            errors[k] = error
+    return None, errors
 
 
 @dataclass
@@ -152,6 +171,8 @@ class _Work:
             tolerance=self.tolerance,
             max_iterations=self.max_iterations,
         )
+        settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
+        found = redo_unresolved(found, lambda k: self.problem, self.meshes, **settings)
         return {**found._asdict(), "start": starts, "samples": np.full(len(runs), sample_count(self.problem))}
 
     def fingerprint(self) -> str:

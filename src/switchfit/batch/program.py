@@ -9,8 +9,9 @@ What `minimize_traced` does not treat is finished by `minimize`, as in a single 
 
 from __future__ import annotations
 
+import re
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -29,18 +30,26 @@ from switchfit.mesh import Mesh
 from switchfit.model import Arguments, Structure, float64
 from switchfit.native.foreign import foreign_derivatives
 from switchfit.optimize import Status
+from switchfit.optimize.qp import nearest_feasible
 from switchfit.optimize.traced import Constraints, Outcome, minimize_traced
 from switchfit.optimize.variables import Variables
 from switchfit.priors import PriorTerms
 from switchfit.problem import Problem
 from switchfit.result import inverse_on
-from switchfit.solve import message_of, minimized
+from switchfit.solve import constraints_of, message_of, minimized
 
 CHUNK = 32
 """Fits that one call of the program takes on a CPU."""
 
 CHUNK_IN_LOCKSTEP = 1024
 """The same on a GPU, where they go in lockstep."""
+
+
+LONGEST_ERROR = 500
+"""Characters of an error that are listed."""
+
+RAISED = re.compile(r"\s*[\w.]+(Error|Exception): ")
+"""The line of a traceback that names an exception."""
 
 
 class Varying(NamedTuple):
@@ -100,7 +109,7 @@ class Chunk(NamedTuple):
     status : (R,) str
         Name of the `Status`.
     message : (R,) str
-        Empty where the status is CONVERGED without an active constraint.
+        Empty where the status is CONVERGED without an active constraint; the error of a fit that ended with one.
     free : (R,) int
         Directions that constraints and kinks leave free; the covariance is of these.
     covariance : (R, d, d)
@@ -162,13 +171,14 @@ def fit_chunk(
         varying.places,
         lockstep,
         tolerance,
-        max_iterations,
+        max_iterations // 2,  # what it does not settle has as many left for the optimiser that finishes it
     )
     count = len(starts)
     size = max(count, chunk_size(lockstep))
     evaluator = Evaluator(problem, meshes=meshes)
     variables = unknowns.variables
-    constraints = (unknowns.A, unknowns.b, variables.inward(unknowns.lower), variables.inward(unknowns.upper))
+    bounds = variables.inward(unknowns.lower), variables.inward(unknowns.upper)
+    constraints = (unknowns.A, unknowns.b, *bounds, variables.sizes_inward(problem.sizes))
     with float64():
         given = (
             tuple(evaluator.arguments),
@@ -179,8 +189,11 @@ def fit_chunk(
             _padded(variables.inward(np.asarray(starts)), size),
             count,
         )
-        with _compiling(layout, given):
-            outcome = jax.tree.map(lambda a: np.asarray(a)[:count], _fits(*given, layout=layout))
+        try:
+            with _compiling(layout, given):
+                outcome = jax.tree.map(lambda a: np.asarray(a)[:count], _fits(*given, layout=layout))
+        except Exception:  # of one fit, as where a function of the model calls back into Python: each by itself, then
+            outcome = _not_begun(np.asarray(starts, dtype=float))
     return _finished(problem, evaluator, varying, outcome, tolerance, max_iterations)
 
 
@@ -316,6 +329,57 @@ def _alike(layout: Layout, arguments: tuple[Arguments, ...]) -> list[list[int]]:
     return list(groups.values())
 
 
+def error_message(error: BaseException) -> str:
+    """What to list for a fit that ended with an error, on one line."""
+    text = str(error)
+    if "Traceback" in text:  # as JAX hands on what a callback raised: its last line says what it was
+        raised = [line.strip() for line in text.splitlines() if RAISED.match(line)]
+        text = raised[-1] if raised else text
+    else:
+        text = f"{type(error).__name__}: {text}"
+    return Status.ERROR.value.format(error=" ".join(text.split())[:LONGEST_ERROR])
+
+
+def with_errors(chunk: Chunk, errors: Mapping[int, BaseException]) -> Chunk:
+    """The chunk with some of its fits listed as failed, which had no data of their own to fit.
+
+    Parameters
+    ----------
+    chunk : Chunk
+    errors : mapping of int to exception
+        By the place of the fit in the chunk.
+    """
+    found = {name: np.array(value) for name, value in chunk._asdict().items()}
+    found["message"] = found["message"].astype(object)
+    found["status"] = found["status"].astype(object)
+    for k, error in errors.items():
+        found["status"][k], found["message"][k] = Status.ERROR.name, error_message(error)
+        for name in ("theta", "cost", "gradient", "hessian", "optimality", "covariance"):
+            found[name][k] = np.nan
+        for name in ("iterations", "evaluations", "free"):
+            found[name][k] = 0
+    return Chunk(**found | {name: found[name].astype(str) for name in ("status", "message")})
+
+
+def failed_chunk(starts: FloatArray, errors: Mapping[int, BaseException]) -> Chunk:
+    """A chunk of fits (R, d) none of which could begin."""
+    R, d = starts.shape
+    nothing, none, blank = np.full(R, np.nan), np.zeros(R, dtype=int), np.full(R, "", dtype=object)
+    square = np.full((R, d, d), np.nan)
+    return with_errors(
+        Chunk(starts.copy(), nothing, np.full((R, d), np.nan), square, nothing, none, none, blank, blank, none, square),
+        errors,
+    )
+
+
+def _not_begun(starts: FloatArray) -> Outcome:
+    """Outcomes of fits (R, d) that are all left to `minimize`."""
+    R, d = starts.shape
+    nothing, none = np.full(R, np.nan), np.zeros(R, dtype=int)
+    derivatives = np.full((R, d), np.nan), np.full((R, d, d), np.nan)
+    return Outcome(starts, nothing, *derivatives, nothing, none, none, np.zeros(R, dtype=bool))  # type: ignore[arg-type]  # NumPy's
+
+
 def _finished(
     problem: Problem,
     evaluator: Evaluator,
@@ -335,12 +399,19 @@ def _finished(
     base = tuple(evaluator.arguments)
     if settled.any():
         covariance[settled] = np.linalg.inv(found["hessian"][settled])
+    constraints = constraints_of(problem)
     for k in np.flatnonzero(~settled):
-        values = tuple(value[k] for value in varying.values)
-        with float64():
-            evaluator.replace_arguments(replaced(base, varying.places, [jnp.asarray(value) for value in values]))
-        left = max(max_iterations - int(found["iterations"][k]), 0)
-        result = minimized(evaluator, found["theta"][k], "exact", tolerance, left, None)
+        try:
+            values = tuple(value[k] for value in varying.values)
+            with float64():
+                evaluator.replace_arguments(replaced(base, varying.places, [jnp.asarray(value) for value in values]))
+            left = max_iterations - int(found["iterations"][k])
+            start = nearest_feasible(constraints, found["theta"][k])
+            result = minimized(evaluator, start, "exact", tolerance, left, constraints=constraints)
+        except Exception as error:  # whatever it is, it must not end the other fits
+            status[k], message[k] = Status.ERROR.name, error_message(error)
+            free[k] = 0
+            continue
         for name in ("theta", "cost", "gradient", "hessian", "optimality"):
             found[name][k] = getattr(result, name)
         result = replace(result, iterations=int(found["iterations"][k]) + result.iterations)

@@ -37,7 +37,7 @@ READABLE = (2, 3)
 
 LATER_FIELDS: dict[type, tuple[str, ...]] = {
     Trajectory: ("time_unit",),
-    Fit: ("engine", "integration_error_of"),
+    Fit: ("engine", "idle", "integration_error_of"),
     Certificate: ("integration_error_of",),
 }
 """Fields that files of version 2 lack: they take their defaults."""

@@ -129,6 +129,26 @@ class LinearConstraints:
         identity = np.eye(self.size)
         return np.vstack([self.A, identity, -identity])
 
+    def exact_rows(self, index: NDArray[np.intp]) -> list[tuple[int, int, float]]:
+        """Of the given rows of A those that can hold with equality in floating point.
+
+        ``(i, -1, value)`` for a row that holds where theta_i is the value; ``(i, j, 0.0)`` for ``theta_i >= theta_j``.
+        """
+        return [self._exact[k] for k in index.tolist() if k in self._exact]
+
+    @cached_property
+    def _exact(self) -> dict[int, tuple[int, int, float]]:
+        found = {}
+        for k, (row, bound) in enumerate(zip(self.A, self.b.tolist(), strict=True)):
+            places = np.flatnonzero(row)
+            if np.any(np.abs(row[places]) != 1.0):
+                continue
+            if places.size == 1:
+                found[k] = (int(places[0]), -1, bound * float(row[places[0]]))
+            elif places.size == 2 and bound == 0.0 and row[places].sum() == 0.0:
+                found[k] = (int(np.argmax(row)), int(np.argmin(row)), 0.0)
+        return found
+
     def rows(self, index: NDArray[np.intp]) -> FloatArray:
         """The normals at the given places, shape (k, d)."""
         m, d = self.b.size, self.size
@@ -159,6 +179,25 @@ class LinearConstraints:
         """Size of the rounding error of `slack` at unknowns of size `scale`, shape (m + 2 d,)."""
         rows = 16 * EPS * (np.abs(self.b) + np.abs(self.A) @ scale)
         return np.concatenate([rows, np.zeros(2 * self.size)])
+
+
+def nearest_feasible(constraints: LinearConstraints, theta: FloatArray) -> FloatArray:
+    """The feasible point nearest to theta (d,), up to rounding.
+
+    ``min ||s||²`` subject to ``N s >= -slack`` is a nonnegative least-squares problem ([1]_, chapter 23, section 4).
+    """
+    slack = constraints.slack(theta)
+    if np.all(slack >= 0.0):
+        return theta
+    kept = np.isfinite(slack)
+    normals = constraints.normals[kept]
+    size = float(np.max(-slack))
+    right = np.append(np.zeros(theta.size), 1.0)
+    found = nnls(np.vstack([normals.T, -slack[kept] / size]), right)[0]
+    residual = np.append(normals.T @ found, -slack[kept] @ found / size) - right
+    if not residual[-1] < 0.0:
+        raise ValueError("no point satisfies all the constraints")
+    return np.asarray(np.clip(theta - size * residual[:-1] / residual[-1], constraints.lower, constraints.upper))
 
 
 @dataclass(frozen=True, eq=False)

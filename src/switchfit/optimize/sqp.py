@@ -40,6 +40,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.optimize.arrow import Arrow, ArrowFactor, arrow_scaling, convexify_arrow, solve_arrow_qp
+from switchfit.optimize.diagnosis import Finding, find_reason, wrong_slope
 from switchfit.optimize.qp import (
     EIGENVALUE_FLOOR,
     EPS,
@@ -70,6 +71,8 @@ NEGLIGIBLE_STEP = 1e-10
 #: Iterations spent on making the last step negligible once the optimality is below the tolerance.
 EXTRA_ITERATIONS = 5
 MAX_BACKTRACKS = 60
+#: Times a minimisation begins anew from where its line search has failed.
+RESTARTS = 3
 #: All combinations of sides are compared for up to this many concave kinks that constraints couple.
 MANY_CONCAVE_KINKS = 6
 #: Newton steps up to this multiple of the unknowns' size are never shortened by changing the Hessian.
@@ -101,12 +104,13 @@ class Status(Enum):
         "minimiser although no gradient vanishes there; covariances do not apply to such an unknown."
     )
     MAX_ITERATIONS = (
-        "Stopped after {iterations} iterations with optimality {optimality:.1e} above the tolerance {tolerance:.1e}. "
+        "Stopped after {iterations} iterations{earlier} with optimality {optimality:.1e} above the tolerance "
+        "{tolerance:.1e}. "
         "Raise max_iterations, use hessian='exact', or start closer."
     )
     LINE_SEARCH_FAILED = (
-        "The line search found no decrease of the cost along a descent direction (optimality {optimality:.1e}). "
-        "The gradient does not belong to the cost: check the derivatives, or missing breakpoints."
+        "The line search found no decrease of the cost along a descent direction (optimality {optimality:.1e}), nor "
+        "did it after a fresh start from there. {reason}"
     )
     INTERRUPTED = "Interrupted after {iterations} iterations with optimality {optimality:.1e}: the best point so far."
     NONFINITE_START = (
@@ -120,15 +124,25 @@ class Status(Enum):
         "Converged, but the cost is flat to second order along {direction} (scaled eigenvalue "
         "{smallest_eigenvalue:.1e}): these unknowns are not identified. Fix one of them or add data."
     )
-
+    COLLAPSED = (
+        "Converged (optimality {optimality:.1e}), with a mode that has no duration: the cost depends neither on where "
+        "it would stand nor on what acts in it alone ({idle}). Leave it out of mode_sequence, start from another "
+        "guess, or give min_duration."
+    )
     INFEASIBLE = (
         "The constraints are not met: {violated}. Start nearer to a point that meets them, or check that one can."
     )
+    ERROR = "The fit ended with an error, and was left where it was. {error}"
 
     @property
     def successful(self) -> bool:
         """Whether the point is a local minimiser as far as second-order conditions can tell."""
         return self in (Status.CONVERGED, Status.CONVERGED_PRECISION, Status.CONVERGED_AT_KINK)
+
+    @property
+    def converged(self) -> bool:
+        """Whether the minimisation ended as it should: also where J is flat in some direction, or a mode collapsed."""
+        return self.successful or self in (Status.SINGULAR, Status.COLLAPSED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +175,7 @@ class IterationRecord:
 
 Callback = Callable[[IterationRecord], object]
 Evaluate = Callable[[FloatArray, int], Evaluation]
+Idle = Callable[[FloatArray, bool], NDArray[np.bool_]]
 Index = NDArray[np.intp] | slice
 
 
@@ -203,6 +218,13 @@ class Result:
         The start and every iteration.
     violated : str
         Equality constraints that are not met, with their values.
+    idle : tuple of int
+        Coordinates on which J does not depend at theta, by the word of the caller's `idle`, and those that active rows
+        tie to them; they are not in `free_basis`.
+    reason : str
+        What was seen where the line search failed, and what to do.
+    earlier : int
+        How many of the iterations belong to minimisations before, which this one resumed.
     """
 
     theta: FloatArray
@@ -224,6 +246,9 @@ class Result:
     tolerance: float
     history: tuple[IterationRecord, ...]
     violated: str = ""
+    idle: tuple[int, ...] = ()
+    reason: str = ""
+    earlier: int = 0
 
     @property
     def successful(self) -> bool:
@@ -249,6 +274,9 @@ class Result:
             kinks=kinks,
             direction=direction,
             violated=self.violated,
+            idle=", ".join(f"theta[{i}]" for i in self.idle),
+            reason=self.reason,
+            earlier=f", {self.earlier} of them before the mesh was refined," if self.earlier else "",
         )
         return sentence + (f" Active: {'; '.join(self.active)}." if self.active else "")
 
@@ -265,6 +293,8 @@ class _Problem:
     labels: FloatArray | None  # of the blocks, where the Hessian is cut into blocks
     tolerance: float
     max_iterations: int
+    size: FloatArray  # typical size of each coordinate, zero where only its values tell
+    idle: Idle | None
 
     @property
     def uses_hessian(self) -> bool:
@@ -293,6 +323,7 @@ class _Point:
     optimality: float
     multipliers: FloatArray  # shape (m + 2 d,)
     downhill: NDArray[np.int_]  # like side, and for each kink the side to descend to, 0 to hold it
+    idle: NDArray[np.bool_]  # coordinates that are held because J does not depend on them here
     curvatures: dict[bytes, _Curvature] = field(default_factory=dict)  # found already, by the constraints' places
 
     @property
@@ -332,7 +363,12 @@ def _mixed(plus: FloatArray | Arrow, minus: FloatArray | Arrow, sides: NDArray[n
 
 
 def _first_order(
-    plus: _Sample, minus: _Sample, kink: NDArray[np.bool_], side: NDArray[np.int_], normals: FloatArray
+    plus: _Sample,
+    minus: _Sample,
+    kink: NDArray[np.bool_],
+    side: NDArray[np.int_],
+    normals: FloatArray,
+    idle: NDArray[np.bool_],
 ) -> tuple[float, FloatArray, NDArray[np.int_]]:
     """The steepest descent over feasible directions of length one, its multipliers, and the side of each coordinate.
 
@@ -341,6 +377,8 @@ def _first_order(
     KKT residual; that of J' itself is the largest over the choices.
     """
     left, right = minus.gradient, plus.gradient
+    if idle.any():
+        left, right, normals = left * ~idle, right * ~idle, normals * ~idle
     if plus is minus:
         return *kkt_residual(right, right, normals), side
     alone = np.where((left <= 0.0) & (right >= 0.0), 0, np.where(-right >= left, 1, -1))
@@ -406,19 +444,29 @@ class _Oracle:
     def complete(self, theta: FloatArray, first: _Sample, scale: FloatArray) -> _Point | None:
         """The point: the other side is evaluated only if some coordinate is on a breakpoint and has room there."""
         kink, side = self._sides(theta)
+        constraints = self.problem.constraints
+        rounding = constraints.rounding(np.maximum(np.maximum(scale, self.problem.size), np.abs(theta)))
+        active = np.flatnonzero(constraints.slack(theta) <= rounding)
+        idle = self._idle(theta, active)
+        kink &= ~idle
         plus = minus = first
         if kink.any() or ((side < 0).any() and (side > 0).any()):
             other = self.sample(theta, -1)
             if other is None:
                 return None
             minus = other
-        constraints = self.problem.constraints
-        rounding = constraints.rounding(np.maximum(scale, np.abs(theta)))
-        active = np.flatnonzero(constraints.slack(theta) <= rounding)
-        optimality, values, downhill = _first_order(plus, minus, kink, side, constraints.rows(active))
+        normals = constraints.rows(active)
+        optimality, values, downhill = _first_order(plus, minus, kink, side, normals, idle)
         multipliers = np.zeros(len(constraints.names))
         multipliers[active] = values
-        return _Point(theta, plus, minus, kink, side, active, optimality, multipliers, downhill)
+        return _Point(theta, plus, minus, kink, side, active, optimality, multipliers, downhill, idle)
+
+    def _idle(self, theta: FloatArray, active: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Coordinates on which J does not depend while the rows that are active stay so: (d,)."""
+        idle = self.problem.idle
+        if idle is None or not np.any(active < self.problem.constraints.b.size):
+            return np.zeros(theta.size, dtype=bool)
+        return idle(theta.copy(), False)
 
     def point(self, theta: FloatArray, scale: FloatArray) -> _Point | None:
         first = self.first(theta)
@@ -461,7 +509,10 @@ class _State:
     cost_scale: float = 0.0  # largest |J| seen
     gradient_scale: float = 0.0  # largest derivative seen
     lowest_cost: float = np.inf
+    restarts: int = 0
+    careful: bool = False  # the next step is taken with the diagonal of the Hessian alone
     status: Status | None = None
+    reason: str = ""  # why it failed, where it did
 
 
 @dataclass(frozen=True, eq=False)
@@ -507,6 +558,7 @@ def _advance(problem: _Problem, state: _State, accepted: _Accepted) -> _State:
         cost_scale=max(state.cost_scale, abs(point.cost)),
         gradient_scale=max(state.gradient_scale, point.largest_derivative),
         lowest_cost=min(state.lowest_cost, point.cost),
+        careful=False,
     )
 
 
@@ -531,21 +583,137 @@ def _stalled(oracle: _Oracle, state: _State, direction: _Direction) -> _State:
     below_rounding = direction.reduction <= 10 * NOISE * state.cost_scale
     if below_rounding and state.point.optimality <= 1e5 * EPS * floor:
         return _finish(oracle, state, Status.CONVERGED_PRECISION)
-    return replace(state, status=Status.LINE_SEARCH_FAILED)
+    # Near a saddle, where slopes are lost in rounding, its negative curvature still leads away.
+    escaped = _escape(oracle, state) if oracle.problem.uses_hessian and below_rounding else None
+    if escaped is not None:
+        return _advance(oracle.problem, state, escaped)
+    if state.restarts < RESTARTS and not state.careful:
+        point = oracle.point(state.point.theta, np.abs(state.point.theta))
+        if point is not None:
+            fresh = _initial_state(point)
+            return replace(fresh, iteration=state.iteration, restarts=state.restarts + 1, careful=True)
+    return replace(state, status=Status.LINE_SEARCH_FAILED, reason=_reason(oracle, state, direction))
+
+
+def _reason(oracle: _Oracle, state: _State, direction: _Direction) -> str:
+    """What J is like along the direction that failed, in words."""
+    problem, theta = oracle.problem, state.point.theta
+    noise = NOISE * max(abs(state.point.cost), 0.01 * state.cost_scale)
+
+    def line(fraction: float) -> tuple[float, float] | None:
+        if fraction == 0.0:
+            return state.point.cost, direction.slope
+        sample = oracle.sample(theta + fraction * direction.step, 1)
+        return None if sample is None else (sample.cost, float(sample.gradient @ direction.step))
+
+    marks = [_next_breakpoint(points, theta[i], direction.step[i]) for i, points in problem.breakpoints]
+    found = find_reason(line, noise, min([*marks, 1.0]))
+    at = theta + found.at * direction.step
+    if found.kind == "wrong slope":
+        return (
+            f"The gradient does not belong to the cost: along that direction it says {found.before:.3g}, differences "
+            f"of the cost say {found.after:.3g}{_wrong_entries(oracle, state, noise)}. Check the derivatives."
+        )
+    if found.kind == "jump":
+        who = _who_jumps(oracle, theta, direction.step, found, noise)
+        return (
+            f"The cost jumps from {found.before:.8g} to {found.after:.8g} where {who}. The optimiser needs a cost that "
+            "is continuous there."
+        )
+    if found.kind == "kink":
+        where = ", ".join(f"theta[{i}] = {at[i]:.8g}" for i in _who_bends(oracle, theta, direction.step, found))
+        return (
+            f"The derivatives are right, but there is a kink close by, near {where}: along that direction the slope "
+            f"jumps from {found.before:.3g} to {found.after:.3g}. Start elsewhere, or fix what is at the kink there."
+        )
+    if found.kind == "rounding":
+        return (
+            "The derivatives are right, but what the cost can still fall along that direction is less than its "
+            f"rounding error, {noise:.1e}. Scale the unknowns to be of size one, or ask for a larger tolerance."
+        )
+    curvature = _curvature(problem, state, state.point.active).eigenvalues
+    condition = curvature[-1] / curvature[0] if curvature.size and curvature[0] > 0.0 else np.inf
+    return (
+        "The derivatives are right, but the cost has a narrow valley there (condition number of the scaled Hessian "
+        f"{condition:.1e}). Start elsewhere, fix one of the unknowns that trade off, or take hessian='gauss-newton'."
+    )
+
+
+def _next_breakpoint(points: FloatArray, x: float, step: float) -> float:
+    """Fraction of a step of one coordinate up to the next breakpoint that it meets; infinite if it meets none."""
+    if step == 0.0:
+        return np.inf
+    ahead = points[points > x] if step > 0.0 else points[points < x]
+    return float(np.min((ahead - x) / step, initial=np.inf))
+
+
+def _wrong_entries(oracle: _Oracle, state: _State, noise: float) -> str:
+    """The coordinates whose derivative differences of J do not confirm, in words."""
+    theta, problem = state.point.theta, oracle.problem
+    breakpoints = dict(problem.breakpoints)
+    wrong = []
+    for i in np.flatnonzero(problem.constraints.movable):
+        for sign in (1.0, -1.0):
+            unit = np.zeros(theta.size)
+            unit[i] = sign * 0.01 * max(abs(theta[i]), problem.size[i], 1e-3)
+
+            def line(fraction: float, unit: FloatArray = unit) -> tuple[float, float] | None:
+                sample = oracle.sample(theta + fraction * unit, 1)
+                return None if sample is None else (sample.cost, float(sample.gradient @ unit))
+
+            smooth = min(_next_breakpoint(breakpoints.get(int(i), np.zeros(0)), theta[i], unit[i]), 1.0)
+            measured = wrong_slope(line, noise, smooth)
+            if measured is not None:
+                stated = state.point.plus.gradient[i]
+                wrong.append(f"theta[{i}] (derivative {stated:.3g}, differences {measured / unit[i]:.3g})")
+                break
+    return f"; it is wrong in {', '.join(wrong[:4])}" if wrong else ""
+
+
+def _who_bends(oracle: _Oracle, theta: FloatArray, step: FloatArray, found: Finding) -> list[int]:
+    """The coordinates along which the derivative of J jumps at a kink on the line."""
+    width = max(2.0**-40 * found.at, 1e-15)
+    sides = [oracle.sample(theta + (found.at + w) * step, 1) for w in (-width, width)]
+    moving = np.flatnonzero(step).tolist()
+    if sides[0] is None or sides[1] is None:
+        return moving[:4]
+    jumps = np.abs((sides[1].gradient - sides[0].gradient) * step)
+    return [i for i in moving if jumps[i] > 0.1 * jumps.max()][:4]
+
+
+def _who_jumps(oracle: _Oracle, theta: FloatArray, step: FloatArray, found: Finding, noise: float) -> str:
+    """The coordinate whose change by a hair across a jump of J makes it jump, in words."""
+    width = max(2.0**-40 * found.at, 1e-15)
+    before, after = theta + (found.at - width) * step, theta + (found.at + width) * step
+    base = oracle.sample(before, 1)
+    for i in np.flatnonzero(before != after) if base is not None else ():
+        moved = before.copy()
+        moved[i] = after[i]
+        there = oracle.sample(moved, 1)
+        if (
+            base is not None
+            and there is not None
+            and abs(there.cost - base.cost) > 0.5 * abs(found.after - found.before)
+        ):
+            return f"theta[{i}] passes {after[i]:.8g}"
+    return "the step passes " + ", ".join(f"theta[{i}] = {after[i]:.8g}" for i in np.flatnonzero(step)[:4])
 
 
 def _finish(oracle: _Oracle, state: _State, status: Status) -> _State:
     """At a KKT point: leave a saddle if possible, otherwise classify the point by its free curvature."""
     problem = oracle.problem
     if problem.uses_hessian or _is_finite(state.point.plus.hessian):
-        accepted = _escape(oracle, state) if state.iteration < problem.max_iterations else None
-        if accepted is not None:
-            return _advance(problem, state, accepted)
+        if state.iteration < problem.max_iterations:
+            accepted = _close_gaps(oracle, state) or _escape(oracle, state)
+            if accepted is not None:
+                return _advance(problem, state, accepted)
         curvature = _curvature(problem, state, state.point.active)
         if curvature.smallest < NEGATIVE_CURVATURE:
             return replace(state, status=Status.SADDLE)
         if curvature.smallest <= EIGENVALUE_FLOOR:
             return replace(state, status=Status.SINGULAR)
+        if state.point.idle.any() or curvature.idle.any():
+            return replace(state, status=Status.COLLAPSED)
     return replace(state, status=Status.CONVERGED_AT_KINK if _genuine_kinks(state).any() else status)
 
 
@@ -603,7 +771,7 @@ def _solve_on_sides(
     point, constraints = state.point, problem.constraints
     gradient, hessian = point.derivatives(sides)
     lower, upper = np.minimum(low - point.theta, 0.0), np.maximum(high - point.theta, 0.0)
-    free = constraints.movable
+    free = constraints.movable & ~point.idle
     if point.kink.any():
         lower[point.kink & (sides > 0)] = 0.0
         upper[point.kink & (sides < 0)] = 0.0
@@ -645,7 +813,8 @@ def _solve_arrow(
     """The same for a Hessian in the shape of an arrow; what is held keeps its place, with a step of zero."""
     point, constraints = state.point, problem.constraints
     m, d = constraints.b.size, free.size
-    matrix = hessian if problem.labels is None else hessian.masked(problem.labels)
+    labels = _labels_of(problem, state)
+    matrix = hessian if labels is None else hessian.masked(labels)
     pressed = constraints.rows(np.flatnonzero(point.multipliers > 0.0)) * free
     convex = convexify_arrow(matrix.held(free), pressed[np.any(pressed != 0.0, axis=1)], _floor(state) * free)
     slack = np.maximum(constraints.A @ point.theta - constraints.b, 0.0)
@@ -668,12 +837,18 @@ def _model_matrix(problem: _Problem, state: _State, hessian: FloatArray | Arrow,
     if problem.hessian == "descent-first" and not _is_positive_definite(hessian[free][:, free]):
         return np.eye(point.theta.size) / state.metric
     matrix = hessian.copy()
-    if problem.labels is not None:
-        matrix *= problem.labels[:, None] == problem.labels[None, :]
+    labels = _labels_of(problem, state)
+    if labels is not None:
+        matrix *= labels[:, None] == labels[None, :]
     pressed = problem.constraints.rows(np.flatnonzero(point.multipliers > 0.0))[:, free]
     block = free if isinstance(free, slice) else np.ix_(free, free)
     matrix[block] = convexify(matrix[block], pressed, _floor(state)[free])
     return matrix
+
+
+def _labels_of(problem: _Problem, state: _State) -> FloatArray | None:
+    """Labels of the blocks of the Hessian that count: each unknown by itself for a step after a failed line search."""
+    return np.arange(state.point.theta.size, dtype=float) if state.careful else problem.labels
 
 
 def _floor(state: _State) -> FloatArray:
@@ -789,10 +964,15 @@ def _blind_step(oracle: _Oracle, state: _State, direction: _Direction) -> _Accep
 
 
 def _move(problem: _Problem, theta: FloatArray, step: FloatArray) -> FloatArray:
-    """theta + step, feasible, and bit for bit on a bound or breakpoint that it reaches up to rounding."""
+    """theta + step, feasible, and bit for bit on a bound, breakpoint or row that it reaches up to rounding.
+
+    Rounding is measured by the typical size of an unknown too: a time that is 1e-30 after the start of the horizon is
+    at its start, and no step along it could ever be told from none.
+    """
     lower, upper = problem.constraints.lower, problem.constraints.upper
     moved = theta + step
-    near = 8 * EPS * (step != 0.0) * np.maximum(np.maximum(np.abs(theta), np.abs(step)), np.abs(moved))
+    reach = np.maximum(np.maximum(np.abs(theta), np.abs(step)), np.abs(moved))
+    near = 8 * EPS * np.maximum((step != 0.0) * reach, problem.size)
     pinned = np.zeros(theta.size, dtype=bool)
     for i, points in problem.breakpoints:
         mark = _nearest(points, moved[i])
@@ -801,7 +981,38 @@ def _move(problem: _Problem, theta: FloatArray, step: FloatArray) -> FloatArray:
     moved = np.where(moved - near <= lower, lower, np.where(moved + near >= upper, upper, moved))
     if problem.constraints.b.size == 0:
         return moved
-    return _repair(problem.constraints, moved, pinned | (moved == lower) | (moved == upper))
+    pinned |= (moved == lower) | (moved == upper)
+    return _snap_to_rows(problem, _repair(problem.constraints, moved, pinned), pinned)
+
+
+def _snap_to_rows(
+    problem: _Problem, theta: FloatArray, pinned: NDArray[np.bool_], reach: float = 16 * EPS
+) -> FloatArray:
+    """theta with the slack of each row removed that is at most `reach` of the size of the unknowns that it joins.
+
+    Only of rows that can hold exactly: that bound one coordinate, ``+-theta_i >= b``, or keep two in order,
+    ``theta_i - theta_j >= 0``.
+    """
+    constraints = problem.constraints
+    slack = constraints.A @ theta - constraints.b
+    close = np.abs(slack) <= reach * (np.abs(constraints.A) @ problem.size)
+    if not slack[close].any():
+        return theta
+    snapped, fixed = theta.copy(), pinned.copy()
+    rows = sorted(constraints.exact_rows(np.flatnonzero(close)), key=lambda row: row[1] >= 0)
+    for _ in rows:  # a coordinate that moves may leave a row that held
+        before = snapped.copy()
+        for i, j, bound in rows:
+            if j < 0:
+                snapped[i], fixed[i] = bound, True
+            elif fixed[i] and not fixed[j]:
+                snapped[j], fixed[j] = snapped[i], True
+            elif not fixed[i]:
+                snapped[i], fixed[i] = snapped[j], fixed[j]
+        if np.array_equal(snapped, before):
+            break
+    snapped = np.clip(snapped, constraints.lower, constraints.upper)
+    return snapped if _violation(constraints, snapped) <= _violation(constraints, theta) else theta
 
 
 def _repair(constraints: LinearConstraints, theta: FloatArray, pinned: NDArray[np.bool_]) -> FloatArray:
@@ -845,6 +1056,7 @@ class _Curvature:
     eigenvalues: FloatArray
     unscaled: FloatArray
     lowest: FloatArray  # of unit length in theta
+    idle: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))  # coordinates left out as idle
 
     @property
     def smallest(self) -> float:
@@ -869,8 +1081,23 @@ def _curvature(problem: _Problem, state: _State, rows: NDArray[np.intp]) -> _Cur
 
 def _curvature_on(problem: _Problem, state: _State, rows: NDArray[np.intp]) -> _Curvature:
     point = state.point
+    held = _genuine_kinks(state) | ~(problem.constraints.lower < problem.constraints.upper) | point.idle
+    found = _curvature_without(problem, state, rows, held)
+    collapsed = problem.idle is not None and np.any(point.active < problem.constraints.b.size)
+    m = problem.constraints.b.size
+    bounds = point.active[point.active >= m]
+    loose = np.any(point.multipliers[bounds] <= 1e-10 * state.gradient_scale)  # a bound that holds nothing back
+    if collapsed and problem.idle is not None and (found.smallest <= EIGENVALUE_FLOOR or loose):
+        idle = problem.idle(point.theta.copy(), True) & ~held
+        if idle.any():
+            found = replace(_curvature_without(problem, state, rows, held | idle), idle=idle)
+    return found
+
+
+def _curvature_without(problem: _Problem, state: _State, rows: NDArray[np.intp], held: NDArray[np.bool_]) -> _Curvature:
+    """Curvature in the null space of the constraints without the coordinates that are held."""
+    point = state.point
     d = point.theta.size
-    held = _genuine_kinks(state) | ~(problem.constraints.lower < problem.constraints.upper)
     hessian = point.derivatives(_reported_sides(point))[1]
     if isinstance(hessian, Arrow):
         found = _arrow_curvature(problem, state, rows, hessian, held)
@@ -892,6 +1119,16 @@ def _curvature_on(problem: _Problem, state: _State, rows: NDArray[np.intp]) -> _
     lowest[free] = null @ vectors[:, 0] / scaling
     unscaled = np.asarray(np.linalg.eigvalsh(basis.T @ hessian @ basis), dtype=float)
     return _Curvature(basis, np.asarray(values, dtype=float), unscaled, lowest / np.linalg.norm(lowest))
+
+
+def _idle_names(problem: _Problem, state: _State) -> tuple[int, ...]:
+    """Coordinates on which J does not depend at the state's point, and those that active rows tie to them."""
+    point = state.point
+    idle = set(np.flatnonzero(point.idle).tolist())
+    ties = [{i, j} for i, j, _ in problem.constraints.exact_rows(point.active) if j >= 0]
+    for _ in ties:
+        idle |= {k for tie in ties if tie & idle for k in tie}
+    return tuple(sorted(idle | set(np.flatnonzero(_curvature(problem, state, point.active).idle).tolist())))
 
 
 def _arrow_curvature(
@@ -935,6 +1172,22 @@ def _smallest(matrix: Arrow, free: NDArray[np.bool_]) -> tuple[float, FloatArray
 def _reported_sides(point: _Point) -> NDArray[np.int_]:
     """The right-hand side for every coordinate on a breakpoint that has one."""
     return np.where(point.kink, 1, point.side)
+
+
+def _close_gaps(oracle: _Oracle, state: _State) -> _Accepted | None:
+    """The rows that the point misses by less than it is accurate to made to hold, if it stays as good a solution.
+
+    A mode that lasts a part of 1e-13 of the horizon has collapsed. Taken for one that has not, its two ends would be
+    free, and the curvature along them, which is that of J in its duration, may be negative.
+    """
+    problem, point = oracle.problem, state.point
+    theta = _snap_to_rows(problem, point.theta, np.zeros(point.theta.size, dtype=bool), NEGLIGIBLE_STEP)
+    if np.array_equal(theta, point.theta):
+        return None
+    closed = oracle.point(theta, state.scale)
+    if closed is None or closed.cost > point.cost + NOISE * abs(point.cost):
+        return None
+    return None if closed.optimality > max(problem.tolerance, point.optimality) else _Accepted(closed, 1.0)
 
 
 def _escape(oracle: _Oracle, state: _State) -> _Accepted | None:
@@ -994,6 +1247,8 @@ def minimize(
     tolerance: float = 1e-7,
     max_iterations: int = 200,
     callback: Callback | None = None,
+    size: ArrayLike | None = None,
+    idle: Idle | None = None,
 ) -> Result:
     """Minimise a piecewise smooth cost under linear constraints; every iterate is feasible.
 
@@ -1023,6 +1278,13 @@ def minimize(
     max_iterations : int
     callback : callable, optional
         Gets an `IterationRecord` after every iteration; a true return value stops with ``INTERRUPTED``.
+    size : array, shape (d,), optional
+        Typical size of each unknown, of which rounding is a part: for a time, the length of the horizon, however
+        small the time itself. Left out, the unknown's own values say it.
+    idle : callable, optional
+        ``idle(theta, everything)`` says which coordinates, (d,) of bool, may be held at a theta with active rows,
+        because J depends on none of them while these rows are active, whatever derivatives say, which have the error
+        of its evaluation. Where `everything` is false, those that are found at no cost are enough.
 
     Returns
     -------
@@ -1040,7 +1302,9 @@ def minimize(
     breakpoint. The rate is quadratic with the exact Hessian if the second-order sufficient conditions hold.
     """
     start = np.atleast_1d(np.asarray(theta0, dtype=float)).copy()
-    problem = _make_problem(evaluate, start, constraints, breakpoints, hessian, blocks, tolerance, max_iterations)
+    problem = _make_problem(
+        evaluate, start, constraints, breakpoints, hessian, blocks, tolerance, max_iterations, size, idle
+    )
     theta = _feasible_start(problem, start)
     oracle = _Oracle(problem)
     point = oracle.point(theta, np.abs(theta))
@@ -1070,6 +1334,8 @@ def _make_problem(
     blocks: ArrayLike | None,
     tolerance: float,
     max_iterations: int,
+    size: ArrayLike | None,
+    idle: Idle | None,
 ) -> _Problem:
     """The problem with all settings checked."""
     d = constraints.size
@@ -1089,6 +1355,8 @@ def _make_problem(
         labels=_labels(hessian, blocks, d),
         tolerance=tolerance,
         max_iterations=max_iterations,
+        size=np.zeros(d) if size is None else np.broadcast_to(np.asarray(size, dtype=float), (d,)),
+        idle=idle,
     )
 
 
@@ -1120,7 +1388,7 @@ def _feasible_start(problem: _Problem, theta: FloatArray) -> FloatArray:
         raise ValueError(f"theta0 is not finite: {theta}")
     slack = constraints.slack(theta)
     bounds = np.abs(np.concatenate([constraints.lower, constraints.upper]))
-    rows = np.abs(constraints.b) + np.abs(constraints.A) @ np.abs(theta)
+    rows = np.abs(constraints.b) + np.abs(constraints.A) @ np.maximum(np.abs(theta), problem.size)
     size = np.concatenate([rows, np.where(np.isfinite(bounds), bounds, 0.0)])
     violated = np.flatnonzero(slack < -1e-12 * (size + np.finfo(float).tiny))
     if violated.size:
@@ -1177,6 +1445,8 @@ def _result(oracle: _Oracle, state: _State, status: Status, history: tuple[Itera
         flat_direction=curvature.lowest,
         tolerance=problem.tolerance,
         history=history,
+        idle=_idle_names(problem, state),
+        reason=state.reason,
     )
 
 

@@ -3,9 +3,9 @@
 It takes the steps of `switchfit.optimize.sqp` wherever these are of the ordinary kind: Newton steps on the exact
 Hessian, made positive definite by the absolute values of its eigenvalues, a quadratic programme where constraints are
 in the way, and Armijo backtracking with the same constants. What is rare it leaves alone: a coordinate held at a kink,
-the escape from a saddle, a face on which the Hessian is indefinite. `Outcome.settled` is True only for a regular
-minimum, an interior point with a positive definite Hessian and a negligible next step; everything else is to be
-finished by `minimize`, from `Outcome.theta` on.
+the escape from a saddle, a face on which the Hessian is indefinite; where it makes no headway it stops.
+`Outcome.settled` is True only for a regular minimum, an interior point with a positive definite Hessian and a
+negligible next step; everything else is to be finished by `minimize`, from `Outcome.theta` on.
 
 Every function here is for one fit; `jax.lax.map` or `jax.vmap` make many of it. The loop evaluates J once a turn, at
 the point that is to be judged: fits in lockstep then never wait for another one's line search, and the program, which
@@ -29,6 +29,10 @@ Array = jax.Array
 MAX_TRIALS = 30
 """Fractions of a step that are tried."""
 
+CRAWLING = (30, 2)
+"""A fit that has refused more fractions of steps than this, plus this many an iteration, has met a kink and is left to
+`minimize`. Fits that settle refuse a dozen at most; at a kink they would go on by hundreds, to no end."""
+
 RIDGE = 1e-14
 """Added to the diagonal of the dual programme, whose rows are of unit length: constraints may depend on one another."""
 
@@ -37,12 +41,16 @@ TracedEvaluate = Callable[[Array], tuple[Array, Array, Array]]
 
 
 class Constraints(NamedTuple):
-    """``A theta >= b`` and bounds, infinite where there is none: (m, d), (m,), (d,), (d,)."""
+    """``A theta >= b`` and bounds, infinite where there is none: (m, d), (m,), (d,), (d,).
+
+    `size` (d,) is the typical size of each unknown, of which rounding is a part, as of `minimize`.
+    """
 
     A: Array
     b: Array
     lower: Array
     upper: Array
+    size: Array | float = 0.0
 
     def slack(self, theta: Array) -> Array:
         """Of rows, lower and upper bounds: (m + 2 d,)."""
@@ -156,7 +164,9 @@ def minimize_traced(
         hopeless = unsaid | (trials >= MAX_TRIALS)
         # A search that finds nothing below the tolerance has met rounding: that too is the end.
         stationary = hopeless & (state.optimality <= tolerance)
-        return state._replace(length=length, trials=trials, done=hopeless, stationary=stationary)
+        refused = state.evaluations - state.iterations - 1
+        crawling = refused > CRAWLING[0] + CRAWLING[1] * state.iterations
+        return state._replace(length=length, trials=trials, done=hopeless | crawling, stationary=stationary)
 
     def turn(state: _State) -> _State:
         theta = _moved(constraints, state.theta, state.length * state.step)
@@ -214,7 +224,7 @@ def _not_begun(start: Array) -> _State:
 
 def _active(constraints: Constraints, theta: Array, scale: Array) -> Array:
     """Which constraints hold with equality up to rounding: (m + 2 d,) bool."""
-    size = jnp.maximum(scale, jnp.abs(theta))
+    size = jnp.maximum(jnp.maximum(scale, constraints.size), jnp.abs(theta))
     rows = 16 * EPS * (jnp.abs(constraints.b) + jnp.abs(constraints.A) @ size)
     return constraints.slack(theta) <= jnp.concatenate([rows, jnp.zeros(2 * theta.shape[0])])
 

@@ -58,6 +58,10 @@ class Variables(NamedTuple):
         positive = xp.where(self.log & (theta > 0), theta, 1.0)
         return xp.where(self.log, xp.where(theta > 0, xp.log(positive), -xp.inf), theta / self.size)
 
+    def sizes_inward(self, sizes: FloatArray) -> FloatArray:
+        """Sizes of z for sizes of theta (d,): rounding of a logarithm is measured by 1."""
+        return np.where(self.log, 1.0, sizes / self.size)
+
     def slopes(self, theta: Any, xp: Any = np) -> tuple[Any, Any]:
         """D and E at theta: (d,) each."""
         return xp.where(self.log, theta, self.size), xp.where(self.log, theta, 0.0)

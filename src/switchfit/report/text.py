@@ -80,7 +80,7 @@ def warnings_of(fit: Fit) -> list[str]:
     ----------
     fit : Fit
     """
-    sources = (_held, _at_kinks, _undetermined, _without_errors, _noise, _trends, _covariances, _integration)
+    sources = (_held, _idle, _at_kinks, _undetermined, _without_errors, _noise, _trends, _covariances, _integration)
     return [warning for source in sources for warning in source(fit)]
 
 
@@ -201,6 +201,7 @@ _FAILURES = {
     "SADDLE": "NOT A MINIMUM: the numbers below are a saddle point of the cost",
     "INFEASIBLE": "CONSTRAINTS NOT MET: the numbers below break a guard or a terminal constraint",
     "SINGULAR": "NOT UNIQUE: other numbers than those below fit the data as well",
+    "COLLAPSED": "A MODE HAS COLLAPSED: it lasts no time at the solution, and what acts in it alone is not determined",
 }
 
 
@@ -299,7 +300,7 @@ def _unknowns(fit: Fit) -> list[str]:
     joins = {t.index: f"{t.before} -> {t.after}" for t in transitions_of(fit)}
     rows = [["", "value", "std. error", "", "", "first guess", ""]]
     for i, name in enumerate(fit.theta_names):
-        value, error, relative = rounded(fit.theta[i], errors[i])
+        value, error, relative = rounded(fit.theta[i], np.nan if name in fit.idle else errors[i])
         prior = f"prior: {fit.priors[name]}" if name in fit.priors else ""
         notes = [joins.get(i, ""), prior, _on_log_scale(fit, i), _mark(fit, i)]
         note = ", ".join(note for note in notes if note)
@@ -331,6 +332,8 @@ def _on_log_scale(fit: Fit, i: int) -> str:
 def _mark(fit: Fit, i: int) -> str:
     """What holds an unknown, in capitals."""
     name = fit.theta_names[i]
+    if name in fit.idle:
+        return "MODE COLLAPSED"
     if any(text.startswith(f"{name} at its lower bound") for text in fit.active):
         return "AT LOWER BOUND"
     if any(text.startswith(f"{name} at its upper bound") for text in fit.active):
@@ -401,16 +404,35 @@ def _held(fit: Fit) -> Iterator[str]:
     for text in fit.active:
         sentence = text[:1].upper() + text[1:] if text.startswith("mode ") else text
         if "collapsed" in text:
-            yield f"{sentence}: the data want no such mode there. Leave it out of mode_sequence, or start elsewhere."
+            yield (
+                f"{sentence}: the data want no such mode there. Leave it out of mode_sequence, start from another "
+                "guess, or give min_duration."
+            )
         elif "minimum duration" in text:
             yield f"{sentence}: the data would have it shorter. Lower min_duration, or leave the mode out."
-        elif " bound " in text:
+        elif " bound " in text and text.partition(" at its ")[0] not in fit.idle:
             yield (
                 f"{sentence.replace(' at its', ' is at its')}: it has no standard error, and those of the others take "
                 "it as known. Move the bound if it is not a physical one."
             )
-        else:
+        elif " bound " not in text:
             yield f"Active constraint: {text}."
+
+
+def _idle(fit: Fit) -> Iterator[str]:
+    """Unknowns of which a collapsed mode leaves nothing to know."""
+    times = [name for name in fit.idle if name.rpartition(".")[2].startswith("tau_")]
+    others = [name for name in fit.idle if name not in times]
+    if times:
+        yield (
+            f"Where the collapsed mode would stand does not matter, since the same mode is active before and after it: "
+            f"{', '.join(times)} may lie anywhere in between, and the numbers above say no more than that."
+        )
+    if others:
+        yield (
+            f"{', '.join(others)}: acts only in modes that have collapsed. The data say nothing about it, and its "
+            "value above is where the fit left it, not an estimate."
+        )
 
 
 def _at_kinks(fit: Fit) -> Iterator[str]:
