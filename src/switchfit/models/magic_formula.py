@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.system import HybridSystem
@@ -133,8 +134,8 @@ def _drive(
     m = m_b + 4 * m_w
     inertia = m_b * (B_l**2 + B_w**2) / 12 + 4 * m_w * (a**2 + b**2)
     load = 1e-3 * g * m / 4
-    ahead = jnp.array([a, a, -a, -a])  # wheels 1 and 2 in front,
-    left = jnp.array([-b, b, b, -b])  # 2 and 3 on the left
+    ahead = np.array([a, a, -a, -a])  # wheels 1 and 2 in front,
+    left = np.array([-b, b, b, -b])  # 2 and 3 on the left
 
     def drive(t: Any, x: Any, p: Any, u: Any) -> Any:
         _, dX, _, dY, theta, dtheta = x
