@@ -355,6 +355,7 @@ def _minimized_with_constraints(
         constraints=constraints_of(problem),
         breakpoints=evaluator.breakpoints(),
         size=problem.sizes,
+        scale=problem.elapsed(theta),
     )
     values, multipliers = found.constraints.tolist(), found.multipliers.tolist()
     return found.result, tuple(zip(names, values, multipliers, strict=True))

@@ -338,6 +338,13 @@ class Problem:
             sizes[where[where >= 0]] = _clock(experiment)
         return sizes
 
+    def elapsed(self, theta: FloatArray) -> FloatArray:
+        """theta with transition times counted from their experiment's t0, (d,): it does not depend on the clock."""
+        counted = theta.copy()
+        for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
+            counted[where[where >= 0]] -= experiment.t0
+        return counted
+
     def vectors(self, theta: FloatArray, e: int) -> tuple[FloatArray, FloatArray]:
         """What the compiled programs of experiment e take: its transition times (N,) and its p (M,)."""
         places, N = self.places[e], self.structures[e].N

@@ -93,6 +93,7 @@ def minimize_constrained(
     *,
     tolerance: float,
     max_iterations: int,
+    scale: FloatArray,
     callback: Callback | None = None,
     **settings: Any,
 ) -> ConstrainedResult:
@@ -105,13 +106,15 @@ def minimize_constrained(
     theta0 : (d,)
     names : what to call the m constraints in messages
     tolerance, max_iterations, callback : as of `minimize`; iterations count over all minimisations
+    scale : (d,)
+        theta0 in units whose zero means nothing: what the unknowns change by is measured by it.
     settings : the other arguments of `minimize`
     """
     m, d = len(names), len(theta0)
     theta: FloatArray = np.array(theta0, dtype=float)
     multipliers: FloatArray = np.zeros(m)
     first = evaluate(theta, 1, multipliers, np.zeros(m))
-    size = np.where(theta != 0.0, np.abs(theta), 1.0)
+    size = np.where(scale != 0.0, np.abs(scale), 1.0)
     unit = _lengths(first.jacobian * size)
     curvature = float(np.max(np.abs(np.diag(first.hessian)) * size**2, initial=0.0))
     # Where J is flat, its change over the size of the unknowns.
