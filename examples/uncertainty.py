@@ -29,8 +29,7 @@ log = sf.Measurements(
     minutes, exact + 0.8 * np.random.default_rng(4).standard_normal(len(minutes)), sigma=0.8, names=("T",)
 )
 
-off = sf.Parameter(40.0, unit="min")
-run = sf.Experiment(log, mode_sequence=("on", "off"), transition_times=(off,), t0=0.0, tf=120.0)
+run = sf.Experiment(log, mode_sequence=("on", "off"), transition_times=(40.0,), t0=0.0, tf=120.0, time_unit="min")
 problem = sf.Problem(
     room,
     run,

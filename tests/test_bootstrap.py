@@ -224,7 +224,7 @@ def test_what_cannot_be_resampled():
     study = sf.bootstrap(fit, 10)
     with pytest.raises(ValueError, match="level must lie between 0 and 1; got 0"):
         study.intervals(0)
-    with pytest.raises(ValueError, match="method must be one of percentile, basic, bca; got 't'"):
+    with pytest.raises(ValueError, match="method must be 'percentile', 'basic' or 'bca'; got 't'"):
         study.intervals(method="t")
 
 

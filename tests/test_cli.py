@@ -1,6 +1,7 @@
 """The command line: what it writes, what it prints where, and its exit codes."""
 
 import csv
+import errno
 import io
 import json
 import os
@@ -148,7 +149,7 @@ def test_second_interrupt_stops_at_once(folder, monkeypatch):
 
     monkeypatch.setattr(sf, "estimate", estimate)
     result = run("fit", folder / "problem.toml")
-    assert result.exit_code == 1
+    assert result.exit_code == 130
     assert "interrupted before there was anything to write" in result.stderr
 
 
@@ -231,6 +232,91 @@ def test_model_that_raises(folder):
     assert "Traceback" in result.stderr
 
 
+WILD = (
+    "KeyboardInterrupt",
+    "SystemExit(0)",
+    "GeneratorExit",
+    "StopIteration",
+    "BaseException('no')",
+    "type('Wild', (BaseException,), {})('no')",
+    "__import__('click').exceptions.Exit(0)",
+)
+
+
+@pytest.mark.parametrize("wild", WILD)
+@pytest.mark.parametrize("where", ["file", "factory", "mode", "observation"])
+def test_whatever_a_model_file_raises_is_said_with_its_place(wild, where, tmp_path):
+    (tmp_path / "log.csv").write_text("t,T\n0,1\n1,2\n6,3\n")
+    bad = ROOM.replace("room =", f"def observe(t, x, p):\n    raise {wild}\n\nroom =") + f"\nraise {wild}\n"
+    if where == "factory":
+        bad = ROOM + f"\ndef make():\n    raise {wild}\n"
+    elif where != "file":
+        bad = ROOM.replace('return p["heating"]', f'raise {wild}\n    return p["heating"]')
+        if where == "observation":
+            bad = ROOM + f"\ndef observe(t, x, p):\n    raise {wild}\n"
+    (tmp_path / "bad.py").write_text(bad)
+    problem = PROBLEM.replace("room.py:room", "bad.py:make" if where == "factory" else "bad.py:room")
+    if where == "observation":
+        problem = problem.replace('columns = ["T"]', 'columns = ["T"]\nobserve = "bad.py:observe"')
+    (tmp_path / "bad.toml").write_text(problem)
+    line = next(number for number, text in enumerate(bad.splitlines(), 1) if text.strip() == f"raise {wild}")
+    if where == "file":
+        line = len(bad.splitlines())
+    for command in (["check"], ["fit"]):
+        result = run(*command, tmp_path / "bad.toml")
+        assert result.exit_code == 2, (result.exception, result.stderr)
+        assert f"{tmp_path / 'bad.py'}, line {line}" in result.stderr
+        assert "Traceback" not in result.stderr
+
+
+def test_ctrl_c_is_an_interrupt_wherever_it_comes(tmp_path):
+    """A signal that arrives while a model file runs is no error of that file."""
+    (tmp_path / "log.csv").write_text("t,T\n0,1\n1,2\n6,3\n")
+    (tmp_path / "slow.py").write_text("import signal\nsignal.raise_signal(signal.SIGINT)\n" + ROOM)
+    (tmp_path / "slow.toml").write_text(PROBLEM.replace("room.py", "slow.py"))
+    result = run("fit", tmp_path / "slow.toml")
+    assert result.exit_code == 130
+    assert result.stderr == "switchfit: interrupted before there was anything to write.\n"
+
+
+def test_ctrl_c_that_is_ignored_stays_so(folder, monkeypatch):
+    """As in a background job of a shell script."""
+    monkeypatch.setattr(sf, "check_derivatives", lambda problem: signal.raise_signal(signal.SIGINT) or 1 / 0)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert run("check", folder / "problem.toml").exit_code == 3
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_check_without_running_the_model(folder, tmp_path):
+    (tmp_path / "log.csv").write_text((folder / "log.csv").read_text())
+    (tmp_path / "room.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
+    path = tmp_path / "problem.toml"
+    path.write_text(PROBLEM)
+    result = run("check", path, "--no-run")
+    assert result.exit_code == 0, result.stderr
+    assert "on -> off on [0, 6] s, at 2 s" in result.stdout
+    assert "12 samples of T, 0.25 to 5.75" in result.stdout
+    assert "No Python file was run" in result.stdout
+    assert not (tmp_path / "ran").exists()
+    for old, new, message in (
+        ('columns = ["T"]', 'columns = ["U"]', "log.csv has no column 'U'; its columns are t, T."),
+        ("transition_times = [2.0]", "transition_times = [7.0]", "experiments[1]: transition_times must increase"),
+        ("sigma = 0.1", "sigma = -1.0", "experiments[1].data[1]: sigma must be"),
+        ("room.py:room", "house.py:room", "there is no file"),
+        ("room.py:room", "roof", "model 'roof' is not known"),
+        ("heating = 0.4", "heating = { value = 0.4, lower = 1.0 }", "parameters.heating: Parameter value 0.4 lies"),
+    ):
+        path.write_text(PROBLEM.replace(old, new))
+        result = run("check", path, "--no-run")
+        assert result.exit_code == 2
+        assert message in result.stderr
+    path.write_text('problem = "room.py:make"\n')
+    assert run("check", path, "--no-run").exit_code == 0
+    assert not (tmp_path / "ran").exists()
+
+
 def test_model_that_raises_later(folder, monkeypatch):
     (folder / "late.py").write_text(ROOM + "\ndef late():\n    raise LookupError('not today')\n")
     (folder / "late.toml").write_text(PROBLEM.replace("room.py", "late.py"))
@@ -267,18 +353,18 @@ def test_file_that_cannot_be_written(folder, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["x.csv"]
 
 
-def test_writing_is_all_or_nothing(tmp_path):
-    path = tmp_path / "report.txt"
-    path.write_text("before")
+def test_a_full_disk_leaves_the_old_file_and_says_so(folder, tmp_path, monkeypatch):
+    (tmp_path / "report.txt").write_text("before")
 
-    def half(target):
-        target.write_text("half")
-        raise RuntimeError("stopped")
+    def full(handle):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    with pytest.raises(RuntimeError, match="stopped"):
-        cli._write(path, half)
-    assert path.read_text() == "before"
-    assert list(tmp_path.iterdir()) == [path]
+    monkeypatch.setattr(os, "fsync", full)
+    result = run("fit", folder / "problem.toml", "--out", tmp_path)
+    assert result.exit_code == 2
+    assert f"{tmp_path / 'report.txt'} cannot be written: No space left on device; name another" in result.stderr
+    assert (tmp_path / "report.txt").read_text() == "before"
+    assert list(tmp_path.iterdir()) == [tmp_path / "report.txt"]
 
 
 # --- progress, and all of it ------------------------------------------------------------------------------------------

@@ -91,7 +91,7 @@ def test_a_held_input_is_the_same_as_modes_that_switch_at_fixed_times():
 
     switched = sf.HybridSystem({f"level {i}": mode(level) for i, level in enumerate(levels)}, [0.3, 0.0])
     times = [sf.Parameter(jump, fixed=True) for jump in jumps]
-    second = sf.Problem(switched, sf.Experiment(cost, switched.modes, times, 0.0, 2.0), k)
+    second = sf.Problem(switched, sf.Experiment(cost, tuple(switched.modes), times, 0.0, 2.0), k)
     meshes = [refined_mesh(first, 0, first.initial_theta)]
     theta = np.array([1.3])
     a, b = Evaluator(first, meshes=meshes)(theta), Evaluator(second, meshes=meshes)(theta)

@@ -195,6 +195,24 @@ def test_a_fit_with_guards_and_noise_is_where_the_closed_form_has_its_minimum():
         assert cost(inflow + step[0], rim + step[1]) > fit.cost
 
 
+def test_priors_count_beside_guards():
+    """They are part of J and of the Lagrangian, and pull a fit whose data say less."""
+    plain = tank()
+    known = {"inflow": sf.Parameter(0.8, prior=sf.Normal(0.45, 1e-3)), "rim": sf.Parameter(1.5, lower=0.0)}
+    problem = sf.Problem(plain.system, plain.experiments, known)
+    theta = problem.initial_theta
+    evaluator = Evaluator(problem)
+    found, expected = evaluator.constrained(theta), evaluator(theta)
+    assert found.cost == pytest.approx(expected.cost, rel=1e-12)
+    assert found.value == pytest.approx(expected.cost, rel=1e-12)
+    np.testing.assert_allclose(found.gradient, expected.gradient, rtol=1e-10)
+    np.testing.assert_allclose(found.slope, expected.gradient, rtol=1e-10)
+    np.testing.assert_allclose(found.hessian, expected.hessian, rtol=1e-10, atol=1e-10)
+    fit = sf.estimate(problem)
+    assert fit.success
+    assert 0.45 < fit.parameters["inflow"] < 0.499  # 0.5 without the prior
+
+
 def test_constraints_are_saved_and_loaded(tmp_path):
     fit = sf.estimate(tank())
     fit.save(tmp_path / "fit.json")

@@ -177,7 +177,7 @@ def test_left_out_times_are_the_nodes_with_each_transition_twice():
 
 def test_what_cannot_be_predicted():
     fit = sf.estimate(noisy())
-    with pytest.raises(ValueError, match=r"times must lie inside \[t0, tf\] = \[0.0, 6.0\]; got 6.5"):
+    with pytest.raises(ValueError, match=r"times must lie inside \[t0, tf\] = \[0.0, 6.0\] s; got 6.5"):
         fit.predict([1.0, 6.5])
     with pytest.raises(ValueError, match="times must be finite numbers of shape"):
         fit.predict([np.nan])

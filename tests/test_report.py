@@ -104,11 +104,13 @@ def several(count: int, names=None) -> Fit:
         lower=np.full(count + 1, -np.inf),
         upper=np.full(count + 1, np.inf),
         transition_times=tuple(np.array([3.0 + 0.1 * e, 7.0]) for e in range(count)),
+        gradient=np.zeros(count + 1),
         hessian=np.diag(np.linspace(100.0, 400.0, count + 1)),
         free_basis=np.eye(count + 1),
         trajectories=trajectories,
         comparisons=tuple((comparison_of(t, names=("X", "dX")),) for t in trajectories),
         cost=29.0 * count,
+        history=tuple(IterationRecord(k, 900.0 / (k + 1), 10.0**-k, 1.0, theta, k + 1) for k in range(3)),
     )
 
 
@@ -345,8 +347,8 @@ def test_no_trend_where_the_data_is_met_exactly():
 
 
 def test_warning_of_a_large_integration_error():
-    assert only_warning(made(integration_error=3e-5)).startswith("The integration error of the cost is 3.0e-05")
-    assert only_warning(made(integration_error=np.nan)).startswith("The integration error of the cost is nan")
+    assert only_warning(made(integration_error=3e-5)).startswith("The integration error of J is 3.0e-05")
+    assert only_warning(made(integration_error=np.nan)).startswith("The integration error of J is nan")
 
 
 # --- several experiments ----------------------------------------------------------------------------------------------

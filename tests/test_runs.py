@@ -302,7 +302,7 @@ def test_a_name_of_a_map_with_another_shape():
 @pytest.mark.parametrize(
     ("start", "message"),
     [
-        ([sf.Parameter(1.0), "v"], "initial_state must have a number or an sf.Parameter for each state; got 'v'"),
+        ([sf.Parameter(1.0), "v"], "each entry of initial_state must be a number or an sf.Parameter; got 'v'"),
         (
             [sf.Parameter([1.0, 2.0]), 0.0],
             r"one sf.Parameter of one number for each state; got an entry of shape \(2,\)",

@@ -81,7 +81,7 @@ def with_everything_odd() -> Fit:
     return made(
         parameters={"scalar": np.array(-0.0), "matrix": np.array([[5e-324, 1 / 3], [-np.inf, 1e308]]),
                     "none": np.zeros((2, 0, 3)), "one": np.array([0.1 + 0.2])},
-        trajectories=(trajectory,), comparisons=((comparison, empty),), transition_times=(np.zeros(0),),
+        trajectories=(trajectory,), comparisons=((comparison, empty),), transition_times=(np.array([-0.0, 7.0]),),
         kinks=(("tau_1", -1.5, 2.5),), active=("a", "b"), sigma_known=None, theta_units=("", "°C", "m/s²"),
         free_basis=np.zeros((3, 0)),
     )  # fmt: skip
@@ -107,14 +107,16 @@ FLOATS = st.floats(allow_nan=False) | st.just(np.nan)
 
 
 @given(
-    theta=hnp.arrays(np.float64, hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4), elements=FLOATS),
-    labels=hnp.arrays("<U4", st.integers(0, 5), elements=st.text(alphabet='aé"\\\n', max_size=4)),
-    counts=hnp.arrays(np.intp, st.integers(0, 5)),
+    numbers=hnp.arrays(np.float64, hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4), elements=FLOATS),
+    labels=hnp.arrays("<U4", st.integers(1, 5), elements=st.text(alphabet='aé"\\\n', max_size=4)),
     cost=FLOATS,
 )
-def test_any_array_comes_back_to_the_bit(tmp_path_factory, theta, labels, counts, cost):
-    trajectory = replace(trajectory_of(), modes=labels, segments=counts)
-    fit = made(theta=theta, cost=cost, trajectories=(trajectory,))
+def test_any_array_comes_back_to_the_bit(tmp_path_factory, numbers, labels, cost):
+    trajectory = replace(trajectory_of(("m",), (0.0, 1.0), nodes=len(labels)), modes=labels)
+    fit = made(
+        parameters={"p": numbers}, cost=cost, trajectories=(trajectory,), comparisons=((),),
+        transition_times=(np.zeros(0),),
+    )  # fmt: skip
     assert_same(fit, round_trip(fit, tmp_path_factory.getbasetemp())[0])
 
 
@@ -226,14 +228,15 @@ def test_a_missing_file(tmp_path):
     [
         (b"", "no valid JSON"),
         (b"PK\x03\x04\xff\xfe", "no valid JSON"),
-        (b'{"format": "switchfit fit", "version": 2, "fit"', "no valid JSON"),
+        (b'{"format": "switchfit fit", "version": 3, "fit"', "no valid JSON"),
         (b'{"format": "switchfit fit", "version": NaN}', "no valid JSON \\(it contains NaN\\)"),
         (b"[" * 100_000, "no valid JSON"),
+        (b'{"format": "switchfit fit", "version": 2, "version": 2}', "it has the entry 'version' twice"),
         (b"[1, 2]", 'no entry "format": "switchfit fit"'),
         (b'{"theta": [1.0]}', 'no entry "format": "switchfit fit"'),
-        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads version 2"),
-        (b'{"format": "switchfit fit", "version": 3}', "of version 3; this switchfit reads version 2"),
-        (b'{"format": "switchfit fit", "version": 2}', "is damaged: fit must be an object; got null"),
+        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads the versions 2 and 3"),
+        (b'{"format": "switchfit fit", "version": 1}', "of version 1; this switchfit reads the versions 2 and 3"),
+        (b'{"format": "switchfit fit", "version": 3}', "is damaged: fit must be an object; got null"),
     ],
 )
 def test_what_is_no_saved_fit(text, message, tmp_path):
@@ -270,7 +273,7 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
         (
             ("fit", "trajectories", 0, "segments"),
             {"dtype": "<i8", "shape": [1], "values": ["a"]},
-            "is no array of int64",
+            'fit.trajectories[0].segments must be an integer; got "a"',
         ),
         (("fit", "status"), "FINE", "fit.status must be one of CONVERGED, "),
         (("fit", "status"), None, "fit.status must be one of CONVERGED, "),
@@ -285,6 +288,38 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
         (("fit", "comparisons", 0, 0, "kind"), None, "fit.comparisons[0][0].kind must be a string; got null"),
         (("fit", "colour"), "red", "fit has the unknown entry 'colour'"),
         (("certificate",), {}, "certificate.optimality is missing"),
+        # Sizes that do not fit one another
+        (
+            ("fit", "theta_units"),
+            ["s"],
+            "fit.theta_units must have the shape (3,), since fit.theta_names has 3 entries",
+        ),
+        (
+            ("fit", "theta"),
+            [1.0, 2.0],
+            "fit.theta must have the shape (3,), since fit.theta_names has 3 entries; got (2,",
+        ),
+        (("fit", "lower"), 1.0, "fit.lower must have the shape (3,)"),
+        (("fit", "hessian"), [[1.0, 2.0, 3.0]], "fit.hessian must have the shape (3, 3)"),
+        (("fit", "saved_gauss_newton"), [[1.0]], "fit.saved_gauss_newton must have the shape (3, 3)"),
+        (("fit", "history", 1, "theta"), [1.0], "fit.history[1].theta must have the shape (3,)"),
+        (("fit", "free_basis"), [[1.0]], "fit.free_basis must have 3 rows and at most as many columns"),
+        (("fit", "free_basis"), [[1.0], [1.0], [0.0]], "fit.free_basis must have orthonormal columns"),
+        (("fit", "kinks"), [["nu", 1.0, 2.0]], "fit.kinks has the name 'nu', which is none of fit.theta_names"),
+        (("fit", "trajectories"), [], "fit.trajectories must have one entry or more; got none"),
+        (("fit", "comparisons"), [], "fit.comparisons must have the shape (1,), since fit.trajectories has 1 entries"),
+        (("fit", "transition_times"), [[4.0]], "fit.trajectories[0].segments must have the shape (3,)"),
+        (("fit", "trajectories", 0, "times", 1), "nan", "fit.trajectories[0].times must be a list of finite numbers"),
+        (("fit", "trajectories", 0, "times"), 1.0, "fit.trajectories[0].times must be a list of finite numbers"),
+        (
+            ("fit", "trajectories", 0, "segments", "values"),
+            [0, 9, 9, 27],
+            "fit.trajectories[0].segments must increase from 0 to 27",
+        ),
+        (("fit", "comparisons", 0, 0, "kind"), "x", 'kind must be "measurements" or "reference"; got "x"'),
+        (("fit", "comparisons", 0, 0, "sigma"), [0.1], "fit.comparisons[0][0].sigma must have the shape (30, 2)"),
+        (("fit", "comparisons", 0, 0, "curve"), [[0.1]], "curve must have the shape (27, 2)"),
+        (("fit", "message"), "\ud800", "surrogates not allowed"),
     ],
 )
 def test_what_is_damaged(place, value, message, tmp_path):

@@ -86,10 +86,11 @@ def make_problem(*, until=52, adaptation=ADAPTATION):
         sf.Measurements(noon, np.sqrt(used), observe=root_of_count, names=("root of count",)),
         mode_sequence=tuple(GERMANY.modes),
         transition_times=[
-            sf.Parameter(PUBLISHED[f"tau_{k}"], lower=-4.0, upper=until - DELAY - 2.5, unit="d") for k in (1, 2, 3)
+            sf.Parameter(PUBLISHED[f"tau_{k}"], lower=-4.0, upper=until - DELAY - 2.5) for k in (1, 2, 3)
         ],
         t0=noon[0] - 0.5,
         tf=noon[-1] + 0.5,
+        time_unit="d",
     )
     return sf.Problem(
         GERMANY,

@@ -13,7 +13,7 @@ from switchfit.optimize import Status
 from switchfit.result import Certificate, Fit, free_curvature
 
 LARGE_INTEGRATION_ERROR = 1e-6
-"""Relative error of the cost by halving the steps above which a fit has fewer digits than it seems."""
+"""Relative error of J or of a constraint by halving the steps above which a fit has fewer digits than it seems."""
 
 NEGATIVE = -1e-8
 """Eigenvalues of the scaled Hessian below this are negative curvature, not rounding."""
@@ -50,6 +50,7 @@ def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
         condition_number=found.condition_number if len(scaled) else np.inf,
         worst_direction=found.directions[0].summary if found.directions else "none",
         integration_error=fit.integration_error,
+        integration_error_of=fit.integration_error_of,
         gradient_gap=float(gaps[0]),
         hessian_gap=float(gaps[1]),
         taylor_orders=orders,
@@ -67,7 +68,7 @@ def _failures(
     if smallest < NEGATIVE:
         yield f"the Hessian has a negative eigenvalue on the free directions ({smallest:.1e}, scaled)"
     if not fit.integration_error <= LARGE_INTEGRATION_ERROR:
-        yield f"the integration error of J is {fit.integration_error:.1e}, relative"
+        yield f"the integration error of {fit.integration_error_of} is {fit.integration_error:.1e}, relative"
     if max(gaps) > LARGEST_GAP and not stiff:
         yield f"the paper's equations differ from the derivatives of J by {max(gaps):.1e}, relative"
     # The first order says nothing at a minimum, where the gradient vanishes.

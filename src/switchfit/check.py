@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from switchfit.data import FloatArray
 from switchfit.evaluate import Evaluation, Evaluator, evaluator_of
 from switchfit.problem import Problem
+from switchfit.validation import as_instance, as_seed
 
 LARGEST_GAP = 1e-4
 """Relative gap between the paper's equations and the discretised cost's derivatives that is still the integrator's."""
@@ -125,7 +126,16 @@ def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, seed:
     -------
     DerivativeCheck
         Print it, or look at ``.passed``.
+
+    Raises
+    ------
+    ValueError
+        For a theta of the wrong shape or order, or a seed that is negative.
+    TypeError
+        If an argument is of the wrong type.
     """
+    as_instance(problem, "problem", Problem, "an sf.Problem")
+    seed = as_seed(seed)
     evaluator = evaluator_of(problem)
     table = taylor_table(evaluator, problem.checked_theta(theta), seed=seed)
     at = table.theta

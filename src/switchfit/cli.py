@@ -1,18 +1,18 @@
 """The command line: ``switchfit fit | check | simulate | paper``.
 
 Exit codes: 0 converged, 1 not converged (what was found is still written), 2 a problem with what was given,
-3 an error of switchfit itself. Only typer is imported here; the numerical parts load when a command needs them, so
-that ``--help`` is quick.
+3 an error of switchfit itself, 130 interrupted by Ctrl-C. Only typer is imported here; the numerical parts load when a
+command needs them, so that ``--help`` is quick.
 """
 
 from __future__ import annotations
 
 import contextlib
 import csv
+import io
 import os
 import signal
 import sys
-import tempfile
 import threading
 import traceback
 from collections.abc import Callable, Iterator
@@ -25,7 +25,7 @@ import typer
 if TYPE_CHECKING:
     from switchfit.io.problem_file import ProblemFile
 
-CONVERGED, NOT_CONVERGED, BAD_INPUT, INTERNAL_ERROR = 0, 1, 2, 3
+CONVERGED, NOT_CONVERGED, BAD_INPUT, INTERNAL_ERROR, INTERRUPTED = 0, 1, 2, 3, 130
 
 app = typer.Typer(
     name="switchfit",
@@ -102,10 +102,13 @@ def fit(
         report = str(estimate) + checked  # after the certificate, which it begins with where that fails
         typer.echo(report)
         if out is not None:
-            _write(out / "report.txt", lambda path: path.write_text(report + "\n", encoding="utf-8"))
-            _write(out / "estimate.json", lambda path: _save(estimate, path, complete=certificate))
+            _write(out / "report.txt", report + "\n")
+            with _writing(out / "estimate.json") as path:
+                _save(estimate, path, complete=certificate)
             if figures:
-                _write(out / "fit.png", lambda path: estimate.plot().savefig(path, dpi=150))
+                figure = io.BytesIO()
+                estimate.plot().savefig(figure, format="png", dpi=150)
+                _write(out / "fit.png", figure.getvalue())
             typer.echo(f"written to {out}", err=True)
     if not estimate.success:
         typer.echo(f"switchfit: not converged. {estimate.message}", err=True)
@@ -113,11 +116,21 @@ def fit(
 
 
 @app.command()
-def check(problem: ProblemPath, debug: Debug = False) -> None:
+def check(
+    problem: ProblemPath,
+    no_run: Annotated[
+        bool, typer.Option("--no-run", help="Read the problem file and its data; run no Python file that it names.")
+    ] = False,
+    debug: Debug = False,
+) -> None:
     """Check a problem without fitting it: data, derivatives, what the data can tell at the first guess.
 
     Exit code 0: the derivatives are right; 1: they are not; 2: something is wrong with what was given.
     """
+    if no_run:
+        with _reported(debug):
+            _check_files(problem)
+        return
     with _reported(debug):
         loaded = _load(problem)
         import switchfit as sf
@@ -137,24 +150,32 @@ def simulate(
     out: Annotated[Path, typer.Option(metavar="FILE.csv", help="CSV file to write.", show_default=False)],
     debug: Debug = False,
 ) -> None:
-    """Integrate the model at the first guess and write time, mode and states as CSV."""
+    """Integrate the model at the first guess and write time, mode and states as CSV.
+
+    The column of times is called t, or "t (min)" where the experiments' time_unit is "min" and not "s".
+    """
     with _reported(debug):
         loaded = _load(problem)
         import switchfit as sf
 
         runs = [sf.simulate(loaded.problem, experiment=e) for e in range(len(loaded.problem.experiments))]
+        units = {run.time_unit for run in runs}
+        if len(units) > 1:
+            raise ValueError(
+                f"the experiments have times in different units ({', '.join(sorted(units))}), and one column of the "
+                "CSV file would mix them: give each its own problem file."
+            )
+        (unit,) = units
         _make_folder(out.parent)
 
-        def save(path: Path) -> None:
-            with path.open("w", newline="", encoding="utf-8") as file:
-                table = csv.writer(file)
-                table.writerow(["experiment", "t", "mode", *runs[0].state_names])
-                for k, run in enumerate(runs):
-                    name = loaded.problem.experiments[k].name or f"run{k + 1}"
-                    for t, mode, x in zip(run.times.tolist(), run.modes, run.states.tolist(), strict=True):
-                        table.writerow([name, t, mode, *x])
-
-        _write(out, save)
+        text = io.StringIO()
+        table = csv.writer(text, lineterminator="\r\n")
+        table.writerow(["experiment", "t" if unit == "s" else f"t ({unit})", "mode", *runs[0].state_names])
+        for k, run in enumerate(runs):
+            name = loaded.problem.experiments[k].name or f"run{k + 1}"
+            for t, mode, x in zip(run.times.tolist(), run.modes, run.states.tolist(), strict=True):
+                table.writerow([name, t, mode, *x])
+        _write(out, text.getvalue())
 
 
 @app.command()
@@ -187,7 +208,7 @@ def paper(
         try:
             run(out, quick=quick, only=only, say=lambda text: typer.echo(text, err=True))
         except KeyboardInterrupt:
-            _fail("interrupted; the same command goes on from here.", NOT_CONVERGED)
+            _fail("interrupted; the same command goes on from here.", INTERRUPTED)
         except OSError as error:
             raise InputError(f"{out} cannot be written: {error.strerror}; name another with --out.") from error
         typer.echo((out / TABLE).read_text(encoding="utf-8"))
@@ -197,28 +218,63 @@ def paper(
 # --- errors -----------------------------------------------------------------------------------------------------------
 
 
+class _CtrlC(KeyboardInterrupt):
+    """Ctrl-C at the keyboard, and not a KeyboardInterrupt that a model file raises."""
+
+
+def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
+    raise _CtrlC
+
+
 @contextlib.contextmanager
 def _reported(debug: bool) -> Iterator[None]:
-    """Turn exceptions into a sentence on stderr and an exit code."""
+    """Turn exceptions into a sentence on stderr and an exit code, those of model files whatever they are."""
     try:
-        yield
-    except typer.Exit:
-        raise
-    except KeyboardInterrupt:
-        _fail("interrupted before there was anything to write.", NOT_CONVERGED)
-    except Exception as error:
+        with _handle_interrupt(_interrupt):
+            yield
+    except BaseException as error:
+        from switchfit.io.python_file import user_place
+
+        users = user_place(error) is not None
+        if isinstance(error, typer.Exit) and not users:
+            raise
         if debug:
             traceback.print_exc()
-        from switchfit.io.errors import InputError
-        from switchfit.io.python_file import located, user_place
+        if isinstance(error, _CtrlC) or (isinstance(error, KeyboardInterrupt) and not users):
+            _fail("interrupted before there was anything to write.", INTERRUPTED)
+        if not (users or isinstance(error, Exception)):
+            raise
+        _explain(error, users=users, debug=debug)
 
-        if user_place(error) is not None and not isinstance(error, InputError):
-            _fail(f"{located(error)}. (--debug shows the full traceback.)", BAD_INPUT)
-        if isinstance(error, (InputError, ValueError)):
-            _fail(str(error), BAD_INPUT)
-        if not debug:
-            traceback.print_exc()
-        _fail("this is an error in switchfit itself; please report it with the lines above.", INTERNAL_ERROR)
+
+def _explain(error: BaseException, *, users: bool, debug: bool) -> NoReturn:
+    """Say what is wrong; `users`: it was raised in a file of the user's."""
+    from switchfit.io.errors import InputError
+    from switchfit.io.python_file import located
+
+    if users and not isinstance(error, InputError):
+        _fail(f"{located(error)}. (--debug shows the full traceback.)", BAD_INPUT)
+    if isinstance(error, (ValueError, OSError)):
+        _fail(str(error), BAD_INPUT)
+    if isinstance(error, MemoryError):
+        _fail(f"not enough memory: {str(error) or 'the problem is too large'}.", BAD_INPUT)
+    if not debug:
+        traceback.print_exception(error)
+    _fail("this is an error in switchfit itself; please report it with the lines above.", INTERNAL_ERROR)
+
+
+@contextlib.contextmanager
+def _handle_interrupt(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
+    """Context in which Ctrl-C calls a handler; not where it is ignored, nor outside the main thread, which has them."""
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before in (signal.SIG_IGN, None):
+        yield
+        return
+    signal.signal(signal.SIGINT, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _fail(message: str, code: int) -> NoReturn:
@@ -233,6 +289,17 @@ def _load(problem: Path) -> ProblemFile:
     from switchfit.io.problem_file import load_problem
 
     return load_problem(problem)
+
+
+def _check_files(problem: Path) -> None:
+    """What can be known of a problem without running a Python file."""
+    from switchfit.io.problem_file import read_experiments
+    from switchfit.io.summary import describe_experiments
+
+    experiments = read_experiments(problem)
+    if experiments:
+        typer.echo(f"{describe_experiments(experiments)}\n")
+    typer.echo("No Python file was run: modes, states, functions and names of parameters are not checked.")
 
 
 def _estimate(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: bool) -> Any:
@@ -272,18 +339,12 @@ def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
 
     def ask(number: int, frame: FrameType | None) -> None:
         if asked.is_set():
-            raise KeyboardInterrupt
+            raise _CtrlC
         asked.set()
         typer.echo("stopping after this iteration; Ctrl-C again to stop at once", err=True)
 
-    if threading.current_thread() is not threading.main_thread():
+    with _handle_interrupt(ask):
         yield asked.is_set
-        return
-    before = signal.signal(signal.SIGINT, ask)
-    try:
-        yield asked.is_set
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 @contextlib.contextmanager
@@ -321,28 +382,20 @@ def _make_folder(folder: Path) -> None:
         raise InputError(f"the folder {folder} cannot be made: {error.strerror}; name another with --out.") from error
 
 
-def _write(path: Path, save: Callable[[Path], object]) -> None:
-    """Write a file whole or not at all: into a file beside it, which then takes its name."""
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[Path]:
+    """Context that says in an InputError which file cannot be written, and why."""
     from switchfit.io.errors import InputError
 
     try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+        yield path
     except OSError as error:
         raise InputError(f"{path} cannot be written: {error.strerror}; name another with --out.") from error
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        save(temporary)
-        temporary.chmod(0o666 & ~_umask())
-        temporary.replace(path)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}; name another with --out.") from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
-def _umask() -> int:
-    """The process's umask, which can only be read by setting it."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def _write(path: Path, content: str | bytes) -> None:
+    """Write a file whole or not at all."""
+    from switchfit.io.files import write_atomically
+
+    with _writing(path):
+        write_atomically(content, path)

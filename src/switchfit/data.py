@@ -6,7 +6,7 @@ so that the integrator never steps across one and inside a step the signal is on
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -14,8 +14,28 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.losses import LOSSES
+from switchfit.validation import (
+    as_array,
+    as_callable,
+    as_choice,
+    as_finite,
+    as_name,
+    as_names,
+    as_number,
+    as_positive,
+    shown,
+)
 
 FloatArray = NDArray[np.float64]
+MOST_FILTERED = 10**7
+"""Points at which a signal may be filtered."""
+OVERFLOW = (
+    "The signal between the samples of an Input or a ReferenceSignal overflows: values must be smaller, or times "
+    "further apart."
+)
+LOWEST_CUTOFF = 1e-6
+"""Smallest cut-off of a low-pass filter in cycles a point. At 1e-8 its output is off by 3 %, below that by anything."""
+
 Observe = Callable[..., Any]
 """``h(t, x, p) -> (q,)``: what a sensor sees of the state."""
 
@@ -32,6 +52,10 @@ class PiecewisePolynomial:
 
     knots: FloatArray
     coefficients: FloatArray
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.coefficients).all():
+            raise ValueError(OVERFLOW)
 
     @property
     def channels(self) -> int:
@@ -58,7 +82,7 @@ class Input:
     Parameters
     ----------
     times : (K,) array_like
-        Increasing times (s). They must reach over the experiment's ``[t0, tf]``; a held input only has to
+        Increasing times in the experiment's time unit. They must reach over its ``[t0, tf]``; a held input only has to
         start by t0, its last value is kept.
     values : (K,) or (K, q) array_like
         The modes get a scalar u, or a ``(q,)`` array.
@@ -70,6 +94,8 @@ class Input:
     ValueError
         For times that do not increase, values that are not finite or differ in length from times, too few
         samples, or an unknown kind.
+    TypeError
+        If times or values are not numbers, dates among them.
     """
 
     times: Any
@@ -77,11 +103,11 @@ class Input:
     kind: Literal["hold", "linear", "cubic"] = "hold"
 
     def __post_init__(self) -> None:
-        if self.kind not in ("hold", "linear", "cubic"):
-            raise ValueError(f"Input kind must be 'hold', 'linear' or 'cubic'; got {self.kind!r}.")
-        at_least = {"hold": 1, "linear": 2, "cubic": 4}[self.kind]
+        kind = as_choice(self.kind, "Input kind", ("hold", "linear", "cubic"))
+        at_least = {"hold": 1, "linear": 2, "cubic": 4}[kind]
         times, values = _samples(self.times, self.values, "Input", at_least=at_least)
         _require_finite(values, "Input values")
+        object.__setattr__(self, "kind", kind)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values)
 
@@ -95,7 +121,9 @@ class Input:
         if self.kind == "cubic":
             return _spline(times, values)
         if self.kind == "linear":
-            return _from_powers(times, [values[:-1], np.diff(values, axis=0) / np.diff(times)[:, None]])
+            with np.errstate(all="ignore"):
+                slopes = np.diff(values, axis=0) / np.diff(times)[:, None]
+            return _from_powers(times, [values[:-1], slopes])
         end = max(tf, times[-1] + 1.0)
         return _from_powers(np.append(times, end), [values])
 
@@ -183,8 +211,7 @@ class ReferenceSignal:
                 "ReferenceSignal is made from samples by sf.ReferenceSignal.from_samples(times, values, ...); "
                 f"got {type(self.signal).__name__}."
             )
-        if self.observe is not None and not callable(self.observe):
-            raise TypeError(f"observe must be a function h(t, x, p); got {type(self.observe).__name__}.")
+        _check_observe(self.observe)
         object.__setattr__(self, "weights", _weight_matrix(self.weights, self.signal.channels))
         object.__setattr__(self, "names", _channel_names(self.names, self.signal.channels))
 
@@ -204,23 +231,27 @@ class ReferenceSignal:
         Parameters
         ----------
         times : (K,) array_like
-            Increasing sample times (s), four or more. A time given twice breaks the spline there, as at the
-            transitions of a simulated trajectory; each part then needs four samples.
+            Increasing sample times in the experiment's time unit, four or more. A time given twice breaks the spline
+            there, as at the transitions of a simulated trajectory; each part then needs four samples.
         values : (K,) or (K, q) array_like
-            NaN marks a missing value; it is bridged by the interpolation.
+            NaN marks a missing value, as does the mask of a masked array; it is bridged by the interpolation.
         observe : callable ``h(t, x, p) -> (q,)``, optional
         lowpass_hz : float, optional
-            Cut-off (Hz) of a second-order Butterworth filter run forward and backward over the interpolated
-            signal, so that no phase shift remains (the gain at the cut-off is then 1/2).
+            Cut-off, in cycles per time unit of the experiment (Hz only where that is s), of a second-order Butterworth
+            filter run forward and backward over the interpolated signal, so that no phase shift remains (the gain at
+            the cut-off is then 1/2).
         weights : (q,) or (q, q) array_like, optional
         names : sequence of str, optional
 
         Raises
         ------
         ValueError
-            For bad times or values, fewer than four samples in a channel, or a cut-off that is not positive.
+            For bad times or values, fewer than four samples in a channel, or a cut-off that is not positive or far
+            beyond what the samples show.
+        TypeError
+            If times, values, weights or the cut-off are not numbers, dates among them.
         """
-        times, values = _samples(times, values, "ReferenceSignal", at_least=4, breaks=True)
+        times, values = _samples(times, values, "ReferenceSignal", at_least=4, breaks=True, missing=True)
         table = values.reshape(len(times), -1)
         if np.isinf(table).any():
             raise ValueError("ReferenceSignal values must be finite, or NaN where one is missing; got infinity.")
@@ -228,6 +259,7 @@ class ReferenceSignal:
         parts = zip(np.split(times, cuts), np.split(table, cuts), strict=True)
         signal = _joined([_bridged_spline(part_times, part) for part_times, part in parts])
         if lowpass_hz is not None:
+            lowpass_hz = as_positive(lowpass_hz, "lowpass_hz")
             signal = _lowpass(signal, lowpass_hz)
         return cls(signal, observe, weights, names, (times, table), lowpass_hz)  # type: ignore[arg-type]  # made a tuple there
 
@@ -243,9 +275,9 @@ class Measurements:
     Parameters
     ----------
     times : (K,) array_like
-        Increasing sample times (s); they may be irregular.
+        Increasing sample times in the experiment's time unit; they may be irregular.
     values : (K,) or (K, q) array_like
-        Samples; NaN marks a missing one.
+        Samples; NaN marks a missing one, as does the mask of a masked array.
     observe : callable ``h(t, x, p) -> (q,)``, optional
         Left out, the whole state is measured. At a transition with a reset map the sample is of the state
         just before the jump.
@@ -260,15 +292,17 @@ class Measurements:
     loss_scale : float, optional
         C, in units of sigma: residuals beyond it are outliers.
     delay : float or str, optional
-        By how much (s) the sensor is late: a sample stamped t_k is of the state at ``t_k - delay``, and `observe` is
-        called with that time. A string names the parameter that it is. Give channels of different delays as several
-        `Measurements`.
+        By how much the sensor is late, in the experiment's time unit: a sample stamped t_k is of the state at
+        ``t_k - delay``, and `observe` is called with that time. A string names the parameter that it is. Give channels
+        of different delays as several `Measurements`.
 
     Raises
     ------
     ValueError
         For times that do not increase, shapes that do not match, no sample at all, infinite values, a
         sigma that is not positive, or a loss that is not known or has no scale to be measured by.
+    TypeError
+        If times, values, sigma or another number is not a number, dates among them.
     """
 
     times: Any
@@ -281,24 +315,23 @@ class Measurements:
     delay: float | str = 0.0
 
     def __post_init__(self) -> None:
-        times, values = _samples(self.times, self.values, "Measurements", at_least=1)
+        times, values = _samples(self.times, self.values, "Measurements", at_least=1, missing=True)
         values = values.reshape(len(times), -1)
         if np.isinf(values).any():
             raise ValueError("Measurements values must be finite, or NaN where a sample is missing; got infinity.")
         if np.isnan(values).all():
             raise ValueError("Measurements values are all NaN: there is nothing to fit.")
-        if self.observe is not None and not callable(self.observe):
-            raise TypeError(f"observe must be a function h(t, x, p); got {type(self.observe).__name__}.")
+        _check_observe(self.observe)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "sigma", _checked_sigma(self.sigma, values.shape))
         object.__setattr__(self, "names", _channel_names(self.names, values.shape[1]))
         self._check_loss()
-        if not isinstance(self.delay, str):
-            delay = as_number(self.delay, "delay (a number, or the name of a parameter)")
-            if not np.isfinite(delay):
-                raise ValueError(f"delay must be finite; got {self.delay}.")
-            object.__setattr__(self, "delay", delay)
+        if isinstance(self.delay, str):
+            delay: float | str = as_name(self.delay, "delay")
+        else:
+            delay = as_finite(as_number(self.delay, "delay (a number, or the name of a parameter)"), "delay")
+        object.__setattr__(self, "delay", delay)
 
     @property
     def seen_times(self) -> FloatArray:
@@ -306,11 +339,10 @@ class Measurements:
         return self.times if isinstance(self.delay, str) or self.delay == 0.0 else self.times - self.delay
 
     def _check_loss(self) -> None:
-        if self.loss not in LOSSES:
-            raise ValueError(f"loss must be one of {', '.join(LOSSES)}; got {self.loss!r}.")
-        scale = as_number(self.loss_scale, "loss_scale")
-        if not (np.isfinite(scale) and scale > 0):
-            raise ValueError(f"loss_scale must be positive and finite; got {self.loss_scale}.")
+        object.__setattr__(self, "loss", as_choice(self.loss, "loss", LOSSES))
+        scale = as_positive(self.loss_scale, "loss_scale")
+        if not 0 < scale * scale < np.inf:
+            raise ValueError(f"loss_scale must have a square that is neither 0 nor infinite; got {scale}.")
         object.__setattr__(self, "loss_scale", scale)
         if self.loss != "linear" and self.sigma is None:
             raise ValueError(
@@ -356,14 +388,14 @@ Data = RunningCost | TerminalCost | TerminalConstraint | ReferenceSignal | Measu
 
 
 def _samples(
-    times: ArrayLike, values: ArrayLike, what: str, *, at_least: int, breaks: bool = False
+    times: ArrayLike, values: ArrayLike, what: str, *, at_least: int, breaks: bool = False, missing: bool = False
 ) -> tuple[FloatArray, FloatArray]:
-    """Times (K,) and values (K, ...) as float64, checked against each other; with `breaks` a time may stand twice."""
-    try:
-        times = np.array(times, dtype=np.float64)
-        values = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{what} times and values must be arrays of numbers; {error}.") from error
+    """Return times (K,) and values (K, ...) as float64, checked against each other.
+
+    With `breaks` a time may stand twice; with `missing` masked values become NaN.
+    """
+    times = as_array(times, f"{what} times", form="an array of numbers")
+    values = as_array(values, f"{what} values", form="an array of numbers", missing=missing)
     if times.ndim != 1 or values.ndim not in (1, 2):
         raise ValueError(
             f"{what} needs times of shape (K,) and values of shape (K,) or (K, q); "
@@ -387,20 +419,9 @@ def _samples(
     return times, values
 
 
-def as_numbers(value: Any, what: str) -> FloatArray:
-    """`value` as a float64 array; ValueError naming it otherwise."""
-    try:
-        return np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{what} must be a number or an array of numbers; got {value!r}.") from error
-
-
-def as_number(value: Any, what: str) -> float:
-    """`value` as a float; ValueError naming it otherwise."""
-    number = as_numbers(value, what)
-    if number.size != 1:
-        raise ValueError(f"{what} must be a single number; got {value!r}.")
-    return float(number.reshape(()))
+def _check_observe(observe: Any) -> None:
+    if observe is not None:
+        as_callable(observe, "observe", "a function h(t, x, p)")
 
 
 def _require_finite(values: FloatArray, what: str) -> None:
@@ -414,10 +435,10 @@ def _checked_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | tuple[str
     if sigma is None:
         return None
     if isinstance(sigma, str):
-        return (sigma,) * shape[1]
+        return (as_name(sigma, "sigma"),) * shape[1]
     if isinstance(sigma, (list, tuple)) and any(isinstance(entry, str) for entry in sigma):
         return _sigma_of_channels(sigma, shape[1])
-    sigma = as_numbers(sigma, "sigma")
+    sigma = as_array(sigma, "sigma")
     if sigma.shape not in ((), (shape[1],), shape):
         raise ValueError(
             f"sigma must be a number, of shape ({shape[1]},) (one a channel) or {shape} (one a sample); "
@@ -425,46 +446,55 @@ def _checked_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | tuple[str
         )
     if not np.all(sigma > 0) or not np.all(np.isfinite(sigma)):
         raise ValueError(f"sigma must be positive and finite; got a smallest value of {sigma.min()}.")
+    _check_inverse_square(sigma)
     return sigma
+
+
+def _check_inverse_square(sigma: Any) -> None:
+    with np.errstate(over="ignore"):
+        if not np.all(np.isfinite(np.asarray(sigma, dtype=np.float64) ** -2.0)):
+            raise ValueError(f"sigma must not be so small that 1 / sigma**2 is infinite; got {shown(sigma)}.")
 
 
 def _sigma_of_channels(sigma: Sequence[Any], channels: int) -> tuple[str | float, ...]:
     """Names of parameters and numbers, one a channel."""
     if len(sigma) != channels:
-        raise ValueError(f"sigma must have one entry for each of the {channels} channels; got {list(sigma)}.")
+        raise ValueError(f"sigma must have one entry for each of the {channels} channels; got {shown(sigma)}.")
     if any(entry is None for entry in sigma):
         raise ValueError(
             "sigma of one channel cannot be left out (None) where that of another is a parameter: name a parameter for "
-            f"it too; got {list(sigma)}."
+            f"it too; got {shown(sigma)}."
         )
-    numbers = [as_number(entry, "sigma of a channel") for entry in sigma if not isinstance(entry, str)]
-    if not all(np.isfinite(number) and number > 0 for number in numbers):
-        raise ValueError(f"sigma must be positive and finite; got {list(sigma)}.")
-    return tuple(entry if isinstance(entry, str) else float(entry) for entry in sigma)
+    entries = [
+        as_name(entry, "sigma of a channel") if isinstance(entry, str) else as_number(entry, "sigma of a channel")
+        for entry in sigma
+    ]
+    if not all(np.isfinite(entry) and entry > 0 for entry in entries if not isinstance(entry, str)):
+        raise ValueError(f"sigma must be positive and finite; got {shown(sigma)}.")
+    _check_inverse_square([entry for entry in entries if not isinstance(entry, str)])
+    return tuple(entries)
 
 
 def _channel_names(names: Sequence[str] | None, channels: int) -> tuple[str, ...] | None:
     if names is None:
         return None
-    if not isinstance(names, Iterable):
-        raise TypeError(f"names must be a sequence of strings, one for each channel; got {names!r}.")
-    names = (names,) if isinstance(names, str) else tuple(names)
-    if len(names) != channels:
-        raise ValueError(f"names must have one entry for each of the {channels} channels; got {list(names)}.")
-    return names
+    given = (names,) if isinstance(names, str) else names
+    checked = as_names(given, "names", "a sequence of strings, one for each channel")
+    if len(checked) != channels:
+        raise ValueError(f"names must have one entry for each of the {channels} channels; got {shown(checked)}.")
+    return checked
 
 
 def _weight_matrix(weights: ArrayLike | None, channels: int) -> FloatArray:
     """W as a symmetric positive semi-definite ``(q, q)`` matrix."""
     if weights is None:
         return np.eye(channels)
-    matrix = as_numbers(weights, "weights")
-    if matrix.ndim == 1:
-        matrix = np.diag(matrix)
-    if matrix.shape != (channels, channels):
-        raise ValueError(f"weights must have shape ({channels},) or ({channels}, {channels}); got {np.shape(weights)}.")
+    matrix = as_array(weights, "weights")
+    if matrix.shape not in ((channels,), (channels, channels)):
+        raise ValueError(f"weights must have shape ({channels},) or ({channels}, {channels}); got {matrix.shape}.")
+    matrix = np.diag(matrix) if matrix.ndim == 1 else matrix
     if not np.all(np.isfinite(matrix)) or not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
-        raise ValueError(f"weights must be finite and symmetric; got {matrix.tolist()}.")
+        raise ValueError(f"weights must be finite and symmetric; got {shown(matrix.tolist())}.")
     smallest = np.linalg.eigvalsh(matrix)[0]
     if smallest < -1e-12 * np.abs(matrix).max():
         raise ValueError(f"weights must be positive semi-definite; its smallest eigenvalue is {smallest:.3g}.")
@@ -483,7 +513,11 @@ def _spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
     """Not-a-knot cubic spline through ``values`` (K, q)."""
     from scipy.interpolate import CubicSpline  # here, since importing it takes longer than most fits
 
-    spline = CubicSpline(times, values, axis=0)
+    try:
+        with np.errstate(all="ignore"):
+            spline = CubicSpline(times, values, axis=0)
+    except ValueError:  # times and values are finite, but their slopes are not
+        raise ValueError(OVERFLOW) from None
     return PiecewisePolynomial(times, np.moveaxis(spline.c[::-1], 0, 1))
 
 
@@ -509,14 +543,22 @@ def _lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePolynomi
     """Butterworth filter of second order forward and backward, on a grid of ten points a period of the cut-off."""
     import scipy.signal  # here, since importing it takes longer than most fits
 
-    cutoff_hz = as_number(cutoff_hz, "lowpass_hz")
-    if not (np.isfinite(cutoff_hz) and cutoff_hz > 0):
-        raise ValueError(f"lowpass_hz must be positive; got {cutoff_hz}.")
-    start, end = signal.knots[[0, -1]]
+    start, end = signal.knots[[0, -1]].tolist()
     step = min(0.1 / cutoff_hz, float(np.median(np.diff(signal.knots))))
+    if not (end - start) * max(10 * cutoff_hz, 1 / step) <= MOST_FILTERED:
+        raise ValueError(
+            f"lowpass_hz must not ask for more than {MOST_FILTERED} points, ten a period; got {cutoff_hz:g} Hz for a "
+            f"signal from {start:g} to {end:g}. Its samples show nothing above "
+            f"{0.5 / np.min(np.diff(signal.knots)):.3g} Hz; a higher cut-off filters nothing."
+        )
     grid = np.linspace(start, end, max(int(np.ceil((end - start) / step)) + 1, 8))
     rate = (len(grid) - 1) / (end - start)
+    if cutoff_hz < LOWEST_CUTOFF * rate:
+        raise ValueError(
+            f"lowpass_hz must be {LOWEST_CUTOFF * rate:.3g} Hz or more for {rate:.6g} points a second, below which the "
+            f"filter is rounding; got {cutoff_hz:g}."
+        )
     sos = scipy.signal.butter(2, cutoff_hz, fs=rate, output="sos")
-    padding = min(len(grid) - 1, int(np.ceil(3 * rate / cutoff_hz)))
+    padding = int(min(len(grid) - 1, np.ceil(3 * rate / cutoff_hz)))
     filtered = scipy.signal.sosfiltfilt(sos, signal(grid), axis=0, padtype="odd", padlen=padding)
     return _spline(grid, filtered)

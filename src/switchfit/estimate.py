@@ -13,6 +13,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.accuracy import worst_error
 from switchfit.certificate import certify
 from switchfit.data import FloatArray
 from switchfit.engine import Engine
@@ -33,8 +34,9 @@ from switchfit.report.uncertainty import plot_diagnostics
 from switchfit.residuals import ResidualDiagnostics, diagnose
 from switchfit.result import Certificate, Fit
 from switchfit.sensitivity import Sensitivity, gauss_newton_of, sample_derivatives, sensitivity
-from switchfit.simulate import compared, cost_of, runs_of
-from switchfit.solve import constraints_of, least_squares, message_of, minimized, plain, sigma_known, smallest_cost
+from switchfit.simulate import compared, runs_of
+from switchfit.solve import constraints_of, least_squares, message_of, minimized, plain, sigma_known
+from switchfit.validation import as_callable, as_choice, as_count, as_flag, as_instance, as_path, as_positive
 
 HESSIANS = get_args(HessianKind)
 
@@ -42,11 +44,8 @@ REFINEMENTS = 2
 """Times the mesh may be refined at the solution and the fit resumed, if the integration error asks for it."""
 
 LARGEST_INTEGRATION_ERROR = 1e-8
-"""Relative error of J (by halving all steps) above which the mesh is refined again, unless rtol allows more."""
-
-PERFECT_FIT = 1e-3
-"""Where J has fallen to less than this part of its first value, the integration error is measured against that part:
-the relative error of a cost that vanishes says nothing."""
+"""Relative error of J, a guard or a terminal constraint (by halving all steps, see `switchfit.accuracy`) above which
+the mesh is refined again, unless rtol allows more."""
 
 MOST_SENSITIVITIES = 2**28
 """Bytes that the derivatives of states and outputs at all nodes may take; beyond, figures have no bands."""
@@ -141,7 +140,7 @@ class Estimate(Fit):
             Of the bands.
         """
         quantile = self.quantile(level)
-        drawn = bands and self.problem is not None and np.isfinite(standard_errors_of(self)).all()
+        drawn = as_flag(bands, "bands") and self.problem is not None and np.isfinite(standard_errors_of(self)).all()
         shown = range(min(len(self.trajectories), LARGEST_FIGURE)) if drawn and self._sensitivities_fit() else range(0)
         return plot_fit(self, [Bands.of(predict(self, experiment=e), quantile, level) for e in shown])
 
@@ -171,7 +170,8 @@ class Estimate(Fit):
 
     def save(self, path: str | Path) -> None:
         """Write everything but the model to a JSON file, atomically; `load` reads it."""
-        save_fit(self.complete(), self.certificate, Path(path))
+        file = as_path(path, "path")
+        save_fit(self.complete(), self.certificate, file)
 
     def complete(self) -> Estimate:
         """The same with everything that is saved, which is the Gauss-Newton matrix."""
@@ -190,14 +190,25 @@ class Estimate(Fit):
         Raises
         ------
         ValueError
-            If the file is not one of switchfit's, or the problem has other unknowns.
+            If the file is not one of switchfit's, or the problem has other unknowns or other time units.
         """
-        fit, certificate = load_fit(Path(path))
+        if problem is not None:
+            as_instance(problem, "problem", Problem, "an sf.Problem")
+        fit, certificate = load_fit(as_path(path, "path"))
         if problem is not None and problem.theta_names != fit.theta_names:
             raise ValueError(
                 f"{path} holds the unknowns {', '.join(fit.theta_names)}, the problem has "
                 f"{', '.join(problem.theta_names)}: it is the fit of another problem."
             )
+        if problem is not None:
+            saved = [trajectory.time_unit for trajectory in fit.trajectories]
+            given = [experiment.time_unit for experiment in problem.experiments]
+            if saved != given:
+                raise ValueError(
+                    f"{path} holds times in {', '.join(saved)}, the problem has them in {', '.join(given)}, and times "
+                    "are not converted. Files that were saved before there was a time_unit count as s: if it is one of "
+                    "them, and its times are those of the problem, give the problem's experiments time_unit='s'."
+                )
         own = {f.name: getattr(fit, f.name) for f in fields(Fit)}
         return cls(**own, saved_certificate=certificate, problem=problem)
 
@@ -239,8 +250,16 @@ def estimate(
     ------
     ValueError
         For a bad setting, or a guess at which the model cannot be integrated.
+    TypeError
+        If an argument is of the wrong type.
     """
-    _check_settings(problem, hessian, tolerance, max_iterations)
+    as_instance(problem, "problem", Problem, "an sf.Problem; several are what sf.estimate_many takes")
+    hessian = as_choice(hessian, "hessian", HESSIANS)
+    tolerance, max_iterations = checked_settings(tolerance, max_iterations)
+    if callback is not None:
+        as_callable(callback, "callback", "a function callback(record)", arguments=1)
+    if problem.constraint_names and hessian != "exact":
+        raise ValueError(f"with guards or terminal constraints hessian must be 'exact'; got {hessian!r}.")
     began = time.perf_counter()
     theta, evaluator = _beginning(problem, start)
     constraints = constraints_of(problem)
@@ -261,9 +280,14 @@ def estimate(
         theta = result.theta
         fine = evaluator.divided()
         runs = runs_of(problem, theta, fine.meshes, fine.arguments)
-        fine_cost = cost_of(problem, theta, runs)
-        first_cost = abs(history[0].cost) if history else 0.0
-        error = abs(fine_cost - result.cost) / max(abs(fine_cost), PERFECT_FIT * first_cost, smallest_cost(problem))
+        error, output = worst_error(
+            fine,
+            theta,
+            runs,
+            cost=result.cost,
+            first_cost=history[0].cost if history else 0.0,
+            constraints=[value for _, value, _ in held],
+        )
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
         done = result.status in (Status.INTERRUPTED, Status.NONFINITE_START) or attempt == REFINEMENTS
         if done or not excess > 1:
@@ -282,25 +306,20 @@ def estimate(
         trajectories=trajectories,
         comparisons=comparisons,
         integration_error=float(error),
+        integration_error_of=output,
         seconds=time.perf_counter() - began,
         constraints=held,
     )
 
 
-def _check_settings(problem: Problem, hessian: HessianKind, tolerance: float, max_iterations: int) -> None:
-    if hessian not in HESSIANS:
-        raise ValueError(f"hessian must be one of {', '.join(HESSIANS)}; got {hessian!r}.")
-    if not tolerance > 0:
-        raise ValueError(f"tolerance must be positive; got {tolerance}.")
-    if max_iterations < 0:
-        raise ValueError(f"max_iterations must not be negative; got {max_iterations}.")
-    if problem.constraint_names and hessian != "exact":
-        raise ValueError(f"with guards or terminal constraints hessian must be 'exact'; got {hessian!r}.")
+def checked_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:
+    """Return the two settings of every fit, checked."""
+    return as_positive(tolerance, "tolerance"), as_count(max_iterations, "max_iterations")
 
 
 def _beginning(problem: Problem, start: ArrayLike | None) -> tuple[FloatArray, Evaluator]:
     """Where a fit begins (d,), guarded transitions on their guards if that is near, and the meshes for it."""
-    theta = problem.checked_theta(start)
+    theta = problem.checked_theta(start, "start")
     evaluator = evaluator_of(problem) if start is None else Evaluator(problem, theta)
     if any(structure.guarded for structure in problem.structures):
         with suppress(ValueError):  # if there is no such point nearby, the optimiser may find one farther off

@@ -29,6 +29,7 @@ from switchfit.problem import Problem
 from switchfit.propagate import path_cost, propagate
 from switchfit.refine import refined_mesh
 from switchfit.simulate import cost_of, runs_of
+from switchfit.validation import as_choice, as_instance
 
 Method = Literal["auto", "forward", "discrete-adjoint", "adjoint", "autodiff"]
 Matrix = Literal["exact", "gauss-newton", "none"]
@@ -157,6 +158,10 @@ class Evaluator:
             np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
             np.add.at(jacobian[here].T, mine, A[:, own].T)
             c[here] = c_e
+        if self._priors is not None:
+            J, g, h = self._priors.evaluate(theta)
+            cost, gradient = cost + float(J), gradient + g
+            value, slope, hessian = value + float(J), slope + g, hessian + np.diag(h)
         return ConstrainedEvaluation(cost, gradient, value, slope, hessian, c, jacobian)
 
     def arrow(self, theta: FloatArray, side: int = 1, matrix: Matrix = "exact") -> ArrowEvaluation:
@@ -195,11 +200,12 @@ class Evaluator:
     def cost(self, theta: FloatArray) -> float:
         """J alone."""
         natives = self._natives(0)
-        if any(native is None for native in natives):
-            return cost_of(self.problem, theta, runs_of(self.problem, theta, self.meshes, self.arguments))
-        prior = 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0])
         vectors = [self.problem.vectors(theta, e) for e in range(len(natives))]
-        return prior + sum(native.cost(*given) for native, given in zip(natives, vectors, strict=True) if native)
+        costs = [None if native is None else native.cost(*at) for native, at in zip(natives, vectors, strict=True)]
+        known = [cost for cost in costs if cost is not None]
+        if len(known) < len(natives):
+            return cost_of(self.problem, theta, runs_of(self.problem, theta, self.meshes, self.arguments))
+        return sum(known, 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0]))
 
     @property
     def engine(self) -> Engine:
@@ -222,7 +228,9 @@ class Evaluator:
         if method == "auto" and matrix != "gauss-newton":
             natives = [native for native in self._natives(2 if matrix == "exact" else 1) if native is not None]
             if len(natives) == len(self.arguments):
-                return [native(*self.problem.vectors(theta, e), side) for e, native in enumerate(natives)]
+                found = [native(*self.problem.vectors(theta, e), side) for e, native in enumerate(natives)]
+                if not any(result is None for result in found):
+                    return found
         compiled = (method, matrix) in self._compiled
         with float64(), nullcontext() if compiled else compilation_cache():
             results = [
@@ -283,14 +291,16 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     ------
     ValueError
         For a theta of the wrong shape or with transition times out of order, or an unknown method.
+    TypeError
+        If an argument is of the wrong type.
 
     Notes
     -----
     The mesh is refined once, at the initial guess, so that J is one smooth function of theta. Where a transition
     time sits exactly on a sample time the derivatives are those for increasing it.
     """
-    if method not in METHODS:
-        raise ValueError(f"method must be one of {', '.join(METHODS)}; got {method!r}.")
+    as_instance(problem, "problem", Problem, "an sf.Problem")
+    method = as_choice(method, "method", METHODS)
     return evaluator_of(problem)(problem.checked_theta(theta), method=method)
 
 

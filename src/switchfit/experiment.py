@@ -19,11 +19,11 @@ from switchfit.data import (
     RunningCost,
     TerminalConstraint,
     TerminalCost,
-    as_number,
 )
 from switchfit.parameter import Parameter as Parameter
 from switchfit.parameter import as_parameter
 from switchfit.system import Guard, HybridSystem, ResetMap, as_state
+from switchfit.validation import as_instance, as_name, as_number, as_sequence, shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +38,10 @@ class Experiment:
     mode_sequence : sequence of str
         Names of the modes in the order in which they are active; a mode may return.
     transition_times : sequence of float or Parameter
-        First guess (s) of each transition, one fewer than modes, strictly increasing inside ``(t0, tf)``;
-        an entry may be a `Parameter` with bounds, or fixed.
+        First guess of each transition, in the experiment's time unit, one fewer than modes, strictly increasing inside
+        ``(t0, tf)``; an entry may be a `Parameter` with bounds, or fixed. Its unit, where given, must be `time_unit`.
     t0, tf : float
-        Horizon (s).
+        Horizon, in the experiment's time unit.
     inputs : Input, optional
         Known input; modes are then called as ``f(t, x, p, u)``.
     initial_state : (n,) array_like or callable ``p -> (n,)``, optional
@@ -52,11 +52,18 @@ class Experiment:
         The model's name of a parameter -> the problem's: with ``{"beta": "beta_run3"}`` the functions of this run find
         the problem's ``beta_run3`` under ``p["beta"]``. Names that are not in it mean themselves, and several names
         may mean one parameter.
+    time_unit : str, optional
+        The unit of all times of this run: of its samples, inputs, t0, tf, transition times and delays. Reports, figures
+        and files print it; nothing is converted.
 
     Raises
     ------
     ValueError
-        If lengths do not match, times are unordered or outside the horizon, or data lies outside it.
+        If lengths do not match, times are unordered or outside the horizon, data lies outside it, `time_unit` is empty,
+        or a transition time has another unit.
+    TypeError
+        If an argument is of the wrong type: times that are not numbers (dates among them), mode names that are no
+        strings, data that are none of the kinds above.
 
     Notes
     -----
@@ -75,28 +82,36 @@ class Experiment:
     initial_state: Any = None
     name: str | None = None
     parameter_map: Any = None
+    time_unit: str = "s"
 
     def __post_init__(self) -> None:
         t0, tf = as_number(self.t0, "t0"), as_number(self.tf, "tf")
         if not (np.isfinite(t0) and np.isfinite(tf) and t0 < tf):
-            raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got ({self.t0}, {self.tf}).")
-        if isinstance(self.mode_sequence, str):
-            raise TypeError(f"mode_sequence must be a sequence of mode names; got the string {self.mode_sequence!r}.")
-        if not isinstance(self.mode_sequence, Iterable):
-            raise TypeError(f"mode_sequence must be a sequence of mode names; got {self.mode_sequence!r}.")
-        sequence = tuple(self.mode_sequence)
+            raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got ({t0}, {tf}).")
+        modes = as_sequence(self.mode_sequence, "mode_sequence", "a sequence of mode names")
+        sequence = tuple(as_name(mode, "each of mode_sequence", "the name of a mode") for mode in modes)
         if not sequence:
             raise ValueError("mode_sequence is empty; name at least one mode.")
-        given = self.transition_times if isinstance(self.transition_times, Iterable) else (self.transition_times,)
+        given = self.transition_times
+        several = isinstance(given, Iterable) and getattr(given, "ndim", 1) > 0
+        given = as_sequence(given, "transition_times", "a sequence of numbers or sf.Parameter") if several else (given,)
+        if len(given) != len(sequence) - 1:
+            raise ValueError(
+                f"transition_times must be one fewer than the {len(sequence)} modes of mode_sequence; "
+                f"got {len(given)}, needed {len(sequence) - 1}."
+            )
         times = tuple(as_parameter(tau, "a transition time") for tau in given)
-        if self.inputs is not None and not isinstance(self.inputs, Input):
-            raise TypeError(f"inputs must be an sf.Input; got {type(self.inputs).__name__}.")
+        if self.inputs is not None:
+            as_instance(self.inputs, "inputs", Input, "an sf.Input")
+        if self.name is not None:
+            object.__setattr__(self, "name", as_name(self.name, "name of an experiment"))
         if self.initial_state is not None and not callable(self.initial_state):
             object.__setattr__(self, "initial_state", as_state(self.initial_state, "initial_state"))
         for field, value in (("t0", t0), ("tf", tf), ("mode_sequence", sequence), ("transition_times", times)):
             object.__setattr__(self, field, value)
         object.__setattr__(self, "data", _checked_data(self.data))
         object.__setattr__(self, "parameter_map", _checked_map(self.parameter_map))
+        self._check_time_unit()
         self._check_times()
         self._check_data_inside()
         if self.inputs is not None:
@@ -107,23 +122,29 @@ class Experiment:
         """Guess of all transition times, fixed ones included: an ``(N,)`` array."""
         return np.array([tau.value for tau in self.transition_times], dtype=np.float64)
 
+    def _check_time_unit(self) -> None:
+        unit = as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'")
+        for i, tau in enumerate(self.transition_times, start=1):
+            if tau.unit not in ("", unit):
+                raise ValueError(
+                    f"transition time {i} has the unit {tau.unit!r}, but time_unit of the experiment is {unit!r}, and "
+                    f"times are not converted. If all times of the experiment are in {tau.unit}, give it "
+                    f"time_unit={tau.unit!r}; otherwise give the transition time in {unit}."
+                )
+
     def _check_times(self) -> None:
-        needed = len(self.mode_sequence) - 1
-        if len(self.transition_times) != needed:
-            raise ValueError(
-                f"transition_times must be one fewer than the {len(self.mode_sequence)} modes of mode_sequence; "
-                f"got {len(self.transition_times)}, needed {needed}."
-            )
         if any(tau.scale != "linear" for tau in self.transition_times):
             raise ValueError("transition_times are estimated as they are; leave out scale='log'.")
         if any(tau.shape != () for tau in self.transition_times):
             shapes = [tau.shape for tau in self.transition_times]
-            raise ValueError(f"transition_times must be single numbers or Parameters of one; got the shapes {shapes}.")
+            raise ValueError(
+                f"transition_times must be single numbers or Parameters of one; got the shapes {shown(shapes)}."
+            )
         knots = np.concatenate([[self.t0], self.initial_times, [self.tf]])
         if np.any(np.diff(knots) <= 0):
             raise ValueError(
                 f"transition_times must increase strictly inside (t0, tf) = ({self.t0}, {self.tf}); "
-                f"got {self.initial_times.tolist()}."
+                f"got {shown(self.initial_times)}."
             )
 
     def _check_data_inside(self) -> None:
@@ -176,9 +197,9 @@ def _checked_map(given: Any) -> Mapping[str, str]:
     if not strings:
         raise TypeError(
             "parameter_map must be a dict of the model's name -> the problem's name, such as "
-            f"{{'beta': 'beta_run3'}}; got {given!r}."
+            f"{{'beta': 'beta_run3'}}; got {shown(given)}."
         )
-    return dict(names)
+    return {as_name(here, "parameter_map"): as_name(target, "parameter_map") for here, target in names.items()}
 
 
 def _checked_data(data: Any) -> tuple[Data, ...]:

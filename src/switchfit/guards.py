@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.data import FloatArray
 from switchfit.evaluate import Evaluator, evaluator_of
 from switchfit.problem import Problem
+from switchfit.validation import as_instance, listed, shown
 
 ITERATIONS = 60
 #: Newton steps below this part of a transition time are rounding.
@@ -66,7 +67,11 @@ def evaluate_on_guards(problem: Problem, theta: ArrayLike | None = None) -> Guar
     ------
     ValueError
         Without guards, or if no transition times near `theta` meet them.
+    TypeError
+        If an argument is of the wrong type.
     """
+    as_instance(problem, "problem", Problem, "an sf.Problem")
+    guarded_places(problem)  # an error where there are no guards
     evaluator = evaluator_of(problem)
     at = on_guards(evaluator, problem.checked_theta(theta))
     evaluator = Evaluator(problem, at)  # a mesh for where the transitions really are
@@ -117,9 +122,9 @@ def on_guards(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     else:
         if np.all(np.abs(step[guarded]) <= 1e-10 * np.maximum(np.abs(theta[guarded]), 1.0)):
             return theta
-    names = ", ".join(problem.theta_names[k] for k in guarded)
+    near, names = shown(theta[guarded].round(6)), listed(problem.theta_names[k] for k in guarded)
     raise ValueError(
-        f"No transition times near {theta[guarded].round(6).tolist()} put {names} on their guards: the state does not "
+        f"No transition times near {near} put {names} on their guards: the state does not "
         "reach a guard there, or grazes it. Give transition_times nearer to where the guards vanish (sf.simulate shows "
         "the states), or another mode_sequence."
     )

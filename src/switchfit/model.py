@@ -7,9 +7,9 @@ nothing is compiled anew when transition times, parameters or data change.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -20,7 +20,6 @@ import numpy as np
 from switchfit.data import (
     FloatArray,
     Measurements,
-    Observe,
     PiecewisePolynomial,
     ReferenceSignal,
     RunningCost,
@@ -28,6 +27,8 @@ from switchfit.data import (
     TerminalCost,
 )
 from switchfit.experiment import Experiment, Parameter, guards_of, initial_state_of, reset_maps_of, signals_of
+from switchfit.functions import Function, Shape, trace_function
+from switchfit.functions import float64 as float64
 from switchfit.losses import influence, robust
 from switchfit.mesh import Mesh
 from switchfit.rungekutta import Density, Field, Tableau, tableau_of
@@ -36,15 +37,10 @@ from switchfit.system import HybridSystem
 Array = jax.Array
 
 
-def float64() -> Any:
-    """Context in which JAX computes in float64; the user's setting is back in force afterwards."""
-    return jax.enable_x64(True)
-
-
 class Sensor(NamedTuple):
     """What of one `Measurements` shapes the program: functions, names and the loss."""
 
-    observe: Observe | None
+    observe: Function | None  # None: the whole state
     channels: int
     sigma: tuple[str | None, ...]  # the parameter that is the sigma of each channel; empty where all are numbers
     loss: str
@@ -52,30 +48,35 @@ class Sensor(NamedTuple):
     delay: str | None  # the parameter that is the delay; None where it is a number, which is in the times
 
     @classmethod
-    def of(cls, item: Measurements) -> Sensor:
+    def of(cls, item: Measurements, observe: Function | None) -> Sensor:
         """That of one of the data."""
         delay = item.delay if isinstance(item.delay, str) else None
-        return cls(item.observe, item.values.shape[1], item.sigma_names, item.loss, item.loss_scale, delay)
+        return cls(observe, item.values.shape[1], item.sigma_names, item.loss, item.loss_scale, delay)
+
+    @property
+    def named(self) -> set[str]:
+        """Parameters that it is measured with."""
+        return {name for name in (*self.sigma, self.delay) if name is not None}
 
 
 @dataclass(frozen=True)
 class Structure:
-    """What a compiled program depends on beside the shapes of its arguments. Hashable; functions by identity."""
+    """What a compiled program depends on beside the shapes of its arguments. Hashable; functions by what they do."""
 
     mode_names: tuple[str, ...]
-    modes: tuple[Callable[..., Any], ...]
+    modes: tuple[Function, ...]
     mode_of_segment: tuple[int, ...]
-    reset_maps: tuple[Callable[..., Any] | None, ...]
-    initial_state: Callable[..., Any] | None
+    reset_maps: tuple[Function | None, ...]
+    initial_state: Function | None
     n: int
     unknown_states: tuple[int, ...]  # entries of the initial state that are estimated
     parameters: tuple[tuple[str, tuple[int, ...], bool], ...]  # the model's name, shape, free
-    running: tuple[Callable[..., Any], ...]
-    references: tuple[tuple[Observe | None, int], ...]  # observe, channels
+    running: tuple[Function, ...]
+    references: tuple[tuple[Function | None, int], ...]  # observe, channels
     measurements: tuple[Sensor, ...]
-    terminal: tuple[Callable[..., Any], ...]
-    guards: tuple[Callable[..., Any] | None, ...]
-    terminal_constraints: tuple[Callable[..., Any], ...]
+    terminal: tuple[Function, ...]
+    guards: tuple[Function | None, ...]
+    terminal_constraints: tuple[Function, ...]
     input_shape: tuple[int, ...] | None
     solver: str
 
@@ -85,7 +86,7 @@ class Structure:
         return tableau_of(self.solver)
 
     @property
-    def outputs(self) -> tuple[tuple[Observe | None, int], ...]:
+    def outputs(self) -> tuple[tuple[Function | None, int], ...]:
         """What sees the state, reference signals first, then the Measurements: function and channels of each."""
         return (*self.references, *((sensor.observe, sensor.channels) for sensor in self.measurements))
 
@@ -113,6 +114,27 @@ class Structure:
     def guarded(self) -> tuple[int, ...]:
         """The transitions (from 0) that have a guard."""
         return tuple(i for i, guard in enumerate(self.guards) if guard is not None)
+
+    @property
+    def terminal_constraint_count(self) -> int:
+        """Number of terminal constraints, m."""
+        return sum(int(np.prod(psi.shape)) for psi in self.terminal_constraints)
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """What identifies each of its functions in every process, by what the function is."""
+        found = {f"mode {name!r}": mode for name, mode in zip(self.mode_names, self.modes, strict=True)}
+        for kind, functions in (
+            ("initial_state", (self.initial_state,)),
+            ("reset map", self.reset_maps),
+            ("guard", self.guards),
+            ("RunningCost", self.running),
+            ("observe", tuple(observe for observe, _ in self.outputs)),
+            ("TerminalCost", self.terminal),
+            ("TerminalConstraint", self.terminal_constraints),
+        ):
+            found |= {f"{kind} {k + 1}": function for k, function in enumerate(functions) if function is not None}
+        return {name: function.digest for name, function in found.items()}
 
     @property
     def constrained(self) -> bool:
@@ -217,15 +239,14 @@ class Model:
     def field(self, mode: int, piece: Piece) -> Field:
         """Vector field of a mode inside one cell."""
         structure = self.structure
-        function, name = structure.modes[mode], structure.mode_names[mode]
+        function = structure.modes[mode]
 
         def f(t: Array, x: Array, p: Array) -> Array:
             given: tuple[Any, ...] = (t, x, self.parameters(p))
             if structure.input_shape is not None:
                 size = int(np.prod(structure.input_shape))
                 given += (piece(t)[piece.coefficients.shape[-1] - size :].reshape(structure.input_shape),)
-            what = f"mode {name!r}"
-            return checked_vector(function, given, (structure.n,), what, f"f({'t, x, p, u'[: 3 * len(given) - 2]})")
+            return function(*given)
 
         return f
 
@@ -240,7 +261,7 @@ class Model:
         def ell(t: Array, x: Array, p: Array) -> Array:
             total = jnp.zeros(())
             for function in self.structure.running:
-                total = total + checked_vector(function, (t, x, self.parameters(p)), (), "RunningCost", "ell(t, x, p)")
+                total = total + function(t, x, self.parameters(p))
             for residual, W in zip(self.reference_residuals(piece), self.arguments.weights, strict=True):
                 r = residual(t, x, p)
                 total = total + 0.5 * r @ weighted(W, r)
@@ -257,24 +278,16 @@ class Model:
         ]
 
     def _reference_residual(self, k: int, channels: slice, piece: Piece, t: Array, x: Array, p: Array) -> Array:
-        observe, q = self.structure.references[k]
-        return self.observed(observe, t, x, p, q) - piece(t)[channels]
+        return self.observed(self.structure.references[k][0], t, x, p) - piece(t)[channels]
 
-    def observed(self, observe: Observe | None, t: Array, x: Array, p: Array, channels: int) -> Array:
+    def observed(self, observe: Function | None, t: Array, x: Array, p: Array) -> Array:
         """What a sensor sees: (q,)."""
-        if observe is None:
-            if x.shape != (channels,):
-                raise ValueError(
-                    f"Without observe the whole state is compared: its {x.shape[0]} entries need as many channels of "
-                    f"data; got {channels}. Give observe=h(t, x, p) -> ({channels},)."
-                )
-            return x
-        return checked_vector(observe, (t, x, self.parameters(p)), (channels,), "observe", "h(t, x, p)")
+        return x if observe is None else observe(t, x, self.parameters(p))
 
     def sample_residual(self, k: int, sample: Samples, x: Array, p: Array) -> Array:
         """``h - y`` of one sample of the k-th Measurements, 0 where it is missing: (q,)."""
         sensor = self.structure.measurements[k]
-        h = self.observed(sensor.observe, sample.time, x, p, sensor.channels)
+        h = self.observed(sensor.observe, sample.time, x, p)
         return jnp.where(sample.weight > 0, h - sample.value, 0.0)
 
     def seen_at(self, k: int, sample: Samples, p: Array) -> Samples:
@@ -318,47 +331,25 @@ class Model:
         """Sum of the terminal costs."""
         total = jnp.zeros(())
         for phi in self.structure.terminal:
-            total = total + checked_vector(phi, (x, self.parameters(p)), (), "TerminalCost", "phi(x, p)")
+            total = total + phi(x, self.parameters(p))
         return total
 
     def reset(self, i: int) -> Callable[[Array, Array, Array], Array]:
         """Reset map R_i(t, x, p) of transition i, which must have one."""
-        function = self.structure.reset_maps[i]
-        sequence = [self.structure.mode_names[m] for m in self.structure.mode_of_segment[i : i + 2]]
-        if function is None:
-            raise ValueError(f"transition {i + 1} has no reset map.")
-        apply = function
-
-        def R(t: Array, x: Array, p: Array) -> Array:
-            given = (t, x, self.parameters(p))
-            return checked_vector(apply, given, (self.structure.n,), f"reset map {tuple(sequence)}", "R(t, x, p)")
-
-        return R
+        return self._at_transition(self.structure.reset_maps[i], f"transition {i + 1} has no reset map.")
 
     def guard(self, i: int) -> Callable[[Array, Array, Array], Array]:
         """Guard g_i(t, x, p) of transition i, which must have one."""
-        function = self.structure.guards[i]
-        sequence = [self.structure.mode_names[m] for m in self.structure.mode_of_segment[i : i + 2]]
+        return self._at_transition(self.structure.guards[i], f"transition {i + 1} has no guard.")
+
+    def _at_transition(self, function: Function | None, missing: str) -> Callable[[Array, Array, Array], Array]:
         if function is None:
-            raise ValueError(f"transition {i + 1} has no guard.")
-        apply = function
-
-        def g(t: Array, x: Array, p: Array) -> Array:
-            return checked_vector(apply, (t, x, self.parameters(p)), (), f"guard {tuple(sequence)}", "g(t, x, p)")
-
-        return g
+            raise ValueError(missing)
+        return lambda t, x, p: function(t, x, self.parameters(p))
 
     def terminal_constraint(self, x: Array, p: Array) -> Array:
         """All terminal constraints in one: (m,)."""
-        parts = []
-        for psi in self.structure.terminal_constraints:
-            value = called(psi, (x, self.parameters(p)), "TerminalConstraint", "psi(x, p)")
-            if value.ndim > 1:
-                raise ValueError(
-                    f"TerminalConstraint: psi(x, p) must return a number or an array of shape (m,); got shape "
-                    f"{value.shape}."
-                )
-            parts.append(checked_vector(psi, (x, self.parameters(p)), value.shape, "TerminalConstraint", "psi(x, p)"))
+        parts = [psi(x, self.parameters(p)) for psi in self.structure.terminal_constraints]
         return jnp.concatenate([part.reshape(-1) for part in parts])
 
     def initial_state(self, p: Array) -> Array:
@@ -367,110 +358,7 @@ class Model:
             unknown = self.structure.unknown_states
             x0 = self.arguments.initial_state
             return x0.at[np.array(unknown)].set(p[-len(unknown) :]) if unknown else x0
-        given = (self.parameters(p),)
-        return checked_vector(
-            self.structure.initial_state, given, (self.structure.n,), "initial_state", "initial_state(p)"
-        )
-
-
-class _Asked(dict[str, Array]):
-    """The dict the user's functions get while it is found out which parameters they ask for.
-
-    Parameters
-    ----------
-    shown : what the dict holds
-    others : what it holds only for a function that asks by name: the targets of parameter maps
-    asked : set of str, to which every name that is asked for is added
-    """
-
-    def __init__(self, shown: Mapping[str, Array], others: Mapping[str, Array], asked: set[str]) -> None:
-        super().__init__(shown)
-        self.others = others
-        self.asked = asked
-
-    def __getitem__(self, name: str) -> Array:
-        value = super().__getitem__(name) if name in self.keys_alone() else self.others[name]
-        self.asked.add(name)
-        return value
-
-    def __contains__(self, name: object) -> bool:
-        there = name in self.keys_alone()
-        if there:
-            self.asked.add(str(name))
-        return there
-
-    def get(self, name: str, default: Any = None) -> Any:
-        return self[name] if name in self.keys_alone() or name in self.others else default
-
-    def keys_alone(self) -> Any:
-        """The names, without asking for them."""
-        return super().keys()
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.whole())
-
-    def __len__(self) -> int:
-        return len(self.whole())
-
-    def keys(self) -> Any:
-        return self.whole().keys()
-
-    def values(self) -> Any:
-        return self.whole().values()
-
-    def items(self) -> Any:
-        return self.whole().items()
-
-    def whole(self) -> dict[str, Array]:
-        """All that is shown, which counts as asked for."""
-        self.asked.update(self.keys_alone())
-        return {name: super(_Asked, self).__getitem__(name) for name in self.keys_alone()}
-
-
-class _Asking(Model):
-    """A model whose functions are watched: which parameters do they ask for?"""
-
-    def __init__(self, structure: Structure, arguments: Arguments, others: frozenset[str], asked: set[str]) -> None:
-        super().__init__(structure, arguments)
-        self.others = others
-        self.asked = asked
-
-    def parameters(self, p: Array) -> Mapping[str, Array]:
-        named = super().parameters(p)
-        shown = {name: value for name, value in named.items() if name not in self.others}
-        return _Asked(shown, {name: named[name] for name in self.others}, self.asked)
-
-
-UNTRACEABLE = (
-    jax.errors.ConcretizationTypeError,
-    jax.errors.TracerArrayConversionError,
-    jax.errors.TracerIntegerConversionError,
-)
-"""What JAX raises where Python code wants to know a number that is not known yet."""
-
-
-def called(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, signature: str) -> Array:
-    """Call a function of the user's while tracing; whatever it raises becomes one sentence that names it."""
-    try:
-        value = function(*arguments)
-    except KeyError as error:
-        parameters = next(given for given in arguments if isinstance(given, dict))
-        raise ValueError(
-            f"{what} asks for the parameter {error}, which the problem lacks; it has {', '.join(parameters) or 'none'}."
-        ) from error
-    except UNTRACEABLE as error:
-        raise ValueError(
-            f"{what} decides by the value of t, x or p (an `if`, a `while`, float() or numpy function), which JAX "
-            "cannot differentiate. Write it with jax.numpy; if the dynamics change there, make it a mode with a "
-            "transition time."
-        ) from error
-    except Exception as error:
-        said = str(error).rstrip(".")
-        raise ValueError(f"{what}: {signature} raised {type(error).__name__}: {said}.") from error
-    try:
-        return jnp.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{what}: {signature} must return an array of numbers; got {value!r}.") from error
+        return self.structure.initial_state(self.parameters(p))
 
 
 def weighted(W: Array, r: Array) -> Array:
@@ -484,70 +372,138 @@ def _compact(W: FloatArray) -> FloatArray:
     return diagonal if np.array_equal(W, np.diag(diagonal)) else W
 
 
-def checked_vector(
-    function: Callable[..., Any], arguments: tuple[Any, ...], shape: tuple[int, ...], what: str, signature: str
-) -> Array:
-    """What a function of the user's returns, checked (while tracing) to be a float64 array of the given shape."""
-    array = called(function, arguments, what, signature)
-    if array.shape != shape and array.size == int(np.prod(shape)) == 1:
-        array = array.reshape(shape)
-    if array.shape != shape:
-        raise ValueError(f"{what}: {signature} must return an array of shape {shape}; got shape {array.shape}.")
-    if jnp.issubdtype(array.dtype, jnp.integer) or array.dtype == jnp.bool_:
-        return array.astype(jnp.float64)
-    if array.dtype != jnp.float64:
-        raise ValueError(
-            f"{what}: {signature} must return float64; got {array.dtype}. Its arguments are float64: do not cast them."
-        )
-    return array
-
-
-def structure_of(
-    system: HybridSystem,
-    experiment: Experiment,
-    parameters: Mapping[str, Parameter],
-    solver: str,
-    targets: frozenset[str] = frozenset(),
-) -> Structure:
-    """The structure of one experiment, its functions checked.
+class Functions:
+    """Traces the functions of a problem's experiments, each of them once.
 
     Parameters
     ----------
+    parameters : mapping of str to Parameter
+        Of the problem.
     targets : set of str
-        Parameters of the problem that some experiment's map names as what it maps to. They are this experiment's
-        where it maps to them, or asks for them by their own name.
+        Those that some experiment's map names as what it maps to. They are an experiment's where it maps to them, or
+        asks for them by their own name.
     """
+
+    def __init__(self, parameters: Mapping[str, Parameter], targets: frozenset[str]) -> None:
+        self.parameters, self.targets = parameters, targets
+        self._traced: dict[Any, Function] = {}
+
+    def of(self, experiment: Experiment) -> _Tracer:
+        """What traces the functions of one experiment."""
+        mapped = experiment.parameter_map
+        order = {name: k for k, name in enumerate(self.parameters)}
+        # The same order in every run, whatever its map: runs then share a program.
+        named = sorted({*self.parameters, *mapped}, key=lambda name: (order.get(name, len(order)), name))
+        hidden = frozenset(name for name in self.targets if name not in mapped)
+        return _Tracer({name: self.parameters[mapped.get(name, name)] for name in named}, hidden, self._traced)
+
+
+class _Tracer:
+    """Traces the functions of one experiment, and notes which parameters they ask for.
+
+    Attributes
+    ----------
+    named : dict of str to Parameter, by the model's names
+    hidden : set of str
+        Those that a function sees only if it asks for them by name.
+    asked : set of str
+    """
+
+    def __init__(self, named: dict[str, Parameter], hidden: frozenset[str], traced: dict[Any, Function]) -> None:
+        self.named, self.hidden, self._traced = named, hidden, traced
+        self.shapes = {name: q.shape for name, q in named.items()}
+        self.asked: set[str] = set()
+        self._key = tuple(self.shapes.items()), hidden
+
+    def __call__(
+        self,
+        function: Callable[..., Any],
+        arguments: tuple[Shape | None, ...],
+        shape: Shape | None,
+        what: str,
+        form: str,
+    ) -> Function:
+        """A function that takes arguments of these shapes, None standing for p, and returns an array of a shape."""
+        key = (id(function), arguments, shape, what, self._key)
+        traced = self._traced.get(key)
+        if traced is None:
+            traced = trace_function(function, arguments, self.shapes, self.hidden, what=what, form=form, shape=shape)
+            self._traced[key] = traced
+        self.asked.update(traced.parameters)
+        return traced
+
+
+def structure_of(system: HybridSystem, experiment: Experiment, functions: Functions, solver: str) -> Structure:
+    """The structure of one experiment, its functions traced and checked.
+
+    Raises
+    ------
+    ValueError
+        Naming the mode or function, what it should return and what it returned.
+    """
+    trace = functions.of(experiment)
     names = tuple(dict.fromkeys(experiment.mode_sequence))
     initial = initial_state_of(system, experiment)
-    of_kind = partial(_of_kind, experiment.data)
-    mapped = experiment.parameter_map
-    order = {name: k for k, name in enumerate(parameters)}
-    # The same order in every run, whatever its map: runs then share a program.
-    named = sorted({*parameters, *mapped}, key=lambda name: (order.get(name, len(order)), name))
-    others = frozenset(name for name in targets if name not in mapped)
-    meant = {name: parameters[mapped.get(name, name)] for name in named}
+    x0 = trace(initial, (None,), None, "initial_state", "initial_state(p)") if callable(initial) else None
+    if x0 is not None and (len(x0.shape) != 1 or x0.shape == (0,)):
+        raise ValueError(f"initial_state(p) must return an array of shape (n,); got shape {x0.shape}.")
+    n = len(initial) if x0 is None else x0.shape[0]
     unknown = () if callable(initial) else tuple(k for k, x in enumerate(initial) if not getattr(x, "fixed", True))
+    of_kind = partial(_of_kind, experiment.data)
+    at: tuple[Shape | None, ...] = ((), (n,), None)
+    inputs = None if experiment.inputs is None else tuple(experiment.inputs.values.shape[1:])
+    in_mode, form = (at, "f(t, x, p)") if inputs is None else ((*at, inputs), "f(t, x, p, u)")
+
+    def transitions(kind: tuple[Callable[..., Any] | None, ...], shape: Shape, what: str, form: str) -> tuple[Any, ...]:
+        pairs = zip(kind, pairwise(experiment.mode_sequence), strict=True)
+        return tuple(None if g is None else trace(g, at, shape, f"{what} {pair}", form) for g, pair in pairs)
+
+    def observe(item: Measurements | ReferenceSignal, channels: int) -> Function | None:
+        if item.observe is not None:
+            return trace(item.observe, at, (channels,), "observe", "h(t, x, p)")
+        if channels != n:
+            raise ValueError(
+                f"Without observe the whole state is compared: its {n} entries need as many channels of data; got "
+                f"{channels}. Give observe=h(t, x, p) -> ({channels},)."
+            )
+        return None
+
+    modes = tuple(trace(system.modes[name], in_mode, (n,), f"mode {name!r}", form) for name in names)
+    references = ((item, item.signal.channels) for item in of_kind(ReferenceSignal))
+    measurements = ((item, item.values.shape[1]) for item in of_kind(Measurements))
+    constraints = tuple(
+        trace(item.psi, at[1:], None, "TerminalConstraint", "psi(x, p)") for item in of_kind(TerminalConstraint)
+    )
+    for psi in constraints:
+        if len(psi.shape) > 1:
+            raise ValueError(
+                f"TerminalConstraint: psi(x, p) must return a number or an array of shape (m,); got shape {psi.shape}."
+            )
     structure = Structure(
         mode_names=names,
-        modes=tuple(system.modes[name] for name in names),
+        modes=modes,
         mode_of_segment=tuple(names.index(mode) for mode in experiment.mode_sequence),
-        reset_maps=reset_maps_of(system, experiment.mode_sequence),
-        initial_state=initial if callable(initial) else None,
-        n=_state_size(initial, meant),
+        reset_maps=transitions(reset_maps_of(system, experiment.mode_sequence), (n,), "reset map", "R(t, x, p)"),
+        initial_state=x0,
+        n=n,
         unknown_states=unknown,
-        parameters=tuple((name, q.shape, not q.fixed) for name, q in meant.items()),
-        running=tuple(item.ell for item in of_kind(RunningCost)),
-        references=tuple((item.observe, item.signal.channels) for item in of_kind(ReferenceSignal)),
-        measurements=tuple(map(Sensor.of, of_kind(Measurements))),
-        terminal=tuple(item.phi for item in of_kind(TerminalCost)),
-        guards=guards_of(system, experiment.mode_sequence),
-        terminal_constraints=tuple(item.psi for item in of_kind(TerminalConstraint)),
-        input_shape=None if experiment.inputs is None else tuple(experiment.inputs.values.shape[1:]),
+        parameters=(),
+        running=tuple(trace(item.ell, at, (), "RunningCost", "ell(t, x, p)") for item in of_kind(RunningCost)),
+        references=tuple((observe(item, channels), channels) for item, channels in references),
+        measurements=tuple(Sensor.of(item, observe(item, channels)) for item, channels in measurements),
+        terminal=tuple(trace(item.phi, at[1:], (), "TerminalCost", "phi(x, p)") for item in of_kind(TerminalCost)),
+        guards=transitions(guards_of(system, experiment.mode_sequence), (), "guard", "g(t, x, p)"),
+        terminal_constraints=constraints,
+        input_shape=inputs,
         solver=solver,
     )
-    asked = checked_functions(structure, others)
-    # What is fixed costs nothing, and functions may look at it in ways that do not show.
-    used = tuple(q for q in structure.parameters if q[0] in asked or not (q[2] or q[0] in others))
+    asked = trace.asked.union(*(sensor.named for sensor in structure.measurements))
+    # What is fixed costs nothing.
+    used = tuple(
+        (name, q.shape, not q.fixed)
+        for name, q in trace.named.items()
+        if name in asked or (q.fixed and name not in trace.hidden)
+    )
     return replace(structure, parameters=used)
 
 
@@ -578,111 +534,8 @@ def initial_values(initial: Any) -> FloatArray:
     return np.array([x.value if isinstance(x, Parameter) else x for x in initial], dtype=np.float64)
 
 
-@lru_cache(maxsize=256)
-def checked_functions(structure: Structure, others: frozenset[str] = frozenset()) -> frozenset[str]:
-    """Call every function of the user's once, abstractly: that shapes, dtypes and parameter names are right.
-
-    What has been found right is not looked at again when another problem is made of it.
-
-    Parameters
-    ----------
-    structure : Structure
-        With all parameters that functions may ask for.
-    others : set of str
-        Those among them that a function sees only if it asks for them by name.
-
-    Returns
-    -------
-    asked : set of str
-        The parameters that they ask for; all but the `others` where that cannot be told, since a function does
-        something with the dict that only an ordinary one allows.
-
-    Raises
-    ------
-    ValueError
-        Naming the mode or function, what it should return and what it returned.
-    """
-    asked: set[str] = set()
-    try:
-        _call_functions(structure, partial(_Asking, others=others, asked=asked))
-        return frozenset(asked)
-    except Exception:
-        shown = tuple(q for q in structure.parameters if q[0] not in others)
-    try:
-        _call_functions(replace(structure, parameters=shown), Model)
-    except ValueError:
-        if not others:
-            raise
-        shown = structure.parameters  # one of the others may be asked for; if not, this says what is wrong
-        _call_functions(structure, Model)
-    return frozenset(name for name, _, _ in shown)
-
-
-def _call_functions(structure: Structure, model_of: Callable[[Structure, Arguments], Model]) -> None:
-    def call_all(arguments: Arguments, t: Array, x: Array, p: Array, samples: list[Samples]) -> list[Array]:
-        model = model_of(structure, arguments)
-        piece = Piece(t, arguments.signals[0])
-        values = [model.field(mode, piece)(t, x, p) for mode in range(len(structure.modes))]
-        values += [model.reset(i)(t, x, p) for i in structure.resets]
-        values += [model.guard(i)(t, x, p) for i in structure.guarded]
-        if structure.terminal_constraints:
-            values.append(model.terminal_constraint(x, p))
-        values.append(model.density(piece)(t, x, p))
-        values += [model.sample_cost(k, model.seen_at(k, s, p), x, p) for k, s in enumerate(samples)]
-        return [*values, model.terminal(x, p), model.initial_state(p)]
-
-    with float64():
-        t, x, p = (jax.ShapeDtypeStruct(shape, jnp.float64) for shape in ((), (structure.n,), (structure.M,)))
-        rows = [jax.ShapeDtypeStruct((sensor.channels,), jnp.float64) for sensor in structure.measurements]
-        samples: Any = [Samples(jax.ShapeDtypeStruct((), jnp.int64), t, row, row) for row in rows]  # type: ignore[arg-type]
-        jax.eval_shape(call_all, _shapes_of_arguments(structure), t, x, p, samples)
-
-
-@lru_cache(maxsize=256)
-def terminal_constraint_count(structure: Structure) -> int:
-    """Number of terminal constraints, m."""
-    if not structure.terminal_constraints:
-        return 0
-
-    def constraint(arguments: Arguments, x: Array, p: Array) -> Array:
-        return Model(structure, arguments).terminal_constraint(x, p)
-
-    with float64():
-        x, p = (jax.ShapeDtypeStruct((size,), jnp.float64) for size in (structure.n, structure.M))
-        return int(jax.eval_shape(constraint, _shapes_of_arguments(structure), x, p).shape[0])
-
-
-def _shapes_of_arguments(structure: Structure) -> Arguments:
-    """Arguments on a mesh of one cell: shapes alone."""
-    channels = sum(q for _, q in structure.references) + int(np.prod(structure.input_shape or ()))
-
-    def shaped(*shape: int) -> Any:
-        return jax.ShapeDtypeStruct(shape, jnp.float64)
-
-    return Arguments(
-        nodes=shaped(2),
-        signals=shaped(1, 4, channels),
-        fixed=tuple(shaped(*shape) for _, shape, free in structure.parameters if not free),
-        initial_state=shaped(structure.n),
-        samples=(),
-        weights=tuple(shaped(q) for _, q in structure.references),
-    )
-
-
 def _of_kind(data: tuple[Any, ...], kind: type) -> list[Any]:
     return [item for item in data if isinstance(item, kind)]
-
-
-def _state_size(initial: Any, parameters: Mapping[str, Parameter]) -> int:
-    """Number of states, from the initial state or what its function returns."""
-    if not callable(initial):
-        return len(initial)
-    with float64():
-        p = {name: jax.ShapeDtypeStruct(q.shape, jnp.float64) for name, q in parameters.items()}
-        shape = jax.eval_shape(lambda p: called(initial, (p,), "initial_state", "initial_state(p)"), p).shape
-    if len(shape) != 1 or shape[0] == 0:
-        raise ValueError(f"initial_state(p) must return an array of shape (n,); got shape {shape}.")
-    return int(shape[0])
 
 
 def _padded_samples(item: Measurements, length: int, mesh: Mesh) -> Samples:

@@ -6,8 +6,12 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.priors import LogNormal, Normal, Prior, PriorTerms
+from switchfit.validation import as_array, as_choice, as_flag, as_text, shown
+
+FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +25,7 @@ class Parameter:
     lower, upper : float or array_like, optional
         Bounds; broadcast to the shape of `value`.
     unit : str, optional
-        For the report.
+        For the report. That of a transition time is its experiment's `time_unit`.
     fixed : bool, optional
         A fixed parameter is not estimated.
     prior : Normal or LogNormal, optional
@@ -36,6 +40,8 @@ class Parameter:
     ValueError
         If a value is not finite, bounds cross, the guess lies outside them, a prior does not fit, or the scale or the
         prior is logarithmic and p not confined to positive numbers.
+    TypeError
+        If a value or a bound is not a number, `unit` not a string, or `fixed` neither True nor False.
     """
 
     value: Any
@@ -47,48 +53,61 @@ class Parameter:
     scale: Literal["linear", "log"] = "linear"
 
     def __post_init__(self) -> None:
-        try:
-            value = np.array(self.value, dtype=np.float64)
-            lower = np.broadcast_to(np.asarray(self.lower, dtype=np.float64), value.shape).copy()
-            upper = np.broadcast_to(np.asarray(self.upper, dtype=np.float64), value.shape).copy()
-        except (TypeError, ValueError) as error:
-            raise ValueError(
-                f"Parameter needs numbers: value {self.value!r}, lower {self.lower!r}, upper {self.upper!r}; {error}."
-            ) from error
+        value = as_array(self.value, "Parameter value")
+        lower, upper = (self._bound(name, value.shape) for name in ("lower", "upper"))
         if value.size == 0:
             raise ValueError("Parameter value must have one entry or more; got none.")
         if not np.all(np.isfinite(value)):
-            raise ValueError(f"Parameter value must be finite; got {self.value!r}.")
+            raise ValueError(f"Parameter value must be finite; got {shown(value)}.")
         if not np.all(lower <= upper):
-            raise ValueError(f"Parameter bounds must satisfy lower <= upper; got [{self.lower}, {self.upper}].")
+            raise ValueError(f"Parameter bounds must satisfy lower <= upper; got {self._shown_bounds}.")
         if not (np.all(lower <= value) and np.all(value <= upper)):
-            raise ValueError(f"Parameter value {self.value} lies outside its bounds [{self.lower}, {self.upper}].")
-        if self.scale not in ("linear", "log"):
-            raise ValueError(f"Parameter scale must be 'linear' or 'log'; got {self.scale!r}.")
-        if self.scale == "log":
+            raise ValueError(f"Parameter value {shown(self.value)} lies outside its bounds {self._shown_bounds}.")
+        scale = as_choice(self.scale, "Parameter scale", ("linear", "log"))
+        if scale == "log":
             lower = np.where(np.isneginf(lower), 0.0, lower)
             if not (np.all(value > 0) and np.all(lower >= 0)):
                 raise ValueError(
                     "Parameter with scale='log' must be positive, and its lower bound 0 or more; got the value "
-                    f"{self.value} and the lower bound {self.lower}."
+                    f"{shown(self.value)} and the lower bound {shown(self.lower)}."
                 )
-        for name, array in (("value", value), ("lower", lower), ("upper", upper)):
-            object.__setattr__(self, name, array)
+        unit, fixed = as_text(self.unit, "Parameter unit"), as_flag(self.fixed, "Parameter fixed")
+        checked = {"value": value, "lower": lower, "upper": upper, "unit": unit, "fixed": fixed, "scale": scale}
+        for name, entry in checked.items():
+            object.__setattr__(self, name, entry)
         self._check_prior()
+
+    def _bound(self, name: str, shape: tuple[int, ...]) -> FloatArray:
+        """Return a bound with one entry for each of the value."""
+        bound = as_array(getattr(self, name), f"Parameter {name}")
+        try:
+            return np.broadcast_to(bound, shape).copy()
+        except ValueError:
+            raise ValueError(
+                f"Parameter needs numbers that fit its value, of shape {shape}; got {name} {shown(bound)} of shape "
+                f"{bound.shape}."
+            ) from None
+
+    @property
+    def _shown_bounds(self) -> str:
+        return f"[{shown(self.lower)}, {shown(self.upper)}]"
 
     def _check_prior(self) -> None:
         if self.prior is None:
             return
         if not isinstance(self.prior, (Normal, LogNormal)):
-            raise TypeError(f"Parameter prior must be an sf.Normal or an sf.LogNormal; got {self.prior!r}.")
+            raise TypeError(f"Parameter prior must be an sf.Normal or an sf.LogNormal; got {shown(self.prior)}.")
         try:
             PriorTerms.of(self.prior, self.shape)
         except ValueError as error:
-            raise ValueError(f"Parameter prior does not fit a value of shape {self.shape}: {error}.") from error
+            raise ValueError(
+                f"Parameter prior does not fit a value of shape {self.shape}: "
+                f"{', '.join(f'{name} has shape {np.shape(number)}' for name, number in vars(self.prior).items())}."
+            ) from error
         if isinstance(self.prior, LogNormal) and not (self.positive or self.fixed):
             raise ValueError(
                 "Parameter with a LogNormal prior must stay positive: give it a lower bound above 0, or scale='log'; "
-                f"got the lower bound {self.lower}."
+                f"got the lower bound {shown(self.lower)}."
             )
 
     @property
@@ -112,11 +131,18 @@ class Parameter:
         return tuple(self.value.shape)
 
 
+def unit_suffix(unit: str) -> str:
+    """Return what follows a number in this unit, such as " min"; nothing for "" and for "1", a pure number."""
+    return "" if unit in ("", "1") else f" {unit}"
+
+
 def as_parameter(value: Any, what: str) -> Parameter:
     """`value` itself if it is a `Parameter`, otherwise a free one without bounds; errors call it `what`."""
     if isinstance(value, Parameter):
         return value
+    form = "a number, an array or an sf.Parameter"
+    array = as_array(value, what, form=form)
     try:
-        return Parameter(value)
+        return Parameter(array)
     except ValueError as error:
-        raise ValueError(f"{what} must be a number, an array or an sf.Parameter: {error}") from error
+        raise ValueError(f"{what} must be {form}: {error}") from error

@@ -21,11 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.data import FloatArray, Measurements, ReferenceSignal, as_numbers
+from switchfit.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.mesh import Mesh
+from switchfit.parameter import unit_suffix
 from switchfit.problem import Problem
 from switchfit.result import Fit
 from switchfit.sensitivity import Points, Sensitivity, sensitivity
+from switchfit.validation import as_array, as_index
 
 NEAR = 2.0
 """Standard errors of a transition time within which a band is not to be trusted."""
@@ -37,7 +39,7 @@ class Prediction:
 
     Attributes
     ----------
-    times : (K,) array (s)
+    times : (K,) array, in `time_unit`
     states, state_errors : (K, n)
     outputs, output_errors : (K, q)
         What the reference signals see, then the Measurements; their standard errors.
@@ -45,6 +47,8 @@ class Prediction:
         Standard deviation of one sample: sigma (of the sample nearest in time, where it differs), or where that is
         unknown the root of the residual variance; NaN for reference signals.
     state_names, state_units, output_names : tuple of str
+    time_unit : str
+        That of the experiment.
     near_transition : (K,) bool
         Within two standard errors of a transition time: the bands take no account of the other mode there.
     fit : Fit
@@ -59,6 +63,7 @@ class Prediction:
     state_names: tuple[str, ...]
     state_units: tuple[str, ...]
     output_names: tuple[str, ...]
+    time_unit: str
     near_transition: NDArray[np.bool_]
     fit: Fit = field(repr=False)
 
@@ -86,8 +91,8 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
     ----------
     estimate : Estimate
     times : (K,) array_like, optional
-        In any order, inside [t0, tf] (s), at samples or between them; at a transition what is just before it. Left
-        out, all nodes of the mesh, each transition twice: with the state before and after it.
+        In any order, inside [t0, tf], in the experiment's time unit, at samples or between them; at a transition what
+        is just before it. Left out, all nodes of the mesh, each transition twice: with the state before and after it.
     experiment : int, optional
         Which experiment, from 0.
 
@@ -98,7 +103,7 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
     Raises
     ------
     TypeError
-        If this is no estimate.
+        If this is no estimate, or an argument is of the wrong type.
     ValueError
         For times outside the horizon, an experiment that does not exist, or an estimate without a problem or without
         a covariance.
@@ -108,8 +113,7 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
         raise TypeError(f"predict needs the result of sf.estimate; got {type(fit).__name__}. Fit the problem first.")
     evaluator = estimate.evaluator_at_solution()
     problem: Problem = evaluator.problem
-    if not 0 <= experiment < len(problem.experiments):
-        raise ValueError(f"experiment must lie in 0..{len(problem.experiments) - 1}; got {experiment}.")
+    experiment = as_index(experiment, "experiment", len(problem.experiments))
     if times is None:
         points = estimate.sensitivities[experiment].nodes
     else:
@@ -139,6 +143,7 @@ def _prediction(fit: Fit, problem: Problem, e: int, points: Points) -> Predictio
         trajectory.state_names,
         trajectory.state_units,
         tuple(names),
+        trajectory.time_unit,
         _near(fit, problem, e, points.times),
         fit,
     )
@@ -175,11 +180,12 @@ def _near(fit: Fit, problem: Problem, e: int, times: FloatArray) -> NDArray[np.b
 
 
 def _checked_times(times: ArrayLike, problem: Problem, e: int) -> FloatArray:
-    asked = np.atleast_1d(as_numbers(times, "times"))
+    asked = np.atleast_1d(as_array(times, "times"))
     t0, tf = problem.experiments[e].t0, problem.experiments[e].tf
     if asked.ndim != 1 or asked.size == 0 or not np.isfinite(asked).all():
         raise ValueError(f"times must be finite numbers of shape (K,); got shape {asked.shape}.")
     outside = (asked < t0) | (asked > tf)
     if outside.any():
-        raise ValueError(f"times must lie inside [t0, tf] = [{t0}, {tf}]; got {asked[outside][0]}.")
+        unit = unit_suffix(problem.experiments[e].time_unit)
+        raise ValueError(f"times must lie inside [t0, tf] = [{t0}, {tf}]{unit}; got {asked[outside][0]}.")
     return asked

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.validation import as_array, shown
+
 FloatArray = NDArray[np.float64]
 
 
@@ -30,6 +32,8 @@ class Normal:
     ------
     ValueError
         If a number is not finite, or sd not positive.
+    TypeError
+        If one is not a number.
     """
 
     mean: Any
@@ -54,6 +58,8 @@ class LogNormal:
     ------
     ValueError
         If a number is not finite, or not positive.
+    TypeError
+        If one is not a number.
 
     Notes
     -----
@@ -66,7 +72,7 @@ class LogNormal:
     def __post_init__(self) -> None:
         _check(self, "median", "log_sd")
         if not np.all(self.median > 0):
-            raise ValueError(f"LogNormal median must be positive; got {self.median}.")
+            raise ValueError(f"LogNormal median must be positive; got {shown(self.median)}.")
 
 
 Prior = Normal | LogNormal
@@ -75,16 +81,16 @@ Prior = Normal | LogNormal
 def _check(prior: Any, center: str, spread: str) -> None:
     kind = type(prior).__name__
     for name in (center, spread):
-        given = getattr(prior, name)
-        try:
-            value = np.array(given, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{kind} {name} must be a number or an array of numbers; got {given!r}.") from error
+        value = as_array(getattr(prior, name), f"{kind} {name}")
         if not np.all(np.isfinite(value)):
-            raise ValueError(f"{kind} {name} must be finite; got {given}.")
+            raise ValueError(f"{kind} {name} must be finite; got {shown(value)}.")
         object.__setattr__(prior, name, value)
-    if not np.all(getattr(prior, spread) > 0):
-        raise ValueError(f"{kind} {spread} must be positive; got {getattr(prior, spread)}.")
+    deviation = getattr(prior, spread)
+    if not np.all(deviation > 0):
+        raise ValueError(f"{kind} {spread} must be positive; got {shown(deviation)}.")
+    with np.errstate(over="ignore"):
+        if not np.all(np.isfinite(deviation**-2.0)):
+            raise ValueError(f"{kind} {spread} must not be so small that 1 / {spread}**2 is infinite; got {deviation}.")
 
 
 class PriorTerms(NamedTuple):

@@ -15,14 +15,18 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.data import FloatArray, Measurements, as_number, as_numbers
+from switchfit.data import FloatArray, Measurements
 from switchfit.experiment import Experiment, initial_state_of, run_names
 from switchfit.mesh import Mesh, common_lengths
-from switchfit.model import Arguments, Structure, arguments_of, structure_of, terminal_constraint_count
+from switchfit.model import Arguments, Functions, Structure, arguments_of, structure_of
 from switchfit.optimize.variables import Variables
-from switchfit.parameter import Parameter, as_parameter
+from switchfit.parameter import Parameter, as_parameter, unit_suffix
 from switchfit.priors import PriorTerms
 from switchfit.system import HybridSystem
+from switchfit.validation import as_array, as_choice, as_instance, as_name, as_number, as_positive, listed, shown
+
+GIVEN = ("system", "experiments", "parameters", "min_duration", "solver", "rtol", "atol")
+"""What a `Problem` is built from."""
 
 SMALLEST_RTOL = 1e-13
 """Local errors below this part of the state are rounding."""
@@ -87,17 +91,23 @@ class Problem:
     parameters : mapping of str to Parameter, number or array
         A bare number is a free parameter without bounds.
     min_duration : float, optional
-        Shortest time (s) a mode may last; 0 lets it vanish, which the result then reports.
+        Shortest time a mode may last, in the time unit that all experiments then share; 0 lets a mode vanish, which
+        the result then reports.
     solver : {"explicit", "stiff"}, optional
         Butcher's explicit Runge-Kutta method of order 5, or Radau IIA of order 5 for stiff modes.
     rtol, atol : float, optional
-        Tolerances of the local error by which the mesh is refined.
+        Tolerances of the local error by which the mesh is refined. With the defaults J has a relative error of about
+        1e-8, its gradient and its Hessian of about 1e-7. Ten times smaller tolerances make these errors about ten times
+        smaller or better, and take up to 1.6 times as many steps.
 
     Raises
     ------
     ValueError
-        For unknown modes, unknown parameters in a map, impossible minimum durations, or a vector field, reset map,
-        observation or cost of the wrong shape or dtype.
+        For unknown modes, unknown parameters in a map, impossible minimum durations, a minimum duration or a delay for
+        experiments with different time units, or a vector field, reset map, observation or cost of the wrong shape or
+        dtype.
+    TypeError
+        If an argument is of the wrong type.
     """
 
     system: HybridSystem
@@ -111,53 +121,71 @@ class Problem:
     structures: tuple[Structure, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.system, HybridSystem):
-            raise TypeError(f"system must be an sf.HybridSystem; got {type(self.system).__name__}.")
+        as_instance(self.system, "system", HybridSystem, "an sf.HybridSystem")
         given = self.experiments
         experiments = tuple(given) if isinstance(given, (list, tuple)) else (given,)
         if not experiments or not all(isinstance(e, Experiment) for e in experiments):
-            raise TypeError(f"experiments must be an sf.Experiment or a non-empty list of them; got {given!r}.")
+            raise TypeError(f"experiments must be an sf.Experiment or a non-empty list of them; got {shown(given)}.")
         for experiment in experiments:
             for mode in experiment.mode_sequence:
                 if mode not in self.system.modes:
                     raise ValueError(
-                        f"mode_sequence names the unknown mode {mode!r}; the modes are {', '.join(self.system.modes)}."
+                        f"mode_sequence names the unknown mode {shown(mode)}; the modes are "
+                        f"{listed(self.system.modes)}."
                     )
-        if self.solver not in ("explicit", "stiff"):
-            raise ValueError(f"solver must be 'explicit' or 'stiff'; got {self.solver!r}.")
+        object.__setattr__(self, "solver", as_choice(self.solver, "solver", ("explicit", "stiff")))
         for name in ("rtol", "atol"):
-            value = as_number(getattr(self, name), name)
-            if not (np.isfinite(value) and value > 0):
-                raise ValueError(f"{name} must be positive; got {value}.")
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, name, as_positive(getattr(self, name), name))
         if not SMALLEST_RTOL <= self.rtol < 1:
             raise ValueError(f"rtol must lie between {SMALLEST_RTOL} (rounding) and 1; got {self.rtol}.")
         parameters = _checked_parameters(self.parameters)
         object.__setattr__(self, "experiments", experiments)
         object.__setattr__(self, "parameters", parameters)
         dwell = as_number(self.min_duration, "min_duration")
+        object.__setattr__(self, "min_duration", dwell)
         self._check_maps()
         self._check_states()
         object.__setattr__(self, "unknowns", _unknowns(self.system, experiments, parameters, dwell))
         self._check_noise()
         self._check_delays()
         targets = frozenset(name for e in experiments for name in e.parameter_map.values())
-        structures = tuple(structure_of(self.system, e, parameters, self.solver, targets) for e in experiments)
+        functions = Functions(parameters, targets)
+        structures = tuple(structure_of(self.system, e, functions, self.solver) for e in experiments)
         for structure in structures:
             self.system.check_labels_of(structure.n)
         object.__setattr__(self, "structures", structures)
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is pickled: not the meshes and programs that were made for it."""
-        return {key: value for key, value in self.__dict__.items() if key != "evaluator"}
+        """What is pickled: the user's functions, and of their traces what identifies them."""
+        state = {name: getattr(self, name) for name in GIVEN}
+        return state | {"digests": self.digests}
+
+    @property
+    def digests(self) -> list[dict[str, str]]:
+        """What identifies the functions of each experiment in every process."""
+        return [structure.digests for structure in self.structures]
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Build the problem again; ValueError if a function does something else than when the problem was built."""
+        for name in GIVEN:
+            object.__setattr__(self, name, state[name])
+        self.__post_init__()
+        for structure, digests in zip(self.structures, state["digests"], strict=True):
+            changed = [name for name, digest in structure.digests.items() if digests.get(name) != digest]
+            if changed:
+                raise ValueError(
+                    f"{', '.join(changed)} does something else in this process, or now, than when the problem was "
+                    "built: it reads something that has changed since. Then build the problem anew before it is sent "
+                    "to other processes."
+                )
 
     def _check_maps(self) -> None:
         for name, experiment in zip(run_names(self.experiments), self.experiments, strict=True):
             for here, target in experiment.parameter_map.items():
                 if target not in self.parameters:
                     raise ValueError(
-                        f"parameter_map of experiment {name} gives the model's {here!r} as the unknown parameter "
-                        f"{target!r}; the problem has {', '.join(self.parameters) or 'none'}."
+                        f"parameter_map of experiment {listed([name])} gives the model's {shown(here)} as the "
+                        f"unknown parameter {shown(target)}; the problem has {listed(self.parameters)}."
                     )
 
     def _check_noise(self) -> None:
@@ -168,8 +196,8 @@ class Problem:
                 parameter = self.parameters.get(experiment.parameter_map.get(name, name))
                 if parameter is None:
                     raise ValueError(
-                        f"sigma names the parameter {name!r}, which the problem lacks; it has "
-                        f"{', '.join(self.parameters) or 'none'}."
+                        f"sigma names the parameter {shown(name)}, which the problem lacks; it has "
+                        f"{listed(self.parameters)}."
                     )
                 if parameter.shape != () or not (parameter.positive or (parameter.fixed and parameter.value > 0)):
                     raise ValueError(
@@ -198,18 +226,33 @@ class Problem:
                 parameter = self.parameters.get(experiment.parameter_map.get(item.delay, item.delay))
                 if parameter is None or parameter.shape != ():
                     raise ValueError(
-                        f"delay names {item.delay!r}, which must be a parameter of one number; the problem has "
-                        f"{', '.join(self.parameters) or 'none'}."
+                        f"delay names {shown(item.delay)}, which must be a parameter of one number; the problem has "
+                        f"{listed(self.parameters)}."
                     )
+                self._check_delay_unit(experiment, item.delay)
+                unit = unit_suffix(experiment.time_unit)
                 low, high = item.times[-1] - experiment.tf, item.times[0] - experiment.t0
                 least, most = (parameter.value,) * 2 if parameter.fixed else (parameter.lower, parameter.upper)
                 if not low <= least <= most <= high:
                     raise ValueError(
-                        f"the delay {item.delay!r} may lie in [{least}, {most}] (its bounds, if it is not fixed), but "
-                        f"only from {low:.6g} to {high:.6g} are all samples of moments inside (t0, tf) = "
-                        f"({experiment.t0}, {experiment.tf}): give it narrower bounds, move t0 or tf, or leave out "
-                        "samples at the ends."
+                        f"the delay {item.delay!r} may lie in [{least}, {most}]{unit} (its bounds, if it is not "
+                        f"fixed), but only from {low:.6g} to {high:.6g}{unit} are all samples of moments inside "
+                        f"(t0, tf) = ({experiment.t0}, {experiment.tf}): give it narrower bounds, move t0 or tf, or "
+                        "leave out samples at the ends."
                     )
+
+    def _check_delay_unit(self, experiment: Experiment, delay: str) -> None:
+        """A delay is a time: in the unit of the experiment, and shared by experiments of one time unit alone."""
+        name = experiment.parameter_map.get(delay, delay)
+        unit = self.parameters[name].unit
+        if unit not in ("", experiment.time_unit):
+            raise ValueError(
+                f"the delay {name!r} has the unit {unit!r}, but time_unit of its experiment is "
+                f"{experiment.time_unit!r}, and times are not converted. Give both in the same unit."
+            )
+        runs = zip(run_names(self.experiments), self.experiments, strict=True)
+        units = {run: e.time_unit for run, e in runs if name in _delay_targets(e)}
+        _require_one_time_unit(units, f"the delay {name!r}", "give each run a delay of its own (parameter_map)")
 
     def _check_states(self) -> None:
         """Sizes of initial states that are no functions."""
@@ -243,13 +286,13 @@ class Problem:
             for i in structure.guarded:
                 before, after = experiment.mode_sequence[i : i + 2]
                 names.append(f"{prefix}guard of tau_{i + 1} ({before} -> {after})")
-            names += [f"{prefix}terminal constraint {k + 1}" for k in range(terminal_constraint_count(structure))]
+            names += [f"{prefix}terminal constraint {k + 1}" for k in range(structure.terminal_constraint_count)]
         return tuple(names)
 
     @cached_property
     def constraint_counts(self) -> tuple[int, ...]:
         """Number of constraints of each experiment."""
-        return tuple(len(s.guarded) + terminal_constraint_count(s) for s in self.structures)
+        return tuple(len(s.guarded) + s.terminal_constraint_count for s in self.structures)
 
     @property
     def _prefixes(self) -> list[str]:
@@ -338,35 +381,41 @@ class Problem:
         named = self.named(theta, e) if late else {}
         return np.concatenate([np.zeros(0), *(times - named[delay] for times, delay in late)])
 
-    def checked_theta(self, theta: ArrayLike | None) -> FloatArray:
-        """`theta`, or the initial guess for None, as a ``(d,)`` array; ValueError where shape or order is wrong."""
+    def checked_theta(self, theta: ArrayLike | None, what: str = "theta") -> FloatArray:
+        """Return `theta`, or the initial guess for None, as a ``(d,)`` array; messages call it `what`.
+
+        Raises
+        ------
+        ValueError
+            Where the shape or the order of transition times is wrong.
+        """
         if theta is None:
             return self.initial_theta
-        checked = as_numbers(theta, "theta")
+        checked = as_array(theta, what)
         if checked.shape != self.unknowns.initial.shape:
             raise ValueError(
-                f"theta must have shape ({len(self.theta_names)},): {', '.join(self.theta_names)}; "
+                f"{what} must have shape ({len(self.theta_names)},): {listed(self.theta_names)}; "
                 f"got shape {checked.shape}."
             )
         if not np.all(np.isfinite(checked)):
-            raise ValueError(f"theta must be finite; got {checked.tolist()}.")
+            raise ValueError(f"{what} must be finite; got {shown(checked)}.")
         for experiment, times in zip(self.experiments, self.split(checked)[0], strict=True):
             knots = np.concatenate([[experiment.t0], times, [experiment.tf]])
             if np.any(np.diff(knots) < 0):
                 raise ValueError(
-                    f"The transition times in theta must not decrease inside (t0, tf) = ({experiment.t0}, "
-                    f"{experiment.tf}); got {times.tolist()}."
+                    f"The transition times in {what} must not decrease inside (t0, tf) = ({experiment.t0}, "
+                    f"{experiment.tf}); got {shown(times)}."
                 )
-        self._check_delays_inside(checked)
+        self._check_delays_inside(checked, what)
         return checked
 
-    def _check_delays_inside(self, theta: FloatArray) -> None:
+    def _check_delays_inside(self, theta: FloatArray, what: str) -> None:
         for e, experiment in enumerate(self.experiments):
             seen = self.late_times(theta, e)
             if seen.size and (seen.min() < experiment.t0 or seen.max() > experiment.tf):
                 raise ValueError(
-                    f"theta has delays with which samples are of moments from {seen.min():.6g} to {seen.max():.6g}, "
-                    f"outside (t0, tf) = ({experiment.t0}, {experiment.tf})."
+                    f"{what} has delays with which samples are of moments from {seen.min():.6g} to {seen.max():.6g}"
+                    f"{unit_suffix(experiment.time_unit)}, outside (t0, tf) = ({experiment.t0}, {experiment.tf})."
                 )
 
     def split(self, theta: FloatArray) -> tuple[list[FloatArray], dict[str, FloatArray]]:
@@ -384,12 +433,11 @@ class Problem:
 
 
 def _checked_parameters(parameters: Any) -> dict[str, Parameter]:
-    if not isinstance(parameters or {}, Mapping):
-        raise TypeError(f"parameters must be a dict of name -> value or sf.Parameter; got {parameters!r}.")
-    for name in parameters or {}:
-        if not isinstance(name, str):
-            raise TypeError(f"parameter names must be strings; got {name!r}.")
-    return {name: as_parameter(value, f"parameter {name!r}") for name, value in (parameters or {}).items()}
+    if not isinstance(parameters, Mapping | None):
+        raise TypeError(f"parameters must be a dict of name -> value or sf.Parameter; got {shown(parameters)}.")
+    given = {} if parameters is None else parameters
+    names = [as_name(name, "parameter names", "strings") for name in given]
+    return {name: as_parameter(given[name], f"parameter {shown(name)}") for name in names}
 
 
 def _unknowns(
@@ -406,7 +454,7 @@ def _unknowns(
             if not tau.fixed:
                 positions[i] = len(names)
                 names.append(f"{prefix}tau_{i + 1}")
-                units.append(tau.unit or "s")
+                units.append(experiment.time_unit)
                 pieces.append(tau)
         where.append(positions)
     spans: dict[str, slice] = {}
@@ -431,13 +479,29 @@ def _unknowns(
         raise ValueError("Nothing to estimate: every parameter and transition time is fixed.")
     if len(set(names)) != len(names):
         twice = sorted({name for name in names if names.count(name) > 1})
-        raise ValueError(f"Two unknowns share a name: {', '.join(twice)}; rename the parameter or the experiment.")
+        raise ValueError(f"Two unknowns share a name: {listed(twice)}; rename the parameter or the experiment.")
     flat = {key: np.concatenate([getattr(q, key).ravel() for q in pieces]) for key in ("value", "lower", "upper")}
     priors = PriorTerms.joined([PriorTerms.of(q.prior, q.shape) for q in pieces])
     log = np.concatenate([np.full(q.value.size, q.scale == "log") for q in pieces])
     A, b, rows = _ordering(experiments, where, len(names), dwell)
     vectors = flat["value"], flat["lower"], flat["upper"]
     return Unknowns(tuple(names), tuple(units), *vectors, tuple(where), spans, tuple(states), A, b, rows, priors, log)
+
+
+def _delay_targets(experiment: Experiment) -> set[str]:
+    """Names of the problem's parameters that are delays in an experiment."""
+    delays = [item.delay for item in experiment.data if isinstance(item, Measurements)]
+    return {experiment.parameter_map.get(delay, delay) for delay in delays if isinstance(delay, str)}
+
+
+def _require_one_time_unit(units: Mapping[str, str], what: str, otherwise: str) -> None:
+    """Raise ValueError if `what`, one time for several experiments, would have several units; `units` by run's name."""
+    if len(set(units.values())) > 1:
+        shown = ", ".join(f"{name} in {unit}" for name, unit in units.items())
+        raise ValueError(
+            f"{what} is one number for experiments whose times are in different units ({shown}), and times are not "
+            f"converted. Give all times in one unit, as time_unit of each experiment, or {otherwise}."
+        )
 
 
 def _index(k: tuple[int, ...]) -> str:
@@ -452,15 +516,20 @@ def _ordering(
         raise ValueError(f"min_duration must be zero or positive; got {dwell}.")
     rows, bounds, names = [], [], []
     labels = run_names(experiments)
+    if dwell > 0:
+        units = {name: experiment.time_unit for name, experiment in zip(labels, experiments, strict=True)}
+        _require_one_time_unit(units, "min_duration", "leave it out and bound the transition times of each")
     for e, (experiment, positions) in enumerate(zip(experiments, where, strict=True)):
         run = "" if len(experiments) == 1 else f" of {labels[e]}"
         knots = np.concatenate([[experiment.t0], experiment.initial_times, [experiment.tf]])
         ends = np.concatenate([[-1], positions, [-1]])
+        unit = unit_suffix(experiment.time_unit)
         for i, mode in enumerate(experiment.mode_sequence):
             length = knots[i + 1] - knots[i]
             if length < dwell * (1 - 1e-12):
                 raise ValueError(
-                    f"min_duration is {dwell} s, but the guess gives mode {i + 1} ({mode!r}){run} only {length:.6g} s."
+                    f"min_duration is {dwell}{unit}, but the guess gives mode {i + 1} ({mode!r}){run} only "
+                    f"{length:.6g}{unit}."
                 )
             if ends[i] < 0 and ends[i + 1] < 0:
                 continue

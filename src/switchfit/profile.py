@@ -40,6 +40,7 @@ from switchfit.refine import refined_mesh
 from switchfit.report.uncertainty import plot_profile, profile_text
 from switchfit.result import Fit
 from switchfit.solve import constraints_of, minimized
+from switchfit.validation import as_callable, as_level, as_name, listed, shown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -577,7 +578,7 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     Raises
     ------
     TypeError
-        If this is no estimate.
+        If this is no estimate, or an argument is of the wrong type.
     ValueError
         For an unknown that is not in theta, an estimate that has no problem, did not converge or has no noise model.
 
@@ -589,8 +590,11 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     fit: Fit = estimate
     if not isinstance(fit, Fit):
         raise TypeError(f"profile needs the result of sf.estimate; got {type(fit).__name__}. Fit the problem first.")
-    if name not in fit.theta_names:
-        raise ValueError(f"there is no unknown {name!r}; there are {', '.join(fit.theta_names)}.")
+    if as_name(name, "name") not in fit.theta_names:
+        raise ValueError(f"there is no unknown {shown(name)}; there are {listed(fit.theta_names)}.")
+    level = as_level(level)
+    if callback is not None:
+        as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
     evaluator = estimate.evaluator_at_solution()
     _check(fit)
     threshold = fit.quantile(level)

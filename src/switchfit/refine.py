@@ -27,6 +27,7 @@ from switchfit.mesh import Mesh
 from switchfit.model import Arguments, Model, Piece, Structure, float64
 from switchfit.native.kernels import Adaptive
 from switchfit.native.program import NativeExperiment, native_experiment
+from switchfit.parameter import unit_suffix
 from switchfit.problem import Problem
 
 MAX_STEPS = 200_000
@@ -105,6 +106,7 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
     whole = problem.arguments(e, coarse)
     arguments, signals = whole.without_mesh(), np.asarray(whole.signals)
     tau, p = problem.vectors(theta, e)
+    unit = unit_suffix(experiment.time_unit)
     ends = np.concatenate([[experiment.t0], tau, [experiment.tf]])
     inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
     steps = [np.array([experiment.t0])]
@@ -121,14 +123,14 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
                     value = after_reset(arguments, ends[i], x, p, structure=structure, i=i - 1)
                 else:
                     value = native.after_reset(i - 1, ends[i], x, p)
-                x = _finite(value, f"reset map {names} at t = {ends[i]:.6g}, x = {x.tolist()}")
+                x = _finite(value, f"reset map {names} at t = {ends[i]:.6g}{unit}, x = {x.tolist()}")
             knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
             stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
             for start, end in pairwise(stops.tolist()):
                 if end > start:
                     found = None if native is None else _solve_natively(problem, native, mode, start, end, x, p)
                     if found is None:
-                        found = _solve(problem, structure, arguments, signals, coarse, mode, start, end, x, p)
+                        found = _solve(problem, structure, arguments, signals, coarse, mode, start, end, x, p, unit)
                     accepted, x = found
                     steps.append(accepted)
     return np.concatenate(steps)
@@ -145,6 +147,7 @@ def _solve(
     end: float,
     x: FloatArray,
     p: FloatArray,
+    unit: str = "",
 ) -> tuple[FloatArray, FloatArray]:
     """Adaptive solve of one mode from start to end: accepted times (start left out) and the final state."""
     name = structure.mode_names[mode]
@@ -162,8 +165,8 @@ def _solve(
                 f"a running cost in mode {name!r} returned {density}" if finite else f"mode {name!r} returned {slope}"
             )
             raise ValueError(
-                f"{what} at t = {t:.6g}, x = {y[:-1].tolist()}: the guess leads to where the model is not defined or "
-                "grows without bound; use a better guess, or change the model there."
+                f"{what} at t = {t:.6g}{unit}, x = {y[:-1].tolist()}: the guess leads to where the model is not "
+                "defined or grows without bound; use a better guess, or change the model there."
             )
         return value
 
@@ -178,7 +181,7 @@ def _solve(
             remedy = "use solver='stiff', or a better guess" if problem.solver == "explicit" else "use a better guess"
             reason = message or f"it needs more than {MAX_STEPS} steps"
             raise ValueError(
-                f"mode {name!r} cannot be integrated at the guess beyond t = {solver.t:.6g}, where x = "
+                f"mode {name!r} cannot be integrated at the guess beyond t = {solver.t:.6g}{unit}, where x = "
                 f"{solver.y[:-1].tolist()} ({reason}): {remedy}."
             )
         accepted.append(float(solver.t))
@@ -221,6 +224,8 @@ def _first_step(
     if not np.isfinite(slope).all():
         return np.nan
     of_state, of_slope = size(y), size(slope)
+    if not np.isfinite(of_slope):  # the first step then fails, and the caller says of what
+        return min(1e-6, end - start)
     guess = min(1e-6 if of_state < 1e-5 or of_slope < 1e-5 else 0.01 * of_state / of_slope, end - start)
     if guess == 0.0:
         return 0.0

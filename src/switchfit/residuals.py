@@ -53,7 +53,9 @@ class ChannelResiduals:
     experiment : int, from 0
     name : str
     times, values : (n,), (n,)
-        Sample times (s) and standardised residuals of the samples that are not missing.
+        Sample times and standardised residuals of the samples that are not missing.
+    time_unit : str
+        That of the experiment.
     sigma_known : bool
     mean : float
         Of the standardised residuals; 1 / sqrt(n) is its standard deviation if they are white.
@@ -77,6 +79,7 @@ class ChannelResiduals:
     name: str
     times: FloatArray
     values: FloatArray
+    time_unit: str
     sigma_known: bool
     mean: float
     rms: float
@@ -202,12 +205,12 @@ def diagnose(fit: Fit, labels: list[str] | None = None) -> ResidualDiagnostics:
                 continue
             for k, name in enumerate(comparison.names):
                 if np.isfinite(comparison.measured[:, k]).sum() > 0:
-                    channels.append(of_channel(comparison, k, e))
+                    channels.append(of_channel(comparison, k, e, fit.trajectories[e].time_unit))
                     names.append(name if single else f"{runs[e]} {name}")
     return ResidualDiagnostics(tuple(channels), tuple(names))
 
 
-def of_channel(comparison: Comparison, k: int, experiment: int = 0) -> ChannelResiduals:
+def of_channel(comparison: Comparison, k: int, experiment: int = 0, time_unit: str = "s") -> ChannelResiduals:
     """Test one channel of a comparison.
 
     Parameters
@@ -216,7 +219,8 @@ def of_channel(comparison: Comparison, k: int, experiment: int = 0) -> ChannelRe
     k : int
         Which channel, from 0.
     experiment : int, optional
-        To be noted in the result.
+    time_unit : str, optional
+        Both are noted in the result.
     """
     raw = comparison.residuals[:, k]
     there = np.isfinite(raw)
@@ -245,6 +249,7 @@ def of_channel(comparison: Comparison, k: int, experiment: int = 0) -> ChannelRe
         name=comparison.names[k],
         times=comparison.times[there],
         values=z,
+        time_unit=time_unit,
         sigma_known=known,
         mean=float(z.mean()),
         rms=float(root),

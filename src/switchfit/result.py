@@ -15,6 +15,7 @@ from switchfit.data import FloatArray
 from switchfit.engine import Engine
 from switchfit.optimize import IterationRecord, Status
 from switchfit.simulate import Comparison, Trajectory
+from switchfit.validation import as_choice, as_level
 
 CovarianceKind = Literal["exact", "gauss-newton"]
 
@@ -37,7 +38,9 @@ class Certificate:
     worst_direction : str
         The worst-determined direction in words.
     integration_error : float
-        ``|J(half the steps) - J|`` relative to J, or to 1e-3 of the first J where that is more.
+        Largest relative change by halving all steps of J, the guards and the terminal constraints: of J relative to J,
+        or to 1e-3 of the first J where that is more; of a constraint relative to what the
+        states make of it as they go through their ranges in the run.
     gradient_gap, hessian_gap : float
         Relative gap between the paper's equations (6)-(17) and the exact derivatives of the discretised cost; NaN
         where that was not checked.
@@ -49,6 +52,8 @@ class Certificate:
         Constraints that hold with equality, collapsed modes and bounds among them, and kinks.
     failures : tuple of str
         What of all this is not as it has to be; nothing: the certificate is good.
+    integration_error_of : str
+        The output that has the `integration_error`: "J", or the name of a guard or terminal constraint.
     """
 
     optimality: float
@@ -62,6 +67,7 @@ class Certificate:
     taylor_orders: tuple[float, ...]
     active: tuple[str, ...]
     failures: tuple[str, ...]
+    integration_error_of: str = "J"
 
     @property
     def passed(self) -> bool:
@@ -75,7 +81,7 @@ class Certificate:
             ("  with unknowns scaled to unit curvature", f"{self.smallest_scaled_eigenvalue:.4g}"),
             ("  condition number of that", f"{self.condition_number:.3g}"),
             ("  worst-determined direction", self.worst_direction),
-            ("integration error of J, relative", f"{self.integration_error:.1e}"),
+            ("largest integration error, relative", f"{self.integration_error:.1e} ({self.integration_error_of})"),
             ("paper's gradient against discretised, relative", _gap(self.gradient_gap)),
             ("paper's Hessian against discretised, relative", _gap(self.hessian_gap)),
             ("Taylor orders of J, with gradient, with Hessian", _orders(self.taylor_orders)),
@@ -125,11 +131,12 @@ class Fit:
     sigma_known : bool or None
         Whether the noise of the measurements is known; None where the cost has no noise model.
     integration_error : float
-        ``|J(half the steps) - J|`` relative to J, or to 1e-3 of the first J where that is more.
+        Largest relative change by halving all steps of J, the guards and the terminal constraints; see
+        `Certificate.integration_error`.
     hessian_kind : str
     tolerance : float
     seconds : float
-        Wall time of the estimation.
+        Wall time of the estimation, in seconds whatever the unit of the experiments' times is.
     constraints : tuple of (name, value, multiplier)
         Guards and terminal constraints. With them the Hessian is that of J plus multipliers times constraints.
     saved_gauss_newton : (d, d) or None
@@ -142,6 +149,8 @@ class Fit:
         Whether what measurements and priors add to J is half a sum of squares: no sigma is a parameter, no loss robust.
     engine : Engine or None
         What evaluated cost and derivatives: machine code, or JAX and why. None where that is not known.
+    integration_error_of : str
+        The output that has the `integration_error`: "J", or the name of a guard or terminal constraint.
     """
 
     theta_names: tuple[str, ...]
@@ -177,6 +186,7 @@ class Fit:
     log_scaled: tuple[str, ...] = ()
     least_squares: bool = True
     engine: Engine | None = None
+    integration_error_of: str = "J"
 
     @property
     def success(self) -> bool:
@@ -248,8 +258,7 @@ class Fit:
             For another kind, or where the Gauss-Newton matrix is not known: the cost is not made of Measurements
             alone, or the estimate was loaded without its problem from a file that lacks it.
         """
-        if hessian not in ("exact", "gauss-newton"):
-            raise ValueError(f"hessian must be 'exact' or 'gauss-newton'; got {hessian!r}.")
+        hessian = as_choice(hessian, "hessian", ("exact", "gauss-newton"))
         matrix = self.hessian if hessian == "exact" else self.gauss_newton
         if matrix is None:
             raise ValueError(
@@ -271,8 +280,7 @@ class Fit:
 
     def quantile(self, level: float) -> float:
         """Two-sided quantile: of Student's t where sigma is unknown, of the normal distribution where it is known."""
-        if not 0 < level < 1:
-            raise ValueError(f"level must lie between 0 and 1; got {level}.")
+        level = as_level(level)
         tail = 0.5 + level / 2
         freedom = max(self.freedom, 1)
         return float(scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail))
@@ -361,7 +369,11 @@ def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:
         return nothing
     reduced = Z.T @ hessian @ Z
     size = 1 / np.sqrt(np.maximum(np.abs(np.diag(reduced)), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(reduced * np.outer(size, size))
+    with np.errstate(over="ignore", invalid="ignore"):
+        scaled = reduced * np.outer(size, size)
+    if not np.isfinite(scaled).all():  # numbers near the limits of float64
+        return nothing
+    values, vectors = np.linalg.eigh(scaled)
     if len(values) and values[0] <= 1e-14:
         return nothing
     root = Z @ (size[:, None] * vectors / np.sqrt(values))

@@ -123,7 +123,7 @@ def sensitivity(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> Sens
 def _natively(
     structure: Structure, whole: Arguments, mesh: Mesh, tau: FloatArray, p: FloatArray
 ) -> tuple[list[Segment], NDArray[np.intp]] | None:
-    """All segments by machine code, and the cells in which they begin; None where there is none.
+    """All segments by machine code, and the cells in which they begin; None where there is none that can be used.
 
     Its derivatives are those at the ends of rows, which move where they are transitions. At the time at which such an
     end is they are less dx/dt.
@@ -133,6 +133,8 @@ def _natively(
     if native is None or fields is None:
         return None
     found = native.simulated(tau, p)
+    if found is None:
+        return None
     N, cells = structure.N, len(mesh.times) - 1
     lasts = [*found.first_cell[1:].tolist(), cells - 1]
     segments = []
@@ -146,7 +148,10 @@ def _natively(
             if 0 <= transition < N:
                 slope = fields.slope(mode, times[k], np.append(states[k], 0.0), p, first if k == 0 else last)[:-1]
                 tangents[k, :, transition] -= slope
-        points = Points(times, states, tangents, *native.outputs(times, states, p, tangents))
+        seen = native.outputs(times, states, p, tangents)
+        if seen is None:
+            return None
+        points = Points(times, states, tangents, *seen)
         before = Points(*(column[:-1] for column in points))
         segments.append(Segment(times[:-1], times[1:], before, Points(*(column[1:] for column in points))))
     return segments, found.first_cell.astype(np.intp)
@@ -286,7 +291,7 @@ def _block_along(
 
     def outputs(t: jax.Array, x: jax.Array, X: jax.Array) -> tuple[jax.Array, jax.Array]:
         def seen(x: jax.Array, p: jax.Array) -> jax.Array:
-            return jnp.concatenate([jnp.zeros(0), *(model.observed(h, t, x, p, q) for h, q in structure.outputs)])
+            return jnp.concatenate([jnp.zeros(0), *(model.observed(h, t, x, p) for h, _ in structure.outputs)])
 
         y, linear = jax.linearize(seen, x, p)
         return y, jax.vmap(linear, in_axes=(1, 1), out_axes=1)(X, P)
@@ -311,7 +316,7 @@ class SampleDerivatives(NamedTuple):
     item, channel : (S,) int
         Which of the experiment's Measurements, and which of its channels.
     time, residual, weight : (S,)
-        Sample time (s), fitted less measured, ``1 / sigma**2`` (1 where sigma is unknown).
+        Sample time in the experiment's time unit, fitted less measured, ``1 / sigma**2`` (1 where sigma is unknown).
     derivative : (S, d)
         Of the fitted value in theta.
     """

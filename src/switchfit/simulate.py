@@ -22,6 +22,7 @@ from switchfit.native.program import NativeExperiment, native_experiment
 from switchfit.problem import Problem
 from switchfit.refine import after_reset, initial_state, refined_mesh
 from switchfit.rungekutta import step
+from switchfit.validation import as_index, as_instance
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,14 +31,16 @@ class Trajectory:
 
     Attributes
     ----------
-    times : (K,) array (s)
-        All nodes; each transition time stands twice, with the state before and after it.
+    times : (K,) array
+        All nodes, in `time_unit`; each transition time stands twice, with the state before and after it.
     states : (K, n) array
     modes : (K,) array of str
         The mode that is active.
     segments : (N + 2,) int array
         Entries ``segments[i]:segments[i + 1]`` belong to the i-th entry of the mode sequence.
     state_names, state_units : tuple of str
+    time_unit : str
+        That of the experiment.
     """
 
     times: FloatArray
@@ -46,6 +49,7 @@ class Trajectory:
     segments: NDArray[np.intp]
     state_names: tuple[str, ...]
     state_units: tuple[str, ...]
+    time_unit: str = "s"
 
     @property
     def mode_spans(self) -> list[tuple[str, float, float]]:
@@ -116,9 +120,11 @@ def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: in
     ValueError
         For a theta of the wrong shape or order, an experiment that does not exist, or a trajectory that
         cannot be integrated.
+    TypeError
+        If an argument is of the wrong type.
     """
-    if not 0 <= experiment < len(problem.experiments):
-        raise ValueError(f"experiment must lie in 0..{len(problem.experiments) - 1}; got {experiment}.")
+    as_instance(problem, "problem", Problem, "an sf.Problem")
+    experiment = as_index(experiment, "experiment", len(problem.experiments))
     checked = problem.checked_theta(theta)
     mesh = refined_mesh(problem, experiment, checked)
     run = _simulated(problem, experiment, checked, mesh, problem.arguments(experiment, mesh))
@@ -199,8 +205,9 @@ def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh, whole: A
     structure = problem.structures[e]
     tau, p = problem.vectors(theta, e)
     native = native_experiment(structure, whole, mesh.times, order=0)
-    if native is not None:
-        cost, segments, first_cell = _natively(structure, native, mesh.times, tau, p)
+    found = None if native is None else _natively(structure, native, mesh.times, tau, p)
+    if found is not None:
+        cost, segments, first_cell = found
     else:
         with float64(), compilation_cache():
             cost, segments, first_cell = _by_blocks(structure, whole, tau, p)
@@ -222,16 +229,21 @@ def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh, whole: A
             of_samples += float(np.sum(there * np.log(sigma)))
         of_samples += 0.5 * float(np.sum(robust(sensor.loss, sensor.loss_scale, u)))
         first += sensor.channels
-    return replace(run, cost=cost if native is not None else cost + of_samples, seen=tuple(all_seen))
+    return replace(run, cost=cost if found is not None else cost + of_samples, seen=tuple(all_seen))
 
 
 def _natively(
     structure: Structure, native: NativeExperiment, nodes: FloatArray, tau: FloatArray, p: FloatArray
-) -> tuple[float, list[Segment], NDArray[np.intp]]:
-    """J, all segments and the cells in which they begin, by machine code."""
+) -> tuple[float, list[Segment], NDArray[np.intp]] | None:
+    """J, all segments and the cells in which they begin, by machine code; None where it presumed wrongly."""
     found = native.simulated(tau, p)
-    y = native.outputs(found.times, found.states, p)[0]
-    reset_y = native.outputs(tau, found.reset_states, p)[0] if structure.resets else y
+    if found is None:
+        return None
+    seen = native.outputs(found.times, found.states, p)
+    behind = native.outputs(tau, found.reset_states, p) if structure.resets else seen
+    if seen is None or behind is None:
+        return None
+    y, reset_y = seen[0], behind[0]
     bounds = np.concatenate([nodes[:1], tau, nodes[-1:]])
     lasts = [*found.first_cell[1:].tolist(), len(nodes) - 2]
     segments = []
@@ -323,7 +335,7 @@ def _late_block(
             lambda x, m=m: step(model.tableau, model.field(m, piece), None, start, time, x, p)[0]
             for m in range(len(structure.modes))
         ]
-        return model.observed(sensor.observe, time, lax.switch(mode, steps, x), p, sensor.channels)
+        return model.observed(sensor.observe, time, lax.switch(mode, steps, x), p)
 
     return jax.vmap(one)(times, mode, start, x, Piece(origin, coefficients))
 
@@ -385,7 +397,7 @@ def _block(
     costs, before, after = modes[0](x) if len(modes) == 1 else lax.switch(mode, modes, x)
 
     def outputs(t: jax.Array, x: jax.Array) -> jax.Array:
-        seen = [model.observed(observe, t, x, p, q) for observe, q in structure.outputs]
+        seen = [model.observed(observe, t, x, p) for observe, _ in structure.outputs]
         return jnp.concatenate([jnp.zeros(0), *seen])
 
     over_rows = jax.vmap(outputs)
@@ -409,7 +421,15 @@ def _trajectory(problem: Problem, e: int, run: Run) -> Trajectory:
     names = system.state_names or tuple(f"x{k + 1}" for k in range(structure.n))
     units = system.state_units or ("",) * structure.n
     segments = np.cumsum([0, *(len(part) for part in times)])
-    return Trajectory(np.concatenate(times), np.concatenate(states), np.concatenate(modes), segments, names, units)
+    return Trajectory(
+        np.concatenate(times),
+        np.concatenate(states),
+        np.concatenate(modes),
+        segments,
+        names,
+        units,
+        problem.experiments[e].time_unit,
+    )
 
 
 def _shown(part: Segment, before: FloatArray, after: FloatArray) -> FloatArray:

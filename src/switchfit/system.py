@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.parameter import Parameter
+from switchfit.validation import as_array, as_callable, as_name, as_names, as_sequence, as_text, listed, shown
 
 VectorField = Callable[..., Any]
 """``f(t, x, p) -> (n,)``, or ``f(t, x, p, u) -> (n,)`` in an experiment with inputs."""
@@ -33,8 +34,8 @@ class HybridSystem:
     ----------
     modes : mapping of str to callable
         Vector field of each mode by name: ``f(t, x, p) -> (n,)`` written with ``jax.numpy``. ``t`` is a
-        scalar (s), ``x`` an ``(n,)`` array and ``p`` a dict of arrays; all are float64. In an experiment
-        with inputs modes are called as ``f(t, x, p, u)``, ``u`` being a dict or an array as the
+        scalar in the experiment's time unit, ``x`` an ``(n,)`` array and ``p`` a dict of arrays; all are float64.
+        In an experiment with inputs modes are called as ``f(t, x, p, u)``, ``u`` being a dict or an array as the
         `switchfit.Input` was given.
     initial_state : (n,) array_like, or callable ``p -> (n,)``
         State at ``t0``; as a function of the parameters it is differentiated with them. An entry may be a
@@ -53,7 +54,7 @@ class HybridSystem:
     ValueError
         If a reset map or a guard names an unknown mode, or names, units and initial state differ in length.
     TypeError
-        If a mode or a reset map is not callable.
+        If a mode, a reset map or a guard is not callable, the initial state not made of numbers, or a name no string.
     """
 
     modes: Mapping[str, VectorField]
@@ -64,30 +65,22 @@ class HybridSystem:
     guards: Mapping[tuple[str, str], Guard] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.modes, Mapping) or not self.modes:
-            raise ValueError(f"modes must be a non-empty dict of name -> vector field; got {self.modes!r}.")
+        if not isinstance(self.modes, Mapping) or len(self.modes) == 0:
+            raise ValueError(f"modes must be a non-empty dict of name -> vector field; got {shown(self.modes)}.")
         for name, mode in self.modes.items():
-            if not isinstance(name, str):
-                raise TypeError(f"mode names must be strings; got {name!r}.")
-            if not callable(mode):
-                raise TypeError(f"mode {name!r} must be a function f(t, x, p); got {type(mode).__name__}.")
+            as_name(name, "mode names", "strings")
+            as_callable(mode, f"mode {shown(name)}", "a function f(t, x, p)")
         _set(self, "modes", MappingProxyType(dict(self.modes)))
         for name in ("reset_maps", "guards"):
             _set(self, name, MappingProxyType(_checked_pairs(getattr(self, name), name, self.modes)))
         if not callable(self.initial_state):
             _set(self, "initial_state", as_state(self.initial_state, "initial_state"))
-        for label in ("state_names", "state_units"):
-            self._check_labels(label)
-
-    def _check_labels(self, label: str) -> None:
-        given = getattr(self, label)
-        if given is None:
-            return
-        if isinstance(given, str):
-            raise TypeError(f"{label} must be a sequence of strings, one for each state; got the string {given!r}.")
-        if not isinstance(given, Iterable):
-            raise TypeError(f"{label} must be a sequence of strings, one for each state; got {given!r}.")
-        _set(self, label, tuple(str(g) for g in given))
+        form = "a sequence of strings, one for each state"
+        if self.state_names is not None:
+            _set(self, "state_names", as_names(self.state_names, "state_names", form))
+        if self.state_units is not None:
+            units = as_sequence(self.state_units, "state_units", form)
+            _set(self, "state_units", tuple(as_text(unit, "each of state_units") for unit in units))
         if not callable(self.initial_state):
             self.check_labels_of(len(self.initial_state))
 
@@ -97,7 +90,7 @@ class HybridSystem:
             labels = getattr(self, label)
             if labels is not None and len(labels) != n:
                 raise ValueError(
-                    f"{label} must have one entry for each of the {n} states; got {len(labels)}: {labels}."
+                    f"{label} must have one entry for each of the {n} states; got {len(labels)}: {shown(labels)}."
                 )
 
     def reset_map(self, before: str, after: str) -> ResetMap | None:
@@ -123,24 +116,24 @@ def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ..
         return value.entries()
     if isinstance(value, (list, tuple)) and any(isinstance(entry, Parameter) for entry in value):
         return tuple(_as_entry(entry, name) for entry in value)
-    try:
-        state = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be an array of numbers, one for each state; got {value!r}.") from error
+    state = as_array(value, name, form="an array of numbers, one for each state")
     if state.ndim != 1 or state.size == 0:
         raise ValueError(f"{name} must have shape (n,), one entry for each state; got shape {state.shape}.")
     if not np.all(np.isfinite(state)):
-        raise ValueError(f"{name} must be finite; got {state.tolist()}.")
+        raise ValueError(f"{name} must be finite; got {shown(state)}.")
     state.flags.writeable = False
     return state
 
 
 def _as_entry(entry: Any, name: str) -> Parameter:
     """One entry of an initial state that has unknown ones: a number is known."""
-    try:
-        parameter = entry if isinstance(entry, Parameter) else Parameter(entry, fixed=True)
-    except ValueError as error:
-        raise ValueError(f"{name} must have a number or an sf.Parameter for each state; got {entry!r}.") from error
+    if isinstance(entry, Parameter):
+        parameter = entry
+    else:
+        array = as_array(entry, f"each entry of {name}", form="a number or an sf.Parameter")
+        if not np.all(np.isfinite(array)) or array.size == 0:
+            raise ValueError(f"{name} must have a number or an sf.Parameter for each state; got {shown(entry)}.")
+        parameter = Parameter(array, fixed=True)
     if parameter.shape != ():
         raise ValueError(
             f"{name} must have one number or one sf.Parameter of one number for each state; got an entry of shape "
@@ -153,18 +146,17 @@ def _checked_pairs(
     given: Mapping[tuple[str, str], Callable[..., Any]] | None, name: str, modes: Mapping[str, VectorField]
 ) -> dict[tuple[str, str], Callable[..., Any]]:
     """Functions of transitions, by the modes before and after."""
-    if not isinstance(given or {}, Mapping):
-        raise TypeError(f"{name} must be a dict of (mode before, mode after) -> function; got {given!r}.")
-    checked = dict(given or {})
+    if not isinstance(given, Mapping | None):
+        raise TypeError(f"{name} must be a dict of (mode before, mode after) -> function; got {shown(given)}.")
+    checked = {} if given is None else dict(given)
     for key, function in checked.items():
         if not (isinstance(key, tuple) and len(key) == 2):
-            raise ValueError(f"{name} must have keys (mode before, mode after); got {key!r}.")
+            raise ValueError(f"{name} must have keys (mode before, mode after); got {shown(key)}.")
         for mode in key:
             if mode not in modes:
-                raise ValueError(f"{name} names the unknown mode {mode!r}; the modes are {', '.join(modes)}.")
-        if not callable(function):
-            what, form = ("reset map", "R(t, x, p)") if name == "reset_maps" else ("guard", "g(t, x, p)")
-            raise TypeError(f"{what} {key} must be a function {form}; got {type(function).__name__}.")
+                raise ValueError(f"{name} names the unknown mode {shown(mode)}; the modes are {listed(modes)}.")
+        what, form = ("reset map", "R(t, x, p)") if name == "reset_maps" else ("guard", "g(t, x, p)")
+        as_callable(function, f"{what} {shown(key)}", f"a function {form}")
     return checked
 
 

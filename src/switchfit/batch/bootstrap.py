@@ -38,11 +38,11 @@ import numpy as np
 import scipy.special
 
 from switchfit.batch.chunks import Arrays, fingerprint
-from switchfit.batch.fits import Fits, repeat, sample_count
+from switchfit.batch.fits import Fits, check_long_run, repeat, sample_count
 from switchfit.batch.monte_carlo import simulated
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
 from switchfit.data import FloatArray, Measurements
-from switchfit.estimate import Estimate
+from switchfit.estimate import Estimate, checked_settings
 from switchfit.evaluate import Evaluator
 from switchfit.mesh import Mesh
 from switchfit.problem import Problem
@@ -51,6 +51,7 @@ from switchfit.residuals import autocorrelation
 from switchfit.result import inverse_on
 from switchfit.sensitivity import sample_derivatives
 from switchfit.solve import plain
+from switchfit.validation import as_choice, as_count, as_level, as_seed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -106,10 +107,8 @@ class Bootstrap(Fits):
             estimate; "bca" shifts them for bias and for acceleration (Efron 1987), whose sum over the leave-one-out
             estimates is taken to first order, from exact derivatives, instead of fitting again without each sample.
         """
-        if not 0 < level < 1:
-            raise ValueError(f"level must lie between 0 and 1; got {level}.")
-        if method not in get_args(Interval):
-            raise ValueError(f"method must be one of {', '.join(get_args(Interval))}; got {method!r}.")
+        level = as_level(level)
+        method = as_choice(method, "method", get_args(Interval))
         theta = self.theta[self.success]
         found = np.full((len(self.estimate), 2), np.nan)
         if len(theta) < 2:
@@ -172,19 +171,19 @@ def bootstrap(
     Raises
     ------
     TypeError
-        If this is no estimate.
+        If this is no estimate, or an argument is of the wrong type.
     ValueError
         For an estimate that has no problem or did not converge, data that cannot be resampled, fewer than two
         experiments for "runs", or a folder that holds something else.
     """
     if not isinstance(estimate, Estimate):
         raise TypeError(f"bootstrap needs the result of sf.estimate; got {type(estimate).__name__}.")
-    if resample not in get_args(Resample):
-        raise ValueError(f"resample must be one of {', '.join(get_args(Resample))}; got {resample!r}.")
+    resample = as_choice(resample, "resample", get_args(Resample))
     if block is not None and resample != "blocks":
         raise ValueError(f"block is the length of blocks: give it with resample='blocks', not with {resample!r}.")
-    if runs < 1:
-        raise ValueError(f"runs must be 1 or more; got {runs}.")
+    runs, seed = as_count(runs, "runs", at_least=1), as_seed(seed)
+    tolerance, max_iterations = checked_settings(tolerance, max_iterations)
+    check_long_run(client, folder, callback)
     if not estimate.success:
         raise ValueError(f"a bootstrap begins at a minimum, and this fit has not found one: {estimate.message}")
     problem = estimate.evaluator_at_solution().problem
@@ -266,7 +265,7 @@ class _Draw:
         self.block = 1
         if resample == "blocks":
             longest = max(len(item.times) for item in self.items)
-            self.block = self._length() if block is None else int(block)
+            self.block = self._length() if block is None else as_count(block, "block")
             if not 1 <= self.block <= longest:
                 raise ValueError(f"block must lie between 1 and the {longest} samples there are; got {block}.")
 
@@ -353,6 +352,7 @@ class _Runs:
     def fingerprint(self) -> str:
         unknowns = self.problem.unknowns
         settings = self.seed, self.tolerance, self.max_iterations, unknowns.names, self.problem.solver
-        data = [item.values for run in self.problem.experiments for item in run.data]
-        nodes = [mesh.nodes for mesh in self.meshes]
-        return fingerprint("bootstrap of runs", settings, self.start, unknowns.lower, unknowns.upper, *nodes, *data)
+        leaves = jax.tree.leaves([self.problem.arguments(e, mesh) for e, mesh in enumerate(self.meshes)])
+        bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
+        model = self.problem.digests
+        return fingerprint("bootstrap of runs", settings, model, self.start, *bounds, *map(np.asarray, leaves))

@@ -11,16 +11,19 @@ import hashlib
 import io
 import json
 import os
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.io.files import write_atomically
+from switchfit.io.errors import first_line
+from switchfit.io.files import PREFIX, SUFFIX, set_aside, write_atomically
 
 Arrays = dict[str, NDArray[Any]]
 Progress = Callable[[int, int], object]
@@ -60,7 +63,8 @@ def run_chunks(
         Where the chunks are computed; in threads of this process, one a core, if left out. A chunk whose worker is
         lost is computed again by another one.
     folder : path, optional
-        Each chunk is written there when it is done, and chunks that are found there are not computed again.
+        Each chunk is written there when it is done, and chunks that are found there are not computed again. A damaged
+        file is renamed, which is said in a warning, and its runs are computed again.
     progress : callable, optional
         ``progress(done, total)``; a true return value stops, as Ctrl-C does.
 
@@ -74,11 +78,7 @@ def run_chunks(
     ------
     ValueError
         If the folder holds the chunks of something else.
-    TypeError
-        If the client is none.
     """
-    if client is not None and not hasattr(client, "submit"):
-        raise TypeError(f"client must be a dask.distributed.Client; got {type(client).__name__}.")
     chunks = [range(first, min(first + work.size, count)) for first in range(0, count, work.size)]
     store = None if folder is None else _Store(Path(folder), work.fingerprint(), work.size)
     results: dict[int, Arrays] = {}
@@ -173,45 +173,114 @@ def _remote(blob: bytes, start: int, stop: int) -> Arrays:
 
 
 class _Store:
-    """A folder with ``chunk-<first run>.npz`` files and ``run.json``, which says what they belong to."""
+    """A folder with ``chunk-<first run>.npz`` files, and ``run.json``, which says what they belong to.
+
+    Each chunk also holds the fingerprint of its run and a digest of everything in it (`_seal`), so that a chunk that
+    was cut off, edited or copied here from elsewhere is recognised, and ``run.json`` can be written anew if it is lost.
+    """
 
     def __init__(self, folder: Path, fingerprint: str, size: int) -> None:
-        self.folder = folder
+        self.folder, self.fingerprint = folder, fingerprint
         folder.mkdir(parents=True, exist_ok=True)
         description = {"fingerprint": fingerprint, "runs in a chunk": size}
         label = folder / "run.json"
-        if label.exists():
-            try:
-                there = json.loads(label.read_text(encoding="utf-8"))
-            except ValueError:
-                there = None
-            if there != description:
-                raise ValueError(
-                    f"{folder} holds the results of another run (of other data, models or settings). Choose another "
-                    "folder, or delete this one."
+        there, reason = _read_label(label)
+        if there is not None and there != description:
+            raise ValueError(_ANOTHER_RUN.format(folder=folder))
+        if there is None:
+            self._check_unlabelled(label.name)
+            if reason:
+                set_aside(label, reason, "Chunks in this folder that belong to this run are used.")
+            elif any(folder.glob(CHUNKS)):
+                warnings.warn(
+                    f"{label} is lost; the chunks say themselves what they belong to, and it is written again.",
+                    stacklevel=2,
                 )
-        elif any(folder.iterdir()):
-            raise ValueError(f"{folder} holds other files: give an empty or a new folder for the results.")
-        else:
             write_atomically(json.dumps(description), label)
 
+    def _check_unlabelled(self, label: str) -> None:
+        """Without run.json: ValueError if the folder holds intact chunks of another run, or no chunk but other files.
+
+        Chunks that are damaged are no reason to refuse: `load` sets them aside, and nothing of them is used.
+        """
+        for path in self.folder.glob(CHUNKS):
+            arrays, _ = _read_chunk(path)
+            if arrays is not None and str(arrays["fingerprint"]) != self.fingerprint:
+                raise ValueError(_ANOTHER_RUN.format(folder=self.folder))
+        own = (label, CHUNKS, "*.damaged*", f"{PREFIX}*{SUFFIX}")
+        names = [entry.name for entry in self.folder.iterdir()]
+        if not all(any(fnmatch(name, pattern) for pattern in own) for name in names):
+            raise ValueError(f"{self.folder} holds other files: give an empty or a new folder for the results.")
+
     def load(self, chunk: range) -> Arrays | None:
-        """The chunk's arrays, None if it is not there."""
+        """The chunk's arrays; None if it is not there, or damaged and therefore set aside."""
         path = self._path(chunk)
         if not path.exists():
             return None
-        with np.load(path) as file:
-            arrays = {name: file[name] for name in file.files}
-        return arrays if all(len(array) == len(chunk) for array in arrays.values()) else None
+        arrays, reason = _read_chunk(path)
+        if arrays is not None:
+            found, runs = str(arrays.pop("fingerprint")), arrays.pop("runs").tolist()
+            if found != self.fingerprint:
+                reason = "it belongs to another run"
+            elif runs[0] != chunk.start:
+                reason = f"it holds runs from {runs[0]} on, which is not what its name says"
+            else:
+                return arrays if runs[1] == chunk.stop else None  # the last chunk of a shorter study
+        set_aside(path, reason, f"Runs {chunk.start} to {chunk.stop - 1} are computed again.")
+        return None
 
     def save(self, chunk: range, arrays: Arrays) -> None:
         """Write a chunk, whole or not at all."""
+        runs = np.array([chunk.start, chunk.stop])
+        whole: Arrays = {**arrays, "fingerprint": np.array(self.fingerprint), "runs": runs}
         buffer = io.BytesIO()
-        np.savez(buffer, **arrays)  # type: ignore[arg-type]
+        np.savez(buffer, **whole, seal=np.array(_seal(whole)))  # type: ignore[arg-type]
         write_atomically(buffer.getvalue(), self._path(chunk))
 
     def _path(self, chunk: range) -> Path:
         return self.folder / f"chunk-{chunk.start:08d}.npz"
+
+
+CHUNKS = "chunk-*.npz"
+_ANOTHER_RUN = (
+    "{folder} holds the results of another run (of other data, models or settings). Choose another folder, or delete "
+    "this one."
+)
+
+
+def _read_label(path: Path) -> tuple[dict[str, Any] | None, str]:
+    """What run.json says, or None and what is wrong with it: nothing if it is not there."""
+    try:
+        there = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        return None, ""
+    except (ValueError, RecursionError):
+        return None, "it is no valid JSON"
+    names = {"fingerprint": str, "runs in a chunk": int}
+    if not isinstance(there, dict) or {name: type(value) for name, value in there.items()} != names:
+        return None, f"it must hold {' and '.join(repr(name) for name in names)} alone"
+    return there, ""
+
+
+def _read_chunk(path: Path) -> tuple[Arrays | None, str]:
+    """The arrays of a chunk with its fingerprint and runs but not its seal; or None and what is wrong with it."""
+    content = path.read_bytes()  # OSError names the file
+    if not content:
+        return None, "it is empty"
+    try:
+        with np.load(io.BytesIO(content)) as file:
+            arrays = {name: file[name] for name in file.files}
+        seal = str(arrays.pop("seal", ""))
+    except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds on what they cannot read
+        return None, f"it cannot be read ({first_line(error)})"
+    if seal != _seal(arrays) or not {"fingerprint", "runs"} <= arrays.keys():
+        return None, "its content is not what was written"
+    return arrays, ""
+
+
+def _seal(arrays: Arrays) -> str:
+    """A digest of names, types, shapes and numbers."""
+    return fingerprint(*(part for name in sorted(arrays) for part in (name, np.asarray(arrays[name]))))
 
 
 def fingerprint(*parts: Any) -> str:

@@ -21,6 +21,7 @@ from switchfit.problem import Problem
 from switchfit.progress import reporting
 from switchfit.result import interval
 from switchfit.solve import sigma_known
+from switchfit.validation import as_callable, as_level, as_path
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +102,7 @@ class Fits:
 
     def confidence_intervals(self, level: float = 0.95) -> FloatArray:
         """Intervals of each fit: (R, d, 2); see `Estimate.confidence_intervals`."""
-        if not 0 < level < 1:
-            raise ValueError(f"level must lie between 0 and 1; got {level}.")
+        level = as_level(level)
         freedom, tail = np.maximum(self.samples - self.free, 1), 0.5 + level / 2
         quantile = scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail)
         half = np.reshape(quantile, (-1, 1)) * self.standard_errors
@@ -125,6 +125,16 @@ class Fits:
             lines.append("not converged (all of them in .failures):")
             lines += [f"  run {run}: {message}" for run, message in self.failures[:3]]
         return lines
+
+
+def check_long_run(client: Any, folder: Any, callback: Any) -> None:
+    """Raise for settings of a long run of the wrong type, before anything long is done."""
+    if client is not None and not hasattr(client, "submit"):
+        raise TypeError(f"client must be a dask.distributed.Client; got {type(client).__name__}.")
+    if folder is not None:
+        as_path(folder, "folder")
+    if callback is not None:
+        as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
 
 
 def repeat(

@@ -11,15 +11,17 @@ from typing import Any
 import jax
 import numpy as np
 
+from switchfit.accuracy import cost_error
 from switchfit.batch.chunks import Arrays, fingerprint
-from switchfit.batch.fits import Fits, repeat, sample_count
+from switchfit.batch.fits import Fits, check_long_run, repeat, sample_count
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
-from switchfit.estimate import LARGEST_INTEGRATION_ERROR, estimate
+from switchfit.estimate import LARGEST_INTEGRATION_ERROR, checked_settings, estimate
 from switchfit.evaluate import evaluator_of
 from switchfit.optimize import Status
 from switchfit.problem import Problem
 from switchfit.result import inverse_on
-from switchfit.solve import sigma_known, smallest_cost
+from switchfit.solve import sigma_known
+from switchfit.validation import as_instance, as_sequence, listed
 
 
 def estimate_many(
@@ -50,16 +52,27 @@ def estimate_many(
     ------
     ValueError
         If the problems differ in more than their numbers, or the folder holds something else.
+    TypeError
+        If an argument is of the wrong type.
     """
-    problems = list(problems)
+    problems = list(as_sequence(problems, "problems", "a sequence of sf.Problem"))
+    tolerance, max_iterations = checked_settings(tolerance, max_iterations)
+    check_long_run(client, folder, callback)
     if not problems:
         raise ValueError("estimate_many needs one problem or more; got none.")
     first = problems[0]
     for k, problem in enumerate(problems):
+        as_instance(problem, f"problems[{k}]", Problem, "an sf.Problem")
         if problem.theta_names != first.theta_names or sigma_known(problem) is not sigma_known(first):
             raise ValueError(
                 f"problem {k} differs from the first one in more than its numbers: it has the unknowns "
-                f"{', '.join(problem.theta_names)}, the first one {', '.join(first.theta_names)}. Fit it by itself."
+                f"{listed(problem.theta_names)}, the first one {listed(first.theta_names)}. Fit it by itself."
+            )
+        units = [[run.time_unit for run in of.experiments] for of in (problem, first)]
+        if units[0] != units[1]:
+            raise ValueError(
+                f"problem {k} has its times in {', '.join(units[0])}, the first one in {', '.join(units[1])}: their "
+                "estimates would stand in one array. Give all logs the same time_unit, with their times in it."
             )
     began = time.perf_counter()
     work = _Work(problems, tolerance, max_iterations)
@@ -114,8 +127,7 @@ class _Work:
         """Do a fit again by `estimate` if its integration error is too large."""
         theta, cost = arrays["theta"][k], arrays["cost"][k]
         fine = evaluator_of(problem).divided().cost(theta)
-        size = max(abs(fine), smallest_cost(problem))
-        if abs(fine - cost) <= max(LARGEST_INTEGRATION_ERROR, problem.rtol) * size:
+        if cost_error(problem, fine, cost, 0.0) <= max(LARGEST_INTEGRATION_ERROR, problem.rtol):
             return
         again = estimate(problem, tolerance=self.tolerance, max_iterations=self.max_iterations, start=theta)
         for name in ("theta", "cost", "gradient", "hessian", "optimality"):
@@ -133,8 +145,7 @@ class _Work:
         for problem in self.problems:
             leaves = jax.tree.leaves(tuple(evaluator_of(problem).arguments))
             parts += [problem.theta_names, problem.initial_theta, *problem.unknowns.priors, *map(np.asarray, leaves)]
-        first = self.problems[0]
-        parts.append(evaluator_of(first).cost(first.initial_theta))  # stands for the functions
+            parts.append(problem.digests)
         return fingerprint(*parts)
 
 

@@ -12,11 +12,12 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.accuracy import cost_error
 from switchfit.batch.chunks import Arrays, fingerprint
-from switchfit.batch.fits import Fits, repeat, sample_count
+from switchfit.batch.fits import Fits, check_long_run, repeat, sample_count
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
-from switchfit.data import FloatArray, Measurements, ReferenceSignal, as_numbers
-from switchfit.estimate import LARGEST_INTEGRATION_ERROR, ORDER, PERFECT_FIT, REFINEMENTS, estimate
+from switchfit.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.estimate import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, checked_settings, estimate
 from switchfit.evaluate import Evaluator
 from switchfit.mesh import Mesh
 from switchfit.model import by_cell
@@ -24,7 +25,7 @@ from switchfit.problem import Problem
 from switchfit.refine import refined_mesh
 from switchfit.report.batch import plot_monte_carlo, table_of_monte_carlo
 from switchfit.simulate import compared, runs_of
-from switchfit.solve import smallest_cost
+from switchfit.validation import as_array, as_callable, as_count, as_instance, as_seed, shown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -125,16 +126,23 @@ def monte_carlo(
     ------
     ValueError
         If the noise is not known, there is nothing to simulate, or the folder holds something else.
+    TypeError
+        If an argument is of the wrong type.
 
     Notes
     -----
     All fits share one mesh, which resolves the trajectories at the start and at the truth.
     """
-    if runs < 1:
-        raise ValueError(f"runs must be 1 or more; got {runs}.")
+    as_instance(problem, "problem", Problem, "an sf.Problem")
+    runs, seed = as_count(runs, "runs", at_least=1), as_seed(seed)
+    tolerance, max_iterations = checked_settings(tolerance, max_iterations)
+    check_long_run(client, folder, callback)
+    noise = _checked_noise(noise)
     began = time.perf_counter()
-    truth = estimate(problem).theta if theta is None else problem.checked_theta(theta)
-    begin = truth if start is None else problem.checked_theta(start)
+    given = None if theta is None else problem.checked_theta(theta)
+    begin = None if start is None else problem.checked_theta(start, "start")
+    truth = estimate(problem).theta if given is None else given
+    begin = truth if begin is None else begin
     found, error = simulated(
         problem,
         runs,
@@ -151,6 +159,15 @@ def monte_carlo(
         callback=callback,
     )
     return MonteCarlo(**found, truth=truth, integration_error=error)
+
+
+def _checked_noise(noise: Noise) -> Noise:
+    """Return the noise as an array, a function or None."""
+    if noise is None:
+        return None
+    if callable(noise):
+        return as_callable(noise, "noise", "a function noise(rng, clean, item)", arguments=3)
+    return as_array(noise, "noise", form="a number, one for each channel, or a function")
 
 
 def simulated(
@@ -234,8 +251,7 @@ def _meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tuple[lis
         evaluator = Evaluator(problem, meshes=[refined_mesh(problem, e, *thetas, finer=finer) for e in indices])
         fine = evaluator.divided().cost(truth)
         # Without noise J vanishes at the truth; then the error is measured against J where the fits begin.
-        size = max(abs(fine), PERFECT_FIT * abs(evaluator(start).cost), smallest_cost(problem))
-        error = abs(evaluator(truth).cost - fine) / size
+        error = cost_error(problem, fine, evaluator(truth).cost, evaluator(start).cost)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
         if not excess > 1 or attempt == REFINEMENTS:
             break
@@ -280,7 +296,7 @@ class _Work:
 
     def _drawn(self, rng: np.random.Generator, clean: FloatArray, item: Any, e: int) -> FloatArray:
         if callable(self.noise):
-            return np.asarray(self.noise(rng, clean.copy(), item), dtype=np.float64)
+            return as_array(self.noise(rng, clean.copy(), item), "what noise(rng, clean, item) returns")
         sigma = self.noise
         if sigma is None:
             sigma = item.noise(self.problem.named(self.truth, e)) if isinstance(item, Measurements) else None
@@ -290,11 +306,11 @@ class _Work:
                     "for each channel, or a function."
                 )
         try:
-            spread = np.broadcast_to(as_numbers(sigma, "noise"), clean.shape)
+            spread = np.broadcast_to(sigma, clean.shape)
         except ValueError as error:
             raise ValueError(f"noise of shape {np.shape(sigma)} does not fit data of shape {clean.shape}.") from error
         if not (np.isfinite(spread).all() and (spread >= 0).all()):
-            raise ValueError(f"noise must be zero or positive; got {sigma}.")
+            raise ValueError(f"noise must be zero or positive; got {shown(sigma)}.")
         return clean + spread * rng.standard_normal(clean.shape)
 
     def problem_of(self, run: int) -> Problem:
@@ -353,9 +369,10 @@ class _Work:
         data = [np.asarray(values) for items in self.clean for values in items if values is not None]
         drawn = list(self._noisy(0).values())  # stands for the noise, which may be a function
         settings = self.seed, self.tolerance, self.max_iterations, unknowns.names, self.problem.solver
+        model = self.problem.digests
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
         nodes = [mesh.nodes for mesh in self.meshes]
-        return fingerprint("monte carlo", settings, self.truth, self.start, *bounds, *nodes, *data, *drawn)
+        return fingerprint("monte carlo", settings, model, self.truth, self.start, *bounds, *nodes, *data, *drawn)
 
 
 def _with_values(item: Any, values: FloatArray) -> Any:

@@ -14,19 +14,24 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.batch.chunks import Arrays, fingerprint
-from switchfit.batch.fits import Fits, repeat, sample_count
+from switchfit.batch.fits import Fits, check_long_run, repeat, sample_count
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
-from switchfit.data import FloatArray, as_numbers
-from switchfit.estimate import Estimate, estimate
-from switchfit.evaluate import Evaluator, evaluator_of
+from switchfit.data import FloatArray
+from switchfit.estimate import Estimate, checked_settings, estimate
+from switchfit.evaluate import evaluator_of
 from switchfit.mesh import Mesh
 from switchfit.optimize.qp import solve_qp
+from switchfit.parameter import unit_suffix
 from switchfit.problem import Problem
 from switchfit.report.batch import plot_waterfall
 from switchfit.solve import constraints_of
+from switchfit.validation import as_array, as_count, as_instance, as_seed, listed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+MOST_DRAWN = 2**30
+"""Points that SciPy's Sobol sequences have."""
 
 SAME_COST = 1e-6
 """Two ends are one minimum if their costs differ by less than this part of them, and ..."""
@@ -56,9 +61,8 @@ class Multistart(Fits):
         lines = [*self._summary(), "", f"{int(self.clusters.max(initial=-1)) + 1} minima:"]
         for k in range(min(int(self.clusters.max(initial=-1)) + 1, 10)):
             here = np.flatnonzero(self.clusters == k)
-            place = ", ".join(
-                f"{name} = {value:.6g}" for name, value in zip(self.theta_names, self.theta[here[0]], strict=True)
-            )
+            columns = zip(self.theta_names, self.theta[here[0]], self.theta_units, strict=True)
+            place = ", ".join(f"{name} = {value:.6g}{unit_suffix(unit)}" for name, value, unit in columns)
             lines.append(f"  J = {self.cost[here].min():.9g}  {len(here):>5} starts  {place}")
         return "\n".join(lines)
 
@@ -99,13 +103,20 @@ def multistart(
     ------
     ValueError
         If a parameter lacks a bound and starts are to be drawn, or given starts have the wrong shape or are infeasible.
+    TypeError
+        If an argument is of the wrong type.
 
     Notes
     -----
     All starts share the mesh that is refined at the initial guess; the best end is fitted again on a mesh of its own.
     """
+    as_instance(problem, "problem", Problem, "an sf.Problem")
+    seed = as_seed(seed)
+    tolerance, max_iterations = checked_settings(tolerance, max_iterations)
+    check_long_run(client, folder, callback)
     began = time.perf_counter()
-    points = _drawn(problem, starts, seed) if isinstance(starts, int) else _given(problem, starts)
+    several = hasattr(type(starts), "__len__")
+    points = _given(problem, starts) if several else _drawn(problem, starts, seed)
     work = _Work(problem, list(evaluator_of(problem).meshes), points, tolerance, max_iterations)
     found = repeat(problem, work, len(points), "Multistart", began, client=client, folder=folder, callback=callback)
     fits = Fits(**found)
@@ -147,33 +158,29 @@ class _Work:
         unknowns = self.problem.unknowns
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
         leaves = jax.tree.leaves([self.problem.arguments(e, mesh) for e, mesh in enumerate(self.meshes)])
-        first = Evaluator(self.problem, meshes=self.meshes).cost(
-            self.starts[0]
-        )  # stands for the functions of the model
-        settings = self.tolerance, self.max_iterations, unknowns.names, first
+        settings = self.tolerance, self.max_iterations, unknowns.names, self.problem.digests
         return fingerprint("multistart", settings, self.starts, *bounds, *map(np.asarray, leaves))
 
 
-def _given(problem: Problem, starts: ArrayLike) -> FloatArray:
+def _given(problem: Problem, starts: Any) -> FloatArray:
     """Starts of the user's, checked."""
-    points = as_numbers(starts, "starts")
+    points = as_array(starts, "starts")
     d = len(problem.theta_names)
     if points.ndim != 2 or points.shape[1] != d or len(points) == 0:
         raise ValueError(f"starts must be a number, or an array of shape (S, {d}); got shape {points.shape}.")
     constraints = constraints_of(problem)
     for k, point in enumerate(points):
-        slack = constraints.slack(problem.checked_theta(point))
+        slack = constraints.slack(problem.checked_theta(point, f"starts[{k}]"))
         if np.any(slack < -1e-12 * (1 + np.max(np.abs(point)))):
             raise ValueError(f"start {k} violates: {constraints.names[int(np.argmin(slack))]}.")
     return points
 
 
-def _drawn(problem: Problem, count: int, seed: int) -> FloatArray:
+def _drawn(problem: Problem, starts: Any, seed: int) -> FloatArray:
     """Starts from a Sobol sequence: (S, d)."""
     from scipy.stats import qmc  # here, since importing it takes longer than most fits
 
-    if count < 1:
-        raise ValueError(f"starts must be 1 or more; got {count}.")
+    count = as_count(starts, "starts", at_least=1, at_most=MOST_DRAWN)
     unknowns = problem.unknowns
     is_time = np.zeros(len(unknowns.names), dtype=bool)
     for where in unknowns.times:
@@ -181,7 +188,7 @@ def _drawn(problem: Problem, count: int, seed: int) -> FloatArray:
     unbounded = ~is_time & ~(np.isfinite(unknowns.lower) & np.isfinite(unknowns.upper))
     unbounded |= unknowns.log & (unknowns.lower <= 0)
     if unbounded.any():
-        names = ", ".join(np.array(unknowns.names)[unbounded])
+        names = listed(np.array(unknowns.names)[unbounded])
         raise ValueError(
             f"multistart draws starts between bounds, but there are none for {names}: give sf.Parameter(..., "
             "lower=..., upper=...), or the starts themselves."

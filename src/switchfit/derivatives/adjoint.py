@@ -159,7 +159,7 @@ def paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -> tuple[
     ----------
     model : Model
     tau : (N,)
-        Transition times (s), not decreasing.
+        Transition times in the experiment's time unit, not decreasing.
     p : (M,)
         Free parameters.
     side : ()

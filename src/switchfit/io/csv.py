@@ -10,6 +10,7 @@ import numpy as np
 
 from switchfit.data import FloatArray
 from switchfit.io.errors import InputError
+from switchfit.io.files import is_device
 
 
 def read_columns(path: str | Path, columns: Sequence[str]) -> FloatArray:
@@ -56,6 +57,8 @@ def read_columns(path: str | Path, columns: Sequence[str]) -> FloatArray:
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Line number and stripped cells of each line that is neither empty nor a comment."""
+    if is_device(path):
+        raise InputError(f"{path} is a device; name a CSV file.")
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             lines = file.read().splitlines()
@@ -67,13 +70,20 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not a text file in UTF-8 (byte {error.start}); export it as CSV.") from error
+    except ValueError as error:
+        raise InputError(f"{str(path)!r} is no name of a file: {error}.") from error
     kept = [(k, line) for k, line in enumerate(lines, start=1) if line.strip() and not line.lstrip().startswith("#")]
     if not kept:
         return
     delimiter = max(",;\t", key=kept[0][1].count)
     cells_of_lines = csv.reader((line for _, line in kept), delimiter=delimiter, skipinitialspace=True)
-    for (number, _), cells in zip(kept, cells_of_lines, strict=False):
-        yield number, [cell.strip() for cell in cells]
+    try:
+        for cells in cells_of_lines:
+            # Quotes may join lines; then the last one counts.
+            yield kept[cells_of_lines.line_num - 1][0], [cell.strip() for cell in cells]
+    except csv.Error as error:
+        line = kept[min(cells_of_lines.line_num, len(kept)) - 1][0]
+        raise InputError(f"{path}, line {line}: {error}; is a quotation mark missing?") from error
 
 
 def _position(path: Path, names: list[str], column: str) -> int:
@@ -89,6 +99,8 @@ def _number(path: Path, line: int, column: str, cell: str) -> float:
     if cell == "" or cell.upper() == "NA":
         return np.nan
     try:
+        if "_" in cell:  # Python would read 1_5 as 15
+            raise ValueError
         return float(cell)
     except ValueError:
         raise InputError(

@@ -1,27 +1,124 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and files that turned out to be damaged."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import secrets
+import warnings
 from pathlib import Path
 
+try:
+    import fcntl
+except ImportError:  # Windows, which refuses to delete a file that another process has open
+    fcntl = None  # type: ignore[assignment]
 
-def write_atomically(content: str | bytes, path: Path) -> None:
-    """Write a new file beside `path`, which then takes its name; text as UTF-8.
+PREFIX, SUFFIX = ".switchfit-", ".tmp"
+"""How the names of temporary files begin and end."""
+ATTEMPTS = 100
+
+
+def write_atomically(content: str | bytes, path: Path, *, sync: bool = True) -> None:
+    """Write a temporary file beside `path`, then rename it to `path`; text as UTF-8.
+
+    Temporary files that a killed process left in the same folder are deleted first. A file that is being written is
+    locked, and the lock ends with the process: so those of processes that still write are left alone.
+
+    Parameters
+    ----------
+    content : str or bytes
+    path : Path
+    sync : bool
+        False does not wait until the disk has the content: for files that are checked when they are read.
 
     Raises
     ------
     OSError
-        If the file cannot be written; an existing one is then left as it was.
+        If the file cannot be written, with the name of the file; an existing one is then left as it was.
     """
+    data = content.encode() if isinstance(content, str) else content
+    if path.exists() and not path.is_file() and not path.is_dir():
+        path.write_bytes(data)  # a device or a pipe, which cannot be replaced
+        return
     path = path.resolve()  # a link stays one
-    temporary = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
+    try:
+        _delete_abandoned(path.parent)
+        for attempt in range(ATTEMPTS):
+            try:
+                return _write(data, path, sync)
+            except FileNotFoundError:
+                # Another process saw the temporary file before it was locked, and deleted it.
+                if attempt == ATTEMPTS - 1 or not path.parent.is_dir():
+                    raise
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def _write(data: bytes, path: Path, sync: bool) -> None:
+    temporary = path.with_name(f"{PREFIX}{secrets.token_hex(8)}{SUFFIX}")
     try:
         with temporary.open("xb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
+            if fcntl is not None:
+                with contextlib.suppress(OSError):  # a file system without locks
+                    fcntl.flock(file, fcntl.LOCK_EX)
+            file.write(data)
             file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
+            if sync:
+                os.fsync(file.fileno())
+            if fcntl is not None:
+                temporary.replace(path)  # while it is locked
+        if fcntl is None:
+            temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _delete_abandoned(folder: Path) -> None:
+    """Delete the temporary files in a folder that no process is writing."""
+    found = []
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        found = [entry.path for entry in entries if entry.name.startswith(PREFIX) and entry.name.endswith(SUFFIX)]
+    for name in found:
+        with contextlib.suppress(OSError):  # locked, or gone in the meantime
+            if fcntl is None:
+                os.unlink(name)
+                continue
+            with open(name, "r+b") as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                os.unlink(name)
+
+
+def is_regular(path: Path) -> bool:
+    """Whether there is a file of that name; False for names that no file can have."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # too long; a null character
+        return False
+
+
+def is_device(path: Path) -> bool:
+    """Whether it is a device, such as a terminal or ``/dev/zero``, which can be read without end."""
+    try:
+        return path.is_char_device() or path.is_block_device()
+    except (OSError, ValueError):
+        return False
+
+
+def set_aside(path: Path, reason: str, remedy: str) -> None:
+    """Rename a damaged file to ``NAME.damaged`` (``.damaged-2``, ... if there is one), and warn.
+
+    Parameters
+    ----------
+    path : Path
+    reason : str
+        What is wrong with it, as the end of a sentence.
+    remedy : str
+        What happens now, as a sentence.
+    """
+    number, target = 1, path.with_name(f"{path.name}.damaged")
+    while target.exists():
+        number += 1
+        target = path.with_name(f"{path.name}.damaged-{number}")
+    with contextlib.suppress(FileNotFoundError):  # another process was first
+        path.rename(target)
+    warnings.warn(f"{path} is damaged: {reason}. It is now {target.name}. {remedy}", stacklevel=2)

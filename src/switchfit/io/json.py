@@ -1,6 +1,6 @@
 """Fits as JSON files that can be read without switchfit, and back again without losing a bit.
 
-A file holds ``{"format": "switchfit fit", "version": 2, "fit": {...}, "certificate": {...}}`` with the fields of
+A file holds ``{"format": "switchfit fit", "version": 3, "fit": {...}, "certificate": {...}}`` with the fields of
 `Fit` and `Certificate` under their own names:
 
 - numbers are written with as many digits as it takes to read the same float64; JSON has no NaN and no infinities, so
@@ -9,13 +9,14 @@ A file holds ``{"format": "switchfit fit", "version": 2, "fit": {...}, "certific
   ``{"dtype": ..., "shape": ..., "values": [...]}``;
 - a status is its name.
 
-What is read is checked against the types that the fields of the dataclasses declare.
+What is read is checked against the types that the fields of the dataclasses declare, and then all sizes against one
+another (`_check_fit`): what was loaded can be printed and plotted, and has intervals.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from pathlib import Path
@@ -25,11 +26,21 @@ from typing import Any, NoReturn, get_args, get_origin, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.data import FloatArray
 from switchfit.io.files import write_atomically
 from switchfit.result import Certificate, Fit
+from switchfit.simulate import Comparison, Trajectory
 
 FORMAT = "switchfit fit"
-VERSION = 2
+VERSION = 3
+READABLE = (2, 3)
+
+LATER_FIELDS: dict[type, tuple[str, ...]] = {
+    Trajectory: ("time_unit",),
+    Fit: ("engine", "integration_error_of"),
+    Certificate: ("integration_error_of",),
+}
+"""Fields that files of version 2 lack: they take their defaults."""
 
 
 def save_fit(fit: Fit, certificate: Certificate, path: Path) -> None:
@@ -74,23 +85,27 @@ def load_fit(path: Path) -> tuple[Fit, Certificate]:
     OSError
         If there is no such file (FileNotFoundError) or it cannot be read.
     ValueError
-        If it is no JSON, not written by switchfit, of another version, or a field is missing or of a wrong type.
+        If it is no JSON, not written by switchfit, of another version, or a field is missing, of a wrong type or of a
+        size that does not fit the others; the message names the file and the field.
     """
     try:
-        content = json.loads(Path(path).read_bytes().decode(), parse_constant=_refuse_constant)
+        text = Path(path).read_bytes().decode()
+        content = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_without_repetition)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not a saved estimate: it is no valid JSON ({error}).") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f'{path} is not a saved estimate: it has no entry "format": "{FORMAT}" at its top.')
-    if content.get("version") != VERSION:
+    if content.get("version") not in READABLE:
         raise ValueError(
-            f"{path} is a saved estimate of version {content.get('version')!r}; this switchfit reads version "
-            f"{VERSION}. Read it with the switchfit that wrote it."
+            f"{path} is a saved estimate of version {content.get('version')!r}; this switchfit reads the "
+            f"versions {' and '.join(map(str, READABLE))}. Read it with the switchfit that wrote it."
         )
     try:
         fit = _decoded(Fit, content.get("fit"), "fit")
-        return fit, _decoded(Certificate, content.get("certificate"), "certificate")
-    except (ValueError, OverflowError) as error:
+        certificate = _decoded(Certificate, content.get("certificate"), "certificate")
+        _check_fit(fit)
+        return fit, certificate
+    except (ValueError, OverflowError, RecursionError, MemoryError) as error:
         raise ValueError(f"{path} is damaged: {error}.") from error
 
 
@@ -138,6 +153,15 @@ def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f"it contains {name}")
 
 
+def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object, none of whose names stands there twice."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"it has the entry {next(name for name in names if names.count(name) > 1)!r} twice")
+    return found
+
+
 def _decoded(hint: Any, value: Any, where: str) -> Any:
     """`value` as what the type hint of the field `where` says; ValueError otherwise."""
     origin, inner = get_origin(hint), get_args(hint)
@@ -148,14 +172,15 @@ def _decoded(hint: Any, value: Any, where: str) -> Any:
         return None if value is None else _decoded(optional[0], value, where)
     if origin is np.ndarray:
         array, declared = _array(value, where), np.dtype(get_args(inner[1])[0])
-        if array.dtype.kind != declared.kind:
+        same_size = declared.kind == "U" or array.dtype.itemsize == declared.itemsize
+        if array.dtype.kind != declared.kind or not same_size:
             raise ValueError(f"{where} must be an array of {declared.type.__name__}; got one of {array.dtype}")
         return array
     if origin is tuple:
         return _tuple(inner, value, where)
     if origin is Mapping:
         entries = _checked(value, dict, where).items()
-        return {name: _decoded(inner[1], entry, f"{where}[{name!r}]") for name, entry in entries}
+        return {_checked(name, str, where): _decoded(inner[1], entry, f"{where}[{name!r}]") for name, entry in entries}
     if isinstance(hint, type) and issubclass(hint, Enum):
         names = hint.__members__
         if not isinstance(value, str) or value not in names:
@@ -165,16 +190,16 @@ def _decoded(hint: Any, value: Any, where: str) -> Any:
 
 
 def _dataclass(kind: type, value: Any, where: str) -> Any:
-    """An instance of a dataclass from a dict with exactly its fields."""
+    """An instance of a dataclass from a dict with its fields and no others."""
     hints = get_type_hints(kind)
     names = [f.name for f in fields(kind)]
     given = _checked(value, dict, where)
     for name in names:
-        if name not in given:
+        if name not in given and name not in LATER_FIELDS.get(kind, ()):
             raise ValueError(f"{where}.{name} is missing")
     if unknown := [name for name in given if name not in names]:
         raise ValueError(f"{where} has the unknown entry {unknown[0]!r}")
-    return kind(**{name: _decoded(hints[name], given[name], f"{where}.{name}") for name in names})
+    return kind(**{name: _decoded(hints[name], given[name], f"{where}.{name}") for name in names if name in given})
 
 
 def _tuple(kinds: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
@@ -201,7 +226,12 @@ def _array(value: Any, where: str) -> NDArray[Any]:
     if dtype.kind not in "bifuU":
         raise ValueError(f"{where} has the dtype {value['dtype']!r}, which is none of numbers or text")
     values = _checked(value["values"], list, where)
-    flat = _assembled(_numbers(values, where) if dtype.kind == "f" else values, dtype, where)
+    if dtype.kind == "f":
+        values = _numbers(values, where)
+    else:
+        kind = {"U": str, "b": bool}.get(dtype.kind, int)
+        values = [_checked(entry, kind, where) for entry in values]
+    flat = _assembled(values, dtype, where)
     shape = _tuple((int, ...), value["shape"], f"{where} shape")
     if flat.size != np.prod(shape) or min(shape, default=0) < 0:
         raise ValueError(f"{where} has the shape {shape} but {flat.size} values")
@@ -211,7 +241,7 @@ def _array(value: Any, where: str) -> NDArray[Any]:
 def _assembled(values: Any, dtype: np.dtype[Any], where: str) -> NDArray[Any]:
     try:
         return np.array(values, dtype=dtype)
-    except (TypeError, ValueError, OverflowError) as error:
+    except (TypeError, ValueError, OverflowError, MemoryError) as error:
         raise ValueError(f"{where} is no array of {dtype}: {error}") from error
 
 
@@ -234,9 +264,96 @@ def _checked(value: Any, kind: type, where: str) -> Any:
     if type(value) is not kind:
         words = {dict: "an object", list: "a list", str: "a string", int: "an integer", bool: "true or false"}
         raise ValueError(f"{where} must be {words.get(kind, kind)}; got {_shown(value)}")
+    if isinstance(value, str):
+        value.encode()  # half of a surrogate pair can be written as JSON, but is no text
     return value
 
 
 def _shown(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) <= 40 else f"{text[:40]}..."
+
+
+# --- sizes ------------------------------------------------------------------------------------------------------------
+
+
+def _check_fit(fit: Fit) -> None:
+    """ValueError if sizes, names or times do not fit one another."""
+    d, experiments = len(fit.theta_names), len(fit.trajectories)
+    unknowns = f"since fit.theta_names has {d} entries"
+    _check_size("fit.theta_units", fit.theta_units, (d,), unknowns)
+    for name in ("initial_theta", "theta", "lower", "upper", "gradient"):
+        _check_size(f"fit.{name}", getattr(fit, name), (d,), unknowns)
+    for name in ("hessian", "saved_gauss_newton"):
+        if getattr(fit, name) is not None:
+            _check_size(f"fit.{name}", getattr(fit, name), (d, d), unknowns)
+    for k, record in enumerate(fit.history):
+        _check_size(f"fit.history[{k}].theta", record.theta, (d,), unknowns)
+    _check_basis(fit.free_basis, d)
+    _check_names("fit.kinks", (name for name, _, _ in fit.kinks), fit.theta_names)
+    _check_names("fit.priors", fit.priors, fit.theta_names)
+    _check_names("fit.log_scaled", fit.log_scaled, fit.theta_names)
+    if experiments == 0:
+        raise ValueError("fit.trajectories must have one entry or more; got none")
+    runs = f"since fit.trajectories has {experiments} entries"
+    _check_size("fit.transition_times", fit.transition_times, (experiments,), runs)
+    _check_size("fit.comparisons", fit.comparisons, (experiments,), runs)
+    for e, (trajectory, times) in enumerate(zip(fit.trajectories, fit.transition_times, strict=True)):
+        _check_trajectory(trajectory, times, e)
+        for k, comparison in enumerate(fit.comparisons[e]):
+            _check_comparison(comparison, f"fit.comparisons[{e}][{k}]")
+
+
+def _check_trajectory(trajectory: Trajectory, transition_times: FloatArray, e: int) -> None:
+    where = f"fit.trajectories[{e}]"
+    _check_times(f"{where}.times", trajectory.times)
+    n, K = len(trajectory.state_names), len(trajectory.times)
+    _check_size(f"{where}.state_units", trajectory.state_units, (n,), f"since its state_names has {n} entries")
+    nodes = f"since its times has {K} entries"
+    _check_size(f"{where}.states", trajectory.states, (K, n), f"{nodes} and its state_names {n}")
+    _check_size(f"{where}.modes", trajectory.modes, (K,), nodes)
+    _check_size(f"fit.transition_times[{e}]", transition_times, (transition_times.size,), "a list of numbers")
+    N = len(transition_times)
+    _check_size(f"{where}.segments", trajectory.segments, (N + 2,), f"since fit.transition_times[{e}] has {N} entries")
+    ends = trajectory.segments
+    if ends[0] != 0 or ends[-1] != K or np.any(np.diff(ends) <= 0):
+        raise ValueError(f"{where}.segments must increase from 0 to {K}, the number of times; got {ends.tolist()}")
+
+
+def _check_comparison(comparison: Comparison, where: str) -> None:
+    if comparison.kind not in ("measurements", "reference"):
+        raise ValueError(f'{where}.kind must be "measurements" or "reference"; got {_shown(comparison.kind)}')
+    _check_times(f"{where}.times", comparison.times)
+    _check_times(f"{where}.curve_times", comparison.curve_times)
+    q, K, L = len(comparison.names), len(comparison.times), len(comparison.curve_times)
+    sizes = f"since its times has {K} entries and its names {q}"
+    for name in ("measured", "fitted", "sigma", "downweighted"):
+        if getattr(comparison, name) is not None:
+            _check_size(f"{where}.{name}", getattr(comparison, name), (K, q), sizes)
+    _check_size(f"{where}.curve", comparison.curve, (L, q), f"since its curve_times has {L} entries and its names {q}")
+
+
+def _check_size(where: str, value: Any, shape: tuple[int, ...], reason: str) -> None:
+    found = value.shape if isinstance(value, np.ndarray) else (len(value),)
+    if found != shape:
+        raise ValueError(f"{where} must have the shape {shape}, {reason}; got {found}")
+
+
+def _check_times(where: str, times: FloatArray) -> None:
+    """Times up to 1e100 in size, beyond which no axis can be drawn."""
+    if times.ndim != 1 or not (np.abs(times) < 1e100).all() or np.any(np.diff(times) < 0):
+        raise ValueError(f"{where} must be a list of finite numbers (below 1e100) that do not decrease")
+
+
+def _check_basis(basis: FloatArray, d: int) -> None:
+    """Columns of length 1 at right angles to one another."""
+    if basis.ndim != 2 or basis.shape[0] != d or basis.shape[1] > d:
+        raise ValueError(f"fit.free_basis must have {d} rows and at most as many columns; got the shape {basis.shape}")
+    if not (np.abs(basis) <= 2).all() or not np.allclose(basis.T @ basis, np.eye(basis.shape[1]), atol=1e-6):
+        raise ValueError("fit.free_basis must have orthonormal columns")
+
+
+def _check_names(where: str, given: Iterable[str], known: tuple[str, ...]) -> None:
+    for name in given:
+        if name not in known:
+            raise ValueError(f"{where} has the name {name!r}, which is none of fit.theta_names")

@@ -24,7 +24,8 @@ from switchfit.data import FloatArray, Input, Measurements, ReferenceSignal
 from switchfit.experiment import Experiment, Parameter
 from switchfit.io.csv import read_columns
 from switchfit.io.errors import InputError
-from switchfit.io.python_file import call, load_object, located, user_place
+from switchfit.io.files import is_device
+from switchfit.io.python_file import call, find_object, load_object, located, user_place
 from switchfit.models import BUILT_IN
 from switchfit.priors import LogNormal, Normal, Prior
 from switchfit.problem import Problem
@@ -73,6 +74,36 @@ def load_problem(path: str | Path) -> ProblemFile:
     options = contents.options.model_dump(include={"hessian", "tolerance", "max_iterations"}, exclude_none=True)
     build = _from_tables if contents.problem is None else _from_python
     return ProblemFile(path, build(path, contents), options)
+
+
+def read_experiments(path: str | Path) -> tuple[Experiment, ...]:
+    """Read a problem file and the data files it names, but do not run the Python file that it names.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    tuple of Experiment
+        With data and horizon, but without functions for what is observed; none if the whole problem is made in Python.
+
+    Raises
+    ------
+    InputError
+        As of `load_problem`.
+    """
+    path = Path(path)
+    contents = _validated(path, _parsed(path))
+    if contents.problem is not None:
+        find_object(contents.problem, path.parent, f"{path}: problem")
+        return ()
+    if contents.model is not None and contents.model.name not in BUILT_IN:
+        _check_model_name(f"{path}: model", contents.model)
+        find_object(contents.model.name, path.parent, f"{path}: model")
+    for name, table in contents.parameters.items():
+        _explained(f"{path}: parameters.{name}", _parameter, table)
+    return _experiments(path, contents, None)
 
 
 # --- the format -------------------------------------------------------------------------------------------------------
@@ -130,9 +161,10 @@ class ParameterTable(_Table):
 class TransitionTable(_Table):
     """First guess of a transition time, with bounds of its own."""
 
-    value: float = Field(description="first guess of the transition time (s)")
-    lower: float = Field(default=-np.inf, description="earliest time (s)")
-    upper: float = Field(default=np.inf, description="latest time (s)")
+    value: float = Field(description="first guess of the transition time, in the experiment's time_unit")
+    lower: float = Field(default=-np.inf, description="earliest time")
+    upper: float = Field(default=np.inf, description="latest time")
+    unit: str = Field(default="", description="left out or the same as the experiment's time_unit")
     fixed: bool = Field(default=False, description="true if the time is known and not to be estimated")
     prior: PriorTable | None = Field(
         default=None, description="what is known of it: { mean, sd } or { median, log_sd }"
@@ -163,7 +195,7 @@ class LogTable(_Table):
         default=None, description="[from, to]: only rows with the time column in between are used"
     )
     time_offset: float = Field(default=0.0, description="subtracted from the time column")
-    time_scale: float = Field(default=1.0, gt=0, description="then multiplied: 1e-3 if the column is in milliseconds")
+    time_scale: float = Field(default=1.0, gt=0, description="then multiplied: 1e-3 turns ms into s")
 
 
 class DataTable(LogTable):
@@ -187,10 +219,15 @@ class DataTable(LogTable):
     )
     loss_scale: float = Field(default=1.0, gt=0, description="size of a residual, in sigmas, beyond which it is one")
     delay: float | str = Field(
-        default=0.0, description="by how much the sensor is late (s), or the parameter that it is (measurements only)"
+        default=0.0,
+        description="by how much the sensor is late, in the experiment's time_unit, or the parameter that it is "
+        "(measurements only)",
     )
     lowpass_hz: float | None = Field(
-        default=None, gt=0, description="cut-off of a low-pass filter (Hz; reference only)"
+        default=None,
+        gt=0,
+        description="cut-off of a low-pass filter, in cycles per time_unit of the experiment: Hz if that is s "
+        "(reference only)",
     )
     weights: list[float] | None = Field(default=None, description="weight of each column (reference only)")
 
@@ -206,13 +243,16 @@ class ExperimentTable(_Table):
 
     mode_sequence: list[str] = Field(min_length=1, description="names of the modes in the order of their activity")
     transition_times: list[Annotated[TransitionTable, pydantic.BeforeValidator(_number_as_table)]] = Field(
-        description="first guess of each transition time (s), one fewer than modes"
+        description="first guess of each transition time, in time_unit, one fewer than modes"
+    )
+    time_unit: str = Field(
+        default="s", min_length=1, description="unit of all times of the run, for the report; nothing is converted"
     )
     data: Annotated[list[DataTable], pydantic.BeforeValidator(_table_as_list)] = Field(
         min_length=1, description="what the model is compared with; several tables add up"
     )
-    t0: float | None = Field(default=None, description="start of the horizon (s); left out, the first sample")
-    tf: float | None = Field(default=None, description="end of the horizon (s); left out, the last sample")
+    t0: float | None = Field(default=None, description="start of the horizon; left out, the first sample")
+    tf: float | None = Field(default=None, description="end of the horizon; left out, the last sample")
     initial_state: list[Annotated[StateTable, pydantic.BeforeValidator(_known_as_table)]] | None = Field(
         default=None,
         description="state at t0, instead of the model's: a number, or a table where it is to be estimated",
@@ -235,7 +275,9 @@ class ModelTable(_Table):
 class OptionsTable(_Table):
     """How to solve; what is left out has the library's default."""
 
-    min_duration: float | None = Field(default=None, ge=0, description="shortest time a mode may last (s)")
+    min_duration: float | None = Field(
+        default=None, ge=0, description="shortest time a mode may last, in the time_unit of the experiments"
+    )
     solver: Literal["explicit", "stiff"] | None = Field(default=None, description="integrator")
     rtol: float | None = Field(default=None, gt=0, description="relative tolerance of the integrator")
     atol: float | None = Field(default=None, gt=0, description="absolute tolerance of the integrator")
@@ -267,6 +309,8 @@ class Contents(_Table):
 
 
 def _parsed(path: Path) -> dict[str, Any]:
+    if is_device(path):
+        raise InputError(f"{path} is a device; name a problem file.")
     try:
         with path.open("rb") as file:
             return tomllib.load(file)
@@ -274,7 +318,9 @@ def _parsed(path: Path) -> dict[str, Any]:
         raise InputError(f"There is no problem file {path}; check the name and the folder.") from None
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except RecursionError as error:
+        raise InputError(f"{path} is not valid TOML: brackets are nested too deep.") from error
+    except ValueError as error:  # of TOML, of UTF-8, of a number with thousands of digits
         raise InputError(f"{path} is not valid TOML: {error}.") from error
 
 
@@ -395,11 +441,7 @@ def _from_python(path: Path, contents: Contents) -> Problem:
 
 def _from_tables(path: Path, contents: Contents) -> Problem:
     system = _system(path, contents.model or ModelTable(name=""))
-    experiments = []
-    for k, table in enumerate(contents.experiments, start=1):
-        where = f"{path}: experiments[{k}]"
-        known = frozenset(contents.parameters) | frozenset(table.parameter_map)
-        experiments.append(_explained(where, _experiment, path.parent, table, system, where, known))
+    experiments = _experiments(path, contents, system)
     parameters = {
         name: _explained(f"{path}: parameters.{name}", _parameter, table) for name, table in contents.parameters.items()
     }
@@ -407,13 +449,23 @@ def _from_tables(path: Path, contents: Contents) -> Problem:
     return _explained(f"{path}", Problem, system, experiments, parameters, **options)
 
 
+def _experiments(path: Path, contents: Contents, system: HybridSystem | None) -> tuple[Experiment, ...]:
+    """The experiments; without a system their observations are left out."""
+    experiments = []
+    for k, table in enumerate(contents.experiments, start=1):
+        where = f"{path}: experiments[{k}]"
+        known = frozenset(contents.parameters) | frozenset(table.parameter_map)
+        experiments.append(_explained(where, _experiment, path.parent, table, system, where, known))
+    return tuple(experiments)
+
+
 def _explained(where: str, build: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
     """Build something; what it says is wrong is said with the place in the problem file."""
     try:
         return build(*arguments, **named)
-    except InputError:
+    except (InputError, KeyboardInterrupt):
         raise
-    except Exception as error:
+    except BaseException as error:
         if user_place(error) is not None:
             raise InputError(f"{where}: {located(error)}.") from error
         if isinstance(error, (ValueError, TypeError)):
@@ -423,15 +475,11 @@ def _explained(where: str, build: Callable[..., Any], *arguments: Any, **named: 
 
 def _system(path: Path, table: ModelTable) -> HybridSystem:
     what = f"{path}: model"
-    if ".py" in table.name:
-        found = load_object(table.name, path.parent, what)
-    elif table.name in BUILT_IN:
+    if table.name in BUILT_IN:
         found = BUILT_IN[table.name]
     else:
-        raise InputError(
-            f"{what} {table.name!r} is not known; the built-in models are {', '.join(BUILT_IN)}, your own is given as "
-            "'file.py:object'."
-        )
+        _check_model_name(what, table)
+        found = load_object(table.name, path.parent, what)
     if callable(found):
         found = call(found, f"{what} {table.name!r}", **_accepted(found, table, what))
     elif table.arguments:
@@ -442,6 +490,14 @@ def _system(path: Path, table: ModelTable) -> HybridSystem:
             f"got {type(found).__name__}."
         )
     return found
+
+
+def _check_model_name(what: str, table: ModelTable) -> None:
+    if ".py" not in table.name:
+        raise InputError(
+            f"{what} {table.name!r} is not known; the built-in models are {', '.join(BUILT_IN)}, your own is given as "
+            "'file.py:object'."
+        )
 
 
 def _accepted(factory: Callable[..., Any], table: ModelTable, what: str) -> dict[str, Any]:
@@ -470,7 +526,7 @@ def _prior(table: PriorTable) -> Prior:
 
 
 def _experiment(
-    folder: Path, table: ExperimentTable, system: HybridSystem, where: str, parameters: frozenset[str]
+    folder: Path, table: ExperimentTable, system: HybridSystem | None, where: str, parameters: frozenset[str]
 ) -> Experiment:
     places = [f"{where}.data[{k}]" for k in range(1, len(table.data) + 1)]
     data = [
@@ -481,13 +537,14 @@ def _experiment(
     return Experiment(
         data=data,
         mode_sequence=tuple(table.mode_sequence),
-        transition_times=tuple(_parameter(tau, unit="s") for tau in table.transition_times),
+        transition_times=tuple(_parameter(tau) for tau in table.transition_times),
         t0=min(span[0] for span in spans) if table.t0 is None else table.t0,
         tf=max(span[-1] for span in spans) if table.tf is None else table.tf,
         inputs=None if table.inputs is None else _explained(f"{where}.inputs", _input, folder, table.inputs),
         initial_state=_initial_state(table),
         parameter_map=table.parameter_map,
         name=table.name,
+        time_unit=table.time_unit,
     )
 
 
@@ -501,7 +558,7 @@ def _initial_state(table: ExperimentTable) -> list[Parameter] | list[float] | No
 
 
 def _data(
-    folder: Path, table: DataTable, system: HybridSystem, where: str, parameters: frozenset[str]
+    folder: Path, table: DataTable, system: HybridSystem | None, where: str, parameters: frozenset[str]
 ) -> Measurements | ReferenceSignal:
     observe = _observe(folder, table, system, where)
     names = tuple(table.observe) if isinstance(table.observe, list) else tuple(table.columns)
@@ -572,11 +629,14 @@ def _log(folder: Path, table: LogTable, more: Sequence[str] = ()) -> tuple[Float
     return (rows[:, 0] - table.time_offset) * table.time_scale, rows[:, 1:]
 
 
-def _observe(folder: Path, table: DataTable, system: HybridSystem, where: str) -> Callable[..., Any] | None:
-    """The observation h(t, x, p), or None for the whole state."""
+def _observe(folder: Path, table: DataTable, system: HybridSystem | None, where: str) -> Callable[..., Any] | None:
+    """The observation h(t, x, p), or None for the whole state, and where there is no system to observe."""
     if table.observe is None:
         return None
     if isinstance(table.observe, str):
+        if system is None:
+            find_object(table.observe, folder, f"{where}.observe")
+            return None
         observe = load_object(table.observe, folder, f"{where}.observe")
         if not callable(observe):
             raise ValueError(f"observe {table.observe!r} must be a function h(t, x, p); got {type(observe).__name__}.")
@@ -585,6 +645,8 @@ def _observe(folder: Path, table: DataTable, system: HybridSystem, where: str) -
         raise ValueError(
             f"observe must name one state for each of the {len(table.columns)} columns; got {table.observe}."
         )
+    if system is None:
+        return None
     if system.state_names is None:
         raise ValueError("observe names states, but the model has no state_names; give it some.")
     unknown = [name for name in table.observe if name not in system.state_names]

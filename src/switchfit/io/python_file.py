@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from switchfit.io.errors import InputError, first_line
+from switchfit.io.files import is_regular
 
 
 def load_object(reference: str, folder: Path, what: str) -> Any:
@@ -28,12 +29,7 @@ def load_object(reference: str, folder: Path, what: str) -> Any:
     InputError
         If the file or the object is missing, or running the file raises.
     """
-    file, colon, name = reference.rpartition(":")
-    if not colon or not file.endswith(".py") or not name.isidentifier():
-        raise InputError(f"{what} must be given as 'file.py:object'; got {reference!r}.")
-    path = folder / file
-    if not path.is_file():
-        raise InputError(f"{what} {reference!r}: there is no file {path}.")
+    path, name = find_object(reference, folder, what)
     module = _run(path)
     if not hasattr(module, name):
         public = [key for key in vars(module) if not key.startswith("_")]
@@ -41,13 +37,35 @@ def load_object(reference: str, folder: Path, what: str) -> Any:
     return getattr(module, name)
 
 
+def find_object(reference: str, folder: Path, what: str) -> tuple[Path, str]:
+    """The file and the name that ``"file.py:object"`` stands for; the file is not run.
+
+    Parameters
+    ----------
+    reference, folder, what : as of `load_object`
+
+    Raises
+    ------
+    InputError
+        If it is written in another way, or the file is missing.
+    """
+    file, colon, name = reference.rpartition(":")
+    if not colon or not file.endswith(".py") or not name.isidentifier():
+        raise InputError(f"{what} must be given as 'file.py:object'; got {reference!r}.")
+    path = folder / file
+    if not is_regular(path):
+        raise InputError(f"{what} {reference!r}: there is no file {path}.")
+    return path, name
+
+
 def call(function: Any, what: str, **arguments: Any) -> Any:
     """Call a user's factory; InputError says where it failed."""
     try:
-        return function(**arguments)
-    except InputError:
+        with _double_precision():
+            return function(**arguments)
+    except (InputError, KeyboardInterrupt):
         raise
-    except Exception as error:
+    except BaseException as error:  # whatever a user's file raises, SystemExit among it
         raise InputError(f"{what} failed: {located(error)}.") from error
 
 
@@ -78,6 +96,13 @@ def user_place(error: BaseException | None) -> str | None:
     return f"{_files[frame.filename]}, line {frame.lineno}{inside}"
 
 
+def _double_precision() -> Any:
+    """Context in which what a file makes with jax.numpy is as precise as what it computes with later."""
+    import jax  # here, since a file that is only read needs none of it
+
+    return jax.enable_x64(True)
+
+
 #: Every file that was run, absolute -> as the user named it.
 _files: dict[str | None, Path] = {}
 
@@ -99,8 +124,11 @@ def _run(path: Path) -> Any:
     sys.modules[module.__name__] = module
     sys.path.insert(0, str(path.parent))
     try:
-        specification.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
+        with _double_precision():
+            specification.loader.exec_module(module)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
         raise InputError(f"Running {path} failed: {located(error)}.") from error
     finally:
         sys.path.remove(str(path.parent))

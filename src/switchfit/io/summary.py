@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from switchfit.data import Measurements, ReferenceSignal
 from switchfit.experiment import Experiment
+from switchfit.parameter import unit_suffix
 from switchfit.problem import Problem
 
 
@@ -16,10 +19,7 @@ def describe(problem: Problem) -> str:
     ----------
     problem : Problem
     """
-    lines = []
-    for k, experiment in enumerate(problem.experiments, start=1):
-        lines.append(f"Experiment {k}{f' ({experiment.name})' if experiment.name else ''}")
-        lines += [f"  {line}" for line in _experiment_lines(experiment)]
+    lines = [describe_experiments(problem.experiments)]
     unknowns = problem.unknowns
     width = max(len(name) for name in unknowns.names)
     lines.append("Unknowns, first guess and bounds")
@@ -33,32 +33,48 @@ def describe(problem: Problem) -> str:
     return "\n".join(lines)
 
 
+def describe_experiments(experiments: Sequence[Experiment]) -> str:
+    """Modes, horizon and data of experiments as text.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+    """
+    lines = []
+    for k, experiment in enumerate(experiments, start=1):
+        lines.append(f"Experiment {k}{f' ({experiment.name})' if experiment.name else ''}")
+        lines += [f"  {line}" for line in _experiment_lines(experiment)]
+    return "\n".join(lines)
+
+
 def _experiment_lines(experiment: Experiment) -> list[str]:
+    unit = unit_suffix(experiment.time_unit)
     times = ", ".join(f"{t:.6g}" for t in experiment.initial_times)
-    lines = [f"{' -> '.join(experiment.mode_sequence)} on [{experiment.t0:.6g}, {experiment.tf:.6g}] s, at {times} s"]
+    sequence, horizon = " -> ".join(experiment.mode_sequence), f"[{experiment.t0:.6g}, {experiment.tf:.6g}]{unit}"
+    lines = [f"{sequence} on {horizon}, at {times}{unit}" if times else f"{sequence} on {horizon}"]
     for item in experiment.data:
         if isinstance(item, Measurements):
             step = np.median(np.diff(item.times)) if len(item.times) > 1 else np.nan
             missing = item.values.size - item.count
             lines.append(
                 f"{len(item.times)} samples of {_names(item.names, item.values.shape[1])}, "
-                f"{item.times[0]:.6g} to {item.times[-1]:.6g} s, typically {step:.4g} s apart, {missing} values missing"
-                f"{_sensor(item)}"
+                f"{item.times[0]:.6g} to {item.times[-1]:.6g}{unit}, typically {step:.4g}{unit} apart, "
+                f"{missing} values missing{_sensor(item, unit)}"
             )
         elif isinstance(item, ReferenceSignal):
             knots = item.signal.knots
             names = _names(item.names, item.signal.channels)
-            lines.append(f"reference signal of {names}, {knots[0]:.6g} to {knots[-1]:.6g} s, {len(knots)} knots")
+            lines.append(f"reference signal of {names}, {knots[0]:.6g} to {knots[-1]:.6g}{unit}, {len(knots)} knots")
         else:
             lines.append(type(item).__name__)
     return lines
 
 
-def _sensor(item: Measurements) -> str:
+def _sensor(item: Measurements, unit: str) -> str:
     """What is to be said of delay, noise and loss, where there is anything."""
     named = sorted({name for name in item.sigma_names if name})
     said = [
-        f"late by {item.delay}" if item.delay else "",
+        f"late by {item.delay}{'' if isinstance(item.delay, str) else unit}" if item.delay else "",
         "noise unknown" if item.sigma is None else "",
         f"sigma: {', '.join(named)}" if named else "",
         f"loss {item.loss} ({item.loss_scale:g} sigma)" if item.loss != "linear" else "",

@@ -29,14 +29,16 @@ from switchfit.native.kernels import (
     STAGES,
     START,
     START_BACK,
+    STATES,
     Adaptive,
     Sizes,
 )
 from switchfit.native.llvm import BUDGET, Module, literal
+from switchfit.native.scalars import CHECKED
 
 POINTERS = (
     *("nodes", "signals", "c", "p", "tau", "first_cell", "states", "tangents", "stages", "stage_tangents", "jumps"),
-    *("units", "psi", "J", "g", "H", "reset_states", "reset_tangents", "entries", "length"),
+    *("units", "psi", "J", "g", "H", "reset_states", "reset_tangents", "entries", "length", CHECKED),
 )
 """What the driver finds in its table of pointers; then four for each Measurements: cell, time, value, weight."""
 
@@ -366,10 +368,8 @@ class Driver:
                 "x": self.at(found["reset_states"], i * n),
                 "Z": self.at(found["reset_tangents"], i * n * width),
             }
-        last = {}
-        if structure.terminal:
-            state = self.let(f"add i64 %cells, {N}")
-            last = {"x": self.at(found["states"], state, n), "Z": self.at(found["tangents"], state, n * width)}
+        state = self.let(f"add i64 %cells, {N}")
+        last = {"x": self.at(found["states"], state, n), "Z": self.at(found["tangents"], state, n * width)}
         # Straight lines, which are called with their pointers, and loops, which say whether they came to their end.
         phases: list[str | tuple[str, tuple[str, ...], dict[str, str]]] = [("start", START, found | befores[0])]
         for i, mode in enumerate(structure.mode_of_segment):
@@ -377,6 +377,7 @@ class Driver:
                 behind = {"x_after": afters[i]["x"], "Z_after": afters[i]["Z"]}
                 phases.append((f"reset_{i - 1}", RESET, found | befores[i] | behind))
             phases.append(f"forward_{mode}({spans[i]}, ptr %progress, ptr {afters[i]['x']}, ptr {afters[i]['Z']})")
+            phases.append(("check_state", STATES, found | (befores[i + 1] if i < N else last)))
         for k in range(len(structure.measurements)):
             phases.append(f"samples_{k}(ptr %table, i64 %count_{k}, ptr %progress)")
         if structure.terminal:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from switchfit.native.driver import POINTERS, Driver
 from switchfit.native.kernels import STAGES, Sizes
+from switchfit.native.scalars import CHECKED
 
 MAJOR, MINOR = 0, 1
 """Version of the interface."""
@@ -26,7 +27,7 @@ def workspace(sizes: Sizes, cells: int, samples: bool) -> dict[str, int]:
     """Lengths of the results of the operation; the first is what it is for."""
     n, N, D, width, rows = sizes.n, sizes.N, sizes.D, sizes.width, cells + sizes.N
     return {
-        "psi": n + 1 + width + D * width,
+        "psi": n + 2 + width + D * width,
         "states": (rows + 1 + N) * n,
         "tangents": (rows + 1) * n * width,
         "stages": rows * STAGES * n,
@@ -77,6 +78,7 @@ def handler(driver: Driver) -> str:
         "J": driver.at(found["psi"], n),
         "g": driver.at(found["psi"], n + 1),
         "H": driver.at(found["psi"], n + 1 + width),
+        CHECKED: driver.at(found["psi"], n + 1 + width + D * width),
         "reset_states": driver.at(found["states"], behind, n),
     }
     for k, name in enumerate(POINTERS):
@@ -88,7 +90,7 @@ def handler(driver: Driver) -> str:
             driver.line(f"store ptr {pointer}, ptr {driver.at('%table', len(POINTERS) + 4 * k + m)}")
         counts += f", i64 {driver.let(f'load i64, ptr {dimensions}')}"
     jumps = driver.let(f"load i64, ptr {shapes['jumps']}")
-    for name, length in (("psi", str(n + 1 + width + D * width)), ("jumps", jumps)):
+    for name, length in (("psi", str(n + 2 + width + D * width)), ("jumps", jumps)):
         size = driver.let(f"mul i64 {length}, 8")
         driver.line(f"call void @llvm.memset.p0.i64(ptr {found[name]}, i8 0, i64 {size}, i1 false)")
     first = driver.let(f"load double, ptr {found['nodes']}")

@@ -24,7 +24,7 @@ from scipy.integrate import RK45
 
 from switchfit.model import Arguments, Model, Piece, Samples, Structure
 from switchfit.native.llvm import Module
-from switchfit.native.scalars import Graph, Node, Objects, Template, as_objects
+from switchfit.native.scalars import CHECKED, Graph, Node, Objects, Template, as_objects
 from switchfit.native.trace import traced
 from switchfit.rungekutta import EXPLICIT
 
@@ -73,6 +73,9 @@ class Sizes:
         """Stages that one function adds to the Hessian: all of a row, unless the function became too long."""
         return STAGES if self.n * self.D <= SHORT else 1
 
+
+LARGE = 1e200
+"""States beyond 1e308 / LARGE count as infinite."""
 
 SHORT = 100
 """Products of a row with a vector that are written out for each stage."""
@@ -125,6 +128,7 @@ class Kernels:
         time, y, Y      a moment, what the sensors see then, and its derivative
         moment          (t, first node of the cell), for the adaptive solver; its y is (x, running cost)
         entries         second derivatives at the stages of a row, (s, count)
+        check           not a number once something was not finite that had been presumed so, else 0
     """
 
     def __init__(self, structure: Structure, sizes: Sizes, order: int, module: Module) -> None:
@@ -263,7 +267,7 @@ class Kernels:
             X_j = x + h * _combined(a[j], K) if any(a[j]) else x
             t_j = start + c[j] * h
             given = (t_j, X_j, p, w, nothing, origin, signal, *constants)
-            f, ell = stage(graph, *given, only=(F, ELL))
+            f, ell = stage(graph, *given, only=(F, ELL), checked=self.order == 0)
             if self.order > 0:
                 stores += _stored("X", j * n, X_j)
             cost = cost + b[j] * ell.item()
@@ -284,6 +288,8 @@ class Kernels:
             stores += _stored("Z_after", 0, after_d + h_d * _combined(b, K) if end_row else after_d)
         if self.structure.running or self.structure.references:
             stores.append(("J", 0, graph.load("J", 0) + h * cost))
+        if self.order == 0:  # else the backward row checks
+            stores += graph.check()
         self.module.straight(name, FORWARD, stores)
 
     def backward_row(self, name: str, stage: Template, end_row: bool) -> list[tuple[int, int]]:
@@ -313,7 +319,9 @@ class Kernels:
             X_j, t_j = graph.loads("X", n, j * n), start + c[j] * h
             w = h * (b[j] * psi + _combined([row[j] for row in a], mu))
             given = (t_j, X_j, p, w, h * b[j], origin, signal, *constants)
-            g_t, mu[j], g_p, *second = stage(graph, *given, only=GRADIENT + (SECOND if self.second else ()))
+            g_t, mu[j], g_p, *second = stage(
+                graph, *given, only=GRADIENT + (SECOND if self.second else ()), checked=True
+            )
             gradient = gradient + g_p
             gradient_t[j] = g_t.item()
             if self.second:
@@ -344,7 +352,7 @@ class Kernels:
         for j in range(STAGES if self.second else 0):
             values = [found[j][key] for key in chosen] + [graph.constant(c[j])] * end_row
             stores += [("entries", j * len(values) + k, node) for k, node in enumerate(values)]
-        self.module.straight(name, BACKWARD, stores)
+        self.module.straight(name, BACKWARD, stores + graph.check())
         return chosen
 
     def curvature_function(self, name: str, chosen: list[tuple[int, int]], end_row: bool) -> None:
@@ -419,7 +427,7 @@ class Kernels:
         cost, *derivatives = at(graph, x, p, constants)
         stores = [("J", 0, graph.load("J", 0) + cost.item())]
         if self.order == 0:
-            self.module.straight(name, pointers, stores)
+            self.module.straight(name, pointers, stores + graph.check())
             return
         _, g_x, g_p, *second = derivatives
         stores += _stored(jump, 0, graph.loads(jump, self.sizes.n) + g_x)
@@ -429,7 +437,7 @@ class Kernels:
             none = graph.constant(0.0)
             along = [(none, [none] * self.sizes.D), *self.state_directions(graph, "Z")]
             stores += self.curved_once(graph, _entries(second, with_time=False), along)
-        self.module.straight(name, pointers, stores)
+        self.module.straight(name, pointers, stores + graph.check())
 
     def reset_functions(self, i: int) -> None:
         """A reset map, forward and backward."""
@@ -438,13 +446,15 @@ class Kernels:
         p, constants = self.inputs(graph)
         x, t = graph.loads("x", n), graph.load("tau", i)
         none = np.full(n, graph.constant(0.0), dtype=object)
-        (after,) = template(graph, t, x, p, none, *constants, only=(0,))
+        (after,) = template(graph, t, x, p, none, *constants, only=(0,), checked=self.order == 0)
         stores = _stored("x_after", 0, after)
         if self.second:
             R_t, R_x, R_p = template(graph, t, x, p, none, *constants, only=(1, 2, 3))
             Z = graph.loads("Z", n, vector=True)
             Z_after = R_x @ Z + _along(R_p, self.units(graph)) + R_t * graph.unit(i)
             stores += [("Z_after", k, _as_vector(graph, v)) for k, v in enumerate(Z_after)]
+        if self.order == 0:
+            stores += graph.check()
         self.module.straight(f"reset_{i}", RESET, stores, seen=True)
         if self.order == 0:
             return
@@ -452,14 +462,14 @@ class Kernels:
         graph = Graph()
         p, constants = self.inputs(graph)
         x, t, psi = graph.loads("x", n), graph.load("tau", i), graph.loads("psi", n)
-        g_t, g_x, g_p, *second = template(graph, t, x, p, psi, *constants, only=range(4, 13))
+        g_t, g_x, g_p, *second = template(graph, t, x, p, psi, *constants, only=range(4, 13), checked=True)
         g = graph.load("g", 0, vector=True) + _along(g_p, self.units(graph)) + g_t.item() * graph.unit(i)
         stores = [*_stored("psi", 0, g_x), ("g", 0, g)]
         if self.second:
             numbers = [graph.constant(float(d == i)) for d in range(self.sizes.D)]
             along = [(graph.unit(i), numbers), *self.state_directions(graph, "Z")]
             stores += self.curved_once(graph, _entries(second, with_time=True), along)
-        self.module.straight(f"reset_back_{i}", RESET_BACK, stores)
+        self.module.straight(f"reset_back_{i}", RESET_BACK, stores + graph.check())
 
     def start_functions(self) -> None:
         """The initial state, forward and backward."""
@@ -467,12 +477,14 @@ class Kernels:
         graph = Graph()
         p, constants = self.inputs(graph)
         none = np.full(n, graph.constant(0.0), dtype=object)
-        (x,) = template(graph, p, none, *constants, only=(0,))
+        (x,) = template(graph, p, none, *constants, only=(0,), checked=self.order == 0)
         stores = _stored("x", 0, x)
         if self.second:
             (x_p,) = template(graph, p, none, *constants, only=(1,))
             Z = _along(x_p, self.units(graph))
             stores += [("Z", k, _as_vector(graph, v)) for k, v in enumerate(Z)]
+        if self.order == 0:
+            stores += graph.check()
         self.module.straight("start", START, stores, seen=True)
         if self.order == 0:
             return
@@ -482,13 +494,28 @@ class Kernels:
         psi = graph.loads("psi", n)
         if self.has_samples:
             psi = psi + graph.loads("jump", n)
-        g_p, g_pp = template(graph, p, psi, *constants, only=(2, 3))
+        g_p, g_pp = template(graph, p, psi, *constants, only=(2, 3), checked=True)
         units = self.units(graph)
         stores = [("g", 0, graph.load("g", 0, vector=True) + _along(g_p, units))]
         if self.second:
             rows = [(N + k, graph.load("H", N + k, vector=True), _along(g_pp[k], units)) for k in range(len(units))]
             stores += [("H", d, row + more) for d, row, more in rows]
-        self.module.straight("start_back", START_BACK, stores)
+        self.module.straight("start_back", START_BACK, stores + graph.check())
+
+    def state_function(self) -> None:
+        """Check that a state is finite, and so small that products of a few entries do not overflow; and its tangents.
+
+        Products with zero have been left out without a look at it.
+        """
+        graph, n = Graph(), self.sizes.n
+        total = graph.load(CHECKED, 0)
+        for x in graph.loads("x", n):
+            total = total + graph.certain_product(0.0, x * LARGE)
+        if self.second:
+            for k in range(n):
+                for Z in graph.loads("Z", self.sizes.D, k * self.sizes.width):
+                    total = total + graph.certain_product(0.0, Z)
+        self.module.straight("check_state", STATES, [(CHECKED, 0, total)])
 
     def slope_function(self, name: str, stage: Template) -> None:
         """f and ell at one moment, for the adaptive solver: derivatives of y = (x, running cost so far)."""
@@ -498,8 +525,8 @@ class Kernels:
         signal = graph.loads("signal", 4 * self.sizes.signals)
         none = np.full(n, graph.constant(0.0), dtype=object)
         given = (t, graph.loads("y", n), p, none, graph.constant(0.0), origin, signal, *constants)
-        f, ell = stage(graph, *given, only=(F, ELL))
-        self.module.straight(name, SLOPE, _stored("K", 0, [*f, ell.item()]), seen=True)
+        f, ell = stage(graph, *given, only=(F, ELL), checked=True)
+        self.module.straight(name, SLOPE, _stored("K", 0, [*f, ell.item()]) + graph.check(), seen=True)
 
     def adaptive_functions(self) -> None:
         """What the adaptive solver does between its slopes: SciPy's RK45, with the same control of its steps.
@@ -569,7 +596,7 @@ class Kernels:
             model = self.model(constants)
 
             def seen(x: Any, p: Any) -> Any:
-                each = [model.observed(observe, t, x, p, q) for observe, q in self.structure.outputs]
+                each = [model.observed(observe, t, x, p) for observe, _ in self.structure.outputs]
                 return jnp.concatenate([jnp.zeros(0), *each])
 
             return [seen(x, p), *(jax.jacfwd(seen, argnums=(0, 1))(x, p) if self.second else ())]
@@ -577,28 +604,30 @@ class Kernels:
         template = traced(outputs, (), (self.sizes.n,), (self.sizes.M,), *self.sizes.constants, name="observe")
         graph = Graph()
         p, constants = self.inputs(graph)
-        y, *jacobians = template(graph, graph.load("time", 0), graph.loads("x", self.sizes.n), p, *constants)
+        given = graph.load("time", 0), graph.loads("x", self.sizes.n), p
+        y, *jacobians = template(graph, *given, *constants, checked=True)
         stores = _stored("y", 0, y)
         if self.second:
             h_x, h_p = jacobians
             y_d = h_x @ graph.loads("Z", self.sizes.n, vector=True) + _along(h_p, self.units(graph))
             stores += [("Y", k, _as_vector(graph, value)) for k, value in enumerate(y_d)]
-        self.module.straight("outputs", OUTPUTS, stores)
+        self.module.straight("outputs", OUTPUTS, stores + graph.check())
 
 
-FORWARD = ("c", "p", "row", "signal", "opens", "closes", "x", "Z", "X", "XZ", "x_after", "Z_after", "J")
-BACKWARD = ("c", "p", "row", "signal", "opens", "closes", "psi", "jump", "X", "XZ", "g", "entries", "length")
+FORWARD = ("c", "p", "row", "signal", "opens", "closes", "x", "Z", "X", "XZ", "x_after", "Z_after", "J", CHECKED)
+BACKWARD = ("c", "p", "row", "signal", "opens", "closes", "psi", "jump", "X", "XZ", "g", "entries", "length", CHECKED)
+STATES = ("x", "Z", CHECKED)
 LENGTH = ("opens", "closes", "length", "H")
 CURVATURE = ("entries", "opens", "closes", "XZ", "H")
-SLOPE = ("c", "p", "moment", "signal", "y", "K")
+SLOPE = ("c", "p", "moment", "signal", "y", "K", CHECKED)
 ADAPTIVE = ("state", "y", "argument", "K")
-START = ("c", "p", "x", "Z")
-START_BACK = ("c", "p", "psi", "jump", "g", "H")
-OUTPUTS = ("c", "p", "time", "x", "Z", "y", "Y")
-RESET = ("c", "p", "tau", "x", "Z", "x_after", "Z_after")
-RESET_BACK = ("c", "p", "tau", "x", "Z", "psi", "g", "H")
-SAMPLE = ("c", "p", "time", "value", "weight", "x", "Z", "jump", "J", "g", "H")
-END = ("c", "p", "x", "Z", "psi", "J", "g", "H")
+START = ("c", "p", "x", "Z", CHECKED)
+START_BACK = ("c", "p", "psi", "jump", "g", "H", CHECKED)
+OUTPUTS = ("c", "p", "time", "x", "Z", "y", "Y", CHECKED)
+RESET = ("c", "p", "tau", "x", "Z", "x_after", "Z_after", CHECKED)
+RESET_BACK = ("c", "p", "tau", "x", "Z", "psi", "g", "H", CHECKED)
+SAMPLE = ("c", "p", "time", "value", "weight", "x", "Z", "jump", "J", "g", "H", CHECKED)
+END = ("c", "p", "x", "Z", "psi", "J", "g", "H", CHECKED)
 
 F, F_T, F_X, F_P, ELL = range(5)
 SLOPES = tuple(range(8))

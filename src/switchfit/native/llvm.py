@@ -8,23 +8,20 @@ from __future__ import annotations
 import ctypes
 import ctypes.util
 import hashlib
-import os
 import re
 import struct
 import sys
-import tempfile
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import llvmlite
 import llvmlite.binding as llvm
 import numpy as np
 
-from switchfit.cache import usable_folder
+from switchfit.cache import read_code, usable_folder, write_code
 from switchfit.native.scalars import LOGIC, Node, needed
 
 INTRINSICS = {
@@ -256,11 +253,11 @@ def compiled(text: str) -> Program:
     machine = llvm.Target.from_default_triple().create_target_machine(cpu=name, features=features, opt=2)
     folder = usable_folder()
     path = None if folder is None else folder / f"native-{key}"
-    code = None if path is None else _read(path)
+    code = None if path is None else read_code(path)
     if code is None:
         code = _object_code(machine, text)
         if path is not None:
-            _write(path, code)
+            write_code(path, code)
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
@@ -275,26 +272,6 @@ def _object_code(machine: Any, text: str) -> bytes:
     while not wait([future], timeout=0.1).done:  # on Windows a wait without an end cannot be interrupted
         pass
     return future.result()
-
-
-def _write(path: Path, code: bytes) -> None:
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent)
-        with os.fdopen(handle, "wb") as file:
-            file.write(hashlib.sha256(code).digest() + code)
-        os.replace(name, path)
-    except OSError:
-        pass  # a cache that cannot be written is no reason to stop
-
-
-def _read(path: Path) -> bytes | None:
-    """The code in a file; None where there is none, or a damaged one, which would end the process."""
-    try:
-        content = path.read_bytes()
-    except OSError:
-        return None
-    check, code = content[:32], content[32:]
-    return code if hashlib.sha256(code).digest() == check else None
 
 
 @cache

@@ -22,6 +22,7 @@ from switchfit.native.driver import POINTERS, Driver
 from switchfit.native.frame import handler
 from switchfit.native.kernels import END, RESET, SAMPLE, SLOPE, STAGES, START, Kernels, Sizes, constants_of
 from switchfit.native.llvm import BUDGET, Module, Program, compiled
+from switchfit.native.scalars import CHECKED
 from switchfit.native.trace import Unsupported
 from switchfit.rungekutta import EXPLICIT
 
@@ -108,16 +109,21 @@ def _write(module: Module, structure: Structure, sizes: Sizes, order: int) -> No
 
         def sample(graph: Any, x: Any, p: Any, constants: Any, template: Any = template, q: int = q) -> Any:
             given = graph.load("time", 0), graph.loads("value", q), graph.loads("weight", q)
-            return template(graph, *given, x, p, *constants)
+            return template(graph, *given, x, p, *constants, checked=True)
 
         kernels.cost_function(f"sample_{k}", SAMPLE, sample, "jump")
         module.add(driver.samples(k, q))
     if structure.terminal:
         end = kernels.at_end()
-        kernels.cost_function("end", END, lambda graph, x, p, constants: end(graph, x, p, *constants), "psi")
+
+        def at_end(graph: Any, x: Any, p: Any, constants: Any) -> Any:
+            return end(graph, x, p, *constants, checked=True)
+
+        kernels.cost_function("end", END, at_end, "psi")
     for i in structure.resets:
         kernels.reset_functions(i)
     kernels.start_functions()
+    kernels.state_function()
     if order == 2:
         kernels.length_function()
     if order != 1:
@@ -208,7 +214,7 @@ class NativeExperiment:
         units[1:, :D] = np.eye(D)
         first, second = (rows if kept else 0 for kept in (order > 0, order == 2))
         self._theta, self._first_cell = np.zeros(D), np.zeros(N + 1, dtype=np.int64)
-        self._sums = np.zeros(n + 1 + width + D * width)
+        self._sums = np.zeros(n + 2 + width + D * width)
         lengths = {
             "states": (rows + 1) * n,
             "reset_states": N * n,  # behind the states
@@ -237,7 +243,8 @@ class NativeExperiment:
             "psi": self._sums,
             "J": self._sums[n:],
             "g": self._sums[n + 1 :],
-            "H": self._sums[n + 1 + width :],
+            "H": self._sums[n + 1 + width : -1],
+            CHECKED: self._sums[-1:],
         }
         self._named: dict[str, Any] = arrays
         self._arrays = [arrays.get(name, self._memory) for name in POINTERS]
@@ -247,12 +254,17 @@ class NativeExperiment:
         self._table = np.array([a.__array_interface__["data"][0] for a in self._arrays], dtype=np.uintp)
         self._address = self._table.ctypes.data
         self._progress = (ctypes.c_int64 * 3)()
-        self._result = self._sums[n + 1 : n + 1 + D], self._sums[n + 1 + width :].reshape(D, width)[:, :D]
+        self._result = self._sums[n + 1 : n + 1 + D], self._sums[n + 1 + width : -1].reshape(D, width)[:, :D]
 
-    def __call__(self, tau: FloatArray, p: FloatArray, side: float) -> tuple[float, FloatArray, FloatArray]:
-        """J, its gradient (D,) and its Hessian (D, D), NaN without it; as in `switchfit.evaluate.derivatives`."""
+    def __call__(self, tau: FloatArray, p: FloatArray, side: float) -> tuple[float, FloatArray, FloatArray] | None:
+        """J, its gradient (D,) and its Hessian (D, D), NaN without it; as in `switchfit.evaluate.derivatives`.
+
+        None if a presumption was wrong: then JAX has to do it.
+        """
         with self._workspace.lock:
             self._run(tau, p, side)
+            if self._presumed_wrongly:
+                return None
             g, H = self._result
             hessian = H.copy() if self.order == 2 else np.full(H.shape, np.nan)
             return float(self._sums[self.sizes.n]), g.copy(), hessian
@@ -262,19 +274,29 @@ class NativeExperiment:
         self(tau, p, 1.0)
         return lambda: self._in_pieces(self._evaluate, *self._scalars)
 
-    def cost(self, tau: FloatArray, p: FloatArray) -> float:
-        """J alone."""
+    @property
+    def _presumed_wrongly(self) -> bool:
+        """Whether a product with zero was left out whose other factor was not finite.
+
+        A cost that is not finite says enough as it is.
+        """
+        return bool(np.isnan(self._sums[-1])) and bool(np.isfinite(self._sums[self.sizes.n]))
+
+    def cost(self, tau: FloatArray, p: FloatArray) -> float | None:
+        """J alone; None if a presumption was wrong."""
         with self._workspace.lock:
             self._run(tau, p, 1.0)
-            return float(self._sums[self.sizes.n])
+            return None if self._presumed_wrongly else float(self._sums[self.sizes.n])
 
-    def simulated(self, tau: FloatArray, p: FloatArray) -> Simulated:
-        """States at all ends of rows, in second order with their derivatives."""
+    def simulated(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
+        """States at all ends of rows, in second order with their derivatives; None if a presumption was wrong."""
         with self._workspace.lock:
             return self._simulated(tau, p)
 
-    def _simulated(self, tau: FloatArray, p: FloatArray) -> Simulated:
+    def _simulated(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
         self._run(tau, p, 1.0)
+        if self._presumed_wrongly:
+            return None
         n, D, cells = self.sizes.n, self.sizes.D, self._scalars[0]
         firsts, lasts = self._first_cell.tolist(), [*self._first_cell[1:].tolist(), cells - 1]
         ends = zip(firsts, lasts, [*tau.tolist(), self._times[-1]], strict=True)
@@ -294,8 +316,11 @@ class NativeExperiment:
 
     def outputs(
         self, times: FloatArray, states: FloatArray, p: FloatArray, tangents: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """What all sensors see, (L, q), and, where the derivatives (L, n, D) of the states are given, its own."""
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """What all sensors see, (L, q), and, where the derivatives (L, n, D) of the states are given, its own.
+
+        None if a presumption was wrong.
+        """
         count, (n, D, width) = len(times), (self.sizes.n, self.sizes.D, self.sizes.width)
         y, Y = np.zeros((count, self._channels)), np.zeros((count, self._channels, width))
         Z = np.zeros((count, n, width) if tangents is not None else 0)
@@ -307,25 +332,26 @@ class NativeExperiment:
             types = [pointer, pointer, ctypes.c_int64, *[pointer] * 5]
             function = self._program.function(f"{self._prefix}all_outputs", *types)
             given = [np.ascontiguousarray(times), np.ascontiguousarray(states), Z, y, Y]
+            self._sums[-1] = 0.0
             self._in_pieces(function, count, *(a.ctypes.data for a in given))
+            if np.isnan(self._sums[-1]):
+                return None
         return y, Y[..., :D]
 
     def initial_state(self, p: FloatArray) -> FloatArray:
-        """x(t0): (n,)."""
+        """x(t0): (n,); NaN if a presumption was wrong."""
         self._theta[self.sizes.N :] = p
         x = np.zeros(self.sizes.n)
-        self._call("start", START, {"x": x})
-        return x
+        return x + self._call("start", START, {"x": x})
 
     def after_reset(self, i: int, t: float, x: FloatArray, p: FloatArray) -> FloatArray:
-        """State after the reset map of transition i (from 0): (n,)."""
+        """State after the reset map of transition i (from 0): (n,); NaN if a presumption was wrong."""
         self._theta[i], self._theta[self.sizes.N :] = t, p
         before, after = np.array(x, dtype=float), np.zeros(self.sizes.n)
-        self._call(f"reset_{i}", RESET, {"x": before, "x_after": after})
-        return after
+        return after + self._call(f"reset_{i}", RESET, {"x": before, "x_after": after})
 
     def slope(self, mode: int, t: float, y: FloatArray, p: FloatArray, cell: int | None = None) -> FloatArray:
-        """f and ell at t, y = (x, running cost so far): (n + 1,).
+        """f and ell at t, y = (x, running cost so far): (n + 1,); NaN if a presumption was wrong.
 
         With the signals of a cell; left out, of the one that holds t, or begins there.
         """
@@ -334,11 +360,12 @@ class NativeExperiment:
             cell = min(max(int(self._times.searchsorted(t, "right")) - 1, 0), len(self._times) - 2)
         moment, slope = np.array([t, self._times[cell]]), np.zeros(len(y))
         signal = self._named["signals"][cell]
-        self._call(f"slope_{mode}", SLOPE, {"moment": moment, "signal": signal, "y": y, "K": slope})
-        return slope
+        return slope + self._call(f"slope_{mode}", SLOPE, {"moment": moment, "signal": signal, "y": y, "K": slope})
 
     def adaptive_steps(self, mode: int, state: FloatArray, y: FloatArray, p: FloatArray, most: int) -> FloatArray:
         """Up to `most` steps of SciPy's RK45, from `state` and y, which change: the moments reached.
+
+        y is NaN if a presumption was wrong.
 
         They may be fewer, even none: after some work that takes milliseconds it returns, to be called again.
 
@@ -355,14 +382,21 @@ class NativeExperiment:
         types = [pointer, number, pointer, pointer, pointer, number, pointer]
         solve = self._program.function(f"{self._prefix}adaptive_{mode}_steps", *types)
         addresses = [a.ctypes.data for a in (state, y, times, count)]
+        self._sums[-1] = 0.0
         solve(self._address, self._scalars[0], *addresses[:3], most, addresses[3])
+        y += self._sums[-1]
         return times[: count[0]]
 
-    def _call(self, name: str, order: tuple[str, ...], given: dict[str, FloatArray]) -> None:
-        """One of the straight lines; what is not given it finds where the driver does."""
-        arrays = [given[key] if key in given else self._named.get(key) for key in order]
-        addresses = [None if a is None else a.ctypes.data for a in arrays]
+    def _call(self, name: str, order: tuple[str, ...], given: dict[str, FloatArray]) -> float:
+        """One of the straight lines; what is not given it finds where the driver does.
+
+        Returns 0, or NaN if a presumption was wrong.
+        """
+        check = np.zeros(1)
+        arrays = [given[key] if key in given else self._named.get(key) for key in order[:-1]]
+        addresses = [None if a is None else a.ctypes.data for a in (*arrays, check)]
         self._program.function(f"{self._prefix}{name}", *[ctypes.c_void_p] * len(order))(*addresses)
+        return float(check[0])
 
     def _run(self, tau: FloatArray, p: FloatArray, side: float) -> None:
         N = self.sizes.N

@@ -4,6 +4,10 @@ A node is an operation on earlier nodes. Equal operations are one node; sums wit
 gone before they exist, so that structural zeros of Jacobians and Hessians cost nothing. A node is a scalar or a vector
 with one entry for each unknown (the derivative of some scalar along theta); a scalar beside a vector stands for all its
 entries. A scalar is a double or a truth value, which do not mix.
+
+A product with zero is zero only if the other factor is finite, and it is left out before anybody knows. What can be
+infinite or not a number for finite arguments (`MAY_FAIL`) is therefore *presumed* finite where such a product is left
+out, and a program checks at run time what it presumed (`Graph.check`): JAX does the evaluation again if it was wrong.
 """
 
 from __future__ import annotations
@@ -66,6 +70,12 @@ FOLDED: dict[str, Callable[..., Any]] = {
 }
 """Every operation, with its value for numbers."""
 
+MAY_FAIL = frozenset(
+    {"div", "sqrt", "log", "log1p", "pow", "exp", "expm1", "exp2", "sinh", "cosh", "asin", "acos", "acosh", "atanh"}
+    | {"rem"}
+)
+"""Operations that are infinite or not a number for some finite arguments; sums and products that overflow aside."""
+
 COMPARISONS = ("lt", "le", "eq", "ne")
 """From doubles to a truth value."""
 
@@ -73,6 +83,10 @@ LOGIC = ("and", "or", "xor", "not")
 """From truth values to a truth value."""
 
 COMMUTATIVE = ("add", "mul", "eq", "ne", "and", "or", "xor", "max", "min")
+
+
+CHECKED = "check"
+"""Pointer to what is not a number once a presumption was wrong."""
 
 
 class Node:
@@ -151,11 +165,19 @@ def _is_truth(op: str, args: tuple[Any, ...]) -> bool:
 
 
 class Graph:
-    """Nodes in the order in which they can be computed."""
+    """Nodes in the order in which they can be computed.
+
+    Attributes
+    ----------
+    presumed : dict of index -> Node
+        What must be finite for the products with zero that were left out.
+    """
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
+        self.presumed: dict[int, Node] = {}
         self._known: dict[tuple[Any, ...], Node] = {}
+        self._finite: set[int] = set()
 
     def constant(self, number: Any) -> Node:
         """A number, or a truth value."""
@@ -191,6 +213,32 @@ class Graph:
             args = args[::-1]
         return self._node(op, args, any(a.vector for a in args))
 
+    def presume(self, node: Node) -> None:
+        """Note all that has to be finite for a node to be finite."""
+        pending = [node]
+        while pending:
+            each = pending.pop()
+            if each.index in self._finite or each.op in ("const", "load", "unit", "zeros") or each.truth:
+                continue
+            self._finite.add(each.index)
+            if each.op in MAY_FAIL and not (each.op == "div" and each.args[1].number):
+                if each.vector:  # a vector divided by a scalar
+                    self.presume(self.apply("div", 1.0, each.args[1]))
+                else:
+                    self.presumed[each.index] = each
+            pending += each.args
+
+    def certain_product(self, factor: float, node: Node) -> Node:
+        """The product as it is, without simplification."""
+        return self._node("mul", (self.constant(factor), node), node.vector)
+
+    def check(self) -> list[tuple[str, int, Node]]:
+        """A store that makes `CHECKED` not a number if anything presumed is not finite; none if nothing is."""
+        total = self.load(CHECKED, 0)
+        for node in self.presumed.values():
+            total = total + self.certain_product(0.0, node)
+        return [(CHECKED, 0, total)] if self.presumed else []
+
     def _simpler(self, op: str, args: tuple[Node, ...]) -> Node | None:
         a, b = args[0], args[-1]
         if op in ("add", "sub"):
@@ -205,6 +253,7 @@ class Graph:
         elif op == "mul":
             for this, other in ((a, b), (b, a)):
                 if this.number == 0.0:
+                    self.presume(other)
                     return this
                 if this.number == 1.0:
                     return other
@@ -213,7 +262,10 @@ class Graph:
                 if this.op == "neg":
                     return self.apply("neg", self.apply("mul", this.args[0], other))
         elif op == "div":
-            if a.number == 0.0 or b.number == 1.0:
+            if b.number == 1.0:
+                return a
+            if a.number == 0.0 and not b.vector:
+                self.presume(self.apply("div", 1.0, b))
                 return a
             if b.number is not None and math.frexp(b.number)[0] in (0.5, -0.5):
                 return self.apply("mul", a, 1.0 / b.number)
@@ -267,21 +319,31 @@ class Template:
     ----------
     inputs : list of arrays of nodes, which are loads from pointers "0", "1", ...
     outputs : list of arrays of nodes and numbers
+    presumed : nodes that have to be finite
     """
 
-    def __init__(self, outputs: Sequence[Objects]) -> None:
+    def __init__(self, outputs: Sequence[Objects], presumed: Sequence[Node] = ()) -> None:
+        self.presumed = list(presumed)
         self.shapes = [np.shape(a) for a in outputs]
         self._flat = [list(np.asarray(a, dtype=object).reshape(-1)) for a in outputs]
         self._needed: dict[tuple[int, ...], list[Node]] = {}
 
-    def __call__(self, graph: Graph, *inputs: Any, only: Sequence[int] | None = None) -> list[Objects]:
-        """The outputs (or `only` some, in the order asked for) for given inputs, arrays of nodes."""
+    def __call__(
+        self, graph: Graph, *inputs: Any, only: Sequence[int] | None = None, checked: bool = False
+    ) -> list[Objects]:
+        """The outputs (or `only` some, in the order asked for) for given inputs, arrays of nodes.
+
+        With `checked` the graph presumes what the template does, for whichever of its outputs.
+        """
         chosen = tuple(range(len(self._flat)) if only is None else only)
-        if chosen not in self._needed:
-            self._needed[chosen] = needed([v for k in chosen for v in self._flat[k] if isinstance(v, Node)])
+        presumed = self.presumed if checked else []
+        key = (*chosen, -1) if checked else chosen
+        if key not in self._needed:
+            wanted = [v for k in chosen for v in self._flat[k] if isinstance(v, Node)]
+            self._needed[key] = needed([*wanted, *presumed])
         given = [np.asarray(a, dtype=object).reshape(-1) for a in inputs]
         made: dict[int, Node] = {}
-        for node in self._needed[chosen]:
+        for node in self._needed[key]:
             if node.op == "load":
                 value = given[int(node.args[0])][node.args[1]]
                 made[node.index] = value if isinstance(value, Node) else graph.constant(value)
@@ -289,6 +351,8 @@ class Template:
                 made[node.index] = graph.constant(node.args[0])
             else:
                 made[node.index] = graph.apply(node.op, *(made[a.index] for a in node.args))
+        for node in presumed:
+            graph.presume(made[node.index])
         results = []
         for k in chosen:
             values = [made[v.index] if isinstance(v, Node) else graph.constant(v) for v in self._flat[k]]

@@ -68,7 +68,7 @@ def traced(function: Callable[..., Sequence[Any]], *shapes: tuple[int, ...], nam
             raise Unsupported("returns something else than float64")
     except Unsupported as error:
         raise Unsupported(f"{name} {error.what}", error.where) from error
-    return Template(outputs)
+    return Template(outputs, list(graph.presumed.values()))
 
 
 def _jaxpr_of(function: Callable[..., Sequence[Any]], structs: Sequence[Any]) -> Any:

@@ -1125,7 +1125,7 @@ def _feasible_start(problem: _Problem, theta: FloatArray) -> FloatArray:
     violated = np.flatnonzero(slack < -1e-12 * (size + np.finfo(float).tiny))
     if violated.size:
         worst = [f"{constraints.names[i]} (by {-slack[i]:.3g})" for i in violated[:5]]
-        raise ValueError(f"theta0 violates {', '.join(worst)}; start at a feasible point")
+        raise ValueError(f"The start violates {', '.join(worst)}; start at a feasible point.")
     return _move(problem, theta, np.zeros_like(theta))
 
 

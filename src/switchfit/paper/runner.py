@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import secrets
 import shutil
 import time
 from collections.abc import Mapping
@@ -12,7 +14,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, cast
 
-from switchfit.io.files import write_atomically
+from switchfit.io.errors import first_line
+from switchfit.io.files import set_aside, write_atomically
 from switchfit.paper import convergence, horizon, lti, magic, noise, trials
 from switchfit.paper.part import Found, Part, Row, Say
 
@@ -28,6 +31,8 @@ PARTS: Mapping[str, Part] = MappingProxyType(
     }
 )
 RESULTS, TABLE = "results.json", "table.md"
+FINISHED = ".finished-"
+"""How the name of the hidden folder begins when nothing in it is needed any more."""
 
 
 def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say | None = None) -> dict[str, Any]:
@@ -59,26 +64,29 @@ def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say | N
     Notes
     -----
     What is done is kept in a hidden folder in `out` until the run is complete. After an interruption (the exception is
-    KeyboardInterrupt then) the same call goes on from there.
+    KeyboardInterrupt then) the same call goes on from there. A file in it that is damaged is renamed, which is said in
+    a warning, and its part is computed again.
     """
     if only is not None and only not in PARTS:
         raise ValueError(f"there is no part {only!r}; the parts are {', '.join(PARTS)}.")
     tell = say or (lambda text: None)
     names = list(PARTS) if only is None else [only]
     unfinished = out / f".unfinished-{version('switchfit')}-{'quick' if quick else 'full'}-{only or 'all'}"
+    for left in out.glob(f"{FINISHED}*"):  # by a run that was killed while it tidied up
+        shutil.rmtree(left, ignore_errors=True)
     unfinished.mkdir(parents=True, exist_ok=True)
     results = _earlier(out / RESULTS) if only is not None else {}
     for number, name in enumerate(names, start=1):
         part, place = PARTS[name], f"[{number}/{len(names)}] {PARTS[name].TITLE}"
         kept = unfinished / f"{name}.json"
-        if kept.exists():
+        entry = _read_kept(kept)
+        if entry is not None:
             tell(f"{place}: done before the interruption")
-            entry = json.loads(kept.read_text(encoding="utf-8"))
         else:
             began = time.perf_counter()
             found = part.compute(quick, unfinished / name, lambda text, place=place: tell(f"{place}: {text}"))  # type: ignore[misc]  # mypy cannot infer the default
             entry = {"quick": quick, "seconds": round(time.perf_counter() - began, 1), "found": found}
-            write_atomically(json.dumps(entry), kept)
+            write_atomically(json.dumps({"entry": entry, "digest": _digest(entry)}), kept)
         results[name] = entry
         for title, figure in part.draw(entry["found"]).items():
             for kind in ("pdf", "png"):
@@ -86,7 +94,8 @@ def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say | N
     results = {name: results[name] for name in PARTS if name in results}
     write_atomically(_lines(results), out / RESULTS)
     write_atomically(table(results), out / TABLE)
-    shutil.rmtree(unfinished)
+    finished = unfinished.rename(out / f"{FINISHED}{secrets.token_hex(4)}")  # whole or not at all
+    shutil.rmtree(finished)
     return results
 
 
@@ -112,13 +121,43 @@ def _line(row: Row) -> str:
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |"
 
 
-def _earlier(path: Path) -> dict[str, Any]:
-    """Results of parts that were run before, if there are any that can be read."""
+def _read_kept(path: Path) -> dict[str, Any] | None:
+    """The entry of a part that was done before; None if there is none, or a damaged one, which is set aside."""
     try:
-        earlier = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        content = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    try:
+        kept = json.loads(content)
+        entry: dict[str, Any] = kept["entry"]
+        if kept["digest"] == _digest(entry):
+            return entry
+        reason = "its content is not what was written"
+    except (ValueError, LookupError, TypeError, RecursionError) as error:
+        reason = f"it cannot be read ({first_line(error)})"
+    set_aside(path, reason, "This part is computed again.")
+    return None
+
+
+def _digest(entry: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(entry).encode()).hexdigest()
+
+
+def _earlier(path: Path) -> dict[str, Any]:
+    """Results of parts that were run before; none if the file is missing, or damaged and therefore set aside."""
+    try:
+        earlier = json.loads(path.read_bytes())
+    except FileNotFoundError:
         return {}
-    return {name: entry for name, entry in earlier.items() if name in PARTS} if isinstance(earlier, dict) else {}
+    except (ValueError, RecursionError) as error:
+        set_aside(path, f"it is no valid JSON ({first_line(error)})", "The other parts have to be computed again.")
+        return {}
+    fields = {"quick": bool, "seconds": float, "found": dict}
+    for name, entry in earlier.items() if isinstance(earlier, dict) else [("", None)]:
+        if name not in PARTS or not isinstance(entry, dict) or {k: type(v) for k, v in entry.items()} != fields:
+            set_aside(path, f"{name!r} is no part with its results", "The other parts have to be computed again.")
+            return {}
+    return earlier
 
 
 def _save(figure: Any, path: Path) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from switchfit.data import FloatArray
 from switchfit.optimize import IterationRecord
-from switchfit.report.text import run_names, standard_errors_of, transitions_of, unit_of
+from switchfit.report.text import run_names, standard_errors_of, time_label, transitions_of, unit_of
 from switchfit.result import Fit
 from switchfit.simulate import Comparison, Trajectory
 
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 LARGEST_FIGURE = 10
 """Experiments that one figure shows."""
+LARGEST_DRAWN = 1e100
+"""Numbers beyond this overflow in matplotlib."""
 COLUMNS = 4
 """Experiments side by side."""
 
@@ -126,7 +128,7 @@ def plot_comparison(comparison: Comparison, trajectory: Trajectory, channel: int
     -------
     matplotlib.axes.Axes
     """
-    measured = comparison.measured[:, channel]
+    measured = _drawable(comparison.measured[:, channel])
     if comparison.kind == "measurements":
         ax.plot(comparison.times, measured, label="measured", zorder=3, **_dots(len(measured)))
         _mark_outliers(comparison, measured, channel, ax)
@@ -153,7 +155,7 @@ def plot_residuals(comparison: Comparison, trajectory: Trajectory, channel: int,
     -------
     matplotlib.axes.Axes
     """
-    residual = comparison.residuals[:, channel]
+    residual = _drawable(comparison.residuals[:, channel])
     ax.axhline(0.0, color=FIT, linewidth=1.0, zorder=2)
     if comparison.kind == "measurements":
         ax.plot(comparison.times, residual, zorder=3, **_dots(len(residual)))
@@ -162,7 +164,7 @@ def plot_residuals(comparison: Comparison, trajectory: Trajectory, channel: int,
         times, line = _broken(comparison.times, residual, trajectory)
         ax.plot(times, line, "-", color=REFERENCE, linewidth=1.0, zorder=3)
     if comparison.sigma is not None:
-        sigma = comparison.sigma[:, channel]
+        sigma = _drawable(comparison.sigma[:, channel])
         ax.plot(comparison.times, sigma, ":", color=TRANSITION, linewidth=1.0, zorder=2, label="± sigma")
         ax.plot(comparison.times, -sigma, ":", color=TRANSITION, linewidth=1.0, zorder=2)
     unit = unit_of(comparison.names[channel], trajectory)
@@ -451,8 +453,14 @@ def _mark_outliers(comparison: Comparison, values: FloatArray, channel: int, ax:
     )
 
 
+def _drawable(values: FloatArray) -> FloatArray:
+    """Values with NaN where they are too large for an axis, as a sigma of 1e308 is that takes a sample out."""
+    return np.where(np.abs(values) < LARGEST_DRAWN, values, np.nan)
+
+
 def _broken(times: FloatArray, values: FloatArray, trajectory: Trajectory) -> tuple[FloatArray, FloatArray]:
     """A curve over the trajectory's nodes with a gap at each transition, where a reset map may make it jump."""
+    values = _drawable(values)
     if len(times) != len(trajectory.times):
         return times, values
     inner = trajectory.segments[1:-1]
@@ -467,5 +475,5 @@ def _labelled(name: str, trajectory: Trajectory) -> str:
 def _time_axis(ax: Axes, trajectory: Trajectory) -> Axes:
     """The experiment's horizon, labelled."""
     ax.set_xlim(float(trajectory.times[0]), float(trajectory.times[-1]))
-    ax.set_xlabel("time (s)")
+    ax.set_xlabel(time_label(trajectory.time_unit))
     return ax

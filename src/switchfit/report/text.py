@@ -12,6 +12,7 @@ import scipy.special
 from switchfit.certificate import LARGE_INTEGRATION_ERROR, certify
 from switchfit.data import FloatArray
 from switchfit.identifiability import WEAK, Identifiability, after
+from switchfit.parameter import unit_suffix
 from switchfit.residuals import diagnose
 from switchfit.result import Certificate, Fit, disagreement, free_curvature
 from switchfit.simulate import Comparison, Trajectory
@@ -97,7 +98,9 @@ class Transition:
         The experiment's name; empty where there is only one.
     name : str
         As in `Fit.theta_names`.
-    time : float (s)
+    time : float
+    unit : str
+        That of the experiment's times.
     before, after : str
         The modes that it joins.
     index : int or None
@@ -108,6 +111,7 @@ class Transition:
     run: str
     name: str
     time: float
+    unit: str
     before: str
     after: str
     index: int | None
@@ -139,7 +143,9 @@ def transitions_of(fit: Fit) -> list[Transition]:
         modes = [mode for mode, _, _ in trajectory.mode_spans]
         prefix = f"{run}." if run else ""
         found += [
-            Transition(e, run, f"{prefix}tau_{i + 1}", float(times[i]), modes[i], modes[i + 1], where)
+            Transition(
+                e, run, f"{prefix}tau_{i + 1}", float(times[i]), trajectory.time_unit, modes[i], modes[i + 1], where
+            )
             for i, where in enumerate(places)
         ]
     return found
@@ -160,6 +166,11 @@ def unit_of(channel: str, trajectory: Trajectory) -> str:
     """The unit of a channel that is called like a state; "" for any other, and for a pure number."""
     units = dict(zip(trajectory.state_names, trajectory.state_units, strict=True))
     return _shown_unit(units.get(channel, ""))
+
+
+def time_label(unit: str) -> str:
+    """The label of an axis of times in a unit, such as "time (min)"."""
+    return f"time ({unit})" if _shown_unit(unit) else "time"
 
 
 def standard_errors_of(fit: Fit) -> FloatArray:
@@ -199,7 +210,8 @@ def _experiments(fit: Fit) -> Iterator[str]:
     names = ["experiment"] if single else run_names(fit)
     for name, trajectory, run in list(zip(names, fit.trajectories, fit.comparisons, strict=True))[:LISTED_EXPERIMENTS]:
         sequence = " -> ".join(mode for mode, _, _ in trajectory.mode_spans)
-        yield from _row(name, f"{sequence}, {trajectory.times[0]:.6g} to {trajectory.times[-1]:.6g} s")
+        horizon = f"{trajectory.times[0]:.6g} to {trajectory.times[-1]:.6g}{unit_suffix(trajectory.time_unit)}"
+        yield from _row(name, f"{sequence}, {horizon}")
         for comparison in run:
             yield from _row("", _data(comparison))
         if not run:
@@ -246,7 +258,8 @@ def _quality(fit: Fit) -> Iterator[str]:
         else:
             noise = f"so sigma is about {np.sqrt(variance):.4g}"
             yield from _row("residual variance", f"{variance:.4g}   ({origin}, {noise})")
-    yield from _row("integration error", f"{fit.integration_error:.1e}   (of J, relative, by halving all steps)")
+    of = fit.integration_error_of
+    yield from _row("integration error", f"{fit.integration_error:.1e}   (of {of}, relative, by halving all steps)")
 
 
 def _channels(fit: Fit) -> list[str]:
@@ -351,7 +364,8 @@ def _exponent(number: float) -> int:
 
 def _fixed(fit: Fit) -> list[str]:
     """Transition times and parameters that were not estimated."""
-    rows = [[t.name, f"{t.time:.8g}", "s", f"{t.before} -> {t.after}"] for t in transitions_of(fit) if t.index is None]
+    fixed = [t for t in transitions_of(fit) if t.index is None]
+    rows = [[t.name, f"{t.time:.8g}", _shown_unit(t.unit), f"{t.before} -> {t.after}"] for t in fixed]
     free = {name.partition("[")[0] for name in fit.theta_names}
     for name, value in fit.parameters.items():
         if name not in free:
@@ -492,8 +506,9 @@ def _integration(fit: Fit) -> Iterator[str]:
     """A trajectory that is not accurate enough."""
     if not fit.integration_error <= LARGE_INTEGRATION_ERROR:
         yield (
-            f"The integration error of the cost is {fit.integration_error:.1e}, relative: the numbers have fewer "
-            "digits than it seems. Give the Problem a smaller rtol, or solver='stiff' if a mode is stiff."
+            f"The integration error of {fit.integration_error_of} is {fit.integration_error:.1e}, relative: the "
+            "numbers have fewer digits than it seems. Give the Problem a smaller rtol, or solver='stiff' if a mode is "
+            "stiff."
         )
 
 

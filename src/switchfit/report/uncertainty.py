@@ -8,7 +8,7 @@ import numpy as np
 import scipy.special
 
 from switchfit.report.plot import LARGEST_FIGURE
-from switchfit.report.text import rounded
+from switchfit.report.text import rounded, time_label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -206,7 +206,11 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics) -> Figure:
         row[0].set_ylabel(f"{label}\nresidual / sigma" if channel.sigma_known else f"{label}\nresidual / rms")
     for ax, title in zip(axes[0], ("Residuals in time", "Autocorrelation", "Quantiles"), strict=True):
         ax.set_title(title)
-    for ax, label in zip(axes[-1], ("time (s)", "lag (samples)", "normal quantile"), strict=True):
+    for k, ax in enumerate(axes[:, 0]):  # below all rows, or wherever the next row has times in another unit
+        unit = shown[k][1].time_unit
+        if k + 1 == len(shown) or shown[k + 1][1].time_unit != unit:
+            ax.set_xlabel(time_label(unit))
+    for ax, label in zip(axes[-1, 1:], ("lag (samples)", "normal quantile"), strict=True):
         ax.set_xlabel(label)
     return figure
 

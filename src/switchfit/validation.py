@@ -1,0 +1,499 @@
+"""Checks of what users hand over: each function returns the value in the form the code works with, or raises.
+
+Every public constructor, function and method passes its arguments through here, so that a mistake ends in one sentence
+where it was made, and not in an error of NumPy or JAX somewhere inside. A message says which argument of what, what
+was given (shortened, `shown`) and what is wanted.
+
+- `TypeError` for a wrong type, `ValueError` for a wrong value. Text where a number is wanted is a wrong value, as it is
+  for ``float("x")``.
+- Numbers are integers and floating-point numbers of Python, NumPy, JAX and pandas. Truth values, complex numbers,
+  text, dates and `None` are not numbers here, although NumPy would convert most of them.
+- Numbers of less than double precision are refused if reading them as doubles makes visible that they have changed
+  (`refuse_single_precision`).
+- Masked entries are missing samples, NaN, where missing samples are allowed; elsewhere they are refused.
+
+Problem files are validated with pydantic, Python calls are not. pydantic has no notion of arrays, precision, masks or
+dates, so that every field would need a validator of its own, which are the functions below; its errors are tables about
+a model class instead of a sentence about an argument; and it takes longer to import than all else that `import
+switchfit` may load.
+"""
+
+from __future__ import annotations
+
+import datetime
+import inspect
+import numbers
+import operator
+import os
+import reprlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import is_dataclass
+from decimal import Decimal
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn, TypeVar
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+T = TypeVar("T")
+
+ARRAY = "a number or an array of numbers"
+LARGEST_COUNT = 10**9
+LARGEST_SEED = 2**64 - 1
+MOST_DIMENSIONS = 8
+"""Depth of nested lists beyond which nothing is read: lists that contain themselves have no end."""
+LONGEST = 120
+"""Characters of a value that a message shows."""
+MOST_LISTED = 10
+"""Names that a message lists."""
+BLOCK = 4096
+"""Numbers of single precision whose texts are compared at once: a log that changes is refused in the first block."""
+
+_INTEGERS = (np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32, np.uint64)
+_EXACT: frozenset[type] = frozenset({int, float, np.float64, *_INTEGERS})
+"""Types that `numpy.array(..., dtype=float64)` reads as they are."""
+_TEXT = (str, bytes, bytearray)
+_DATES = (datetime.date, datetime.time, datetime.timedelta)
+
+
+# --- what messages show -----------------------------------------------------------------------------------------------
+
+
+class _Short(reprlib.Repr):
+    """Representations of bounded length, made in bounded time."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxlist = self.maxtuple = self.maxset = self.maxfrozenset = self.maxdeque = self.maxdict = 6
+        self.maxlevel = 4
+        self.maxstring = self.maxother = 60
+
+    def repr_int(self, x: int, level: int) -> str:
+        """Python refuses to write integers of more than 4,300 digits."""
+        return repr(x) if x.bit_length() <= 128 else f"an integer of {x.bit_length()} bits"
+
+    def repr_ndarray(self, x: Any, level: int) -> str:
+        array = np.asarray(x)
+        if array.size <= 8:
+            return self.repr1(array.tolist(), level)
+        return f"an array of shape {array.shape} ({array.dtype})"
+
+    def repr_instance(self, x: Any, level: int) -> str:
+        """A problem holds all its data: its type says enough."""
+        return (
+            f"<{type(x).__name__}>" if is_dataclass(x) and not isinstance(x, type) else super().repr_instance(x, level)
+        )
+
+    repr_ArrayImpl = repr_MaskedArray = repr_ndarray  # noqa: N815  # reprlib calls repr_<name of the type>
+
+
+_SHORT = _Short()
+
+
+def shown(value: Any) -> str:
+    """Return `value` as a message shows it: at most `LONGEST` characters, whatever it is."""
+    try:
+        text = " ".join(_SHORT.repr(value).split())
+    except Exception:  # a __repr__ of somebody else
+        text = f"an object of type {type(value).__name__}"
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+
+
+def listed(names: Iterable[Any]) -> str:
+    """Return names with commas between them, the first ten if there are more; 'none' for no names."""
+    every = list(names)
+    texts = [f"{name!s:.40}" for name in every[:MOST_LISTED]]
+    more = [f"... ({len(every)} in all)"] if len(every) > MOST_LISTED else []
+    return ", ".join(texts + more) or "none"
+
+
+# --- numbers ----------------------------------------------------------------------------------------------------------
+
+
+class _Door(NamedTuple):
+    """What a message about one argument needs.
+
+    Attributes
+    ----------
+    what : name of the argument
+    form : what it must be
+    given : all of it
+    missing : whether masked entries stand for missing samples
+    """
+
+    what: str
+    form: str
+    given: Any
+    missing: bool
+
+    def refuse(self, entry: Any, error: type[Exception] = TypeError, why: str = "") -> NoReturn:
+        """Raise `error` about one entry of what was given."""
+        inside = "" if entry is self.given else f", in which {shown(entry)} is not a number"
+        raise error(f"{self.what} must be {self.form}; got {shown(self.given)}{inside}{why}.")
+
+
+def as_array(value: Any, what: str, *, form: str = ARRAY, missing: bool = False) -> FloatArray:
+    """Return `value` as a new float64 array of any shape; NaN and infinities are allowed.
+
+    Parameters
+    ----------
+    value : number, array, or nested list or tuple of numbers
+    what : str
+        Name of the argument, for messages.
+    form : str, optional
+        What it must be, for messages.
+    missing : bool, optional
+        Whether masked entries become NaN; otherwise they are refused.
+
+    Raises
+    ------
+    TypeError
+        If something in it is not a number.
+    ValueError
+        For text, nested lists of different lengths, numbers beyond the range of doubles, masked entries, or numbers of
+        single precision that reading them as doubles changes.
+    """
+    if type(value) is np.ndarray and value.dtype == np.float64:
+        return np.array(value, dtype=np.float64)
+    door = _Door(what, form, value, missing)
+    exact = _exact(value, door, 0)
+    try:
+        with np.errstate(all="ignore"):
+            return np.array(exact, dtype=np.float64)
+    except OverflowError:
+        raise ValueError(
+            f"{what} must be {form} up to 1.8e308, the largest double; got {shown(value)}, which is larger."
+        ) from None
+    except ValueError:
+        raise ValueError(
+            f"{what} must be {form}; got {shown(value)}, whose rows differ in length or in shape."
+        ) from None
+
+
+def as_number(value: Any, what: str) -> float:
+    """Return `value` as a float; NaN and infinities are allowed."""
+    if type(value) is float:
+        return value
+    number = as_array(value, what, form="a number")
+    if number.size != 1:
+        raise ValueError(f"{what} must be a single number; got {shown(value)}.")
+    return float(number.item())
+
+
+def as_finite(value: Any, what: str) -> float:
+    """Return `value` as a finite float."""
+    number = as_number(value, what)
+    if not np.isfinite(number):
+        raise ValueError(f"{what} must be finite; got {number}.")
+    return number
+
+
+def as_positive(value: Any, what: str) -> float:
+    """Return `value` as a positive, finite float."""
+    number = as_number(value, what)
+    if not number > 0:
+        raise ValueError(f"{what} must be positive; got {number}.")
+    return as_finite(number, what)
+
+
+def as_level(value: Any, what: str = "level") -> float:
+    """Return a confidence level as a float between 0 and 1."""
+    number = as_number(value, what)
+    if not 0 < number < 1:
+        raise ValueError(f"{what} must lie between 0 and 1; got {number}.")
+    return number
+
+
+def as_count(value: Any, what: str, *, at_least: int = 0, at_most: int = LARGEST_COUNT) -> int:
+    """Return an integer of Python, NumPy or JAX as an int in the given range; floats are not taken for integers."""
+    try:
+        count = None if isinstance(value, (bool, np.bool_)) else operator.index(value)
+    except Exception:  # TypeError; JAX's tracers raise their own
+        count = None
+    if count is None or getattr(value, "dtype", None) == np.bool_:
+        raise TypeError(f"{what} must be a whole number (an int); got {shown(value)}.")
+    if count < at_least:
+        wanted = "must not be negative" if at_least == 0 else f"must be {at_least} or more"
+        raise ValueError(f"{what} {wanted}; got {shown(count)}.")
+    if count > at_most:
+        raise ValueError(f"{what} must be at most {at_most}; got {shown(count)}.")
+    return count
+
+
+def as_seed(value: Any, what: str = "seed") -> int:
+    """Return the seed of a random number generator."""
+    return as_count(value, what, at_most=LARGEST_SEED)
+
+
+def as_index(value: Any, what: str, size: int) -> int:
+    """Return an index from 0 to `size` - 1."""
+    try:
+        return as_count(value, what, at_most=size - 1)
+    except ValueError:
+        raise ValueError(f"{what} must lie in 0..{size - 1}; got {shown(value)}.") from None
+
+
+def _exact(value: Any, door: _Door, depth: int) -> Any:
+    """Return what `numpy.array` turns into float64 without changing a number: a number, an array, or nested lists."""
+    if type(value) in _EXACT:
+        return value
+    if depth > MOST_DIMENSIONS:
+        door.refuse(door.given, ValueError, f", which is nested more than {MOST_DIMENSIONS} deep")
+    if _is_pandas(value) and hasattr(value, "columns"):  # a DataFrame: its columns may differ in type
+        columns = [_exact(value.iloc[:, k], door, depth + 1) for k in range(len(value.columns))]
+        return np.stack(columns, axis=1) if columns else np.zeros((len(value), 0))
+    if hasattr(value, "__array__") and not isinstance(value, type):
+        return _exact_array(value, door, depth)
+    if isinstance(value, Sequence) and not isinstance(value, (*_TEXT, memoryview)):
+        kinds = set(map(type, value))
+        if kinds <= _EXACT:
+            return list(value)
+        if len(kinds) == 1 and issubclass(next(iter(kinds)), np.number):
+            return _exact_array(np.array(value), door, depth)
+        return [_exact(entry, door, depth + 1) for entry in value]
+    if isinstance(value, (numbers.Real, Decimal)) and not isinstance(value, bool):
+        try:
+            return float(value)
+        except OverflowError:
+            door.refuse(value, ValueError, ", which is beyond the largest double, 1.8e308")
+        except Exception:
+            door.refuse(value)
+    if isinstance(value, _DATES):
+        _refuse_dates(value, door)
+    if isinstance(value, _TEXT):
+        door.refuse(value, ValueError)
+    door.refuse(value, why=": give a list or an array" if isinstance(value, (Iterator, AbstractSet)) else "")
+
+
+def _exact_array(value: Any, door: _Door, depth: int) -> Any:
+    """Return an array, or whatever else has a dtype, as an array of integers or doubles."""
+    try:
+        array = _of_pandas(value) if _is_pandas(value) else np.asarray(np.ma.getdata(np.asanyarray(value)))
+    except Exception as error:
+        door.refuse(value, why=f", which NumPy cannot read ({type(error).__name__})")
+    if array.dtype.kind in "Mm":
+        _refuse_dates(value, door)
+    if array.dtype.kind == "O":
+        array = _exact(array.tolist(), door, depth + 1)
+    elif is_low_precision(array.dtype):
+        refuse_single_precision(value if isinstance(value, jax.Array) else array, door.what)
+        array = array.astype(np.float64)
+    elif array.dtype.kind not in "iuf":
+        door.refuse(value, ValueError if array.dtype.kind in "SUT" else TypeError, f" ({array.dtype})")
+    mask = np.ma.getmaskarray(value) if isinstance(value, np.ma.MaskedArray) else np.False_
+    if np.any(mask):
+        if not door.missing:
+            raise ValueError(
+                f"{door.what} must be {door.form}; got a masked array with {int(np.sum(mask))} masked entries. Leave "
+                "them out, or fill them in."
+            )
+        array = np.where(mask, np.nan, array)
+    return array
+
+
+def _is_pandas(value: Any) -> bool:
+    return type(value).__module__.partition(".")[0] == "pandas"
+
+
+def _of_pandas(value: Any) -> NDArray[Any]:
+    """Return a Series or an Index as an array, NA as NaN.
+
+    The types of pandas that know NA turn into arrays of objects, which hide that they were of single precision.
+    """
+    kind = getattr(getattr(value, "dtype", None), "numpy_dtype", None)
+    if kind is None or kind.kind not in "iuf":
+        return np.asarray(value)
+    gaps = bool(value.isna().any())
+    return np.asarray(value.to_numpy(dtype=np.float64 if gaps and kind.kind != "f" else kind, na_value=np.nan))
+
+
+def _refuse_dates(value: Any, door: _Door) -> NoReturn:
+    door.refuse(
+        value,
+        why=": dates and time differences are not supported. Give numbers in one unit, such as the seconds since the "
+        "start: (dates - dates[0]) / np.timedelta64(1, 's')",
+    )
+
+
+# --- single precision -------------------------------------------------------------------------------------------------
+
+
+def is_low_precision(dtype: Any) -> bool:
+    """Whether this is the dtype of floating-point numbers of less than double precision."""
+    return bool(np.dtype(dtype).itemsize < 8 and jax.dtypes.issubdtype(dtype, np.floating))
+
+
+def refuse_single_precision(value: Any, what: str) -> None:
+    """Raise if reading an array or a scalar of less than double precision as doubles changes a number.
+
+    A number passes if it equals the double that its shortest decimal text stands for: 0.5 and 3.0 do. The text of
+    ``float32(0.1)`` is 0.1, but the number is 0.10000000149011612, so that a fit would answer another question than the
+    one asked, with an error of 1e-8 that no check inside the fit can see.
+
+    Parameters
+    ----------
+    value : array or scalar of NumPy or JAX
+        Anything else, and any other dtype, passes.
+    what : str
+        Name of the argument, or of the constant.
+
+    Raises
+    ------
+    ValueError
+        With the first number that changes, and what to write instead.
+    """
+    dtype = getattr(value, "dtype", None)
+    if not isinstance(dtype, np.dtype) or not is_low_precision(dtype):
+        return
+    given = np.asarray(value).ravel()
+    wide = given.astype(np.float64)
+    doubtful = np.isfinite(wide)
+    if given.dtype == np.float32:
+        # Decimals of at most 6 digits, and integers up to 2**24, are their own shortest text: no need to write them.
+        with np.errstate(over="ignore", invalid="ignore"):
+            thousands = 1e3 * wide
+            short = (thousands == np.rint(thousands)) & (np.abs(thousands) <= 1e6)
+            whole = (wide == np.rint(wide)) & (np.abs(wide) <= 2**24)
+        doubtful &= ~(short | whole)
+    places = np.flatnonzero(doubtful)
+    for first in range(0, len(places), BLOCK):
+        here = places[first : first + BLOCK]
+        meant = _shortest_decimals(given[here])
+        if np.any(changed := meant != wide[here]):
+            k = int(np.argmax(changed))
+            advice = (
+                "JAX makes arrays of 32 bits unless it is told otherwise: write a list or a NumPy array in place of "
+                "the jnp array."
+                if isinstance(value, jax.Array)
+                else "Give doubles (float64); if the numbers really are of that precision, as those of a log may be, "
+                "write np.asarray(values, dtype=np.float64)."
+            )
+            raise ValueError(
+                f"{what} must be in double precision: {float(meant[k])!r} became {float(wide[here[k]])!r} "
+                f"({given.dtype.name}). {advice}"
+            )
+
+
+def _shortest_decimals(values: NDArray[Any]) -> FloatArray:
+    """Return the doubles that the shortest decimal texts of finite low-precision numbers (K,) stand for."""
+    if values.dtype in (np.float16, np.float32):
+        return values.astype(str).astype(np.float64)
+    kind, found = values.dtype.type, []  # bfloat16 and the like: NumPy does not know their shortest texts
+    for value in values:
+        texts = (float(f"{float(value):.{digits}e}") for digits in range(17))
+        found.append(next(decimal for decimal in texts if kind(decimal) == value))
+    return np.array(found)
+
+
+# --- everything else --------------------------------------------------------------------------------------------------
+
+
+def as_flag(value: Any, what: str) -> bool:
+    """Return a truth value of Python or NumPy as a bool; numbers are not taken for one."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise TypeError(f"{what} must be True or False; got {shown(value)}.")
+    return bool(value)
+
+
+def as_choice(value: Any, what: str, choices: Sequence[str]) -> Any:
+    """Return one of the strings `choices`."""
+    if isinstance(value, str) and value in choices:
+        return choices[choices.index(value)]
+    quoted = [repr(choice) for choice in choices]
+    few = f"{', '.join(quoted[:-1])} or {quoted[-1]}"
+    wanted = few if len(choices) <= 3 else f"one of {', '.join(choices)}"
+    error = ValueError if isinstance(value, str) else TypeError
+    raise error(f"{what} must be {wanted}; got {shown(value)}.")
+
+
+def as_name(value: Any, what: str, form: str = "a string") -> str:
+    """Return a string that is not empty."""
+    if not isinstance(value, str):
+        raise TypeError(f"{what} must be {form}; got {shown(value)}.")
+    if not value.strip():
+        raise ValueError(f"{what} must not be empty; got {shown(value)}.")
+    return str(value)
+
+
+def as_text(value: Any, what: str) -> str:
+    """Return a string, which may be empty."""
+    if not isinstance(value, str):
+        raise TypeError(f"{what} must be a string; got {shown(value)}.")
+    return str(value)
+
+
+def as_names(value: Any, what: str, form: str) -> tuple[str, ...]:
+    """Return a sequence of strings that are not empty and differ from each other."""
+    names = tuple(as_name(name, what, form) for name in as_sequence(value, what, form))
+    if len(set(names)) < len(names):
+        twice = next(name for k, name in enumerate(names) if name in names[:k])
+        raise ValueError(f"{what} must differ from each other; got {shown(twice)} twice.")
+    return names
+
+
+def as_sequence(value: Any, what: str, form: str) -> tuple[Any, ...]:
+    """Return the entries of a list, a tuple, an array or another sequence.
+
+    Raises
+    ------
+    TypeError
+        For text, and for what has no order or can be read only once: sets, dicts, generators.
+    """
+    if isinstance(value, _TEXT):
+        raise TypeError(f"{what} must be {form}; got the string {shown(value)}.")
+    if isinstance(value, (AbstractSet, Mapping, Iterator)):
+        raise TypeError(f"{what} must be {form}; got {shown(value)} ({type(value).__name__}): give a list or a tuple.")
+    try:
+        return tuple(value)
+    except Exception:  # TypeError; arrays without dimensions and others raise their own
+        raise TypeError(f"{what} must be {form}; got {shown(value)}.") from None
+
+
+def as_instance(value: Any, what: str, kind: type[T], form: str) -> T:
+    """Return `value` if it is an instance of `kind`, which messages call `form`."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{what} must be {form}; got {type(value).__name__}.")
+    return value
+
+
+def as_callable(value: Any, what: str, form: str, *, arguments: int | None = None) -> Callable[..., Any]:
+    """Return a function, which messages call `form`; a class is not taken for one.
+
+    Parameters
+    ----------
+    value : callable
+    what : str
+    form : str
+        Such as ``"a function h(t, x, p)"``.
+    arguments : int, optional
+        With how many it is called; checked as far as the signature is known.
+    """
+    if not callable(value) or isinstance(value, type):
+        given = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+        raise TypeError(f"{what} must be {form}; got {given}.")
+    if arguments is not None:
+        try:
+            signature = inspect.signature(value)
+        except Exception:  # functions written in C have none
+            return value
+        try:
+            signature.bind(*range(arguments))
+        except TypeError:
+            raise TypeError(
+                f"{what} must be {form}; got one that cannot be called with {arguments} argument(s): "
+                f"it takes {str(signature)[:LONGEST]}."
+            ) from None
+    return value
+
+
+def as_path(value: Any, what: str) -> Path:
+    """Return a path that is not empty."""
+    text = os.fspath(value) if isinstance(value, (str, os.PathLike)) else None
+    if not isinstance(text, str):
+        raise TypeError(f"{what} must be a path (a string or a pathlib.Path); got {shown(value)}.")
+    if not text.strip() or "\0" in text:
+        raise ValueError(f"{what} must be a path; got {shown(value)}.")
+    return Path(text)

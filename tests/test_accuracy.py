@@ -1,0 +1,109 @@
+"""What is said about the integration error: of every output that a problem contains, and against finer meshes."""
+
+from functools import cache
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import switchfit as sf
+from switchfit.evaluate import Evaluator
+from switchfit.paper.vehicle import TRUTH, simulated
+
+
+def pendulum(torque):
+    """Angle, angular velocity and a clock."""
+    return lambda t, x, p: jnp.stack([x[1], torque - jnp.sin(x[0]) - 0.1 * x[1] ** 2, 1.0 + 0 * x[0]])
+
+
+def fastest_swing(begin=0.0, **settings):
+    """From rest at 0 to rest at 2 rad in the shortest time: J is a clock, which every mesh integrates exactly."""
+    system = sf.HybridSystem(
+        {"push": pendulum(1.5), "brake": pendulum(-1.5), "done": lambda t, x, p: jnp.zeros(3)}, [0.0, 0.0, 0.0]
+    )
+    costs = [sf.TerminalCost(lambda x, p: x[2]), sf.TerminalConstraint(lambda x, p: jnp.stack([x[0] - 2.0, x[1]]))]
+    times = (begin + 3.0, begin + 4.0)
+    run = sf.Experiment(costs, ("push", "brake", "done"), times, begin, begin + 20.0)
+    return sf.Problem(system, run, **settings)
+
+
+@cache
+def swing():
+    return sf.estimate(fastest_swing())
+
+
+def misses(theta, begin=0.0):
+    """By how much the end is really missed: (angle, angular velocity)."""
+    return Evaluator(fastest_swing(begin, rtol=1e-13, atol=1e-15), theta).constrained(theta).constraints
+
+
+def test_the_mesh_is_refined_for_terminal_constraints():
+    fit = swing()
+    assert fit.success
+    np.testing.assert_allclose(misses(fit.theta), 0.0, rtol=0, atol=1e-8)
+    assert 1e-13 < fit.integration_error < 1e-8
+
+
+def test_the_error_that_is_reported_is_that_of_the_end():
+    """With a coarse mesh, what is reported is by how much the end is missed, over the range of angle or velocity."""
+    fit = sf.estimate(fastest_swing(rtol=1e-4, atol=1e-6))
+    ranges = np.ptp(fit.trajectory.states, axis=0)[:2]
+    errors = np.abs(misses(fit.theta) - [c for _, c, _ in fit.constraints]) / ranges
+    worst = int(np.argmax(errors))
+    assert fit.integration_error_of == f"terminal constraint {worst + 1}"
+    assert fit.integration_error == pytest.approx(errors[worst], rel=0.1)
+    assert f"{fit.integration_error:.1e}   (of terminal constraint {worst + 1}, relative" in str(fit)
+    assert f"{fit.integration_error:.1e} (terminal constraint {worst + 1})" in str(fit.certificate)
+    assert f"the integration error of terminal constraint {worst + 1} is" in fit.certificate.failures[0]
+
+
+def test_the_error_does_not_depend_on_where_time_begins():
+    theta = swing().theta
+    early, late = (
+        sf.estimate(fastest_swing(begin, rtol=1e-4), start=theta + begin, max_iterations=0) for begin in (0.0, 1024.0)
+    )
+    assert early.integration_error_of.startswith("terminal constraint")
+    assert late.integration_error_of == early.integration_error_of
+    assert late.integration_error == pytest.approx(early.integration_error, rel=1e-6)
+
+
+def test_the_mesh_is_refined_for_guards():
+    """J looks at the first state alone, which is a line; the guard hangs on a state that is not."""
+    fast = lambda t, x, p: jnp.stack([1.0 + 0 * x[0], p["w"] * x[2], -p["w"] * x[1]])  # noqa: E731
+    slow = lambda t, x, p: jnp.stack([0.1 + 0 * x[0], 0 * x[1], 0 * x[2]])  # noqa: E731
+    system = sf.HybridSystem({"a": fast, "b": slow}, [0.0, 0.0, 1.0], guards={("a", "b"): lambda t, x, p: x[1]})
+    w = 11.0
+    crossing = 6 * np.pi / w
+    data = sf.Measurements([0.5, 4.0], [[0.5], [crossing + 0.1 * (4.0 - crossing)]], lambda t, x, p: x[:1], sigma=0.1)
+    run = sf.Experiment(data, ("a", "b"), (1.7,), 0.0, 4.0)
+    loose = sf.Problem(system, run, {"w": sf.Parameter(w, fixed=True)}, rtol=1e-5, atol=1e-7)
+    fit = sf.estimate(loose)
+    assert fit.success
+    assert fit.integration_error_of == "guard of tau_1 (a -> b)"
+    assert 0.0 < fit.integration_error < 1e-5
+    assert 0.0 < abs(fit.theta[0] - crossing) < 1e-5
+
+
+# What the defaults promise: J to some 1e-8, its derivatives to some 1e-7, and the solution to 1e-8
+
+
+AWAY = np.array([0.03, 0.02, 0.001])
+
+
+@pytest.mark.parametrize("theta", [(5.0, 9.0, 0.8), (5.43, 9.27, 0.77), tuple(TRUTH + AWAY)])
+def test_default_tolerances_give_the_derivatives_to_about_1e_7(theta):
+    """The paper's problem on its reference of 0.1 s; the last theta is near the solution, where J almost vanishes."""
+    problem, theta = simulated(), np.array(theta)
+    found = Evaluator(problem, theta)(theta)
+    exact = Evaluator(problem, theta).divided(4)(theta)
+    error = np.linalg.norm(found.gradient - exact.gradient) / np.linalg.norm(exact.gradient)
+    assert 1e-9 < error < 2e-7
+    assert np.linalg.norm(found.hessian - exact.hessian) / np.linalg.norm(exact.hessian) < 1e-7
+
+
+def test_default_tolerances_give_the_solution_to_1e_8():
+    fit = sf.estimate(simulated())
+    exact = sf.estimate(sf.Problem(fit.problem.system, fit.problem.experiments, fit.problem.parameters, rtol=1e-12))
+    assert fit.success
+    assert exact.success
+    np.testing.assert_allclose(fit.theta, exact.theta, rtol=1e-8, atol=0)

@@ -1,0 +1,418 @@
+"""A problem sees what its functions read when it is built, and equal functions share compiled programs."""
+
+from __future__ import annotations
+
+import functools
+import math
+import types
+
+import cloudpickle
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import switchfit as sf
+from switchfit import functions, reads
+from switchfit.functions import trace_function
+
+SAMPLES = sf.Measurements([0.5, 1.0], [math.exp(-0.5), math.exp(-1.0)], sigma=0.1)
+
+
+def problem_of(f, observe=None, **settings):
+    data = SAMPLES if observe is None else sf.Measurements(SAMPLES.times, SAMPLES.values, observe=observe, sigma=0.1)
+    system = sf.HybridSystem({"fall": f}, [1.0], **settings)
+    return sf.Problem(system, sf.Experiment(data, ("fall",), (), 0.0, 1.0), {"a": 0.8})
+
+
+# What a function reads has changed: a way to read g, and a way to change it
+
+GLOBAL = {"g": 1.0}
+PLAIN = 1.0
+
+
+def by_global_dict():
+    def change():
+        GLOBAL["g"] = 2.0
+
+    GLOBAL["g"] = 1.0
+    return lambda t, x, p: -GLOBAL["g"] * p["a"] * x, change
+
+
+def by_global_number():
+    def change():
+        globals()["PLAIN"] = 2.0
+
+    globals()["PLAIN"] = 1.0
+    return lambda t, x, p: -PLAIN * p["a"] * x, change
+
+
+def by_closure():
+    g = 1.0
+
+    def f(t, x, p):
+        return -g * p["a"] * x
+
+    def change():
+        nonlocal g
+        g = 2.0
+
+    return f, change
+
+
+def by_array_in_place():
+    g = np.array([1.0])
+    return lambda t, x, p: -g * p["a"] * x, lambda: g.__setitem__(0, 2.0)
+
+
+def by_array_without_axes():
+    g = np.array(1.0)
+    return lambda t, x, p: -g * p["a"] * x, lambda: g.__setitem__((), 2.0)
+
+
+def by_nested_list():
+    g = {"gains": [0.0, [1.0]]}
+    return lambda t, x, p: -g["gains"][1][0] * p["a"] * x, lambda: g["gains"][1].__setitem__(0, 2.0)
+
+
+def by_default():
+    def f(t, x, p, g=1.0):
+        return -g * p["a"] * x
+
+    def change():
+        f.__defaults__ = (2.0,)
+
+    return f, change
+
+
+def by_attribute_of_the_function():
+    def f(t, x, p):
+        return -f.g * p["a"] * x
+
+    f.g = 1.0
+    return f, lambda: setattr(f, "g", 2.0)
+
+
+class Body:
+    gain = 1.0
+
+    def __init__(self):
+        self.g = 1.0
+
+    def f(self, t, x, p):
+        return -self.g * p["a"] * x
+
+    def __call__(self, t, x, p):
+        return -self.g * p["a"] * x
+
+
+def by_bound_method():
+    body = Body()
+    return body.f, lambda: setattr(body, "g", 2.0)
+
+
+def by_callable_object():
+    body = Body()
+    return body, lambda: setattr(body, "g", 2.0)
+
+
+def by_attribute_of_an_object():
+    body = Body()
+    return lambda t, x, p: -body.g * p["a"] * x, lambda: setattr(body, "g", 2.0)
+
+
+def by_attribute_of_a_class():
+    body = type("Body", (), {"g": 1.0})
+    return lambda t, x, p: -body.g * p["a"] * x, lambda: setattr(body, "g", 2.0)
+
+
+def by_module():
+    module = types.ModuleType("constants")
+    module.g = 1.0
+    return lambda t, x, p: -module.g * p["a"] * x, lambda: setattr(module, "g", 2.0)
+
+
+def by_partial():
+    gains = [1.0]
+
+    def f(gains, t, x, p):
+        return -gains[0] * p["a"] * x
+
+    return functools.partial(f, gains), lambda: gains.__setitem__(0, 2.0)
+
+
+def by_helper():
+    g = [1.0]
+
+    def gain():
+        return g[0]
+
+    def middle(x):
+        return gain() * x
+
+    return lambda t, x, p: -middle(p["a"] * x), lambda: g.__setitem__(0, 2.0)
+
+
+def by_jitted():
+    g = [1.0]
+    return jax.jit(lambda t, x, p: -g[0] * p["a"] * x), lambda: g.__setitem__(0, 2.0)
+
+
+def by_jitted_helper():
+    g = [1.0]
+    helper = jax.jit(lambda x: g[0] * x)
+    return lambda t, x, p: -helper(p["a"] * x), lambda: g.__setitem__(0, 2.0)
+
+
+def by_mapped_helper():
+    g = [1.0]
+    helper = jax.vmap(lambda x: g[0] * x)
+    return lambda t, x, p: -helper(p["a"] * x), lambda: g.__setitem__(0, 2.0)
+
+
+def by_global_lookup():
+    GLOBAL["g"] = 1.0
+    return lambda t, x, p: -globals()["GLOBAL"]["g"] * p["a"] * x, lambda: GLOBAL.__setitem__("g", 2.0)
+
+
+def by_inner_function():
+    g = [1.0]
+
+    def f(t, x, p):
+        def inner(y):
+            return sum(g[0] * y for _ in range(1))
+
+        return -inner(p["a"] * x)
+
+    return f, lambda: g.__setitem__(0, 2.0)
+
+
+WAYS = [
+    by_global_dict,
+    by_global_number,
+    by_closure,
+    by_array_in_place,
+    by_array_without_axes,
+    by_nested_list,
+    by_default,
+    by_attribute_of_the_function,
+    by_bound_method,
+    by_callable_object,
+    by_attribute_of_an_object,
+    by_attribute_of_a_class,
+    by_module,
+    by_partial,
+    by_helper,
+    by_jitted,
+    by_jitted_helper,
+    by_mapped_helper,
+    by_global_lookup,
+    by_inner_function,
+]
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_new_problem_sees_what_its_functions_see_now(way):
+    f, change = way()
+    old = problem_of(f)
+    assert sf.estimate(old).parameters["a"] == pytest.approx(1.0, abs=1e-8)
+    change()
+    new = sf.estimate(problem_of(f))
+    assert new.parameters["a"] == pytest.approx(0.5, abs=1e-8)
+    assert new.success
+
+
+def test_both_engines_see_it():
+    f, change = by_array_in_place()
+    old = problem_of(f)
+    change()
+    new = problem_of(f)
+    for problem in (old, new):
+        fast, slow = (sf.evaluate(problem, method=method).gradient for method in ("auto", "forward"))
+        np.testing.assert_allclose(fast, slow, rtol=1e-13)
+    assert abs(sf.evaluate(old).gradient - sf.evaluate(new).gradient) > 0.1
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_problem_keeps_its_functions_as_they_were_when_it_was_built(way):
+    f, change = way()
+    before = sf.evaluate(problem_of(f)).cost
+    old = problem_of(f)
+    change()
+    assert sf.evaluate(old).cost == before
+    assert sf.evaluate(problem_of(f)).cost != pytest.approx(before, rel=1e-3)
+
+
+OTHER = {"g": 1.0}
+
+
+@pytest.mark.parametrize(
+    "place",
+    ["observe", "reset", "guard", "running", "terminal", "constraint", "initial state", "reference"],
+)
+def test_every_kind_of_function_is_seen_anew(place):
+    def scaled(value):
+        return OTHER["g"] * value
+
+    system = sf.HybridSystem(
+        {"a": lambda t, x, p: -p["a"] * x, "b": lambda t, x, p: -0.5 * x},
+        (lambda p: scaled(jnp.ones(1))) if place == "initial state" else [1.0],
+        reset_maps={("a", "b"): lambda t, x, p: scaled(x)} if place == "reset" else {},
+        guards={("a", "b"): lambda t, x, p: scaled(x[0]) - 0.7} if place == "guard" else {},
+    )
+    times = np.linspace(0.0, 1.0, 9)
+    seen = (lambda t, x, p: scaled(x)) if place in ("observe", "reference") else None
+    data = [sf.Measurements(times, np.exp(-times), observe=seen if place == "observe" else None, sigma=0.1)]
+    if place == "running":
+        data = [sf.RunningCost(lambda t, x, p: scaled(x[0] ** 2))]
+    if place == "reference":
+        data = [sf.ReferenceSignal.from_samples(times, np.exp(-times), observe=seen)]
+    if place == "terminal":
+        data.append(sf.TerminalCost(lambda x, p: scaled(x[0] ** 2)))
+    if place == "constraint":
+        data.append(sf.TerminalConstraint(lambda x, p: scaled(x[0]) - 0.5))
+
+    def figures():
+        problem = sf.Problem(system, sf.Experiment(data, ("a", "b"), (0.4,), 0.0, 1.0), {"a": 0.8})
+        if place in ("guard", "constraint"):
+            return sf.estimate(problem).theta
+        return sf.evaluate(problem).gradient
+
+    OTHER["g"] = 1.0
+    before = figures()
+    OTHER["g"] = 1.1
+    after = figures()
+    OTHER["g"] = 1.0
+    again = figures()
+    assert not np.allclose(before, after, rtol=1e-3)
+    np.testing.assert_array_equal(before, again)
+
+
+def test_a_rule_for_derivatives_that_has_changed_is_another_function():
+    slope = [1.0]
+
+    def problem():
+        @jax.custom_jvp
+        def identity(x):
+            return x
+
+        identity.defjvp(lambda primals, tangents: (identity(*primals), slope[0] * tangents[0]))
+        return problem_of(lambda t, x, p: -identity(p["a"]) * x)
+
+    right = sf.evaluate(problem()).gradient
+    slope[0] = 2.0
+    np.testing.assert_allclose(sf.evaluate(problem()).gradient, 2 * right, rtol=1e-12)
+
+
+# The opposite: equal functions are one
+
+TRACED = []
+
+
+def test_functions_made_anew_share_their_programs():
+    def made(number):
+        rows = np.array([0])
+        return problem_of(lambda t, x, p: -number * p["a"] * x, observe=lambda t, x, p: x[rows])
+
+    one, other, different = made(1.0), made(1.0), made(np.nextafter(1.0, 2.0))
+    assert one.structures == other.structures
+    assert hash(one.structures) == hash(other.structures)
+    assert one.structures[0].modes[0] is other.structures[0].modes[0]
+    assert one.structures != different.structures
+
+
+def test_runs_with_functions_of_their_own_are_one_program():
+    system = sf.HybridSystem({"fall": lambda t, x, p: -p["a"] * x}, [1.0])
+    runs = [
+        sf.Experiment(
+            sf.Measurements([0.5, 1.0], [0.6, 0.4], observe=lambda t, x, p: x[:1], sigma=0.1), ("fall",), (), 0.0, 1.0
+        )
+        for _ in range(10)
+    ]
+    problem = sf.Problem(system, runs, {"a": 1.0})
+    assert problem.alike == (tuple(range(10)),)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda x, p: x - p["a"],
+        lambda x, p: p["a"] - x,
+        lambda x, p: x - p["b"],
+        lambda x, p: x + p["a"],
+        lambda x, p: x - p["a"] * 1.0000000000000002,
+        lambda x, p: jnp.sin(x) - p["a"],
+        lambda x, p: x[::-1] - p["a"],
+        lambda x, p: jnp.roll(x, 1) - p["a"],
+        lambda x, p: jax.lax.fori_loop(0, 2, lambda k, x: x - p["a"], x),
+        lambda x, p: jax.lax.fori_loop(0, 3, lambda k, x: x - p["a"], x),
+        lambda x, p: jax.lax.fori_loop(0, 2, lambda k, x: x + p["a"], x),
+        lambda x, p: jnp.where(x > 0.0, x, p["a"]),
+        lambda x, p: jnp.where(x >= 0.0, x, p["a"]),
+        lambda x, p: jax.nn.relu(x) - p["a"],
+        lambda x, p: jax.nn.silu(x) - p["a"],
+        lambda x, p: jnp.linalg.solve(jnp.eye(2) + x[:, None], x) - p["a"],
+        lambda x, p: jnp.linalg.solve(jnp.eye(2) + x[None, :], x) - p["a"],
+    ],
+)
+def test_other_functions_are_other(change):
+    given = (((2,), None), {"a": (), "b": ()})
+    settings = {"what": "f", "form": "f(x, p)", "shape": (2,)}
+    own = trace_function(change, *given, **settings)
+    assert trace_function(lambda x, p: change(x, p), *given, **settings) == own
+    for other in TRACED:
+        assert own != other
+        assert own.digest != other.digest
+    TRACED.append(own)
+
+
+def test_a_function_that_reads_plain_things_is_not_called_again(monkeypatch):
+    calls = []
+    real = functions._trace
+    monkeypatch.setattr(functions, "_trace", lambda *given: calls.append(1) or real(*given))
+    constants = {"g": 1.25, "table": np.arange(3.0), "pair": (1, "a")}
+
+    def rate(a):
+        return constants["g"] * a * constants["table"][1] * math.pi
+
+    for end in (1.0, 2.0):
+        data = sf.Measurements([0.5, end], [0.6, 0.4], sigma=0.1)
+        system = sf.HybridSystem({"fall": lambda t, x, p: -rate(p["k"]) * x}, [1.0])
+        sf.Problem(system, sf.Experiment(data, ("fall",), (), 0.0, end), {"k": end})
+    assert len(calls) == 1
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_what_is_read_is_told_by_content_or_not_at_all(way):
+    f, change = way()
+    before = reads.contents(f)
+    change()
+    after = reads.contents(f)
+    assert after is None or before != after
+
+
+def test_values_of_different_types_are_different():
+    values = [0.0, -0.0, 1, True, 1.0, "1", np.float64(1.0), np.ones(1), [1.0], (1.0,), {"a": 1.0}, np.ones(1, int)]
+    read = [reads.contents(lambda value=value: value) for value in values]
+    assert None not in read
+    assert len(set(read)) == len(values)
+
+
+# A problem that travels
+
+
+def test_a_problem_that_is_pickled_is_the_same():
+    g = np.array([1.0])
+    problem = problem_of(lambda t, x, p: -g * p["a"] * x)
+    travelled = cloudpickle.loads(cloudpickle.dumps(problem))
+    assert travelled.structures == problem.structures
+    assert sf.evaluate(travelled).cost == sf.evaluate(problem).cost
+
+
+def test_a_problem_whose_functions_have_changed_is_not_pickled_in_silence():
+    g = np.array([1.0])
+    problem = problem_of(lambda t, x, p: -g * p["a"] * x)
+    g[0] = 2.0
+    blob = cloudpickle.dumps(problem)
+    with pytest.raises(ValueError, match=r"mode 'fall' does something else .* build the problem anew"):
+        cloudpickle.loads(blob)

@@ -1,0 +1,160 @@
+"""Damaged estimates: each is refused with the name of its file, or is as good as any other once it is loaded."""
+
+from __future__ import annotations
+
+import copy
+import json
+import random
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from test_report import made, several
+from test_save import CERTIFICATE, with_everything_odd, without_numbers
+
+import switchfit as sf
+from switchfit.io.json import save_fit
+
+SIZES = [pytest.param(250, id="short"), pytest.param(12_000, id="long", marks=pytest.mark.slow)]
+ODD: tuple[Any, ...] = (
+    None, True, False, 0, -1, 1, 2, 3, 10**30, -(10**400), 0.0, -0.0, 0.5, 1e308, 1e-320, "nan", "inf", "-inf", "", "a",
+    "tau_1", "exact", "\ud800", "\0", "$", [], [[]], [0.0], [1.0, 2.0], [[1.0], [2.0, 3.0]], ["nan"] * 3, {}, {"a": 1},
+    {"dtype": "<f8", "shape": [0], "values": []}, {"dtype": "<f4", "shape": [1], "values": [1.0]},
+    {"dtype": "<U99999999999", "shape": [1], "values": ["a"]}, {"dtype": "|b1", "shape": [2, 1], "values": [True, 0]},
+    {"dtype": "<i8", "shape": [2], "values": [0, 9]}, {"dtype": "<U1", "shape": [], "values": ["a"]},
+)  # fmt: skip
+"""What may stand where something else should."""
+
+
+def saved() -> list[dict[str, Any]]:
+    """Contents of files of several kinds of fits."""
+    constrained = made(
+        constraints=(("x_1 at the end", 1e-9, 2.0),), priors={"mu": "normal(1, 2)"}, log_scaled=("mu",),
+        kinks=(("tau_1", -1.0, 1.0),), active=("mu at its lower bound 0.05",), saved_gauss_newton=np.eye(3) * 300.0,
+    )  # fmt: skip
+    fits = [made(), made(sigma_known=False), several(3), without_numbers(), with_everything_odd(), constrained]
+    return [_content(fit) for fit in fits]
+
+
+def _content(fit: sf.result.Fit) -> dict[str, Any]:
+    from switchfit.io.json import FORMAT, VERSION, _encoded
+
+    return json.loads(
+        json.dumps({"format": FORMAT, "version": VERSION, "fit": _encoded(fit), "certificate": _encoded(CERTIFICATE)})
+    )
+
+
+def places(value: Any, here: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Paths of everything inside a JSON value."""
+    inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [here] * bool(here) + [path for key, entry in inside for path in places(entry, (*here, key))]
+
+
+def mutate(content: Any, rng: random.Random) -> None:
+    """One change at a place drawn by its depth first, so that large arrays do not take all of them."""
+    found = places(content)
+    depth = rng.choice(sorted({len(path) for path in found}))
+    path = rng.choice([path for path in found if len(path) == depth])
+    holder = content
+    for key in path[:-1]:
+        holder = holder[key]
+    key, value = path[-1], holder[path[-1]]
+    kind = rng.choice(["drop", "twice", "odd", "odd", "other", "resize", "nest", "flip"])
+    if kind == "drop":
+        del holder[key]
+    elif kind == "twice":
+        if isinstance(holder, list):
+            holder.insert(key, copy.deepcopy(value))
+        else:
+            holder[f"{key}_2"] = copy.deepcopy(value)
+    elif kind == "odd":
+        holder[key] = copy.deepcopy(rng.choice(ODD))
+    elif kind == "other":
+        other = content
+        for step in rng.choice(found):
+            other = other[step]
+        holder[key] = copy.deepcopy(other)
+    elif kind == "resize" and isinstance(value, list):
+        cut = rng.randrange(len(value) + 1)
+        holder[key] = rng.choice([value[:cut], value + value[:cut], value[::-1]])
+    elif kind == "nest":
+        holder[key] = rng.choice([[value], {"a": value}, [value, copy.deepcopy(value)]])
+    elif isinstance(value, (int, float)) and not isinstance(value, bool):
+        holder[key] = rng.choice([-value, value * 1e300, value / 1e300, value + 1, float(value)])
+    elif isinstance(value, str):
+        holder[key] = rng.choice([value[::-1], value * 2, value.upper()])
+
+
+def is_refused(path: Path, number: int) -> bool:
+    """Whether a file is refused; AssertionError if that is not by a ValueError that names it."""
+    try:
+        sf.Estimate.load(path)
+    except Exception as error:
+        if not isinstance(error, ValueError) or not str(error).startswith(f"{path} is "):
+            raise AssertionError(f"damage {number}") from error
+        return True
+    return False
+
+
+def use(path: Path, folder: Path) -> None:
+    """Everything that a loaded estimate is for, without its model."""
+    estimate = sf.Estimate.load(path)
+    assert isinstance(str(estimate), str)
+    d = len(estimate.theta)
+    assert estimate.confidence_intervals().shape == (d, 2)
+    assert estimate.correlation.shape == (d, d)
+    assert isinstance(estimate.plot(), Figure)
+    estimate.save(folder / "again.json")
+    sf.Estimate.load(folder / "again.json")
+
+
+@pytest.mark.parametrize("count", SIZES)
+def test_what_is_loaded_can_be_used(count, tmp_path):
+    originals = saved()
+    path = tmp_path / "fit.json"
+    refused = 0
+    for number in range(count):
+        rng = random.Random(number)
+        content = copy.deepcopy(originals[number % len(originals)])
+        for _ in range(rng.choice([1, 1, 1, 2, 5])):
+            mutate(content, rng)
+        path.write_text(json.dumps(content))
+        if is_refused(path, number):
+            refused += 1
+            continue
+        try:
+            with warnings.catch_warnings():
+                # Numbers near the limits of float64 may overflow, which NumPy says; nothing else may be said.
+                warnings.filterwarnings("ignore", category=RuntimeWarning, message=".*(overflow|invalid|divide)")
+                use(path, tmp_path)
+        except Exception as error:
+            raise AssertionError(f"mutation {number} loads and cannot be used") from error
+    assert 0.2 * count < refused < 0.95 * count
+
+
+@pytest.mark.parametrize("count", SIZES)
+def test_a_file_with_damaged_bytes_is_refused_or_can_be_used(count, tmp_path):
+    """Cut off, bits that flipped, pieces that were written twice or moved."""
+    save_fit(made(), CERTIFICATE, tmp_path / "whole.json")
+    whole, path = (tmp_path / "whole.json").read_bytes(), tmp_path / "fit.json"
+    for number in range(count):
+        rng = random.Random(number)
+        data = bytearray(whole)
+        a, b = sorted(rng.sample(range(len(data)), 2))
+        kind = rng.choice(["cut", "flip", "repeat", "remove", "zeros"])
+        if kind == "cut":
+            del data[b:]
+        elif kind == "flip":
+            data[a] ^= 1 << rng.randrange(8)
+        elif kind == "repeat":
+            data[b:b] = data[a : min(b, a + 50)]
+        elif kind == "remove":
+            del data[a : min(b, a + 50)]
+        else:
+            data[a:b] = bytes(b - a)
+        path.write_bytes(data)
+        if not is_refused(path, number) and number % 5 == 0:
+            use(path, tmp_path)

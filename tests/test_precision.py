@@ -1,0 +1,168 @@
+"""Numbers that lost digits in single precision are refused with their names."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import switchfit as sf
+from switchfit.io.python_file import call, load_object
+
+K = jnp.array(0.1)  # JAX is in 32-bit mode here, as it is in a user's module
+EXACT = jnp.array([0.5, 2.0])
+TIMES = np.linspace(0.0, 1.0, 9)
+
+
+def problem_of(mode=None, initial_state=(1.0,), data=None, reset=None, guard=None, inputs=None):
+    system = sf.HybridSystem(
+        {"on": mode or (lambda t, x, p: -p["a"] * x), "off": lambda t, x, p: -0.5 * x},
+        initial_state,
+        reset_maps={} if reset is None else {("on", "off"): reset},
+        guards={} if guard is None else {("on", "off"): guard},
+    )
+    data = data or sf.Measurements(TIMES, np.exp(-TIMES), sigma=0.1)
+    return sf.Problem(system, sf.Experiment(data, ("on", "off"), (0.4,), 0.0, 1.0, inputs=inputs), {"a": 0.8})
+
+
+class Body:
+    def __init__(self):
+        self.gain = jnp.array([0.1])
+
+    def __call__(self, t, x, p):
+        return -self.gain * p["a"] * x
+
+
+def by_default(t, x, p, k=K):
+    return k * x
+
+
+def by_closure():
+    drag = jnp.array([0.5, 0.3])
+    return lambda t, x, p: -drag[1] * x
+
+
+def by_numpy():
+    drag = np.array([0.3], np.float32)
+    return lambda t, x, p: -drag * x
+
+
+def by_half():
+    drag = jnp.array([0.3], jnp.bfloat16)
+    return lambda t, x, p: -drag * x
+
+
+def by_dict():
+    constants = {"drag": jnp.array(0.3)}
+    return lambda t, x, p: -constants["drag"] * x
+
+
+def by_loop():
+    drag = jnp.array(0.3)
+    return lambda t, x, p: jax.lax.fori_loop(0, 2, lambda k, y: y - drag * x, x)
+
+
+def by_arithmetic():
+    return lambda t, x, p: -(EXACT[0] / EXACT[1] / 10.0) * x
+
+
+def scaled(x, k):
+    return k * x
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (
+            lambda: {"mode": lambda t, x, p: -K * p["a"] * x},
+            "the constant K of mode 'on' must be in double precision: 0.1 became 0.1000000014",
+        ),
+        (lambda: {"mode": lambda t, x, p: -jnp.sin(K) * x}, "the constant K of mode 'on'"),
+        (lambda: {"mode": by_closure()}, "the constant drag of mode 'on' must .*: 0.3 became 0.30000001192092896"),
+        (lambda: {"mode": by_numpy()}, r"the constant drag of mode 'on' must .*\(float32\)"),
+        (lambda: {"mode": by_half()}, r"the constant drag of mode 'on' must .*\(bfloat16\)"),
+        (lambda: {"mode": by_dict()}, r"the constant constants\['drag'\] of mode 'on'"),
+        (lambda: {"mode": by_loop()}, "the constant drag of mode 'on'"),
+        (
+            lambda: {"mode": by_arithmetic()},
+            r"a constant of mode 'on' \(test_precision.py:\d+\).*0.025 became",
+        ),
+        (lambda: {"mode": Body()}, "the constant self.gain of mode 'on'"),
+        (lambda: {"mode": by_default}, "the constant k of mode 'on'"),
+        (lambda: {"mode": functools.partial(lambda k, t, x, p: k * x, K)}, "the constant argument 1 of mode 'on'"),
+        (lambda: {"mode": lambda t, x, p: jax.jit(scaled)(x, K)}, "the constant K of mode 'on'"),
+        (lambda: {"mode": lambda t, x, p: -jnp.float32(0.3) * x}, "a constant of mode 'on'.*0.3 became"),
+        (lambda: {"reset": lambda t, x, p: K * x}, r"the constant K of reset map \('on', 'off'\)"),
+        (lambda: {"guard": lambda t, x, p: x[0] - K}, r"the constant K of guard \('on', 'off'\)"),
+        (lambda: {"initial_state": lambda p: jnp.ones(1) * K}, "the constant K of initial_state"),
+        (lambda: {"data": sf.RunningCost(lambda t, x, p: K * x[0])}, "the constant K of RunningCost"),
+        (lambda: {"data": sf.TerminalCost(lambda x, p: K * x[0])}, "the constant K of TerminalCost"),
+        (
+            lambda: {"data": [sf.RunningCost(lambda t, x, p: x[0]), sf.TerminalConstraint(lambda x, p: x[0] - K)]},
+            "the constant K of TerminalConstraint",
+        ),
+        (
+            lambda: {"data": sf.Measurements(TIMES, TIMES, observe=lambda t, x, p: K * x, sigma=1.0)},
+            "the constant K of observe",
+        ),
+        (
+            lambda: {"data": sf.ReferenceSignal.from_samples(TIMES, TIMES, observe=lambda t, x, p: K * x)},
+            "the constant K of observe",
+        ),
+    ],
+)
+def test_a_constant_in_single_precision_is_refused_by_its_name(make, said):
+    with pytest.raises(ValueError, match=said) as caught:
+        problem_of(**make())
+    assert "write" in str(caught.value), "what to write instead"
+
+
+@pytest.mark.parametrize(
+    "mode",
+    [
+        lambda t, x, p: x.astype(jnp.float32).astype(jnp.float64),
+        lambda t, x, p: jnp.float32(0.5) * x.astype(jnp.float32) + 0.0 * x,
+        lambda t, x, p: jax.lax.fori_loop(0, 2, lambda k, y: y.astype(jnp.float16).astype(jnp.float64), x),
+    ],
+)
+def test_a_function_that_casts_is_refused(mode):
+    with pytest.raises(ValueError, match=r"mode 'on' computes in float(32|16) \(test_precision.py:\d+\)"):
+        problem_of(mode)
+
+
+@pytest.mark.parametrize(
+    "mode",
+    [
+        lambda t, x, p: -EXACT[0] * p["a"] * x,
+        lambda t, x, p: -jnp.array([0.1]) * p["a"] * x,
+        lambda t, x, p: x[jnp.array([0])] * p["a"],
+        lambda t, x, p: -np.float64(0.1) * x,
+        lambda t, x, p: -(EXACT[0] * EXACT[1]) * x,
+        lambda t, x, p: jnp.where(EXACT[:1] > 0.25, x, -x),
+    ],
+)
+def test_constants_that_lost_nothing_are_taken(mode):
+    sf.evaluate(problem_of(mode))
+
+
+def test_what_is_taken_is_what_was_meant():
+    taken, meant = (sf.evaluate(problem_of(lambda t, x, p, k=k: -k * p["a"] * x)) for k in (EXACT[1], 2.0))
+    np.testing.assert_array_equal(taken.hessian, meant.hessian)
+
+
+def test_a_model_file_is_run_in_double_precision(tmp_path):
+    (tmp_path / "model.py").write_text(
+        "import jax.numpy as jnp\nimport switchfit as sf\nK = jnp.array(0.1)\n"
+        "def model(gain=0.3):\n    gain = jnp.array(gain)\n"
+        "    return sf.HybridSystem({'on': lambda t, x, p: -K * gain * p['a'] * x}, jnp.array([0.1]))\n"
+    )
+    system = load_object("model.py:model", tmp_path, "system")
+    assert system is not None
+    built = call(system, "system")
+    assert built.initial_state.tolist() == [0.1]
+    log = sf.Measurements(TIMES, np.exp(-TIMES), sigma=0.1)
+    sf.Problem(built, sf.Experiment(log, ("on",), (), 0.0, 1.0), {"a": 0.8})
+    assert jnp.array(0.1).dtype == jnp.float32

@@ -1,0 +1,711 @@
+"""Random systems with everything that a problem may contain, against the reference in NumPy (`reference.py`).
+
+Each system is drawn from a seed: its vector fields, observations, costs, guards and constraints are random
+expressions that run with NumPy and with JAX. J, gradient, Hessian, constraints and their derivatives are compared block
+by block, at the first guess and at a theta with a tie (a transition at a sample, or within rounding of one), coinciding
+transitions or a mode that lasts no time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property, partial
+from itertools import pairwise
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+
+import switchfit as sf
+from switchfit.evaluate import Evaluator
+from switchfit.refine import refined_mesh
+
+SYSTEMS = 200
+METHODS = ("discrete-adjoint", "forward", "autodiff", "adjoint")
+
+RTOL, ATOL = 1e-11, 1e-12
+"""Tolerances of the meshes: integration errors are then below the tolerances of the comparison."""
+
+VALUE, GRADIENT, HESSIAN = 1e-10, 1e-8, 2e-7
+"""Largest error of J and c, of first and of second derivatives: of a block, relative to its largest entry plus 1 % of
+the largest entry of all and of 1. What is left is integration error: of the meshes' tolerance in J, and larger by a
+power of the step's length with each derivative in a transition time, which is the end of a step."""
+
+PAPER = 1e-6
+"""The same for the paper's equations, whose derivatives are integrated by themselves, with larger error constants."""
+
+
+# Random expressions
+
+
+Tree = tuple[Any, ...]
+
+
+def value_of(tree: Tree, xp: Any, t: Any, x: Any, p: Any, u: Any = None) -> Any:
+    """The value of an expression, with the functions of NumPy or of JAX."""
+    kind, *rest = tree
+    if kind == "const":
+        return rest[0]
+    if kind == "t":
+        return t
+    if kind == "x":
+        return x[rest[0]]
+    if kind == "u":
+        return u[rest[0]]
+    if kind == "p":
+        return p[rest[0]] if rest[1] is None else p[rest[0]][rest[1]]
+    given = [value_of(part, xp, t, x, p, u) for part in rest]
+    if kind == "+":
+        return given[0] + given[1]
+    if kind == "-":
+        return given[0] - given[1]
+    if kind == "*":
+        return given[0] * given[1]
+    if kind == "square":
+        return given[0] * given[0]
+    if kind == "gauss":
+        return xp.exp(-given[0] * given[0])
+    if kind == "ratio":
+        return given[0] / (2.0 + given[1] * given[1])
+    return getattr(xp, kind)(given[0])
+
+
+def total(*trees: Tree) -> Tree:
+    """The sum of expressions."""
+    first, *others = trees
+    for other in others:
+        first = ("+", first, other)
+    return first
+
+
+def scaled(factor: float, tree: Tree) -> Tree:
+    """A multiple of an expression."""
+    return ("*", ("const", round(float(factor), 3)), tree)
+
+
+class Expressions:
+    """Draws expressions over t, x (n,), parameters and inputs that stay of the order of 1."""
+
+    def __init__(self, rng: np.random.Generator, n: int, parameters: list[tuple[str, int | None]], inputs: int) -> None:
+        self.rng, self.n, self.parameters, self.inputs = rng, n, parameters, inputs
+
+    def leaf(self, *, state: bool = True, inputs: bool = False) -> Tree:
+        kinds = ["t", "p", "p", "const", *["x"] * (3 * state), *["u"] * (2 * inputs * bool(self.inputs))]
+        kind = self.rng.choice(kinds)
+        if kind == "x":
+            return ("x", int(self.rng.integers(self.n)))
+        if kind == "p":
+            return ("p", *self.parameters[int(self.rng.integers(len(self.parameters)))])
+        if kind == "u":
+            return ("u", int(self.rng.integers(self.inputs)))
+        return ("t",) if kind == "t" else ("const", round(float(self.rng.normal()), 2))
+
+    def tree(self, depth: int, **leaves: bool) -> Tree:
+        """An expression of a depth."""
+        if depth == 0:
+            return self.leaf(**leaves)
+        kind = str(self.rng.choice(["+", "-", "*", "*", "ratio", "sin", "cos", "tanh", "gauss", "square"]))
+        if kind == "square":
+            return ("square", ("sin", self.tree(depth - 1, **leaves)))
+        count = 2 if kind in ("+", "-", "*", "ratio") else 1
+        return (kind, *(self.tree(depth - 1, **leaves) for _ in range(count)))
+
+    def bounded(self, depth: int, **leaves: bool) -> Tree:
+        """An expression between -1 and 1."""
+        return (str(self.rng.choice(["sin", "cos", "tanh"])), self.tree(depth, **leaves))
+
+    def rate(self, i: int, depth: int) -> Tree:
+        """The rate of a state: damped, driven by something bounded, with a quadratic term."""
+        j, k = self.rng.integers(self.n, size=2)
+        damping = scaled(-self.rng.uniform(0.1, 1.2), ("x", i))
+        driven = scaled(self.rng.normal(), self.bounded(depth, inputs=True))
+        return total(damping, driven, scaled(0.15 * self.rng.normal(), ("*", ("x", int(j)), ("x", int(k)))))
+
+    def jump(self, i: int) -> Tree:
+        """A state after a reset."""
+        return total(scaled(self.rng.uniform(0.5, 1.0), ("x", i)), scaled(0.4, self.bounded(1)))
+
+    def output(self) -> Tree:
+        """What a sensor sees, or what a constraint is made of."""
+        return total(("x", int(self.rng.integers(self.n))), scaled(0.5, self.bounded(1)))
+
+
+def vector(trees: list[Tree], xp: Any, *, arguments: str = "txp", flat_input: bool = False) -> Callable[..., Any]:
+    """A function that returns the values of expressions: an array for JAX, a list of arrays for the reference."""
+
+    def function(*given: Any) -> Any:
+        named = dict(zip(arguments, given, strict=True))
+        u = named.get("u")
+        u = u[None] if flat_input and xp is jnp else u
+        x = named.get("x")
+        values = [value_of(tree, xp, named.get("t", 0.0), x, named["p"], u) for tree in trees]
+        return values if xp is np else jnp.stack([value + jnp.zeros(()) for value in values])
+
+    return function
+
+
+def number(tree: Tree, xp: Any, *, arguments: str = "txp") -> Callable[..., Any]:
+    """A function that returns the value of one expression."""
+    of = vector([tree], xp, arguments=arguments)
+    return lambda *given: of(*given)[0]
+
+
+# Random problems
+
+
+@dataclass(frozen=True)
+class Features:
+    """What a system has; each is drawn unless it is given."""
+
+    states: int
+    transitions: int
+    modes: int
+    runs: int
+    input: str | None
+    tracking: bool
+    running: bool
+    terminal: bool
+    samples: int
+    late: bool
+    noise: str
+    robust: bool
+    priors: bool
+    resets: bool
+    guards: bool
+    constraints: bool
+    initial: str
+    array: bool
+    fixed: bool
+    solver: str
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator, **given: Any) -> Features:
+        def flag(probability: float) -> bool:
+            return bool(rng.random() < probability)
+
+        kinds = ["unknown", "number", "channel", "sample", "parameter", "mixed"]
+        drawn = {
+            "states": int(rng.choice([1, 2, 3, 4, 6, 8, 10], p=[0.15, 0.25, 0.2, 0.15, 0.1, 0.075, 0.075])),
+            "transitions": int(rng.choice([0, 1, 2, 3, 4], p=[0.05, 0.25, 0.35, 0.2, 0.15])),
+            "modes": int(rng.integers(1, 4)),
+            "runs": 2 if flag(0.2) else 1,
+            "input": str(rng.choice(["hold", "linear", "cubic"])) if flag(0.35) else None,
+            "tracking": flag(0.25),
+            "running": flag(0.3),
+            "terminal": flag(0.35),
+            "samples": int(rng.choice([0, 1, 2], p=[0.2, 0.6, 0.2])),
+            "late": flag(0.15),
+            "noise": str(rng.choice(kinds)),
+            "robust": flag(0.35),
+            "priors": flag(0.35),
+            "resets": flag(0.45),
+            "guards": flag(0.3),
+            "constraints": flag(0.25),
+            "initial": str(rng.choice(["numbers", "unknown", "function"])),
+            "array": flag(0.2),
+            "fixed": flag(0.35),
+            "solver": "stiff" if flag(0.03) else "explicit",
+        }
+        return cls(**{**drawn, **given})
+
+
+class System:
+    """One random problem, for switchfit and for the reference."""
+
+    def __init__(self, seed: int, **given: Any) -> None:
+        self.rng = rng = np.random.default_rng([7, seed])
+        self.has = has = Features.drawn(rng, **given)
+        self.t0 = float(np.round(rng.uniform(-2.0, 2.0), 2))
+        self.tf = self.t0 + float(np.round(rng.uniform(1.0, 2.5), 2))
+        self.weighed = has.noise != "unknown"  # robust losses, priors and sigmas need a sigma
+        self.inputs = int(rng.integers(1, 3)) if has.input else 0
+        self.parameters = self._draw_parameters()
+        names = [name for name in self.parameters if name[0] in "abcv"]
+        entries = [(name, k) for name in names for k in (range(2) if self.parameters[name].shape else [None])]
+        self.expressions = Expressions(rng, has.states, entries, self.inputs)
+        depth = 1 if has.states > 4 else 2
+        self.modes = [
+            [self.expressions.rate(i, depth) for i in range(has.states)]
+            for _ in range(min(has.modes, 1 + has.transitions))
+        ]
+        pairs = [(a, b) for a in range(len(self.modes)) for b in range(len(self.modes))]
+        jumps, watched = (rng.random(len(pairs)) < on for on in (0.6 * has.resets, 0.6 * has.guards))
+        self.resets = {
+            pair: [self.expressions.jump(i) for i in range(has.states)]
+            for pair, on in zip(pairs, jumps, strict=True)
+            if on
+        }
+        self.guards = {pair: self.expressions.output() for pair, on in zip(pairs, watched, strict=True) if on}
+        self.initial = self._draw_initial()
+        self.experiments: list[sf.Experiment] = []
+        self.runs: list[dict[str, Any]] = []
+        for e in range(has.runs):
+            self._draw_run(e)
+
+    def _prior(self, value: float, positive: bool) -> Any:
+        if not (self.has.priors and self.weighed and self.rng.random() < 0.5):
+            return None
+        if positive and self.rng.random() < 0.5:
+            return sf.LogNormal(value * self.rng.uniform(0.7, 1.4), self.rng.uniform(0.2, 1.0))
+        return sf.Normal(value + 0.3 * self.rng.normal(), self.rng.uniform(0.2, 1.0))
+
+    def _parameter(self, value: float, *, positive: bool = False, **settings: Any) -> sf.Parameter:
+        prior = None if settings.get("fixed") else self._prior(value, positive)
+        return sf.Parameter(value, prior=prior, **({"lower": 0.05} if positive else {}), **settings)
+
+    def _draw_parameters(self) -> dict[str, sf.Parameter]:
+        rng, has = self.rng, self.has
+        found = {"a": self._parameter(float(rng.uniform(0.3, 1.5)), positive=bool(rng.random() < 0.5))}
+        if rng.random() < 0.6:
+            found["b"] = self._parameter(float(rng.normal()))
+        if has.fixed:
+            found["c"] = sf.Parameter(float(rng.normal()), fixed=True)
+        if has.array:
+            found["v"] = sf.Parameter(rng.normal(size=2), prior=self._prior(0.1, False))
+        if has.runs == 2:
+            found["other"] = self._parameter(
+                float(rng.uniform(0.3, 1.5)), positive=True
+            )  # what "a" is in the second run
+        if has.noise in ("parameter", "mixed"):
+            found["sigma"] = self._parameter(float(rng.uniform(0.2, 0.6)), positive=True)
+        if has.late:
+            found["delay"] = sf.Parameter(float(rng.uniform(0.03, 0.12)), lower=0.0, upper=0.2)
+        order = rng.permutation(list(found))
+        return {str(name): found[name] for name in order}
+
+    def _draw_initial(self) -> Any:
+        values = self.rng.normal(size=self.has.states)
+        if self.has.initial == "function":
+            return [
+                total(("const", round(float(v), 2)), scaled(0.5, self.expressions.tree(1, state=False))) for v in values
+            ]
+        unknown = self.rng.random(self.has.states) < 0.5
+        if self.has.initial == "numbers" or not unknown.any():
+            return values.tolist()
+        return [self._parameter(float(v)) if on else float(v) for v, on in zip(values, unknown, strict=True)]
+
+    def _times(self) -> list[Any]:
+        count, span = self.has.transitions, self.tf - self.t0
+        gaps = self.rng.uniform(0.3, 1.0, count + 1)
+        times = self.t0 + span * np.cumsum(gaps)[:-1] / gaps.sum()
+        return [
+            sf.Parameter(float(t), fixed=True)
+            if self.rng.random() < 0.1 * self.has.fixed
+            else self._parameter(float(t))
+            for t in times
+        ]
+
+    def _draw_run(self, e: int) -> None:
+        rng, has = self.rng, self.has
+        sequence = rng.integers(len(self.modes), size=has.transitions + 1).tolist()
+        times = self._times()
+        mapped = {"a": "other"} if e == 1 else {}
+        run: dict[str, Any] = {"samples": [], "tracking": [], "running": [], "terminal": [], "constraints": []}
+        data: list[Any] = []
+        for k in range(has.samples):
+            self._add_samples(run, data, late=has.late and k == 0)
+        if has.tracking:
+            self._add_tracking(run, data)
+        if has.running:
+            tree = total(("square", self.expressions.output()), scaled(0.3, self.expressions.bounded(1)))
+            run["running"].append(number(tree, np))
+            data.append(sf.RunningCost(number(tree, jnp)))
+        if has.terminal or not data:
+            tree = ("square", self.expressions.output())
+            run["terminal"].append(number(tree, np, arguments="xp"))
+            data.append(sf.TerminalCost(number(tree, jnp, arguments="xp")))
+        if has.constraints:
+            trees = [self.expressions.output() for _ in range(int(rng.integers(1, 3)))]
+            run["constraints"].append(vector(trees, np, arguments="xp"))
+            data.append(sf.TerminalConstraint(vector(trees, jnp, arguments="xp")))
+        inputs, run["input"] = self._draw_input()
+        self.experiments.append(
+            sf.Experiment(
+                data,
+                tuple(f"m{k}" for k in sequence),
+                times,
+                self.t0,
+                self.tf,
+                inputs=inputs,
+                parameter_map=mapped or None,
+            )
+        )
+        run |= {"sequence": sequence, "times": times, "mapped": mapped}
+        self.runs.append(run)
+
+    def _add_samples(self, run: dict[str, Any], data: list[Any], *, late: bool) -> None:
+        rng, has = self.rng, self.has
+        count, q = int(rng.integers(3, 12)), int(rng.integers(1, 3))
+        whole = has.states if rng.random() < 0.2 and not late else 0
+        first = self.t0 + 0.25 if late else self.t0 + rng.choice([0.0, 0.1])
+        last = self.tf - 0.05 if late else self.tf - rng.choice([0.0, 0.1])
+        times = np.sort(rng.uniform(first, last, count))
+        if rng.random() < 0.5:
+            times[0], times[-1] = first, last
+        q = whole or q
+        trees = [("x", k) for k in range(q)] if whole else [self.expressions.output() for _ in range(q)]
+        values = rng.normal(size=(count, q))
+        values[rng.random(values.shape) < 0.1] = np.nan
+        values[0, 0] = 0.3
+        sigma: Any = {
+            "unknown": None,
+            "number": 0.4,
+            "channel": rng.uniform(0.2, 0.8, q),
+            "sample": rng.uniform(0.2, 0.8, (count, q)),
+            "parameter": "sigma",
+            "mixed": ["sigma", *rng.uniform(0.2, 0.8, q - 1).tolist()],
+        }[has.noise]
+        loss = str(rng.choice(["soft_l1", "huber", "cauchy"])) if has.robust and self.weighed else "linear"
+        scale = float(rng.uniform(1.2, 2.5))
+        delay: Any = "delay" if late else 0.0
+        if not late and rng.random() < 0.15:
+            delay = 0.05
+            times = times[times >= self.t0 + delay]
+            values = values[-len(times) :]
+            sigma = sigma[-len(times) :] if has.noise == "sample" else sigma
+            if len(times) == 0 or np.isnan(values).all():
+                return
+        settings = {"sigma": sigma, "loss": loss, "loss_scale": scale, "delay": delay}
+        observe = None if whole else vector(trees, jnp)
+        data.append(sf.Measurements(times, values, observe, **settings))
+        settings["sigma"] = ["sigma"] * q if isinstance(sigma, str) else sigma
+        run["samples"].append(reference.Samples(times, values, vector(trees, np), **settings))
+
+    def _add_tracking(self, run: dict[str, Any], data: list[Any]) -> None:
+        rng = self.rng
+        count, q = int(rng.integers(4, 9)), int(rng.integers(1, 3))
+        times = np.linspace(self.t0, self.tf, count)
+        times[1:-1] += rng.uniform(-0.03, 0.03, count - 2)
+        values = rng.normal(size=(count, q))
+        root = rng.normal(size=(q, q))
+        weights = root @ root.T if rng.random() < 0.5 else np.diag(rng.uniform(0.3, 2.0, q))
+        trees = [self.expressions.output() for _ in range(q)]
+        signal = sf.ReferenceSignal.from_samples(times, values, observe=vector(trees, jnp), weights=weights)
+        data.append(signal)
+        run["tracking"].append(
+            reference.Tracking(reference.Signal.spline(times, values), vector(trees, np), np.asarray(weights))
+        )
+
+    def _draw_input(self) -> tuple[Any, Any]:
+        if not self.inputs:
+            return None, None
+        rng, kind = self.rng, str(self.has.input)
+        times = np.linspace(self.t0, self.tf, int(rng.integers(4, 8)))
+        times[1:-1] += rng.uniform(-0.03, 0.03, len(times) - 2)
+        values = 0.5 * rng.normal(size=(len(times), self.inputs))
+        make = {"hold": reference.Signal.hold, "linear": reference.Signal.linear, "cubic": reference.Signal.spline}
+        return sf.Input(times, values[:, 0] if self.inputs == 1 else values, kind), make[kind](times, values)
+
+    @cached_property
+    def problem(self) -> sf.Problem:
+        """The problem as switchfit takes it."""
+        arguments = "txpu" if self.inputs else "txp"
+        flat = self.inputs == 1
+        initial = self.initial
+        if self.has.initial == "function":
+            initial = vector(initial, jnp, arguments="p")
+        system = sf.HybridSystem(
+            {f"m{k}": vector(trees, jnp, arguments=arguments, flat_input=flat) for k, trees in enumerate(self.modes)},
+            initial,
+            {(f"m{a}", f"m{b}"): vector(trees, jnp) for (a, b), trees in self.resets.items()},
+            guards={(f"m{a}", f"m{b}"): number(tree, jnp) for (a, b), tree in self.guards.items()},
+        )
+        settings = {"solver": self.has.solver, "rtol": RTOL, "atol": ATOL}
+        return sf.Problem(system, self.experiments, self.parameters, **settings)
+
+    @cached_property
+    def reference(self) -> reference.Reference:
+        """The same for the reference; theta is numbered as documented."""
+        priors: list[tuple[int, str, float, float]] = []
+        count = 0
+
+        def take(parameter: sf.Parameter) -> int:
+            nonlocal count
+            entries = parameter.entries()
+            for k, entry in enumerate(entries):
+                if isinstance(entry.prior, sf.LogNormal):
+                    priors.append((count + k, "log-normal", float(entry.prior.median), float(entry.prior.log_sd)))
+                elif entry.prior is not None:
+                    priors.append((count + k, "normal", float(entry.prior.mean), float(entry.prior.sd)))
+            count += len(entries)
+            return count - len(entries)
+
+        times = [[float(tau.value) if tau.fixed else take(tau) for tau in run["times"]] for run in self.runs]
+        parameters = {
+            name: q.value if q.fixed else (slice(at := take(q), at + q.value.size), q.shape)
+            for name, q in self.parameters.items()
+        }
+        initials: list[Any] = []
+        for _ in self.runs:
+            if self.has.initial == "function":
+                initials.append(vector(self.initial, np, arguments="p"))
+            else:
+                initials.append([take(x) if isinstance(x, sf.Parameter) else float(x) for x in self.initial])
+        arguments = "txpu" if self.inputs else "txp"
+        modes = [vector(trees, np, arguments=arguments) for trees in self.modes]
+        runs = []
+        for run, own, initial in zip(self.runs, times, initials, strict=True):
+            sequence = run["sequence"]
+            pairs = list(pairwise(sequence))
+            runs.append(
+                reference.Run(
+                    modes=[modes[k] for k in sequence],
+                    t0=self.t0,
+                    tf=self.tf,
+                    times=own,
+                    initial=initial,
+                    names={name: run["mapped"].get(name, name) for name in self.parameters},
+                    resets=[vector(self.resets[pair], np) if pair in self.resets else None for pair in pairs],
+                    guards=[number(self.guards[pair], np) if pair in self.guards else None for pair in pairs],
+                    samples=run["samples"],
+                    tracking=run["tracking"],
+                    running=run["running"],
+                    terminal=run["terminal"],
+                    constraints=run["constraints"],
+                    input=run["input"],
+                )
+            )
+        return reference.Reference(runs, parameters, priors)
+
+    @cached_property
+    def kinds(self) -> np.ndarray:
+        """What each entry of theta is: tau, p, sigma, delay or x0."""
+
+        def kind(name: str) -> str:
+            last = name.rpartition(".")[2]
+            special = {"sigma": "sigma", "delay": "delay"}
+            return "tau" if last.startswith("tau_") else special.get(last, "x0" if last.startswith("x") else "p")
+
+        return np.array([kind(name) for name in self.problem.theta_names])
+
+    def nodes(self, run: dict[str, Any]) -> np.ndarray:
+        """Moments of a run at which a transition may tie with something: samples and knots."""
+        times = [item.times - item.delay for item in run["samples"] if not isinstance(item.delay, str)]
+        times += [item.signal.knots for item in run["tracking"]]
+        if run["input"] is not None:
+            times.append(run["input"].knots)
+        times = np.unique(np.concatenate([*times, [self.t0, self.tf]]))
+        return times[(times >= self.t0) & (times <= self.tf)]
+
+    def special_theta(self) -> tuple[str, np.ndarray]:
+        """A theta at which something coincides, and what: the other unknowns are moved a little too."""
+        rng = self.rng
+        theta = self.problem.initial_theta
+        is_time = self.kinds == "tau"
+        theta = np.where(is_time, theta, theta * (1 + 0.03 * rng.normal(size=len(theta))))
+        kind = str(rng.choice(["tie", "before", "after", "coincide", "first", "last", "all"]))
+        for run, where in zip(self.runs, self.reference.runs, strict=True):
+            free = [at for at in where.times if isinstance(at, int)]
+            if len(free) < len(where.times) or not free:
+                continue
+            tau, nodes = theta[free], self.nodes(run)
+            k = int(rng.integers(len(tau)))
+            node = float(nodes[np.argmin(np.abs(nodes - tau[k]))])
+            if kind == "tie":
+                tau[k] = node
+            elif kind in ("before", "after"):
+                away = -np.inf if kind == "before" else np.inf
+                tau[k] = np.clip(np.nextafter(node, away), self.t0, self.tf)
+            elif kind == "coincide":
+                tau[k] = tau[max(k - 1, 0)]
+            elif kind == "first":
+                tau[0] = self.t0
+            elif kind == "last":
+                tau[-1] = self.tf
+            else:
+                tau[:] = node
+            theta[free] = np.sort(tau)
+        return kind, theta
+
+
+# The comparison
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What was found beside what the reference says, by blocks."""
+
+    system: System
+    where: str
+
+    def errors(self, order: int, found: np.ndarray, expected: np.ndarray) -> Iterator[tuple[str, float]]:
+        """The relative error of each block of a derivative of an order, (d,) or (d, d) in its last axes."""
+        kinds = self.system.kinds
+        largest = np.max(np.abs(expected), initial=0.0)
+        names = [*dict.fromkeys(kinds)]
+        for k, a in enumerate(names):
+            if order == 1:
+                blocks = [(a, np.ix_(*[np.arange(m) for m in found.shape[:-1]], kinds == a))]
+            else:
+                lead = [np.arange(m) for m in found.shape[:-2]]
+                blocks = [(f"{a}-{b}", np.ix_(*lead, kinds == a, kinds == b)) for b in names[k:]]
+            for name, here in blocks:
+                off, size = np.abs(found[here] - expected[here]), np.abs(expected[here])
+                parts = {name: np.ones(off.shape, bool)}
+                if name == "tau-tau":
+                    diagonal = np.broadcast_to(np.eye(off.shape[-1], dtype=bool), off.shape)
+                    parts = {"tau-tau diagonal": diagonal, "tau-tau off-diagonal": ~diagonal}
+                for part, on in parts.items():
+                    scale = np.max(size[on], initial=0.0) + 0.01 * max(largest, 1.0)
+                    error = np.max(off[on], initial=0.0) / scale
+                    yield part, float(error if np.isfinite(found).all() else np.inf)
+
+    def check(self, what: str, order: int, found: Any, expected: Any, tolerance: float) -> list[str]:
+        """What is wrong, as sentences."""
+        found, expected = np.asarray(found), np.asarray(expected)
+        if order == 0:
+            errors = [("", float(np.max(np.abs(found - expected) / np.maximum(np.abs(expected), 1.0), initial=0.0)))]
+        else:
+            errors = list(self.errors(order, found, expected))
+        LARGEST[what] = max(LARGEST.get(what, 0.0), *(error for _, error in errors), 0.0)
+        return [
+            f"{self.where}: {what} {block} is off by {error:.1e}" for block, error in errors if not error <= tolerance
+        ]
+
+
+LARGEST: dict[str, float] = {}
+"""The largest error of each kind that was seen: to set the tolerances by."""
+
+
+def differences(system: System, methods: tuple[str, ...]) -> list[str]:
+    """Everything in which switchfit differs from the reference, as sentences."""
+    problem = system.problem
+    special, other = system.special_theta()
+    thetas = {"guess": problem.initial_theta, special: problem.checked_theta(other)}
+    meshes = [refined_mesh(problem, e, *thetas.values()) for e in range(len(problem.experiments))]
+    evaluator = Evaluator(problem, meshes=meshes)
+    wrong: list[str] = []
+    for name, theta in thetas.items():
+        for side in (1, -1) if name == "tie" else (1,):
+            expected = system.reference.derivatives(theta, side)
+            for method in ("auto", *methods):
+                found = evaluator(theta, side, method)
+                slack = PAPER / GRADIENT if method == "adjoint" else 1.0
+                check = partial(Comparison(system, f"{name}, side {side}, {method}").check)
+                label = "paper's " if method == "adjoint" else ""
+                wrong += check(f"{label}J", 0, found.cost, expected.cost, VALUE * slack)
+                wrong += check(f"{label}gradient", 1, found.gradient, expected.gradient, GRADIENT * slack)
+                wrong += check(
+                    f"{label}Hessian", 2, found.hessian, expected.hessian, PAPER if method == "adjoint" else HESSIAN
+                )
+            if len(problem.experiments) > 1:
+                check = Comparison(system, f"{name}, side {side}, arrow").check
+                arrow = evaluator.arrow(theta, side)
+                wrong += check("gradient", 1, arrow.gradient, expected.gradient, GRADIENT)
+                wrong += check("Hessian", 2, arrow.hessian.dense(), expected.hessian, HESSIAN)
+            if problem.constraint_names:
+                wrong += _constrained(system, evaluator, theta, side, name, expected)
+    return wrong
+
+
+def _constrained(
+    system: System, evaluator: Evaluator, theta: np.ndarray, side: int, name: str, expected: reference.Derivatives
+) -> list[str]:
+    """The same for constraints and their augmented Lagrangian."""
+    rng = np.random.default_rng(1)
+    m = len(expected.constraints)
+    multipliers, penalty = rng.normal(size=m), rng.uniform(0.1, 2.0, m)
+    found = evaluator.constrained(theta, side, multipliers, penalty)
+    c, A = expected.constraints, expected.jacobian
+    weights = multipliers + penalty * c
+    value = expected.cost + multipliers @ c + 0.5 * penalty @ c**2
+    hessian = expected.hessian + np.einsum("k,kij->ij", weights, expected.curvatures) + (A.T * penalty) @ A
+    check = Comparison(system, f"{name}, side {side}, constrained").check
+    return [
+        *check("J", 0, found.cost, expected.cost, VALUE),
+        *check("gradient", 1, found.gradient, expected.gradient, GRADIENT),
+        *check("constraints", 0, found.constraints, c, VALUE),
+        *check("Jacobian", 1, found.jacobian, A, GRADIENT),
+        *check("Lagrangian", 0, found.value, value, VALUE),
+        *check("slope of the Lagrangian", 1, found.slope, expected.gradient + weights @ A, GRADIENT),
+        *check("Hessian of the Lagrangian", 2, found.hessian, hessian, HESSIAN),
+    ]
+
+
+# The tests
+
+
+@pytest.fixture(autouse=True)
+def _quickly_compiled():
+    """These programs run for milliseconds: XLA need not make them fast."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+PLAIN: dict[str, Any] = {
+    "runs": 1,
+    "late": False,
+    "guards": False,
+    "constraints": False,
+    "array": False,
+    "solver": "explicit",
+    "transitions": 2,
+    "states": 2,
+    "modes": 2,
+}
+"""A small system, to which the short tests add one thing after the other."""
+
+SHORT = {
+    "resets, a sigma that is a parameter": {"resets": True, "noise": "parameter", "samples": 2},
+    "inputs, a reference signal": {"input": "cubic", "tracking": True, "transitions": 3},
+    "robust losses, priors": {"robust": True, "priors": True, "noise": "mixed", "samples": 1},
+    "two runs with a map": {"runs": 2, "running": True, "states": 1, "initial": "unknown"},
+    "ten states": {"states": 10, "modes": 1, "transitions": 1, "samples": 1},
+    "four transitions": {"transitions": 4, "states": 1, "modes": 3, "terminal": True, "initial": "function"},
+}
+
+
+@pytest.mark.parametrize(("seed", "name"), list(enumerate(SHORT)))
+def test_derivatives_of_random_systems_in_machine_code(seed, name):
+    assert not differences(System(1000 + seed, **{**PLAIN, **SHORT[name]}), ())
+
+
+@pytest.mark.parametrize(
+    ("seed", "given", "methods"),
+    [
+        (1, {"guards": True, "constraints": True, "priors": True, "transitions": 1, "states": 1}, ()),
+        (2, {"late": True, "samples": 1, "transitions": 1, "states": 1}, ()),
+    ],
+)
+def test_derivatives_of_random_systems_in_jax(seed, given, methods):
+    """Guards and terminal constraints with priors, and a delay that is estimated."""
+    system = System(2000 + seed, **{**PLAIN, **given})
+    assert bool(system.problem.constraint_names) == given.get("guards", False)
+    assert not differences(system, methods)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(SYSTEMS))
+def test_derivatives_of_random_systems(seed):
+    """Machine code, or JAX where there is none, and each of the other methods in turn."""
+    assert not differences(System(seed), (METHODS[seed % len(METHODS)],))
+
+
+def test_the_reference_knows_a_closed_form():
+    """x' = -a x, then -b x from tau on, a sample before and one after it: J and its derivatives by hand."""
+    a, b, tau, x0, sigma = 0.7, 1.9, 0.6, 1.3, 0.2
+
+    def decay(name: str) -> Callable[..., Any]:
+        return lambda t, x, p: [-p[name] * x[0]]
+
+    samples = reference.Samples(np.array([0.4, 1.0]), np.array([[0.4], [0.3]]), lambda t, x, p: [x[0]], sigma=sigma)
+    run = reference.Run(
+        [decay("a"), decay("b")], 0.0, 1.0, [0], [x0], {"a": "a", "b": "b"}, [None], [None], samples=[samples]
+    )
+    found = reference.Reference([run], {"a": (slice(1, 2), ()), "b": b}).derivatives(np.array([tau, a]))
+    early, late = x0 * np.exp(-0.4 * a), x0 * np.exp(-a * tau - b * (1 - tau))
+    r, slopes = (
+        np.array([early - 0.4, late - 0.3]) / sigma,
+        np.array([[0, -0.4 * early], [(b - a) * late, -tau * late]]),
+    )
+    curvatures = np.array([[[0, 0], [0, 0.16 * early]], late * np.outer([b - a, -tau], [b - a, -tau])])
+    curvatures[1] += late * np.array([[0, -1.0], [-1.0, 0]])
+    assert found.cost == pytest.approx(0.5 * r @ r, rel=1e-13)
+    np.testing.assert_allclose(found.gradient, r @ slopes / sigma, rtol=1e-12)
+    hessian = slopes.T @ slopes / sigma**2 + np.einsum("k,kij->ij", r, curvatures) / sigma
+    np.testing.assert_allclose(found.hessian, hessian, rtol=1e-9)

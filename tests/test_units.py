@@ -1,0 +1,472 @@
+"""The unit of times: one source, the experiment; everything that prints a time uses it, and nothing converts it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from test_report import made, trajectory_of
+from test_save import CERTIFICATE
+from typer.testing import CliRunner
+
+import switchfit as sf
+from switchfit import cli
+from switchfit.io.json import load_fit, save_fit
+from switchfit.io.problem_file import load_problem
+from switchfit.io.summary import describe
+from switchfit.report.plot import plot_comparison, plot_fit, plot_modes, plot_residuals, plot_state
+from switchfit.report.text import report
+
+MINUTES = np.arange(1.0, 120.0, 4.0)
+LONE_S = re.compile(r"(?<![\w'’])s(?!\w)")
+"""The letter s by itself, as a unit stands in texts and in JSON; neither s² nor the s of "Newton's"."""
+
+
+def on(t, x, p):
+    return p["heating"] - p["cooling"] * (x - 15.0)
+
+
+def off(t, x, p):
+    return -p["cooling"] * (x - 15.0)
+
+
+def room(**more):
+    return sf.HybridSystem({"on": on, "off": off}, [15.0], state_names=("T",), state_units=("°C",), **more)
+
+
+def log(switched=43.0, seed=1, **more):
+    """Heated at 0.5 °C/min until `switched`, noise 0.1 °C."""
+    heated = 25.0 * (1.0 - np.exp(-0.02 * np.minimum(MINUTES, switched)))
+    exact = 15.0 + heated * np.exp(-0.02 * np.maximum(MINUTES - switched, 0.0))
+    noise = 0.1 * np.random.default_rng(seed).standard_normal(len(MINUTES))
+    return sf.Measurements(MINUTES, exact + noise, sigma=0.1, names=("T",), **more)
+
+
+def run(tau=30.0, data=None, modes=("on", "off"), **more):
+    taus = tau if isinstance(tau, tuple) else (tau,)
+    return sf.Experiment(log() if data is None else data, modes, taus, t0=0.0, tf=120.0, **more)
+
+
+RATES = {
+    "heating": sf.Parameter(0.3, 0.01, 2.0, unit="°C/min"),
+    "cooling": sf.Parameter(0.05, 0.001, 1.0, unit="1/min"),
+}
+
+
+def problem(unit, **more):
+    """Two runs: the transition time of the first is estimated, that of the second known."""
+    fixed = sf.Parameter(46.0, fixed=True, unit=unit)
+    runs = [run(time_unit=unit), run(fixed, log(46.0, 2), time_unit=unit, name="known")]
+    return sf.Problem(room(), runs, RATES, **more)
+
+
+def doubtful(unit):
+    """Twelve readings, from which the transition time and the rates cannot well be told apart."""
+    few = sf.Measurements(MINUTES[1::3] + 0.5, log().values[1::3], sigma=0.8)
+    return sf.Problem(room(), run(40.0, few, time_unit=unit), RATES | {"heating": 0.4, "cooling": 0.03})
+
+
+def texts_of(figure):
+    """All texts of a figure, drawn, in the order in which it holds them."""
+    figure.canvas.draw()
+    return "\n".join(text.get_text() for text in figure.findobj(Text))
+
+
+def message_of(call):
+    with pytest.raises(ValueError, match=r".") as caught:
+        call()
+    return str(caught.value)
+
+
+def messages(unit):
+    """What is said of a bad guess, min_duration, a delay, a theta, a reset map, collapsed modes."""
+    late = log(delay="late")
+    delayed = sf.Problem(room(), run(30.0, late, time_unit=unit), RATES | {"late": sf.Parameter(0.5, 0.0, 1.0)})
+    nowhere = sf.HybridSystem({"on": lambda t, x, p: p["heating"] * jnp.sqrt(20.0 - t), "off": off}, [15.0])
+    endless = sf.HybridSystem({"on": lambda t, x, p: p["heating"] * x**2, "off": off}, [15.0])
+    broken = room(reset_maps={("on", "off"): lambda t, x, p: x * np.nan})
+    calls = {
+        "min_duration": lambda: problem(unit, min_duration=50.0),
+        "delay": lambda: sf.Problem(room(), run(30.0, late, time_unit=unit), RATES | {"late": 0.5}),
+        "theta": lambda: sf.evaluate(delayed, [30.0, 0.3, 0.05, 3.0]),
+        "nan": lambda: sf.simulate(sf.Problem(nowhere, run(time_unit=unit), RATES)),
+        "blows up": lambda: sf.simulate(sf.Problem(endless, run(time_unit=unit), RATES)),
+        "reset map": lambda: sf.simulate(sf.Problem(broken, run(time_unit=unit), RATES)),
+    }
+    said = {name: message_of(call) for name, call in calls.items()}
+    three = sf.Problem(room(), run((42.0, 44.0), modes=("on", "off", "on"), time_unit=unit), RATES)
+    said["collapsed mode"] = str(sf.estimate(three))
+    held = sf.Problem(room(), run((30.0, 60.0), modes=("on", "off", "on"), time_unit=unit), RATES, min_duration=10.0)
+    said["shortest mode"] = str(sf.estimate(held))
+    return said
+
+
+FILE = """
+model = "room.py:room"
+
+[parameters]
+heating = {{ value = 0.3, unit = "°C/min" }}
+cooling = {{ value = 0.05, unit = "1/min" }}
+
+[[experiments]]
+mode_sequence = ["on", "off"]
+transition_times = [{{ value = 30.0, lower = 5.0, unit = {unit} }}]
+t0 = 0.0
+tf = 120.0
+time_unit = {unit}
+data = {{ file = "log.csv", time = "t", columns = ["T"], sigma = 0.1 }}
+
+[options]
+min_duration = 1.0
+"""
+
+MODEL = """
+import switchfit as sf
+
+room = sf.HybridSystem(
+    modes={
+        "on": lambda t, x, p: p["heating"] - p["cooling"] * (x - 15.0),
+        "off": lambda t, x, p: -p["cooling"] * (x - 15.0),
+    },
+    initial_state=[15.0],
+    state_names=("T",),
+    state_units=("°C",),
+)
+"""
+
+
+def invoke(*arguments):
+    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+
+
+def command_line(unit, folder):
+    """Everything that the commands print and write, for a log in a file."""
+    (folder / "room.py").write_text(MODEL)
+    data = log()
+    rows = "".join(f"{t},{x!r}\n" for t, x in zip(data.times, data.values[:, 0].tolist(), strict=True))
+    (folder / "log.csv").write_text("t,T\n" + rows)
+    path = folder / "problem.toml"
+    path.write_text(FILE.format(unit=json.dumps(unit, ensure_ascii=False)), encoding="utf-8")
+    fitted = invoke("fit", path, "--out", folder / "out", "--certificate")
+    checked = invoke("check", path)
+    simulated = invoke("simulate", path, "--out", folder / "x.csv")
+    assert (fitted.exit_code, checked.exit_code, simulated.exit_code) == (0, 0, 0)
+    bad = folder / "bad.toml"
+    bad.write_text(path.read_text(encoding="utf-8").replace("min_duration = 1.0", "min_duration = 50.0"))
+    return {
+        "fit": fitted.stdout,
+        "fit: report.txt": (folder / "out" / "report.txt").read_text(encoding="utf-8"),
+        "fit: estimate.json": numbers_left_out((folder / "out" / "estimate.json").read_text(encoding="utf-8")),
+        "check": checked.stdout,
+        "simulate": (folder / "x.csv").read_text(encoding="utf-8").splitlines()[0],
+        "refused": invoke("fit", bad).stderr.replace(str(folder), "FOLDER"),
+    }
+
+
+def numbers_left_out(text):
+    """A saved estimate without its wall time."""
+    content = json.loads(text)
+    del content["fit"]["seconds"]
+    return json.dumps(content, ensure_ascii=False, indent=0)
+
+
+def everything(unit, folder):
+    """Every text that a fit of `problem(unit)`, and studies of it, print, draw, save or raise, by what it is."""
+    whole = problem(unit, min_duration=1.0)
+    fit = sf.estimate(whole)
+    profile = fit.profile("run1.tau_1")
+    bootstrap, study = sf.bootstrap(fit, 20), sf.monte_carlo(whole, 20, theta=fit.theta)
+    search = sf.multistart(whole, 4)
+    fit.save(folder / "fit.json")
+    (folder / "cli").mkdir()
+    found = {
+        "report": str(fit),
+        "certificate": str(fit.certificate),
+        "identifiability": str(fit.identifiability),
+        "identifiability before": str(sf.identifiability(doubtful(unit))),
+        "residuals": str(fit.residuals),
+        "profile": str(profile),
+        "bootstrap": str(bootstrap),
+        "monte_carlo": str(study),
+        "multistart": str(search),
+        "estimate_many": str(sf.estimate_many([whole, whole])),
+        "summary": describe(whole),
+        "json": numbers_left_out((folder / "fit.json").read_text(encoding="utf-8")),
+        "loaded": str(sf.Estimate.load(folder / "fit.json")),
+        "figure of the fit": texts_of(fit.plot()),
+        "figure of the residuals": texts_of(fit.plot_residuals()),
+        "figure of the profile": texts_of(profile.plot()),
+        "figure of the bootstrap": texts_of(bootstrap.plot()),
+        "figure of the study": texts_of(study.plot()),
+        "figure of the search": texts_of(search.plot()),
+        "prediction": fit.predict([5.0]).time_unit,
+        "simulation": sf.simulate(whole).time_unit,
+    }
+    found |= {f"message: {name}": text for name, text in messages(unit).items()}
+    found |= {f"command: {name}": text for name, text in command_line(unit, folder / "cli").items()}
+    return {name: without_wall_time(text) for name, text in found.items()}
+
+
+def without_wall_time(text):
+    """Seconds of the clock on the wall are seconds whatever the unit of the log is."""
+    text = re.sub(r"(evaluations?), [\d.e+-]+\s+s\b", r"\1", text)
+    return re.sub(r"fits in [\d.]+ s \([\d.]+ ms each\)", "fits", text)
+
+
+@pytest.fixture(scope="module")
+def in_seconds(tmp_path_factory):
+    return everything("s", tmp_path_factory.mktemp("s"))
+
+
+@pytest.mark.parametrize("unit", ["min", pytest.param("{0} %", marks=pytest.mark.slow)])
+def test_the_unit_of_times_is_the_only_one_that_is_printed(unit, in_seconds, tmp_path):
+    """No s anywhere, and all texts are those of the same problem in s with the unit in the place of s."""
+    for name, text in everything(unit, tmp_path).items():
+        assert not LONE_S.search(text), f"{name}: {text}"
+        expected = in_seconds[name]
+        if name == "command: simulate":
+            assert (text, expected) == (f"experiment,t ({unit}),mode,T", "experiment,t,mode,T")
+            continue
+        replaced = LONE_S.sub(lambda _: unit, expected)
+        assert squeezed(text) == squeezed(replaced), name
+
+
+def squeezed(text):
+    """Without line breaks and spaces, which move with the length of the unit."""
+    return re.sub(r"\s", "", text)
+
+
+def test_where_a_time_is_printed_its_unit_is(in_seconds):
+    """The test above would pass if no unit was printed at all."""
+    for name, pieces in {
+        "report": ["on -> off, 0 to 120 s\n", "%)  s                30  on -> off", "run2.tau_1  46  s"],
+        "identifiability before": ["s later"],
+        "profile": ["± 0.10 s\n", "] s   (likelihood ratio"],
+        "bootstrap": ["run1.tau_1 (s)"],
+        "monte_carlo": ["run1.tau_1 (s)"],
+        "multistart": ["run1.tau_1 = 42.9702 s, heating = 0.50146 °C/min"],
+        "summary": ["on [0, 120] s, at 30 s", "1 to 117 s, typically 4 s apart", "run1.tau_1  30 s"],
+        "json": ['"theta_units": [\n"s"', '"time_unit": "s"'],
+        "figure of the fit": ["time (s)"],
+        "figure of the residuals": ["time (s)"],
+        "figure of the profile": ["run1.tau_1 (s)"],
+        "figure of the bootstrap": ["run1.tau_1 (s)"],
+        "figure of the study": ["run1.tau_1 (s)"],
+        "message: min_duration": ["min_duration is 50.0 s, but the guess gives mode 1 ('on') of run1 only 30 s."],
+        "message: delay": ["may lie in [-inf, inf] s", "only from -3 to 1 s"],
+        "message: theta": ["are of moments from -2 to 114 s"],
+        "message: nan": ["at t = 2", " s, x = "],
+        "message: blows up": ["beyond t = 0.", " s, where x = "],
+        "message: reset map": ["at t = 30 s, x = "],
+        "command: check": ["on [0, 120] s, at 30 s"],
+        "command: refused": ["min_duration is 50.0 s, but the guess gives mode 1 ('on') only 30 s."],
+    }.items():
+        for piece in pieces:
+            assert piece in in_seconds[name], f"{name}: {piece!r} is not in {in_seconds[name]}"
+
+
+@given(unit=st.text(min_size=1).filter(str.strip))
+def test_any_text_that_is_not_blank_is_a_unit(unit):
+    problem = sf.Problem(room(), run(time_unit=unit), RATES)
+    assert problem.unknowns.units == (unit, "°C/min", "1/min")
+    if unit != "1":
+        assert f"on [0, 120] {unit}, at 30 {unit}\n" in describe(problem)
+
+
+@given(unit=st.text(min_size=1).filter(str.strip))
+def test_any_unit_is_saved_and_loaded(unit, tmp_path_factory):
+    path = tmp_path_factory.mktemp("unit") / "fit.json"
+    save_fit(made(trajectories=(in_unit(trajectory_of(), unit),)), CERTIFICATE, path)
+    assert load_fit(path)[0].trajectory.time_unit == unit
+
+
+def in_unit(trajectory, unit):
+    return replace(trajectory, time_unit=unit)
+
+
+def test_a_file_that_was_saved_before_there_were_units_is_in_seconds(tmp_path):
+    path = tmp_path / "fit.json"
+    save_fit(made(trajectories=(in_unit(trajectory_of(), "min"),)), CERTIFICATE, path)
+    content = json.loads(path.read_text())
+    assert content["fit"]["trajectories"][0].pop("time_unit") == "min"
+    path.write_text(json.dumps(content))
+    assert load_fit(path)[0].trajectory.time_unit == "s"
+    del content["fit"]["trajectories"][0]["segments"]
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"fit\.trajectories\[0\]\.segments is missing"):
+        load_fit(path)
+
+
+def test_times_without_a_unit():
+    """The unit "1" is that of pure numbers, and not shown: as of parameters."""
+    problem = sf.Problem(room(), run(time_unit="1"), RATES)
+    fit = sf.estimate(problem)
+    assert "on -> off, 0 to 120\n" in str(fit)
+    assert [ax.get_xlabel() for ax in fit.plot().axes] == ["", "time"]
+    assert "on [0, 120], at 30\n" in describe(problem)
+
+
+def test_without_transitions_the_summary_has_no_times():
+    one = sf.Problem(room(), run((), modes=("on",), time_unit="min"), RATES)
+    assert "on on [0, 120] min\n" in describe(one)
+
+
+# --- each plot function, and several units at once --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda comparison, trajectory, ax: plot_comparison(comparison, trajectory, 0, ax),
+        lambda comparison, trajectory, ax: plot_residuals(comparison, trajectory, 0, ax),
+        lambda comparison, trajectory, ax: plot_state(trajectory, 0, ax),
+        lambda comparison, trajectory, ax: plot_modes(trajectory, ax),
+    ],
+)
+def test_every_axis_of_times_has_their_unit(draw):
+    fit = made()
+    ax = draw(fit.comparisons[0][0], in_unit(fit.trajectory, "h"), Figure().subplots())
+    assert ax.get_xlabel() == "time (h)"
+
+
+def test_each_experiment_has_its_own_unit(tmp_path):
+    """One run in minutes, one in hours with rates of its own; no number of one is shown in the unit of the other."""
+    hours = sf.Measurements(MINUTES / 60, log(46.0, 2).values, sigma=0.1, names=("T",))
+    later = sf.Experiment(
+        hours, ("on", "off"), (sf.Parameter(46 / 60, fixed=True),), t0=0.0, tf=2.0, name="later", time_unit="h",
+        parameter_map={"heating": "heating_h", "cooling": "cooling_h"},
+    )  # fmt: skip
+    third = sf.Experiment(
+        hours, ("on", "off"), (0.6,), t0=0.0, tf=2.0, name="third", time_unit="h",
+        parameter_map={"heating": "heating_h", "cooling": "cooling_h"},
+    )  # fmt: skip
+    per_hour = {"heating_h": sf.Parameter(18.0, unit="°C/h"), "cooling_h": sf.Parameter(3.0, unit="1/h")}
+    whole = sf.Problem(room(), [run(time_unit="min", name="first"), later, third], RATES | per_hour)
+    assert whole.unknowns.units == ("min", "h", "°C/min", "1/min", "°C/h", "1/h")
+    fit = sf.estimate(whole)
+    assert fit.success
+    text = str(fit)
+    assert re.search(r"first +on -> off, 0 to 120 min\n", text)
+    assert re.search(r"run2 +on -> off, 0 to 2 h\n", text)
+    assert re.search(r"run2\.tau_1 +0\.76666667 +h +on -> off", text)
+    labels = [ax.get_xlabel() for ax in fit.plot().axes]
+    assert labels == ["", "time (min)", "", "time (h)", "", "time (h)"]
+    residuals = fit.plot_residuals().axes
+    assert [ax.get_xlabel() for ax in residuals[::3]] == ["time (min)", "", "time (h)"]
+    assert [ax.get_xlabel() for ax in residuals[1::3]] == ["", "", "lag (samples)"]
+    summary = describe(whole)
+    assert "typically 4 min apart" in summary
+    assert "typically 0.06667 h apart" in summary
+    fit.save(tmp_path / "fit.json")
+    loaded = sf.Estimate.load(tmp_path / "fit.json", problem=whole)
+    assert [trajectory.time_unit for trajectory in loaded.trajectories] == ["min", "h", "h"]
+    assert str(loaded) == text
+    assert [fit.predict(experiment=e).time_unit for e in range(3)] == ["min", "h", "h"]
+
+
+def test_fixed_times_are_in_the_unit_of_their_experiment():
+    fit = made(
+        theta_names=("tau_2", "mu"), theta_units=("h", "1"), theta=np.array([7.0, 0.8]), lower=np.full(2, -np.inf),
+        initial_theta=np.array([8.0, 0.5]), upper=np.full(2, np.inf), gradient=np.zeros(2), hessian=np.eye(2),
+        free_basis=np.eye(2), trajectories=(in_unit(trajectory_of(), "h"),),
+    )  # fmt: skip
+    assert re.search(r"tau_1 +4 +h +stick -> slip", report(fit))
+    assert [ax.get_xlabel() for ax in plot_fit(fit).axes][-1] == "time (h)"
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("unit", [None, 1, b"s", ["s"]])
+def test_a_unit_is_a_string(unit):
+    with pytest.raises(TypeError, match="time_unit must be a string such as 's' or 'min'; got"):
+        run(time_unit=unit)
+
+
+@pytest.mark.parametrize("unit", ["", " ", "\n\t"])
+def test_a_unit_is_not_blank(unit):
+    with pytest.raises(ValueError, match="time_unit must not be empty; got"):
+        run(time_unit=unit)
+
+
+@pytest.mark.parametrize(("given", "unit"), [("min", "s"), ("s", "min"), ("1", "s"), ("Min", "min")])
+@pytest.mark.parametrize("fixed", [False, True])
+def test_a_transition_time_in_another_unit_is_refused(given, unit, fixed):
+    with pytest.raises(ValueError, match=f"transition time 2 has the unit '{given}', but time_unit .* is '{unit}'"):
+        run((30.0, sf.Parameter(50.0, unit=given, fixed=fixed)), modes=("on", "off", "on"), time_unit=unit)
+
+
+def test_a_problem_file_with_two_units_for_one_run(tmp_path):
+    (tmp_path / "room.py").write_text(MODEL)
+    (tmp_path / "log.csv").write_text("t,T\n1,15\n100,16\n")
+    text = FILE.format(unit='"min"')
+    for old, new, said in (
+        ('time_unit = "min"\n', "", r"experiments\[1\]: transition time 1 has the unit 'min', but time_unit .* is 's'"),
+        ('time_unit = "min"\n', 'time_unit = ""\n', r"time_unit' must have at least 1 entries; got ''|time_unit"),
+        ('time_unit = "min"\n', "time_unit = 60\n", r"experiments\[1\]\.time_unit' must be a string; got 60"),
+        ('unit = "min" }', 'unit = "h" }', "transition time 1 has the unit 'h'"),
+    ):
+        assert old in text
+        (tmp_path / "problem.toml").write_text(text.replace(old, new))
+        with pytest.raises(ValueError, match=said):
+            load_problem(tmp_path / "problem.toml")
+
+
+def test_one_shortest_duration_for_two_units():
+    runs = [run(time_unit="min"), run(time_unit="h", name="other")]
+    sf.Problem(room(), runs, RATES)
+    with pytest.raises(ValueError, match=r"min_duration is one number .* different units \(run1 in min, other in h\)"):
+        sf.Problem(room(), runs, RATES, min_duration=1e-3)
+
+
+def test_a_delay_is_a_time():
+    late = log(delay="late")
+    between = {"lower": 0.0, "upper": 1.0}
+    sf.Problem(room(), run(30.0, late, time_unit="min"), RATES | {"late": sf.Parameter(0.5, **between, unit="min")})
+    with pytest.raises(ValueError, match="the delay 'late' has the unit 's', but time_unit of its experiment is 'min'"):
+        sf.Problem(room(), run(30.0, late, time_unit="min"), RATES | {"late": sf.Parameter(0.5, **between, unit="s")})
+    runs = [run(30.0, late, time_unit="min"), run(time_unit="s"), run(30.0, late, time_unit="h")]
+    with pytest.raises(ValueError, match=r"the delay 'late' is one number .* \(run1 in min, run3 in h\)"):
+        sf.Problem(room(), runs, RATES | {"late": sf.Parameter(0.5, **between)})
+    own = [run(30.0, late, time_unit=u, parameter_map={"late": f"late_{u}"}) for u in ("min", "h")]
+    sf.Problem(room(), own, RATES | {f"late_{u}": sf.Parameter(0.5, **between, unit=u) for u in ("min", "h")})
+
+
+def test_logs_in_one_array_have_one_unit():
+    logs = [sf.Problem(room(), run(time_unit=unit), RATES) for unit in ("min", "min", "h")]
+    assert sf.estimate_many(logs[:2]).theta_units[0] == "min"
+    with pytest.raises(ValueError, match="problem 2 has its times in h, the first one in min"):
+        sf.estimate_many(logs)
+
+
+def test_a_saved_fit_and_its_problem_have_one_unit(tmp_path):
+    minutes, hours = (sf.Problem(room(), run(time_unit=unit), RATES) for unit in ("min", "h"))
+    sf.estimate(minutes).save(tmp_path / "fit.json")
+    assert sf.Estimate.load(tmp_path / "fit.json", problem=minutes).predict([5.0]).time_unit == "min"
+    with pytest.raises(ValueError, match=r"fit\.json holds times in min, the problem has them in h"):
+        sf.Estimate.load(tmp_path / "fit.json", problem=hours)
+
+
+def test_one_column_of_times_has_one_unit(tmp_path):
+    (tmp_path / "room.py").write_text(MODEL)
+    (tmp_path / "log.csv").write_text("t,T\n1,15\n100,16\n")
+    one = FILE.format(unit='"min"').partition("[options]")[0]
+    other = one.partition("[[experiments]]")[2].replace('"min"', '"h"')
+    (tmp_path / "two.toml").write_text(f"{one}\n[[experiments]]\n{other}")
+    said = invoke("simulate", tmp_path / "two.toml", "--out", tmp_path / "x.csv")
+    assert said.exit_code == 2
+    assert "times in different units (h, min), and one column of the CSV file would mix them" in said.stderr
+    assert not (tmp_path / "x.csv").exists()
+    (tmp_path / "two.toml").write_text(f"{one}\n[[experiments]]\n{other.replace(chr(34) + 'h', chr(34) + 'min')}")
+    assert invoke("simulate", tmp_path / "two.toml", "--out", tmp_path / "x.csv").exit_code == 0
+    with (tmp_path / "x.csv").open(newline="") as file:
+        assert next(csv.reader(file)) == ["experiment", "t (min)", "mode", "T"]

@@ -1,0 +1,161 @@
+"""Zero times what is not finite is not a number, in machine code as in JAX."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import switchfit as sf
+from switchfit.evaluate import evaluator_of
+from switchfit.functions import float64
+from switchfit.native.scalars import Graph
+from switchfit.native.trace import traced
+
+TIMES = np.linspace(0.1, 1.0, 5)
+GOOD, BAD = 0.5, -0.5
+
+
+def problem_of(mode, observe=None, initial=None, data=(), states=2, **transitions):
+    """Two parameters, a and b; b = 0.5 at the guess."""
+    system = sf.HybridSystem({"one": mode, "two": mode}, initial or [1.0] * states, **transitions)
+    seen = observe or (lambda t, x, p: x[:1])
+    log = sf.Measurements(TIMES, np.exp(-TIMES), observe=seen, sigma=0.1)
+    run = sf.Experiment([log, *data], ("one", "two"), (0.45,), 0.0, 1.0)
+    return sf.Problem(system, run, {"a": 0.8, "b": GOOD})
+
+
+def plain(t, x, p):
+    return -p["a"] * x * (1.0 + 0.0 * p["b"])
+
+
+def away(t, x, p):
+    """The second state is far from the first, which alone is measured."""
+    return jnp.stack([-p["a"] * x[0], p["b"] * x[1] ** 2])
+
+
+CASES = {
+    "log in a mode": lambda: problem_of(lambda t, x, p: -p["a"] * x + 0.0 * jnp.log(p["b"])),
+    "root in a mode": lambda: problem_of(lambda t, x, p: -p["a"] * x + 0.0 * jnp.sqrt(p["b"] * x)),
+    "quotient in a mode": lambda: problem_of(lambda t, x, p: -p["a"] * x + 0.0 / (p["b"] + 0.5)),
+    "power in a mode": lambda: problem_of(
+        lambda t, x, p: -p["a"] * x + 0.0 * jnp.abs(p["b"]) ** p["b"] / (p["b"] + 0.5)
+    ),
+    "product with a matrix": lambda: problem_of(
+        lambda t, x, p: jnp.array([[-1.0, 0.0], [0.0, -1.0]]) @ jnp.stack([p["a"] * x[0], jnp.log(p["b"])])
+    ),
+    "in a reset": lambda: problem_of(
+        plain, reset_maps={("one", "two"): lambda t, x, p: x + 0.0 * jnp.arccosh(1.0 + p["b"])}
+    ),
+    "in the initial state": lambda: problem_of(plain, initial=lambda p: jnp.ones(2) + 0.0 * jnp.log(p["b"])),
+    "in what is observed": lambda: problem_of(plain, observe=lambda t, x, p: x[:1] + 0.0 * jnp.log(p["b"])),
+    "in a running cost": lambda: problem_of(
+        plain, data=[sf.RunningCost(lambda t, x, p: x[0] ** 2 + 0.0 * jnp.log(p["b"]))]
+    ),
+    "in a terminal cost": lambda: problem_of(
+        plain, data=[sf.TerminalCost(lambda x, p: x[0] ** 2 + 0.0 * jnp.log1p(3.0 * p["b"]))]
+    ),
+    "exponential": lambda: problem_of(lambda t, x, p: -p["a"] * x + 0.0 * jnp.exp(-2000.0 * p["b"])),
+    "derivative of a root": lambda: problem_of(
+        lambda t, x, p: jnp.stack([-p["a"] * x[0], jnp.sqrt(jnp.maximum(p["b"], 0.0))])
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_both_engines_agree_on_what_is_not_a_number(name):
+    problem = CASES[name]()
+    evaluator = evaluator_of(problem)
+    for b, wrong in ((GOOD, False), (BAD, True)):
+        theta = problem.initial_theta
+        theta[-1] = b
+        fast, slow = (evaluator(theta, method=method) for method in ("auto", "discrete-adjoint"))
+        assert all(native is not None for native in evaluator._natives(2))
+        assert (not np.isfinite([fast.cost, *fast.gradient, *fast.hessian.ravel()]).all()) == wrong
+        for kind in ("cost", "gradient", "hessian"):
+            one, other = np.atleast_1d(getattr(fast, kind)), np.atleast_1d(getattr(slow, kind))
+            np.testing.assert_array_equal(np.isfinite(one), np.isfinite(other), err_msg=kind)
+            np.testing.assert_allclose(one[np.isfinite(one)], other[np.isfinite(other)], rtol=1e-9, atol=1e-9)
+        assert np.isnan(evaluator.cost(theta)) == np.isnan(slow.cost)
+
+
+def test_a_state_that_overflows_beside_the_others_is_seen():
+    """x[1] = 1 / (1 - b t) leaves all numbers behind; only x[0] is measured, with a gain of zero for x[1]."""
+    problem = problem_of(away, observe=lambda t, x, p: x[:1] + jnp.array([[0.0]]) @ x[1:])
+    evaluator = evaluator_of(problem)
+    theta = problem.initial_theta
+    assert np.isfinite(evaluator(theta).cost)
+    theta[-1] = 2000.0
+    assert np.isnan(evaluator(theta, method="discrete-adjoint").cost)
+    assert np.isnan(evaluator(theta).cost)
+
+
+def test_what_is_masked_stays_a_number():
+    """A branch that is not taken may be anything: the value and its derivatives are those of the other one."""
+
+    def mode(t, x, p):
+        positive = p["b"] > 0.0
+        return -p["a"] * x + jnp.where(positive, jnp.log(jnp.where(positive, p["b"], 1.0)), 0.0)
+
+    evaluator = evaluator_of(problem_of(mode))
+    theta = evaluator.problem.initial_theta
+    theta[-1] = BAD
+    fast, slow = (evaluator(theta, method=method) for method in ("auto", "discrete-adjoint"))
+    np.testing.assert_allclose(fast.hessian, slow.hessian, rtol=1e-10, atol=1e-10)
+    assert np.isfinite(fast.hessian).all()
+
+
+def test_simulations_see_it_too():
+    problem = problem_of(plain, observe=lambda t, x, p: x[:1] + 0.0 * jnp.log(p["b"]))
+    theta = problem.initial_theta
+    theta[-1] = BAD
+    assert np.isnan(evaluator_of(problem).cost(theta))
+    sf.simulate(problem, theta)  # the states are finite
+    with pytest.raises(ValueError, match=r"initial_state .* not finite"):
+        sf.simulate(problem_of(plain, initial=lambda p: jnp.ones(2) + 0.0 * jnp.log(p["b"])), theta)
+    with pytest.raises(ValueError, match="mode 'one' returned"):
+        sf.simulate(problem_of(lambda t, x, p: -p["a"] * x + 0.0 * jnp.log(p["b"])), theta)
+
+
+def test_a_batch_hands_such_fits_to_the_single_optimiser():
+    problem = problem_of(lambda t, x, p: -p["a"] * x + 0.0 * jnp.sqrt(p["b"] + 0.25))
+    starts = np.tile(problem.initial_theta, (2, 1))
+    starts[1, -1] = BAD
+    found = sf.multistart(problem, starts=starts)
+    assert "NONFINITE_START" in set(found.status)
+
+
+# What is presumed
+
+
+def presumed(function, *shapes):
+    with float64():
+        return {node.op for node in traced(function, *shapes).presumed}
+
+
+@pytest.mark.parametrize(
+    ("function", "ops"),
+    [
+        (lambda x: [0.0 * jnp.log(x)], {"log"}),
+        (lambda x: [0.0 * jnp.sin(x)], set()),
+        (lambda x: [0.0 * (x * x + 1.0) * jnp.tanh(x)], set()),
+        (lambda x: [0.0 * (1.0 + jnp.sqrt(jnp.log(x)))], {"sqrt", "log"}),
+        (lambda x: [0.0 / x], {"div"}),
+        (lambda x: [0.0 / (jnp.cos(x) + 2.0)], {"div"}),
+        (lambda x: [x / 3.0 * 0.0], set()),
+        (lambda x: [jax.jacfwd(lambda x: x[0] * jnp.exp(x[1]))(jnp.stack([x, 2.0 * x]))], {"exp"}),
+        (lambda x: [jnp.log(x)], set()),
+    ],
+)
+def test_what_has_to_be_finite(function, ops):
+    assert presumed(function, ()) == ops
+
+
+def test_nothing_is_checked_that_was_not_left_out():
+    graph = Graph()
+    x = graph.load("x", 0)
+    graph.apply("log", x)
+    assert graph.check() == []
+    assert graph.apply("mul", 0.0, graph.apply("log", x)).number == 0.0
+    assert len(graph.check()) == 1
