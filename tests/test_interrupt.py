@@ -177,13 +177,13 @@ def test_a_wrong_mode_is_refused_in_words(modes, request):
         assert f"mode '{name}'" in message
         assert " t = " in message
         assert "x = [" in message
-    assert "returned [nan] at t = 0, x = [1.0]" in said["nan"]
-    assert "returned [inf] at t = 0, x = [1.0]" in said["infinite"]
+    assert "returned [nan] at t = 0 s, x = [1.0]" in said["nan"]
+    assert "returned [inf] at t = 0 s, x = [1.0]" in said["infinite"]
     assert "returned [nan] at t = 0.5" in said["nan later"]
 
 
 def test_a_first_slope_that_is_not_finite_is_refused():
     run = sf.Experiment(sf.Measurements([1.0], [1.0], sigma=1.0), ("m",), (), 0.0, 1.0)
     problem = sf.Problem(sf.HybridSystem({"m": WRONG["infinite"]}, [1.0]), run, {"a": 1.0})
-    with pytest.raises(ValueError, match=r"mode 'm' returned \[inf\] at t = 0, x = \[1.0\]"):
+    with pytest.raises(ValueError, match=r"mode 'm' returned \[inf\] at t = 0 s, x = \[1.0\]"):
         sf.evaluate(problem)
