@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ import pytest
 from systems import NODES, P0, case, problem_of
 
 import switchfit as sf
+from switchfit.batch.chunks import run_chunks
 from switchfit.evaluate import evaluator_of
 from switchfit.native import driver, program
 from switchfit.native.program import forget_programs, native_experiment
@@ -187,3 +189,30 @@ def test_a_first_slope_that_is_not_finite_is_refused():
     problem = sf.Problem(sf.HybridSystem({"m": WRONG["infinite"]}, [1.0]), run, {"a": 1.0})
     with pytest.raises(ValueError, match=r"mode 'm' returned \[inf\] at t = 0 s, x = \[1.0\]"):
         sf.evaluate(problem)
+
+
+class Endless:
+    """Work whose second chunk takes very long."""
+
+    size = 1
+
+    def __init__(self):
+        self.released = threading.Event()
+
+    def __call__(self, runs):
+        if runs.start:
+            self.released.wait(60.0)
+        return {"run": np.array(runs)}
+
+    def fingerprint(self):
+        return "endless"
+
+
+def test_a_batch_that_is_stopped_does_not_wait_for_the_chunk_under_way():
+    work = Endless()
+    began = time.monotonic()
+    runs, _ = run_chunks(work, 2, progress=lambda done, total: True)
+    waited = time.monotonic() - began
+    work.released.set()
+    assert runs.tolist() == [0]
+    assert waited < 30.0, "as long as the chunk"

@@ -132,7 +132,8 @@ def _threaded(work: Work, chunks: list[range]) -> Iterator[tuple[range, Arrays]]
             for future in sorted(finished, key=lambda future: futures[future].start):
                 yield futures[future], future.result()
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        # Stopped early, a chunk under way may take long: it ends by itself, and nobody waits for it.
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _distributed(work: Work, chunks: list[range], client: Any) -> Iterator[tuple[range, Arrays]]:
