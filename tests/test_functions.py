@@ -112,7 +112,7 @@ def test_functions_that_models_often_have(name):
     assert_same_function(name)
 
 
-@pytest.mark.slow
+@pytest.mark.fuzz
 @pytest.mark.parametrize("name", [name for name in FUNCTIONS if name not in OFTEN])
 def test_all_other_functions(name):
     assert_same_function(name)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 import types
+from pathlib import Path
 
 import cloudpickle
 import jax
@@ -416,3 +418,12 @@ def test_a_problem_whose_functions_have_changed_is_not_pickled_in_silence():
     blob = cloudpickle.dumps(problem)
     with pytest.raises(ValueError, match=r"mode 'fall' does something else .* build the problem anew"):
         cloudpickle.loads(blob)
+
+
+def test_the_page_on_models_runs_and_prints_what_it_says(capsys):
+    page = (Path(__file__).parent.parent / "docs" / "models.md").read_text()
+    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    exec(compile(block, "models.md", "exec"), {})
+    said = re.findall(r"\)  # ([0-9.]+)$", block, re.MULTILINE)
+    assert len(said) == 3
+    assert capsys.readouterr().out.split() == said

@@ -744,7 +744,7 @@ def test_the_doors_are_all_that_is_public(doors):
     assert set(sf.__all__) - made_by_switchfit <= set(doors)
 
 
-@pytest.mark.slow
+@pytest.mark.fuzz
 def test_the_valid_calls_succeed(doors):
     for name, door in doors.items():
         try:
@@ -763,7 +763,7 @@ def test_some_malformed_calls(cheap_doors):
 
 
 @OVERFLOWS
-@pytest.mark.slow
+@pytest.mark.fuzz
 def test_every_malformed_call(doors):
     rng = np.random.default_rng(2024)
     singles = calls_of(doors)

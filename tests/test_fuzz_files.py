@@ -23,7 +23,7 @@ import switchfit as sf
 from switchfit import cli, paper
 from switchfit.native.program import forget_programs
 
-SIZES = [pytest.param(60, id="short"), pytest.param(1200, id="long", marks=pytest.mark.slow)]
+SIZES = [pytest.param(60, id="short"), pytest.param(1200, id="long", marks=pytest.mark.fuzz)]
 LONGEST = 120
 """Seconds after which a command hangs."""
 

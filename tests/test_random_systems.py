@@ -679,7 +679,7 @@ def test_derivatives_of_random_systems_in_jax(seed, given, methods):
     assert not differences(system, methods)
 
 
-@pytest.mark.slow
+@pytest.mark.fuzz
 @pytest.mark.parametrize("seed", range(SYSTEMS))
 def test_derivatives_of_random_systems(seed):
     """Machine code, or JAX where there is none, and each of the other methods in turn."""

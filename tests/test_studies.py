@@ -61,13 +61,13 @@ def test_refits(name):
 # In full
 
 
-@pytest.mark.slow
+@pytest.mark.fuzz
 @pytest.mark.parametrize(("name", "count"), [("fishing", 400), ("linear", 200), ("vehicle", 200)])
 def test_a_thousand_starts(name, count):
     no_failure(start_anywhere(name, count, seed=7))
 
 
-@pytest.mark.slow
+@pytest.mark.fuzz
 @pytest.mark.parametrize("seed", [0, 1])
 def test_starts_of_a_fit_whose_modes_collapse(seed):
     problem, truth = thermostat()
@@ -78,7 +78,7 @@ def test_starts_of_a_fit_whose_modes_collapse(seed):
     assert np.sum(study.status == "COLLAPSED") > 10
 
 
-@pytest.mark.slow
+@pytest.mark.fuzz
 @pytest.mark.parametrize("from_guess", [False, True])
 @pytest.mark.parametrize("name", MEASURED)
 def test_ten_thousand_refits(name, from_guess):
