@@ -168,5 +168,15 @@ def test_a_coarse_mesh_is_no_jump():
     data = sf.Measurements(TIMES, np.exp(-TIMES), sigma=0.1)
     problem = sf.Problem(system, sf.Experiment(data, ("m",), (), 0.0, 4.0), {"k": 1.0}, rtol=1e-2, atol=1e-2)
     found = sf.estimate(problem)
-    evaluator = found.evaluator_at_solution()
-    refuse_jumps(evaluator, found.theta)
+    refuse_jumps(found.evaluator_at_solution(), found.theta)
+
+
+def test_a_perfect_fit_is_no_jump():
+    """J is 1e-20 there, rounding alone, and its integration error is all of it."""
+    system = sf.HybridSystem({"m": lambda t, x, p: -p["k"] * x}, [1.0])
+    data = sf.Measurements(TIMES, np.exp(-TIMES), sigma=0.1)
+    run = sf.Experiment(data, ("m",), (), 0.0, 4.0)
+    found = sf.estimate(sf.Problem(system, run, {"k": 1.0}, rtol=1e-11, atol=1e-13), start=[1.0])
+    assert found.success
+    assert found.cost < 1e-15
+    refuse_jumps(found.evaluator_at_solution(), found.theta)

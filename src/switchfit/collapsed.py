@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from switchfit.data import FloatArray
 from switchfit.evaluate import Evaluator
+from switchfit.experiment import Experiment
 from switchfit.optimize.qp import EPS
 from switchfit.problem import Problem
 
@@ -68,7 +69,10 @@ def _idle_groups(problem: Problem, theta: FloatArray) -> Iterator[NDArray[np.int
 
 def _coincident(problem: Problem, theta: FloatArray, e: int) -> Iterator[tuple[int, int]]:
     """First and last of two or more transitions of experiment e that coincide strictly inside the horizon."""
-    times, short, room = problem.split(theta)[0][e], *_lengths(problem, theta, e)
+    experiment, times = problem.experiments[e], problem.vectors(theta, e)[0]
+    if not np.any(times[1:] - times[:-1] <= _rounding(experiment)):  # the rule, and asked at every step
+        return
+    short, room = _lengths(problem, theta, e)
     first = 0
     for i in range(1, len(times) + 1):
         if i < len(times) and short[i]:
@@ -82,7 +86,7 @@ def _opened(problem: Problem, theta: FloatArray) -> FloatArray:
     """theta with its free transition times moved so that every collapsed mode lasts a little, where there is room."""
     opened = theta.copy()
     for e, (experiment, where) in enumerate(zip(problem.experiments, problem.unknowns.times, strict=True)):
-        times, short, _ = problem.split(theta)[0][e], *_lengths(problem, theta, e)
+        times, short = problem.vectors(theta, e)[0], _lengths(problem, theta, e)[0]
         if not short.any():
             continue
         gap = OPENED * (experiment.tf - experiment.t0) * short
@@ -98,12 +102,15 @@ def _opened(problem: Problem, theta: FloatArray) -> FloatArray:
 def _lengths(problem: Problem, theta: FloatArray, e: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which modes of experiment e have no duration (N + 1,), and which transitions are at an end of it (N,)."""
     experiment = problem.experiments[e]
-    times = problem.split(theta)[0][e]
-    clock = max(experiment.tf - experiment.t0, abs(experiment.t0), abs(experiment.tf))
-    rounding = 32 * EPS * clock
+    times, rounding = problem.vectors(theta, e)[0], _rounding(experiment)
     knots = np.concatenate([[experiment.t0], times, [experiment.tf]])
     at_end = (times - experiment.t0 <= rounding) | (experiment.tf - times <= rounding)
     return np.diff(knots) <= rounding, at_end
+
+
+def _rounding(experiment: Experiment) -> float:
+    """Rounding error of the difference of two times of an experiment."""
+    return 32 * EPS * max(experiment.tf - experiment.t0, abs(experiment.t0), abs(experiment.tf))
 
 
 def _parameters(problem: Problem) -> list[int]:

@@ -94,7 +94,10 @@ def _jump(evaluator: Evaluator, theta: FloatArray, i: int) -> tuple[float, Findi
         end = float(np.clip(theta[i] + change * size, lower, upper))
         if end != theta[i] and here is not None:
             low, high = min(end, float(theta[i])), max(end, float(theta[i]))
-            finding = find_jump(line, low, high, CHANGED * abs(here[0]))
+            there = line(end)
+            # Measured by the larger of the two: where the fit is perfect, J itself is rounding.
+            noise = CHANGED * max(abs(here[0]), 0.0 if there is None else abs(there[0]))
+            finding = find_jump(line, low, high, noise)
             if finding is not None:
                 return finding.at, finding
     return None

@@ -104,7 +104,7 @@ def minimized(
         tolerance=tolerance,
         max_iterations=max_iterations,
         callback=told,
-        size=variables.sizes_inward(problem.sizes),
+        size=problem.sizes if identity else variables.sizes_inward(problem.sizes),
         idle=idle,
     )
     if result.status is Status.LINE_SEARCH_FAILED:

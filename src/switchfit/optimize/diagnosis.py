@@ -93,7 +93,9 @@ def find_jump(line: Line, low: float, high: float, noise: float) -> Finding | No
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
         there = line(middle)
-        if there is None or not low < middle < high:
+        if there is None:
+            return None
+        if not low < middle < high:
             break
         if abs(_excess(low, left, middle, there)) >= abs(_excess(middle, there, high, right)):
             high, right = middle, there

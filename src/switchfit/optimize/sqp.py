@@ -296,6 +296,16 @@ class _Problem:
     size: FloatArray  # typical size of each coordinate, zero where only its values tell
     idle: Idle | None
 
+    @cached_property
+    def row_size(self) -> FloatArray:
+        """Size of what the rows of the constraints add up, of which rounding is a part: (m,)."""
+        return np.asarray(np.abs(self.constraints.A) @ self.size)
+
+    @cached_property
+    def row_rounding(self) -> FloatArray:
+        """Rounding error of the rows: (m,)."""
+        return np.asarray(16 * EPS * self.row_size)
+
     @property
     def uses_hessian(self) -> bool:
         return self.hessian != "none"
@@ -323,7 +333,7 @@ class _Point:
     optimality: float
     multipliers: FloatArray  # shape (m + 2 d,)
     downhill: NDArray[np.int_]  # like side, and for each kink the side to descend to, 0 to hold it
-    idle: NDArray[np.bool_]  # coordinates that are held because J does not depend on them here
+    idle: NDArray[np.bool_] | None  # coordinates that are held because J does not depend on them; None: there are none
     curvatures: dict[bytes, _Curvature] = field(default_factory=dict)  # found already, by the constraints' places
 
     @property
@@ -368,7 +378,7 @@ def _first_order(
     kink: NDArray[np.bool_],
     side: NDArray[np.int_],
     normals: FloatArray,
-    idle: NDArray[np.bool_],
+    idle: NDArray[np.bool_] | None,
 ) -> tuple[float, FloatArray, NDArray[np.int_]]:
     """The steepest descent over feasible directions of length one, its multipliers, and the side of each coordinate.
 
@@ -377,7 +387,7 @@ def _first_order(
     KKT residual; that of J' itself is the largest over the choices.
     """
     left, right = minus.gradient, plus.gradient
-    if idle.any():
+    if idle is not None:
         left, right, normals = left * ~idle, right * ~idle, normals * ~idle
     if plus is minus:
         return *kkt_residual(right, right, normals), side
@@ -448,7 +458,8 @@ class _Oracle:
         rounding = constraints.rounding(np.maximum(np.maximum(scale, self.problem.size), np.abs(theta)))
         active = np.flatnonzero(constraints.slack(theta) <= rounding)
         idle = self._idle(theta, active)
-        kink &= ~idle
+        if idle is not None:
+            kink &= ~idle
         plus = minus = first
         if kink.any() or ((side < 0).any() and (side > 0).any()):
             other = self.sample(theta, -1)
@@ -461,12 +472,12 @@ class _Oracle:
         multipliers[active] = values
         return _Point(theta, plus, minus, kink, side, active, optimality, multipliers, downhill, idle)
 
-    def _idle(self, theta: FloatArray, active: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Coordinates on which J does not depend while the rows that are active stay so: (d,)."""
-        idle = self.problem.idle
-        if idle is None or not np.any(active < self.problem.constraints.b.size):
-            return np.zeros(theta.size, dtype=bool)
-        return idle(theta.copy(), False)
+    def _idle(self, theta: FloatArray, active: NDArray[np.intp]) -> NDArray[np.bool_] | None:
+        """Coordinates on which J does not depend while the active rows stay active: (d,); None if there are none."""
+        if self.problem.idle is None or not _rows_hold(self.problem, active):
+            return None
+        idle = self.problem.idle(theta.copy(), False)
+        return idle if idle.any() else None
 
     def point(self, theta: FloatArray, scale: FloatArray) -> _Point | None:
         first = self.first(theta)
@@ -712,7 +723,7 @@ def _finish(oracle: _Oracle, state: _State, status: Status) -> _State:
             return replace(state, status=Status.SADDLE)
         if curvature.smallest <= EIGENVALUE_FLOOR:
             return replace(state, status=Status.SINGULAR)
-        if state.point.idle.any() or curvature.idle.any():
+        if state.point.idle is not None or curvature.idle is not None:
             return replace(state, status=Status.COLLAPSED)
     return replace(state, status=Status.CONVERGED_AT_KINK if _genuine_kinks(state).any() else status)
 
@@ -771,7 +782,7 @@ def _solve_on_sides(
     point, constraints = state.point, problem.constraints
     gradient, hessian = point.derivatives(sides)
     lower, upper = np.minimum(low - point.theta, 0.0), np.maximum(high - point.theta, 0.0)
-    free = constraints.movable & ~point.idle
+    free = constraints.movable if point.idle is None else constraints.movable & ~point.idle
     if point.kink.any():
         lower[point.kink & (sides > 0)] = 0.0
         upper[point.kink & (sides < 0)] = 0.0
@@ -979,7 +990,7 @@ def _move(problem: _Problem, theta: FloatArray, step: FloatArray) -> FloatArray:
         if abs(mark - moved[i]) <= near[i]:
             moved[i], pinned[i] = mark, True
     moved = np.where(moved - near <= lower, lower, np.where(moved + near >= upper, upper, moved))
-    if problem.constraints.b.size == 0:
+    if np.all(problem.constraints.A @ moved - problem.constraints.b > problem.row_rounding):
         return moved
     pinned |= (moved == lower) | (moved == upper)
     return _snap_to_rows(problem, _repair(problem.constraints, moved, pinned), pinned)
@@ -995,7 +1006,7 @@ def _snap_to_rows(
     """
     constraints = problem.constraints
     slack = constraints.A @ theta - constraints.b
-    close = np.abs(slack) <= reach * (np.abs(constraints.A) @ problem.size)
+    close = np.abs(slack) <= reach * problem.row_size
     if not slack[close].any():
         return theta
     snapped, fixed = theta.copy(), pinned.copy()
@@ -1056,7 +1067,7 @@ class _Curvature:
     eigenvalues: FloatArray
     unscaled: FloatArray
     lowest: FloatArray  # of unit length in theta
-    idle: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))  # coordinates left out as idle
+    idle: NDArray[np.bool_] | None = None  # coordinates left out as idle, beside those of the point
 
     @property
     def smallest(self) -> float:
@@ -1081,17 +1092,22 @@ def _curvature(problem: _Problem, state: _State, rows: NDArray[np.intp]) -> _Cur
 
 def _curvature_on(problem: _Problem, state: _State, rows: NDArray[np.intp]) -> _Curvature:
     point = state.point
-    held = _genuine_kinks(state) | ~(problem.constraints.lower < problem.constraints.upper) | point.idle
+    held = _genuine_kinks(state) | ~problem.constraints.movable
+    held = held if point.idle is None else held | point.idle
     found = _curvature_without(problem, state, rows, held)
-    collapsed = problem.idle is not None and np.any(point.active < problem.constraints.b.size)
-    m = problem.constraints.b.size
-    bounds = point.active[point.active >= m]
-    loose = np.any(point.multipliers[bounds] <= 1e-10 * state.gradient_scale)  # a bound that holds nothing back
-    if collapsed and problem.idle is not None and (found.smallest <= EIGENVALUE_FLOOR or loose):
-        idle = problem.idle(point.theta.copy(), True) & ~held
-        if idle.any():
-            found = replace(_curvature_without(problem, state, rows, held | idle), idle=idle)
+    if problem.idle is not None and _rows_hold(problem, point.active):
+        bounds = point.active[point.active >= problem.constraints.b.size]
+        loose = np.any(point.multipliers[bounds] <= 1e-10 * state.gradient_scale)  # bounds that hold nothing back
+        if found.smallest <= EIGENVALUE_FLOOR or loose:
+            idle = problem.idle(point.theta.copy(), True) & ~held
+            if idle.any():
+                found = replace(_curvature_without(problem, state, rows, held | idle), idle=idle)
     return found
+
+
+def _rows_hold(problem: _Problem, active: NDArray[np.intp]) -> bool:
+    """Whether rows are among the active constraints, and not bounds alone; these are in ascending order."""
+    return bool(active.size and active[0] < problem.constraints.b.size)
 
 
 def _curvature_without(problem: _Problem, state: _State, rows: NDArray[np.intp], held: NDArray[np.bool_]) -> _Curvature:
@@ -1124,11 +1140,15 @@ def _curvature_without(problem: _Problem, state: _State, rows: NDArray[np.intp],
 def _idle_names(problem: _Problem, state: _State) -> tuple[int, ...]:
     """Coordinates on which J does not depend at the state's point, and those that active rows tie to them."""
     point = state.point
+    found = _curvature(problem, state, point.active).idle
+    alone = set() if found is None else set(np.flatnonzero(found).tolist())
+    if point.idle is None:
+        return tuple(sorted(alone))
     idle = set(np.flatnonzero(point.idle).tolist())
     ties = [{i, j} for i, j, _ in problem.constraints.exact_rows(point.active) if j >= 0]
     for _ in ties:
         idle |= {k for tie in ties if tie & idle for k in tie}
-    return tuple(sorted(idle | set(np.flatnonzero(_curvature(problem, state, point.active).idle).tolist())))
+    return tuple(sorted(idle | alone))
 
 
 def _arrow_curvature(
