@@ -10,6 +10,7 @@ import pytest
 import switchfit as sf
 from switchfit.functions import checked_vector
 from switchfit.model import Model, float64
+from switchfit.models import skid_steer
 
 
 def grow(t, x, p):
@@ -355,7 +356,7 @@ def loud(t, x, p):
         (lambda t, x, p: np.array([x[0]]), ["decides by the value of t, x or p", "numpy function"]),
         (lambda t, x, p: np.arange(3.0)[t] * x, ["decides by the value of t, x or p"]),
         (lambda t, x, p: p["q"] * x, ["asks for the parameter 'q', which the problem lacks; it has k"]),
-        (lambda t, x: x, ["f(t, x, p) raised TypeError", "takes 2 positional arguments but 3 were given"]),
+        (lambda t, x: x, ["is called as f(t, x, p), but takes the arguments (t, x)"]),
         (lambda t, x, p: x.velocity, ["f(t, x, p) raised AttributeError", "velocity"]),
         (lambda t, x, p: np.ones((3, 3)) @ x, ["f(t, x, p) raised TypeError", "(3,) and (1,)"]),
         (lambda t, x, p: np.ones(3) + np.ones(2), ["f(t, x, p) raised ValueError: operands could not be broadcast"]),
@@ -368,7 +369,11 @@ def test_vector_field(mode, said):
 
 def test_a_vector_field_gets_inputs_only_where_there_are_any():
     driven = experiment(inputs=sf.Input([0.0], [1.0]))
-    refused(lambda: problem(driven), ValueError, "mode 'grow': f(t, x, p, u) raised TypeError", "4 were given")
+    refused(
+        lambda: problem(driven),
+        ValueError,
+        "mode 'grow' is called as f(t, x, p, u), but takes the arguments (t, x, p). Modes get",
+    )
 
 
 def test_a_scalar_is_not_taken_for_a_state_of_two():
@@ -398,7 +403,7 @@ def test_reset_map(reset, said):
         (lambda p: jnp.zeros(1, jnp.float32), ["initial_state", "must return float64; got float32"]),
         (lambda p: [p["q"]], ["initial_state asks for the parameter 'q', which the problem lacks; it has k"]),
         (lambda p: [p["k"] if p["k"] > 0 else 1.0], ["initial_state decides by the value of t, x or p"]),
-        (lambda: [1.0], ["initial_state(p) raised TypeError", "takes 0 positional arguments"]),
+        (lambda: [1.0], ["is called as initial_state(p), but takes the arguments ()"]),
         (lambda p: None, ["initial_state(p) must return an array of numbers; got None"]),
     ],
 )
@@ -416,7 +421,10 @@ def test_initial_state_as_a_function(initial, said):
         (sf.RunningCost(branching), ["RunningCost decides by the value of t, x or p"]),
         (sf.TerminalCost(lambda x, p: jnp.zeros(2)), ["TerminalCost: phi(x, p)", "shape (); got shape (2,)"]),
         (sf.TerminalCost(lambda x, p: p["q"]), ["TerminalCost asks for the parameter 'q'"]),
-        (sf.TerminalCost(lambda t, x, p: x[0]), ["TerminalCost: phi(x, p) raised TypeError", "'p'"]),
+        (
+            sf.TerminalCost(lambda t, x, p: x[0]),
+            ["TerminalCost is called as phi(x, p), but takes the arguments (t, x, p)"],
+        ),
     ],
 )
 def test_observations_and_costs(data, said):
@@ -656,3 +664,18 @@ def test_starts_of_a_logarithm_need_a_lower_bound_above_0():
     this = problem(parameters={"k": sf.Parameter(1.0, upper=2.0, scale="log")})
     with pytest.raises(ValueError, match="multistart draws starts between bounds, but there are none for k"):
         sf.multistart(this, 4)
+
+
+def test_a_function_with_the_wrong_number_of_arguments_is_named_with_what_it_gets():
+    vehicle = skid_steer()
+    signal = sf.Input([0.0, 1.0], [0.0, 0.0])
+    data = sf.Measurements([0.5], [[0.0]], observe=lambda t, x, p: x[:1], sigma=1.0)
+    run = sf.Experiment(data, ("stick",), (), 0.0, 1.0, inputs=signal)
+    said = r"mode 'stick' is called as f\(t, x, p, u\), but takes .*\(t.* x.* p.*\)"
+    with pytest.raises(ValueError, match=said):
+        sf.Problem(vehicle, run, {"mu": 0.5})
+    guarded = system(guards={("grow", "shrink"): lambda t, x, p, u: x[0] - 1.0})
+    with pytest.raises(
+        ValueError, match=r"guard \('grow', 'shrink'\) is called as g\(t, x, p\), but takes .* never do"
+    ):
+        problem(of=guarded)

@@ -8,6 +8,7 @@ Whether a trace can be used again without calling the user's function is decided
 from __future__ import annotations
 
 import hashlib
+import inspect
 import itertools
 import threading
 import weakref
@@ -365,6 +366,7 @@ class Asked(dict[str, Array]):
 
 def called(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, form: str) -> Array:
     """Call a function of the user's while tracing; whatever it raises becomes one sentence that names it."""
+    _check_signature(function, arguments, what, form)
     try:
         value = function(*arguments)
     except KeyError as error:
@@ -385,6 +387,19 @@ def called(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, 
         return jnp.asarray(value)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{what}: {form} must return an array of numbers; got {value!r}.") from error
+
+
+def _check_signature(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, form: str) -> None:
+    """ValueError if a function does not take as many arguments as it is called with."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # it does not tell
+        return
+    try:
+        signature.bind(*arguments)
+    except TypeError as error:
+        inputs = " Modes get an input u if and only if the experiment has inputs." if what.startswith("mode ") else ""
+        raise ValueError(f"{what} is called as {form}, but takes the arguments {signature}.{inputs}") from error
 
 
 def checked_vector(
