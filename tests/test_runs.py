@@ -520,7 +520,7 @@ def test_one_program_for_ten_runs_of_different_lengths():
         return _program_of.cache_info().misses - before
 
     def blank(t, x, p):
-        return fall(t, x, p)
+        return 1.0 * fall(t, x, p)
 
     global TANK  # new functions, which nothing has compiled before
     before = TANK
