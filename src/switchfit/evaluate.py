@@ -229,7 +229,7 @@ class Evaluator:
             natives = [native for native in self._natives(2 if matrix == "exact" else 1) if native is not None]
             if len(natives) == len(self.arguments):
                 found = [native(*self.problem.vectors(theta, e), side) for e, native in enumerate(natives)]
-                if not any(result is None for result in found):
+                if None not in found:
                     return found
         compiled = (method, matrix) in self._compiled
         with float64(), nullcontext() if compiled else compilation_cache():

@@ -19,7 +19,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend import core as jex
 
 from switchfit.precision import refuse_single_precision_in
 from switchfit.reads import JITTED, contents
@@ -62,7 +61,7 @@ class Function:
 
     def __call__(self, *arguments: Any) -> Array:
         """Value for arguments in the order of the user's function, p being a mapping of names to arrays."""
-        flat = [jnp.asarray(a, jnp.float64) for a in arguments if not isinstance(a, Mapping)]
+        flat = [_strong(a) for a in arguments if not isinstance(a, Mapping)]
         named = next(argument for argument in arguments if isinstance(argument, Mapping))
         given = [*flat, *(named[name] for name in self.parameters)]
         return jax.core.eval_jaxpr(self._closed.jaxpr, self._closed.consts, *given)[0]
@@ -72,6 +71,17 @@ class Function:
 
     def __eq__(self, other: object) -> bool:
         return self is other or (isinstance(other, Function) and self._key == other._key)
+
+
+def _strong(value: Any) -> Any:
+    """A float64 array as the jaxpr expects it: Python's numbers have a weak type."""
+    if (
+        isinstance(value, (np.ndarray, jax.Array))
+        and value.dtype == np.float64
+        and not getattr(value, "weak_type", False)
+    ):
+        return value
+    return jnp.asarray(value, jnp.float64)
 
 
 _known: weakref.WeakValueDictionary[Any, Function] = weakref.WeakValueDictionary()
@@ -210,7 +220,7 @@ def _function_of(
     consts = [np.array(const) if isinstance(const, np.ndarray) else const for const in closed.consts]
     debug = closed.jaxpr.debug_info.with_unknown_names()
     jaxpr = closed.jaxpr.replace(invars=kept, debug_info=debug)
-    closed = jex.ClosedJaxpr(jaxpr, consts)
+    closed = type(closed)(jaxpr, consts)
     text, opaque = _content(closed)
     return Function(closed, used, hashlib.sha256("\n".join([repr(used), *text]).encode()).hexdigest(), opaque)
 
@@ -264,7 +274,7 @@ class _Text:
         number: dict[Any, int] = {}
 
         def atom(a: Any) -> str:
-            return self._array(a.val) if isinstance(a, jex.Literal) else f"%{number.setdefault(a, len(number))}"
+            return self._array(a.val) if hasattr(a, "val") else f"%{number.setdefault(a, len(number))}"
 
         for variables in (jaxpr.constvars, jaxpr.invars):
             self.lines.append(" ".join(f"{atom(v)}:{v.aval.str_short()}" for v in variables))
@@ -280,13 +290,10 @@ class _Text:
         self.lines.append("-> " + " ".join(map(atom, jaxpr.outvars)))
 
     def _parameter(self, name: str, value: Any) -> None:
-        if isinstance(value, jex.ClosedJaxpr):
+        if hasattr(value, "eqns"):
             self.lines.append(f"{name}:")
-            self.add(value.jaxpr, value.consts)
-        elif isinstance(value, jex.Jaxpr):
-            self.lines.append(f"{name}:")
-            self.add(value, ())
-        elif isinstance(value, (tuple, list)) and any(isinstance(v, (jex.ClosedJaxpr, jex.Jaxpr)) for v in value):
+            self.add(getattr(value, "jaxpr", value), getattr(value, "consts", ()))
+        elif isinstance(value, (tuple, list)) and any(hasattr(v, "eqns") for v in value):
             for entry in value:
                 self._parameter(name, entry)
         elif isinstance(value, (np.ndarray, jax.Array)):

@@ -13,7 +13,6 @@ from typing import Any
 import jax
 import numpy as np
 from jax._src import source_info_util
-from jax.extend import core as jex
 
 from switchfit.reads import named_values
 from switchfit.validation import is_low_precision, refuse_single_precision
@@ -48,19 +47,18 @@ def _has_short(jaxpr: Any, consts: Sequence[Any]) -> bool:
         for atom in (*equation.invars, *equation.outvars):
             if is_low_precision(getattr(atom.aval, "dtype", np.float64)):
                 return True
-        if any(_has_short(inner.jaxpr, inner.consts) for inner in _inner(equation)):
+        if any(_has_short(*inner) for inner in _inner(equation)):
             return True
     return False
 
 
-def _inner(equation: Any) -> list[Any]:
+def _inner(equation: Any) -> list[tuple[Any, Sequence[Any]]]:
+    """The jaxprs that an operation calls, each with its constants."""
     found = []
     for value in equation.params.values():
         for entry in value if isinstance(value, (tuple, list)) else (value,):
-            if isinstance(entry, jex.ClosedJaxpr):
-                found.append(entry)
-            elif isinstance(entry, jex.Jaxpr):
-                found.append(jex.ClosedJaxpr(entry, ()))
+            if hasattr(entry, "eqns"):
+                found.append((getattr(entry, "jaxpr", entry), getattr(entry, "consts", ())))
     return found
 
 
@@ -78,12 +76,12 @@ class _Walk:
             self.check(const)
 
         def value(atom: Any) -> Any:
-            return atom.val if isinstance(atom, jex.Literal) else known.get(atom)
+            return atom.val if hasattr(atom, "val") else known.get(atom)
 
         for equation in jaxpr.eqns:
             given = [value(a) for a in equation.invars]
             for atom, number in zip(equation.invars, given, strict=True):
-                if isinstance(atom, jex.Literal):
+                if hasattr(atom, "val"):
                     self.check(number)
             inner = _inner(equation)
             if inner:
@@ -109,9 +107,9 @@ class _Walk:
 
     def calls(self, equation: Any, inner: list[Any], given: list[Any]) -> list[Any]:
         """Functions that an operation calls: a plain call is followed with its arguments, loops without."""
-        for each in inner:
-            plain = len(inner) == 1 and len(each.jaxpr.invars) == len(given) and equation.primitive.name == "jit"
-            results = self.through(each.jaxpr, each.consts, given if plain else [None] * len(each.jaxpr.invars))
+        for jaxpr, consts in inner:
+            plain = len(inner) == 1 and len(jaxpr.invars) == len(given) and equation.primitive.name == "jit"
+            results = self.through(jaxpr, consts, given if plain else [None] * len(jaxpr.invars))
         return results if plain else [None] * len(equation.outvars)
 
     def check(self, number: Any, where: str = "") -> None:

@@ -10,10 +10,10 @@ tenth of a millisecond there, ten in Python. SciPy itself solves all else, and s
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,8 @@ from switchfit.native.kernels import Adaptive
 from switchfit.native.program import NativeExperiment, native_experiment
 from switchfit.parameter import unit_suffix
 from switchfit.problem import Problem
+
+T = TypeVar("T")
 
 MAX_STEPS = 200_000
 """Adaptive steps in one mode before it is called stiff."""
@@ -111,29 +113,38 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
     inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
     steps = [np.array([experiment.t0])]
     native = native_experiment(structure, whole, coarse.times, order=0)
-    with float64(), compilation_cache():
-        x = _finite(
-            initial_state(arguments, p, structure=structure.functions) if native is None else native.initial_state(p),
-            f"initial_state at p = {_rounded(problem.split(theta)[1])}",
-        )
-        for i, mode in enumerate(structure.mode_of_segment):
-            if i > 0 and structure.reset_maps[i - 1] is not None:
-                names = tuple(experiment.mode_sequence[i - 1 : i + 1])
-                if native is None:
-                    value = after_reset(arguments, ends[i], x, p, structure=structure, i=i - 1)
-                else:
-                    value = native.after_reset(i - 1, ends[i], x, p)
-                x = _finite(value, f"reset map {names} at t = {ends[i]:.6g}{unit}, x = {x.tolist()}")
-            knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
-            stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
-            for start, end in pairwise(stops.tolist()):
-                if end > start:
-                    found = None if native is None else _solve_natively(problem, native, mode, start, end, x, p)
-                    if found is None:
-                        found = _solve(problem, structure, arguments, signals, coarse, mode, start, end, x, p, unit)
-                    accepted, x = found
-                    steps.append(accepted)
+    x = _finite(
+        _by_jax(initial_state, arguments, p, structure=structure.functions)
+        if native is None
+        else native.initial_state(p),
+        f"initial_state at p = {_rounded(problem.split(theta)[1])}",
+    )
+    for i, mode in enumerate(structure.mode_of_segment):
+        if i > 0 and structure.reset_maps[i - 1] is not None:
+            names = tuple(experiment.mode_sequence[i - 1 : i + 1])
+            if native is None:
+                value = _by_jax(after_reset, arguments, ends[i], x, p, structure=structure, i=i - 1)
+            else:
+                value = native.after_reset(i - 1, ends[i], x, p)
+            x = _finite(value, f"reset map {names} at t = {ends[i]:.6g}{unit}, x = {x.tolist()}")
+        knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
+        stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
+        for start, end in pairwise(stops.tolist()):
+            if end > start:
+                found = None if native is None else _solve_natively(problem, native, mode, start, end, x, p)
+                if found is None:
+                    found = _by_jax(
+                        _solve, problem, structure, arguments, signals, coarse, mode, start, end, x, p, unit
+                    )
+                accepted, x = found
+                steps.append(accepted)
     return np.concatenate(steps)
+
+
+def _by_jax(function: Callable[..., T], *given: Any, **settings: Any) -> T:
+    """Call a function that runs JAX's programs; what surrounds it takes longer than most solves in machine code."""
+    with float64(), compilation_cache():
+        return function(*given, **settings)
 
 
 def _solve(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import logging
+import math
 import threading
 from collections.abc import Callable
 from functools import lru_cache
@@ -280,7 +281,8 @@ class NativeExperiment:
 
         A cost that is not finite says enough as it is.
         """
-        return bool(np.isnan(self._sums[-1])) and bool(np.isfinite(self._sums[self.sizes.n]))
+        check = self._sums.item(-1)
+        return check != check and math.isfinite(self._sums.item(self.sizes.n))
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float | None:
         """J alone; None if a presumption was wrong."""
