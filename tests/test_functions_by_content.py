@@ -245,6 +245,17 @@ def test_a_problem_keeps_its_functions_as_they_were_when_it_was_built(way):
     assert sf.evaluate(problem_of(f)).cost != pytest.approx(before, rel=1e-3)
 
 
+@pytest.mark.parametrize("shape", [(), (1,), (3, 1)])
+def test_constants_are_copied_when_a_problem_is_built(shape):
+    """Nothing has been compiled for this number when the array that held it changes."""
+    g = np.full(shape, 1.37)
+    built = problem_of(lambda t, x, p: -np.ravel(g)[0] * jnp.sum(jnp.asarray(g)) * p["a"] * x)
+    expected = sf.evaluate(problem_of(lambda t, x, p: -1.37 * (1.37 * g.size) * p["a"] * x)).cost
+    g[...] = 5.0
+    assert sf.evaluate(built, method="forward").cost == pytest.approx(expected, rel=1e-12)
+    assert sf.evaluate(built).cost == pytest.approx(expected, rel=1e-12)
+
+
 OTHER = {"g": 1.0}
 
 

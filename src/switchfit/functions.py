@@ -7,6 +7,7 @@ Whether a trace can be used again without calling the user's function is decided
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import inspect
 import itertools
@@ -217,12 +218,31 @@ def _function_of(
     refuse_single_precision_in(closed, function, given.what)
     invars = closed.jaxpr.invars
     kept = [*invars[:count], *(v for name, v in zip(names, invars[count:], strict=True) if name in used)]
+    _freeze(closed.jaxpr)
     consts = [np.array(const) if isinstance(const, np.ndarray) else const for const in closed.consts]
     debug = closed.jaxpr.debug_info.with_unknown_names()
     jaxpr = closed.jaxpr.replace(invars=kept, debug_info=debug)
     closed = type(closed)(jaxpr, consts)
     text, opaque = _content(closed)
     return Function(closed, used, hashlib.sha256("\n".join([repr(used), *text]).encode()).hexdigest(), opaque)
+
+
+def _freeze(jaxpr: Any) -> None:
+    """Copy the numbers that stand in a jaxpr: JAX keeps the user's arrays without axes there, which may change."""
+    for equation in jaxpr.eqns:
+        for atom in equation.invars:
+            _copy_literal(atom)
+        for value in equation.params.values():
+            for entry in value if isinstance(value, (tuple, list)) else (value,):
+                if hasattr(entry, "eqns"):
+                    _freeze(getattr(entry, "jaxpr", entry))
+    for atom in jaxpr.outvars:
+        _copy_literal(atom)
+
+
+def _copy_literal(atom: Any) -> None:
+    if isinstance(getattr(atom, "val", None), np.ndarray):
+        atom.val = copy.deepcopy(atom.val)
 
 
 # The content of a jaxpr
