@@ -93,7 +93,7 @@ def check_whole(folder: Path) -> None:
             assert path.read_bytes().rstrip().endswith(b"%%EOF")
 
 
-@pytest.mark.fuzz
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["fit", "monte_carlo", "estimate_many", "bootstrap", "paper"])
 def test_killed_at_random_moments(kind, tmp_path):
     toss = ROOT / "examples" / "toss" / "problem.toml"
