@@ -393,6 +393,25 @@ def test_a_parameter_that_acts_only_in_a_mode_that_collapsed_at_the_start_is_nam
     assert "mode 1 ('drain') has collapsed to nothing" in found.active
 
 
+@pytest.mark.parametrize("rate", [0.8, 1.0])
+@pytest.mark.parametrize("guess", [(2.0, 3.5, 3.6), (1.0, 2.0, 4.0), (2.0, 4.0, 5.0), (3.0, 3.2, 5.0)])
+def test_a_mode_that_collapses_where_the_data_are_met_exactly_is_reported_as_such(guess, rate):
+    """J is zero but for the integration error, whose minimum is where the mode lasts about 1e-12 of the horizon."""
+    times = np.linspace(0.1, 6.0, 40)
+    charged, left = 1.0 - np.exp(-rate * np.minimum(times, 3.0)), np.exp(-rate * np.maximum(times - 3.0, 0.0))
+    modes = {"on": lambda t, x, p: p["k"] * (1.0 - x), "off": lambda t, x, p: -p["k"] * x}
+    system = sf.HybridSystem(modes, [0.0])
+    run = sf.Experiment(sf.Measurements(times, charged * left, sigma=0.01), ("on", "off", "on", "off"), guess, 0.0, 6.0)
+    found = sf.estimate(sf.Problem(system, run, {"k": sf.Parameter(1.2, lower=0.01)}))
+    assert found.status is sf.Status.COLLAPSED
+    assert found.idle in (("tau_1", "tau_2"), ("tau_2", "tau_3"))
+    collapsed = [found.theta_names.index(name) for name in found.idle]
+    assert found.theta[collapsed[0]] == found.theta[collapsed[1]]
+    (switch,) = set(range(3)) - set(collapsed)
+    np.testing.assert_allclose(found.theta[[switch, 3]], [3.0, rate], rtol=1e-8)
+    assert "NOT UNIQUE" not in str(found)
+
+
 @pytest.mark.parametrize(("hessian", "iterations"), [("block-diagonal", 500), ("gauss-newton", 200), ("none", 3)])
 def test_the_hessian_reported_is_exact_whatever_the_fit_worked_with(hessian, iterations):
     """With noise the exact Hessian differs from Gauss-Newton's matrix, and steepest descent has none at all."""

@@ -714,10 +714,10 @@ def _finish(oracle: _Oracle, state: _State, status: Status) -> _State:
     """At a KKT point: leave a saddle if possible, otherwise classify the point by its free curvature."""
     problem = oracle.problem
     if problem.uses_hessian or _is_finite(state.point.plus.hessian):
-        if state.iteration < problem.max_iterations:
-            accepted = _close_gaps(oracle, state) or _escape(oracle, state)
-            if accepted is not None:
-                return _advance(problem, state, accepted)
+        state = _close_gaps(oracle, state)
+        accepted = _escape(oracle, state) if state.iteration < problem.max_iterations else None
+        if accepted is not None:
+            return _advance(problem, state, accepted)
         curvature = _curvature(problem, state, state.point.active)
         if curvature.smallest < NEGATIVE_CURVATURE:
             return replace(state, status=Status.SADDLE)
@@ -1194,20 +1194,29 @@ def _reported_sides(point: _Point) -> NDArray[np.int_]:
     return np.where(point.kink, 1, point.side)
 
 
-def _close_gaps(oracle: _Oracle, state: _State) -> _Accepted | None:
-    """The rows that the point misses by less than it is accurate to made to hold, if it stays as good a solution.
+def _close_gaps(oracle: _Oracle, state: _State) -> _State:
+    """The state with the rows that it misses by less than it is accurate to made to hold, if it stays as good.
 
     A mode that lasts a part of 1e-13 of the horizon has collapsed. Taken for one that has not, its two ends would be
-    free, and the curvature along them, which is that of J in its duration, may be negative.
+    free, and the curvature along them, which is that of J in its duration, may be negative. Where the data are met
+    exactly, J is so curved in the duration that the optimality of the closed point exceeds the tolerance: it is as good
+    all the same if a step from there is negligible.
     """
     problem, point = oracle.problem, state.point
     theta = _snap_to_rows(problem, point.theta, np.zeros(point.theta.size, dtype=bool), NEGLIGIBLE_STEP)
     if np.array_equal(theta, point.theta):
-        return None
+        return state
     closed = oracle.point(theta, state.scale)
-    if closed is None or closed.cost > point.cost + NOISE * abs(point.cost):
-        return None
-    return None if closed.optimality > max(problem.tolerance, point.optimality) else _Accepted(closed, 1.0)
+    if closed is None or closed.cost > point.cost + NOISE * state.cost_scale:
+        return state
+    after = _advance(problem, state, _Accepted(closed, 1.0))
+    if closed.optimality <= max(problem.tolerance, point.optimality):
+        return after
+    if closed.idle is None:
+        return state
+    step = _direction(problem, after, problem.constraints.lower, problem.constraints.upper).step
+    negligible = np.abs(step) <= NEGLIGIBLE_STEP * np.maximum(state.scale, problem.size)
+    return after if np.all(negligible) else state
 
 
 def _escape(oracle: _Oracle, state: _State) -> _Accepted | None:
