@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from benchmarks.vehicle import Row
-from switchfit.rungekutta import EXPLICIT
+from switchfit.discretization.tableaus import EXPLICIT
 
 D = 3
 Symbol = ca.SX | ca.MX
@@ -207,7 +207,7 @@ def _accumulate(function: ca.Function, state: ca.MX, theta: ca.MX, data: np.ndar
 def adjoint(expand: bool) -> Form:
     """Discrete adjoint by hand: forward (x, x_theta), backward (psi, H), both SX rows accumulated over the rows.
 
-    H is the sum over the rows of Z' D^2 (psi F + L) Z, as in `switchfit.derivatives.discrete`.
+    H is the sum over the rows of Z' D^2 (psi F + L) Z, as in `switchfit.engine.jax.second_order`.
     """
 
     def build(rows: list[Row], reference: bool) -> ca.Function:

@@ -15,8 +15,8 @@ import numpy as np
 from benchmarks import vehicle
 from benchmarks.report import Report
 from benchmarks.timing import ms, take_turns
-from switchfit.evaluate import Evaluator
-from switchfit.native.program import native_experiment
+from switchfit.engine.native.program import native_experiment
+from switchfit.fit.evaluator import Evaluator
 
 COARSE = 58
 """Cells of the coarse mesh: with the two rows that the transitions add, 60 rows."""

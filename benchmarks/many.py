@@ -44,9 +44,9 @@ def problem() -> sf.Problem:
 
 def measure(runs: int) -> dict[str, Any]:
     """Seconds a fit: `runs` refits at once, and some of them by `estimate`, one after the other."""
-    from switchfit.batch.monte_carlo import _clean, _meshes, _Work
-    from switchfit.evaluate import Evaluator
-    from switchfit.solve import minimized
+    from switchfit.batch.simulated import _clean, _meshes, _Work
+    from switchfit.fit.evaluator import Evaluator
+    from switchfit.fit.solution import minimized
 
     found: dict[str, Any] = {}
     here = problem()

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import switchfit as sf
-from switchfit.evaluate import Evaluator
-from switchfit.mesh import Mesh
+from switchfit.discretization.mesh import Mesh
+from switchfit.fit.evaluator import Evaluator
 
 HORIZON = 100.0
 

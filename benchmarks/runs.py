@@ -11,9 +11,9 @@ import numpy as np
 import switchfit as sf
 from benchmarks.report import Report
 from benchmarks.timing import ms
-from switchfit.evaluate import Evaluator
-from switchfit.native.program import _program_of
-from switchfit.solve import minimized
+from switchfit.engine.native.program import _program_of
+from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.solution import minimized
 
 RUNS = (10, 20, 40, 80, 160)
 SHARED = {"k": 2.0, "c": 0.3, "b": 0.2}

@@ -15,8 +15,8 @@ import numpy as np
 import switchfit as sf
 from benchmarks.report import Report
 from benchmarks.timing import ms, take_turns
-from switchfit.evaluate import FORWARD_UP_TO, Evaluator
-from switchfit.mesh import Mesh
+from switchfit.discretization.mesh import Mesh
+from switchfit.fit.evaluator import FORWARD_UP_TO, Evaluator
 
 NODES = (500, 1000, 2000, 4000, 8000)
 HORIZON = 10.0

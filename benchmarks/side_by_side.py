@@ -24,8 +24,8 @@ from benchmarks.peers import Functions
 from benchmarks.problems import Case
 from benchmarks.report import Report
 from benchmarks.timing import ms, turns_within
-from switchfit.evaluate import Evaluator
-from switchfit.native.program import forget_programs
+from switchfit.engine.native.program import forget_programs
+from switchfit.fit.evaluator import Evaluator
 
 QUANTITIES = ("cost", "gradient", "hessian")
 ACCURACY = (1e-8, 1e-7, 1e-6)

@@ -8,10 +8,10 @@ import jax
 import numpy as np
 
 import switchfit as sf
-from switchfit.evaluate import Evaluator
-from switchfit.mesh import Mesh, rows
-from switchfit.model import float64
+from switchfit.discretization.mesh import Mesh, rows
+from switchfit.fit.evaluator import Evaluator
 from switchfit.models import skid_steer
+from switchfit.problem.functions import float64
 
 SEQUENCE = ("stick", "slip", "stick")
 START, TRUTH, HORIZON = (5.0, 9.0), (6.0, 10.0), (0.0, 15.0)

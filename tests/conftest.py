@@ -4,7 +4,7 @@ import jax
 import pytest
 from hypothesis import settings
 
-from switchfit.native.program import forget_programs
+from switchfit.engine.native.program import forget_programs
 
 settings.register_profile("switchfit", derandomize=True, deadline=None)
 settings.load_profile("switchfit")

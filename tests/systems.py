@@ -15,17 +15,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from switchfit.data import Input, Measurements, ReferenceSignal, RunningCost, TerminalCost
-from switchfit.derivatives.adjoint import paper_derivatives
-from switchfit.derivatives.discrete import adjoint_hessian, gauss_newton_hessian
-from switchfit.derivatives.first_order import first_order
-from switchfit.derivatives.forward import forward_hessian
-from switchfit.experiment import Experiment, Parameter
-from switchfit.mesh import Mesh
-from switchfit.model import Arguments, Model, float64
-from switchfit.problem import Problem
-from switchfit.propagate import path_cost, propagate
-from switchfit.system import HybridSystem
+from switchfit.discretization.arguments import Arguments, arguments_of
+from switchfit.discretization.mesh import Mesh
+from switchfit.discretization.model import Model
+from switchfit.discretization.propagation import path_cost, propagate
+from switchfit.engine.jax.first_order import first_order
+from switchfit.engine.jax.forward import forward_hessian
+from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
+from switchfit.paper_adjoint import paper_derivatives
+from switchfit.problem.data import Input, Measurements, ReferenceSignal, RunningCost, TerminalCost
+from switchfit.problem.experiment import Experiment, Parameter
+from switchfit.problem.functions import float64
+from switchfit.problem.problem import Problem
+from switchfit.problem.system import HybridSystem
 
 KINDS = ("running", "reference", "samples", "terminal", "all")
 CELLS = 176
@@ -187,7 +189,7 @@ class Case:
         times = np.unique(LAYERED) if self.structure.solver == "stiff" else NODES
         for _ in range(halvings):
             times = np.sort(np.concatenate([times, 0.5 * (times[1:] + times[:-1])]))
-        return weighted(self.problem.arguments(0, padded_mesh(times)), kind, equal)
+        return weighted(arguments_of(self.problem, 0, padded_mesh(times)), kind, equal)
 
     @cached_property
     def _paper(self) -> Callable[..., Any]:

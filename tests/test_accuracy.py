@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.evaluate import Evaluator
+from switchfit.fit.evaluator import Evaluator
 from switchfit.paper.vehicle import TRUTH, simulated
 
 

@@ -15,8 +15,10 @@ import numpy as np
 import pytest
 from systems import KINDS, NODES, P0, Case, Parameter, case, closed_form, closed_form_case, compiled, padded_mesh
 
-from switchfit.model import Model, float64
-from switchfit.propagate import propagate
+from switchfit.discretization.arguments import arguments_of
+from switchfit.discretization.model import Model
+from switchfit.discretization.propagation import propagate
+from switchfit.problem.functions import float64
 
 # A sample inside a stiff mode starts a layer of the adjoints, which this mesh does not resolve.
 SMOOTH_KINDS = ("running", "reference", "terminal")
@@ -130,7 +132,7 @@ def test_coinciding_transitions() -> None:
 
 
 def closed_form_arguments(this: Case):
-    return this.problem.arguments(0, padded_mesh(np.linspace(0.0, 2.0, 41), 40))
+    return arguments_of(this.problem, 0, padded_mesh(np.linspace(0.0, 2.0, 41), 40))
 
 
 @pytest.mark.parametrize("method", ["paper", "discrete"])

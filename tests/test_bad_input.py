@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.functions import checked_vector
-from switchfit.model import Model, float64
+from switchfit.discretization.model import Model
 from switchfit.models import skid_steer
+from switchfit.problem.functions import checked_vector, float64
 
 
 def grow(t, x, p):

@@ -17,12 +17,12 @@ import switchfit as sf
 from switchfit.batch import monte_carlo as module
 from switchfit.batch.chunks import run_chunks
 from switchfit.batch.program import CHUNK, Varying, fit_chunk
-from switchfit.evaluate import Evaluator, evaluator_of
-from switchfit.model import float64
+from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.fit.solution import minimized
 from switchfit.optimize import LinearConstraints, minimize
 from switchfit.optimize.qp import nearest_feasible, solve_qp
 from switchfit.optimize.traced import Constraints, minimize_traced, nonnegative_minimum
-from switchfit.solve import minimized
+from switchfit.problem.functions import float64
 
 TIMES = np.linspace(0.25, 6.0, 24)
 TRUTH = np.array([2.1, 0.8])

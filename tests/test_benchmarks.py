@@ -16,7 +16,7 @@ import switchfit as sf
 from benchmarks import casadi_forms, derivatives, models, problems, side_by_side, vehicle
 from benchmarks.fit import CostBySciPy
 from benchmarks.peers import casadi_collocation, casadi_shooting, scipy_differences, scipy_fits
-from switchfit.model import float64
+from switchfit.problem.functions import float64
 
 ROWS = 22
 

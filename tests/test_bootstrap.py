@@ -10,7 +10,7 @@ import pytest
 import scipy.stats
 
 import switchfit as sf
-from switchfit.batch.bootstrap import _acceleration, _Draw, _Runs
+from switchfit.batch.resampling import _acceleration, _Draw, _Runs
 
 TIMES = np.linspace(0.1, 4.0, 40)
 

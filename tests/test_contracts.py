@@ -16,12 +16,12 @@ import pytest
 
 import switchfit as sf
 from switchfit import functions
-from switchfit.evaluate import derivatives, evaluator_of
-from switchfit.mesh import padded_length
-from switchfit.native.program import _program_of
-from switchfit.refine import initial_state
-from switchfit.simulate import _block, _terminal
-from switchfit.xla import SMALL_LOOPS
+from switchfit.discretization.mesh import padded_length
+from switchfit.engine.adaptive import initial_state
+from switchfit.engine.native.program import _program_of
+from switchfit.fit.evaluator import derivatives, evaluator_of
+from switchfit.fit.trajectory import _block, _terminal
+from switchfit.runtime.xla import SMALL_LOOPS
 
 # Nothing is compiled anew
 

@@ -9,9 +9,10 @@ import pytest
 from numpy.polynomial import Polynomial
 
 import switchfit as sf
-from switchfit.evaluate import Evaluator
-from switchfit.model import Piece, float64
-from switchfit.refine import refined_mesh
+from switchfit.discretization.model import Piece
+from switchfit.engine.adaptive import refined_mesh
+from switchfit.fit.evaluator import Evaluator
+from switchfit.problem.functions import float64
 
 # Inputs
 

@@ -11,8 +11,8 @@ import scipy.optimize
 import scipy.stats
 
 import switchfit as sf
-from switchfit.evaluate import evaluator_of
-from switchfit.solve import minimized
+from switchfit.fit.evaluator import evaluator_of
+from switchfit.fit.solution import minimized
 
 # A capacitor that is charged through one resistor and discharged through another one
 

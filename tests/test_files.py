@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from switchfit.batch.chunks import run_chunks
-from switchfit.cache import read_code, usable_folder, write_code
-from switchfit.io.files import PREFIX, SUFFIX, write_atomically
+from switchfit.runtime.cache import read_code, usable_folder, write_code
+from switchfit.runtime.files import PREFIX, SUFFIX, write_atomically
 
 SOURCE = Path(__file__).parent.parent / "src"
 
@@ -122,7 +122,7 @@ def test_a_disk_that_is_full_half_way(tmp_path):
     (tmp_path / "a.json").write_text("old")
     program = (
         "import resource, signal, sys\nfrom pathlib import Path\n"
-        "from switchfit.io.files import write_atomically\n"
+        "from switchfit.runtime.files import write_atomically\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))\n"
         "write_atomically(b'x' * 100_000, Path(sys.argv[1]))\n"

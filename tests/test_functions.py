@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from functions import FALLS_BACK, FUNCTIONS, ZERO_TIMES_INFINITY
 
-from switchfit.model import float64
-from switchfit.native import llvm
-from switchfit.native.scalars import Graph
-from switchfit.native.trace import Unsupported, traced
+from switchfit.engine.native import llvm
+from switchfit.engine.native.scalars import Graph
+from switchfit.engine.native.trace import Unsupported, traced
+from switchfit.problem.functions import float64
 
 OFTEN = (
     *("arithmetic: mod", "arithmetic: power of a negative", "elementary: guarded log", "rounding: round away"),

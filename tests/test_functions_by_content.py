@@ -16,7 +16,7 @@ import pytest
 
 import switchfit as sf
 from switchfit import functions, reads
-from switchfit.functions import trace_function
+from switchfit.problem.functions import trace_function
 
 SAMPLES = sf.Measurements([0.5, 1.0], [math.exp(-0.5), math.exp(-1.0)], sigma=0.1)
 

@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.evaluate import Evaluator
+from switchfit.fit.evaluator import Evaluator
 
 SOURCE = str(Path(sf.__file__).parent)
 SECONDS = 20
@@ -730,7 +730,7 @@ def cheap_doors(doors, monkeypatch):
     for module in LONG_RUNS:
         monkeypatch.setattr(f"switchfit.batch.{module}.fit_chunk", take_long)
     monkeypatch.setattr(Evaluator, "constrained", take_long)
-    monkeypatch.setattr("switchfit.check.derivative_gap", take_long)
+    monkeypatch.setattr("switchfit.uncertainty.derivative_check.derivative_gap", take_long)
     return {name: door for name, door in doors.items() if not name.startswith(STUDIES)}
 
 

@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli, paper
-from switchfit.native.program import forget_programs
+from switchfit.engine.native.program import forget_programs
 
 SIZES = [pytest.param(60, id="short"), pytest.param(1200, id="long", marks=pytest.mark.fuzz)]
 LONGEST = 120

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.evaluate import Evaluator
-from switchfit.model import Model, float64
-from switchfit.propagate import path_cost, propagate
+from switchfit.discretization.model import Model
+from switchfit.discretization.propagation import path_cost, propagate
+from switchfit.fit.evaluator import Evaluator
+from switchfit.problem.functions import float64
 
 G = 9.8
 HEIGHT, END, TARGET = 50.0, 15.0, 20.0

@@ -15,11 +15,11 @@ from systems import NODES, P0, case, problem_of
 
 import switchfit as sf
 from switchfit.batch.chunks import run_chunks
-from switchfit.evaluate import evaluator_of
-from switchfit.native import driver, program
-from switchfit.native.program import forget_programs, native_experiment
-from switchfit.refine import refined_mesh
-from switchfit.simulate import runs_of
+from switchfit.engine.adaptive import refined_mesh
+from switchfit.engine.native import driver, program
+from switchfit.engine.native.program import forget_programs, native_experiment
+from switchfit.fit.evaluator import evaluator_of
+from switchfit.fit.trajectory import runs_of
 
 SLOW = """
 import sys, time

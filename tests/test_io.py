@@ -8,10 +8,10 @@ import pytest
 
 import switchfit as sf
 from switchfit.io.csv import read_columns
-from switchfit.io.errors import InputError
 from switchfit.io.problem_file import load_problem
 from switchfit.io.python_file import load_object
 from switchfit.io.summary import describe
+from switchfit.runtime.errors import InputError
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from switchfit.cache import read_code
+from switchfit.runtime.cache import read_code
 
 ROOT = Path(__file__).parent.parent
 KILLS = 20

@@ -11,12 +11,14 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import switchfit as sf
-from switchfit.evaluate import Evaluator
-from switchfit.mesh import CHUNK, Mesh, chunk_count, padded_length, row_ending_cell, rows
-from switchfit.model import Model, float64
-from switchfit.native.program import native_experiment
-from switchfit.propagate import path_cost, propagate
-from switchfit.refine import _solve, _solve_natively, fixed_nodes, refined_mesh
+from switchfit.discretization.arguments import arguments_of
+from switchfit.discretization.mesh import CHUNK, Mesh, chunk_count, padded_length, row_ending_cell, rows
+from switchfit.discretization.model import Model
+from switchfit.discretization.propagation import path_cost, propagate
+from switchfit.engine.adaptive import _solve, _solve_natively, fixed_nodes, refined_mesh
+from switchfit.engine.native.program import native_experiment
+from switchfit.fit.evaluator import Evaluator
+from switchfit.problem.functions import float64
 
 # Rows
 
@@ -300,7 +302,7 @@ def cost_of(made, **settings):
         return path_cost(model, propagate(model, tau, jnp.zeros(0), jnp.ones(())), jnp.zeros(0))
 
     with float64():
-        return float(cost(problem.arguments(0, mesh), run.initial_times))
+        return float(cost(arguments_of(problem, 0, mesh), run.initial_times))
 
 
 @pytest.mark.parametrize(
@@ -335,7 +337,7 @@ def test_the_compiled_solver_takes_the_steps_of_scipy():
     run = sf.Experiment(data, ("a", "b", "a"), (1.7, 2.9), 0.0, 6.0, inputs=inputs)
     problem = sf.Problem(system, run)
     coarse = Mesh.from_times(fixed_nodes(run))
-    arguments = problem.arguments(0, coarse)
+    arguments = arguments_of(problem, 0, coarse)
     native = native_experiment(problem.structures[0], arguments, coarse.times, 0)
     given = (problem, problem.structures[0], arguments.without_mesh(), arguments.signals, coarse)
     for mode, start, end, x in ((0, 0.0, 1.7, [0.0, 0.0]), (1, 1.7, 2.5, [0.4, 1.0]), (0, 2.9, 6.0, [0.1, -0.2])):

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from switchfit.model import float64
 from switchfit.models import BUILT_IN, magic_formula, skid_steer, sliding_block
 from switchfit.models.magic_formula import MAGIC_FORMULA, lateral_force, longitudinal_force
+from switchfit.problem.functions import float64
 
 
 def value(function, *arguments):

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.hidden import refuse_jumps
-from switchfit.identifiability import identifiability
+from switchfit.fit.hidden import refuse_jumps
+from switchfit.uncertainty.identification import identifiability
 
 TIMES = np.linspace(0.5, 4.0, 8)
 A, B, C = 0.7, 0.2, 1.1

@@ -19,17 +19,18 @@ from hypothesis import strategies as st
 from systems import KINDS, NODES, P0, case, problem_of, weighted
 
 import switchfit as sf
-from switchfit.evaluate import Evaluator, evaluator_of
-from switchfit.model import float64
-from switchfit.native import kernels, llvm
-from switchfit.native import program as program_module
-from switchfit.native.foreign import foreign_derivatives
-from switchfit.native.program import forget_programs, native_experiment
-from switchfit.native.scalars import Graph, Node
-from switchfit.native.trace import Unsupported, traced
-from switchfit.sensitivity import _by_blocks as sensitivities_by_blocks
-from switchfit.sensitivity import _natively as sensitivities_natively
-from switchfit.simulate import runs_of
+from switchfit.discretization.arguments import arguments_of
+from switchfit.engine.native import kernels, llvm
+from switchfit.engine.native import program as program_module
+from switchfit.engine.native.foreign import foreign_derivatives
+from switchfit.engine.native.program import forget_programs, native_experiment
+from switchfit.engine.native.scalars import Graph, Node
+from switchfit.engine.native.trace import Unsupported, traced
+from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.fit.trajectory import runs_of
+from switchfit.problem.functions import float64
+from switchfit.uncertainty.sensitivity import _by_blocks as sensitivities_by_blocks
+from switchfit.uncertainty.sensitivity import _natively as sensitivities_natively
 
 # Functions as scalars
 
@@ -411,7 +412,7 @@ def by_jax(monkeypatch):
     """Simulations by JAX."""
 
     def switch():
-        monkeypatch.setattr(sys.modules["switchfit.simulate"], "native_experiment", lambda *_, **__: None)
+        monkeypatch.setattr(sys.modules["switchfit.fit.trajectory"], "native_experiment", lambda *_, **__: None)
 
     return switch
 
@@ -439,7 +440,7 @@ def test_simulations_are_those_of_jax(name, by_jax):
 def test_sensitivities_are_those_of_jax(name):
     problem = problem_of(name)
     (mesh,) = evaluator_of(problem).meshes
-    given = problem.structures[0], problem.arguments(0, mesh), mesh, *problem.vectors(problem.initial_theta, 0)
+    given = problem.structures[0], arguments_of(problem, 0, mesh), mesh, *problem.vectors(problem.initial_theta, 0)
     found, first = sensitivities_natively(*given)
     expected, expected_first = sensitivities_by_blocks(*given)
     np.testing.assert_array_equal(first, expected_first)

@@ -10,9 +10,9 @@ import pytest
 from systems import problem_of
 
 import switchfit as sf
-from switchfit.evaluate import evaluator_of
-from switchfit.mesh import Mesh
-from switchfit.sensitivity import gauss_newton_of, sample_derivatives, sensitivity
+from switchfit.discretization.mesh import Mesh
+from switchfit.fit.evaluator import evaluator_of
+from switchfit.uncertainty.sensitivity import gauss_newton_of, sample_derivatives, sensitivity
 
 SIGMA = 0.1
 TIMES = np.linspace(0.25, 6.0, 24)

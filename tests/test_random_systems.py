@@ -21,8 +21,8 @@ import pytest
 import reference
 
 import switchfit as sf
-from switchfit.evaluate import Evaluator
-from switchfit.refine import refined_mesh
+from switchfit.engine.adaptive import refined_mesh
+from switchfit.fit.evaluator import Evaluator
 
 SYSTEMS = 200
 METHODS = ("discrete-adjoint", "forward", "autodiff", "adjoint")

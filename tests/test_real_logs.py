@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.evaluate import derivatives, evaluator_of
-from switchfit.losses import LOSSES, influence, robust
-from switchfit.model import float64
-from switchfit.optimize.variables import Variables
-from switchfit.priors import PriorTerms
-from switchfit.simulate import compared, runs_of
-from switchfit.solve import message_of
+from switchfit.fit.evaluator import derivatives, evaluator_of
+from switchfit.fit.solution import message_of
+from switchfit.fit.trajectory import compared, runs_of
+from switchfit.problem.functions import float64
+from switchfit.problem.losses import LOSSES, influence, robust
+from switchfit.problem.priors import PriorTerms
+from switchfit.problem.variables import Variables
 
 
 def free(t, x, p):

@@ -14,6 +14,8 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 import switchfit as sf
+from switchfit.fit.result import Fit
+from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord, Status
 from switchfit.report.plot import (
     MODE_COLOURS,
@@ -26,8 +28,6 @@ from switchfit.report.plot import (
     plot_transitions,
 )
 from switchfit.report.text import report, rounded, transitions_of, warnings_of
-from switchfit.result import Fit
-from switchfit.simulate import Comparison, Trajectory
 
 
 def trajectory_of(modes=("stick", "slip", "stick"), times=(0.0, 4.0, 7.0, 10.0), nodes=9) -> Trajectory:

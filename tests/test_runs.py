@@ -11,12 +11,12 @@ from typer.testing import CliRunner
 import switchfit as sf
 from switchfit.batch.program import Layout, _total
 from switchfit.cli import app
-from switchfit.evaluate import evaluator_of
-from switchfit.io.errors import InputError
+from switchfit.discretization.mesh import common_lengths, padded_length
+from switchfit.engine.native.program import _program_of
+from switchfit.fit.evaluator import evaluator_of
+from switchfit.fit.solution import minimized
 from switchfit.io.problem_file import load_problem
-from switchfit.mesh import common_lengths, padded_length
-from switchfit.native.program import _program_of
-from switchfit.solve import minimized
+from switchfit.runtime.errors import InputError
 
 METHODS = ("auto", "forward", "discrete-adjoint", "autodiff")
 TIMES = np.linspace(0.0, 2.0, 12)

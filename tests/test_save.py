@@ -16,9 +16,9 @@ from hypothesis.extra import numpy as hnp
 from test_report import comparison_of, made, several, trajectory_of
 
 import switchfit as sf
+from switchfit.fit.result import Certificate, Fit
 from switchfit.io.json import FORMAT, VERSION, load_fit, save_fit
 from switchfit.optimize import Status
-from switchfit.result import Certificate, Fit
 
 CERTIFICATE = Certificate(
     optimality=2e-9,

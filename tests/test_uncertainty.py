@@ -11,14 +11,14 @@ import scipy.stats
 from test_report import comparison_of, made, trajectory_of
 
 import switchfit as sf
-from switchfit.certificate import certify
-from switchfit.evaluate import Evaluation, Evaluator, evaluator_of
-from switchfit.identifiability import analyse
+from switchfit.fit.evaluator import Evaluation, Evaluator, evaluator_of
+from switchfit.fit.result import disagreement
 from switchfit.models import skid_steer
 from switchfit.optimize import Status
 from switchfit.report.text import report, warnings_of
-from switchfit.residuals import diagnose, of_channel
-from switchfit.result import disagreement
+from switchfit.uncertainty.certificate import certify
+from switchfit.uncertainty.identification import analyse
+from switchfit.uncertainty.residuals import diagnose, of_channel
 
 TIMES = np.linspace(0.25, 6.0, 24)
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 import switchfit as sf
-from switchfit.validation import (
+from switchfit.problem.validation import (
     LONGEST,
     as_array,
     as_callable,

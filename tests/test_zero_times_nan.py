@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.evaluate import evaluator_of
-from switchfit.functions import float64
-from switchfit.native.scalars import Graph
-from switchfit.native.trace import traced
+from switchfit.engine.native.scalars import Graph
+from switchfit.engine.native.trace import traced
+from switchfit.fit.evaluator import evaluator_of
+from switchfit.problem.functions import float64
 
 TIMES = np.linspace(0.1, 1.0, 5)
 GOOD, BAD = 0.5, -0.5

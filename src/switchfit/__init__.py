@@ -1,27 +1,27 @@
 """switchfit: when did the system switch mode, and what were its parameters?"""
 
-from switchfit.batch.bootstrap import Bootstrap, bootstrap
 from switchfit.batch.fits import Fits
 from switchfit.batch.logs import estimate_many
-from switchfit.batch.monte_carlo import MonteCarlo, monte_carlo
-from switchfit.batch.multistart import Multistart, multistart
-from switchfit.check import DerivativeCheck, check_derivatives
-from switchfit.data import Input, Measurements, ReferenceSignal, RunningCost, TerminalConstraint, TerminalCost
-from switchfit.estimate import Estimate, estimate
-from switchfit.evaluate import Evaluation, evaluate
-from switchfit.experiment import Experiment, Parameter
-from switchfit.guards import GuardedEvaluation, evaluate_on_guards
-from switchfit.identifiability import Direction, Identifiability, identifiability
+from switchfit.batch.resampling import Bootstrap, bootstrap
+from switchfit.batch.simulated import MonteCarlo, monte_carlo
+from switchfit.batch.starts import Multistart, multistart
+from switchfit.estimation.estimator import Estimate, estimate
+from switchfit.fit.evaluator import Evaluation, evaluate
+from switchfit.fit.guards import GuardedEvaluation, evaluate_on_guards
+from switchfit.fit.result import Certificate
+from switchfit.fit.trajectory import Comparison, Trajectory, simulate
 from switchfit.optimize import Status
-from switchfit.prediction import Prediction, predict
-from switchfit.priors import LogNormal, Normal
-from switchfit.problem import Problem
-from switchfit.profile import Profile, profile
-from switchfit.residuals import ChannelResiduals, ResidualDiagnostics
-from switchfit.result import Certificate
-from switchfit.simulate import Comparison, Trajectory, simulate
-from switchfit.system import HybridSystem
-from switchfit.xla import compile_small_loops_whole
+from switchfit.problem.data import Input, Measurements, ReferenceSignal, RunningCost, TerminalConstraint, TerminalCost
+from switchfit.problem.experiment import Experiment, Parameter
+from switchfit.problem.priors import LogNormal, Normal
+from switchfit.problem.problem import Problem
+from switchfit.problem.system import HybridSystem
+from switchfit.runtime.xla import compile_small_loops_whole
+from switchfit.uncertainty.derivative_check import DerivativeCheck, check_derivatives
+from switchfit.uncertainty.identification import Direction, Identifiability, identifiability
+from switchfit.uncertainty.prediction import Prediction, predict
+from switchfit.uncertainty.profiles import Profile, profile
+from switchfit.uncertainty.residuals import ChannelResiduals, ResidualDiagnostics
 
 compile_small_loops_whole()
 

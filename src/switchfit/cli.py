@@ -200,9 +200,9 @@ def paper(
     """
     os.environ.setdefault("MPLBACKEND", "Agg")
     with _reported(debug):
-        from switchfit.io.errors import InputError
         from switchfit.paper import run
         from switchfit.paper.runner import TABLE
+        from switchfit.runtime.errors import InputError
 
         _make_folder(out)
         try:
@@ -249,8 +249,8 @@ def _reported(debug: bool) -> Iterator[None]:
 
 def _explain(error: BaseException, *, users: bool, debug: bool) -> NoReturn:
     """Say what is wrong; `users`: it was raised in a file of the user's."""
-    from switchfit.io.errors import InputError
     from switchfit.io.python_file import located
+    from switchfit.runtime.errors import InputError
 
     if users and not isinstance(error, InputError):
         _fail(f"{located(error)}. (--debug shows the full traceback.)", BAD_INPUT)
@@ -326,8 +326,8 @@ def _import_figures() -> None:
 
 def _save(estimate: Any, path: Path, *, complete: bool) -> None:
     """Save an estimate; not `complete` leaves the paper's equations out of its certificate, which take seconds."""
-    from switchfit.certificate import certify
     from switchfit.io.json import save_fit
+    from switchfit.uncertainty.certificate import certify
 
     save_fit(estimate.complete(), estimate.certificate if complete else certify(estimate, None), path)
 
@@ -374,7 +374,7 @@ def _line(record: Any) -> str:
 
 
 def _make_folder(folder: Path) -> None:
-    from switchfit.io.errors import InputError
+    from switchfit.runtime.errors import InputError
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -385,7 +385,7 @@ def _make_folder(folder: Path) -> None:
 @contextlib.contextmanager
 def _writing(path: Path) -> Iterator[Path]:
     """Context that says in an InputError which file cannot be written, and why."""
-    from switchfit.io.errors import InputError
+    from switchfit.runtime.errors import InputError
 
     try:
         yield path
@@ -395,7 +395,7 @@ def _writing(path: Path) -> Iterator[Path]:
 
 def _write(path: Path, content: str | bytes) -> None:
     """Write a file whole or not at all."""
-    from switchfit.io.files import write_atomically
+    from switchfit.runtime.files import write_atomically
 
     with _writing(path):
         write_atomically(content, path)

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.accuracy import cost_error
 from switchfit.batch.program import Chunk
-from switchfit.estimate import LARGEST_INTEGRATION_ERROR, Estimate, estimate
-from switchfit.evaluate import Evaluator
-from switchfit.mesh import Mesh
+from switchfit.discretization.mesh import Mesh
+from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, Estimate, estimate
+from switchfit.fit.accuracy import cost_error
+from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.result import inverse_on
 from switchfit.optimize import Status
-from switchfit.problem import Problem
-from switchfit.result import inverse_on
+from switchfit.problem.problem import Problem
 
 
 def redo_unresolved(

@@ -22,8 +22,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.io.errors import first_line
-from switchfit.io.files import PREFIX, SUFFIX, set_aside, write_atomically
+from switchfit.runtime.errors import first_line
+from switchfit.runtime.files import PREFIX, SUFFIX, set_aside, write_atomically
 
 Arrays = dict[str, NDArray[Any]]
 Progress = Callable[[int, int], object]

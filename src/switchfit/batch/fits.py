@@ -15,15 +15,15 @@ import scipy.special
 from numpy.typing import NDArray
 
 from switchfit.batch.chunks import Work, run_chunks
-from switchfit.data import FloatArray, Measurements
-from switchfit.evaluate import evaluator_of
-from switchfit.hidden import refuse_hidden_switches
+from switchfit.fit.evaluator import evaluator_of
+from switchfit.fit.hidden import refuse_hidden_switches
+from switchfit.fit.result import interval
+from switchfit.fit.solution import sigma_known
 from switchfit.optimize import Status
-from switchfit.problem import Problem
-from switchfit.progress import reporting
-from switchfit.result import interval
-from switchfit.solve import sigma_known
-from switchfit.validation import as_callable, as_level, as_path
+from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.problem import Problem
+from switchfit.problem.validation import as_callable, as_level, as_path
+from switchfit.runtime.progress import reporting
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,12 +15,12 @@ from switchfit.batch.again import adopt, is_resolved
 from switchfit.batch.chunks import Arrays, fingerprint
 from switchfit.batch.fits import Fits, check_long_run, repeat, sample_count
 from switchfit.batch.program import Varying, chunk_size, error_message, failed_chunk, fit_chunk
-from switchfit.estimate import checked_settings, estimate
-from switchfit.evaluate import evaluator_of
+from switchfit.estimation.estimator import checked_settings, estimate
+from switchfit.fit.evaluator import evaluator_of
+from switchfit.fit.solution import sigma_known
 from switchfit.optimize import Status
-from switchfit.problem import Problem
-from switchfit.solve import sigma_known
-from switchfit.validation import as_instance, as_sequence, listed
+from switchfit.problem.problem import Problem
+from switchfit.problem.validation import as_instance, as_sequence, listed
 
 
 def estimate_many(

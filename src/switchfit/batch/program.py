@@ -23,20 +23,22 @@ import numpy as np
 from jax import lax
 from numpy.typing import NDArray
 
-from switchfit.cache import compilation_cache
-from switchfit.data import FloatArray
-from switchfit.evaluate import Evaluator, derivatives
-from switchfit.mesh import Mesh
-from switchfit.model import Arguments, Structure, float64
-from switchfit.native.foreign import foreign_derivatives
+from switchfit.discretization.arguments import Arguments
+from switchfit.discretization.mesh import Mesh
+from switchfit.engine.native.foreign import foreign_derivatives
+from switchfit.fit.evaluator import Evaluator, derivatives
+from switchfit.fit.result import inverse_on
+from switchfit.fit.solution import constraints_of, message_of, minimized
 from switchfit.optimize import Status
 from switchfit.optimize.qp import nearest_feasible
 from switchfit.optimize.traced import Constraints, Outcome, minimize_traced
-from switchfit.optimize.variables import Variables
-from switchfit.priors import PriorTerms
-from switchfit.problem import Problem
-from switchfit.result import inverse_on
-from switchfit.solve import constraints_of, message_of, minimized
+from switchfit.problem.data import FloatArray
+from switchfit.problem.functions import float64
+from switchfit.problem.priors import PriorTerms
+from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Structure
+from switchfit.problem.variables import Variables
+from switchfit.runtime.cache import compilation_cache
 
 CHUNK = 32
 """Fits that one call of the program takes on a CPU."""

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from switchfit.data import FloatArray
-from switchfit.io.errors import InputError
-from switchfit.io.files import is_device
+from switchfit.problem.data import FloatArray
+from switchfit.runtime.errors import InputError
+from switchfit.runtime.files import is_device
 
 
 def read_columns(path: str | Path, columns: Sequence[str]) -> FloatArray:

@@ -26,10 +26,10 @@ from typing import Any, NoReturn, get_args, get_origin, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.data import FloatArray
-from switchfit.io.files import write_atomically
-from switchfit.result import Certificate, Fit
-from switchfit.simulate import Comparison, Trajectory
+from switchfit.fit.result import Certificate, Fit
+from switchfit.fit.trajectory import Comparison, Trajectory
+from switchfit.problem.data import FloatArray
+from switchfit.runtime.files import write_atomically
 
 FORMAT = "switchfit fit"
 VERSION = 3

@@ -20,16 +20,16 @@ import numpy as np
 import pydantic
 from pydantic import Field
 
-from switchfit.data import FloatArray, Input, Measurements, ReferenceSignal
-from switchfit.experiment import Experiment, Parameter
 from switchfit.io.csv import read_columns
-from switchfit.io.errors import InputError
-from switchfit.io.files import is_device
 from switchfit.io.python_file import call, find_object, load_object, located, user_place
 from switchfit.models import BUILT_IN
-from switchfit.priors import LogNormal, Normal, Prior
-from switchfit.problem import Problem
-from switchfit.system import HybridSystem
+from switchfit.problem.data import FloatArray, Input, Measurements, ReferenceSignal
+from switchfit.problem.experiment import Experiment, Parameter
+from switchfit.problem.priors import LogNormal, Normal, Prior
+from switchfit.problem.problem import Problem
+from switchfit.problem.system import HybridSystem
+from switchfit.runtime.errors import InputError
+from switchfit.runtime.files import is_device
 
 HessianKind = Literal["exact", "descent-first", "block-diagonal", "gauss-newton", "none"]
 

@@ -8,8 +8,8 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-from switchfit.io.errors import InputError, first_line
-from switchfit.io.files import is_regular
+from switchfit.runtime.errors import InputError, first_line
+from switchfit.runtime.files import is_regular
 
 
 def load_object(reference: str, folder: Path, what: str) -> Any:

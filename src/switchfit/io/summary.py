@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from switchfit.data import Measurements, ReferenceSignal
-from switchfit.experiment import Experiment
-from switchfit.parameter import unit_suffix
-from switchfit.problem import Problem
+from switchfit.problem.data import Measurements, ReferenceSignal
+from switchfit.problem.experiment import Experiment
+from switchfit.problem.parameter import unit_suffix
+from switchfit.problem.problem import Problem
 
 
 def describe(problem: Problem) -> str:

@@ -6,7 +6,7 @@ from types import MappingProxyType
 from switchfit.models.magic_formula import magic_formula
 from switchfit.models.skid_steer import skid_steer
 from switchfit.models.sliding_block import sliding_block
-from switchfit.system import HybridSystem
+from switchfit.problem.system import HybridSystem
 
 #: Name in a problem file -> function that returns the system; its arguments are keyword-only.
 BUILT_IN: Mapping[str, Callable[..., HybridSystem]] = MappingProxyType(

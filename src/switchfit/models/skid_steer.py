@@ -9,7 +9,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
-from switchfit.system import HybridSystem
+from switchfit.problem.system import HybridSystem
 
 WheelForces = tuple[float, float, float, float]
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from switchfit.system import HybridSystem
+from switchfit.problem.system import HybridSystem
 
 
 def sliding_block(*, g: float = 9.81) -> HybridSystem:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from switchfit.estimate import Estimate, HessianKind, estimate
-from switchfit.evaluate import evaluate
+from switchfit.estimation.estimator import Estimate, HessianKind, estimate
+from switchfit.fit.evaluator import evaluate
 from switchfit.paper.part import BLUE, COLUMN, DARK, LIGHT, RED, Found, Row, Say, conditions, new_figure, tidy
 from switchfit.paper.vehicle import TRUTH, simulated, summary
 

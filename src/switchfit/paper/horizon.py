@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from switchfit.batch.monte_carlo import monte_carlo
-from switchfit.batch.multistart import multistart
-from switchfit.data import FloatArray, Measurements, ReferenceSignal
-from switchfit.evaluate import evaluate
+from switchfit.batch.simulated import monte_carlo
+from switchfit.batch.starts import multistart
+from switchfit.fit.evaluator import evaluate
 from switchfit.paper.part import BLUE, COLUMN, DARK, RED, SYMBOLS, Found, Row, Say, new_figure, tidy
 from switchfit.paper.vehicle import HORIZON, NAMES, TRUTH, complete, driven, position, states_at, stick_slip
+from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

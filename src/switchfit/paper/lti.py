@@ -15,17 +15,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import expm
 
-from switchfit.data import FloatArray, ReferenceSignal
-from switchfit.estimate import HessianKind, estimate
-from switchfit.evaluate import evaluate
-from switchfit.experiment import Experiment, Parameter
-from switchfit.model import float64
+from switchfit.estimation.estimator import HessianKind, estimate
+from switchfit.fit.evaluator import evaluate
+from switchfit.fit.trajectory import simulate
 from switchfit.paper.convergence import convergence_figure, thinned
 from switchfit.paper.part import Found, Row, Say, conditions
 from switchfit.paper.vehicle import summary
-from switchfit.problem import Problem
-from switchfit.simulate import simulate
-from switchfit.system import HybridSystem
+from switchfit.problem.data import FloatArray, ReferenceSignal
+from switchfit.problem.experiment import Experiment, Parameter
+from switchfit.problem.functions import float64
+from switchfit.problem.problem import Problem
+from switchfit.problem.system import HybridSystem
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -7,11 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from switchfit.data import Measurements
-from switchfit.estimate import estimate
-from switchfit.evaluate import evaluate
-from switchfit.experiment import Parameter
-from switchfit.identifiability import identifiability
+from switchfit.estimation.estimator import estimate
+from switchfit.fit.evaluator import evaluate
 from switchfit.models.magic_formula import MAGIC_FORMULA
 from switchfit.paper.part import BLUE, DARK, LIGHT, PAGE, RED, Found, Row, Say, conditions, new_figure, tidy
 from switchfit.paper.vehicle import (
@@ -28,7 +25,10 @@ from switchfit.paper.vehicle import (
     summary,
     wheel_speeds,
 )
+from switchfit.problem.data import Measurements
+from switchfit.problem.experiment import Parameter
 from switchfit.report.plot import MODE_COLOURS
+from switchfit.uncertainty.identification import identifiability
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

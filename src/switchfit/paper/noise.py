@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from switchfit.batch.monte_carlo import MonteCarlo, monte_carlo
-from switchfit.data import FloatArray, Measurements
+from switchfit.batch.simulated import MonteCarlo, monte_carlo
+from switchfit.fit.result import inverse_on
 from switchfit.paper.part import BLUE, DARK, PAGE, RED, SYMBOLS, Found, Row, Say, new_figure, tidy
 from switchfit.paper.vehicle import (
     HORIZON,
@@ -23,8 +23,8 @@ from switchfit.paper.vehicle import (
     states_at,
     stick_slip,
 )
-from switchfit.problem import Problem
-from switchfit.result import inverse_on
+from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.problem import Problem
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,10 +14,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, cast
 
-from switchfit.io.errors import first_line
-from switchfit.io.files import set_aside, write_atomically
 from switchfit.paper import convergence, horizon, lti, magic, noise, trials
 from switchfit.paper.part import Found, Part, Row, Say
+from switchfit.runtime.errors import first_line
+from switchfit.runtime.files import set_aside, write_atomically
 
 #: Name -> part, in the order of the paper.
 PARTS: Mapping[str, Part] = MappingProxyType(

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from switchfit.estimate import estimate
+from switchfit.estimation.estimator import estimate
+from switchfit.fit.trajectory import simulate
 from switchfit.paper.part import COLUMN, DARK, LIGHT, RED, Found, Row, Say, new_figure, tidy
 from switchfit.paper.vehicle import curve, gps_reference, log_on_tyres, states_at, stick_slip, summary, wheel_speeds
-from switchfit.simulate import simulate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

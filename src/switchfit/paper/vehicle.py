@@ -8,15 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from switchfit.batch.fits import Fits
-from switchfit.data import Data, FloatArray, Input, Measurements, ReferenceSignal
-from switchfit.estimate import Estimate
-from switchfit.experiment import Experiment, Parameter
+from switchfit.estimation.estimator import Estimate
+from switchfit.fit.result import free_curvature
+from switchfit.fit.trajectory import Trajectory, simulate
 from switchfit.models.magic_formula import MAGIC_FORMULA, magic_formula
 from switchfit.models.skid_steer import skid_steer
 from switchfit.optimize import Status
-from switchfit.problem import Problem
-from switchfit.result import free_curvature
-from switchfit.simulate import Trajectory, simulate
+from switchfit.problem.data import Data, FloatArray, Input, Measurements, ReferenceSignal
+from switchfit.problem.experiment import Experiment, Parameter
+from switchfit.problem.problem import Problem
 
 SEQUENCE = ("stick", "slip", "stick")
 NAMES = ("tau_1", "tau_2", "mu")

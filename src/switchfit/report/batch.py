@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from switchfit.data import FloatArray
+from switchfit.problem.data import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from switchfit.batch.bootstrap import Bootstrap
     from switchfit.batch.fits import Fits
-    from switchfit.batch.monte_carlo import MonteCarlo
-    from switchfit.batch.multistart import Multistart
+    from switchfit.batch.resampling import Bootstrap
+    from switchfit.batch.simulated import MonteCarlo
+    from switchfit.batch.starts import Multistart
 
 ESTIMATE, TRUTH, NORMAL = "#4a7fb5", "#b2182b", "#222222"
 CLUSTER_COLOURS = ("#b2182b", "#4a7fb5", "#e0a030", "#5c9e5c", "#8a5fa3", "#777777")

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.data import FloatArray
+from switchfit.fit.result import Fit
+from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord
+from switchfit.problem.data import FloatArray
 from switchfit.report.text import run_names, standard_errors_of, time_label, transitions_of, unit_of
-from switchfit.result import Fit
-from switchfit.simulate import Comparison, Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

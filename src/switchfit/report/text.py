@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.special
 
-from switchfit.certificate import LARGE_INTEGRATION_ERROR, certify
-from switchfit.data import FloatArray
-from switchfit.identifiability import WEAK, Identifiability, after
-from switchfit.parameter import unit_suffix
-from switchfit.residuals import diagnose
-from switchfit.result import Certificate, Fit, disagreement, free_curvature
-from switchfit.simulate import Comparison, Trajectory
+from switchfit.fit.result import Certificate, Fit, disagreement, free_curvature
+from switchfit.fit.trajectory import Comparison, Trajectory
+from switchfit.problem.data import FloatArray
+from switchfit.problem.parameter import unit_suffix
+from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR, certify
+from switchfit.uncertainty.identification import WEAK, Identifiability, after
+from switchfit.uncertainty.residuals import diagnose
 
 WIDTH = 100
 LABEL = 18

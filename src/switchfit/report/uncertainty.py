@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from switchfit.profile import Profile
-    from switchfit.residuals import ChannelResiduals, ResidualDiagnostics
+    from switchfit.uncertainty.profiles import Profile
+    from switchfit.uncertainty.residuals import ChannelResiduals, ResidualDiagnostics
 
 LINE, QUADRATIC, THRESHOLD, SHADE = "#b2182b", "#777777", "#333333", "#4a7fb5"
 LEVELS = (0.683, 0.95, 0.99)

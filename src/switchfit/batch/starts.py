@@ -1,0 +1,299 @@
+"""Multistart: the same problem from many starts, to see which minima it has and which is the lowest."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from switchfit.batch.again import redo_unresolved
+from switchfit.batch.chunks import Arrays, fingerprint
+from switchfit.batch.fits import Fits, check_long_run, repeat, sample_count
+from switchfit.batch.program import Varying, chunk_size, error_message, fit_chunk
+from switchfit.discretization.arguments import arguments_of
+from switchfit.discretization.mesh import Mesh
+from switchfit.estimation.estimator import Estimate, checked_settings, estimate
+from switchfit.fit.evaluator import evaluator_of
+from switchfit.fit.solution import constraints_of
+from switchfit.optimize import Status
+from switchfit.optimize.qp import solve_qp
+from switchfit.problem.data import FloatArray
+from switchfit.problem.parameter import unit_suffix
+from switchfit.problem.problem import Problem
+from switchfit.problem.validation import as_array, as_count, as_instance, as_seed, listed
+from switchfit.report.batch import plot_waterfall
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+MOST_DRAWN = 2**30
+"""Points that SciPy's Sobol sequences have."""
+
+ENDS_TRIED = 10
+"""Ends from which a full estimate is tried, the lowest first."""
+
+SAME_COST = 1e-6
+"""Two ends are one minimum if their costs differ by less than this part of them, and ..."""
+
+SAME_PLACE = 1e-3
+"""... each parameter by less than this part of the spread of the starts, or of its size where they do not differ in it,
+each transition time by less than this part of the horizon. Modes that have collapsed (shorter than that) do not count:
+where they sit is arbitrary."""
+
+
+@dataclass(frozen=True, eq=False)
+class Multistart(Fits):
+    """Result of `multistart`: everything in `Fits`, the minima that were found, and the best. Print it for the table.
+
+    Attributes
+    ----------
+    clusters : (R,) int
+        Which minimum each start ended in, 0 being the lowest; -1 where it did not converge.
+    best : Estimate or None
+        A full estimate, resumed at the lowest end; None where each of the lowest ones raises an error.
+    """
+
+    clusters: NDArray[np.int64]
+    best: Estimate | None
+
+    def __str__(self) -> str:
+        lines = [*self._summary(), "", f"{int(self.clusters.max(initial=-1)) + 1} minima:"]
+        for k in range(min(int(self.clusters.max(initial=-1)) + 1, 10)):
+            here = np.flatnonzero(self.clusters == k)
+            columns = zip(self.theta_names, self.theta[here[0]], self.theta_units, strict=True)
+            place = ", ".join(f"{name} = {value:.6g}{unit_suffix(unit)}" for name, value, unit in columns)
+            lines.append(f"  J = {self.cost[here].min():.9g}  {len(here):>5} starts  {place}")
+        return "\n".join(lines)
+
+    def plot(self) -> Figure:
+        """Waterfall: the cost at the end of every start, ascending, as a matplotlib Figure."""
+        return plot_waterfall(self)
+
+
+def multistart(
+    problem: Problem,
+    starts: int | ArrayLike = 64,
+    *,
+    seed: int = 0,
+    tolerance: float = 1e-7,
+    max_iterations: int = 200,
+    client: Any = None,
+    folder: str | Path | None = None,
+    callback: Callable[[int, int], object] | None = None,
+) -> Multistart:
+    """Fit a problem from many starts.
+
+    Parameters
+    ----------
+    problem : Problem
+    starts : int or (S, d) array_like
+        How many, drawn from a scrambled Sobol sequence over everything that bounds, order and minimum durations allow;
+        or the starts themselves. The first of those that are drawn is the problem's initial guess.
+    seed : int
+        Of the sequence.
+    tolerance, max_iterations : as of `estimate`
+    client, folder, callback : as of `monte_carlo`
+
+    Returns
+    -------
+    Multistart
+
+    Raises
+    ------
+    ValueError
+        If a parameter lacks a bound and starts are to be drawn, or given starts have the wrong shape or are infeasible.
+    TypeError
+        If an argument is of the wrong type.
+
+    Notes
+    -----
+    All starts share the mesh that is refined at the initial guess; the best end is fitted again on a mesh of its own.
+    """
+    as_instance(problem, "problem", Problem, "an sf.Problem")
+    seed = as_seed(seed)
+    tolerance, max_iterations = checked_settings(tolerance, max_iterations)
+    check_long_run(client, folder, callback)
+    began = time.perf_counter()
+    several = hasattr(type(starts), "__len__")
+    points = _given(problem, starts) if several else _drawn(problem, starts, seed)
+    work = _Work(problem, list(evaluator_of(problem).meshes), points, tolerance, max_iterations)
+    found = repeat(problem, work, len(points), "Multistart", began, client=client, folder=folder, callback=callback)
+    best, errors = _best(problem, Fits(**found), tolerance, max_iterations)
+    if errors:
+        status, message = found["status"].astype(object), found["message"].astype(object)
+        for k, error in errors.items():
+            status[k], message[k] = Status.ERROR.name, error_message(error)
+        found |= {"status": status.astype(str), "message": message.astype(str)}
+    return Multistart(**found, clusters=_clusters(problem, Fits(**found)), best=best)
+
+
+def _best(
+    problem: Problem, fits: Fits, tolerance: float, max_iterations: int
+) -> tuple[Estimate | None, dict[int, Exception]]:
+    """A full estimate, resumed at the lowest end that allows one, and the errors of the ends that do not."""
+    errors: dict[int, Exception] = {}
+    for k in np.lexsort((np.nan_to_num(fits.cost, nan=np.inf), ~fits.success))[:ENDS_TRIED].tolist():
+        start = fits.theta[k] if np.isfinite(fits.theta[k]).all() else fits.start[k]
+        try:
+            return estimate(problem, start=start, tolerance=tolerance, max_iterations=max_iterations), errors
+        except Exception as error:  # of this end alone: listed
+            errors[k] = error
+    return None, errors
+
+
+@dataclass
+class _Work:
+    """The runs of a multistart, for `run_chunks`."""
+
+    problem: Problem
+    meshes: list[Mesh]
+    starts: FloatArray
+    tolerance: float
+    max_iterations: int
+
+    @property
+    def size(self) -> int:
+        return chunk_size()
+
+    def __call__(self, runs: range) -> Arrays:
+        starts = self.starts[runs.start : runs.stop]
+        found = fit_chunk(
+            self.problem,
+            self.meshes,
+            Varying((), ()),
+            starts,
+            tolerance=self.tolerance,
+            max_iterations=self.max_iterations,
+        )
+        settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
+        found = redo_unresolved(found, lambda k: self.problem, self.meshes, **settings)
+        return {**found._asdict(), "start": starts, "samples": np.full(len(runs), sample_count(self.problem))}
+
+    def fingerprint(self) -> str:
+        unknowns = self.problem.unknowns
+        bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
+        leaves = jax.tree.leaves([arguments_of(self.problem, e, mesh) for e, mesh in enumerate(self.meshes)])
+        settings = self.tolerance, self.max_iterations, unknowns.names, self.problem.digests
+        return fingerprint("multistart", settings, self.starts, *bounds, *map(np.asarray, leaves))
+
+
+def _given(problem: Problem, starts: Any) -> FloatArray:
+    """Starts of the user's, checked."""
+    points = as_array(starts, "starts")
+    d = len(problem.theta_names)
+    if points.ndim != 2 or points.shape[1] != d or len(points) == 0:
+        raise ValueError(f"starts must be a number, or an array of shape (S, {d}); got shape {points.shape}.")
+    constraints = constraints_of(problem)
+    for k, point in enumerate(points):
+        slack = constraints.slack(problem.checked_theta(point, f"starts[{k}]"))
+        if np.any(slack < -1e-12 * (1 + np.max(np.abs(point)))):
+            raise ValueError(f"start {k} violates: {constraints.names[int(np.argmin(slack))]}.")
+    return points
+
+
+def _drawn(problem: Problem, starts: Any, seed: int) -> FloatArray:
+    """Starts from a Sobol sequence: (S, d)."""
+    from scipy.stats import qmc  # here, since importing it takes longer than most fits
+
+    count = as_count(starts, "starts", at_least=1, at_most=MOST_DRAWN)
+    unknowns = problem.unknowns
+    is_time = np.zeros(len(unknowns.names), dtype=bool)
+    for where in unknowns.times:
+        is_time[where[where >= 0]] = True
+    unbounded = ~is_time & ~(np.isfinite(unknowns.lower) & np.isfinite(unknowns.upper))
+    unbounded |= unknowns.log & (unknowns.lower <= 0)
+    if unbounded.any():
+        names = listed(np.array(unknowns.names)[unbounded])
+        raise ValueError(
+            f"multistart draws starts between bounds, but there are none for {names}: give sf.Parameter(..., "
+            "lower=..., upper=...), or the starts themselves."
+        )
+    sobol = qmc.Sobol(len(unknowns.names), seed=seed)
+    cube = sobol.random(1 << max(count - 1, 0).bit_length())[:count]
+    low, high = np.where(is_time, 0.0, unknowns.lower), np.where(is_time, 1.0, unknowns.upper)
+    points = low + cube * (high - low)
+    log = unknowns.log
+    points[:, log] = low[log] * (high[log] / low[log]) ** cube[:, log]
+    for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
+        for begin, end, group in _stretches(experiment, where):
+            # Sorted uniform numbers are uniform over all ordered times; the room that minimum durations take is added.
+            room = end - begin - (len(group) + 1) * problem.min_duration
+            ordered = np.sort(cube[:, group], axis=1)
+            points[:, group] = begin + max(room, 0.0) * ordered + problem.min_duration * np.arange(1, len(group) + 1)
+    points[0] = unknowns.initial
+    return np.array([_nearest_feasible(problem, point) for point in points])
+
+
+def _stretches(experiment: Any, where: NDArray[np.intp]) -> list[tuple[float, float, NDArray[np.intp]]]:
+    """Groups of free transition times with the fixed times (or ends of the horizon) that enclose them."""
+    knots = np.concatenate([[experiment.t0], experiment.initial_times, [experiment.tf]])
+    fixed = [0, *(np.flatnonzero(where < 0) + 1).tolist(), len(knots) - 1]
+    return [(float(knots[a]), float(knots[b]), where[a : b - 1]) for a, b in pairwise(fixed) if b - a > 1]
+
+
+def _nearest_feasible(problem: Problem, point: FloatArray) -> FloatArray:
+    """The feasible point nearest to `point`, each unknown measured by its own range."""
+    constraints = constraints_of(problem)
+    inside = problem.initial_theta
+    if np.all(constraints.slack(point) >= 0):
+        return point
+    size = np.maximum(np.abs(point - inside), 1e-9 * (1 + np.abs(inside)))
+    matrix = np.diag(1 / size**2)
+    offsets = -np.maximum(constraints.slack(inside), 0.0)
+    step = solve_qp(-(point - inside) / size**2, matrix, constraints.normals, offsets).step
+    return np.clip(inside + step, constraints.lower, constraints.upper)
+
+
+def _clusters(problem: Problem, fits: Fits) -> NDArray[np.int64]:
+    """Number of the minimum in which each fit ended, ascending in cost; -1 where it did not converge."""
+    labels = np.full(len(fits), -1)
+    unknowns = problem.unknowns
+    times = np.concatenate(unknowns.times)
+    places = np.setdiff1d(np.arange(len(unknowns.names)), times).tolist()
+    spread = np.ptp(fits.start, axis=0)
+    size = np.max(np.abs(fits.theta[fits.success]), axis=0, initial=1e-9)
+    spread = np.where(spread > 1e-12 * (1 + np.max(np.abs(fits.start), axis=0)), spread, size)[places]
+    found: list[tuple[float, FloatArray, list[Any]]] = []
+    for k in np.argsort(fits.cost, kind="stable"):
+        if not fits.success[k]:
+            continue
+        cost, p, schedule = float(fits.cost[k]), fits.theta[k][places], _schedule(problem, fits.theta[k])
+        for label, (other_cost, other_p, other_schedule) in enumerate(found):
+            level = abs(cost - other_cost) <= SAME_COST * max(abs(cost), 1e-300)
+            if level and np.all(np.abs(p - other_p) <= SAME_PLACE * spread) and _alike(schedule, other_schedule):
+                labels[k] = label
+                break
+        else:
+            labels[k] = len(found)
+            found.append((cost, p, schedule))
+    return labels
+
+
+def _schedule(problem: Problem, theta: FloatArray) -> list[Any]:
+    """For each experiment its modes without the collapsed ones, and when they switch as parts of the horizon."""
+    schedules = []
+    for experiment, times in zip(problem.experiments, problem.split(theta)[0], strict=True):
+        knots = np.concatenate([[experiment.t0], times, [experiment.tf]])
+        knots = (knots - experiment.t0) / (experiment.tf - experiment.t0)
+        modes: list[str] = []
+        switches: list[float] = []
+        for mode, begin, end in zip(experiment.mode_sequence, knots[:-1], knots[1:], strict=True):
+            if end - begin > SAME_PLACE and (not modes or modes[-1] != mode):
+                modes.append(mode)
+                switches.append(float(begin))
+        schedules.append((modes, np.array(switches)))
+    return schedules
+
+
+def _alike(one: list[Any], other: list[Any]) -> bool:
+    return all(
+        modes == others and np.all(np.abs(times - other_times) <= SAME_PLACE)
+        for (modes, times), (others, other_times) in zip(one, other, strict=True)
+    )

@@ -1,0 +1,106 @@
+"""The numbers of an experiment on a mesh, as the arrays that its programs take."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from switchfit.discretization.mesh import Mesh
+from switchfit.problem.data import FloatArray, Measurements, PiecewisePolynomial, ReferenceSignal
+from switchfit.problem.experiment import Experiment, initial_state_of, signals_of
+from switchfit.problem.problem import Problem
+from switchfit.problem.structure import initial_values, of_kind
+
+Array = jax.Array
+
+
+class Samples(NamedTuple):
+    """Discrete samples: cell that ends at each (K,), time (K,), value (K, q), weight (K, q), 0 where missing."""
+
+    cell: Array
+    time: Array
+    value: Array
+    weight: Array
+
+
+class Arguments(NamedTuple):
+    """Numbers of a run, none of them estimated.
+
+    Attributes
+    ----------
+    nodes : (G + 1,)
+    signals : (G, 4, S)
+        Polynomial of each signal channel in each cell, in powers of time since the cell's first node: the
+        references in the order of the data, then the input.
+    fixed : values of the fixed parameters, in order
+    initial_state : (n,), zeros where it is a function of the parameters; unknown entries are not looked at
+    samples : one `Samples` for each `Measurements`
+    weights : W of each `ReferenceSignal`, its diagonal (q,) where it is diagonal, else (q, q)
+    """
+
+    nodes: Array
+    signals: Array
+    fixed: tuple[Array, ...]
+    initial_state: Array
+    samples: tuple[Samples, ...]
+    weights: tuple[Array, ...]
+
+    def without_mesh(self) -> Arguments:
+        """What the functions of the model need of them: shapes do not depend on the number of nodes or samples."""
+        return self._replace(nodes=np.zeros(2), signals=np.zeros((1, *self.signals.shape[1:])), samples=())  # type: ignore[arg-type]
+
+
+def arguments_of(problem: Problem, e: int, mesh: Mesh) -> Arguments:
+    """The arrays (NumPy's) of experiment e on a mesh that holds all its sample times and knots as nodes."""
+    structure, experiment = problem.structures[e], problem.experiments[e]
+    initial = initial_state_of(problem.system, experiment)
+    mapped = experiment.parameter_map
+    fixed = tuple(
+        problem.parameters[mapped.get(name, name)].value for name, _, free in structure.parameters if not free
+    )
+    measurements = of_kind(experiment.data, Measurements)
+    lengths = problem.sample_lengths[e]
+    samples = tuple(_padded_samples(*given, mesh) for given in zip(measurements, lengths, strict=True))
+    weights = tuple(_compact(item.weights) for item in of_kind(experiment.data, ReferenceSignal))
+    x0 = np.zeros(structure.n) if callable(initial) else initial_values(initial)
+    return Arguments(mesh.nodes, _signals_by_cell(experiment, mesh), fixed, x0, samples, weights)  # type: ignore[arg-type]
+
+
+def _compact(W: FloatArray) -> FloatArray:
+    """The diagonal of a diagonal matrix: it costs q products instead of q squared at every stage of every step."""
+    diagonal = np.diag(W)
+    return diagonal if np.array_equal(W, np.diag(diagonal)) else W
+
+
+def _padded_samples(item: Measurements, length: int, mesh: Mesh) -> Samples:
+    """Samples of one Measurements, padded with missing ones to a length."""
+    extra = length - len(item.times)
+    rows = ((0, extra), (0, 0))
+    return Samples(
+        np.pad(mesh.cell_ending_at(item.seen_times), (0, extra), mode="edge"),  # type: ignore[arg-type]  # made jax arrays
+        np.pad(item.seen_times, (0, extra), mode="edge"),  # type: ignore[arg-type]
+        np.pad(np.nan_to_num(item.values), rows),  # type: ignore[arg-type]
+        np.pad(item.weights, rows),  # type: ignore[arg-type]
+    )
+
+
+def _signals_by_cell(experiment: Experiment, mesh: Mesh) -> FloatArray:
+    """Every signal as a cubic in each cell, in powers of the time since the cell's first node: (G, 4, S)."""
+    none = np.zeros((len(mesh.nodes) - 1, 4, 0))
+    return np.concatenate([none, *(by_cell(signal, mesh) for signal in signals_of(experiment))], axis=2)
+
+
+def by_cell(signal: PiecewisePolynomial, mesh: Mesh) -> FloatArray:
+    """One signal as a cubic in each cell of a mesh that has its knots as nodes: (G, 4, q)."""
+    starts = mesh.nodes[:-1]
+    middles = 0.5 * (mesh.nodes[:-1] + mesh.nodes[1:])
+    k = signal.interval(middles)
+    s = (starts - signal.knots[k])[:, None]
+    shifted = signal.coefficients[k]
+    c1, c2, c3 = shifted[:, 1].copy(), shifted[:, 2].copy(), shifted[:, 3]
+    shifted[:, 0] += s * (c1 + s * (c2 + s * c3))
+    shifted[:, 1] += s * (2 * c2 + 3 * s * c3)
+    shifted[:, 2] += 3 * s * c3
+    return shifted

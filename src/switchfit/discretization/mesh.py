@@ -1,0 +1,161 @@
+"""The mesh: fixed nodes, cut by the transition times.
+
+The *nodes* of an experiment are t0, tf, all sample times, the knots of inputs and reference signals and a refinement
+grid. They stay where they are while the optimiser works. The transition times cut the *cells* between them into
+*rows*: one row is one Runge-Kutta step, in one mode, inside one cell. Every moment that matters is thus the end of a
+row, and only the rows beside a transition move with it.
+
+Rows are laid out in chunks of `CHUNK` rows of one segment (the time a mode is active), each segment padded to whole
+chunks with rows of length zero, so that a chunk has one mode and all shapes are fixed whatever the transition times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.problem.data import FloatArray
+from switchfit.problem.lengths import common_lengths, padded_length
+from switchfit.problem.problem import Problem
+
+CHUNK = 16
+"""Rows in a chunk: long enough to fill vector registers (rows times stages), short enough to waste few in padding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Fixed nodes of one experiment.
+
+    Attributes
+    ----------
+    nodes : (G + 1,) array
+        Increasing, from t0 to tf; padded at the end with tf to a length out of `padded_length`, so that
+        experiments of similar size share one compiled program.
+    cells : int
+        Cells before the padding.
+    """
+
+    nodes: FloatArray
+    cells: int
+
+    @classmethod
+    def from_times(cls, times: FloatArray) -> Mesh:
+        """The mesh whose nodes are `times`, in any order and with repetitions."""
+        nodes = np.unique(times)
+        cells = len(nodes) - 1
+        padding = np.full(padded_length(cells) - cells, nodes[-1])
+        return cls(np.concatenate([nodes, padding]), cells)
+
+    @property
+    def times(self) -> FloatArray:
+        """The nodes without the padding."""
+        return self.nodes[: self.cells + 1]
+
+    def padded_to(self, cells: int) -> Mesh:
+        """The mesh with its padding made so long that it has the given number of cells."""
+        return Mesh(np.append(self.times, np.full(cells - self.cells, self.times[-1])), self.cells)
+
+    def divided(self, parts: int = 2) -> Mesh:
+        """The mesh with every cell cut into equal parts."""
+        nodes = self.times
+        return Mesh.from_times(
+            np.concatenate([nodes[:-1] + np.diff(nodes) * k / parts for k in range(parts)] + [nodes])
+        )
+
+    def cell_ending_at(self, times: FloatArray) -> NDArray[np.intp]:
+        """Index of the cell that ends at each of `times`, which must be nodes; -1 for t0."""
+        return np.searchsorted(self.times, times) - 1
+
+
+def with_common_lengths(problem: Problem, meshes: Sequence[Mesh]) -> list[Mesh]:
+    """The meshes of all experiments, those of experiments that are alike padded to common lengths."""
+    padded = list(meshes)
+    if len(padded) == 1:
+        return padded
+    for group in problem.alike:
+        lengths = common_lengths([meshes[e].cells for e in group])
+        for e, length in zip(group, lengths, strict=True):
+            padded[e] = meshes[e] if len(group) == 1 else meshes[e].padded_to(length)
+    return padded
+
+
+class Rows(NamedTuple):
+    """The rows of a mesh at given transition times: Q chunks of C rows.
+
+    Attributes
+    ----------
+    segment : (Q,) int, which entry of the mode sequence
+    opens : (Q,) bool, whether the chunk opens a segment other than the first (a transition precedes it)
+    cell : (Q, C) int
+    start, end : (Q, C) times
+    starts_at, ends_at : (Q, C) int, index (from 0) of the transition time at which a row starts or ends, else -1
+    first_chunk : (N + 1,) int, the chunk that opens each segment
+    last_row : (N + 1,) int, flat index of the last row of each segment
+    first_cell : (N + 1,) int, the cell in which each segment begins
+    """
+
+    segment: jax.Array
+    opens: jax.Array
+    cell: jax.Array
+    start: jax.Array
+    end: jax.Array
+    starts_at: jax.Array
+    ends_at: jax.Array
+    first_chunk: jax.Array
+    last_row: jax.Array
+    first_cell: jax.Array
+
+
+def chunk_count(cells: int, transitions: int) -> int:
+    """Chunks that hold all rows wherever the transition times lie: the padding wastes at most C - 1 rows a segment."""
+    return (cells + transitions + (transitions + 1) * (CHUNK - 1)) // CHUNK
+
+
+def rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
+    """Cut the cells between `nodes` (G + 1,) at `tau` (N,).
+
+    Where tau_i equals a node, `side` = +1 lets segment i begin in the cell after it, so that derivatives are those
+    for tau_i increasing, and -1 in the cell before it. Computed in the arrays of
+    `xp`, JAX's or NumPy's.
+    """
+    cells, N = nodes.shape[0] - 1, tau.shape[0]
+    passed = xp.where(side > 0, nodes[None] <= tau[:, None], nodes[None] < tau[:, None]).sum(1)
+    real_cells = (nodes[1:] > nodes[:-1]).sum()  # without the padding, so that tau = tf stays before what is at tf
+    first_cell = xp.clip(passed - 1, 0, real_cells - 1)
+    first_cell = xp.concatenate([xp.zeros(1, first_cell.dtype), first_cell])
+    last_cell = xp.concatenate([first_cell[1:], xp.full(1, cells - 1, first_cell.dtype)])
+    count = last_cell - first_cell + 1
+    chunks = -(-count // CHUNK)
+    first_chunk = xp.concatenate([xp.zeros(1, chunks.dtype), xp.cumsum(chunks)[:-1]])
+
+    q = xp.arange(chunk_count(cells, N))
+    segment = (q[:, None] >= first_chunk[None, 1:]).sum(1)
+    offset = (q - first_chunk[segment])[:, None] * CHUNK + xp.arange(CHUNK)
+    rows_here = count[segment][:, None]
+    padding = offset >= rows_here
+    cell = first_cell[segment][:, None] + xp.minimum(offset, rows_here - 1)
+
+    begins = xp.concatenate([nodes[:1], tau])[segment][:, None]
+    finishes = xp.concatenate([tau, nodes[-1:]])[segment][:, None]
+    opening = (offset == 0) & (segment > 0)[:, None]
+    closing = (offset == rows_here - 1) & (segment < N)[:, None]
+    start = xp.where(padding, finishes, xp.where(opening, begins, nodes[cell]))
+    end = xp.where(padding | closing, finishes, nodes[cell + 1])
+    starts_at = xp.where(opening, segment[:, None] - 1, -1)
+    ends_at = xp.where(closing, segment[:, None], -1)
+    opens = opening[:, 0]
+    last_row = first_chunk * CHUNK + count - 1
+    return Rows(segment, opens, cell, start, end, starts_at, ends_at, first_chunk, last_row, first_cell)
+
+
+def row_ending_cell(layout: Rows, cell: jax.Array) -> jax.Array:
+    """Flat index of the last row inside each of the given cells (K,); -1 for cell -1."""
+    segment = (cell[:, None] >= layout.first_cell[None, 1:]).sum(1)
+    row = layout.first_chunk[segment] * CHUNK + cell - layout.first_cell[segment]
+    return jnp.where(cell < 0, -1, row)

@@ -1,0 +1,208 @@
+"""The functions of one experiment, bound to its arguments while JAX traces a program."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from switchfit.discretization.arguments import Arguments, Samples
+from switchfit.discretization.tableaus import Density, Field, tableau_of
+from switchfit.problem.functions import Function
+from switchfit.problem.losses import influence, robust
+from switchfit.problem.structure import Structure
+
+Array = jax.Array
+
+
+class Piece(NamedTuple):
+    """The signals in one cell: first node (), coefficients (4, S)."""
+
+    origin: Array
+    coefficients: Array
+
+    def __call__(self, t: Array) -> Array:
+        """All channels at time t: (S,)."""
+        return _polynomial(t - self.origin, self.coefficients)
+
+
+@jax.custom_jvp
+def _polynomial(s: Array, c: Array) -> Array:
+    """``c[0] + c[1] s + c[2] s**2 + ...``: (S,).
+
+    Its derivative in s is given as a polynomial too. Differentiated by JAX, Horner's scheme carries a tangent through
+    each of its steps in every direction: with a reference signal a quarter of an evaluation went into that.
+    The coefficients are data and have no derivative.
+    """
+    value = c[-1]
+    for k in reversed(range(c.shape[0] - 1)):
+        value = c[k] + s * value
+    return value
+
+
+@_polynomial.defjvp
+def _polynomial_jvp(at: tuple[Array, Array], direction: tuple[Array, Array]) -> tuple[Array, Array]:
+    s, c = at
+    powers = jnp.arange(1.0, c.shape[0])[:, None]
+    slope = _polynomial(s, powers * c[1:]) if c.shape[0] > 1 else jnp.zeros_like(c[0])
+    return _polynomial(s, c), slope * direction[0]
+
+
+class Model:
+    """The functions of one experiment, bound to its arguments while a program is traced.
+
+    All functions take the flat vector p (M,) of the free parameters and the unknown entries of the initial state.
+    """
+
+    def __init__(self, structure: Structure, arguments: Arguments) -> None:
+        self.structure = structure
+        self.arguments = arguments
+        self.tableau = tableau_of(structure.solver)
+
+    def parameters(self, p: Array) -> Mapping[str, Array]:
+        """The dict the user's functions get."""
+        named: dict[str, Array] = {}
+        fixed = iter(self.arguments.fixed)
+        position = 0
+        for name, shape, free in self.structure.parameters:
+            if free:
+                size = int(np.prod(shape))
+                named[name] = p[position : position + size].reshape(shape)
+                position += size
+            else:
+                named[name] = next(fixed)
+        return named
+
+    def field(self, mode: int, piece: Piece) -> Field:
+        """Vector field of a mode inside one cell."""
+        structure = self.structure
+        function = structure.modes[mode]
+
+        def f(t: Array, x: Array, p: Array) -> Array:
+            given: tuple[Any, ...] = (t, x, self.parameters(p))
+            if structure.input_shape is not None:
+                size = int(np.prod(structure.input_shape))
+                given += (piece(t)[piece.coefficients.shape[-1] - size :].reshape(structure.input_shape),)
+            return function(*given)
+
+        return f
+
+    @property
+    def has_running_cost(self) -> bool:
+        """Whether anything is integrated along the trajectory."""
+        return bool(self.structure.running or self.structure.references)
+
+    def density(self, piece: Piece) -> Density:
+        """Sum of all running costs inside one cell, reference signals included."""
+
+        def ell(t: Array, x: Array, p: Array) -> Array:
+            total = jnp.zeros(())
+            for function in self.structure.running:
+                total = total + function(t, x, self.parameters(p))
+            for residual, W in zip(self.reference_residuals(piece), self.arguments.weights, strict=True):
+                r = residual(t, x, p)
+                total = total + 0.5 * r @ weighted(W, r)
+            return total
+
+        return ell
+
+    def reference_residuals(self, piece: Piece) -> list[Callable[[Array, Array, Array], Array]]:
+        """``y(t, x, p) - y_m(t)`` of each reference signal, (q,)."""
+        ends = np.cumsum([0, *(channels for _, channels in self.structure.references)]).tolist()
+        return [
+            partial(self._reference_residual, k, slice(first, last), piece)
+            for k, (first, last) in enumerate(pairwise(ends))
+        ]
+
+    def _reference_residual(self, k: int, channels: slice, piece: Piece, t: Array, x: Array, p: Array) -> Array:
+        return self.observed(self.structure.references[k][0], t, x, p) - piece(t)[channels]
+
+    def observed(self, observe: Function | None, t: Array, x: Array, p: Array) -> Array:
+        """What a sensor sees: (q,)."""
+        return x if observe is None else observe(t, x, self.parameters(p))
+
+    def sample_residual(self, k: int, sample: Samples, x: Array, p: Array) -> Array:
+        """``h - y`` of one sample of the k-th Measurements, 0 where it is missing: (q,)."""
+        sensor = self.structure.measurements[k]
+        h = self.observed(sensor.observe, sample.time, x, p)
+        return jnp.where(sample.weight > 0, h - sample.value, 0.0)
+
+    def seen_at(self, k: int, sample: Samples, p: Array) -> Samples:
+        """A late sample with the time of the state that it is of, ``t - delay``, in place of its own."""
+        delay = self.structure.measurements[k].delay
+        return sample if delay is None else sample._replace(time=sample.time - self.parameters(p)[delay])
+
+    def log_sigma(self, k: int, sample: Samples, p: Array) -> Array:
+        """Logarithm of the sigma of each channel that is a parameter and has a value in this sample, else 0: (q,)."""
+        named = self.structure.measurements[k].sigma
+        parameters = self.parameters(p)
+        sigma = [jnp.ones(()) if name is None else parameters[name] for name in named]
+        return jnp.where(sample.weight > 0, jnp.log(jnp.stack(sigma)), 0.0)
+
+    def sample_cost(self, k: int, sample: Samples, x: Array, p: Array) -> Array:
+        """``1/2 sum C**2 rho(((h - y) / sigma)**2 / C**2) + sum log sigma`` of one sample.
+
+        Without a robust loss rho is the identity; log sigma is there where sigma is a parameter.
+        """
+        sensor = self.structure.measurements[k]
+        r = self.sample_residual(k, sample, x, p)
+        u = sample.weight * r * r
+        if not sensor.sigma:
+            return 0.5 * jnp.sum(robust(sensor.loss, sensor.loss_scale, u, jnp))
+        log_sigma = self.log_sigma(k, sample, p)
+        u = u * jnp.exp(-2.0 * log_sigma)
+        return jnp.sum(0.5 * robust(sensor.loss, sensor.loss_scale, u, jnp) + log_sigma)
+
+    def sample_information(self, k: int, sample: Samples, x: Array, p: Array) -> Array:
+        """Weight of each channel of one sample in the Gauss-Newton matrix, ``rho' / sigma**2``: (q,)."""
+        sensor = self.structure.measurements[k]
+        weight = sample.weight
+        if sensor.sigma:
+            weight = weight * jnp.exp(-2.0 * self.log_sigma(k, sample, p))
+        if sensor.loss == "linear":
+            return weight
+        r = self.sample_residual(k, sample, x, p)
+        return weight * influence(sensor.loss, sensor.loss_scale, weight * r * r, jnp)
+
+    def terminal(self, x: Array, p: Array) -> Array:
+        """Sum of the terminal costs."""
+        total = jnp.zeros(())
+        for phi in self.structure.terminal:
+            total = total + phi(x, self.parameters(p))
+        return total
+
+    def reset(self, i: int) -> Callable[[Array, Array, Array], Array]:
+        """Reset map R_i(t, x, p) of transition i, which must have one."""
+        return self._at_transition(self.structure.reset_maps[i], f"transition {i + 1} has no reset map.")
+
+    def guard(self, i: int) -> Callable[[Array, Array, Array], Array]:
+        """Guard g_i(t, x, p) of transition i, which must have one."""
+        return self._at_transition(self.structure.guards[i], f"transition {i + 1} has no guard.")
+
+    def _at_transition(self, function: Function | None, missing: str) -> Callable[[Array, Array, Array], Array]:
+        if function is None:
+            raise ValueError(missing)
+        return lambda t, x, p: function(t, x, self.parameters(p))
+
+    def terminal_constraint(self, x: Array, p: Array) -> Array:
+        """All terminal constraints in one: (m,)."""
+        parts = [psi(x, self.parameters(p)) for psi in self.structure.terminal_constraints]
+        return jnp.concatenate([part.reshape(-1) for part in parts])
+
+    def initial_state(self, p: Array) -> Array:
+        """x(t0), (n,)."""
+        if self.structure.initial_state is None:
+            unknown = self.structure.unknown_states
+            x0 = self.arguments.initial_state
+            return x0.at[np.array(unknown)].set(p[-len(unknown) :]) if unknown else x0
+        return self.structure.initial_state(self.parameters(p))
+
+
+def weighted(W: Array, r: Array) -> Array:
+    """``W r`` for a W given by its diagonal (q,) or in full (q, q); r is (q,) or (q, D)."""
+    return W @ r if W.ndim == 2 else (W * r.T).T

@@ -1,0 +1,167 @@
+"""The forward pass as JAX functions: states at all rows of the mesh, and the cost of the discretised system."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from switchfit.discretization.arguments import Samples
+from switchfit.discretization.mesh import Rows, row_ending_cell, rows
+from switchfit.discretization.model import Model, Piece
+from switchfit.discretization.tableaus import combine, stages, step
+
+Array = jax.Array
+
+
+class Path(NamedTuple):
+    """One simulation: rows in the layout of `switchfit.discretization.mesh.Rows`, Q chunks of C.
+
+    Attributes
+    ----------
+    layout : Rows
+    pieces : Piece with origin (Q, C) and coefficients (Q, C, 4, S)
+    before, after : (Q, C, n), state at the start and at the end of each row
+    stages, slopes : (Q, C, s, n), states X_j and slopes K_j at the stages of each row
+    """
+
+    layout: Rows
+    pieces: Piece
+    before: Array
+    after: Array
+    stages: Array
+    slopes: Array
+
+    def before_transition(self, i: Array | int) -> Array:
+        """x(tau_i-), the state before the reset map of transition i (from 0): (n,)."""
+        return self.after[self.layout.first_chunk[jnp.asarray(i) + 1] - 1, -1]
+
+    def at_samples(self, cell: Array) -> Array:
+        """State at the ends of the given cells (K,), the one before a jump: (K, n)."""
+        return at_cells(self.layout, self.before[0, 0], self.after, cell)
+
+
+def by_row(values: Array) -> Array:
+    """Values (Q, C, ...) as (Q C, ...): one entry a row."""
+    return values.reshape((values.shape[0] * values.shape[1], *values.shape[2:]))
+
+
+def at_cells(layout: Rows, first: Array, after: Array, cell: Array) -> Array:
+    """Pick from values (Q, C, ...) at the ends of rows those at the ends of cells (K,); `first` for cell -1."""
+    flat = jnp.concatenate([first[None], by_row(after)])
+    return flat[row_ending_cell(layout, cell) + 1]
+
+
+def by_mode(model: Model, segment: Array, branch: Callable[[int], Callable[..., Any]], *operands: Any) -> Any:
+    """Call ``branch(mode)(*operands)`` for the mode that is active in a segment, compiling only what is needed."""
+    sequence = jnp.asarray(model.structure.mode_of_segment)
+    count = len(model.structure.modes)
+    if count == 1:
+        return branch(0)(*operands)
+    return lax.switch(sequence[segment], [branch(mode) for mode in range(count)], *operands)
+
+
+def propagate(model: Model, tau: Array, p: Array, side: Array) -> Path:
+    """Integrate from t0 to tf: equation (1), with reset maps at the transitions."""
+    layout = rows(model.arguments.nodes, tau, side)
+    pieces = Piece(model.arguments.nodes[layout.cell], model.arguments.signals[layout.cell])
+
+    def through(mode: int) -> Callable[..., tuple[Array, tuple[Array, ...]]]:
+        def row(x: Array, given: tuple[Array, Array, Piece]) -> tuple[Array, tuple[Array, ...]]:
+            start, end, piece = given
+            X, K = stages(model.tableau, model.field(mode, piece), start, end, x, p)
+            after = x + (end - start) * combine(model.tableau.b, K)
+            return after, (x, after, jnp.stack(X), jnp.stack(K))
+
+        return lambda x, start, end, piece: lax.scan(row, x, (start, end, piece))
+
+    def chunk(x: Array, given: tuple[Array, Array, Array, Array, Piece]) -> tuple[Array, tuple[Array, ...]]:
+        segment, opens, start, end, piece = given
+        x = apply_reset(model, tau, x, p, segment, opens)
+        return by_mode(model, segment, through, x, start, end, piece)
+
+    given = (layout.segment, layout.opens, layout.start, layout.end, pieces)
+    _, columns = lax.scan(chunk, model.initial_state(p), given)
+    return Path(layout, pieces, *columns)
+
+
+def apply_reset(model: Model, tau: Array, x: Array, p: Array, segment: Array, opens: Array) -> Array:
+    """``x(tau+) = R(tau, x(tau-), p)`` where a chunk opens a segment whose transition has a reset map."""
+    resets = model.structure.resets
+    if not resets:
+        return x
+    which = jnp.zeros(model.structure.N + 1, dtype=int).at[jnp.array(resets) + 1].set(jnp.arange(1, len(resets) + 1))
+    branches = [lambda t, x: x] + [lambda t, x, i=i: model.reset(i)(t, x, p) for i in resets]
+    times = jnp.concatenate([tau[:1], tau])
+    return lax.switch(jnp.where(opens, which[segment], 0), branches, times[segment], x)
+
+
+def path_cost(model: Model, path: Path, p: Array) -> Array:
+    """The cost J of the discretised system: running costs, samples and terminal costs."""
+    return running_cost(model, path, p).sum() + sample_costs(model, path, p) + model.terminal(path.after[-1, -1], p)
+
+
+def running_cost(model: Model, path: Path, p: Array) -> Array:
+    """Integral of the running costs over each row, ``h sum_j b_j ell(t_j, X_j)``: (Q, C)."""
+    layout = path.layout
+    h = layout.end - layout.start
+    if not model.has_running_cost:
+        return jnp.zeros(h.shape)
+
+    def row(start: Array, h: Array, piece: Piece, X: Array) -> Array:
+        times = start + model.tableau.c * h
+        return h * (model.tableau.b @ jax.vmap(model.density(piece), in_axes=(0, 0, None))(times, X, p))
+
+    return jax.vmap(jax.vmap(row))(layout.start, h, path.pieces, path.stages)
+
+
+def sample_costs(model: Model, path: Path, p: Array) -> Array:
+    """Sum of the costs of all discrete samples."""
+    total = jnp.zeros(())
+    for k, samples in enumerate(model.arguments.samples):
+        if model.structure.measurements[k].delay is None:
+            x = path.at_samples(samples.cell)
+        else:
+            _, segment, piece, start, before = row_holding(model, path, k, p)
+            late = jax.vmap(partial(seen_late, model, k), in_axes=(0, 0, 0, 0, 0, None))
+            samples, x = late(samples, segment, piece, start, before, p)
+        total = total + jax.vmap(lambda s, x, k=k: model.sample_cost(k, s, x, p))(samples, x).sum()
+    return total
+
+
+def row_holding(model: Model, path: Path, k: int, p: Array) -> tuple[Array, Array, Piece, Array, Array]:
+    """The rows with ``start < t - delay <= end`` for the samples of the k-th Measurements, which is late.
+
+    Returns
+    -------
+    row, segment : (K,) int
+    piece : Piece, of K rows
+    start, x : (K,), (K, n), start of the row and the state there
+    """
+    layout = path.layout
+    samples = model.arguments.samples[k]
+    times = lax.stop_gradient(jax.vmap(lambda s: model.seen_at(k, s, p).time)(samples))
+    ends = lax.stop_gradient(by_row(layout.end))
+    row = jnp.minimum(jnp.searchsorted(ends, times), ends.shape[0] - 1)
+    piece = Piece(by_row(path.pieces.origin)[row], by_row(path.pieces.coefficients)[row])
+    segment = layout.segment[row // layout.start.shape[1]]
+    return row, segment, piece, by_row(layout.start)[row], by_row(path.before)[row]
+
+
+def seen_late(
+    model: Model, k: int, sample: Samples, segment: Array, piece: Piece, start: Array, x: Array, p: Array
+) -> tuple[Samples, Array]:
+    """One late sample with the time of the state that it is of, and that state, one step from `start`: (n,)."""
+    there = model.seen_at(k, sample, p)
+
+    def through(mode: int) -> Callable[..., Array]:
+        def state(time: Array, start: Array, x: Array) -> Array:
+            return step(model.tableau, model.field(mode, piece), None, start, time, x, p)[0]
+
+        return state
+
+    return there, by_mode(model, segment, through, there.time, start, x)

@@ -1,0 +1,301 @@
+"""Choosing the mesh: how short the steps have to be, from one adaptive solve at a given theta.
+
+The adaptive solve has the same order as the fixed steps that follow. It also integrates the running costs, so that
+they are resolved as well. Its steps are turned into a refinement of the intervals between the nodes that have to be
+there anyway; the mesh then stays as it is while theta moves.
+
+Explicit solves take SciPy's RK45 step by step, in machine code where there is any: a hundred steps cost less than a
+tenth of a millisecond there, ten in Python. SciPy itself solves all else, and says what is wrong where a solve fails.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from itertools import pairwise
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.integrate
+
+from switchfit.discretization.arguments import Arguments, arguments_of
+from switchfit.discretization.mesh import Mesh
+from switchfit.discretization.model import Model, Piece
+from switchfit.engine.native.kernels import Adaptive
+from switchfit.engine.native.program import NativeExperiment, native_experiment
+from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.experiment import Experiment, signals_of
+from switchfit.problem.functions import float64
+from switchfit.problem.parameter import unit_suffix
+from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Structure
+from switchfit.runtime.cache import compilation_cache
+
+T = TypeVar("T")
+
+MAX_STEPS = 200_000
+"""Adaptive steps in one mode before it is called stiff."""
+
+PACE = 1000
+"""Steps over which the pace of a mode is measured; a stiff one is thus refused before it has cost much."""
+
+
+def fixed_nodes(experiment: Experiment) -> FloatArray:
+    """Moments that must be nodes: t0, tf, sample times, knots of inputs and reference signals inside the horizon."""
+    t0, tf = experiment.t0, experiment.tf
+    times = [np.array([t0, tf])]
+    times += [item.seen_times for item in experiment.data if isinstance(item, Measurements)]
+    times += [signal.knots for signal in signals_of(experiment)]
+    nodes = np.unique(np.concatenate(times))
+    return nodes[(nodes >= t0) & (nodes <= tf)]
+
+
+def refined_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1.0) -> Mesh:
+    """Mesh of experiment e on which its trajectory meets the problem's tolerances at each of the given thetas.
+
+    Parameters
+    ----------
+    finer : float
+        Multiplies the number of cells.
+
+    Raises
+    ------
+    ValueError
+        If a mode returns a value that is not finite, or the trajectory cannot be integrated to its end.
+    """
+    nodes = fixed_nodes(problem.experiments[e])
+    coarse = Mesh.from_times(nodes)
+    steps = _Steps.densest([_adaptive_steps(problem, e, theta, coarse) for theta in thetas])
+    pieces = np.maximum(np.ceil(finer * np.diff(steps.up_to(nodes)) - 0.05).astype(int), 1)
+    inside = [_graded(nodes[k : k + 2], steps, int(pieces[k])) for k in np.flatnonzero(pieces > 1)]
+    return Mesh.from_times(np.concatenate([nodes, *inside]))
+
+
+class _Steps(NamedTuple):
+    """How many steps a solver takes up to each time: linear between `times` (K,), where it is `counts` (K,)."""
+
+    times: FloatArray
+    counts: FloatArray
+
+    @classmethod
+    def densest(cls, solutions: list[FloatArray]) -> _Steps:
+        """The steps of several solutions (all their times), at every moment those of the one with the shortest."""
+        times = np.unique(np.concatenate(solutions))
+        middles = 0.5 * (times[:-1] + times[1:])
+        lengths = [np.diff(steps)[np.searchsorted(steps, middles) - 1] for steps in solutions]
+        return cls(times, np.concatenate([[0.0], np.cumsum(np.diff(times) / np.min(lengths, axis=0))]))
+
+    def up_to(self, t: FloatArray) -> FloatArray:
+        """Steps taken up to times t."""
+        return np.interp(t, self.times, self.counts)
+
+
+def _graded(ends: FloatArray, steps: _Steps, pieces: int) -> FloatArray:
+    """Nodes between two ends: half of them as dense as the solver's steps are, half of them evenly.
+
+    The steps are short in the layers of a stiff mode, which evenly spaced nodes would miss; but layers move with the
+    transition times, and the mesh does not.
+    """
+    inner = steps.times[(steps.times > ends[0]) & (steps.times < ends[1])]
+    times = np.concatenate([ends[:1], inner, ends[1:]])
+    count = steps.up_to(times)
+    density = 0.5 * (count - count[0]) / (count[-1] - count[0]) + 0.5 * (times - ends[0]) / (ends[1] - ends[0])
+    return np.interp(np.linspace(0.0, 1.0, pieces + 1)[1:-1], density, times)
+
+
+def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -> FloatArray:
+    """All times at which the adaptive solver stopped, from t0 to tf, strictly increasing."""
+    experiment, structure = problem.experiments[e], problem.structures[e]
+    whole = arguments_of(problem, e, coarse)
+    arguments, signals = whole.without_mesh(), np.asarray(whole.signals)
+    tau, p = problem.vectors(theta, e)
+    unit = unit_suffix(experiment.time_unit)
+    ends = np.concatenate([[experiment.t0], tau, [experiment.tf]])
+    inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
+    steps = [np.array([experiment.t0])]
+    native = native_experiment(structure, whole, coarse.times, order=0)
+    x = _finite(
+        _by_jax(initial_state, arguments, p, structure=structure.functions)
+        if native is None
+        else native.initial_state(p),
+        f"initial_state at p = {_rounded(problem.split(theta)[1])}",
+    )
+    for i, mode in enumerate(structure.mode_of_segment):
+        if i > 0 and structure.reset_maps[i - 1] is not None:
+            names = tuple(experiment.mode_sequence[i - 1 : i + 1])
+            if native is None:
+                value = _by_jax(after_reset, arguments, ends[i], x, p, structure=structure, i=i - 1)
+            else:
+                value = native.after_reset(i - 1, ends[i], x, p)
+            x = _finite(value, f"reset map {names} at t = {ends[i]:.6g}{unit}, x = {x.tolist()}")
+        knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
+        stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
+        for start, end in pairwise(stops.tolist()):
+            if end > start:
+                found = None if native is None else _solve_natively(problem, native, mode, start, end, x, p)
+                if found is None:
+                    found = _by_jax(
+                        _solve, problem, structure, arguments, signals, coarse, mode, start, end, x, p, unit
+                    )
+                accepted, x = found
+                steps.append(accepted)
+    return np.concatenate(steps)
+
+
+def _by_jax(function: Callable[..., T], *given: Any, **settings: Any) -> T:
+    """Call a function that runs JAX's programs; what surrounds it takes longer than most solves in machine code."""
+    with float64(), compilation_cache():
+        return function(*given, **settings)
+
+
+def _solve(
+    problem: Problem,
+    structure: Structure,
+    arguments: Arguments,
+    signals: FloatArray,
+    coarse: Mesh,
+    mode: int,
+    start: float,
+    end: float,
+    x: FloatArray,
+    p: FloatArray,
+    unit: str = "",
+) -> tuple[FloatArray, FloatArray]:
+    """Adaptive solve of one mode from start to end: accepted times (start left out) and the final state."""
+    name = structure.mode_names[mode]
+    function = partial(_field_and_density, structure=structure.functions, mode=mode)
+    last = len(coarse.times) - 2
+
+    def right_hand_side(t: float, y: FloatArray) -> FloatArray:
+        inside = min(max(t, np.nextafter(start, end)), np.nextafter(end, start))
+        cell = min(int(np.searchsorted(coarse.times, inside, side="right")) - 1, last)
+        value = np.asarray(function(arguments, coarse.nodes[cell], signals[cell], t, y[:-1], p))
+        if not np.isfinite(value).all():
+            slope, density = value[:-1].tolist(), value[-1]
+            finite = np.isfinite(slope).all()
+            what = (
+                f"a running cost in mode {name!r} returned {density}" if finite else f"mode {name!r} returned {slope}"
+            )
+            raise ValueError(
+                f"{what} at t = {t:.6g}{unit}, x = {y[:-1].tolist()}: the guess leads to where the model is not "
+                "defined or grows without bound; use a better guess, or change the model there."
+            )
+        return value
+
+    method = scipy.integrate.RK45 if problem.solver == "explicit" else scipy.integrate.Radau
+    with np.errstate(all="ignore"):  # a slope of 1e300 is refused in words
+        solver = method(right_hand_side, start, np.append(x, 0.0), end, rtol=problem.rtol, atol=problem.atol)
+    accepted = [start]
+    while solver.status == "running":
+        with np.errstate(over="ignore", invalid="ignore"):  # a state that overflows is refused in words
+            message = solver.step()
+        if solver.status == "failed" or _too_many(accepted, end):
+            remedy = "use solver='stiff', or a better guess" if problem.solver == "explicit" else "use a better guess"
+            reason = message or f"it needs more than {MAX_STEPS} steps"
+            raise ValueError(
+                f"mode {name!r} cannot be integrated at the guess beyond t = {solver.t:.6g}{unit}, where x = "
+                f"{solver.y[:-1].tolist()} ({reason}): {remedy}."
+            )
+        accepted.append(float(solver.t))
+    return np.array(accepted[1:]), np.asarray(solver.y[:-1])
+
+
+STEPS_AT_ONCE = 256
+"""Steps that the compiled solver accepts in one call, at most."""
+
+
+def _solve_natively(
+    problem: Problem, native: NativeExperiment, mode: int, start: float, end: float, x: FloatArray, p: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
+    """The same as `_solve` for the explicit method; None where it fails."""
+    y, at = np.append(x, 0.0), Adaptive()
+    state = np.zeros(at.size)
+    state[at.t], state[at.end], state[at.rtol], state[at.atol] = start, end, problem.rtol, problem.atol
+    state[at.low], state[at.high] = np.nextafter(start, end), np.nextafter(end, start)
+    with np.errstate(all="ignore"):
+        state[at.h] = _first_step(problem, native, mode, start, end, y, p)
+    accepted = np.array([start])
+    while state[at.t] < end and not state[at.stuck] and not _too_many(accepted, end):
+        accepted = np.append(accepted, native.adaptive_steps(mode, state, y, p, STEPS_AT_ONCE))
+    return None if state[at.t] < end or not np.isfinite(y).all() else (accepted[1:], y[:-1])
+
+
+def _first_step(
+    problem: Problem, native: NativeExperiment, mode: int, start: float, end: float, y: FloatArray, p: FloatArray
+) -> float:
+    """Hairer, Norsett and Wanner I, section II.4, as SciPy has it.
+
+    NaN if the slope is not finite, 0 if it is too large to be squared: the compiled solver stops at either, and
+    `_solve` says what is wrong, or begins with the shortest step there is.
+    """
+
+    def size(error: FloatArray) -> float:
+        return float(np.sqrt(np.mean((error / (problem.atol + problem.rtol * np.abs(y))) ** 2)))
+
+    slope = native.slope(mode, start, y, p)
+    if not np.isfinite(slope).all():
+        return np.nan
+    of_state, of_slope = size(y), size(slope)
+    if not np.isfinite(of_slope):  # the first step then fails, and the caller says of what
+        return min(1e-6, end - start)
+    guess = min(1e-6 if of_state < 1e-5 or of_slope < 1e-5 else 0.01 * of_state / of_slope, end - start)
+    if guess == 0.0:
+        return 0.0
+    ahead = min(start + guess, float(np.nextafter(end, start)))
+    bend = size(native.slope(mode, ahead, y + guess * slope, p) - slope) / guess
+    flat = of_slope <= 1e-15 and bend <= 1e-15
+    other = max(1e-6, guess * 1e-3) if flat else (0.01 / max(of_slope, bend)) ** 0.2
+    return min(100 * guess, other, end - start)
+
+
+def _too_many(accepted: Sequence[float] | FloatArray, end: float) -> bool:
+    """Whether more than `MAX_STEPS` have been taken, or will be at the pace of the last `PACE` steps."""
+    if len(accepted) < 5 * PACE:
+        return False
+    return len(accepted) + PACE * (end - accepted[-1]) / (accepted[-1] - accepted[-PACE - 1]) > MAX_STEPS
+
+
+def _finite(value: jax.Array | FloatArray, what: str) -> FloatArray:
+    state = np.asarray(value)
+    if not np.isfinite(state).all():
+        raise ValueError(f"{what} returned {state.tolist()}, which is not finite: use a better guess.")
+    return state
+
+
+def _rounded(parameters: Mapping[str, FloatArray]) -> dict[str, Any]:
+    """Parameters for a message."""
+    return {name: np.round(value, 6).tolist() for name, value in parameters.items()}
+
+
+@partial(jax.jit, static_argnames=("structure", "mode"))
+def _field_and_density(
+    arguments: Arguments,
+    origin: jax.Array,
+    coefficients: jax.Array,
+    t: jax.Array,
+    x: jax.Array,
+    p: jax.Array,
+    *,
+    structure: Structure,
+    mode: int,
+) -> jax.Array:
+    model = Model(structure, arguments)
+    piece = Piece(origin, coefficients)
+    cost = model.density(piece)(t, x, p) if model.has_running_cost else jnp.zeros(())
+    return jnp.append(model.field(mode, piece)(t, x, p), cost)
+
+
+@partial(jax.jit, static_argnames=("structure",))
+def initial_state(arguments: Arguments, p: jax.Array, *, structure: Structure) -> jax.Array:
+    """x(t0): (n,)."""
+    return Model(structure, arguments).initial_state(p)
+
+
+@partial(jax.jit, static_argnames=("structure", "i"))
+def after_reset(
+    arguments: Arguments, t: jax.Array, x: jax.Array, p: jax.Array, *, structure: Structure, i: int
+) -> jax.Array:
+    """State after the reset map of transition i (from 0): (n,)."""
+    return Model(structure, arguments).reset(i)(t, x, p)

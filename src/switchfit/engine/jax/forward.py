@@ -1,0 +1,166 @@
+"""Exact Hessian of the *discretised* cost in forward mode, for few unknowns and as a check of the adjoint.
+
+With z = (x_k, theta) the arguments of node map k and Z_k their derivative in theta, the second derivative of the state
+obeys
+
+    x_tt, k+1 = F_x x_tt, k + S_k,      S_k = D^2 F_k (Z_k, Z_k),
+    D^2 J     = sum_k L_x x_tt, k + D^2 L_k (Z_k, Z_k),
+
+where steps, samples, reset maps, the initial state and the terminal cost are all such maps. The sources S_k are
+evaluated for a chunk of rows at once, for the D (D + 1) / 2 pairs i <= j of unknowns; what is done one row after
+another is a product of small matrices. There is no adjoint here, so that a mistake in one is not repeated in the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from switchfit.discretization.arguments import Samples
+from switchfit.discretization.model import Model, Piece
+from switchfit.discretization.propagation import at_cells, by_mode, by_row
+from switchfit.discretization.tableaus import step
+from switchfit.engine.jax.first_order import FirstOrder, parameter_directions, time_directions
+from switchfit.engine.jax.late_samples import anchors, late_costates, late_curvature
+
+Array = jax.Array
+
+
+class Second(NamedTuple):
+    """Second derivative of the state along pairs of unknowns, B = D (D + 1) / 2: (Q, C, n, B) arrays.
+
+    Attributes
+    ----------
+    before, after : at the start and at the end of each row
+    """
+
+    before: Array
+    after: Array
+
+
+def forward_hessian(model: Model, first: FirstOrder, tau: Array, p: Array) -> Array:
+    """Hessian (D, D) of the discretised cost, D = N + M, without an adjoint.
+
+    Parameters
+    ----------
+    model : Model
+    first : FirstOrder
+        What `switchfit.engine.jax.second_order.first_order` returned at the same (tau, p).
+    tau : (N,)
+    p : (M,)
+
+    Notes
+    -----
+    The cost is that of D (D + 1) / 2 second derivatives of each step; `adjoint_hessian` gives the same matrix.
+    """
+    H, second = second_tangents(model, first, tau, p)
+    for k in range(len(model.arguments.samples)):
+        H = H + sample_second(model, first, second, k, p)
+    if model.structure.terminal:
+        x, P = first.path.after[-1, -1], parameter_directions(model)
+        phi_x = jax.grad(model.terminal)(x, p)
+        H = H + phi_x @ second.after[-1, -1]
+        H = H + along_pairs(model.terminal, (x, p), (first.tangents.after[-1, -1], P))
+    return symmetric(H, first.gradient.shape[0])
+
+
+def second_tangents(model: Model, first: FirstOrder, tau: Array, p: Array) -> tuple[Array, Second]:
+    """``x_tt`` along the path, and the part of the Hessian that the running costs make up, (B,)."""
+    P = parameter_directions(model)
+
+    def of_mode(mode: int) -> Callable[..., tuple[Array, ...]]:
+        def row(start: Array, end: Array, piece: Piece, x: Array, *directions: Array) -> tuple[Array, ...]:
+            f, ell = model.field(mode, piece), model.density(piece)
+
+            def function(start: Array, end: Array, x: Array, p: Array) -> tuple[Array, Array]:
+                return step(model.tableau, f, ell if model.has_running_cost else None, start, end, x, p)
+
+            at = (start, end, x, p)
+            return *jax.jacfwd(function, argnums=2)(*at), *along_pairs(function, at, (*directions, P))
+
+        return jax.vmap(row)
+
+    def row(now: tuple[Array, Array], given: tuple[Array, ...]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        H, x_tt = now
+        F_x, L_x, S, S_cost = given
+        after = F_x @ x_tt + S
+        return (H + L_x @ x_tt + S_cost, after), (x_tt, after)
+
+    def chunk(now: tuple[Array, Array], given: Any) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        H, x_tt = now
+        segment, opens, *operands = given
+        if resets is not None:
+            R_x, S_reset = resets
+            x_tt = jnp.where(opens, R_x[segment] @ x_tt + S_reset[segment], x_tt)
+        return lax.scan(row, (H, x_tt), by_mode(model, segment, of_mode, *operands))
+
+    resets = reset_sources(model, first, tau, p)
+    path, layout = first.path, first.path.layout
+    start = along_pairs(model.initial_state, (p,), (P,))
+    directions = (*time_directions(model, layout), first.tangents.before)
+    given = (layout.segment, layout.opens, layout.start, layout.end, path.pieces, path.before, *directions)
+    (H, _), second = lax.scan(chunk, (jnp.zeros(start.shape[-1]), start), given)
+    return H, Second(*second)
+
+
+def reset_sources(model: Model, first: FirstOrder, tau: Array, p: Array) -> tuple[Array, Array] | None:
+    """``D_x R`` (N + 1, n, n) and ``D^2 R (Z, Z)`` (N + 1, n, B) where each segment opens; None without reset maps."""
+    if first.resets is None:
+        return None
+    P = parameter_directions(model)
+    D = P.shape[1]
+    S = jnp.zeros((model.structure.N + 1, model.structure.n, D * (D + 1) // 2))
+    for i in model.structure.resets:
+        at = (tau[i], first.path.before_transition(i), p)
+        along = ((jnp.arange(D) == i) * 1.0, first.tangents.before_transition(first.path.layout, i), P)
+        S = S.at[i + 1].set(along_pairs(model.reset(i), at, along))
+    return first.resets.x, S
+
+
+def sample_second(model: Model, first: FirstOrder, second: Second, k: int, p: Array) -> Array:
+    """Second derivative of the costs of the k-th Measurements: (B,)."""
+    P = parameter_directions(model)
+    samples = model.arguments.samples[k]
+    if model.structure.measurements[k].delay is not None:
+        at = anchors(model, first.path, first.tangents.before, k, p)
+        i, j = pairs(P.shape[1])
+        through_state = jnp.einsum("kn,knb->b", late_costates(model, at, k, samples, p), by_row(second.before)[at.row])
+        return through_state + late_curvature(model, at, k, samples, p, P)[i, j]
+
+    def one(sample: Samples, x: Array, x_d: Array, x_tt: Array) -> Array:
+        def cost(x: Array, p: Array) -> Array:
+            return model.sample_cost(k, sample, x, p)
+
+        return jax.grad(cost)(x, p) @ x_tt + along_pairs(cost, (x, p), (x_d, P))
+
+    path, X = first.path, first.tangents
+    x_d = at_cells(path.layout, X.before[0, 0], X.after, samples.cell)
+    x_tt = at_cells(path.layout, second.before[0, 0], second.after, samples.cell)
+    return jax.vmap(one)(samples, path.at_samples(samples.cell), x_d, x_tt).sum(0)
+
+
+def pairs(D: int) -> tuple[np.ndarray, np.ndarray]:
+    """The B = D (D + 1) / 2 pairs i <= j: two (B,) int arrays."""
+    return np.triu_indices(D)
+
+
+def along_pairs(function: Callable[..., Any], at: tuple[Array, ...], directions: tuple[Array, ...]) -> Any:
+    """Second derivative of `function` along all pairs of D directions (last axis of `directions`): (..., B)."""
+    i, j = pairs(directions[-1].shape[-1])
+
+    def one(u: tuple[Array, ...], v: tuple[Array, ...]) -> Any:
+        return jax.jvp(lambda *z: jax.jvp(function, z, u)[1], at, v)[1]
+
+    u, v = (tuple(d[..., index] for d in directions) for index in (i, j))
+    return jax.vmap(one, in_axes=-1, out_axes=-1)(u, v)
+
+
+def symmetric(values: Array, D: int) -> Array:
+    """The symmetric (D, D) matrix with `values` (B,) on and above its diagonal."""
+    i, j = pairs(D)
+    return jnp.zeros((D, D)).at[i, j].set(values).at[j, i].set(values)

@@ -1,0 +1,301 @@
+"""Straight-line graphs as LLVM functions, and LLVM modules as machine code.
+
+What was compiled once is kept in the folder of `switchfit.runtime.cache` and read from there by the next process.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import ctypes.util
+import hashlib
+import re
+import struct
+import sys
+import threading
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import cache
+from typing import Any
+
+import llvmlite
+import llvmlite.binding as llvm
+import numpy as np
+
+from switchfit.engine.native.scalars import LOGIC, Node, needed
+from switchfit.runtime.cache import read_code, usable_folder, write_code
+
+INTRINSICS = {
+    "sqrt": "sqrt",
+    "abs": "fabs",
+    "floor": "floor",
+    "ceil": "ceil",
+    "rint": "rint",
+    "round": "round",
+    "max": "maximum",
+    "min": "minimum",
+}
+"""Operations that are instructions of the processor."""
+
+BINARY = {"add": "fadd contract", "sub": "fsub contract", "mul": "fmul contract", "div": "fdiv"}
+COMPARISONS = {"lt": "fcmp olt", "le": "fcmp ole", "eq": "fcmp oeq", "ne": "fcmp une"}
+FROM_LIBM = {
+    **{op: op for op in ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "asinh")},
+    **{op: op for op in ("acosh", "atanh", "exp", "log", "pow", "expm1", "log1p", "cbrt", "exp2", "erf", "erfc")},
+    "rem": "fmod",
+}
+"""Functions of the C library."""
+
+EFFORT = {"div": 4, "sqrt": 4, **dict.fromkeys(FROM_LIBM, 20)}
+"""What operations cost where it is not about as much as an addition."""
+
+BUDGET = 20_000_000
+"""Work, in additions, after which a loop returns to Python, so that Ctrl-C is heard: measured, it takes 2 to 10 ms."""
+
+
+def literal(number: float) -> str:
+    """A double, exactly."""
+    return f"0x{struct.unpack('<Q', struct.pack('<d', number))[0]:016X}"
+
+
+class Module:
+    """The text of an LLVM module, function by function.
+
+    Parameters
+    ----------
+    width : int
+        Entries of a vector.
+
+    Attributes
+    ----------
+    prefix : str
+        With which the names of all functions begin that are written from now on.
+    """
+
+    def __init__(self, width: int) -> None:
+        self.width = width
+        self.prefix = ""
+        self.vector = f"<{width} x double>"
+        self.functions: list[str] = []
+        self._work: dict[str, int] = {}
+        self._declared: dict[str, str] = {}
+
+    def straight(
+        self, name: str, pointers: Sequence[str], stores: Sequence[tuple[str, int, Node]], seen: bool = False
+    ) -> None:
+        """A function of pointers that loads, computes and stores: ``(pointer, offset, what)``.
+
+        Everything is loaded before anything is stored. Offsets count doubles, those of vectors vectors. Only what is
+        `seen` can be called from Python.
+        """
+        writer = _Writer(self)
+        nodes = needed([node for _, _, node in stores])
+        for node in nodes:
+            writer.value(node)
+        self._work[self.prefix + name] = sum(self._effort(node) for node in nodes)
+        for pointer, offset, node in stores:
+            writer.store(pointer, offset, node)
+        arguments = ", ".join(f"ptr %{pointer}" for pointer in pointers)
+        body = "\n".join(writer.lines)
+        linkage = "" if seen else "internal "
+        self.functions.append(f"define {linkage}void @{self.prefix}{name}({arguments}) {{\n{body}\n  ret void\n}}\n")
+
+    def work(self, name: str) -> int:
+        """What a function costs that was written with the prefix of now, in additions."""
+        return self._work[self.prefix + name]
+
+    def _effort(self, node: Node) -> int:
+        return EFFORT.get(node.op, 1) * (1 + self.width // 4 if node.vector else 1)
+
+    def add(self, text: str) -> None:
+        """A function written by hand, which calls none but those of the same prefix, and LLVM's."""
+        self.functions.append(re.sub(r"@(?!llvm\.)(\w+)\(", rf"@{self.prefix}\1(", text))
+
+    def declare(self, name: str, signature: str) -> None:
+        """A function from elsewhere."""
+        self._declared[name] = signature
+
+    @property
+    def text(self) -> str:
+        """The whole module."""
+        return "\n".join([*self._declared.values(), *self.functions])
+
+
+class _Writer:
+    """One function: a line an operation."""
+
+    def __init__(self, module: Module) -> None:
+        self.module = module
+        self.lines: list[str] = []
+        self.names: dict[int, str] = {}
+        self.splats: dict[int, str] = {}
+
+    def emit(self, text: str) -> str:
+        name = f"%v{len(self.lines)}"
+        self.lines.append(f"  {name} = {text}")
+        return name
+
+    def value(self, node: Node) -> str:
+        """The name under which the value of a node is known, or a literal."""
+        name = self.names.get(node.index)
+        if name is None:
+            name = self.names[node.index] = self._written(node)
+        return name
+
+    def _written(self, node: Node) -> str:
+        op, args = node.op, node.args
+        if op == "const":
+            return str(args[0]).lower() if isinstance(args[0], bool) else literal(args[0])
+        if op == "load":
+            pointer, offset = args
+            return self.emit(f"load {self._type(node)}, ptr {self.address(pointer, offset, node.vector)}, align 8")
+        if op == "unit":
+            entries = (f"double {literal(float(k == args[0]))}" for k in range(self.module.width))
+            return "<" + ", ".join(entries) + ">"
+        if op == "zeros":
+            return "zeroinitializer"
+        kind = self._type(node)
+        a = [self._as(argument, node.vector) for argument in args]
+        if op in BINARY:
+            return self.emit(f"{BINARY[op]} {kind} {a[0]}, {a[1]}")
+        if op == "neg":
+            return self.emit(f"fneg {kind} {a[0]}")
+        if op in COMPARISONS:
+            return self.emit(f"{COMPARISONS[op]} double {a[0]}, {a[1]}")
+        if op in LOGIC:
+            return self.emit(f"xor i1 {a[0]}, true" if op == "not" else f"{op} i1 {a[0]}, {a[1]}")
+        if op == "select":
+            return self.emit(f"select i1 {self.value(args[0])}, {kind} {a[1]}, {kind} {a[2]}")
+        given = ", ".join(f"double {x}" for x in a)
+        name = f"llvm.{INTRINSICS[op]}.f64" if op in INTRINSICS else FROM_LIBM[op]
+        types = ", ".join("double" for _ in a)
+        memory = "" if op in INTRINSICS else " memory(none) nounwind willreturn"
+        self.module.declare(name, f"declare double @{name}({types}){memory}")
+        return self.emit(f"call double @{name}({given})")
+
+    def store(self, pointer: str, offset: int, node: Node) -> None:
+        if node.truth:
+            raise TypeError(f"a truth value cannot be stored at {pointer}[{offset}], which is a double")
+        value, address = self.value(node), self.address(pointer, offset, node.vector)
+        self.lines.append(f"  store {self._type(node)} {value}, ptr {address}, align 8")
+
+    def address(self, pointer: str, offset: int, vector: bool) -> str:
+        if offset == 0:
+            return f"%{pointer}"
+        unit = self.module.width if vector else 1
+        return self.emit(f"getelementptr inbounds double, ptr %{pointer}, i64 {offset * unit}")
+
+    def _type(self, node: Node) -> str:
+        return self.module.vector if node.vector else "i1" if node.truth else "double"
+
+    def _as(self, node: Node, vector: bool) -> str:
+        """A value as an operand of an operation on vectors, or on scalars."""
+        if not vector or node.vector:
+            return self.value(node)
+        name = self.splats.get(node.index)
+        if name is None:
+            one = self.emit(f"insertelement {self.module.vector} poison, double {self.value(node)}, i64 0")
+            zeros = f"<{self.module.width} x i32> zeroinitializer"
+            name = self.emit(f"shufflevector {self.module.vector} {one}, {self.module.vector} poison, {zeros}")
+            self.splats[node.index] = name
+        return name
+
+
+class Workspace:
+    """Memory that calls of a program work in, one after the other: one piece for all, which stays in the caches.
+
+    Attributes
+    ----------
+    lock : held during a call, since machine code runs beside other threads
+    memory : array of doubles
+    """
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.memory = np.zeros(0)
+
+    def reserve(self, size: int) -> None:
+        """Make sure that it has a size; what was in it may be gone."""
+        if len(self.memory) < size:
+            self.memory = np.zeros(size)
+
+
+class Program:
+    """Machine code of a module, alive as long as this object.
+
+    Attributes
+    ----------
+    key : str
+        Different for every module, the same in every process.
+    workspace : Workspace
+    """
+
+    def __init__(self, engine: Any, key: str) -> None:
+        self._engine, self.key = engine, key
+        self.workspace = Workspace()
+        self._functions: dict[str, Any] = {}
+
+    def address(self, name: str) -> int:
+        """Where one of its functions is."""
+        return int(self._engine.get_function_address(name))
+
+    def function(self, name: str, *types: Any) -> Any:
+        """One of its functions that return nothing, to be called from Python."""
+        if name not in self._functions:
+            self._functions[name] = ctypes.CFUNCTYPE(None, *types)(self.address(name))
+        return self._functions[name]
+
+
+def compiled(text: str) -> Program:
+    """Machine code for this processor, from the cache if it is there."""
+    _start()
+    key = hashlib.sha256("\n".join([text, llvmlite.__version__, *_processor()]).encode()).hexdigest()
+    name, features = _processor()
+    machine = llvm.Target.from_default_triple().create_target_machine(cpu=name, features=features, opt=2)
+    folder = usable_folder()
+    path = None if folder is None else folder / f"native-{key}"
+    code = None if path is None else read_code(path)
+    if code is None:
+        code = _object_code(machine, text)
+        if path is not None:
+            write_code(path, code)
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    return Program(engine, key)
+
+
+def _object_code(machine: Any, text: str) -> bytes:
+    """Compile in a thread: long functions take seconds, and the wait for a thread can be ended by Ctrl-C."""
+    executor = ThreadPoolExecutor(1)
+    future = executor.submit(lambda: bytes(machine.emit_object(llvm.parse_assembly(text))))
+    executor.shutdown(wait=False)
+    while not wait([future], timeout=0.1).done:  # on Windows a wait without an end cannot be interrupted
+        pass
+    return future.result()
+
+
+@cache
+def _processor() -> tuple[str, str]:
+    return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+
+
+@cache
+def _start() -> None:
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    for name in (*FROM_LIBM.values(), "sincos"):
+        address = _address(name)
+        if address is not None:
+            llvm.add_symbol(name, address)
+
+
+@cache
+def _library() -> Any:
+    if sys.platform == "win32":
+        return ctypes.CDLL("ucrtbase")
+    return ctypes.CDLL(ctypes.util.find_library("m"))
+
+
+def _address(name: str) -> int | None:
+    function = getattr(_library(), name, None)
+    return None if function is None else ctypes.cast(function, ctypes.c_void_p).value

@@ -1,0 +1,747 @@
+"""From a JAX function to scalars: its jaxpr, read one operation after another, with arrays of nodes for arrays.
+
+JAX has differentiated by then; what happens here is bookkeeping. Whatever moves entries about (reshape, slice, pad and
+so on) leaves no trace. What has no meaning here (loops of unknown length, random numbers, solvers) raises
+`Unsupported`.
+
+An array is a NumPy array of numbers where all its entries are known, else an object array. Its entries are then Python
+numbers, nodes (doubles, or truth values if the array is boolean), or, if the array is one of integers, `Integer`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache, partial, reduce
+from typing import Any
+
+import jax
+import numpy as np
+from jax._src import source_info_util
+
+from switchfit.engine.native.scalars import COMPARISONS, FOLDED, LOGIC, Graph, Node, Objects, Template, as_objects
+
+
+class Unsupported(Exception):  # noqa: N818  # control flow, not an error: the caller falls back to JAX
+    """A function that cannot be written as a straight line of scalars.
+
+    Attributes
+    ----------
+    what : str
+        What it does, as the rest of a sentence that begins with the function: "calls jnp.sort".
+    where : str or None
+        File and line of the user's code, if known.
+    """
+
+    def __init__(self, what: str, where: str | None = None) -> None:
+        super().__init__(what, where)
+        self.what, self.where = what, where
+
+    def __str__(self) -> str:
+        return self.what if self.where is None else f"{self.what} ({self.where})"
+
+
+MOST_NODES = 50_000
+"""Operations of one function beyond which compiling them one by one takes too long."""
+
+MOST_TURNS = 100_000
+"""Turns of a loop beyond which it is not followed."""
+
+
+def traced(function: Callable[..., Sequence[Any]], *shapes: tuple[int, ...], name: str = "the function") -> Template:
+    """A function of float64 arrays of the given shapes, which returns a flat list of arrays.
+
+    Raises
+    ------
+    Unsupported
+        If it does something that has no scalar form; the message begins with its `name`.
+    """
+    structs = [jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes]
+    graph = Graph()
+    inputs = [graph.loads(str(k), int(np.prod(shape))).reshape(shape) for k, shape in enumerate(shapes)]
+    try:
+        closed = _jaxpr_of(function, structs)
+        with np.errstate(all="ignore"):
+            outputs = _run(graph, closed.jaxpr, closed.consts, inputs)
+        if any(variable.aval.dtype != np.float64 for variable in closed.jaxpr.outvars):
+            raise Unsupported("returns something else than float64")
+    except Unsupported as error:
+        raise Unsupported(f"{name} {error.what}", error.where) from error
+    return Template(outputs, list(graph.presumed.values()))
+
+
+def _jaxpr_of(function: Callable[..., Sequence[Any]], structs: Sequence[Any]) -> Any:
+    try:
+        return jax.make_jaxpr(function)(*structs)
+    except Exception as error:  # the function's own, or JAX's: that it has no derivative, for instance
+        line = (str(error).strip() or "no message").splitlines()[0]
+        raise Unsupported(f"cannot be traced with its derivatives: {type(error).__name__}: {line}") from error
+
+
+def _run(graph: Graph, jaxpr: Any, consts: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
+    known: dict[Any, Any] = {}
+    for variables, values in ((jaxpr.constvars, consts), (jaxpr.invars, inputs)):
+        for variable, value in zip(variables, values, strict=True):
+            known[variable] = _as_array(value)
+
+    def of(atom: Any) -> Any:
+        return np.asarray(atom.val) if hasattr(atom, "val") else known[atom]
+
+    for equation in jaxpr.eqns:
+        try:
+            if len(graph.nodes) > MOST_NODES:
+                raise Unsupported(f"takes more than {MOST_NODES} operations")
+            results = _apply(graph, equation, [of(a) for a in equation.invars])
+        except Unsupported as error:
+            raise _located(error, equation) from None
+        for variable, value in zip(equation.outvars, results, strict=True):
+            known[variable] = _as_array(value)
+    return [of(a) for a in jaxpr.outvars]
+
+
+def _as_array(value: Any) -> Any:
+    """A NumPy array; keys of random numbers, which NumPy does not know, stay as they are."""
+    extended = isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended)
+    return value if extended or isinstance(value, np.ndarray) else np.asarray(value)
+
+
+def _located(error: Unsupported, equation: Any) -> Unsupported:
+    """The same with the line of the user's code, and the name of JAX's function that this line calls.
+
+    Functions of JAX such as `jnp.sort` are traced once for all their callers. What their inner operations say of where
+    they stand may thus be the place of another call.
+    """
+    inner = equation.params.get("jaxpr") if equation.primitive.name in ("jit", "pjit") else None
+    name = None if inner is None else _public_name(inner.jaxpr)
+    if name is not None:
+        more = "" if error.what.startswith("calls ") else f", which {error.what}"
+        return Unsupported(f"calls {name}{more}", _line_of(equation))
+    return Unsupported(error.what, error.where or _line_of(equation))
+
+
+def _public_name(jaxpr: Any) -> str | None:
+    """What users call a function of JAX; None for any other function."""
+    info = getattr(jaxpr, "debug_info", None)
+    file, name = getattr(info, "func_filename", None), str(getattr(info, "func_name", "")).lstrip("_")
+    if file is None or not file.startswith(os.path.dirname(jax.__file__) + os.sep):
+        return None
+    for place, module in _modules():
+        if hasattr(module, name):
+            return f"{place}.{name}"
+    return name or "a function of JAX"
+
+
+@cache
+def _modules() -> list[tuple[str, Any]]:
+    import jax.scipy.linalg
+    import jax.scipy.special
+
+    numpy, scipy = jax.numpy, jax.scipy
+    return [
+        ("jnp", numpy),
+        ("jnp.linalg", numpy.linalg),
+        ("jnp.fft", numpy.fft),
+        ("jax.scipy.special", scipy.special),
+        ("jax.scipy.linalg", scipy.linalg),
+        ("jax.nn", jax.nn),
+        ("jax.random", jax.random),
+        ("jax.lax", jax.lax),
+        ("jax.lax.linalg", jax.lax.linalg),
+    ]
+
+
+def _line_of(equation: Any) -> str | None:
+    """File and line of the user's code from which an operation comes; None if JAX does not say."""
+    try:  # not public: what JAX says where it fails may be said in another way one day
+        frame = source_info_util.user_frame(equation.source_info.traceback)
+        return None if frame is None else f"{os.path.basename(frame.file_name)}:{frame.start_line}"
+    except (AttributeError, TypeError):
+        return None
+
+
+def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
+    name, params = equation.primitive.name, equation.params
+    shapes = [variable.aval.shape for variable in equation.outvars]
+    if shapes and all(0 in shape for shape in shapes):
+        return [np.empty(shape) for shape in shapes]
+    # An empty array is a known one: what a sum over nothing is, JAX knows.
+    args = [a if a.size else np.empty(a.shape, v.aval.dtype) for a, v in zip(args, equation.invars, strict=True)]
+    known = all(a.dtype != object for a in args)
+    if name in CALLS:
+        inner = params[CALLS[name]]
+        if hasattr(inner, "consts"):
+            return _run(graph, inner.jaxpr, inner.consts, args)
+        return _run(graph, inner, (), args)
+    if known and name in INDEXED:  # rows of tangents: XLA would take 60 ms to compile each
+        with suppress(Unsupported):
+            dtype = equation.outvars[0].aval.dtype
+            return [np.asarray(INDEXED[name](equation, *args)).astype(dtype)]
+    if known and name not in MOVES and name not in NUMPY:
+        return _evaluated(equation, args)
+    if name in LOOPS:
+        return LOOPS[name](graph, equation, args)
+    if name in MOVES:
+        result = MOVES[name](params, *args)
+        return result if equation.primitive.multiple_results else [result]
+    if known:
+        dtype = equation.outvars[0].aval.dtype
+        if name == "convert_element_type" and args[0].dtype.kind == "f" and dtype.kind in "iu":
+            return _evaluated(equation, args)  # NumPy and JAX differ where a number does not fit
+        return [np.asarray(NUMPY[name](params, *args)).astype(dtype).reshape(shapes[0])]
+    if name in INDEXED:
+        if any(a.dtype == object for a in args[1:2]):
+            raise Unsupported("takes an index that depends on the state")
+        return [np.asarray(INDEXED[name](equation, *args), dtype=object)]
+    if name in ARRAYS:
+        return [np.asarray(ARRAYS[name](graph, equation, *args), dtype=object)]
+    meaning = _meaning(graph, name, params, equation.invars[-1].aval.dtype)
+    return [np.asarray(np.frompyfunc(meaning, len(args), 1)(*args), dtype=object)]
+
+
+def _evaluated(equation: Any, args: list[Any]) -> list[Any]:
+    """An operation on known numbers, by JAX."""
+    with jax.ensure_compile_time_eval():
+        results = equation.primitive.bind(*args, **equation.params)
+    return [_as_array(a) for a in (results if equation.primitive.multiple_results else [results])]
+
+
+def _meaning(graph: Graph, name: str, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
+    """What an operation does to entries of arrays of a type."""
+    tables = {"f": MEANINGS, "b": OF_TRUTH, "i": OF_INTEGERS}
+    if dtype.kind not in tables or (dtype.kind == "f" and dtype != np.float64):
+        raise Unsupported(f"has numbers of type {dtype} that depend on the state")
+    table = tables[dtype.kind]
+    if name in table:
+        return table[name](graph, params)
+    if dtype.kind == "i":
+        raise Unsupported(f"does integer arithmetic ({name}) with what depends on the state")
+    raise Unsupported(f"calls {OTHER_NAMES.get(name, f'jax.lax.{name}')}")
+
+
+OTHER_NAMES = {"while": "jax.lax.while_loop", "eigh": "jnp.linalg.eigh", "eig": "jnp.linalg.eig", "fft": "jnp.fft"}
+"""What users call some operations that are not called `jax.lax.NAME`."""
+
+
+# Loops and branches
+
+
+def _scan(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
+    """A loop of known length, one turn after another."""
+    params = equation.params
+    fixed, carried, length = params["num_consts"], params["num_carry"], params["length"]
+    consts, carry, columns = args[:fixed], args[fixed : fixed + carried], args[fixed + carried :]
+    made: list[list[Any]] = []
+    for k in reversed(range(length)) if params["reverse"] else range(length):
+        results = _run(
+            graph, params["jaxpr"].jaxpr, params["jaxpr"].consts, [*consts, *carry, *(c[k] for c in columns)]
+        )
+        carry = results[:carried]
+        made.append(results[carried:])
+    if not made:
+        return [*carry, *(np.empty(variable.aval.shape) for variable in equation.outvars[carried:])]
+    rows = made[::-1] if params["reverse"] else made
+    return [*carry, *(np.stack(column) for column in zip(*rows, strict=True))]
+
+
+def _while(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
+    """A loop whose condition never depends on the state."""
+    params = equation.params
+    condition, body = params["cond_jaxpr"], params["body_jaxpr"]
+    first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
+    of_condition, of_body, carry = args[:first], args[first:second], args[second:]
+    for _ in range(MOST_TURNS):
+        (again,) = _run(graph, condition.jaxpr, condition.consts, [*of_condition, *carry])
+        if again.dtype == object:
+            raise Unsupported("calls jax.lax.while_loop with a condition that depends on the state")
+        if not again:
+            return carry
+        carry = _run(graph, body.jaxpr, body.consts, [*of_body, *carry])
+    raise Unsupported(f"has a loop of more than {MOST_TURNS} turns")
+
+
+def _cond(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
+    """All branches, and a choice among their results."""
+    which, *operands = args
+    branches = [
+        (lambda branch=branch: _run(graph, branch.jaxpr, branch.consts, operands))
+        for branch in equation.params["branches"]
+    ]
+    choice = which.item()
+    if not isinstance(choice, Node | Integer):
+        return branches[int(np.clip(choice, 0, len(branches) - 1))]()
+    results, *others = (branch() for branch in branches)
+    for k, values in enumerate(others, start=1):
+        beyond = choice if isinstance(choice, Node) else graph.apply("le", float(k), choice.node)
+        select = np.frompyfunc(partial(_either, graph, beyond), 2, 1)
+        results = [np.asarray(select(yes, no), dtype=object) for yes, no in zip(values, results, strict=True)]
+    return results
+
+
+LOOPS: dict[str, Callable[[Graph, Any, list[Any]], list[Any]]] = {"scan": _scan, "while": _while, "cond": _cond}
+
+CALLS = {
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+    "closed_call": "call_jaxpr",
+    "core_call": "call_jaxpr",
+    "remat": "jaxpr",
+    "remat2": "jaxpr",
+    "checkpoint": "jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr",
+    "custom_vjp_call_jaxpr": "fun_jaxpr",
+}
+"""Operations that run another jaxpr, by where they keep it. Custom derivatives have been used before."""
+
+
+# Entries of arrays that are moved about
+
+
+def _broadcast(params: Any, a: Any, *_: Any) -> Any:
+    shape = [1] * len(params["shape"])
+    for axis, length in zip(params["broadcast_dimensions"], a.shape, strict=True):
+        shape[axis] = length
+    return np.broadcast_to(a.reshape(shape), params["shape"])
+
+
+def _slice(params: Any, a: Any) -> Any:
+    steps = params["strides"] or [1] * a.ndim
+    return a[tuple(slice(*s) for s in zip(params["start_indices"], params["limit_indices"], steps, strict=True))]
+
+
+def _pad(params: Any, a: Any, value: Any) -> Any:
+    """Entries between and around those of an array; a negative number at an end cuts entries off."""
+    config = params["padding_config"]
+    whole = [n + max(n - 1, 0) * inner for n, (_, _, inner) in zip(a.shape, config, strict=True)]
+    shape = [max(low, 0) + n + max(high, 0) for n, (low, high, _) in zip(whole, config, strict=True)]
+    result = np.empty(shape, dtype=object if object in (a.dtype, value.dtype) else a.dtype)
+    result[...] = value.item()
+    spans = zip(whole, config, strict=True)
+    result[tuple(slice(max(low, 0), max(low, 0) + n, inner + 1) for n, (low, _, inner) in spans)] = a
+    return result[
+        tuple(slice(max(-low, 0), n - max(-high, 0)) for n, (low, high, _) in zip(shape, config, strict=True))
+    ]
+
+
+def _dynamic_slice(params: Any, a: Any, *starts: Any) -> Any:
+    if any(s.dtype == object for s in starts):
+        raise Unsupported("takes an index that depends on the state")
+    sizes = params["slice_sizes"]
+    first = [int(np.clip(s, 0, n - size)) for s, n, size in zip(starts, a.shape, sizes, strict=True)]
+    return a[tuple(slice(f, f + size) for f, size in zip(first, sizes, strict=True))]
+
+
+def _dynamic_update_slice(params: Any, a: Any, update: Any, *starts: Any) -> Any:
+    if any(s.dtype == object for s in starts):
+        raise Unsupported("takes an index that depends on the state")
+    first = [int(np.clip(s, 0, n - size)) for s, n, size in zip(starts, a.shape, update.shape, strict=True)]
+    result = a.astype(object if object in (a.dtype, update.dtype) else a.dtype)
+    result[tuple(slice(f, f + size) for f, size in zip(first, update.shape, strict=True))] = update
+    return result
+
+
+def _split(params: Any, a: Any) -> Any:
+    return np.split(a, np.cumsum(params["sizes"])[:-1], axis=params["axis"])
+
+
+MOVES: dict[str, Callable[..., Any]] = {
+    "broadcast_in_dim": _broadcast,
+    "reshape": lambda params, a, *_: a.reshape(params["new_sizes"]),
+    "squeeze": lambda params, a: np.squeeze(a, axis=tuple(params["dimensions"])),
+    "expand_dims": lambda params, a: np.expand_dims(a, tuple(params["dimensions"])),
+    "transpose": lambda params, a: np.transpose(a, params["permutation"]),
+    "slice": _slice,
+    "dynamic_slice": _dynamic_slice,
+    "dynamic_update_slice": _dynamic_update_slice,
+    "concatenate": lambda params, *a: np.concatenate(a, axis=params["dimension"]),
+    "pad": _pad,
+    "rev": lambda params, a: np.flip(a, params["dimensions"]),
+    "tile": lambda params, a: np.tile(a, params["reps"]),
+    "split": _split,
+    "stack": lambda params, *a: np.stack(a, axis=params["axis"]),
+    "unstack": lambda params, a: list(np.moveaxis(a, params["axis"], 0)),
+    "copy": lambda params, a: a,
+    "stop_gradient": lambda params, a: a,
+    "optimization_barrier": lambda params, *a: a,
+}
+"""Operations that only move entries about."""
+
+NUMPY: dict[str, Callable[..., Any]] = {
+    "iota": lambda params: (
+        np.arange(params["shape"][params["dimension"]]).reshape(
+            [-1 if k == params["dimension"] else 1 for k in range(len(params["shape"]))]
+        )
+        + np.zeros(params["shape"], int)
+    ),
+    "convert_element_type": lambda params, a: a,
+    "add": lambda params, a, b: a + b,
+    "sub": lambda params, a, b: a - b,
+    "mul": lambda params, a, b: a * b,
+    "eq": lambda params, a, b: a == b,
+    "ne": lambda params, a, b: a != b,
+    "lt": lambda params, a, b: a < b,
+    "le": lambda params, a, b: a <= b,
+    "ge": lambda params, a, b: a >= b,
+    "gt": lambda params, a, b: a > b,
+    "and": lambda params, a, b: a & b,
+    "or": lambda params, a, b: a | b,
+    "select_n": lambda params, which, *cases: np.choose(which.astype(int), cases),
+}
+"""Operations on known numbers that models have often, without a start of XLA for each."""
+
+
+# Doubles
+
+
+def _simply(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
+    return lambda graph, params: partial(graph.apply, op)
+
+
+def _swapped(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
+    return lambda graph, params: lambda a, b: graph.apply(op, b, a)
+
+
+def _convert_number(graph: Graph, params: Any) -> Callable[[Any], Any]:
+    kind = np.dtype(params["new_dtype"])
+    if kind == np.float64:
+        return lambda a: a
+    if kind.kind == "b":
+        return lambda a: graph.apply("ne", a, 0.0)
+    raise Unsupported(f"converts what depends on the state to {kind}")
+
+
+def _integer_power(graph: Graph, params: Any) -> Callable[[Any], Any]:
+    exponent = int(params["y"])
+
+    def power(a: Any) -> Any:
+        result, square, left = graph.constant(1.0), a, abs(exponent)
+        while left:
+            if left & 1:
+                result = result * square
+            left >>= 1
+            square = square * square if left else square
+        return 1.0 / result if exponent < 0 else result
+
+    return power
+
+
+def _select(graph: Graph, params: Any) -> Callable[..., Any]:
+    """Of several cases that which a truth value or an integer says."""
+
+    def select(which: Any, *cases: Any) -> Any:
+        if not isinstance(which, Node | Integer):
+            return cases[int(which)]
+        if isinstance(which, Node):
+            return _either(graph, which, cases[1], cases[0])
+        result = cases[0]
+        for k, case in enumerate(cases[1:], start=1):
+            result = _either(graph, graph.apply("le", float(k), which.node), case, result)
+        return result
+
+    return select
+
+
+def _either(graph: Graph, condition: Node, yes: Any, no: Any) -> Any:
+    """One of two numbers, truth values or integers."""
+    if isinstance(yes, Integer) or isinstance(no, Integer) or (_is_known_integer(yes) and _is_known_integer(no)):
+        one, other = Integer.of(graph, yes), Integer.of(graph, no)
+        return Integer(graph.apply("select", condition, one.node, other.node), max(one.bound, other.bound))
+    return graph.apply("select", condition, yes, no)
+
+
+def _round(graph: Graph, params: Any) -> Callable[[Any], Any]:
+    """To the nearest integer; of two the even one, or the one farther from zero."""
+    to_even = params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN
+    return partial(graph.apply, "rint" if to_even else "round")
+
+
+def _sign(graph: Graph, params: Any) -> Callable[[Any], Any]:
+    def sign(a: Any) -> Any:
+        negative = graph.apply("select", graph.apply("lt", a, 0.0), -1.0, a)  # 0 and nan stay what they are
+        return graph.apply("select", graph.apply("lt", 0.0, a), 1.0, negative)
+
+    return sign
+
+
+MEANINGS: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
+    **{op: _simply(op) for op in FOLDED if op not in ("select", "lt", "le", "round", *LOGIC)},
+    "add_any": _simply("add"),
+    "lt": _simply("lt"),
+    "le": _simply("le"),
+    "gt": _swapped("lt"),
+    "ge": _swapped("le"),
+    "convert_element_type": _convert_number,
+    "integer_pow": _integer_power,
+    "square": lambda graph, params: lambda a: a * a,
+    "rsqrt": lambda graph, params: lambda a: 1.0 / graph.apply("sqrt", a),
+    "logistic": lambda graph, params: lambda a: 1.0 / (1.0 + graph.apply("exp", -a)),
+    "select_n": _select,
+    "sign": _sign,
+    "round": _round,
+    "clamp": lambda graph, params: lambda low, a, high: graph.apply("min", graph.apply("max", a, low), high),
+    "is_finite": lambda graph, params: lambda a: graph.apply("eq", a - a, 0.0),
+}
+"""Operations on each entry of arrays of doubles."""
+
+
+# Truth values
+
+
+def _logic(function: Callable[[Callable[..., Any], Any, Any], Any]) -> Callable[[Graph, Any], Callable[..., Any]]:
+    return lambda graph, params: lambda a, b: function(graph.apply, a, b)
+
+
+def _convert_truth(graph: Graph, params: Any) -> Callable[[Any], Any]:
+    kind = np.dtype(params["new_dtype"])
+    if kind.kind == "b":
+        return lambda a: a
+    if kind == np.float64:
+        return lambda a: graph.apply("select", a, 1.0, 0.0)
+    if kind.kind == "i":
+        return lambda a: _either(graph, a, 1, 0) if isinstance(a, Node) else int(a)
+    raise Unsupported(f"converts what depends on the state to {kind}")
+
+
+OF_TRUTH: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
+    **{op: _simply(op) for op in LOGIC},
+    "max": _simply("or"),
+    "min": _simply("and"),
+    "eq": _logic(lambda do, a, b: do("not", do("xor", a, b))),
+    "ne": _simply("xor"),
+    "lt": _logic(lambda do, a, b: do("and", do("not", a), b)),
+    "le": _logic(lambda do, a, b: do("or", do("not", a), b)),
+    "gt": _logic(lambda do, a, b: do("and", a, do("not", b))),
+    "ge": _logic(lambda do, a, b: do("or", a, do("not", b))),
+    "convert_element_type": _convert_truth,
+    "select_n": _select,
+}
+"""Operations on each entry of arrays of truth values."""
+
+
+# Integers
+
+
+@dataclass(frozen=True, slots=True)
+class Integer:
+    """An integer that depends on the state, as a double, and a bound on its size: below 2**53 doubles are exact."""
+
+    node: Node
+    bound: float
+
+    @classmethod
+    def of(cls, graph: Graph, value: Any) -> Integer:
+        """A known integer, or one that is such already."""
+        return value if isinstance(value, Integer) else cls(graph.constant(float(value)), abs(float(value)))
+
+
+def _is_known_integer(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+
+
+LARGEST_INTEGER = 2.0**31 - 1
+"""Bound beyond which integers that depend on the state are left to JAX: some types would overflow."""
+
+GROWTH: dict[str, Callable[..., float]] = {
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a + b,
+    "mul": lambda a, b: a * b,
+    "neg": lambda a: a,
+    "abs": lambda a: a,
+    "max": max,
+    "min": max,
+}
+"""Bounds of results from bounds of arguments."""
+
+
+def _whole(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
+    def meaning(graph: Graph, params: Any) -> Callable[..., Any]:
+        def apply(*given: Any) -> Integer:
+            args = [Integer.of(graph, a) for a in given]
+            bound = GROWTH[op](*(a.bound for a in args))
+            if bound > LARGEST_INTEGER:
+                raise Unsupported("does integer arithmetic with what depends on the state")
+            return Integer(graph.apply(op, *(a.node for a in args)), bound)
+
+        return apply
+
+    return meaning
+
+
+def _clamped(graph: Graph, params: Any) -> Callable[..., Any]:
+    smaller, larger = (OF_INTEGERS[name](graph, params) for name in ("min", "max"))
+    return lambda low, a, high: smaller(larger(a, low), high)
+
+
+def _compared(name: str) -> Callable[[Graph, Any], Callable[..., Any]]:
+    def meaning(graph: Graph, params: Any) -> Callable[..., Any]:
+        compare = MEANINGS[name](graph, params)
+        return lambda a, b: compare(Integer.of(graph, a).node, Integer.of(graph, b).node)
+
+    return meaning
+
+
+def _convert_integer(graph: Graph, params: Any) -> Callable[[Any], Any]:
+    kind = np.dtype(params["new_dtype"])
+    if kind.kind == "i" and kind.itemsize >= 4:
+        return lambda a: a
+    if kind in (np.float64, bool):
+        convert = _convert_number(graph, params)
+        return lambda a: convert(Integer.of(graph, a).node)
+    raise Unsupported(f"converts what depends on the state to {kind}")
+
+
+OF_INTEGERS: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
+    **{op: _whole(op) for op in GROWTH},
+    **{name: _compared(name) for name in (*COMPARISONS, "gt", "ge")},
+    "convert_element_type": _convert_integer,
+    "select_n": _select,
+    "clamp": _clamped,
+}
+"""Operations on each entry of arrays of integers."""
+
+
+# Whole arrays
+
+
+def _dot(graph: Graph, equation: Any, a: Any, b: Any) -> Any:
+    if any(variable.aval.dtype != np.float64 for variable in equation.invars):
+        raise Unsupported("multiplies matrices of truth values or integers that depend on the state")
+    (sum_a, sum_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
+    a = np.moveaxis(a, batch_a, range(len(batch_a)))
+    b = np.moveaxis(b, batch_b, range(len(batch_b)))
+    # Where the summed axes lie once the batch is in front.
+    rest_a = [k for k in range(a.ndim) if k not in batch_a]
+    rest_b = [k for k in range(b.ndim) if k not in batch_b]
+    axes = [[rest_a.index(k) for k in sum_a], [rest_b.index(k) for k in sum_b]]
+    if not batch_a:
+        return _contract(a, b, axes)
+    shape = a.shape[: len(batch_a)]
+    flat_a, flat_b = a.reshape(-1, *a.shape[len(shape) :]), b.reshape(-1, *b.shape[len(shape) :])
+    parts = [_contract(x, y, axes) for x, y in zip(flat_a, flat_b, strict=True)]
+    return np.stack(parts).reshape(*shape, *parts[0].shape)
+
+
+def _contract(a: Any, b: Any, axes: Any) -> Objects:
+    a, b = (np.asarray(each, dtype=object) for each in (a, b))  # NumPy hands out scalars without an array around them
+    return np.asarray(np.tensordot(a, b, axes=axes), dtype=object)
+
+
+def _reduced(name: str) -> Callable[..., Any]:
+    """One operation over some axes."""
+
+    def over(graph: Graph, equation: Any, a: Any) -> Any:
+        axes, dtype = equation.params["axes"], equation.invars[0].aval.dtype
+        combine = _meaning(graph, name, {}, dtype)
+        last = np.moveaxis(a, axes, range(a.ndim - len(axes), a.ndim))
+        kept, count = last.shape[: a.ndim - len(axes)], [a.shape[axis] for axis in axes]
+        rows = last.reshape(int(np.prod(kept)), int(np.prod(count)))
+        return as_objects([reduce(combine, row) for row in rows]).reshape(kept)
+
+    return over
+
+
+def _accumulated(name: str) -> Callable[..., Any]:
+    """One operation over all entries up to each along an axis."""
+
+    def along(graph: Graph, equation: Any, a: Any) -> Any:
+        axis, turned = equation.params["axis"], equation.params["reverse"]
+        combine = np.frompyfunc(_meaning(graph, name, {}, equation.invars[0].aval.dtype), 2, 1)
+        ordered = np.flip(a, axis) if turned else a
+        result = combine.accumulate(ordered, axis=axis, dtype=object)
+        return np.flip(result, axis) if turned else result
+
+    return along
+
+
+def _first(name: str) -> Callable[..., Any]:
+    """Where along an axis the largest (or smallest) entry is, the first of several; a NaN counts as such."""
+
+    def along(graph: Graph, equation: Any, a: Any) -> Any:
+        (axis,), dtype = equation.params["axes"], equation.invars[0].aval.dtype
+        beyond = _meaning(graph, name, {}, dtype)
+
+        def first(row: Any) -> Any:
+            best, found = row[0], 0
+            for k, value in enumerate(row[1:], start=1):
+                better = beyond(value, best)
+                if dtype.kind == "f":
+                    undefined = graph.apply("and", graph.apply("ne", value, value), graph.apply("eq", best, best))
+                    better = graph.apply("or", better, undefined)
+                best, found = _either(graph, better, value, best), _either(graph, better, k, found)
+            return found
+
+        rows = np.moveaxis(a, axis, -1)
+        return as_objects([first(row) for row in rows.reshape(-1, rows.shape[-1])]).reshape(rows.shape[:-1])
+
+    return along
+
+
+ARRAYS: dict[str, Callable[..., Any]] = {
+    "argmax": _first("gt"),
+    "argmin": _first("lt"),
+    "dot_general": _dot,
+    "reduce_sum": _reduced("add"),
+    "reduce_prod": _reduced("mul"),
+    "reduce_max": _reduced("max"),
+    "reduce_min": _reduced("min"),
+    "reduce_and": _reduced("and"),
+    "reduce_or": _reduced("or"),
+    "reduce_xor": _reduced("xor"),
+    "cumsum": _accumulated("add"),
+    "cumprod": _accumulated("mul"),
+    "cummax": _accumulated("max"),
+    "cummin": _accumulated("min"),
+}
+"""Operations on whole arrays."""
+
+
+def _windows(equation: Any, shape: tuple[int, ...], indices: Any, many: Any) -> Any:
+    """Pairs of places: a window of an array of a shape, and where it stands among `many` windows.
+
+    As `jax.lax.gather` and `jax.lax.scatter` have it, for known indices.
+    """
+    numbers, params = equation.params["dimension_numbers"], equation.params
+    if equation.primitive.name == "gather":
+        inside, dropped, starts = numbers.offset_dims, numbers.collapsed_slice_dims, numbers.start_index_map
+        batched = numbers.operand_batching_dims
+        sizes = params["slice_sizes"]
+    else:
+        inside, dropped = numbers.update_window_dims, numbers.inserted_window_dims
+        starts, batched = numbers.scatter_dims_to_operand_dims, numbers.operand_batching_dims
+        lengths = iter([many[k] for k in inside])
+        sizes = [1 if k in (*dropped, *batched) else next(lengths) for k in range(len(shape))]
+    if batched:
+        raise Unsupported("takes indices in batches")
+    outside = [k for k in range(len(many)) if k not in inside]
+    for place in np.ndindex(*indices.shape[:-1]):
+        first = [0] * len(shape)
+        for axis, start in zip(starts, indices[place], strict=True):
+            first[axis] = int(start)
+        if any(f < 0 or f + size > n for f, size, n in zip(first, sizes, shape, strict=True)):
+            raise Unsupported("takes an index out of range")
+        window = tuple(f if k in dropped else slice(f, f + sizes[k]) for k, f in enumerate(first))
+        among: list[Any] = [slice(None)] * len(many)
+        for axis, k in zip(outside, place, strict=True):
+            among[axis] = k
+        yield window, tuple(among)
+
+
+def _gather(equation: Any, a: Any, indices: Any) -> Any:
+    result = np.empty(equation.outvars[0].aval.shape, dtype=object)
+    for window, among in _windows(equation, a.shape, indices, result.shape):
+        result[among] = a[window]
+    return result
+
+
+def _scatter(equation: Any, a: Any, indices: Any, updates: Any) -> Any:
+    result = a.astype(object)
+    for window, among in _windows(equation, a.shape, indices, updates.shape):
+        added = equation.primitive.name == "scatter-add"
+        result[window] = result[window] + updates[among] if added else updates[among]
+    return result
+
+
+INDEXED: dict[str, Callable[..., Any]] = {"gather": _gather, "scatter-add": _scatter, "scatter": _scatter}
+"""Operations at known indices."""

@@ -1,0 +1,420 @@
+"""estimate(): a problem in, an `Estimate` out. Puts mesh, derivatives and optimiser together."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from switchfit.engine.adaptive import refined_mesh
+from switchfit.engine.choice import Engine
+from switchfit.fit.accuracy import worst_error
+from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.fit.guards import on_guards
+from switchfit.fit.hidden import refuse_jumps
+from switchfit.fit.result import Certificate, Fit
+from switchfit.fit.solution import constraints_of, least_squares, message_of, minimized, plain, sigma_known
+from switchfit.fit.trajectory import compared, runs_of
+from switchfit.io.json import load_fit, save_fit
+from switchfit.optimize import IterationRecord, Result, Status, minimize_constrained
+from switchfit.optimize.sqp import HessianKind
+from switchfit.problem.data import FloatArray
+from switchfit.problem.problem import Problem
+from switchfit.problem.validation import as_callable, as_choice, as_count, as_flag, as_instance, as_path, as_positive
+from switchfit.report.plot import LARGEST_FIGURE, Bands, plot_fit
+from switchfit.report.text import report, run_names, standard_errors_of
+from switchfit.report.uncertainty import plot_diagnostics
+from switchfit.runtime.progress import Progress
+from switchfit.uncertainty.certificate import certify
+from switchfit.uncertainty.identification import Identifiability, identifiability
+from switchfit.uncertainty.prediction import Prediction, predict
+from switchfit.uncertainty.profiles import Profile, profile
+from switchfit.uncertainty.residuals import ResidualDiagnostics, diagnose
+from switchfit.uncertainty.sensitivity import Sensitivity, gauss_newton_of, sample_derivatives, sensitivity
+
+HESSIANS = get_args(HessianKind)
+
+REFINEMENTS = 2
+"""Times the mesh may be refined at the solution and the fit resumed, if the integration error asks for it."""
+
+LARGEST_INTEGRATION_ERROR = 1e-8
+"""Relative error of J, a guard or a terminal constraint (by halving all steps, see `switchfit.fit.accuracy`) above
+which the mesh is refined again, unless rtol allows more."""
+
+STOPPED = (Status.INTERRUPTED, Status.NONFINITE_START, Status.MAX_ITERATIONS)
+"""Ends after which a fit is not resumed on a finer mesh."""
+
+MOST_SENSITIVITIES = 2**28
+"""Bytes that the derivatives of states and outputs at all nodes may take; beyond, figures have no bands."""
+
+GAUSS_NEWTON_ENGINE = Engine("jax", "the Gauss-Newton matrix has no machine code")
+
+ORDER = 5
+"""Order of both integrators: what dividing the steps gains."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate(Fit):
+    """Result of `estimate`: everything in `Fit`, and what can be done with it. Print it for the report."""
+
+    saved_certificate: Certificate | None = None
+    problem: Problem | None = None
+    evaluator: Evaluator | None = None
+
+    @cached_property
+    def certificate(self) -> Certificate:
+        """How the numbers were checked. The paper's equations are evaluated here, at the first access.
+
+        An estimate that was loaded has no model: its certificate is the one that was saved.
+        """
+        if self.saved_certificate is not None:
+            return self.saved_certificate
+        return certify(self, None if self.problem is None else Evaluator(self.problem, theta=self.theta))
+
+    @cached_property
+    def gauss_newton(self) -> FloatArray | None:
+        """The Gauss-Newton matrix ``sum (D h / sigma)' (D h / sigma)``: (d, d); None where it is not known."""
+        if self.saved_gauss_newton is not None or self.sigma_known is None or self.problem is None:
+            return self.saved_gauss_newton
+        if plain(self.problem) and self._sensitivities_fit():
+            return gauss_newton_of(sample_derivatives(self.problem, self.sensitivities))
+        return self.evaluator_at_solution()(self.theta, matrix="gauss-newton").hessian
+
+    def _sensitivities_fit(self) -> bool:
+        """Whether the derivatives at all nodes take less memory than is worth it."""
+        rows = sum(len(mesh.nodes) for mesh in self.evaluator_at_solution().meshes)
+        width = max(
+            t.states.shape[1] + sum(len(c.names) for c in run)
+            for t, run in zip(self.trajectories, self.comparisons, strict=True)
+        )
+        return 16 * rows * width * len(self.theta) <= MOST_SENSITIVITIES
+
+    @cached_property
+    def sensitivities(self) -> tuple[Sensitivity, ...]:
+        """States and outputs with their derivatives in theta, one an experiment, on the meshes of the fit."""
+        evaluator = self.evaluator_at_solution()
+        meshes = enumerate(evaluator.meshes)
+        return tuple(sensitivity(evaluator.problem, e, self.theta, mesh) for e, mesh in meshes)
+
+    def evaluator_at_solution(self) -> Evaluator:
+        """The problem on the meshes of the fit.
+
+        Raises
+        ------
+        ValueError
+            If the estimate was loaded from a file without its problem.
+        """
+        if self.problem is None:
+            raise ValueError(
+                "This estimate was loaded without its model: load it with Estimate.load(path, problem=problem)."
+            )
+        return self.evaluator or Evaluator(self.problem, theta=self.theta)
+
+    def profile(self, name: str, *, level: float = 0.95, callback: Progress | None = None) -> Profile:
+        """Profile likelihood of one parameter or transition time, see `switchfit.profile`.
+
+        Parameters
+        ----------
+        name : str
+        level : float
+        callback : callable, optional
+        """
+        return profile(self, name, level=level, callback=callback)
+
+    def __str__(self) -> str:
+        known = self.saved_certificate or self.__dict__.get("certificate")
+        return report(self, known, self.identifiability)
+
+    def plot(self, *, bands: bool = True, level: float = 0.95) -> Any:
+        """Measured against fitted over time with the modes shaded, as a matplotlib Figure.
+
+        Parameters
+        ----------
+        bands : bool
+            Confidence and prediction bands of what is fitted, where there is a model and a covariance; the first ones
+            of a model are compiled for a second.
+        level : float, between 0 and 1
+            Of the bands.
+        """
+        quantile = self.quantile(level)
+        drawn = as_flag(bands, "bands") and self.problem is not None and np.isfinite(standard_errors_of(self)).all()
+        shown = range(min(len(self.trajectories), LARGEST_FIGURE)) if drawn and self._sensitivities_fit() else range(0)
+        return plot_fit(self, [Bands.of(predict(self, experiment=e), quantile, level) for e in shown])
+
+    def predict(self, times: ArrayLike | None = None, *, experiment: int = 0) -> Prediction:
+        """States and outputs at any times with their standard errors and bands, see `switchfit.predict`.
+
+        Parameters
+        ----------
+        times : (K,) array_like, optional
+        experiment : int
+        """
+        return predict(self, times, experiment=experiment)
+
+    @property
+    def residuals(self) -> ResidualDiagnostics:
+        """Tests of the residuals, channel by channel: whiteness, normality, effective sample size."""
+        return diagnose(self, run_names(self))
+
+    def plot_residuals(self) -> Any:
+        """Residuals in time, their autocorrelation and their quantiles, as a matplotlib Figure."""
+        return plot_diagnostics(self.residuals)
+
+    @cached_property
+    def identifiability(self) -> Identifiability:
+        """Which combinations of the unknowns the data determine badly, with J evaluated there."""
+        return identifiability(self)
+
+    def save(self, path: str | Path) -> None:
+        """Write everything but the model to a JSON file, atomically; `load` reads it."""
+        file = as_path(path, "path")
+        save_fit(self.complete(), self.certificate, file)
+
+    def complete(self) -> Estimate:
+        """The same with everything that is saved, which is the Gauss-Newton matrix."""
+        return replace(self, saved_gauss_newton=self.gauss_newton)
+
+    @classmethod
+    def load(cls, path: str | Path, *, problem: Problem | None = None) -> Estimate:
+        """Read what `save` wrote.
+
+        Parameters
+        ----------
+        path : path
+        problem : Problem, optional
+            The problem that was fitted, where profiles or predictions are wanted: a file does not hold the model.
+
+        Raises
+        ------
+        ValueError
+            If the file is not one of switchfit's, or the problem has other unknowns or other time units.
+        """
+        if problem is not None:
+            as_instance(problem, "problem", Problem, "an sf.Problem")
+        fit, certificate = load_fit(as_path(path, "path"))
+        if problem is not None and problem.theta_names != fit.theta_names:
+            raise ValueError(
+                f"{path} holds the unknowns {', '.join(fit.theta_names)}, the problem has "
+                f"{', '.join(problem.theta_names)}: it is the fit of another problem."
+            )
+        if problem is not None:
+            saved = [trajectory.time_unit for trajectory in fit.trajectories]
+            given = [experiment.time_unit for experiment in problem.experiments]
+            if saved != given:
+                raise ValueError(
+                    f"{path} holds times in {', '.join(saved)}, the problem has them in {', '.join(given)}, and times "
+                    "are not converted. Files that were saved before there was a time_unit count as s: if it is one of "
+                    "them, and its times are those of the problem, give the problem's experiments time_unit='s'."
+                )
+        own = {f.name: getattr(fit, f.name) for f in fields(Fit)}
+        return cls(**own, saved_certificate=certificate, problem=problem)
+
+
+def estimate(
+    problem: Problem,
+    *,
+    hessian: HessianKind = "exact",
+    tolerance: float = 1e-7,
+    max_iterations: int = 200,
+    callback: Callable[[IterationRecord], object] | None = None,
+    start: ArrayLike | None = None,
+) -> Estimate:
+    """Estimate all transition times and parameters of a problem together.
+
+    Parameters
+    ----------
+    problem : Problem
+    hessian : {"exact", "descent-first", "block-diagonal", "gauss-newton", "none"}
+        Quadratic term of the sequential quadratic programme: equation (3), made positive definite where it is not;
+        steepest descent until it is positive definite, then equation (3), as the paper does it (Section II-A);
+        equation (4); the Gauss-Newton matrix; or none (steepest descent).
+    tolerance : float
+        On the KKT residual, the norm of the gradient where no constraint is active. An unknown on a logarithmic scale
+        counts by its logarithm, one whose first guess is below 1e-3 or above 1e3 in units of (about) that guess.
+    max_iterations : int
+        Most iterations on one mesh. Where a fit has converged but the integration error asks for a finer mesh, at most
+        twice, it is resumed there with as many again; ``iterations`` counts all of them.
+    callback : callable, optional
+        Called with each `IterationRecord`; a true return value stops the fit. Ctrl-C does as well; both
+        return the best point so far.
+    start : (d,) array_like, optional
+        Where to begin, in the order of ``problem.theta_names``; the problem's initial guess if left out.
+
+    Returns
+    -------
+    Estimate
+        Also when it did not converge: see ``.success`` and ``.message``.
+
+    Raises
+    ------
+    ValueError
+        For a bad setting, or a guess at which the model cannot be integrated.
+    TypeError
+        If an argument is of the wrong type.
+    """
+    as_instance(problem, "problem", Problem, "an sf.Problem; several are what sf.estimate_many takes")
+    hessian = as_choice(hessian, "hessian", HESSIANS)
+    tolerance, max_iterations = checked_settings(tolerance, max_iterations)
+    if callback is not None:
+        as_callable(callback, "callback", "a function callback(record)", arguments=1)
+    if problem.constraint_names and hessian != "exact":
+        raise ValueError(f"with guards or terminal constraints hessian must be 'exact'; got {hessian!r}.")
+    began = time.perf_counter()
+    theta, evaluator = _beginning(problem, start)
+    constraints = constraints_of(problem)
+    held: tuple[tuple[str, float, float], ...] = ()
+    history: list[IterationRecord] = []
+    evaluations = 0
+    for attempt in range(REFINEMENTS + 1):
+        last = history[-1] if history else None
+        told = None if callback is None else lambda record, last=last: callback(record.counted_on(last))
+        earlier = max(len(history) - 1, 0)
+        if problem.constraint_names:
+            result, held = _minimized_with_constraints(evaluator, theta, tolerance, max_iterations, told)
+        else:
+            result = minimized(evaluator, theta, hessian, tolerance, max_iterations, told, constraints)
+        records = [record.counted_on(last) for record in result.history]
+        history += records[1:] if history else records
+        evaluations += result.evaluations
+        theta = result.theta
+        fine = evaluator.divided()
+        runs = runs_of(problem, theta, fine.meshes, fine.arguments)
+        error, output = worst_error(
+            fine,
+            theta,
+            runs,
+            cost=result.cost,
+            first_cost=history[0].cost if history else 0.0,
+            constraints=[value for _, value, _ in held],
+        )
+        excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
+        if result.status in STOPPED or attempt == REFINEMENTS or not excess > 1:
+            break
+        evaluator = _refined(fine, problem.checked_theta(start), theta, excess)
+    if excess > 1 and result.status.converged and not problem.constraint_names:
+        refuse_jumps(evaluator, theta)  # the error of steps across a jump does not vanish with their length
+    trajectories, comparisons = compared(problem, theta, runs)
+    return _estimate(
+        problem,
+        evaluator,
+        replace(result, iterations=earlier + result.iterations, earlier=earlier),
+        history,
+        hessian,
+        tolerance,
+        initial_theta=problem.checked_theta(start),
+        evaluations=evaluations,
+        trajectories=trajectories,
+        comparisons=comparisons,
+        integration_error=float(error),
+        integration_error_of=output,
+        seconds=time.perf_counter() - began,
+        constraints=held,
+    )
+
+
+def checked_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:
+    """Return the two settings of every fit, checked."""
+    return as_positive(tolerance, "tolerance"), as_count(max_iterations, "max_iterations")
+
+
+def _beginning(problem: Problem, start: ArrayLike | None) -> tuple[FloatArray, Evaluator]:
+    """Where a fit begins (d,), guarded transitions on their guards if that is near, and the meshes for it."""
+    theta = problem.checked_theta(start, "start")
+    evaluator = evaluator_of(problem) if start is None else Evaluator(problem, theta)
+    if any(structure.guarded for structure in problem.structures):
+        with suppress(ValueError):  # if there is no such point nearby, the optimiser may find one farther off
+            theta = on_guards(evaluator, theta)
+            evaluator = Evaluator(problem, theta)
+    return theta, evaluator
+
+
+def _minimized_with_constraints(
+    evaluator: Evaluator,
+    theta: FloatArray,
+    tolerance: float,
+    max_iterations: int,
+    callback: Callable[[IterationRecord], object] | None,
+) -> tuple[Result, tuple[tuple[str, float, float], ...]]:
+    """One run of the optimiser with guards and terminal constraints: its result, and each with value and multiplier."""
+    problem = evaluator.problem
+    names = problem.constraint_names
+    found = minimize_constrained(
+        evaluator.constrained,
+        theta,
+        names,
+        tolerance=tolerance,
+        max_iterations=max_iterations,
+        callback=callback,
+        constraints=constraints_of(problem),
+        breakpoints=evaluator.breakpoints(),
+        size=problem.sizes,
+        scale=problem.elapsed(theta),
+    )
+    values, multipliers = found.constraints.tolist(), found.multipliers.tolist()
+    return found.result, tuple(zip(names, values, multipliers, strict=True))
+
+
+def _refined(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:
+    """The problem on finer meshes: cells cut in two, or, where that is not enough, refined at the start and at theta.
+
+    A mode that has come to be active in another part of the horizon may find cells there that are far too long for it.
+    """
+    problem = fine.problem
+    if excess <= 2**ORDER:
+        return fine
+    return Evaluator(problem, meshes=[refined_mesh(problem, e, start, theta) for e in range(len(problem.experiments))])
+
+
+def _estimate(
+    problem: Problem,
+    evaluator: Evaluator,
+    result: Result,
+    history: list[IterationRecord],
+    hessian: HessianKind,
+    tolerance: float,
+    **rest: Any,
+) -> Estimate:
+    """Collect what the optimiser found into an Estimate, with the exact Hessian whatever it worked with."""
+    unknowns = problem.unknowns
+    times, parameters = problem.split(result.theta)
+    exact = result.hessian
+    if hessian in ("gauss-newton", "none") and np.isfinite(result.cost):
+        exact = evaluator(result.theta).hessian
+    return Estimate(
+        theta_names=unknowns.names,
+        theta_units=unknowns.units,
+        theta=result.theta,
+        lower=unknowns.lower,
+        upper=unknowns.upper,
+        transition_times=tuple(times),
+        parameters={name: np.array(value) for name, value in parameters.items()},
+        cost=result.cost,
+        gradient=result.gradient,
+        hessian=exact,
+        optimality=result.optimality,
+        iterations=max(len(history) - 1, 0),
+        status=result.status,
+        message=message_of(result, problem),
+        history=tuple(history),
+        active=result.active,
+        kinks=tuple((unknowns.names[i], left, right) for i, left, right in result.kinks),
+        free_basis=result.free_basis,
+        sigma_known=sigma_known(problem),
+        priors={name: text for name, text in zip(unknowns.names, unknowns.priors.texts(), strict=True) if text},
+        log_scaled=unknowns.log_names,
+        idle=tuple(unknowns.names[i] for i in result.idle),
+        least_squares=least_squares(problem),
+        hessian_kind=hessian,
+        tolerance=tolerance,
+        engine=GAUSS_NEWTON_ENGINE if hessian == "gauss-newton" else evaluator.engine,
+        problem=problem,
+        evaluator=evaluator,
+        **rest,
+    )

@@ -1,0 +1,126 @@
+"""Integration error of a fit: what halving all steps changes in J, in the guards and in the terminal constraints.
+
+Each output is compared at the same theta on the meshes of the fit and on meshes with every cell halved, and the change
+is put in relation to a size of that output:
+
+- J: to J itself, or to 1e-3 of its first value where that is more (a cost that vanishes has no relative error).
+- A guard or terminal constraint c is zero at the solution, so its own value is no scale. The integrator's error enters
+  it through the states, and its scale is what these make of it: ``sum_j |D_j c| range_j``, where range_j is the
+  difference between the largest and the smallest value of state j in the run. An error of 1e-8 thus is one of 1e-8 of
+  the way that the states go, wherever the origins of time and of the states are, and however long the run goes on after
+  everything has happened. A constraint in which no state moves is measured in its own unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from switchfit.discretization.arguments import Arguments
+from switchfit.discretization.model import Model
+from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.solution import smallest_cost
+from switchfit.fit.trajectory import Run, cost_of
+from switchfit.problem.data import FloatArray
+from switchfit.problem.functions import float64
+from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Structure
+from switchfit.runtime.cache import compilation_cache
+
+PERFECT_FIT = 1e-3
+"""Where J has fallen to less than this part of its first value, the integration error is measured against that part:
+the relative error of a cost that vanishes says nothing."""
+
+COST = "J"
+"""Name of the cost among the outputs."""
+
+
+class IntegrationError(NamedTuple):
+    """Relative integration error of one output: J, a guard or a terminal constraint."""
+
+    error: float
+    output: str
+
+
+def cost_error(problem: Problem, fine_cost: float, cost: float, first_cost: float) -> float:
+    """Return the change of J by halving all steps, relative to the size of J."""
+    size = max(abs(fine_cost), PERFECT_FIT * abs(first_cost), smallest_cost(problem))
+    return abs(fine_cost - cost) / size
+
+
+def worst_error(
+    fine: Evaluator,
+    theta: FloatArray,
+    runs: Sequence[Run],
+    *,
+    cost: float,
+    first_cost: float,
+    constraints: Sequence[float],
+) -> IntegrationError:
+    """Return the output of a problem with the largest relative integration error.
+
+    Parameters
+    ----------
+    fine : Evaluator
+        On the meshes of the fit with every cell halved.
+    theta : (d,)
+    runs : list of Run
+        The simulation at theta on the meshes of `fine`.
+    cost, first_cost : float
+        J on the meshes of the fit, at theta and at the first guess.
+    constraints : (m,)
+        Guards and terminal constraints on the meshes of the fit at theta.
+
+    Returns
+    -------
+    IntegrationError
+        An error that is not a number counts as the largest.
+    """
+    problem = fine.problem
+    errors = [IntegrationError(cost_error(problem, cost_of(problem, theta, runs), cost, first_cost), COST)]
+    if problem.constraint_names:
+        values, scales = constraint_values(fine, theta, runs)
+        changes = np.abs(values - constraints) / np.where(scales > 0, scales, 1.0)
+        errors += map(IntegrationError, changes.tolist(), problem.constraint_names)
+    return max(errors, key=lambda found: np.inf if np.isnan(found.error) else found.error)
+
+
+def constraint_values(evaluator: Evaluator, theta: FloatArray, runs: Sequence[Run]) -> tuple[FloatArray, FloatArray]:
+    """Return the guards and terminal constraints of a simulation and their scales: (m,) each.
+
+    They follow from the states alone, so that nothing is compiled for the meshes of `evaluator`.
+    """
+    problem = evaluator.problem
+    values, scales = [np.zeros(0)], [np.zeros(0)]
+    for e, (structure, arguments, run) in enumerate(zip(problem.structures, evaluator.arguments, runs, strict=True)):
+        if structure.constrained:
+            tau, p = problem.vectors(theta, e)
+            ends = np.stack([segment.after[-1] for segment in run.segments])
+            states = np.concatenate([states for segment in run.segments for states in (segment.before, segment.after)])
+            with float64(), compilation_cache():
+                found = _constraint_values(arguments.without_mesh(), tau, ends, p, structure=structure)
+            values.append(np.asarray(found[0]))
+            scales.append(np.abs(found[1]) @ np.ptp(states, axis=0))
+    return np.concatenate(values), np.concatenate(scales)
+
+
+@partial(jax.jit, static_argnames=("structure",))
+def _constraint_values(
+    arguments: Arguments, tau: jax.Array, ends: jax.Array, p: jax.Array, *, structure: Structure
+) -> tuple[jax.Array, jax.Array]:
+    """Guards, then terminal constraints, (m,), at the state at the end of each segment, (N + 1, n); and D c, (m, n)."""
+    model = Model(structure, arguments)
+    values, slopes = [], []
+    for i in structure.guarded:
+        value, slope = jax.value_and_grad(model.guard(i), argnums=1)(tau[i], ends[i], p)
+        values.append(value[None])
+        slopes.append(slope[None])
+    if structure.terminal_constraints:
+        values.append(model.terminal_constraint(ends[-1], p))
+        slopes.append(jax.jacfwd(model.terminal_constraint)(ends[-1], p))
+    return jnp.concatenate(values), jnp.concatenate(slopes)

@@ -1,0 +1,136 @@
+"""Modes that have collapsed: whose two transition times are equal, so that they last no time at all.
+
+Where a mode of no duration stands between two stretches of the same mode, as B in (A, B, A), the cost does not depend
+on where that is: to the integration error J is constant as its two transition times move together. Nor does the cost
+depend on a parameter that acts in collapsed modes alone. Such unknowns are *idle*: no data determine them, and the
+curvature of J along them is that of the integration error, of either sign.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.fit.evaluator import Evaluator
+from switchfit.optimize.qp import EPS
+from switchfit.problem.data import FloatArray
+from switchfit.problem.experiment import Experiment
+from switchfit.problem.problem import Problem
+
+CHANGES = (0.1, -0.1)
+"""Parts of a parameter, or of the range between its bounds where it is 0, by which it is changed to see its effect."""
+
+NO_EFFECT = 1e-12
+"""Part of the cost that is rounding: a parameter that changes it by less has no effect."""
+
+OPENED = 1e-3
+"""Part of the horizon for which collapsed modes last where a parameter's effect in them is looked for."""
+
+
+def idle_unknowns(evaluator: Evaluator, theta: FloatArray, parameters: bool) -> NDArray[np.bool_]:
+    """Which unknowns may be held because J does not depend on them while the modes that have collapsed stay so: (d,).
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    theta : (d,)
+    parameters : bool
+        Whether to look for parameters as well, with a few evaluations of J for each. Without them it is the first of
+        the transition times that coincide, which leaves the others free to move away from it.
+    """
+    problem = evaluator.problem
+    idle = np.zeros(len(theta), dtype=bool)
+    for group in _idle_groups(problem, theta):
+        idle[group[0]] = True
+    opened = _opened(problem, theta) if parameters else theta
+    if not np.array_equal(opened, theta):
+        for i in _parameters(problem):
+            idle[i] = _is_idle(evaluator, theta, opened, i)
+    return idle
+
+
+def _idle_groups(problem: Problem, theta: FloatArray) -> Iterator[NDArray[np.intp]]:
+    """Places in theta of transitions that coincide and may move together without an effect.
+
+    None of them is fixed or at an end of the horizon, the mode before them is the mode after them, and no reset map
+    or guard stands between.
+    """
+    system = problem.system
+    for e, experiment in enumerate(problem.experiments):
+        sequence, where = experiment.mode_sequence, problem.unknowns.times[e]
+        for first, last in _coincident(problem, theta, e):
+            passed = [*zip(sequence[first : last + 1], sequence[first + 1 : last + 2], strict=True)]
+            smooth = all(system.reset_map(*pair) is None and system.guard(*pair) is None for pair in passed)
+            if smooth and sequence[first] == sequence[last + 1] and np.all(where[first : last + 1] >= 0):
+                yield where[first : last + 1]
+
+
+def _coincident(problem: Problem, theta: FloatArray, e: int) -> Iterator[tuple[int, int]]:
+    """First and last of two or more transitions of experiment e that coincide strictly inside the horizon."""
+    experiment, times = problem.experiments[e], problem.vectors(theta, e)[0]
+    if not np.any(times[1:] - times[:-1] <= _rounding(experiment)):  # the rule, and asked at every step
+        return
+    short, room = _lengths(problem, theta, e)
+    first = 0
+    for i in range(1, len(times) + 1):
+        if i < len(times) and short[i]:
+            continue
+        if i - first > 1 and not np.any(room[[first, i - 1]]):
+            yield first, i - 1
+        first = i
+
+
+def _opened(problem: Problem, theta: FloatArray) -> FloatArray:
+    """theta with its free transition times moved so that every collapsed mode lasts a little, where there is room."""
+    opened = theta.copy()
+    for e, (experiment, where) in enumerate(zip(problem.experiments, problem.unknowns.times, strict=True)):
+        times, short = problem.vectors(theta, e)[0], _lengths(problem, theta, e)[0]
+        if not short.any():
+            continue
+        gap = OPENED * (experiment.tf - experiment.t0) * short
+        knots = np.concatenate([[experiment.t0], times, [experiment.tf]])
+        for i in range(1, len(times) + 1):
+            knots[i] = max(knots[i], knots[i - 1] + gap[i - 1])
+        for i in range(len(times), 0, -1):
+            knots[i] = min(knots[i], knots[i + 1] - gap[i])
+        opened[where[where >= 0]] = knots[1:-1][where >= 0]
+    return opened
+
+
+def _lengths(problem: Problem, theta: FloatArray, e: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which modes of experiment e have no duration (N + 1,), and which transitions are at an end of it (N,)."""
+    experiment = problem.experiments[e]
+    times, rounding = problem.vectors(theta, e)[0], _rounding(experiment)
+    knots = np.concatenate([[experiment.t0], times, [experiment.tf]])
+    at_end = (times - experiment.t0 <= rounding) | (experiment.tf - times <= rounding)
+    return np.diff(knots) <= rounding, at_end
+
+
+def _rounding(experiment: Experiment) -> float:
+    """Rounding error of the difference of two times of an experiment."""
+    return 32 * EPS * max(experiment.tf - experiment.t0, abs(experiment.t0), abs(experiment.tf))
+
+
+def _parameters(problem: Problem) -> list[int]:
+    """Places in theta of the model's parameters."""
+    return [i for span in problem.unknowns.parameters.values() for i in range(span.start, span.stop)]
+
+
+def _is_idle(evaluator: Evaluator, theta: FloatArray, opened: FloatArray, i: int) -> bool:
+    """Whether parameter i has no effect on J at theta, but has one where the collapsed modes last a little."""
+    unknowns = evaluator.problem.unknowns
+    low, high = unknowns.lower[i], unknowns.upper[i]
+    size = abs(theta[i]) or (high - low if np.isfinite(high - low) else 1.0)
+
+    def acts(at: FloatArray) -> bool:
+        base = evaluator.cost(at)
+        for change in CHANGES:
+            moved = at.copy()
+            moved[i] = np.clip(at[i] + change * size, low, high)
+            if not abs(evaluator.cost(moved) - base) <= NO_EFFECT * abs(base):
+                return True
+        return False
+
+    return not acts(theta) and acts(opened)

@@ -1,0 +1,370 @@
+"""The cost of a problem and its exact derivatives at any theta, on a mesh that stays the same."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from switchfit.discretization.arguments import Arguments, arguments_of
+from switchfit.discretization.mesh import Mesh, with_common_lengths
+from switchfit.discretization.model import Model
+from switchfit.discretization.propagation import path_cost, propagate
+from switchfit.engine.adaptive import refined_mesh
+from switchfit.engine.choice import Engine
+from switchfit.engine.jax.constraints import augmented
+from switchfit.engine.jax.first_order import first_order
+from switchfit.engine.jax.forward import forward_hessian
+from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
+from switchfit.engine.native.program import NativeExperiment, native_experiment, reason_for_jax
+from switchfit.fit.trajectory import cost_of, runs_of
+from switchfit.optimize.arrow import Arrow, ArrowLayout
+from switchfit.paper_adjoint import paper_derivatives
+from switchfit.problem.data import FloatArray
+from switchfit.problem.functions import float64
+from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Structure
+from switchfit.problem.validation import as_choice, as_instance
+from switchfit.runtime.cache import compilation_cache
+
+Method = Literal["auto", "forward", "discrete-adjoint", "adjoint", "autodiff"]
+Matrix = Literal["exact", "gauss-newton", "none"]
+METHODS = ("auto", "forward", "discrete-adjoint", "adjoint", "autodiff")
+
+FORWARD_UP_TO = 0
+"""Unknowns of one experiment up to which second order forward is cheaper than the backward sweep. It never is: at one
+unknown they tie, from two on the sweep is ahead (the scaling part of the benchmarks)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Cost and derivatives at one theta.
+
+    Attributes
+    ----------
+    cost : J
+    gradient : (d,), J's derivative in theta
+    hessian : (d, d)
+    """
+
+    cost: float
+    gradient: FloatArray
+    hessian: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ArrowEvaluation:
+    """Cost and derivatives of many runs: as `Evaluation`, with the Hessian in the shape of an arrow."""
+
+    cost: float
+    gradient: FloatArray
+    hessian: Arrow
+
+
+@dataclass(frozen=True, eq=False)
+class ConstrainedEvaluation:
+    """Cost and constraints at one theta.
+
+    Attributes
+    ----------
+    cost : J
+    gradient : (d,), J's derivative in theta
+    value, slope : the augmented Lagrangian and its derivative (d,)
+    hessian : (d, d), of the augmented Lagrangian
+    constraints, jacobian : c (m,) and its derivative (m, d)
+    """
+
+    cost: float
+    gradient: FloatArray
+    value: float
+    slope: FloatArray
+    hessian: FloatArray
+    constraints: FloatArray
+    jacobian: FloatArray
+
+
+class Evaluator:
+    """A problem on fixed meshes, one an experiment: cost, gradient and Hessian as functions of theta alone.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : (d,) array, optional
+        Where the meshes are refined; the problem's initial guess if left out.
+    meshes : sequence of Mesh, optional
+        Meshes to use instead of refined ones.
+    """
+
+    def __init__(self, problem: Problem, theta: FloatArray | None = None, meshes: Sequence[Mesh] | None = None) -> None:
+        self.problem = problem
+        indices = range(len(problem.experiments))
+        at = problem.initial_theta if theta is None else theta
+        given = list(meshes) if meshes is not None else [refined_mesh(problem, e, at) for e in indices]
+        self.meshes = with_common_lengths(problem, given)
+        self.arguments = [arguments_of(problem, e, mesh) for e, mesh in enumerate(self.meshes)]
+        self._compiled: set[tuple[Method, Matrix]] = set()
+        self._native: dict[int, list[NativeExperiment | None]] = {}
+        self._on_device: list[Arguments] | None = None
+        self._priors = problem.unknowns.priors if problem.unknowns.priors.any else None
+
+    def divided(self, parts: int = 2) -> Evaluator:
+        """The same problem with every cell of its meshes cut into equal parts."""
+        return Evaluator(self.problem, meshes=[mesh.divided(parts) for mesh in self.meshes])
+
+    def __call__(
+        self, theta: FloatArray, side: int = 1, method: Method = "auto", matrix: Matrix = "exact"
+    ) -> Evaluation:
+        """Cost, gradient and Hessian; where a transition time sits on a node, the derivatives to its `side`.
+
+        `matrix` asks for the Gauss-Newton matrix in place of the Hessian, or for none (it is NaN then).
+        """
+        d = len(theta)
+        results = self._results(theta, side, method, matrix)
+        if self.problem.one_to_one:
+            total, gradient, hessian = float(results[0][0]), results[0][1], results[0][2]
+        else:
+            total, gradient, hessian = 0.0, np.zeros(d), np.zeros((d, d))
+            for (J, g, H), (own, mine) in zip(results, self.problem.own_places, strict=True):
+                total += float(J)
+                # Two names of the model may mean one parameter: its place then stands twice, and both count.
+                np.add.at(gradient, mine, g[own])
+                np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
+        if self._priors is not None:
+            J, g, h = self._priors.evaluate(theta, gauss_newton=matrix == "gauss-newton")
+            total, gradient, hessian = total + float(J), gradient + g, hessian + np.diag(h)
+        return Evaluation(total, gradient, hessian)
+
+    def constrained(
+        self, theta: FloatArray, side: int = 1, multipliers: ArrayLike = 0.0, penalty: ArrayLike = 0.0
+    ) -> ConstrainedEvaluation:
+        """Cost, constraints and their augmented Lagrangian with the given multipliers and penalties, (m,) or ()."""
+        d, count = len(theta), len(self.problem.constraint_names)
+        multipliers, penalty = (np.broadcast_to(np.asarray(a, float), count) for a in (multipliers, penalty))
+        cost, value, gradient, slope, hessian = 0.0, 0.0, np.zeros(d), np.zeros(d), np.zeros((d, d))
+        jacobian, c = np.zeros((count, d)), np.zeros(count)
+        last = 0
+        for e, ((s, a, tau, p), (own, mine)) in enumerate(zip(self._each(theta), self.problem.own_places, strict=True)):
+            here = slice(last, last := last + self.problem.constraint_counts[e])
+            with float64(), compilation_cache():
+                found = constrained_derivatives(a, tau, p, float(side), multipliers[here], penalty[here], structure=s)
+            J, g, L, L_d, H, c_e, A = map(np.asarray, found)
+            cost, value = cost + float(J), value + float(L)
+            np.add.at(gradient, mine, g[own])
+            np.add.at(slope, mine, L_d[own])
+            np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
+            np.add.at(jacobian[here].T, mine, A[:, own].T)
+            c[here] = c_e
+        if self._priors is not None:
+            J, g, h = self._priors.evaluate(theta)
+            cost, gradient = cost + float(J), gradient + g
+            value, slope, hessian = value + float(J), slope + g, hessian + np.diag(h)
+        return ConstrainedEvaluation(cost, gradient, value, slope, hessian, c, jacobian)
+
+    def arrow(self, theta: FloatArray, side: int = 1, matrix: Matrix = "exact") -> ArrowEvaluation:
+        """The same by the method "auto", in time and memory that are linear in the number of experiments."""
+        total, gradient, parts = 0.0, np.zeros(len(theta)), []
+        size = self.layout.own.shape[1] + len(self.layout.shared)
+        results = self._results(theta, side, "auto", matrix)
+        for (J, g, H), (own, mine), slots in zip(results, self.problem.own_places, self._slots, strict=True):
+            total += float(J)
+            np.add.at(gradient, mine, g[own])
+            part = np.zeros((size, size))
+            np.add.at(part, (slots[:, None], slots), H[own[:, None], own])
+            parts.append(part)
+        arrow = Arrow.of_runs(self.layout, parts)
+        if self._priors is not None:
+            J, g, h = self._priors.evaluate(theta, gauss_newton=matrix == "gauss-newton")
+            total, gradient, arrow = total + float(J), gradient + g, arrow.plus_diagonal(h)
+        return ArrowEvaluation(total, gradient, arrow)
+
+    @cached_property
+    def layout(self) -> ArrowLayout:
+        """Which unknowns are whose."""
+        return ArrowLayout.of(len(self.problem.theta_names), self.problem.places)
+
+    @cached_property
+    def _slots(self) -> list[NDArray[np.intp]]:
+        return [self.layout.slots(e, mine) for e, (_, mine) in enumerate(self.problem.own_places)]
+
+    def replace_arguments(self, arguments: Sequence[Arguments]) -> None:
+        """Work with other numbers from now on, on the meshes that they have."""
+        self.arguments = list(arguments)
+        self.meshes = [Mesh.from_times(np.asarray(own.nodes)) for own in arguments]
+        self._native.clear()
+        self._on_device = None
+
+    def cost(self, theta: FloatArray) -> float:
+        """J alone."""
+        natives = self._natives(0)
+        vectors = [self.problem.vectors(theta, e) for e in range(len(natives))]
+        costs = [None if native is None else native.cost(*at) for native, at in zip(natives, vectors, strict=True)]
+        known = [cost for cost in costs if cost is not None]
+        if len(known) < len(natives):
+            return cost_of(self.problem, theta, runs_of(self.problem, theta, self.meshes, self.arguments))
+        return sum(known, 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0]))
+
+    @property
+    def engine(self) -> Engine:
+        """What evaluates cost, gradient and exact Hessian by the method "auto": machine code, or JAX and why."""
+        if self.problem.constraint_names:
+            return Engine("jax", "guards and terminal constraints have no machine code")
+        given = zip(self.problem.structures, self.arguments, strict=True)
+        reasons = (reason_for_jax(structure, arguments, 2) for structure, arguments in given)
+        return Engine.of(next((reason for reason in reasons if reason is not None), None))
+
+    def _natives(self, order: int) -> list[NativeExperiment | None]:
+        """What evaluates each experiment in machine code, None where nothing does; with derivatives up to an order."""
+        if order not in self._native:
+            given = zip(self.problem.structures, self.arguments, self.meshes, strict=True)
+            self._native[order] = [native_experiment(s, a, mesh.times, order) for s, a, mesh in given]
+        return self._native[order]
+
+    def _results(self, theta: FloatArray, side: int, method: Method, matrix: Matrix) -> list[Any]:
+        """Cost, gradient and Hessian of each experiment in its own unknowns, as NumPy arrays."""
+        if method == "auto" and matrix != "gauss-newton":
+            natives = [native for native in self._natives(2 if matrix == "exact" else 1) if native is not None]
+            if len(natives) == len(self.arguments):
+                found = [native(*self.problem.vectors(theta, e), side) for e, native in enumerate(natives)]
+                if None not in found:
+                    return found
+        compiled = (method, matrix) in self._compiled
+        with float64(), nullcontext() if compiled else compilation_cache():
+            results = [
+                derivatives(a, tau, p, float(side), structure=s, method=_resolve(method, s), matrix=matrix)
+                for s, a, tau, p in self._each(theta)
+            ]
+        self._compiled.add((method, matrix))
+        return [tuple(map(np.array, result)) for result in results]  # copies: what JAX owns cannot be written to
+
+    def breakpoints(self) -> list[FloatArray]:
+        """For each entry of theta the nodes at which derivatives may jump: none for parameters."""
+        points = [np.zeros(0)] * len(self.problem.theta_names)
+        for mesh, where in zip(self.meshes, self.problem.unknowns.times, strict=True):
+            for place in where[where >= 0]:
+                points[place] = mesh.times
+        return points
+
+    def _each(self, theta: FloatArray) -> list[tuple[Structure, Arguments, FloatArray, FloatArray]]:
+        theta = np.asarray(theta, dtype=np.float64)
+        if self._on_device is None:
+            with float64():
+                self._on_device = jax.device_put(self.arguments)
+        return [
+            (structure, arguments, *self.problem.vectors(theta, e))
+            for e, (structure, arguments) in enumerate(zip(self.problem.structures, self._on_device, strict=True))
+        ]
+
+
+def evaluator_of(problem: Problem) -> Evaluator:
+    """The problem's own evaluator, its meshes refined at the initial guess; made once and kept with the problem."""
+    if "evaluator" not in problem.__dict__:
+        object.__setattr__(problem, "evaluator", Evaluator(problem))
+    own: Evaluator = problem.__dict__["evaluator"]
+    return own
+
+
+def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method = "auto") -> Evaluation:
+    """Cost, exact gradient and exact Hessian of a problem.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : (d,) array_like, optional
+        In the order of ``problem.theta_names``; the initial guess if left out.
+    method : {"auto", "forward", "discrete-adjoint", "adjoint", "autodiff"}
+        "forward" and "discrete-adjoint" are exact for the discretised cost, second order forward and backward, in JAX.
+        "auto" is the latter in machine code of its own, which takes a tenth of the time, and in JAX where a function
+        of the model cannot be written as a straight line of scalars, or steps are implicit. "adjoint" evaluates the
+        paper's equations (6)-(17), which agree with them to the integration error. "autodiff" leaves everything to
+        JAX; slow, an independent check.
+
+    Returns
+    -------
+    Evaluation
+        cost, gradient (d,), hessian (d, d).
+
+    Raises
+    ------
+    ValueError
+        For a theta of the wrong shape or with transition times out of order, or an unknown method.
+    TypeError
+        If an argument is of the wrong type.
+
+    Notes
+    -----
+    The mesh is refined once, at the initial guess, so that J is one smooth function of theta. Where a transition
+    time sits exactly on a sample time the derivatives are those for increasing it.
+    """
+    as_instance(problem, "problem", Problem, "an sf.Problem")
+    method = as_choice(method, "method", METHODS)
+    return evaluator_of(problem)(problem.checked_theta(theta), method=method)
+
+
+def _resolve(method: Method, structure: Structure) -> Method:
+    if method != "auto":
+        return method
+    return "forward" if structure.N + structure.M <= FORWARD_UP_TO else "discrete-adjoint"
+
+
+@partial(jax.jit, static_argnames=("structure", "method", "matrix"))
+def derivatives(
+    arguments: Arguments,
+    tau: jax.Array,
+    p: jax.Array,
+    side: jax.Array,
+    *,
+    structure: Structure,
+    method: Method,
+    matrix: Matrix = "exact",
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Cost, gradient (D,) and Hessian (D, D) of one experiment in its N transition times and its p (M,), traced."""
+    model = Model(structure, arguments)
+    if method == "adjoint":
+        return paper_derivatives(model, tau, p, side)
+    if method == "autodiff":
+        return _autodiff(model, tau, p, side)
+    first = first_order(model, tau, p, side)
+    if matrix == "none":
+        return first.cost, first.gradient, jnp.full((first.gradient.size, first.gradient.size), jnp.nan)
+    if matrix == "gauss-newton":
+        return first.cost, first.gradient, gauss_newton_hessian(model, first, p)
+    second = forward_hessian if method == "forward" else adjoint_hessian
+    return first.cost, first.gradient, second(model, first, tau, p)
+
+
+@partial(jax.jit, static_argnames=("structure",))
+def constrained_derivatives(
+    arguments: Arguments,
+    tau: jax.Array,
+    p: jax.Array,
+    side: jax.Array,
+    multipliers: jax.Array,
+    penalty: jax.Array,
+    *,
+    structure: Structure,
+) -> tuple[jax.Array, ...]:
+    """Cost, gradient; augmented Lagrangian, its gradient and Hessian; constraints (m,), their derivatives (m, D)."""
+    model = Model(structure, arguments)
+    first = first_order(model, tau, p, side)
+    L, L_d, weights, c, A = augmented(model, first, tau, p, multipliers, penalty)
+    H = adjoint_hessian(model, first, tau, p, weights) + (A.T * penalty) @ A
+    return first.cost, first.gradient, L, L_d, H, c, A
+
+
+def _autodiff(model: Model, tau: jax.Array, p: jax.Array, side: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """J and its derivatives by JAX alone, forward over forward."""
+    N = model.structure.N
+
+    def cost(theta: jax.Array) -> jax.Array:
+        path = propagate(model, theta[:N], theta[N:], side)
+        return path_cost(model, path, theta[N:])
+
+    theta = jnp.concatenate([tau, p])
+    return cost(theta), jax.jacfwd(cost)(theta), jax.jacfwd(jax.jacfwd(cost))(theta)

@@ -1,0 +1,121 @@
+"""Switches hidden inside a function: a parameter that changes the cost while its derivative is zero everywhere.
+
+``jnp.where(t < p["t_on"], a, b)`` makes the cost jump, from one step of the integrator to the next, as ``t_on`` passes;
+between the jumps it is constant, and so the derivative, which is right, says nothing. An optimiser would leave such a
+parameter where it is, without a word. Where the parameter has another effect besides, its derivative is that effect's
+alone: the optimiser then walks until a jump stands in its way. Jumps are looked for where a line search has failed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from switchfit.fit.evaluator import Evaluator
+from switchfit.optimize.diagnosis import Finding, find_jump
+from switchfit.problem.data import FloatArray
+
+CHANGES = (1e-3, 1e-2, 0.1, 0.5, -1e-3, -1e-2, -0.1, -0.5)
+"""Parts of a parameter, or of the range between its bounds where it is 0, by which it is changed."""
+
+CHANGED = 1e-9
+"""Part of the cost that is no rounding."""
+
+
+def refuse_hidden_switches(evaluator: Evaluator, theta: FloatArray, gradient: FloatArray) -> None:
+    """ValueError for a parameter whose derivative is exactly 0 although the cost depends on it.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    theta : (d,)
+    gradient : (d,)
+        At theta. Nothing is evaluated where no entry is 0.
+    """
+    unknowns = evaluator.problem.unknowns
+    is_time = np.isin(np.arange(len(theta)), np.concatenate([*unknowns.times, np.zeros(0)]))
+    suspects = np.flatnonzero((gradient == 0.0) & ~is_time)
+    if not suspects.size:
+        return
+    base = evaluator(theta, matrix="none").cost
+    hidden = [unknowns.names[i] for i in suspects if _hidden(evaluator, theta, int(i), base)]
+    if hidden:
+        raise ValueError(
+            f"the cost changes with {', '.join(hidden)}, but its derivative is zero wherever it was tried: "
+            f"{_advice(hidden[0])}"
+        )
+
+
+def refuse_jumps(evaluator: Evaluator, theta: FloatArray) -> None:
+    """ValueError for a parameter with which the cost jumps, although it has a derivative that is right in between.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    theta : (d,)
+        Where a line search has failed.
+    """
+    unknowns = evaluator.problem.unknowns
+    for span in unknowns.parameters.values():
+        for i in range(span.start, span.stop):
+            jump = _jump(evaluator, theta, i)
+            if jump is not None:
+                place, finding = jump
+                raise ValueError(
+                    f"the cost jumps from {finding.before:.8g} to {finding.after:.8g} where {unknowns.names[i]} passes "
+                    f"{place:.8g}, which its derivative knows nothing of: {_advice(unknowns.names[i])}"
+                )
+
+
+def _advice(unknown: str) -> str:
+    """What a function does with such a parameter, and what to write instead."""
+    name = unknown.partition("[")[0]
+    return (
+        f'a function decides by comparing with it, as in jnp.where(t < p["{name}"], a, b), and derivatives do not see '
+        "where such a switch happens. If it is a moment, make it a transition time: a mode for a and a mode for b, "
+        "both in mode_sequence, and its guess in transition_times; what else it does keeps a parameter of its own. "
+        "Otherwise use something smooth, or fix it."
+    )
+
+
+def _jump(evaluator: Evaluator, theta: FloatArray, i: int) -> tuple[float, Finding] | None:
+    """Where the cost jumps as unknown i changes, and from what to what; None if it was not seen to."""
+    lower, upper = evaluator.problem.unknowns.lower[i], evaluator.problem.unknowns.upper[i]
+
+    def line(value: float) -> tuple[float, float] | None:
+        moved = theta.copy()
+        moved[i] = value
+        here = evaluator(moved, matrix="none")
+        slope = float(here.gradient[i])
+        return (here.cost, slope) if np.isfinite(here.cost) and np.isfinite(slope) else None
+
+    size = abs(theta[i]) or (upper - lower if np.isfinite(upper - lower) else 1.0)
+    here = line(float(theta[i]))
+    for change in CHANGES:
+        end = float(np.clip(theta[i] + change * size, lower, upper))
+        if end != theta[i] and here is not None:
+            low, high = min(end, float(theta[i])), max(end, float(theta[i]))
+            there = line(end)
+            # Measured by the larger of the two: where the fit is perfect, J itself is rounding.
+            noise = CHANGED * max(abs(here[0]), 0.0 if there is None else abs(there[0]))
+            finding = find_jump(line, low, high, noise)
+            if finding is not None:
+                return finding.at, finding
+    return None
+
+
+def _hidden(evaluator: Evaluator, theta: FloatArray, i: int, base: float) -> bool:
+    """Whether the cost differs where unknown i is changed, its derivative being 0 there too."""
+    unknowns = evaluator.problem.unknowns
+    lower, upper = unknowns.lower[i], unknowns.upper[i]
+    size = abs(theta[i]) or (upper - lower if np.isfinite(upper - lower) else 1.0)
+    differs = False
+    for change in CHANGES:
+        moved = theta.copy()
+        moved[i] = np.clip(theta[i] + change * size, lower, upper)
+        there = evaluator(moved, matrix="none")
+        if not np.isfinite(there.cost):
+            continue
+        if there.gradient[i] != 0.0:
+            return False
+        differs = differs or abs(there.cost - base) > CHANGED * max(abs(base), abs(there.cost))
+    return differs

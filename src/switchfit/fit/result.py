@@ -1,0 +1,442 @@
+"""The numbers of a fit: plain data that can be saved, loaded, printed and plotted without the model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal, NamedTuple
+
+import numpy as np
+import scipy.special
+from numpy.typing import NDArray
+
+from switchfit.engine.choice import Engine
+from switchfit.fit.trajectory import Comparison, Trajectory
+from switchfit.optimize import IterationRecord, Status
+from switchfit.problem.data import FloatArray
+from switchfit.problem.validation import as_choice, as_level
+
+CovarianceKind = Literal["exact", "gauss-newton"]
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """How the numbers of a fit were checked.
+
+    Attributes
+    ----------
+    optimality : float
+        KKT residual at the solution.
+    smallest_eigenvalue : float
+        Of the Hessian on the free directions; positive: the second-order sufficient condition holds. NaN if
+        nothing is free.
+    smallest_scaled_eigenvalue : float
+        The same with the unknowns scaled to unit curvature each: 1 is perfectly, 0 not at all determined.
+    condition_number : float
+        Of that scaled Hessian.
+    worst_direction : str
+        The worst-determined direction in words.
+    integration_error : float
+        Largest relative change by halving all steps of J, the guards and the terminal constraints: of J relative to J,
+        or to 1e-3 of the first J where that is more; of a constraint relative to what the
+        states make of it as they go through their ranges in the run.
+    gradient_gap, hessian_gap : float
+        Relative gap between the paper's equations (6)-(17) and the exact derivatives of the discretised cost; NaN
+        where that was not checked.
+    taylor_orders : tuple of float
+        Orders of the remainders of J, of J with its gradient and of J with its Hessian along a random direction: at
+        least 1, 2, 3 where the derivatives are right (2, 2, 3 at a minimum, where the gradient vanishes); NaN where a
+        remainder is rounding, or where that was not checked.
+    active : tuple of str
+        Constraints that hold with equality, collapsed modes and bounds among them, and kinks.
+    failures : tuple of str
+        What of all this is not as it has to be; nothing: the certificate is good.
+    integration_error_of : str
+        The output that has the `integration_error`: "J", or the name of a guard or terminal constraint.
+    """
+
+    optimality: float
+    smallest_eigenvalue: float
+    smallest_scaled_eigenvalue: float
+    condition_number: float
+    worst_direction: str
+    integration_error: float
+    gradient_gap: float
+    hessian_gap: float
+    taylor_orders: tuple[float, ...]
+    active: tuple[str, ...]
+    failures: tuple[str, ...]
+    integration_error_of: str = "J"
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing that was checked failed."""
+        return not self.failures
+
+    def __str__(self) -> str:
+        rows = [
+            ("KKT residual", f"{self.optimality:.2e}"),
+            ("smallest Hessian eigenvalue, free directions", f"{self.smallest_eigenvalue:.4g}"),
+            ("  with unknowns scaled to unit curvature", f"{self.smallest_scaled_eigenvalue:.4g}"),
+            ("  condition number of that", f"{self.condition_number:.3g}"),
+            ("  worst-determined direction", self.worst_direction),
+            ("largest integration error, relative", f"{self.integration_error:.1e} ({self.integration_error_of})"),
+            ("paper's gradient against discretised, relative", _gap(self.gradient_gap)),
+            ("paper's Hessian against discretised, relative", _gap(self.hessian_gap)),
+            ("Taylor orders of J, with gradient, with Hessian", _orders(self.taylor_orders)),
+            ("active constraints", "; ".join(self.active) or "none"),
+            ("verdict", f"FAILED: {'; '.join(self.failures)}" if self.failures else "passed"),
+        ]
+        return "\n".join(f"{label:<48} {value}" for label, value in rows)
+
+
+def _gap(gap: float) -> str:
+    return "not checked" if np.isnan(gap) else f"{gap:.1e}"
+
+
+def _orders(orders: tuple[float, ...]) -> str:
+    if np.isnan(orders).all():
+        return "not checked"
+    return ", ".join("rounding" if np.isnan(order) else f"{order:.2f}" for order in orders)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What an estimation found; d unknowns in the order of `theta_names`.
+
+    Attributes
+    ----------
+    theta_names, theta_units : tuple of str
+    initial_theta, theta, lower, upper : (d,)
+    transition_times : tuple of (N,) arrays, one an experiment, fixed ones included
+    parameters : dict of name -> array, fixed ones included
+    cost : float
+    gradient, hessian : (d,), (d, d), exact at theta
+    optimality : float
+        KKT residual; the norm of the gradient where no constraint is active.
+    iterations, evaluations : int
+    status : Status
+    message : str
+        The status as a sentence with what to do.
+    history : tuple of IterationRecord
+    active : tuple of str
+        Constraints that hold with equality.
+    kinks : tuple of (name, left derivative, right derivative)
+        Unknowns that ended where the derivative jumps through zero.
+    free_basis : (d, k)
+        Orthonormal basis of the directions that constraints and kinks leave free.
+    trajectories : tuple of Trajectory, one an experiment
+    comparisons : tuple of tuples of Comparison, one tuple an experiment
+    sigma_known : bool or None
+        Whether the noise of the measurements is known; None where the cost has no noise model.
+    integration_error : float
+        Largest relative change by halving all steps of J, the guards and the terminal constraints; see
+        `Certificate.integration_error`.
+    hessian_kind : str
+    tolerance : float
+    seconds : float
+        Wall time of the estimation, in seconds whatever the unit of the experiments' times is.
+    constraints : tuple of (name, value, multiplier)
+        Guards and terminal constraints. With them the Hessian is that of J plus multipliers times constraints.
+    saved_gauss_newton : (d, d) or None
+        The Gauss-Newton matrix of the samples, where it has been evaluated.
+    priors : dict of name -> str
+        The prior of each unknown that has one, in words.
+    log_scaled : tuple of str
+        Unknowns that were estimated on a logarithmic scale.
+    least_squares : bool
+        Whether what measurements and priors add to J is half a sum of squares: no sigma is a parameter, no loss robust.
+    engine : Engine or None
+        What evaluated cost and derivatives: machine code, or JAX and why. None where that is not known.
+    integration_error_of : str
+        The output that has the `integration_error`: "J", or the name of a guard or terminal constraint.
+    idle : tuple of str
+        Unknowns on which J does not depend because modes have collapsed: the transition times of a mode of no duration
+        between two stretches of the same mode, and parameters that act in collapsed modes alone. Their values say
+        nothing, and they are not in `free_basis`.
+    """
+
+    theta_names: tuple[str, ...]
+    theta_units: tuple[str, ...]
+    initial_theta: FloatArray
+    theta: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    transition_times: tuple[FloatArray, ...]
+    parameters: Mapping[str, FloatArray]
+    cost: float
+    gradient: FloatArray
+    hessian: FloatArray
+    optimality: float
+    iterations: int
+    evaluations: int
+    status: Status
+    message: str
+    history: tuple[IterationRecord, ...]
+    active: tuple[str, ...]
+    kinks: tuple[tuple[str, float, float], ...]
+    free_basis: FloatArray
+    trajectories: tuple[Trajectory, ...]
+    comparisons: tuple[tuple[Comparison, ...], ...]
+    sigma_known: bool | None
+    integration_error: float
+    hessian_kind: str
+    tolerance: float
+    seconds: float
+    constraints: tuple[tuple[str, float, float], ...] = ()
+    saved_gauss_newton: FloatArray | None = None
+    priors: Mapping[str, str] = field(default_factory=dict)
+    log_scaled: tuple[str, ...] = ()
+    least_squares: bool = True
+    engine: Engine | None = None
+    integration_error_of: str = "J"
+    idle: tuple[str, ...] = ()
+
+    @property
+    def success(self) -> bool:
+        """Whether the fit converged; with `Status.SINGULAR` to a point from which J is flat in some direction.
+
+        With `Status.COLLAPSED` J is flat in nothing but what a mode of no duration leaves undetermined.
+        """
+        return self.status.converged
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The fitted trajectory of the only experiment; with several use `trajectories`."""
+        if len(self.trajectories) > 1:
+            raise ValueError(f"There are {len(self.trajectories)} experiments: use .trajectories[e].")
+        return self.trajectories[0]
+
+    @property
+    def initial_state(self) -> tuple[FloatArray, ...]:
+        """The state at t0 of each experiment, its estimated entries and those that are known: (n,) arrays."""
+        return tuple(trajectory.states[0] for trajectory in self.trajectories)
+
+    @property
+    def samples(self) -> int:
+        """Number of measured values that are not missing."""
+        return sum(int(np.isfinite(c.measured).sum()) for run in self.comparisons for c in run if _discrete(c))
+
+    @property
+    def residual_variance(self) -> float:
+        """``2 J / (samples + priors - free unknowns)``: near 1 where sigma is right.
+
+        NaN without measurements, and where J is no sum of squares (`least_squares`).
+        """
+        freedom = self.freedom
+        judged = self.sigma_known is not None and self.least_squares and freedom > 0
+        return 2 * self.cost / freedom if judged else np.nan
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom: measured values, and priors, which count as such, less free unknowns."""
+        return self.samples + len(self.priors) - self.free_basis.shape[1]
+
+    @property
+    def gauss_newton(self) -> FloatArray | None:
+        """The Gauss-Newton matrix of the samples and priors: (d, d); None where it is not known."""
+        return self.saved_gauss_newton
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance of theta from the exact Hessian on the free directions: (d, d).
+
+        ``Z (Z' H Z)^-1 Z'``, times the residual variance where sigma is unknown. With priors it is the covariance of
+        the posterior (Laplace's approximation); with a robust loss, that of noise whose negative log-likelihood the
+        loss is; a sigma that is a parameter is an unknown like others. An unknown held by a bound, a
+        collapsed mode or a kink has variance 0 here. NaN where the cost has no noise model (anything but
+        `Measurements`), the Hessian is not positive definite, or there are too few samples.
+        """
+        return self.covariance_from("exact")
+
+    def covariance_from(self, hessian: CovarianceKind) -> FloatArray:
+        """Covariance of theta from the exact Hessian or from the Gauss-Newton matrix: (d, d).
+
+        Parameters
+        ----------
+        hessian : {"exact", "gauss-newton"}
+            "exact", the observed information, is what `covariance` and everything else here uses. The Gauss-Newton
+            matrix, the expected information, leaves ``sum r D^2 h / sigma^2`` out: it is positive semi-definite
+            whatever the residuals are, and sees the model as linear.
+
+        Raises
+        ------
+        ValueError
+            For another kind, or where the Gauss-Newton matrix is not known: the cost is not made of Measurements
+            alone, or the estimate was loaded without its problem from a file that lacks it.
+        """
+        hessian = as_choice(hessian, "hessian", ("exact", "gauss-newton"))
+        matrix = self.hessian if hessian == "exact" else self.gauss_newton
+        if matrix is None:
+            raise ValueError(
+                "The Gauss-Newton matrix of this fit is not known: it needs a cost made of Measurements alone, and the "
+                "problem. Take hessian='exact'."
+            )
+        scale = self.residual_variance if self.sigma_known is False else 1.0
+        return (np.nan if self.sigma_known is None else scale) * inverse_on(self.free_basis, matrix)
+
+    @property
+    def standard_errors(self) -> FloatArray:
+        """Square roots of the variances: (d,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def correlation(self) -> FloatArray:
+        """Correlation matrix of theta: (d, d); NaN for unknowns that are held."""
+        return correlation_of(self.covariance)
+
+    def quantile(self, level: float) -> float:
+        """Two-sided quantile: of Student's t where sigma is unknown, of the normal distribution where it is known."""
+        level = as_level(level)
+        tail = 0.5 + level / 2
+        freedom = max(self.freedom, 1)
+        return float(scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail))
+
+    def confidence_intervals(self, level: float = 0.95, *, hessian: CovarianceKind = "exact") -> FloatArray:
+        """Intervals theta +- quantile x standard error, cut off at the bounds: (d, 2).
+
+        Of unknowns on a logarithmic scale theta times or by exp(quantile x relative standard error).
+        NaN for an unknown that is held by a bound, a collapsed mode or a kink: the quadratic approximation knows no
+        interval there. `profile` does.
+
+        Parameters
+        ----------
+        level : float, between 0 and 1
+            The quantile is of Student's t where sigma is unknown, of the normal distribution where it is known.
+        hessian : {"exact", "gauss-newton"}
+            As of `covariance_from`.
+        """
+        half = self.quantile(level) * np.sqrt(np.diag(self.covariance_from(hessian)))
+        log = np.isin(self.theta_names, self.log_scaled)
+        low, high = interval(self.theta, np.where(half > 0, half, np.nan), log).T
+        return np.stack([np.maximum(low, self.lower), np.minimum(high, self.upper)], axis=1)
+
+
+def correlation_of(covariance: FloatArray) -> FloatArray:
+    """Correlations (d, d) from covariances; NaN where a variance is 0."""
+    errors = np.sqrt(np.diag(covariance))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(covariance / np.outer(errors, errors))
+
+
+class Disagreement(NamedTuple):
+    """How far the standard errors from the exact Hessian and from the Gauss-Newton matrix lie apart.
+
+    Attributes
+    ----------
+    factor : float
+        Largest ratio of the two, one way or the other, of any linear combination of the unknowns.
+    name : str
+        The unknown whose own standard errors differ the most.
+    exact, gauss_newton : float
+        Its standard errors.
+    """
+
+    factor: float
+    name: str
+    exact: float
+    gauss_newton: float
+
+
+def disagreement(fit: Fit) -> Disagreement | None:
+    """Compare the two covariances of a fit; None where one of them is not known.
+
+    The ratios of the two variances over all linear combinations of the unknowns lie between the smallest and the
+    largest eigenvalue of ``A v = lambda H v`` on the free directions, A being the Gauss-Newton matrix.
+    """
+    Z, A = fit.free_basis, fit.gauss_newton
+    if A is None or fit.sigma_known is None or Z.shape[1] == 0:
+        return None
+    both = fit.covariance, fit.covariance_from("gauss-newton")
+    if not all(np.isfinite(covariance).all() for covariance in both):
+        return None
+    errors = np.sqrt([np.diag(covariance) for covariance in both])
+    size = 1 / np.sqrt(np.diag(Z.T @ fit.hessian @ Z))
+    root = np.linalg.cholesky((Z.T @ fit.hessian @ Z) * np.outer(size, size))
+    half = np.linalg.solve(root, (Z.T @ A @ Z) * np.outer(size, size))
+    ratios = np.linalg.eigvalsh(np.linalg.solve(root, half.T))
+    held = errors[0] <= 0
+    changes = np.where(held, 0.0, np.abs(np.log(np.where(held, 1.0, errors[0]) / np.where(held, 1.0, errors[1]))))
+    k = int(np.argmax(changes))
+    factor = float(np.sqrt(max(ratios[-1], 1 / ratios[0])))
+    return Disagreement(factor, fit.theta_names[k], float(errors[0][k]), float(errors[1][k]))
+
+
+def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_]) -> FloatArray:
+    """``theta -+ half``, or where `log` ``theta exp(-+ half / theta)``: (..., 2)."""
+    size = np.where(log, theta, 1.0)
+    factor = np.exp(np.where(log, half / size, 0.0))
+    return np.stack([np.where(log, theta / factor, theta - half), np.where(log, theta * factor, theta + half)], axis=-1)
+
+
+def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:
+    """``Z (Z' H Z)^-1 Z'``: (d, d); NaN where H is not finite, or not positive definite on the directions Z (d, k)."""
+    nothing = np.full(hessian.shape, np.nan)
+    if not np.isfinite(hessian).all():
+        return nothing
+    reduced = Z.T @ hessian @ Z
+    size = 1 / np.sqrt(np.maximum(np.abs(np.diag(reduced)), np.finfo(float).tiny))
+    with np.errstate(over="ignore", invalid="ignore"):
+        scaled = reduced * np.outer(size, size)
+    if not np.isfinite(scaled).all():  # numbers near the limits of float64
+        return nothing
+    values, vectors = np.linalg.eigh(scaled)
+    if len(values) and values[0] <= 1e-14:
+        return nothing
+    root = Z @ (size[:, None] * vectors / np.sqrt(values))
+    return np.asarray(root @ root.T)
+
+
+class FreeCurvature(NamedTuple):
+    """The Hessian on the directions that constraints and kinks leave free.
+
+    Attributes
+    ----------
+    smallest : float
+        Its smallest eigenvalue; NaN if nothing is free.
+    scaled : (k,)
+        Eigenvalues, ascending, with the unknowns scaled to unit curvature each.
+    weakest : tuple of str
+        The unknowns that the direction of the smallest of them mostly consists of.
+    """
+
+    smallest: float
+    scaled: FloatArray
+    weakest: tuple[str, ...]
+
+
+def free_curvature(fit: Fit) -> FreeCurvature:
+    """How well a fit's unknowns are determined, from its exact Hessian."""
+    Z = fit.free_basis
+    if Z.shape[1] == 0 or not np.isfinite(fit.hessian).all():
+        return FreeCurvature(np.nan, np.zeros(0), ())
+    spectrum = scaled_spectrum(fit.hessian, Z)
+    weight = np.abs(spectrum.vectors[:, 0])
+    strong = [i for i in np.argsort(-weight, kind="stable") if weight[i] > 0.3 * weight.max()][:4]
+    smallest = float(np.linalg.eigvalsh(Z.T @ fit.hessian @ Z)[0])
+    return FreeCurvature(smallest, spectrum.values, tuple(fit.theta_names[i] for i in strong))
+
+
+class ScaledSpectrum(NamedTuple):
+    """Eigenvalues (k,), ascending, and eigenvectors (d, k) of a Hessian scaled to unit curvature of each unknown.
+
+    `size` (d,) is the scaling: an eigenvector times it is a direction in theta.
+    """
+
+    values: FloatArray
+    vectors: FloatArray
+    size: FloatArray
+
+
+def scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> ScaledSpectrum:
+    """Of a finite Hessian (d, d) on the directions Z (d, k)."""
+    diagonal = np.abs(np.diag(hessian))
+    size = 1 / np.sqrt(np.where(diagonal > np.finfo(float).tiny, diagonal, 1.0))
+    basis = np.linalg.qr(Z / size[:, None])[0]
+    values, vectors = np.linalg.eigh(basis.T @ (hessian * np.outer(size, size)) @ basis)
+    return ScaledSpectrum(values, basis @ vectors, size)
+
+
+def _discrete(comparison: Comparison) -> bool:
+    return comparison.kind == "measurements"

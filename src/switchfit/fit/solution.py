@@ -1,0 +1,193 @@
+"""One run of the optimiser on a problem whose meshes are given: what fits, profiles and many fits have in common."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.fit.collapsed import idle_unknowns
+from switchfit.fit.evaluator import ArrowEvaluation, Evaluation, Evaluator
+from switchfit.fit.hidden import refuse_hidden_switches, refuse_jumps
+from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
+from switchfit.optimize.arrow import Arrow
+from switchfit.optimize.sqp import HessianKind
+from switchfit.problem.data import FloatArray, Measurements, TerminalConstraint
+from switchfit.problem.problem import Problem
+from switchfit.problem.variables import Variables
+
+MANY_RUNS = 16
+"""Experiments from which on the Hessian's shape of an arrow is made use of; with fewer, the algebra of full matrices
+takes no longer (the runs part of the benchmarks)."""
+
+
+@dataclass(frozen=True, eq=False)
+class CostAndGradient:
+    """All that steepest descent is given."""
+
+    cost: float
+    gradient: FloatArray
+    hessian: None = None
+
+
+def constraints_of(problem: Problem) -> LinearConstraints:
+    """Ordering, minimum durations and bounds of a problem as the optimiser takes them."""
+    unknowns = problem.unknowns
+    names = [
+        *unknowns.constraint_names,
+        *(f"{name} at its lower bound {value:g}" for name, value in zip(unknowns.names, unknowns.lower, strict=True)),
+        *(f"{name} at its upper bound {value:g}" for name, value in zip(unknowns.names, unknowns.upper, strict=True)),
+    ]
+    return LinearConstraints(unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, tuple(names))
+
+
+def minimized(
+    evaluator: Evaluator,
+    theta: Any,
+    hessian: HessianKind,
+    tolerance: float,
+    max_iterations: int,
+    callback: Callable[[IterationRecord], object] | None = None,
+    constraints: LinearConstraints | None = None,
+    by_blocks: bool | None = None,
+) -> Result:
+    """One run of the optimiser on the evaluator's meshes; arguments as of `estimate`.
+
+    The problem's own constraints hold unless others are given. `by_blocks` says whether to use the shape that the
+    Hessian of several runs has; left out, where it pays.
+    """
+    problem = evaluator.problem
+
+    unknowns = problem.unknowns
+    matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
+    if by_blocks is None:
+        by_blocks = len(problem.experiments) >= MANY_RUNS and 2 * len(evaluator.layout.shared) < len(theta)
+    variables = unknowns.variables
+    constraints = constraints_of(problem) if constraints is None else constraints
+    identity = variables.identity
+    seen: list[bool] = []
+
+    def evaluate_theta(theta: Any, side: int) -> Evaluation | ArrowEvaluation | CostAndGradient:
+        if hessian not in ("none", "descent-first") and by_blocks:
+            return evaluator.arrow(theta, side, matrix)
+        here = evaluator(theta, side, matrix=matrix)
+        return CostAndGradient(here.cost, here.gradient) if hessian == "none" else here
+
+    def evaluate(z: Any, side: int) -> Any:
+        theta = z if identity else _outward(variables, constraints, z)
+        here = evaluate_theta(theta, side)
+        if not seen:
+            seen.append(True)
+            refuse_hidden_switches(evaluator, theta, here.gradient)
+        return here if identity else _inward(variables, theta, here)
+
+    def idle(z: FloatArray, everything: bool) -> NDArray[np.bool_]:
+        return idle_unknowns(evaluator, z if identity else _outward(variables, constraints, z), everything)
+
+    is_time = np.zeros(len(theta), dtype=int)
+    for where in problem.unknowns.times:
+        is_time[where[where >= 0]] = 1
+    told = callback
+    if callback is not None and not identity:
+        told = lambda record: callback(_told(variables, constraints, record))  # noqa: E731
+    result = minimize(
+        evaluate,
+        theta if identity else variables.inward(np.asarray(theta)),
+        constraints=constraints if identity else _constraints_inward(variables, constraints),
+        breakpoints=evaluator.breakpoints(),
+        hessian=hessian,
+        blocks=is_time,
+        tolerance=tolerance,
+        max_iterations=max_iterations,
+        callback=told,
+        size=problem.sizes if identity else variables.sizes_inward(problem.sizes),
+        idle=idle,
+    )
+    if result.status is Status.LINE_SEARCH_FAILED:
+        refuse_jumps(evaluator, result.theta if identity else _outward(variables, constraints, result.theta))
+    return result if identity else _result_outward(variables, constraints, result)
+
+
+def _outward(variables: Variables, constraints: LinearConstraints, z: FloatArray) -> FloatArray:
+    """theta at z, inside its bounds whatever the rounding."""
+    return np.asarray(np.clip(variables.outward(z), constraints.lower, constraints.upper))
+
+
+def _inward(variables: Variables, theta: FloatArray, here: Any) -> Any:
+    """An evaluation at theta as one of the optimiser's variables."""
+    if here.hessian is None:
+        return CostAndGradient(here.cost, variables.slopes(theta)[0] * here.gradient)
+    if isinstance(here.hessian, Arrow):
+        D, E = variables.slopes(theta)
+        hessian = here.hessian.scaled(1.0 / D).plus_diagonal(E * here.gradient)
+        return ArrowEvaluation(here.cost, D * here.gradient, hessian)
+    return Evaluation(here.cost, *variables.derivatives_inward(theta, here.gradient, here.hessian))
+
+
+def _constraints_inward(variables: Variables, constraints: LinearConstraints) -> LinearConstraints:
+    """Bounds of the optimiser's variables; the rows join transition times alone, which are not changed."""
+    lower, upper = variables.inward(constraints.lower), variables.inward(constraints.upper)
+    return replace(constraints, lower=lower, upper=upper)
+
+
+def _told(variables: Variables, constraints: LinearConstraints, record: IterationRecord) -> IterationRecord:
+    """A record of the optimiser's with theta in place of its own variables."""
+    return replace(record, theta=_outward(variables, constraints, record.theta))
+
+
+def _result_outward(variables: Variables, constraints: LinearConstraints, result: Result) -> Result:
+    """The optimiser's result in theta; its optimality and its eigenvalues stay those of its own variables."""
+    theta = _outward(variables, constraints, result.theta)
+    gradient, hessian = variables.derivatives_outward(theta, result.gradient, result.hessian)
+    history = tuple(_told(variables, constraints, record) for record in result.history)
+    return replace(result, theta=theta, gradient=gradient, hessian=hessian, history=history)
+
+
+def message_of(result: Result, problem: Problem) -> str:
+    """The optimiser's message with the unknowns called by their names, and what a delay may have to do with it."""
+    names = problem.unknowns.names
+    message = re.sub(r"theta\[(\d+)\]", lambda match: names[int(match.group(1))], result.message)
+    data = [item for run in problem.experiments for item in run.data]
+    if result.status is Status.LINE_SEARCH_FAILED and any(isinstance(getattr(d, "delay", None), str) for d in data):
+        message += (
+            " A delay is estimated here: J has a kink where a transition meets the moment of which a late sample "
+            "is, and the fit may have ended at one. Fix the delay at its estimate to see."
+        )
+    return message
+
+
+def smallest_cost(problem: Problem) -> float:
+    """A cost below which an error is not measured against it.
+
+    The negative logarithm of a likelihood may be anything, 0 too; its parts are of the size of half the samples.
+    """
+    items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
+    return 1e-300 if least_squares(problem) else 0.5 * sum(item.count for item in items)
+
+
+def least_squares(problem: Problem) -> bool:
+    """Whether J is half a sum of squares: no loss is robust, no sigma a parameter."""
+    items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
+    return not any(item.sigma_names or item.loss != "linear" for item in items)
+
+
+def plain(problem: Problem) -> bool:
+    """Whether J is half a sum of squares of the samples alone, each of the moment at which it was taken."""
+    items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
+    delayed = any(isinstance(item.delay, str) for item in items)
+    return least_squares(problem) and not problem.unknowns.priors.any and not delayed
+
+
+def sigma_known(problem: Problem) -> bool | None:
+    """Whether sigma is known for all measurements, as a number or as a parameter beside the others.
+
+    None where the cost is not made of measurements alone.
+    """
+    items = [item for run in problem.experiments for item in run.data if not isinstance(item, TerminalConstraint)]
+    if not items or not all(isinstance(item, Measurements) for item in items):
+        return None
+    return all(item.sigma is not None for item in items)

@@ -1,0 +1,598 @@
+r"""The paper's derivatives, equations (6)-(17): optimise, then discretise.
+
+Reference: L. M. Miller and T. D. Murphey, sections III and IV. Equation numbers at the lines are the paper's, and so
+are the names: ``f``, ``X`` (the jump X^i of the vector field), ``psi``, ``Omega``, ``Omega_p``, ``Phi``, ``Dp_x``,
+``X_ii``, ``X_ij``, ``X_taup``; ``D1`` is the derivative in x, ``D2`` that in t, ``Dp`` that in p; ``f_im1`` is f_{i-1}.
+The paper has J = int ell(t, x) dt and a continuous x. The formulas here are extended as follows, and reduce to the
+paper's where an extension is absent. Misprints of the paper are corrected, and named where that happens.
+
+**Costs.** ell(t, x, p) may depend on p, which adds D_p ell to (9), D_pD_1 ell to (15) and the derivatives of D_p ell to
+(14). A sample ell_k(x(t_k), p) makes the adjoints jump, and the terminal cost phi(x, p) is where they start:
+
+    psi- = psi+ + D ell_k,    Omega- = Omega+ + D^2 ell_k,    Omega_p- = Omega_p+ + D^2 ell_k D_p x + D_pD_1 ell_k.
+
+**Initial state.** x(t0) = x0(p): D_p x starts at D_p x0; (9) gains psi D_p x0, (14) D_p x0' Omega_p + psi . D_p^2 x0.
+
+**Reset maps.** x(tau_i+) = R(tau_i, x(tau_i-), p). At the same end of mode i - 1 define
+
+    F_{i-1}(t, x, p) = D_t R + D_x R f_{i-1}(t, x, p)              the velocity f_{i-1} carried through R,
+    Lambda(t, x, p)  = ell(t, x, p) - ell(t, R(t, x, p), p)        the jump of ell, 0 without a reset map,
+
+so that x(tau_i+) moves with F_{i-1} as tau_i moves, and X^i = F_{i-1}(x-) - f_i(x+). With V the cost to go of mode i,
+psi = D_x V and D_t V + ell + psi f_i = 0, the derivative of ``V(tau, R(tau, x-, p), p)`` and of the cost up to tau is
+
+    D_{tau_i} J = Lambda + psi(tau_i+) X^i.
+
+Its total derivatives give the second order. They use that psi(tau_i+) changes with tau_i by psi_dot + X^i' Omega,
+psi_dot being (7) (the paper's step from (6) to (11)), with tau_j, j < i, by Omega D_x R Phi X^j, and with p by Omega_p:
+
+    i = j :  D_2 Lambda + D_1 Lambda f_{i-1} - D ell X^i + psi X^{ii} + X^i' Omega X^i,
+             X^{ii} = D_1 f_i f_i + D_1 F_{i-1} f_{i-1} - 2 D_1 f_i F_{i-1} + D_2 F_{i-1} - D_2 f_i
+    i > j :  (D_1 Lambda + psi [D_1 F_{i-1} - D_1 f_i D_x R] + X^i' Omega D_x R) Phi(tau_i-, tau_j) X^j
+    tau, p:  D_1 Lambda D_p x- + D_p Lambda + psi X^{tau,p} + X^i' Omega_p,
+             X^{tau,p} = D_1 F_{i-1} D_p x- - D_1 f_i D_p x+ + D_p F_{i-1} - D_p f_i
+    p, p  :  D_p R' Omega_p + psi . [D_p^2 R + D_1 D_p R D_p x-]  at each transition, added to (14).
+
+All of f_i, D ell, psi, Omega, Omega_p are at (tau_i, x(tau_i+)). Thus (11), (13), (16) and (17) hold as they are
+printed once f_{i-1} is read as F_{i-1}. Through the map itself
+
+    D_p x+ = D_x R D_p x- + D_p R,      psi- = psi+ D_x R,      Omega- = D_x R' Omega+ D_x R + psi+ . D_x^2 R,
+    Omega_p- = D_x R' Omega_p+ + psi+ . [D_x^2 R D_p x- + D_p D_x R],      and (9) gains psi+ D_p R.
+
+**Integration.** Forward and backward with the same Runge-Kutta method over the same rows of the mesh. In the backward
+sweep x(t) comes from quintic Hermite interpolation, since integrating x backward would blow up stiff modes.
+The result differs from the derivatives of the discretised cost (`switchfit.engine.jax.second_order`), which the
+optimiser uses, by the integrator's error; that the gap closes at the integrator's order is what this module is for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.flatten_util import ravel_pytree
+
+from switchfit.discretization.mesh import row_ending_cell
+from switchfit.discretization.model import Model, Piece
+from switchfit.discretization.propagation import Path, at_cells, by_mode, path_cost, propagate
+from switchfit.discretization.tableaus import STIFF, Field, Tableau, combine
+from switchfit.engine.jax.late_samples import anchors, late_state_derivatives
+
+Array = jax.Array
+
+
+class Sensitivities(NamedTuple):
+    """What the forward sweep carries beside x: Phi(t, tau_j) X^j, (n, N), and D_p x, (n, M)."""
+
+    Phi_X: Array
+    Dp_x: Array
+
+
+class Adjoints(NamedTuple):
+    """What the backward sweep carries: psi (n,), Omega (n, n) and Omega^p (n, M), one column a parameter."""
+
+    psi: Array
+    Omega: Array
+    Omega_p: Array
+
+
+class Quadratures(NamedTuple):
+    """What adds up over time: D_p J (M,), equation (9), and D_p D_p J (M, M), equation (14)."""
+
+    Dp_J: Array
+    DpDp_J: Array
+
+
+class Along(NamedTuple):
+    """Derivatives of f and ell on the trajectory at one time, beside D_p x there.
+
+    Attributes
+    ----------
+    Dp_x : (n, M)
+    D1f, Dpf : (n, n), (n, M)
+    D1D1f, DpD1f, D1Dpf, DpDpf : (n, n, n), (n, n, M), (n, M, n), (n, M, M)
+    D1ell, Dpell : (n,), (M,)
+    D1D1ell, DpD1ell, D1Dpell, DpDpell : (n, n), (n, M), (M, n), (M, M)
+    """
+
+    Dp_x: Array
+    D1f: Array
+    Dpf: Array
+    D1D1f: Array
+    DpD1f: Array
+    D1Dpf: Array
+    DpDpf: Array
+    D1ell: Array
+    Dpell: Array
+    D1D1ell: Array
+    DpD1ell: Array
+    D1Dpell: Array
+    DpDpell: Array
+
+
+class Transition(NamedTuple):
+    """Everything at one transition time tau_i that needs only x: before (x-) and after (x+) the reset map.
+
+    Attributes
+    ----------
+    X : (n,), the jump X^i
+    xdot : (n,), f_{i-1}(x-) itself
+    f_im1, D1f_im1, D2f_im1, Dpf_im1 : (n,), (n, n), (n,), (n, M)
+        f_{i-1} carried through R (F_{i-1} above; f_{i-1} itself without a reset map) and its derivatives
+    f_i, D1f_i, D2f_i, Dpf_i : the same of f_i at x+
+    Lambda, D1Lambda, D2Lambda, DpLambda : (), (n,), (), (M,), the jump of ell and its derivatives
+    Dell : (n,), D ell at x+
+    D1R, DpR : (n, n), (n, M)
+    D1D1R, DpD1R, D1DpR, DpDpR : (n, n, n), (n, n, M), (n, M, n), (n, M, M)
+    """
+
+    X: Array
+    xdot: Array
+    f_im1: Array
+    D1f_im1: Array
+    D2f_im1: Array
+    Dpf_im1: Array
+    f_i: Array
+    D1f_i: Array
+    D2f_i: Array
+    Dpf_i: Array
+    Lambda: Array
+    D1Lambda: Array
+    D2Lambda: Array
+    DpLambda: Array
+    Dell: Array
+    D1R: Array
+    DpR: Array
+    D1D1R: Array
+    DpD1R: Array
+    D1DpR: Array
+    DpDpR: Array
+
+
+def paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -> tuple[Array, Array, Array]:
+    """Cost, gradient and Hessian by the paper's adjoint equations.
+
+    Parameters
+    ----------
+    model : Model
+    tau : (N,)
+        Transition times in the experiment's time unit, not decreasing.
+    p : (M,)
+        Free parameters.
+    side : ()
+        +1 or -1: which one-sided derivative is meant where a transition time equals a node of the mesh.
+
+    Returns
+    -------
+    cost : ()
+    gradient : (N + M,)
+        D_tau J, equation (6), and D_p J, equation (9).
+    hessian : (N + M, N + M)
+        Equation (3), from (11), (14) and (16). The tau block is computed for i >= j and mirrored, the cross block
+        computed once; the p block is as (14) gives it, symmetric up to the integrator's error.
+
+    Notes
+    -----
+    With the stiff solver each row takes a dense solve of 3 (n + n^2 + n M) unknowns: a reference for small n.
+    """
+    path = propagate(model, tau, p, side)
+    transitions = [transition_at(model, path, i, tau[i], p) for i in range(model.structure.N)]
+    before, after = sensitivities(model, path, transitions, p)
+    start, opened, total = backward_sweep(model, path, transitions, Sensitivities(before.Dp_x, after.Dp_x), p)
+    total = add(total, at_initial_state(model, start, p))
+
+    D_tau_J, rows_tau = [], []
+    for i, here in enumerate(transitions):
+        opening = path.layout.first_chunk[i + 1]
+        adjoints: Adjoints = jax.tree.map(lambda a, opening=opening: a[opening], opened)
+        minus, plus = pick(after, opening - 1, -1), pick(before, opening, 0)
+        total = add(total, at_reset(here, adjoints, minus.Dp_x))
+        D_tau_J.append(here.Lambda + adjoints.psi @ here.X)  # (6), Lambda = 0 without a reset map
+        rows_tau.append(jnp.concatenate([tau_tau(i, here, adjoints, minus, plus), tau_p(here, adjoints, minus, plus)]))
+
+    gradient = jnp.concatenate([jnp.array(D_tau_J), total.Dp_J])
+    return path_cost(model, path, p), gradient, assembled(rows_tau, total.DpDp_J)
+
+
+def assembled(rows_tau: list[Array], DpDp_J: Array) -> Array:
+    """The Hessian, equation (3), from rows (N + M,) of the tau block, zero for j > i, and the p block."""
+    N, D = len(rows_tau), len(rows_tau) + DpDp_J.shape[0]
+    H = jnp.zeros((D, D)).at[N:, N:].set(DpDp_J)
+    for i, row in enumerate(rows_tau):
+        H = H.at[i, : i + 1].set(row[: i + 1]).at[: i + 1, i].set(row[: i + 1])
+        H = H.at[i, N:].set(row[N:]).at[N:, i].set(row[N:])
+    return H
+
+
+# Equations (11), (13), (16), (17), at a transition time
+
+
+def tau_tau(i: int, here: Transition, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities) -> Array:
+    """D_{tau_j} D_{tau_i} J for all j <= i, equations (11) and (13): (N,), zero for j > i."""
+    psi, Omega, _ = adjoints
+    X, xdot = here.X, here.xdot
+    f_im1, D1f_im1, D2f_im1 = here.f_im1, here.D1f_im1, here.D2f_im1
+    f_i, D1f_i, D2f_i = here.f_i, here.D1f_i, here.D2f_i
+    X_ii = D1f_i @ f_i + D1f_im1 @ xdot - 2 * D1f_i @ f_im1 + D2f_im1 - D2f_i  # (13), i = j
+    second = here.D2Lambda + here.D1Lambda @ xdot  # the jump of ell at a reset map, else 0
+    second = second - here.Dell @ X + psi @ X_ii + X @ Omega @ X  # (11), i = j
+    row = jnp.zeros(minus.Phi_X.shape[1]).at[i].set(second)
+    for j in range(i):
+        # (13), i > j. Misprint: the paper has D1 f_{i-1} at (x(tau_i), tau_j); both Jacobians are at tau_i.
+        X_ij = D1f_im1 @ minus.Phi_X[:, j] - D1f_i @ plus.Phi_X[:, j]
+        second = here.D1Lambda @ minus.Phi_X[:, j] + psi @ X_ij + X @ Omega @ plus.Phi_X[:, j]  # (11), i > j
+        row = row.at[j].set(second)
+    return row
+
+
+def tau_p(here: Transition, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities) -> Array:
+    """D_{tau_i} D_p J, equation (16): (M,)."""
+    psi, _, Omega_p = adjoints
+    X_taup = here.D1f_im1 @ minus.Dp_x - here.D1f_i @ plus.Dp_x + here.Dpf_im1 - here.Dpf_i  # (17)
+    jump = here.D1Lambda @ minus.Dp_x + here.DpLambda  # the jump of ell at a reset map, else 0
+    return jump + psi @ X_taup + here.X @ Omega_p  # (16)
+
+
+def transition_at(model: Model, path: Path, i: int, tau_i: Array, p: Array) -> Transition:
+    """The vector fields, ell and the reset map on both sides of transition i (from 0), equation (8)."""
+    opening = path.layout.first_chunk[i + 1]
+    piece: Piece = pick(path.pieces, opening, 0)
+    modes = model.structure.mode_of_segment
+    f_before, f_after, ell = model.field(modes[i], piece), model.field(modes[i + 1], piece), model.density(piece)
+    R = model.reset(i) if i in model.structure.resets else lambda t, x, p: x
+
+    def carried(t: Array, x: Array, p: Array) -> Array:
+        """F_{i-1} = D_t R + D_x R f_{i-1}, which is f_{i-1} without a reset map."""
+        direction = (jnp.ones(()), f_before(t, x, p), jnp.zeros_like(p))
+        return jax.jvp(R, (t, x, p), direction)[1]
+
+    def Lambda(t: Array, x: Array, p: Array) -> Array:
+        return ell(t, x, p) - ell(t, R(t, x, p), p)
+
+    x_minus, x_plus = path.before_transition(i), path.before[opening, 0]
+    minus, plus = (tau_i, x_minus, p), (tau_i, x_plus, p)
+    f_im1, f_i = carried(*minus), f_after(*plus)
+    D2f_im1, D1f_im1, Dpf_im1 = jax.jacfwd(carried, argnums=(0, 1, 2))(*minus)
+    D2f_i, D1f_i, Dpf_i = jax.jacfwd(f_after, argnums=(0, 1, 2))(*plus)
+    D2Lambda, D1Lambda, DpLambda = jax.grad(Lambda, argnums=(0, 1, 2))(*minus)
+    X = f_im1 - f_i  # (8)
+    D1R, DpR, *second = first_and_second(R, *minus)
+    return Transition(
+        X,
+        f_before(*minus),
+        f_im1,
+        D1f_im1,
+        D2f_im1,
+        Dpf_im1,
+        f_i,
+        D1f_i,
+        D2f_i,
+        Dpf_i,
+        Lambda(*minus),
+        D1Lambda,
+        D2Lambda,
+        DpLambda,
+        jax.grad(ell, argnums=1)(*plus),
+        D1R,
+        DpR,
+        *second,
+    )
+
+
+# The forward sweep: equation (10) and the columns of Phi
+
+
+def sensitivities(
+    model: Model, path: Path, transitions: list[Transition], p: Array
+) -> tuple[Sensitivities, Sensitivities]:
+    """Phi(t, tau_j) X^j and D_p x at the start and at the end of each row: (Q, C, n, N) and (Q, C, n, M) arrays."""
+    n, N = model.structure.n, model.structure.N
+    tableau = model.tableau
+    D1R = jnp.stack([jnp.eye(n), *(t.D1R for t in transitions)])
+    DpR = jnp.stack([jnp.zeros((n, p.shape[0])), *(t.DpR for t in transitions)])
+    X_columns = jnp.zeros((N + 1, n, N))
+    for i, here in enumerate(transitions):
+        X_columns = X_columns.at[i + 1, :, i].set(here.X)
+
+    def of_mode(mode: int) -> Callable[..., tuple[Array, Array]]:
+        def row(start: Array, end: Array, piece: Piece, states: Array) -> tuple[Array, Array]:
+            jacobians = jax.jacfwd(model.field(mode, piece), argnums=(1, 2))
+            times = start + tableau.c * (end - start)
+            return jax.vmap(lambda t, x: jacobians(t, x, p))(times, states)
+
+        return jax.vmap(row)
+
+    def rate(given: tuple[Array, Array], now: Sensitivities) -> Sensitivities:
+        D1f, Dpf = given
+        return Sensitivities(
+            D1f @ now.Phi_X,
+            D1f @ now.Dp_x + Dpf,  # (10) as a differential equation
+        )
+
+    def row(now: Sensitivities, given: Any) -> tuple[Sensitivities, tuple[Sensitivities, Sensitivities]]:
+        h, *jacobians = given
+        after = linear_step(tableau, rate, h, tuple(jacobians), now)[1]
+        return after, (now, after)
+
+    def chunk(now: Sensitivities, given: Any) -> tuple[Sensitivities, tuple[Sensitivities, Sensitivities]]:
+        segment, opens, start, end, piece, states = given
+        # The columns X^i begin at tau_i. Misprint in the display before (10): segment k integrates from tau_k, not t0.
+        jumped = Sensitivities(D1R[segment] @ now.Phi_X + X_columns[segment], D1R[segment] @ now.Dp_x + DpR[segment])
+        now = where(opens, jumped, now)
+        return lax.scan(row, now, (end - start, *by_mode(model, segment, of_mode, start, end, piece, states)))
+
+    layout = path.layout
+    first = Sensitivities(jnp.zeros((n, N)), jax.jacfwd(model.initial_state)(p))
+    given = (layout.segment, layout.opens, layout.start, layout.end, path.pieces, path.stages)
+    return lax.scan(chunk, first, given)[1]
+
+
+# The backward sweep: equations (7), (12), (15) and the integrals (9), (14)
+
+
+def adjoint_rate(d: Along, adjoints: Adjoints) -> Adjoints:
+    """Right-hand sides of the adjoint equations at one time; affine in the adjoints."""
+    psi, Omega, Omega_p = adjoints
+    psi_dot = -d.D1ell - psi @ d.D1f  # (7)
+    Omega_dot = -d.D1D1ell - contract(psi, d.D1D1f) - d.D1f.T @ Omega - Omega @ d.D1f  # (12)
+    Omega_p_dot = (
+        -d.D1D1ell @ d.Dp_x - d.DpD1ell - d.D1f.T @ Omega_p - contract(psi, d.D1D1f @ d.Dp_x + d.DpD1f)
+    )  # (15); D_pD_1 ell is ours
+    return Adjoints(psi_dot, Omega_dot, Omega_p_dot)
+
+
+def integrands(d: Along, adjoints: Adjoints) -> Quadratures:
+    """Integrands of D_p J and D_p D_p J; the terms in ell are ours. (15) is followed by a stray integral sign."""
+    psi, _, Omega_p = adjoints
+    first = psi @ d.Dpf + d.Dpell  # (9)
+    second = (
+        d.Dpf.T @ Omega_p + contract(psi, d.DpDpf) + contract(psi, d.D1Dpf @ d.Dp_x) + d.DpDpell + d.D1Dpell @ d.Dp_x
+    )  # (14)
+    return Quadratures(first, second)
+
+
+def backward_sweep(
+    model: Model, path: Path, transitions: list[Transition], Dp_x: Sensitivities, p: Array
+) -> tuple[Adjoints, Adjoints, Quadratures]:
+    """Adjoints at t0, the adjoints where each chunk opens (Q, ...; tau_i+ where it opens a segment), and (9), (14).
+
+    `Dp_x` holds D_p x at the start and at the end of each row, two (Q, C, n, M) arrays.
+    """
+    Dp_x_before, Dp_x_after = Dp_x
+    final, total = point_cost(model.terminal, path.after[-1, -1], Dp_x_after[-1, -1], p)
+    at_t0, jumps, sampled = sample_jumps(model, path, Dp_x_before, Dp_x_after, p)
+    late, sampled_late = late_jumps(model, path, Dp_x_before, p)
+    total = add(total, add(sampled, sampled_late))
+
+    def row(now: tuple[Adjoints, Quadratures], given: Any) -> tuple[tuple[Adjoints, Quadratures], None]:
+        adjoints, total = now
+        start, end, d, jump, *late = given
+        states, adjoints = linear_step(model.tableau, adjoint_rate, start - end, d, add(adjoints, jump))
+        rates = jax.vmap(integrands)(d, states)
+        b = jnp.asarray(model.tableau.b)
+        total = jax.tree.map(lambda a, r: a + (end - start) * jnp.tensordot(b, r, 1), total, rates)
+        return (add(adjoints, late[0]) if late else adjoints, total), None
+
+    def chunk(now: tuple[Adjoints, Quadratures], given: Any) -> tuple[tuple[Adjoints, Quadratures], Adjoints]:
+        segment, opens, jump, late, start, end, *trajectory = given
+        d = along_rows(model, segment, p, start, end, *trajectory)
+        (opened, total), _ = lax.scan(row, now, (start, end, d, jump, *late), reverse=True)
+        return (before_reset(transitions, segment, opens, opened, pick(Dp_minus, segment)), total), opened
+
+    layout = path.layout
+    minus = [Dp_x_after[layout.first_chunk[i + 1] - 1, -1] for i in range(len(transitions))]
+    Dp_minus = jnp.stack([jnp.zeros_like(Dp_x_before[0, 0]), *minus])
+    rows = (layout.start, layout.end, path.pieces, path.before, path.after, Dp_x_before, Dp_x_after)
+    given = (layout.segment, layout.opens, jumps, late, *rows)
+    (start, total), opened = lax.scan(chunk, (final, total), given, reverse=True)
+    return add(start, at_t0), opened, total
+
+
+def along_rows(
+    model: Model, segment: Array, p: Array, start: Array, end: Array, pieces: Piece, *values: Array
+) -> Along:
+    """`Along` at the stages of the backward sweep through a chunk of rows of one segment, (C, s, ...).
+
+    `values` are x and D_p x at the start and at the end of each row: x_k, x_{k+1}, D_p x_k, D_p x_{k+1}.
+    """
+    fractions = 1.0 - jnp.asarray(model.tableau.c)  # stage j of a row that is traversed from its end to its start
+    directions = jnp.eye(p.shape[0])
+
+    def of_mode(mode: int) -> Callable[..., tuple[Array, ...]]:
+        def row(start: Array, end: Array, piece: Piece, x_k: Array, x_k1: Array, *Dp_x: Array) -> tuple[Array, ...]:
+            f = model.field(mode, piece)
+
+            def stage(s: Array) -> tuple[Array, ...]:
+                x, linear = jax.linearize(lambda *ends: interpolated(f, s, start, end, *ends), x_k, x_k1, p)
+                columns = jax.vmap(linear, in_axes=-1, out_axes=-1)(*Dp_x, directions)
+                return x, columns, *first_and_second(f, start + s * (end - start), x, p)
+
+            return jax.vmap(stage)(fractions)
+
+        return jax.vmap(row)
+
+    def of_ell(start: Array, end: Array, piece: Piece, x: Array) -> tuple[Array, ...]:
+        times = start + fractions * (end - start)
+        return jax.vmap(lambda t, x: first_and_second(model.density(piece), t, x, p))(times, x)
+
+    x, Dp_x, *of_f = by_mode(model, segment, of_mode, start, end, pieces, *values)
+    return Along(Dp_x, *of_f, *jax.vmap(of_ell)(start, end, pieces, x))
+
+
+def interpolated(f: Field, s: Array, start: Array, end: Array, x_k: Array, x_k1: Array, p: Array) -> Array:
+    """x at ``start + s (end - start)``, s in [0, 1], by quintic Hermite interpolation of one row: (n,).
+
+    From x, x_dot = f and x_ddot = D_2 f + D_1 f f at both ends; the error is of order 6 in the row's length.
+    """
+    h = end - start
+
+    def derivatives(t: Array, x: Array) -> tuple[Array, Array]:
+        velocity = f(t, x, p)
+        return velocity, jax.jvp(lambda t, x: f(t, x, p), (t, x), (jnp.ones(()), velocity))[1]
+
+    (v_k, a_k), (v_k1, a_k1) = derivatives(start, x_k), derivatives(end, x_k1)
+    s3, s4, s5 = s**3, s**4, s**5
+    weight = 10 * s3 - 15 * s4 + 6 * s5
+    slopes = (s - 6 * s3 + 8 * s4 - 3 * s5) * v_k + (-4 * s3 + 7 * s4 - 3 * s5) * v_k1
+    bends = (0.5 * s**2 - 1.5 * s3 + 1.5 * s4 - 0.5 * s5) * a_k + (0.5 * s3 - s4 + 0.5 * s5) * a_k1
+    return (1 - weight) * x_k + weight * x_k1 + h * slopes + h**2 * bends
+
+
+# Jumps: samples, the terminal cost, reset maps, the initial state
+
+
+def point_cost(cost: Callable[[Array, Array], Array], x: Array, Dp_x: Array, p: Array) -> tuple[Adjoints, Quadratures]:
+    """What a cost of x at one time, a sample or the terminal cost, adds to the adjoints there and to (9), (14)."""
+    (Dell, Dpell) = jax.grad(cost, argnums=(0, 1))(x, p)
+    (D2ell, DpD1ell), (D1Dpell, DpDpell) = jax.hessian(cost, argnums=(0, 1))(x, p)
+    jump = Adjoints(Dell, D2ell, D2ell @ Dp_x + DpD1ell)
+    return jump, Quadratures(Dpell, DpDpell + D1Dpell @ Dp_x)
+
+
+def sample_jumps(
+    model: Model, path: Path, Dp_x_before: Array, Dp_x_after: Array, p: Array
+) -> tuple[Adjoints, Adjoints, Quadratures]:
+    """Jumps of the adjoints at t0, those at the end of each row (Q, C, ...), and what samples add to (9), (14)."""
+    Q, C, n = path.after.shape
+    M = p.shape[0]
+    jumps = Adjoints(jnp.zeros((Q * C + 1, n)), jnp.zeros((Q * C + 1, n, n)), jnp.zeros((Q * C + 1, n, M)))
+    total = Quadratures(jnp.zeros(M), jnp.zeros((M, M)))
+    for k, samples in enumerate(model.arguments.samples):
+        if model.structure.measurements[k].delay is not None:
+            continue
+
+        def one(sample: Any, x: Array, Dp_x: Array, k: int = k) -> tuple[Adjoints, Quadratures]:
+            return point_cost(lambda x, p: model.sample_cost(k, sample, x, p), x, Dp_x, p)
+
+        Dp_x = at_cells(path.layout, Dp_x_before[0, 0], Dp_x_after, samples.cell)
+        jump, added = jax.vmap(one)(samples, path.at_samples(samples.cell), Dp_x)
+        ends = row_ending_cell(path.layout, samples.cell) + 1  # 0 is t0
+        jumps = jax.tree.map(lambda a, b, ends=ends: a.at[ends].add(b), jumps, jump)
+        total = add(total, jax.tree.map(lambda a: a.sum(0), added))
+    at_rows = jax.tree.map(lambda a: a[1:].reshape((Q, C, *a.shape[1:])), jumps)
+    return pick(jumps, 0), at_rows, total
+
+
+def late_jumps(model: Model, path: Path, Dp_x_before: Array, p: Array) -> tuple[tuple[Adjoints, ...], Quadratures]:
+    """Jumps of the adjoints at the start of each row by samples that are seen late, and what these add to (9), (14).
+
+    A late sample is a cost of the state at the start of the row that holds ``t - delay``. The jumps are one tuple of
+    (Q, C, ...) arrays, or none where nothing is late.
+    """
+    Q, C, n = path.before.shape
+    M = p.shape[0]
+    jumps = Adjoints(jnp.zeros((Q * C, n)), jnp.zeros((Q * C, n, n)), jnp.zeros((Q * C, n, M)))
+    total = Quadratures(jnp.zeros(M), jnp.zeros((M, M)))
+    which = [k for k, sensor in enumerate(model.structure.measurements) if sensor.delay is not None]
+    for k in which:
+        samples = model.arguments.samples[k]
+        at = anchors(model, path, Dp_x_before, k, p)
+        (Dell, Dpell), ((D2ell, DpD1ell), (D1Dpell, DpDpell)) = late_state_derivatives(model, at, k, samples, p)
+        jump = Adjoints(Dell, D2ell, D2ell @ at.x_d + DpD1ell)
+        jumps = jax.tree.map(lambda a, b, row=at.row: a.at[row].add(b), jumps, jump)
+        total = add(total, Quadratures(Dpell.sum(0), (DpDpell + D1Dpell @ at.x_d).sum(0)))
+    at_rows = jax.tree.map(lambda a: a.reshape((Q, C, *a.shape[1:])), jumps)
+    return (at_rows,) if which else (), total
+
+
+def before_reset(
+    transitions: list[Transition], segment: Array, opens: Array, adjoints: Adjoints, Dp_x: Array
+) -> Adjoints:
+    """The adjoints at tau_i- from those at tau_i+, where a chunk opens a segment; `Dp_x` is that at tau_i-."""
+
+    def through(here: Transition) -> Adjoints:
+        psi, Omega, Omega_p = adjoints
+        D1R = here.D1R
+        return Adjoints(
+            psi @ D1R,
+            D1R.T @ Omega @ D1R + contract(psi, here.D1D1R),
+            D1R.T @ Omega_p + contract(psi, here.D1D1R @ Dp_x + here.DpD1R),
+        )
+
+    for i, here in enumerate(transitions):
+        adjoints = where(opens & (segment == i + 1), through(here), adjoints)
+    return adjoints
+
+
+def at_reset(here: Transition, adjoints: Adjoints, Dp_x: Array) -> Quadratures:
+    """What the reset map's own dependence on p adds to (9) and (14); `Dp_x` is that at tau_i-, (n, M)."""
+    psi, _, Omega_p = adjoints
+    return Quadratures(
+        psi @ here.DpR,
+        here.DpR.T @ Omega_p + contract(psi, here.DpDpR + here.D1DpR @ Dp_x),
+    )
+
+
+def at_initial_state(model: Model, adjoints: Adjoints, p: Array) -> Quadratures:
+    """What an initial state x0(p) adds to (9) and (14)."""
+    Dp_x0 = jax.jacfwd(model.initial_state)(p)
+    DpDp_x0 = jax.jacfwd(jax.jacfwd(model.initial_state))(p)
+    psi, _, Omega_p = adjoints
+    return Quadratures(psi @ Dp_x0, Dp_x0.T @ Omega_p + contract(psi, DpDp_x0))
+
+
+# Tools
+
+
+def linear_step(tableau: Tableau, rate: Callable[[Any, Any], Any], h: Array, given: Any, y: Any) -> tuple[Any, Any]:
+    """One Runge-Kutta step of ``dy/dt = rate(given, y)``, affine in y: its stage states (s, ...) and y at its end.
+
+    `given` holds what varies in time, at the s stages; h < 0 steps backward.
+    """
+    flat, unravel = ravel_pytree(y)
+    a, b, c = tableau.a, tableau.b, tableau.c
+
+    def slope(given: Any, y: Array) -> Array:
+        return ravel_pytree(rate(given, unravel(y)))[0]
+
+    if tableau is STIFF:
+        # K_j = slope_j(y) + h slope_j' sum_l a_jl K_l, solved for all stages at once
+        s, m = len(c), flat.shape[0]
+        known = jax.vmap(slope, in_axes=(0, None))(given, flat)
+        jacobians = jax.vmap(jax.jacfwd(slope, argnums=1), in_axes=(0, None))(given, flat)
+        matrix = jnp.eye(s * m) - h * jnp.einsum("jl,jmk->jmlk", a, jacobians).reshape(s * m, s * m)
+        K = jnp.linalg.solve(matrix, known.reshape(-1)).reshape(s, m)
+    else:
+        slopes: list[Array] = []
+        for j in range(len(c)):
+            at_stage = jax.tree.map(lambda g, j=j: g[j], given)
+            slopes.append(slope(at_stage, flat + h * combine(a[j], slopes) if slopes else flat))
+        K = jnp.stack(slopes)
+    return jax.vmap(unravel)(flat + h * (a @ K)), unravel(flat + h * (b @ K))
+
+
+def first_and_second(
+    function: Callable[[Array, Array, Array], Array], t: Array, x: Array, p: Array
+) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """``D1, Dp, D1D1, DpD1, D1Dp, DpDp`` of a function of (t, x, p); the outermost derivative is the last axis."""
+
+    def first(t: Array, x: Array, p: Array) -> tuple[Any, Any]:
+        derivatives = jax.jacfwd(function, argnums=(1, 2))(t, x, p)
+        return derivatives, derivatives
+
+    second, (D1, Dp) = jax.jacfwd(first, argnums=(1, 2), has_aux=True)(t, x, p)
+    (D1D1, DpD1), (D1Dp, DpDp) = second
+    return D1, Dp, D1D1, DpD1, D1Dp, DpDp
+
+
+def contract(psi: Array, second: Array) -> Array:
+    """``psi . D^2``: the row vector psi (n,) times the first axis of a (n, ., .) array."""
+    return jnp.tensordot(psi, second, 1)
+
+
+def add(one: Any, other: Any) -> Any:
+    """Sum of two tuples of arrays."""
+    return jax.tree.map(jnp.add, one, other)
+
+
+def where(condition: Array, one: Any, other: Any) -> Any:
+    """`one` or `other`, tuples of arrays."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)
+
+
+def pick(values: Any, *index: Any) -> Any:
+    """``values[index]`` of a tuple of arrays."""
+    return jax.tree.map(lambda a: a[index], values)

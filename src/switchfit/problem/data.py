@@ -1,0 +1,564 @@
+"""What the model is compared with: measurements, reference signals, other costs; and known inputs.
+
+Every signal in time (an input, a reference) becomes a `PiecewisePolynomial`: its knots are nodes of the mesh,
+so that the integrator never steps across one and inside a step the signal is one polynomial.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from switchfit.problem.losses import LOSSES
+from switchfit.problem.validation import (
+    as_array,
+    as_callable,
+    as_choice,
+    as_finite,
+    as_name,
+    as_names,
+    as_number,
+    as_positive,
+    shown,
+)
+
+FloatArray = NDArray[np.float64]
+MOST_FILTERED = 10**7
+"""Points at which a signal may be filtered."""
+OVERFLOW = (
+    "The signal between the samples of an Input or a ReferenceSignal overflows: values must be smaller, or times "
+    "further apart."
+)
+LOWEST_CUTOFF = 1e-6
+"""Smallest cut-off of a low-pass filter in cycles a point. At 1e-8 its output is off by 3 %, below that by anything."""
+
+Observe = Callable[..., Any]
+"""``h(t, x, p) -> (q,)``: what a sensor sees of the state."""
+
+
+@dataclass(frozen=True, eq=False)
+class PiecewisePolynomial:
+    """A signal that is a cubic between knots: ``sum_i coefficients[k, i] (t - knots[k])**i`` from knot k on.
+
+    Attributes
+    ----------
+    knots : (K,) array, increasing
+    coefficients : (K - 1, 4, q) array, lowest power first
+    """
+
+    knots: FloatArray
+    coefficients: FloatArray
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.coefficients).all():
+            raise ValueError(OVERFLOW)
+
+    @property
+    def channels(self) -> int:
+        """Number of channels, q."""
+        return int(self.coefficients.shape[2])
+
+    def interval(self, times: FloatArray) -> NDArray[np.intp]:
+        """Index of the knot interval that holds each of `times`; beyond the ends the first or the last one."""
+        return np.clip(np.searchsorted(self.knots, times, side="right") - 1, 0, len(self.knots) - 2)
+
+    def __call__(self, times: ArrayLike) -> FloatArray:
+        """Values at `times` (K,): a ``(K, q)`` array."""
+        times = np.asarray(times, dtype=np.float64)
+        k = self.interval(times)
+        s = (times - self.knots[k])[:, None]
+        c = self.coefficients[k]
+        return c[:, 0] + s * (c[:, 1] + s * (c[:, 2] + s * c[:, 3]))
+
+
+@dataclass(frozen=True, eq=False)
+class Input:
+    """A known input ``u(t)``, given by samples; modes are then called as ``f(t, x, p, u)``.
+
+    Parameters
+    ----------
+    times : (K,) array_like
+        Increasing times in the experiment's time unit. They must reach over its ``[t0, tf]``; a held input only has to
+        start by t0, its last value is kept.
+    values : (K,) or (K, q) array_like
+        The modes get a scalar u, or a ``(q,)`` array.
+    kind : {"hold", "linear", "cubic"}
+        Between samples: the last value is held, straight lines, or a cubic spline.
+
+    Raises
+    ------
+    ValueError
+        For times that do not increase, values that are not finite or differ in length from times, too few
+        samples, or an unknown kind.
+    TypeError
+        If times or values are not numbers, dates among them.
+    """
+
+    times: Any
+    values: Any
+    kind: Literal["hold", "linear", "cubic"] = "hold"
+
+    def __post_init__(self) -> None:
+        kind = as_choice(self.kind, "Input kind", ("hold", "linear", "cubic"))
+        at_least = {"hold": 1, "linear": 2, "cubic": 4}[kind]
+        times, values = _samples(self.times, self.values, "Input", at_least=at_least)
+        _require_finite(values, "Input values")
+        object.__setattr__(self, "kind", kind)
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "values", values)
+
+    def signal(self, t0: float, tf: float) -> PiecewisePolynomial:
+        """The input as a piecewise polynomial over ``[t0, tf]``."""
+        times, values = self.times, self.values.reshape(len(self.times), -1)
+        if times[0] > t0 or (self.kind != "hold" and times[-1] < tf):
+            raise ValueError(
+                f"Input must be known over (t0, tf) = ({t0}, {tf}); its samples reach from {times[0]} to {times[-1]}."
+            )
+        if self.kind == "cubic":
+            return _spline(times, values)
+        if self.kind == "linear":
+            with np.errstate(all="ignore"):
+                slopes = np.diff(values, axis=0) / np.diff(times)[:, None]
+            return _from_powers(times, [values[:-1], slopes])
+        end = max(tf, times[-1] + 1.0)
+        return _from_powers(np.append(times, end), [values])
+
+
+@dataclass(frozen=True, eq=False)
+class RunningCost:
+    """Incremental cost: adds ``integral of ell(t, x, p) dt`` over ``[t0, tf]`` to J, equation (2).
+
+    Parameters
+    ----------
+    ell : callable ``ell(t, x, p) -> scalar``, twice differentiable in x and p.
+    """
+
+    ell: Callable[..., Any]
+
+    def __post_init__(self) -> None:
+        if not callable(self.ell):
+            raise TypeError(f"RunningCost needs a function ell(t, x, p); got {type(self.ell).__name__}.")
+
+
+@dataclass(frozen=True, eq=False)
+class TerminalCost:
+    """Cost of the final state: adds ``phi(x(tf), p)`` to J.
+
+    Parameters
+    ----------
+    phi : callable ``phi(x, p) -> scalar``, twice differentiable.
+    """
+
+    phi: Callable[..., Any]
+
+    def __post_init__(self) -> None:
+        if not callable(self.phi):
+            raise TypeError(f"TerminalCost needs a function phi(x, p); got {type(self.phi).__name__}.")
+
+
+@dataclass(frozen=True, eq=False)
+class TerminalConstraint:
+    """What has to hold at the end: ``psi(x(tf), p) = 0``, an equality constraint and no cost.
+
+    Parameters
+    ----------
+    psi : callable ``psi(x, p) -> () or (m,)``, twice differentiable.
+    """
+
+    psi: Callable[..., Any]
+
+    def __post_init__(self) -> None:
+        if not callable(self.psi):
+            raise TypeError(f"TerminalConstraint needs a function psi(x, p); got {type(self.psi).__name__}.")
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceSignal:
+    """A continuous measured signal y_m(t): adds ``integral of 1/2 (y - y_m)' W (y - y_m) dt`` to J.
+
+    The paper's cost (Section V) with ``y = observe(t, x, p)``. Build it with `from_samples`.
+
+    Parameters
+    ----------
+    signal : PiecewisePolynomial
+        y_m, with q channels.
+    observe : callable ``h(t, x, p) -> (q,)``, optional
+        Left out, the whole state is compared.
+    weights : (q,) or (q, q) array_like, optional
+        W, symmetric and positive semi-definite, or its diagonal; the identity if left out.
+    names : sequence of str, optional
+        One for each channel, for reports and plots.
+    samples : (times, values), optional
+        What the signal was made from.
+    lowpass_hz : float, optional
+        The cut-off with which it was made.
+    """
+
+    signal: PiecewisePolynomial
+    observe: Observe | None = None
+    weights: Any = None
+    names: tuple[str, ...] | None = None
+    samples: tuple[FloatArray, FloatArray] | None = None
+    lowpass_hz: float | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.signal, PiecewisePolynomial):
+            raise TypeError(
+                "ReferenceSignal is made from samples by sf.ReferenceSignal.from_samples(times, values, ...); "
+                f"got {type(self.signal).__name__}."
+            )
+        _check_observe(self.observe)
+        object.__setattr__(self, "weights", _weight_matrix(self.weights, self.signal.channels))
+        object.__setattr__(self, "names", _channel_names(self.names, self.signal.channels))
+
+    @classmethod
+    def from_samples(
+        cls,
+        times: ArrayLike,
+        values: ArrayLike,
+        *,
+        observe: Observe | None = None,
+        lowpass_hz: float | None = None,
+        weights: ArrayLike | None = None,
+        names: Sequence[str] | None = None,
+    ) -> ReferenceSignal:
+        """Interpolate samples by cubic splines and, if asked, low-pass filter them without phase shift.
+
+        Parameters
+        ----------
+        times : (K,) array_like
+            Increasing sample times in the experiment's time unit, four or more. A time given twice breaks the spline
+            there, as at the transitions of a simulated trajectory; each part then needs four samples.
+        values : (K,) or (K, q) array_like
+            NaN marks a missing value, as does the mask of a masked array; it is bridged by the interpolation.
+        observe : callable ``h(t, x, p) -> (q,)``, optional
+        lowpass_hz : float, optional
+            Cut-off, in cycles per time unit of the experiment (Hz only where that is s), of a second-order Butterworth
+            filter run forward and backward over the interpolated signal, so that no phase shift remains (the gain at
+            the cut-off is then 1/2).
+        weights : (q,) or (q, q) array_like, optional
+        names : sequence of str, optional
+
+        Raises
+        ------
+        ValueError
+            For bad times or values, fewer than four samples in a channel, or a cut-off that is not positive or far
+            beyond what the samples show.
+        TypeError
+            If times, values, weights or the cut-off are not numbers, dates among them.
+        """
+        times, values = _samples(times, values, "ReferenceSignal", at_least=4, breaks=True, missing=True)
+        table = values.reshape(len(times), -1)
+        if np.isinf(table).any():
+            raise ValueError("ReferenceSignal values must be finite, or NaN where one is missing; got infinity.")
+        cuts = np.flatnonzero(np.diff(times) == 0) + 1
+        parts = zip(np.split(times, cuts), np.split(table, cuts), strict=True)
+        signal = _joined([_bridged_spline(part_times, part) for part_times, part in parts])
+        if lowpass_hz is not None:
+            lowpass_hz = as_positive(lowpass_hz, "lowpass_hz")
+            signal = _lowpass(signal, lowpass_hz)
+        return cls(signal, observe, weights, names, (times, table), lowpass_hz)  # type: ignore[arg-type]  # made a tuple there
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """Discrete noisy samples: adds ``1/2 sum ((y_k - h(t_k, x(t_k), p)) / sigma)**2`` to J.
+
+    With a sigma that is a parameter, ``sum log sigma`` over the samples it belongs to is added too, so that J is the
+    negative logarithm of the likelihood up to a constant. With a robust loss, ``1/2 C**2 rho((r / sigma)**2 / C**2)``
+    stands in place of each ``1/2 (r / sigma)**2``, C being the `loss_scale` (`switchfit.problem.losses`).
+
+    Parameters
+    ----------
+    times : (K,) array_like
+        Increasing sample times in the experiment's time unit; they may be irregular.
+    values : (K,) or (K, q) array_like
+        Samples; NaN marks a missing one, as does the mask of a masked array.
+    observe : callable ``h(t, x, p) -> (q,)``, optional
+        Left out, the whole state is measured. At a transition with a reset map the sample is of the state
+        just before the jump.
+    sigma : float, (q,) or (K, q) array_like, str, or list of float and str, optional
+        Standard deviation of the noise, for all, for each channel or for each sample. A string names the parameter
+        that it is, for all channels; in a list of q entries, for one of them. Left out it is
+        unknown: all samples weigh 1 and the covariance is scaled by the residual variance.
+    names : sequence of str, optional
+        One for each channel.
+    loss : {"linear", "soft_l1", "huber", "cauchy"}, optional
+        As in `scipy.optimize.least_squares`; all but the first count outliers for less.
+    loss_scale : float, optional
+        C, in units of sigma: residuals beyond it are outliers.
+    delay : float or str, optional
+        By how much the sensor is late, in the experiment's time unit: a sample stamped t_k is of the state at
+        ``t_k - delay``, and `observe` is called with that time. A string names the parameter that it is. Give channels
+        of different delays as several `Measurements`.
+
+    Raises
+    ------
+    ValueError
+        For times that do not increase, shapes that do not match, no sample at all, infinite values, a
+        sigma that is not positive, or a loss that is not known or has no scale to be measured by.
+    TypeError
+        If times, values, sigma or another number is not a number, dates among them.
+    """
+
+    times: Any
+    values: Any
+    observe: Observe | None = None
+    sigma: Any = None
+    names: tuple[str, ...] | None = None
+    loss: Literal["linear", "soft_l1", "huber", "cauchy"] = "linear"
+    loss_scale: float = 1.0
+    delay: float | str = 0.0
+
+    def __post_init__(self) -> None:
+        times, values = _samples(self.times, self.values, "Measurements", at_least=1, missing=True)
+        values = values.reshape(len(times), -1)
+        if np.isinf(values).any():
+            raise ValueError("Measurements values must be finite, or NaN where a sample is missing; got infinity.")
+        if np.isnan(values).all():
+            raise ValueError("Measurements values are all NaN: there is nothing to fit.")
+        _check_observe(self.observe)
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "sigma", _checked_sigma(self.sigma, values.shape))
+        object.__setattr__(self, "names", _channel_names(self.names, values.shape[1]))
+        self._check_loss()
+        if isinstance(self.delay, str):
+            delay: float | str = as_name(self.delay, "delay")
+        else:
+            delay = as_finite(as_number(self.delay, "delay (a number, or the name of a parameter)"), "delay")
+        object.__setattr__(self, "delay", delay)
+
+    @property
+    def seen_times(self) -> FloatArray:
+        """Times of the states that were seen, (K,): with a delay that is a parameter, as if there were none."""
+        return self.times if isinstance(self.delay, str) or self.delay == 0.0 else self.times - self.delay
+
+    def _check_loss(self) -> None:
+        object.__setattr__(self, "loss", as_choice(self.loss, "loss", LOSSES))
+        scale = as_positive(self.loss_scale, "loss_scale")
+        if not 0 < scale * scale < np.inf:
+            raise ValueError(f"loss_scale must have a square that is neither 0 nor infinite; got {scale}.")
+        object.__setattr__(self, "loss_scale", scale)
+        if self.loss != "linear" and self.sigma is None:
+            raise ValueError(
+                f"loss={self.loss!r} counts residuals in units of sigma, which is left out: give sigma a number, or "
+                "the name of a parameter to estimate it."
+            )
+        if self.loss == "cauchy" and self.sigma_names and scale <= 1:
+            raise ValueError(
+                "loss='cauchy' with a sigma that is a parameter needs a loss_scale above 1, otherwise J falls without "
+                f"end as sigma vanishes; got {scale}."
+            )
+
+    @property
+    def sigma_names(self) -> tuple[str | None, ...]:
+        """The parameter that is the sigma of each channel, None where it is a number; empty if all are."""
+        if not isinstance(self.sigma, tuple):
+            return ()
+        return tuple(entry if isinstance(entry, str) else None for entry in self.sigma)
+
+    def noise(self, parameters: Mapping[str, Any]) -> FloatArray | None:
+        """Standard deviation of each sample, a (K, q) array, given the model's parameters; None where it is unknown."""
+        if self.sigma is None:
+            return None
+        sigma = self.sigma
+        if isinstance(sigma, tuple):
+            sigma = np.array([float(parameters[s]) if isinstance(s, str) else s for s in sigma])
+        return np.broadcast_to(sigma, self.values.shape).copy()
+
+    @property
+    def weights(self) -> FloatArray:
+        """``1 / sigma**2`` (1 where sigma is unknown or a parameter), 0 where a sample is missing: (K, q)."""
+        sigma = self.noise(dict.fromkeys(filter(None, self.sigma_names), 1.0))
+        inverse = np.ones(self.values.shape) if sigma is None else sigma**-2.0
+        return np.where(np.isnan(self.values), 0.0, inverse)
+
+    @property
+    def count(self) -> int:
+        """Number of values that are not missing."""
+        return int(np.count_nonzero(~np.isnan(self.values)))
+
+
+Data = RunningCost | TerminalCost | TerminalConstraint | ReferenceSignal | Measurements
+
+
+def _samples(
+    times: ArrayLike, values: ArrayLike, what: str, *, at_least: int, breaks: bool = False, missing: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """Return times (K,) and values (K, ...) as float64, checked against each other.
+
+    With `breaks` a time may stand twice; with `missing` masked values become NaN.
+    """
+    times = as_array(times, f"{what} times", form="an array of numbers")
+    values = as_array(values, f"{what} values", form="an array of numbers", missing=missing)
+    if times.ndim != 1 or values.ndim not in (1, 2):
+        raise ValueError(
+            f"{what} needs times of shape (K,) and values of shape (K,) or (K, q); "
+            f"got {times.shape} and {values.shape}."
+        )
+    if len(times) != len(values):
+        raise ValueError(f"{what} needs one row of values for each time; got {len(times)} times, {len(values)} rows.")
+    if len(times) < at_least or values.size == 0:
+        raise ValueError(f"{what} needs {at_least} sample(s) or more; got {len(times)}.")
+    _require_finite(times, f"{what} times")
+    wrong = np.diff(times) <= 0
+    if breaks:
+        wrong = (np.diff(times) < 0) | np.append(times[2:] == times[:-2], False)
+    if wrong.any():
+        k = int(np.argmax(wrong))
+        raise ValueError(
+            f"{what} times must increase strictly; got {times[k]} followed by {times[k + 1]} at index {k + 1}."
+        )
+    times.flags.writeable = False
+    values.flags.writeable = False
+    return times, values
+
+
+def _check_observe(observe: Any) -> None:
+    if observe is not None:
+        as_callable(observe, "observe", "a function h(t, x, p)")
+
+
+def _require_finite(values: FloatArray, what: str) -> None:
+    bad = ~np.isfinite(values)
+    if bad.any():
+        where = np.argwhere(bad)[0].tolist()
+        raise ValueError(f"{what} must be finite; got {values[tuple(where)]} at index {where}.")
+
+
+def _checked_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | tuple[str | float, ...] | None:
+    if sigma is None:
+        return None
+    if isinstance(sigma, str):
+        return (as_name(sigma, "sigma"),) * shape[1]
+    if isinstance(sigma, (list, tuple)) and any(isinstance(entry, str) for entry in sigma):
+        return _sigma_of_channels(sigma, shape[1])
+    sigma = as_array(sigma, "sigma")
+    if sigma.shape not in ((), (shape[1],), shape):
+        raise ValueError(
+            f"sigma must be a number, of shape ({shape[1]},) (one a channel) or {shape} (one a sample); "
+            f"got shape {sigma.shape}."
+        )
+    if not np.all(sigma > 0) or not np.all(np.isfinite(sigma)):
+        raise ValueError(f"sigma must be positive and finite; got a smallest value of {sigma.min()}.")
+    _check_inverse_square(sigma)
+    return sigma
+
+
+def _check_inverse_square(sigma: Any) -> None:
+    with np.errstate(over="ignore"):
+        if not np.all(np.isfinite(np.asarray(sigma, dtype=np.float64) ** -2.0)):
+            raise ValueError(f"sigma must not be so small that 1 / sigma**2 is infinite; got {shown(sigma)}.")
+
+
+def _sigma_of_channels(sigma: Sequence[Any], channels: int) -> tuple[str | float, ...]:
+    """Names of parameters and numbers, one a channel."""
+    if len(sigma) != channels:
+        raise ValueError(f"sigma must have one entry for each of the {channels} channels; got {shown(sigma)}.")
+    if any(entry is None for entry in sigma):
+        raise ValueError(
+            "sigma of one channel cannot be left out (None) where that of another is a parameter: name a parameter for "
+            f"it too; got {shown(sigma)}."
+        )
+    entries = [
+        as_name(entry, "sigma of a channel") if isinstance(entry, str) else as_number(entry, "sigma of a channel")
+        for entry in sigma
+    ]
+    if not all(np.isfinite(entry) and entry > 0 for entry in entries if not isinstance(entry, str)):
+        raise ValueError(f"sigma must be positive and finite; got {shown(sigma)}.")
+    _check_inverse_square([entry for entry in entries if not isinstance(entry, str)])
+    return tuple(entries)
+
+
+def _channel_names(names: Sequence[str] | None, channels: int) -> tuple[str, ...] | None:
+    if names is None:
+        return None
+    given = (names,) if isinstance(names, str) else names
+    checked = as_names(given, "names", "a sequence of strings, one for each channel")
+    if len(checked) != channels:
+        raise ValueError(f"names must have one entry for each of the {channels} channels; got {shown(checked)}.")
+    return checked
+
+
+def _weight_matrix(weights: ArrayLike | None, channels: int) -> FloatArray:
+    """W as a symmetric positive semi-definite ``(q, q)`` matrix."""
+    if weights is None:
+        return np.eye(channels)
+    matrix = as_array(weights, "weights")
+    if matrix.shape not in ((channels,), (channels, channels)):
+        raise ValueError(f"weights must have shape ({channels},) or ({channels}, {channels}); got {matrix.shape}.")
+    matrix = np.diag(matrix) if matrix.ndim == 1 else matrix
+    if not np.all(np.isfinite(matrix)) or not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
+        raise ValueError(f"weights must be finite and symmetric; got {shown(matrix.tolist())}.")
+    smallest = np.linalg.eigvalsh(matrix)[0]
+    if smallest < -1e-12 * np.abs(matrix).max():
+        raise ValueError(f"weights must be positive semi-definite; its smallest eigenvalue is {smallest:.3g}.")
+    return matrix
+
+
+def _from_powers(knots: FloatArray, powers: list[FloatArray]) -> PiecewisePolynomial:
+    """Polynomial with the given coefficient arrays ``(K - 1, q)``, lowest power first, the rest zero."""
+    coefficients = np.zeros((len(knots) - 1, 4, powers[0].shape[1]))
+    for i, power in enumerate(powers):
+        coefficients[:, i] = power
+    return PiecewisePolynomial(np.asarray(knots, dtype=np.float64), coefficients)
+
+
+def _spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
+    """Not-a-knot cubic spline through ``values`` (K, q)."""
+    from scipy.interpolate import CubicSpline  # here, since importing it takes longer than most fits
+
+    try:
+        with np.errstate(all="ignore"):
+            spline = CubicSpline(times, values, axis=0)
+    except ValueError:  # times and values are finite, but their slopes are not
+        raise ValueError(OVERFLOW) from None
+    return PiecewisePolynomial(times, np.moveaxis(spline.c[::-1], 0, 1))
+
+
+def _joined(parts: list[PiecewisePolynomial]) -> PiecewisePolynomial:
+    """One signal out of several that follow each other."""
+    knots = np.concatenate([part.knots[:-1] for part in parts[:-1]] + [parts[-1].knots])
+    return PiecewisePolynomial(knots, np.concatenate([part.coefficients for part in parts]))
+
+
+def _bridged_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
+    """Spline through the samples that are there, each channel's gaps bridged by its own spline first."""
+    filled = values.copy()
+    for channel in filled.T:
+        known = np.isfinite(channel)
+        if known.sum() < 4:
+            raise ValueError(f"ReferenceSignal needs four samples or more in each channel and part; got {known.sum()}.")
+        if not known.all():
+            channel[~known] = _spline(times[known], channel[known][:, None])(times[~known])[:, 0]
+    return _spline(times, filled)
+
+
+def _lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePolynomial:
+    """Butterworth filter of second order forward and backward, on a grid of ten points a period of the cut-off."""
+    import scipy.signal  # here, since importing it takes longer than most fits
+
+    start, end = signal.knots[[0, -1]].tolist()
+    step = min(0.1 / cutoff_hz, float(np.median(np.diff(signal.knots))))
+    if not (end - start) * max(10 * cutoff_hz, 1 / step) <= MOST_FILTERED:
+        raise ValueError(
+            f"lowpass_hz must not ask for more than {MOST_FILTERED} points, ten a period; got {cutoff_hz:g} Hz for a "
+            f"signal from {start:g} to {end:g}. Its samples show nothing above "
+            f"{0.5 / np.min(np.diff(signal.knots)):.3g} Hz; a higher cut-off filters nothing."
+        )
+    grid = np.linspace(start, end, max(int(np.ceil((end - start) / step)) + 1, 8))
+    rate = (len(grid) - 1) / (end - start)
+    if cutoff_hz < LOWEST_CUTOFF * rate:
+        raise ValueError(
+            f"lowpass_hz must be {LOWEST_CUTOFF * rate:.3g} Hz or more for {rate:.6g} points a second, below which the "
+            f"filter is rounding; got {cutoff_hz:g}."
+        )
+    sos = scipy.signal.butter(2, cutoff_hz, fs=rate, output="sos")
+    padding = int(min(len(grid) - 1, np.ceil(3 * rate / cutoff_hz)))
+    filtered = scipy.signal.sosfiltfilt(sos, signal(grid), axis=0, padtype="odd", padlen=padding)
+    return _spline(grid, filtered)

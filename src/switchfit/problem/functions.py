@@ -1,0 +1,450 @@
+"""The user's functions, traced: each is kept as what it did when its problem was built, and compared by that.
+
+A `Function` holds a jaxpr. Equal jaxprs are one `Function`, so that programs compiled for one are used for the other,
+whatever Python objects they came from; and a function that reads something that has changed is another `Function`.
+Whether a trace can be used again without calling the user's function is decided by `switchfit.problem.reads`.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import inspect
+import itertools
+import threading
+import weakref
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from switchfit.problem.precision import refuse_single_precision_in
+from switchfit.problem.reads import JITTED, contents
+
+Array = jax.Array
+Shape = tuple[int, ...]
+
+
+def float64() -> Any:
+    """Context in which JAX computes in float64; the user's setting is back in force afterwards."""
+    return jax.enable_x64(True)
+
+
+UNTRACEABLE = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+"""What JAX raises where Python code wants to know a number that is not known yet."""
+
+
+class Function:
+    """A function of ``(t, x, p)``, or of some of these and an input, as a jaxpr in float64.
+
+    Attributes
+    ----------
+    parameters : tuple of str
+        The names that it asks p for, in the order of the jaxpr's arguments.
+    shape : shape of its result
+    digest : str
+        Of the jaxpr's content: the same in every process.
+    """
+
+    def __init__(self, closed: Any, parameters: tuple[str, ...], digest: str, opaque: tuple[Any, ...]) -> None:
+        self.parameters, self.digest = parameters, digest
+        self.shape: Shape = tuple(closed.out_avals[0].shape)
+        self._closed = closed
+        self._opaque = opaque  # compared by identity, therefore kept alive
+        self._key = (digest, tuple(map(id, opaque)))
+
+    def __call__(self, *arguments: Any) -> Array:
+        """Value for arguments in the order of the user's function, p being a mapping of names to arrays."""
+        flat = [_strong(a) for a in arguments if not isinstance(a, Mapping)]
+        named = next(argument for argument in arguments if isinstance(argument, Mapping))
+        given = [*flat, *(named[name] for name in self.parameters)]
+        return jax.core.eval_jaxpr(self._closed.jaxpr, self._closed.consts, *given)[0]
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, Function) and self._key == other._key)
+
+
+def _strong(value: Any) -> Any:
+    """A float64 array as the jaxpr expects it: Python's numbers have a weak type."""
+    if (
+        isinstance(value, (np.ndarray, jax.Array))
+        and value.dtype == np.float64
+        and not getattr(value, "weak_type", False)
+    ):
+        return value
+    return jnp.asarray(value, jnp.float64)
+
+
+_known: weakref.WeakValueDictionary[Any, Function] = weakref.WeakValueDictionary()
+_traces: OrderedDict[Any, Function] = OrderedDict()
+_lock = threading.Lock()
+
+MOST_TRACES = 1024
+"""Functions whose traces are kept to be used again."""
+
+_turn = itertools.count(1)
+_retracing = jax.make_user_context(0)
+"""With a new value JAX does not use earlier traces of what is jitted inside a function."""
+
+
+def trace_function(
+    function: Callable[..., Any],
+    arguments: Sequence[Shape | None],
+    parameters: Mapping[str, Shape],
+    hidden: frozenset[str] = frozenset(),
+    *,
+    what: str,
+    form: str,
+    shape: Shape | None,
+) -> Function:
+    """Trace a function of the user's, or find the trace that is still what it does.
+
+    Parameters
+    ----------
+    function : callable
+    arguments : sequence of shape or None
+        Of its arguments; None stands for the dict of parameters.
+    parameters : mapping of str to shape
+        What that dict holds.
+    hidden : set of str
+        Those among them that the function sees only if it asks for them by name.
+    what, form : str
+        Its name and signature for messages, such as "mode 'slip'" and "f(t, x, p)".
+    shape : shape, optional
+        What it must return; anything if left out.
+
+    Raises
+    ------
+    ValueError
+        If it raises, returns another shape or dtype, or computes in less than double precision.
+    """
+    function = _without_jit(function)
+    read = contents(function)
+    key = None if read is None else (read, tuple(arguments), tuple(parameters.items()), hidden, shape)
+    if key is not None:
+        with _lock:
+            found = _traces.get(key)
+            if found is not None:
+                _traces.move_to_end(key)
+                return found
+    given = _Given(arguments, parameters, hidden, what, form, shape)
+    with float64():
+        if key is None:
+            with _retracing(next(_turn)):
+                traced = _trace(function, given)
+        else:
+            traced = _trace(function, given)
+    with _lock:
+        traced = _known.setdefault(traced._key, traced)
+        if key is not None:
+            _traces[key] = traced
+            if len(_traces) > MOST_TRACES:
+                _traces.popitem(last=False)
+    return traced
+
+
+def _without_jit(function: Any) -> Any:
+    """The function that was handed to `jax.jit`, which would not look at it again."""
+    while type(function) is JITTED and hasattr(function, "__wrapped__"):
+        function = function.__wrapped__
+    return function
+
+
+class _Given:
+    """How a function is called, and what it must return."""
+
+    def __init__(
+        self,
+        arguments: Sequence[Shape | None],
+        parameters: Mapping[str, Shape],
+        hidden: frozenset[str],
+        what: str,
+        form: str,
+        shape: Shape | None,
+    ) -> None:
+        self.arguments, self.parameters, self.hidden = arguments, parameters, hidden
+        self.what, self.form, self.shape = what, form, shape
+
+
+def _trace(function: Callable[..., Any], given: _Given) -> Function:
+    """Trace with a dict that notes what is asked of it; with an ordinary one where the function allows no other."""
+    shown = tuple(name for name in given.parameters if name not in given.hidden)
+    try:
+        return _traced_with(function, given, tuple(given.parameters), watch=True)
+    except Exception:
+        pass
+    try:
+        return _traced_with(function, given, shown, watch=False)
+    except ValueError:
+        if not given.hidden:
+            raise
+    # One of the hidden may be asked for; if not, this says what is wrong.
+    return _traced_with(function, given, tuple(given.parameters), watch=False)
+
+
+def _traced_with(function: Callable[..., Any], given: _Given, names: tuple[str, ...], watch: bool) -> Function:
+    asked: set[str] = set()
+    position = list(given.arguments).index(None)
+
+    def call(flat: list[Array], values: list[Array]) -> Array:
+        named = dict(zip(names, values, strict=True))
+        if watch:
+            shown = {name: value for name, value in named.items() if name not in given.hidden}
+            named = Asked(shown, {name: named[name] for name in names if name in given.hidden}, asked)
+        arguments = (*flat[:position], named, *flat[position:])
+        return checked_vector(function, arguments, given.shape, given.what, given.form)
+
+    flat = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in given.arguments if shape is not None]
+    values = [jax.ShapeDtypeStruct(given.parameters[name], jnp.float64) for name in names]
+    closed = jax.make_jaxpr(call)(flat, values)
+    used = names if not watch else tuple(name for name in names if name in asked)
+    return _function_of(closed, len(flat), names, used, function, given)
+
+
+def _function_of(
+    closed: Any, count: int, names: tuple[str, ...], used: tuple[str, ...], function: Any, given: _Given
+) -> Function:
+    """The jaxpr with the parameters that are used, its constants copied: what they came from may change."""
+    refuse_single_precision_in(closed, function, given.what)
+    invars = closed.jaxpr.invars
+    kept = [*invars[:count], *(v for name, v in zip(names, invars[count:], strict=True) if name in used)]
+    _freeze(closed.jaxpr)
+    consts = [np.array(const) if isinstance(const, np.ndarray) else const for const in closed.consts]
+    debug = closed.jaxpr.debug_info.with_unknown_names()
+    jaxpr = closed.jaxpr.replace(invars=kept, debug_info=debug)
+    closed = type(closed)(jaxpr, consts)
+    text, opaque = _content(closed)
+    return Function(closed, used, hashlib.sha256("\n".join([repr(used), *text]).encode()).hexdigest(), opaque)
+
+
+def _freeze(jaxpr: Any) -> None:
+    """Copy the numbers that stand in a jaxpr: JAX keeps the user's arrays without axes there, which may change."""
+    for equation in jaxpr.eqns:
+        for atom in equation.invars:
+            _copy_literal(atom)
+        for value in equation.params.values():
+            for entry in value if isinstance(value, (tuple, list)) else (value,):
+                if hasattr(entry, "eqns"):
+                    _freeze(getattr(entry, "jaxpr", entry))
+    for atom in jaxpr.outvars:
+        _copy_literal(atom)
+
+
+def _copy_literal(atom: Any) -> None:
+    if isinstance(getattr(atom, "val", None), np.ndarray):
+        atom.val = copy.deepcopy(atom.val)
+
+
+# The content of a jaxpr
+
+RULES = ("jvp_jaxpr_fun", "jvp_jaxpr_thunk", "fwd_jaxpr_thunk", "bwd", "out_trees", "name", "debug_info")
+"""Parameters of operations that are left out: names, and rules of derivatives, which are seen by differentiating."""
+
+
+def _content(closed: Any) -> tuple[list[str], tuple[Any, ...]]:
+    """A jaxpr as text, with the values of its constants; and the objects in it that have no text."""
+    text, opaque = _Text.of(closed)
+    if text.has_rules:
+        try:
+            more = _Text.of(_twice_differentiated(closed))[0].lines
+        except TypeError:  # reverse rules alone, which have no text
+            return text.lines, (*opaque, object())
+        return text.lines + more, opaque
+    return text.lines, opaque
+
+
+def _twice_differentiated(closed: Any) -> Any:
+    """First and second derivatives along all arguments: custom rules have been applied in it."""
+
+    def value(*arguments: Any) -> Any:
+        return jax.core.eval_jaxpr(closed.jaxpr, closed.consts, *arguments)[0]
+
+    def slope(*arguments: Any) -> Any:
+        return jax.jvp(value, arguments, arguments)[1]
+
+    return jax.make_jaxpr(lambda *a: (slope(*a), jax.jvp(slope, a, a)[1]))(*closed.in_avals)
+
+
+class _Text:
+    """Lines that describe a jaxpr, variables numbered in their order."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.opaque: list[Any] = []
+        self.has_rules = False
+
+    @classmethod
+    def of(cls, closed: Any) -> tuple[_Text, tuple[Any, ...]]:
+        text = cls()
+        text.add(closed.jaxpr, closed.consts)
+        return text, tuple(text.opaque)
+
+    def add(self, jaxpr: Any, consts: Sequence[Any]) -> None:
+        """Describe a jaxpr."""
+        number: dict[Any, int] = {}
+
+        def atom(a: Any) -> str:
+            return self._array(a.val) if hasattr(a, "val") else f"%{number.setdefault(a, len(number))}"
+
+        for variables in (jaxpr.constvars, jaxpr.invars):
+            self.lines.append(" ".join(f"{atom(v)}:{v.aval.str_short()}" for v in variables))
+        self.lines += [self._array(const) for const in consts]
+        for equation in jaxpr.eqns:
+            given = " ".join(map(atom, equation.invars))
+            made = " ".join(f"{atom(v)}:{v.aval.str_short()}" for v in equation.outvars)
+            self.lines.append(f"{made} = {equation.primitive.name} {given}")
+            self.has_rules = self.has_rules or equation.primitive.name.startswith("custom_")
+            for name, value in sorted(equation.params.items()):
+                if name not in RULES:
+                    self._parameter(name, value)
+        self.lines.append("-> " + " ".join(map(atom, jaxpr.outvars)))
+
+    def _parameter(self, name: str, value: Any) -> None:
+        if hasattr(value, "eqns"):
+            self.lines.append(f"{name}:")
+            self.add(getattr(value, "jaxpr", value), getattr(value, "consts", ()))
+        elif isinstance(value, (tuple, list)) and any(hasattr(v, "eqns") for v in value):
+            for entry in value:
+                self._parameter(name, entry)
+        elif isinstance(value, (np.ndarray, jax.Array)):
+            self.lines.append(f"{name}={self._array(value)}")
+        elif callable(value) and not isinstance(value, type):
+            self.lines.append(f"{name}=object {len(self.opaque)}")
+            self.opaque.append(value)
+        else:
+            said = repr(value)
+            if " at 0x" in said:
+                self.opaque.append(value)
+                said = f"object {len(self.opaque)}"
+            self.lines.append(f"{name}={said}")
+
+    def _array(self, value: Any) -> str:
+        array = np.asarray(value)
+        digest = hashlib.blake2b(np.ascontiguousarray(array).tobytes(), digest_size=16).hexdigest()
+        return f"{array.dtype}{list(array.shape)}{digest}"
+
+
+# Calling a function of the user's while tracing
+
+
+class Asked(dict[str, Array]):
+    """The dict the user's functions get while it is found out which parameters they ask for.
+
+    Parameters
+    ----------
+    shown : what the dict holds
+    others : what it holds only for a function that asks by name: the targets of parameter maps
+    asked : set of str, to which every name that is asked for is added
+    """
+
+    def __init__(self, shown: Mapping[str, Array], others: Mapping[str, Array], asked: set[str]) -> None:
+        super().__init__(shown)
+        self.others = others
+        self.asked = asked
+
+    def __getitem__(self, name: str) -> Array:
+        value = super().__getitem__(name) if name in self.keys_alone() else self.others[name]
+        self.asked.add(name)
+        return value
+
+    def __contains__(self, name: object) -> bool:
+        there = name in self.keys_alone()
+        if there:
+            self.asked.add(str(name))
+        return there
+
+    def get(self, name: str, default: Any = None) -> Any:
+        return self[name] if name in self.keys_alone() or name in self.others else default
+
+    def keys_alone(self) -> Any:
+        """The names, without asking for them."""
+        return super().keys()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.whole())
+
+    def __len__(self) -> int:
+        return len(self.whole())
+
+    def keys(self) -> Any:
+        return self.whole().keys()
+
+    def values(self) -> Any:
+        return self.whole().values()
+
+    def items(self) -> Any:
+        return self.whole().items()
+
+    def whole(self) -> dict[str, Array]:
+        """All that is shown, which counts as asked for."""
+        self.asked.update(self.keys_alone())
+        return {name: super(Asked, self).__getitem__(name) for name in self.keys_alone()}
+
+
+def called(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, form: str) -> Array:
+    """Call a function of the user's while tracing; whatever it raises becomes one sentence that names it."""
+    _check_signature(function, arguments, what, form)
+    try:
+        value = function(*arguments)
+    except KeyError as error:
+        parameters = next(given for given in arguments if isinstance(given, dict))
+        raise ValueError(
+            f"{what} asks for the parameter {error}, which the problem lacks; it has {', '.join(parameters) or 'none'}."
+        ) from error
+    except UNTRACEABLE as error:
+        raise ValueError(
+            f"{what} decides by the value of t, x or p (an `if`, a `while`, float() or numpy function), which JAX "
+            "cannot differentiate. Write it with jax.numpy; if the dynamics change there, make it a mode with a "
+            "transition time."
+        ) from error
+    except Exception as error:
+        said = str(error).rstrip(".")
+        raise ValueError(f"{what}: {form} raised {type(error).__name__}: {said}.") from error
+    try:
+        return jnp.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{what}: {form} must return an array of numbers; got {value!r}.") from error
+
+
+def _check_signature(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, form: str) -> None:
+    """ValueError if a function does not take as many arguments as it is called with."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # it does not tell
+        return
+    try:
+        signature.bind(*arguments)
+    except TypeError as error:
+        inputs = " Modes get an input u if and only if the experiment has inputs." if what.startswith("mode ") else ""
+        raise ValueError(f"{what} is called as {form}, but takes the arguments {signature}.{inputs}") from error
+
+
+def checked_vector(
+    function: Callable[..., Any], arguments: tuple[Any, ...], shape: Shape | None, what: str, form: str
+) -> Array:
+    """What a function of the user's returns, checked (while tracing) to be a float64 array of the given shape.
+
+    Without a shape, an array of any.
+    """
+    array = called(function, arguments, what, form)
+    if shape is not None and array.shape != shape:
+        if not array.size == int(np.prod(shape)) == 1:
+            raise ValueError(f"{what}: {form} must return an array of shape {shape}; got shape {array.shape}.")
+        array = array.reshape(shape)
+    if jnp.issubdtype(array.dtype, jnp.integer) or array.dtype == jnp.bool_:
+        return array.astype(jnp.float64)
+    if array.dtype != jnp.float64:
+        raise ValueError(
+            f"{what}: {form} must return float64; got {array.dtype}. Its arguments are float64: do not cast them."
+        )
+    return array

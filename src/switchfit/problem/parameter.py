@@ -1,0 +1,148 @@
+"""`Parameter`, an unknown of any kind: of the model, a transition time, or an entry of an initial state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.problem.priors import LogNormal, Normal, Prior, PriorTerms
+from switchfit.problem.validation import as_array, as_choice, as_flag, as_text, shown
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Parameter:
+    """One unknown, scalar or array: its initial guess and what is known about it.
+
+    Parameters
+    ----------
+    value : float or array_like
+        Initial guess, or the value itself where `fixed`.
+    lower, upper : float or array_like, optional
+        Bounds; broadcast to the shape of `value`.
+    unit : str, optional
+        For the report. That of a transition time is its experiment's `time_unit`.
+    fixed : bool, optional
+        A fixed parameter is not estimated.
+    prior : Normal or LogNormal, optional
+        What is known beforehand: it adds to the cost. Numbers of the prior are broadcast to the shape of `value`; that
+        of a fixed parameter counts for nothing.
+    scale : {"linear", "log"}, optional
+        "log": the optimiser works in log p, and confidence intervals are made there, so that they are positive. All
+        that is given and returned, bounds, priors, theta and covariance too, is p itself.
+
+    Raises
+    ------
+    ValueError
+        If a value is not finite, bounds cross, the guess lies outside them, a prior does not fit, or the scale or the
+        prior is logarithmic and p not confined to positive numbers.
+    TypeError
+        If a value or a bound is not a number, `unit` not a string, or `fixed` neither True nor False.
+    """
+
+    value: Any
+    lower: Any = -np.inf
+    upper: Any = np.inf
+    unit: str = ""
+    fixed: bool = False
+    prior: Prior | None = None
+    scale: Literal["linear", "log"] = "linear"
+
+    def __post_init__(self) -> None:
+        value = as_array(self.value, "Parameter value")
+        lower, upper = (self._bound(name, value.shape) for name in ("lower", "upper"))
+        if value.size == 0:
+            raise ValueError("Parameter value must have one entry or more; got none.")
+        if not np.all(np.isfinite(value)):
+            raise ValueError(f"Parameter value must be finite; got {shown(value)}.")
+        if not np.all(lower <= upper):
+            raise ValueError(f"Parameter bounds must satisfy lower <= upper; got {self._shown_bounds}.")
+        if not (np.all(lower <= value) and np.all(value <= upper)):
+            raise ValueError(f"Parameter value {shown(self.value)} lies outside its bounds {self._shown_bounds}.")
+        scale = as_choice(self.scale, "Parameter scale", ("linear", "log"))
+        if scale == "log":
+            lower = np.where(np.isneginf(lower), 0.0, lower)
+            if not (np.all(value > 0) and np.all(lower >= 0)):
+                raise ValueError(
+                    "Parameter with scale='log' must be positive, and its lower bound 0 or more; got the value "
+                    f"{shown(self.value)} and the lower bound {shown(self.lower)}."
+                )
+        unit, fixed = as_text(self.unit, "Parameter unit"), as_flag(self.fixed, "Parameter fixed")
+        checked = {"value": value, "lower": lower, "upper": upper, "unit": unit, "fixed": fixed, "scale": scale}
+        for name, entry in checked.items():
+            object.__setattr__(self, name, entry)
+        self._check_prior()
+
+    def _bound(self, name: str, shape: tuple[int, ...]) -> FloatArray:
+        """Return a bound with one entry for each of the value."""
+        bound = as_array(getattr(self, name), f"Parameter {name}")
+        try:
+            return np.broadcast_to(bound, shape).copy()
+        except ValueError:
+            raise ValueError(
+                f"Parameter needs numbers that fit its value, of shape {shape}; got {name} {shown(bound)} of shape "
+                f"{bound.shape}."
+            ) from None
+
+    @property
+    def _shown_bounds(self) -> str:
+        return f"[{shown(self.lower)}, {shown(self.upper)}]"
+
+    def _check_prior(self) -> None:
+        if self.prior is None:
+            return
+        if not isinstance(self.prior, (Normal, LogNormal)):
+            raise TypeError(f"Parameter prior must be an sf.Normal or an sf.LogNormal; got {shown(self.prior)}.")
+        try:
+            PriorTerms.of(self.prior, self.shape)
+        except ValueError as error:
+            raise ValueError(
+                f"Parameter prior does not fit a value of shape {self.shape}: "
+                f"{', '.join(f'{name} has shape {np.shape(number)}' for name, number in vars(self.prior).items())}."
+            ) from error
+        if isinstance(self.prior, LogNormal) and not (self.positive or self.fixed):
+            raise ValueError(
+                "Parameter with a LogNormal prior must stay positive: give it a lower bound above 0, or scale='log'; "
+                f"got the lower bound {shown(self.lower)}."
+            )
+
+    @property
+    def positive(self) -> bool:
+        """Whether it can take positive values alone."""
+        return self.scale == "log" or bool(np.all(self.lower > 0))
+
+    def entries(self) -> tuple[Parameter, ...]:
+        """A scalar `Parameter` for each entry, in their order."""
+        terms = PriorTerms.of(self.prior, self.shape)
+        priors: list[Prior | None] = []
+        for center, precision, log in zip(*terms, strict=True):
+            kind = LogNormal if log else Normal
+            priors.append(kind(np.exp(center) if log else center, precision**-0.5) if precision > 0 else None)
+        each = zip(self.value.ravel(), self.lower.ravel(), self.upper.ravel(), priors, strict=True)
+        return tuple(Parameter(x, low, high, self.unit, self.fixed, prior, self.scale) for x, low, high, prior in each)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the parameter, () for a scalar."""
+        return tuple(self.value.shape)
+
+
+def unit_suffix(unit: str) -> str:
+    """Return what follows a number in this unit, such as " min"; nothing for "" and for "1", a pure number."""
+    return "" if unit in ("", "1") else f" {unit}"
+
+
+def as_parameter(value: Any, what: str) -> Parameter:
+    """`value` itself if it is a `Parameter`, otherwise a free one without bounds; errors call it `what`."""
+    if isinstance(value, Parameter):
+        return value
+    form = "a number, an array or an sf.Parameter"
+    array = as_array(value, what, form=form)
+    try:
+        return Parameter(array)
+    except ValueError as error:
+        raise ValueError(f"{what} must be {form}: {error}") from error

@@ -1,0 +1,153 @@
+"""What is known about an unknown before the fit: priors, which add to the cost.
+
+A prior counts as one more measurement, of the unknown itself: J with its priors is the negative logarithm of the
+posterior density, up to a constant, and its minimum the maximum a posteriori (MAP) estimate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.problem.validation import as_array, shown
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """Normal prior: adds ``1/2 ((p - mean) / sd)**2`` to J.
+
+    Parameters
+    ----------
+    mean : float or array_like
+        In the unit of the unknown.
+    sd : float or array_like
+        Standard deviation, positive, in the same unit.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite, or sd not positive.
+    TypeError
+        If one is not a number.
+    """
+
+    mean: Any
+    sd: Any
+
+    def __post_init__(self) -> None:
+        _check(self, "mean", "sd")
+
+
+@dataclass(frozen=True, eq=False)
+class LogNormal:
+    """Log-normal prior of a positive unknown: adds ``1/2 ((log p - log median) / log_sd)**2`` to J.
+
+    Parameters
+    ----------
+    median : float or array_like
+        Positive, in the unit of the unknown.
+    log_sd : float or array_like
+        Standard deviation of log p, positive: 0.1 is about 10 %.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite, or not positive.
+    TypeError
+        If one is not a number.
+
+    Notes
+    -----
+    This is a normal prior of log p, whose density is taken over log p: the maximum a posteriori is that of log p.
+    """
+
+    median: Any
+    log_sd: Any
+
+    def __post_init__(self) -> None:
+        _check(self, "median", "log_sd")
+        if not np.all(self.median > 0):
+            raise ValueError(f"LogNormal median must be positive; got {shown(self.median)}.")
+
+
+Prior = Normal | LogNormal
+
+
+def _check(prior: Any, center: str, spread: str) -> None:
+    kind = type(prior).__name__
+    for name in (center, spread):
+        value = as_array(getattr(prior, name), f"{kind} {name}")
+        if not np.all(np.isfinite(value)):
+            raise ValueError(f"{kind} {name} must be finite; got {shown(value)}.")
+        object.__setattr__(prior, name, value)
+    deviation = getattr(prior, spread)
+    if not np.all(deviation > 0):
+        raise ValueError(f"{kind} {spread} must be positive; got {shown(deviation)}.")
+    with np.errstate(over="ignore"):
+        if not np.all(np.isfinite(deviation**-2.0)):
+            raise ValueError(f"{kind} {spread} must not be so small that 1 / {spread}**2 is infinite; got {deviation}.")
+
+
+class PriorTerms(NamedTuple):
+    """The priors of a whole theta: three (d,) arrays.
+
+    Attributes
+    ----------
+    center : mean, or logarithm of the median
+    precision : 1 / sd**2, 0 where there is no prior
+    log : bool, whether the prior is one of log p
+    """
+
+    center: Any
+    precision: Any
+    log: Any
+
+    @classmethod
+    def of(cls, prior: Prior | None, shape: tuple[int, ...]) -> PriorTerms:
+        """The terms of one unknown of some shape, flat."""
+        size = int(np.prod(shape))
+        if prior is None:
+            return cls(np.zeros(size), np.zeros(size), np.zeros(size, bool))
+        log = isinstance(prior, LogNormal)
+        center, sd = (np.log(prior.median), prior.log_sd) if isinstance(prior, LogNormal) else (prior.mean, prior.sd)
+        return cls(
+            np.broadcast_to(center, shape).ravel().astype(np.float64),
+            np.broadcast_to(sd**-2.0, shape).ravel().astype(np.float64),
+            np.full(size, log),
+        )
+
+    @classmethod
+    def joined(cls, parts: list[PriorTerms]) -> PriorTerms:
+        """The terms of several unknowns, one after the other."""
+        return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    @property
+    def any(self) -> bool:
+        """Whether there is a prior at all."""
+        return bool(np.any(self.precision > 0))
+
+    def evaluate(self, theta: Any, xp: Any = np, *, gauss_newton: bool = False) -> tuple[Any, Any, Any]:
+        """Cost (), gradient (d,) and diagonal of the Hessian (d,), or of the Gauss-Newton matrix, at theta (d,).
+
+        With ``e = (v - center) / sd``, v being p or log p, the cost is ``1/2 sum e**2``.
+        """
+        p = xp.where(self.log, theta, 1.0)
+        e = xp.where(self.log, xp.log(p), theta) - self.center
+        v_p = xp.where(self.log, 1.0 / p, 1.0)
+        v_pp = 0.0 if gauss_newton else xp.where(self.log, -1.0 / p**2, 0.0)
+        w = self.precision
+        return 0.5 * xp.sum(w * e * e), w * e * v_p, w * (v_p**2 + e * v_pp)
+
+    def texts(self) -> list[str]:
+        """Each prior in words; empty where there is none."""
+        found = []
+        for center, precision, log in zip(self.center, self.precision, self.log, strict=True):
+            sd = precision**-0.5 if precision > 0 else 0.0
+            text = f"log-normal({np.exp(center):.6g}, {sd:.4g})" if log else f"normal({center:.6g}, {sd:.4g})"
+            found.append(text if precision > 0 else "")
+        return found

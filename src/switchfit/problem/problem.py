@@ -1,0 +1,573 @@
+"""What is estimated: parameters, experiments, and the flat vector theta of all unknowns with its constraints.
+
+``theta`` holds the free transition times of the first experiment, of the second, ..., then the free parameters
+in the order given, then the unknown entries of the initial states, again experiment by experiment. Everything that
+is fixed stays out of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.experiment import Experiment, initial_state_of, run_names
+from switchfit.problem.lengths import common_lengths
+from switchfit.problem.parameter import Parameter, as_parameter, unit_suffix
+from switchfit.problem.priors import PriorTerms
+from switchfit.problem.structure import Functions, Structure, structure_of
+from switchfit.problem.system import HybridSystem
+from switchfit.problem.validation import (
+    as_array,
+    as_choice,
+    as_instance,
+    as_name,
+    as_number,
+    as_positive,
+    listed,
+    shown,
+)
+from switchfit.problem.variables import Variables
+
+GIVEN = ("system", "experiments", "parameters", "min_duration", "solver", "rtol", "atol")
+"""What a `Problem` is built from."""
+
+SMALLEST_RTOL = 1e-13
+"""Local errors below this part of the state are rounding."""
+
+ROUNDING = 1e-12
+"""Transition times that are out of order by less than this part of the horizon are so by rounding."""
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """Where each unknown stands in theta, and the linear constraints on theta.
+
+    Attributes
+    ----------
+    names, units : tuple of str, length d
+    initial, lower, upper : (d,) arrays
+    times : for each experiment the positions in theta of its transition times, -1 where fixed: (N,) int arrays
+    parameters : dict of name -> slice into theta of the free parameters
+    initial_states : for each experiment the positions in theta of the entries of its initial state, -1 where it is not
+        estimated: (n,) int arrays; (0,) where it is a function
+    A, b : ordering and minimum durations as ``A theta >= b``, (m, d) and (m,)
+    constraint_names : what each row means when it is active
+    priors : PriorTerms
+    log : (d,) bool, whether an unknown is estimated on a logarithmic scale
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    initial: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    times: tuple[NDArray[np.intp], ...]
+    parameters: Mapping[str, slice]
+    initial_states: tuple[NDArray[np.intp], ...]
+    A: FloatArray
+    b: FloatArray
+    constraint_names: tuple[str, ...]
+    priors: PriorTerms
+    log: NDArray[np.bool_]
+
+    @cached_property
+    def variables(self) -> Variables:
+        """What the optimiser works with: transition times as they are, other unknowns scaled or their logarithms."""
+        is_time = np.zeros(len(self.names), dtype=bool)
+        for where in self.times:
+            is_time[where[where >= 0]] = True
+        return Variables.of(self.initial, self.lower, self.upper, self.log, keep=is_time)
+
+    @property
+    def log_names(self) -> tuple[str, ...]:
+        """Names of the unknowns that are estimated on a logarithmic scale."""
+        return tuple(name for name, log in zip(self.names, self.log, strict=True) if log)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A system, the experiments made with it, and the parameters to estimate.
+
+    Parameters
+    ----------
+    system : HybridSystem
+    experiments : Experiment or list of Experiment
+        Parameters are shared by all of them, unless their `parameter_map` says otherwise; each has its own transition
+        times, and its own initial state where that is unknown.
+    parameters : mapping of str to Parameter, number or array
+        A bare number is a free parameter without bounds.
+    min_duration : float, optional
+        Shortest time a mode may last, in the time unit that all experiments then share; 0 lets a mode vanish, which
+        the result then reports.
+    solver : {"explicit", "stiff"}, optional
+        Butcher's explicit Runge-Kutta method of order 5, or Radau IIA of order 5 for stiff modes.
+    rtol, atol : float, optional
+        Tolerances of the local error by which the mesh is refined. With the defaults J has a relative error of about
+        1e-8, its gradient and its Hessian of about 1e-7. Ten times smaller tolerances make these errors about ten times
+        smaller or better, and take up to 1.6 times as many steps.
+
+    Raises
+    ------
+    ValueError
+        For unknown modes, unknown parameters in a map, impossible minimum durations, a minimum duration or a delay for
+        experiments with different time units, or a vector field, reset map, observation or cost of the wrong shape or
+        dtype.
+    TypeError
+        If an argument is of the wrong type.
+    """
+
+    system: HybridSystem
+    experiments: Any
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    min_duration: float = 0.0
+    solver: Literal["explicit", "stiff"] = "explicit"
+    rtol: float = 1e-8
+    atol: float = 1e-10
+    unknowns: Unknowns = field(init=False)
+    structures: tuple[Structure, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        as_instance(self.system, "system", HybridSystem, "an sf.HybridSystem")
+        given = self.experiments
+        experiments = tuple(given) if isinstance(given, (list, tuple)) else (given,)
+        if not experiments or not all(isinstance(e, Experiment) for e in experiments):
+            raise TypeError(f"experiments must be an sf.Experiment or a non-empty list of them; got {shown(given)}.")
+        for experiment in experiments:
+            for mode in experiment.mode_sequence:
+                if mode not in self.system.modes:
+                    raise ValueError(
+                        f"mode_sequence names the unknown mode {shown(mode)}; the modes are "
+                        f"{listed(self.system.modes)}."
+                    )
+        object.__setattr__(self, "solver", as_choice(self.solver, "solver", ("explicit", "stiff")))
+        for name in ("rtol", "atol"):
+            object.__setattr__(self, name, as_positive(getattr(self, name), name))
+        if not SMALLEST_RTOL <= self.rtol < 1:
+            raise ValueError(f"rtol must lie between {SMALLEST_RTOL} (rounding) and 1; got {self.rtol}.")
+        parameters = _checked_parameters(self.parameters)
+        object.__setattr__(self, "experiments", experiments)
+        object.__setattr__(self, "parameters", parameters)
+        dwell = as_number(self.min_duration, "min_duration")
+        object.__setattr__(self, "min_duration", dwell)
+        self._check_maps()
+        self._check_states()
+        object.__setattr__(self, "unknowns", _unknowns(self.system, experiments, parameters, dwell))
+        self._check_noise()
+        self._check_delays()
+        targets = frozenset(name for e in experiments for name in e.parameter_map.values())
+        functions = Functions(parameters, targets)
+        structures = tuple(structure_of(self.system, e, functions, self.solver) for e in experiments)
+        for structure in structures:
+            self.system.check_labels_of(structure.n)
+        object.__setattr__(self, "structures", structures)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled: the user's functions, and of their traces what identifies them."""
+        state = {name: getattr(self, name) for name in GIVEN}
+        return state | {"digests": self.digests}
+
+    @property
+    def digests(self) -> list[dict[str, str]]:
+        """What identifies the functions of each experiment in every process."""
+        return [structure.digests for structure in self.structures]
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Build the problem again; ValueError if a function does something else than when the problem was built."""
+        for name in GIVEN:
+            object.__setattr__(self, name, state[name])
+        self.__post_init__()
+        for structure, digests in zip(self.structures, state["digests"], strict=True):
+            changed = [name for name, digest in structure.digests.items() if digests.get(name) != digest]
+            if changed:
+                raise ValueError(
+                    f"{', '.join(changed)} does something else in this process, or now, than when the problem was "
+                    "built: it reads something that has changed since. Then build the problem anew before it is sent "
+                    "to other processes."
+                )
+
+    def _check_maps(self) -> None:
+        for name, experiment in zip(run_names(self.experiments), self.experiments, strict=True):
+            for here, target in experiment.parameter_map.items():
+                if target not in self.parameters:
+                    raise ValueError(
+                        f"parameter_map of experiment {listed([name])} gives the model's {shown(here)} as the "
+                        f"unknown parameter {shown(target)}; the problem has {listed(self.parameters)}."
+                    )
+
+    def _check_noise(self) -> None:
+        """Parameters that are a sigma, and whether the noise is known where something is weighed against it."""
+        items = [(e, item) for e in self.experiments for item in e.data if isinstance(item, Measurements)]
+        for experiment, item in items:
+            for name in filter(None, item.sigma_names):
+                parameter = self.parameters.get(experiment.parameter_map.get(name, name))
+                if parameter is None:
+                    raise ValueError(
+                        f"sigma names the parameter {shown(name)}, which the problem lacks; it has "
+                        f"{listed(self.parameters)}."
+                    )
+                if parameter.shape != () or not (parameter.positive or (parameter.fixed and parameter.value > 0)):
+                    raise ValueError(
+                        f"sigma names the parameter {name!r}, which must be one number that stays positive: give it a "
+                        f"lower bound above 0, or scale='log'; got shape {parameter.shape}, lower bound "
+                        f"{parameter.lower.tolist()}."
+                    )
+        unknown = any(item.sigma is None for _, item in items)
+        if unknown and any(item.sigma_names or item.loss != "linear" for _, item in items):
+            raise ValueError(
+                "sigma is left out in some Measurements, and a parameter or measured against by a robust loss in "
+                "others: their costs are then not in the same units. Name a parameter for it there too."
+            )
+        if unknown and self.unknowns.priors.any:
+            raise ValueError(
+                "a prior is weighed against the noise of the Measurements, whose sigma is left out: give sigma a "
+                "number, or the name of a parameter to estimate it."
+            )
+
+    def _check_delays(self) -> None:
+        """Parameters that are a delay: within their bounds all samples must be of moments inside the horizon."""
+        for experiment in self.experiments:
+            for item in experiment.data:
+                if not (isinstance(item, Measurements) and isinstance(item.delay, str)):
+                    continue
+                parameter = self.parameters.get(experiment.parameter_map.get(item.delay, item.delay))
+                if parameter is None or parameter.shape != ():
+                    raise ValueError(
+                        f"delay names {shown(item.delay)}, which must be a parameter of one number; the problem has "
+                        f"{listed(self.parameters)}."
+                    )
+                self._check_delay_unit(experiment, item.delay)
+                unit = unit_suffix(experiment.time_unit)
+                low, high = item.times[-1] - experiment.tf, item.times[0] - experiment.t0
+                least, most = (parameter.value,) * 2 if parameter.fixed else (parameter.lower, parameter.upper)
+                if not low <= least <= most <= high:
+                    raise ValueError(
+                        f"the delay {item.delay!r} may lie in [{least}, {most}]{unit} (its bounds, if it is not "
+                        f"fixed), but only from {low:.6g} to {high:.6g}{unit} are all samples of moments inside "
+                        f"(t0, tf) = ({experiment.t0}, {experiment.tf}): give it narrower bounds, move t0 or tf, or "
+                        "leave out samples at the ends."
+                    )
+
+    def _check_delay_unit(self, experiment: Experiment, delay: str) -> None:
+        """A delay is a time: in the unit of the experiment, and shared by experiments of one time unit alone."""
+        name = experiment.parameter_map.get(delay, delay)
+        unit = self.parameters[name].unit
+        if unit not in ("", experiment.time_unit):
+            raise ValueError(
+                f"the delay {name!r} has the unit {unit!r}, but time_unit of its experiment is "
+                f"{experiment.time_unit!r}, and times are not converted. Give both in the same unit."
+            )
+        runs = zip(run_names(self.experiments), self.experiments, strict=True)
+        units = {run: e.time_unit for run, e in runs if name in _delay_targets(e)}
+        _require_one_time_unit(units, f"the delay {name!r}", "give each run a delay of its own (parameter_map)")
+
+    def _check_states(self) -> None:
+        """Sizes of initial states that are no functions."""
+        own = self.system.initial_state
+        for e, experiment in enumerate(self.experiments):
+            initial = initial_state_of(self.system, experiment)
+            if callable(initial):
+                continue
+            if not callable(own) and len(initial) != len(own):
+                raise ValueError(
+                    f"initial_state of experiment {experiment.name or e + 1} must have "
+                    f"{len(own)} entries, as the system's has; got {len(initial)}."
+                )
+            self.system.check_labels_of(len(initial))
+
+    @property
+    def initial_theta(self) -> FloatArray:
+        """The first guess of everything estimated: a ``(d,)`` array."""
+        return self.unknowns.initial.copy()
+
+    @property
+    def theta_names(self) -> tuple[str, ...]:
+        """Name of each entry of theta, transition times first."""
+        return self.unknowns.names
+
+    @cached_property
+    def constraint_names(self) -> tuple[str, ...]:
+        """What has to be zero: guards at transitions, then terminal constraints, experiment by experiment."""
+        names = []
+        for prefix, structure, experiment in zip(self._prefixes, self.structures, self.experiments, strict=True):
+            for i in structure.guarded:
+                before, after = experiment.mode_sequence[i : i + 2]
+                names.append(f"{prefix}guard of tau_{i + 1} ({before} -> {after})")
+            names += [f"{prefix}terminal constraint {k + 1}" for k in range(structure.terminal_constraint_count)]
+        return tuple(names)
+
+    @cached_property
+    def constraint_counts(self) -> tuple[int, ...]:
+        """Number of constraints of each experiment."""
+        return tuple(len(s.guarded) + s.terminal_constraint_count for s in self.structures)
+
+    @property
+    def _prefixes(self) -> list[str]:
+        if len(self.experiments) == 1:
+            return [""]
+        return [f"{name}." for name in run_names(self.experiments)]
+
+    @cached_property
+    def places(self) -> tuple[NDArray[np.intp], ...]:
+        """For each experiment the positions in theta of its N transition times and of its p (M,), -1 where fixed."""
+        unknowns = self.unknowns
+        found = []
+        for e, (structure, experiment) in enumerate(zip(self.structures, self.experiments, strict=True)):
+            free = [name for name, _, is_free in structure.parameters if is_free]
+            spans = [unknowns.parameters[experiment.parameter_map.get(name, name)] for name in free]
+            states = unknowns.initial_states[e]
+            parts = [unknowns.times[e], *(np.arange(s.start, s.stop) for s in spans), states[states >= 0]]
+            found.append(np.concatenate(parts).astype(np.intp))
+        return tuple(found)
+
+    @cached_property
+    def own_places(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+        """For each experiment which entries of what its programs take are unknowns, and their positions in theta."""
+        return [(own, places[own]) for places in self.places for own in [np.flatnonzero(places >= 0)]]
+
+    @cached_property
+    def one_to_one(self) -> bool:
+        """Whether theta is what the programs of a single experiment take."""
+        return len(self.places) == 1 and np.array_equal(self.places[0], np.arange(len(self.theta_names)))
+
+    @cached_property
+    def sizes(self) -> FloatArray:
+        """Typical size of each unknown, by which rounding is measured: (d,).
+
+        For a transition time it is the length of the horizon, or what the clock reads if that is more: a time that is
+        1e-30 after t0 = 0 is t0.
+        """
+        sizes = np.abs(self.unknowns.initial)
+        for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
+            sizes[where[where >= 0]] = _clock(experiment)
+        return sizes
+
+    def elapsed(self, theta: FloatArray) -> FloatArray:
+        """theta with transition times counted from their experiment's t0, (d,): it does not depend on the clock."""
+        counted = theta.copy()
+        for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
+            counted[where[where >= 0]] -= experiment.t0
+        return counted
+
+    def vectors(self, theta: FloatArray, e: int) -> tuple[FloatArray, FloatArray]:
+        """What the compiled programs of experiment e take: its transition times (N,) and its p (M,)."""
+        places, N = self.places[e], self.structures[e].N
+        if self.one_to_one:
+            return theta[:N], theta[N:]
+        where = places[:N]
+        tau = self.experiments[e].initial_times
+        tau[where >= 0] = theta[where[where >= 0]]
+        return tau, theta[places[N:]]
+
+    @cached_property
+    def alike(self) -> tuple[tuple[int, ...], ...]:
+        """Groups of experiments (from 0) that have equal structures: one program each, if their lengths agree too."""
+        groups: dict[Structure, list[int]] = {}
+        for e, structure in enumerate(self.structures):
+            groups.setdefault(structure, []).append(e)
+        return tuple(tuple(group) for group in groups.values())
+
+    @cached_property
+    def sample_lengths(self) -> tuple[tuple[int, ...], ...]:
+        """For each experiment the lengths to which the samples of each of its Measurements are padded."""
+        counts = [[len(item.times) for item in e.data if isinstance(item, Measurements)] for e in self.experiments]
+        for group in self.alike:
+            for k in range(len(counts[group[0]])):
+                for e, length in zip(group, common_lengths([counts[e][k] for e in group]), strict=True):
+                    counts[e][k] = length
+        return tuple(tuple(lengths) for lengths in counts)
+
+    def named(self, theta: FloatArray, e: int) -> dict[str, FloatArray]:
+        """The parameters of experiment e under the names that the model has for them."""
+        own = self.split(theta)[1]
+        mapped = self.experiments[e].parameter_map
+        return own | {name: own[target] for name, target in mapped.items()}
+
+    def late_times(self, theta: FloatArray, e: int) -> FloatArray:
+        """Moments of which the samples of experiment e are whose delay is a parameter: (K,), in no order."""
+        items = [item for item in self.experiments[e].data if isinstance(item, Measurements)]
+        late = [(item.times, item.delay) for item in items if isinstance(item.delay, str)]
+        named = self.named(theta, e) if late else {}
+        return np.concatenate([np.zeros(0), *(times - named[delay] for times, delay in late)])
+
+    def checked_theta(self, theta: ArrayLike | None, what: str = "theta") -> FloatArray:
+        """Return `theta`, or the initial guess for None, as a ``(d,)`` array; messages call it `what`.
+
+        Raises
+        ------
+        ValueError
+            Where the shape or the order of transition times is wrong.
+        """
+        if theta is None:
+            return self.initial_theta
+        checked = as_array(theta, what)
+        if checked.shape != self.unknowns.initial.shape:
+            raise ValueError(
+                f"{what} must have shape ({len(self.theta_names)},): {listed(self.theta_names)}; "
+                f"got shape {checked.shape}."
+            )
+        if not np.all(np.isfinite(checked)):
+            raise ValueError(f"{what} must be finite; got {shown(checked)}.")
+        checked = checked.copy()
+        for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
+            times = experiment.initial_times
+            times[where >= 0] = checked[where[where >= 0]]
+            knots = np.concatenate([[experiment.t0], times, [experiment.tf]])
+            if np.any(np.diff(knots) < -ROUNDING * _clock(experiment)):
+                raise ValueError(
+                    f"The transition times in {what} must not decrease inside (t0, tf) = ({experiment.t0}, "
+                    f"{experiment.tf}); got {shown(times)}."
+                )
+            if np.any(np.diff(knots) < 0):  # by rounding: put in order, round the times that are fixed
+                low = np.maximum.accumulate(np.append(experiment.t0, np.where(where < 0, times, -np.inf)))[1:]
+                high = np.minimum.accumulate(np.append(np.where(where < 0, times, np.inf), experiment.tf)[::-1])[::-1]
+                ordered = np.maximum.accumulate(np.clip(times, low, high[:-1]))
+                checked[where[where >= 0]] = ordered[where >= 0]
+        self._check_delays_inside(checked, what)
+        return checked
+
+    def _check_delays_inside(self, theta: FloatArray, what: str) -> None:
+        for e, experiment in enumerate(self.experiments):
+            seen = self.late_times(theta, e)
+            if seen.size and (seen.min() < experiment.t0 or seen.max() > experiment.tf):
+                raise ValueError(
+                    f"{what} has delays with which samples are of moments from {seen.min():.6g} to {seen.max():.6g}"
+                    f"{unit_suffix(experiment.time_unit)}, outside (t0, tf) = ({experiment.t0}, {experiment.tf})."
+                )
+
+    def split(self, theta: FloatArray) -> tuple[list[FloatArray], dict[str, FloatArray]]:
+        """All transition times, one ``(N,)`` array an experiment, and all parameters by name, fixed ones included."""
+        times = []
+        for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
+            tau = experiment.initial_times
+            tau[where >= 0] = theta[where[where >= 0]]
+            times.append(tau)
+        parameters = {}
+        for name, parameter in self.parameters.items():
+            span = self.unknowns.parameters.get(name)
+            parameters[name] = parameter.value if span is None else theta[span].reshape(parameter.shape)
+        return times, parameters
+
+
+def _clock(experiment: Experiment) -> float:
+    """Size of the times of an experiment, of which rounding is a part: the horizon, or the clock's reading if more."""
+    return max(experiment.tf - experiment.t0, abs(experiment.t0), abs(experiment.tf))
+
+
+def _checked_parameters(parameters: Any) -> dict[str, Parameter]:
+    if not isinstance(parameters, Mapping | None):
+        raise TypeError(f"parameters must be a dict of name -> value or sf.Parameter; got {shown(parameters)}.")
+    given = {} if parameters is None else parameters
+    names = [as_name(name, "parameter names", "strings") for name in given]
+    return {name: as_parameter(given[name], f"parameter {shown(name)}") for name in names}
+
+
+def _unknowns(
+    system: HybridSystem, experiments: tuple[Experiment, ...], parameters: dict[str, Parameter], dwell: float
+) -> Unknowns:
+    names: list[str] = []
+    units: list[str] = []
+    pieces: list[Parameter] = []
+    where: list[NDArray[np.intp]] = []
+    prefixes = [""] if len(experiments) == 1 else [f"{name}." for name in run_names(experiments)]
+    for prefix, experiment in zip(prefixes, experiments, strict=True):
+        positions = np.full(len(experiment.transition_times), -1, dtype=np.intp)
+        for i, tau in enumerate(experiment.transition_times):
+            if not tau.fixed:
+                positions[i] = len(names)
+                names.append(f"{prefix}tau_{i + 1}")
+                units.append(experiment.time_unit)
+                pieces.append(tau)
+        where.append(positions)
+    spans: dict[str, slice] = {}
+    for name, parameter in parameters.items():
+        if not parameter.fixed:
+            spans[name] = slice(len(names), len(names) + parameter.value.size)
+            names += [f"{name}{_index(k)}" for k in np.ndindex(parameter.shape)]
+            units += [parameter.unit] * parameter.value.size
+            pieces.append(parameter)
+    states: list[NDArray[np.intp]] = []
+    for prefix, experiment in zip(prefixes, experiments, strict=True):
+        initial = initial_state_of(system, experiment)
+        positions = np.full(0 if callable(initial) else len(initial), -1, dtype=np.intp)
+        for k in range(len(positions)):
+            if isinstance(initial[k], Parameter) and not initial[k].fixed:
+                positions[k] = len(names)
+                names.append(f"{prefix}{system.state_names[k] if system.state_names else f'x{k + 1}'}(t0)")
+                units.append(initial[k].unit or (system.state_units[k] if system.state_units else ""))
+                pieces.append(initial[k])
+        states.append(positions)
+    if not names:
+        raise ValueError("Nothing to estimate: every parameter and transition time is fixed.")
+    if len(set(names)) != len(names):
+        twice = sorted({name for name in names if names.count(name) > 1})
+        raise ValueError(f"Two unknowns share a name: {listed(twice)}; rename the parameter or the experiment.")
+    flat = {key: np.concatenate([getattr(q, key).ravel() for q in pieces]) for key in ("value", "lower", "upper")}
+    priors = PriorTerms.joined([PriorTerms.of(q.prior, q.shape) for q in pieces])
+    log = np.concatenate([np.full(q.value.size, q.scale == "log") for q in pieces])
+    A, b, rows = _ordering(experiments, where, len(names), dwell)
+    vectors = flat["value"], flat["lower"], flat["upper"]
+    return Unknowns(tuple(names), tuple(units), *vectors, tuple(where), spans, tuple(states), A, b, rows, priors, log)
+
+
+def _delay_targets(experiment: Experiment) -> set[str]:
+    """Names of the problem's parameters that are delays in an experiment."""
+    delays = [item.delay for item in experiment.data if isinstance(item, Measurements)]
+    return {experiment.parameter_map.get(delay, delay) for delay in delays if isinstance(delay, str)}
+
+
+def _require_one_time_unit(units: Mapping[str, str], what: str, otherwise: str) -> None:
+    """Raise ValueError if `what`, one time for several experiments, would have several units; `units` by run's name."""
+    if len(set(units.values())) > 1:
+        shown = ", ".join(f"{name} in {unit}" for name, unit in units.items())
+        raise ValueError(
+            f"{what} is one number for experiments whose times are in different units ({shown}), and times are not "
+            f"converted. Give all times in one unit, as time_unit of each experiment, or {otherwise}."
+        )
+
+
+def _index(k: tuple[int, ...]) -> str:
+    return f"[{','.join(map(str, k))}]" if k else ""
+
+
+def _ordering(
+    experiments: tuple[Experiment, ...], where: list[NDArray[np.intp]], d: int, dwell: float
+) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
+    """Rows ``tau_{i+1} - tau_i >= min_duration`` for every mode of every experiment with a free end."""
+    if not (np.isfinite(dwell) and dwell >= 0):
+        raise ValueError(f"min_duration must be zero or positive; got {dwell}.")
+    rows, bounds, names = [], [], []
+    labels = run_names(experiments)
+    if dwell > 0:
+        units = {name: experiment.time_unit for name, experiment in zip(labels, experiments, strict=True)}
+        _require_one_time_unit(units, "min_duration", "leave it out and bound the transition times of each")
+    for e, (experiment, positions) in enumerate(zip(experiments, where, strict=True)):
+        run = "" if len(experiments) == 1 else f" of {labels[e]}"
+        knots = np.concatenate([[experiment.t0], experiment.initial_times, [experiment.tf]])
+        ends = np.concatenate([[-1], positions, [-1]])
+        unit = unit_suffix(experiment.time_unit)
+        for i, mode in enumerate(experiment.mode_sequence):
+            length = knots[i + 1] - knots[i]
+            if length < dwell * (1 - 1e-12):
+                raise ValueError(
+                    f"min_duration is {dwell}{unit}, but the guess gives mode {i + 1} ({mode!r}){run} only "
+                    f"{length:.6g}{unit}."
+                )
+            if ends[i] < 0 and ends[i + 1] < 0:
+                continue
+            row, bound = np.zeros(d), dwell
+            for end, knot, sign in ((ends[i + 1], knots[i + 1], 1.0), (ends[i], knots[i], -1.0)):
+                if end >= 0:
+                    row[end] += sign
+                else:
+                    bound -= sign * knot
+            rows.append(row)
+            bounds.append(bound)
+            state = "has collapsed to nothing" if dwell == 0 else "is at its minimum duration"
+            names.append(f"mode {i + 1} ({mode!r}){run} {state}")
+    return np.array(rows).reshape(len(rows), d), np.array(bounds), tuple(names)

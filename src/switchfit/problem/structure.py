@@ -1,0 +1,272 @@
+"""The structure of an experiment: everything that shapes a compiled program, the user's functions traced.
+
+Which functions, in which order, with which shapes. Experiments with equal structure and equal (padded) lengths share
+one program, and nothing is compiled anew when transition times, parameters or data change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from switchfit.problem.data import (
+    FloatArray,
+    Measurements,
+    ReferenceSignal,
+    RunningCost,
+    TerminalConstraint,
+    TerminalCost,
+)
+from switchfit.problem.experiment import Experiment, guards_of, initial_state_of, reset_maps_of
+from switchfit.problem.functions import Function, Shape, trace_function
+from switchfit.problem.parameter import Parameter
+from switchfit.problem.system import HybridSystem
+
+
+class Sensor(NamedTuple):
+    """What of one `Measurements` shapes the program: functions, names and the loss."""
+
+    observe: Function | None  # None: the whole state
+    channels: int
+    sigma: tuple[str | None, ...]  # the parameter that is the sigma of each channel; empty where all are numbers
+    loss: str
+    loss_scale: float
+    delay: str | None  # the parameter that is the delay; None where it is a number, which is in the times
+
+    @classmethod
+    def of(cls, item: Measurements, observe: Function | None) -> Sensor:
+        """That of one of the data."""
+        delay = item.delay if isinstance(item.delay, str) else None
+        return cls(observe, item.values.shape[1], item.sigma_names, item.loss, item.loss_scale, delay)
+
+    @property
+    def named(self) -> set[str]:
+        """Parameters that it is measured with."""
+        return {name for name in (*self.sigma, self.delay) if name is not None}
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What a compiled program depends on beside the shapes of its arguments. Hashable; functions by what they do."""
+
+    mode_names: tuple[str, ...]
+    modes: tuple[Function, ...]
+    mode_of_segment: tuple[int, ...]
+    reset_maps: tuple[Function | None, ...]
+    initial_state: Function | None
+    n: int
+    unknown_states: tuple[int, ...]  # entries of the initial state that are estimated
+    parameters: tuple[tuple[str, tuple[int, ...], bool], ...]  # the model's name, shape, free
+    running: tuple[Function, ...]
+    references: tuple[tuple[Function | None, int], ...]  # observe, channels
+    measurements: tuple[Sensor, ...]
+    terminal: tuple[Function, ...]
+    guards: tuple[Function | None, ...]
+    terminal_constraints: tuple[Function, ...]
+    input_shape: tuple[int, ...] | None
+    solver: str
+
+    @property
+    def outputs(self) -> tuple[tuple[Function | None, int], ...]:
+        """What sees the state, reference signals first, then the Measurements: function and channels of each."""
+        return (*self.references, *((sensor.observe, sensor.channels) for sensor in self.measurements))
+
+    @property
+    def N(self) -> int:
+        """Number of transitions."""
+        return len(self.reset_maps)
+
+    @cached_property
+    def M(self) -> int:
+        """Length of p: the free scalar parameters, then the unknown entries of the initial state."""
+        return sum(int(np.prod(shape)) for _, shape, free in self.parameters if free) + len(self.unknown_states)
+
+    @property
+    def functions(self) -> Structure:
+        """The same with one segment: what programs depend on that work in one mode at a time."""
+        return replace(self, mode_of_segment=(0,), reset_maps=(), guards=(), terminal_constraints=())
+
+    @property
+    def resets(self) -> tuple[int, ...]:
+        """The transitions (from 0) at which a reset map acts."""
+        return tuple(i for i, reset in enumerate(self.reset_maps) if reset is not None)
+
+    @property
+    def guarded(self) -> tuple[int, ...]:
+        """The transitions (from 0) that have a guard."""
+        return tuple(i for i, guard in enumerate(self.guards) if guard is not None)
+
+    @property
+    def terminal_constraint_count(self) -> int:
+        """Number of terminal constraints, m."""
+        return sum(int(np.prod(psi.shape)) for psi in self.terminal_constraints)
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """What identifies each of its functions in every process, by what the function is."""
+        found = {f"mode {name!r}": mode for name, mode in zip(self.mode_names, self.modes, strict=True)}
+        for kind, functions in (
+            ("initial_state", (self.initial_state,)),
+            ("reset map", self.reset_maps),
+            ("guard", self.guards),
+            ("RunningCost", self.running),
+            ("observe", tuple(observe for observe, _ in self.outputs)),
+            ("TerminalCost", self.terminal),
+            ("TerminalConstraint", self.terminal_constraints),
+        ):
+            found |= {f"{kind} {k + 1}": function for k, function in enumerate(functions) if function is not None}
+        return {name: function.digest for name, function in found.items()}
+
+    @property
+    def constrained(self) -> bool:
+        """Whether anything has to hold beside the differential equation."""
+        return bool(self.guarded or self.terminal_constraints)
+
+
+class Functions:
+    """Traces the functions of a problem's experiments, each of them once.
+
+    Parameters
+    ----------
+    parameters : mapping of str to Parameter
+        Of the problem.
+    targets : set of str
+        Those that some experiment's map names as what it maps to. They are an experiment's where it maps to them, or
+        asks for them by their own name.
+    """
+
+    def __init__(self, parameters: Mapping[str, Parameter], targets: frozenset[str]) -> None:
+        self.parameters, self.targets = parameters, targets
+        self._traced: dict[Any, Function] = {}
+
+    def of(self, experiment: Experiment) -> _Tracer:
+        """What traces the functions of one experiment."""
+        mapped = experiment.parameter_map
+        order = {name: k for k, name in enumerate(self.parameters)}
+        # The same order in every run, whatever its map: runs then share a program.
+        named = sorted({*self.parameters, *mapped}, key=lambda name: (order.get(name, len(order)), name))
+        hidden = frozenset(name for name in self.targets if name not in mapped)
+        return _Tracer({name: self.parameters[mapped.get(name, name)] for name in named}, hidden, self._traced)
+
+
+class _Tracer:
+    """Traces the functions of one experiment, and notes which parameters they ask for.
+
+    Attributes
+    ----------
+    named : dict of str to Parameter, by the model's names
+    hidden : set of str
+        Those that a function sees only if it asks for them by name.
+    asked : set of str
+    """
+
+    def __init__(self, named: dict[str, Parameter], hidden: frozenset[str], traced: dict[Any, Function]) -> None:
+        self.named, self.hidden, self._traced = named, hidden, traced
+        self.shapes = {name: q.shape for name, q in named.items()}
+        self.asked: set[str] = set()
+        self._key = tuple(self.shapes.items()), hidden
+
+    def __call__(
+        self,
+        function: Callable[..., Any],
+        arguments: tuple[Shape | None, ...],
+        shape: Shape | None,
+        what: str,
+        form: str,
+    ) -> Function:
+        """A function that takes arguments of these shapes, None standing for p, and returns an array of a shape."""
+        key = (id(function), arguments, shape, what, self._key)
+        traced = self._traced.get(key)
+        if traced is None:
+            traced = trace_function(function, arguments, self.shapes, self.hidden, what=what, form=form, shape=shape)
+            self._traced[key] = traced
+        self.asked.update(traced.parameters)
+        return traced
+
+
+def structure_of(system: HybridSystem, experiment: Experiment, functions: Functions, solver: str) -> Structure:
+    """The structure of one experiment, its functions traced and checked.
+
+    Raises
+    ------
+    ValueError
+        Naming the mode or function, what it should return and what it returned.
+    """
+    trace = functions.of(experiment)
+    names = tuple(dict.fromkeys(experiment.mode_sequence))
+    initial = initial_state_of(system, experiment)
+    x0 = trace(initial, (None,), None, "initial_state", "initial_state(p)") if callable(initial) else None
+    if x0 is not None and (len(x0.shape) != 1 or x0.shape == (0,)):
+        raise ValueError(f"initial_state(p) must return an array of shape (n,); got shape {x0.shape}.")
+    n = len(initial) if x0 is None else x0.shape[0]
+    unknown = () if callable(initial) else tuple(k for k, x in enumerate(initial) if not getattr(x, "fixed", True))
+    items = partial(of_kind, experiment.data)
+    at: tuple[Shape | None, ...] = ((), (n,), None)
+    inputs = None if experiment.inputs is None else tuple(experiment.inputs.values.shape[1:])
+    in_mode, form = (at, "f(t, x, p)") if inputs is None else ((*at, inputs), "f(t, x, p, u)")
+
+    def transitions(kind: tuple[Callable[..., Any] | None, ...], shape: Shape, what: str, form: str) -> tuple[Any, ...]:
+        pairs = zip(kind, pairwise(experiment.mode_sequence), strict=True)
+        return tuple(None if g is None else trace(g, at, shape, f"{what} {pair}", form) for g, pair in pairs)
+
+    def observe(item: Measurements | ReferenceSignal, channels: int) -> Function | None:
+        if item.observe is not None:
+            return trace(item.observe, at, (channels,), "observe", "h(t, x, p)")
+        if channels != n:
+            raise ValueError(
+                f"Without observe the whole state is compared: its {n} entries need as many channels of data; got "
+                f"{channels}. Give observe=h(t, x, p) -> ({channels},)."
+            )
+        return None
+
+    modes = tuple(trace(system.modes[name], in_mode, (n,), f"mode {name!r}", form) for name in names)
+    references = ((item, item.signal.channels) for item in items(ReferenceSignal))
+    measurements = ((item, item.values.shape[1]) for item in items(Measurements))
+    constraints = tuple(
+        trace(item.psi, at[1:], None, "TerminalConstraint", "psi(x, p)") for item in items(TerminalConstraint)
+    )
+    for psi in constraints:
+        if len(psi.shape) > 1:
+            raise ValueError(
+                f"TerminalConstraint: psi(x, p) must return a number or an array of shape (m,); got shape {psi.shape}."
+            )
+    structure = Structure(
+        mode_names=names,
+        modes=modes,
+        mode_of_segment=tuple(names.index(mode) for mode in experiment.mode_sequence),
+        reset_maps=transitions(reset_maps_of(system, experiment.mode_sequence), (n,), "reset map", "R(t, x, p)"),
+        initial_state=x0,
+        n=n,
+        unknown_states=unknown,
+        parameters=(),
+        running=tuple(trace(item.ell, at, (), "RunningCost", "ell(t, x, p)") for item in items(RunningCost)),
+        references=tuple((observe(item, channels), channels) for item, channels in references),
+        measurements=tuple(Sensor.of(item, observe(item, channels)) for item, channels in measurements),
+        terminal=tuple(trace(item.phi, at[1:], (), "TerminalCost", "phi(x, p)") for item in items(TerminalCost)),
+        guards=transitions(guards_of(system, experiment.mode_sequence), (), "guard", "g(t, x, p)"),
+        terminal_constraints=constraints,
+        input_shape=inputs,
+        solver=solver,
+    )
+    asked = trace.asked.union(*(sensor.named for sensor in structure.measurements))
+    # What is fixed costs nothing.
+    used = tuple(
+        (name, q.shape, not q.fixed)
+        for name, q in trace.named.items()
+        if name in asked or (q.fixed and name not in trace.hidden)
+    )
+    return replace(structure, parameters=used)
+
+
+def initial_values(initial: Any) -> FloatArray:
+    """An initial state that is no function, as numbers (n,): where it is unknown, its guess."""
+    return np.array([x.value if isinstance(x, Parameter) else x for x in initial], dtype=np.float64)
+
+
+def of_kind(data: tuple[Any, ...], kind: type) -> list[Any]:
+    return [item for item in data if isinstance(item, kind)]

@@ -1,0 +1,165 @@
+"""What is fitted: a hybrid system, that is named modes, reset maps and guards between them, and an initial state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.problem.parameter import Parameter
+from switchfit.problem.validation import as_array, as_callable, as_name, as_names, as_sequence, as_text, listed, shown
+
+VectorField = Callable[..., Any]
+"""``f(t, x, p) -> (n,)``, or ``f(t, x, p, u) -> (n,)`` in an experiment with inputs."""
+
+ResetMap = Callable[..., Any]
+"""``R(t, x, p) -> (n,)``: the state just after a transition from the state just before it."""
+
+Guard = Callable[..., Any]
+"""``g(t, x, p) -> ()``: zero where a transition happens, of the state just before it."""
+
+InitialState = NDArray[np.float64] | tuple[Parameter, ...] | Callable[[Mapping[str, Any]], Any]
+"""An ``(n,)`` array, a `Parameter` for each of n states, or a function of the parameters that returns an array."""
+
+
+@dataclass(frozen=True, eq=False)
+class HybridSystem:
+    """A switched system: in mode ``i`` the state obeys ``dx/dt = f_i(t, x, p)``, equation (1).
+
+    Parameters
+    ----------
+    modes : mapping of str to callable
+        Vector field of each mode by name: ``f(t, x, p) -> (n,)`` written with ``jax.numpy``. ``t`` is a
+        scalar in the experiment's time unit, ``x`` an ``(n,)`` array and ``p`` a dict of arrays; all are float64.
+        In an experiment with inputs modes are called as ``f(t, x, p, u)``, ``u`` being a dict or an array as the
+        `switchfit.Input` was given.
+    initial_state : (n,) array_like, or callable ``p -> (n,)``
+        State at ``t0``; as a function of the parameters it is differentiated with them. An entry may be a
+        `switchfit.Parameter`: it is then estimated, for each experiment by itself.
+    reset_maps : mapping of (str, str) to callable, optional
+        ``reset_maps[a, b]`` is applied at every transition from mode ``a`` to mode ``b``:
+        ``x(tau+) = R(tau, x(tau-), p)``. Transitions without an entry leave the state continuous.
+    state_names, state_units : sequence of str, optional
+        One for each state; they label reports and plots.
+    guards : mapping of (str, str) to callable, optional
+        Every transition from mode ``a`` to mode ``b`` happens where ``guards[a, b](tau, x(tau-), p) = 0``: its time is
+        then no free unknown but follows from the others. Transitions without an entry happen at any time.
+
+    Raises
+    ------
+    ValueError
+        If a reset map or a guard names an unknown mode, or names, units and initial state differ in length.
+    TypeError
+        If a mode, a reset map or a guard is not callable, the initial state not made of numbers, or a name no string.
+    """
+
+    modes: Mapping[str, VectorField]
+    initial_state: Any
+    reset_maps: Mapping[tuple[str, str], ResetMap] = field(default_factory=dict)
+    state_names: tuple[str, ...] | None = None
+    state_units: tuple[str, ...] | None = None
+    guards: Mapping[tuple[str, str], Guard] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.modes, Mapping) or len(self.modes) == 0:
+            raise ValueError(f"modes must be a non-empty dict of name -> vector field; got {shown(self.modes)}.")
+        for name, mode in self.modes.items():
+            as_name(name, "mode names", "strings")
+            as_callable(mode, f"mode {shown(name)}", "a function f(t, x, p)")
+        _set(self, "modes", MappingProxyType(dict(self.modes)))
+        for name in ("reset_maps", "guards"):
+            _set(self, name, MappingProxyType(_checked_pairs(getattr(self, name), name, self.modes)))
+        if not callable(self.initial_state):
+            _set(self, "initial_state", as_state(self.initial_state, "initial_state"))
+        form = "a sequence of strings, one for each state"
+        if self.state_names is not None:
+            _set(self, "state_names", as_names(self.state_names, "state_names", form))
+        if self.state_units is not None:
+            units = as_sequence(self.state_units, "state_units", form)
+            _set(self, "state_units", tuple(as_text(unit, "each of state_units") for unit in units))
+        if not callable(self.initial_state):
+            self.check_labels_of(len(self.initial_state))
+
+    def check_labels_of(self, n: int) -> None:
+        """ValueError unless names and units, where given, have one entry for each of n states."""
+        for label in ("state_names", "state_units"):
+            labels = getattr(self, label)
+            if labels is not None and len(labels) != n:
+                raise ValueError(
+                    f"{label} must have one entry for each of the {n} states; got {len(labels)}: {shown(labels)}."
+                )
+
+    def reset_map(self, before: str, after: str) -> ResetMap | None:
+        """The map applied at a transition from mode `before` to mode `after`; None where x is continuous."""
+        return self.reset_maps.get((before, after))
+
+    def guard(self, before: str, after: str) -> Guard | None:
+        """What is zero at a transition from mode `before` to mode `after`; None where it is free."""
+        return self.guards.get((before, after))
+
+
+def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ...]:
+    """`value` as a finite, read-only ``(n,)`` float64 array, or as n `Parameter` where it has any.
+
+    Raises
+    ------
+    ValueError
+        Naming `name`.
+    """
+    if isinstance(value, Parameter):
+        if len(value.shape) != 1:
+            raise ValueError(f"{name} must have shape (n,), one entry for each state; got shape {value.shape}.")
+        return value.entries()
+    if isinstance(value, (list, tuple)) and any(isinstance(entry, Parameter) for entry in value):
+        return tuple(_as_entry(entry, name) for entry in value)
+    state = as_array(value, name, form="an array of numbers, one for each state")
+    if state.ndim != 1 or state.size == 0:
+        raise ValueError(f"{name} must have shape (n,), one entry for each state; got shape {state.shape}.")
+    if not np.all(np.isfinite(state)):
+        raise ValueError(f"{name} must be finite; got {shown(state)}.")
+    state.flags.writeable = False
+    return state
+
+
+def _as_entry(entry: Any, name: str) -> Parameter:
+    """One entry of an initial state that has unknown ones: a number is known."""
+    if isinstance(entry, Parameter):
+        parameter = entry
+    else:
+        array = as_array(entry, f"each entry of {name}", form="a number or an sf.Parameter")
+        if not np.all(np.isfinite(array)) or array.size == 0:
+            raise ValueError(f"{name} must have a number or an sf.Parameter for each state; got {shown(entry)}.")
+        parameter = Parameter(array, fixed=True)
+    if parameter.shape != ():
+        raise ValueError(
+            f"{name} must have one number or one sf.Parameter of one number for each state; got an entry of shape "
+            f"{parameter.shape}."
+        )
+    return parameter
+
+
+def _checked_pairs(
+    given: Mapping[tuple[str, str], Callable[..., Any]] | None, name: str, modes: Mapping[str, VectorField]
+) -> dict[tuple[str, str], Callable[..., Any]]:
+    """Functions of transitions, by the modes before and after."""
+    if not isinstance(given, Mapping | None):
+        raise TypeError(f"{name} must be a dict of (mode before, mode after) -> function; got {shown(given)}.")
+    checked = {} if given is None else dict(given)
+    for key, function in checked.items():
+        if not (isinstance(key, tuple) and len(key) == 2):
+            raise ValueError(f"{name} must have keys (mode before, mode after); got {shown(key)}.")
+        for mode in key:
+            if mode not in modes:
+                raise ValueError(f"{name} names the unknown mode {shown(mode)}; the modes are {listed(modes)}.")
+        what, form = ("reset map", "R(t, x, p)") if name == "reset_maps" else ("guard", "g(t, x, p)")
+        as_callable(function, f"{what} {shown(key)}", f"a function {form}")
+    return checked
+
+
+def _set(instance: object, name: str, value: object) -> None:
+    """Set a field of a frozen dataclass while it is being built."""
+    object.__setattr__(instance, name, value)

@@ -1,0 +1,227 @@
+"""Checking derivatives at any theta: Taylor remainders, and the paper's equations against the discretised cost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from switchfit.fit.evaluator import Evaluation, Evaluator, evaluator_of
+from switchfit.problem.data import FloatArray
+from switchfit.problem.problem import Problem
+from switchfit.problem.validation import as_instance, as_seed
+
+LARGEST_GAP = 1e-4
+"""Relative gap between the paper's equations and the discretised cost's derivatives that is still the integrator's."""
+
+
+class TaylorTable(NamedTuple):
+    """Remainders of J along a direction: steps (S,), remainders (S, 3), observed orders (S - 1, 3), and where (d,)."""
+
+    steps: FloatArray
+    remainders: FloatArray
+    orders: FloatArray
+    theta: FloatArray
+
+
+def taylor_table(evaluator: Evaluator, theta: FloatArray, *, seed: int = 0) -> TaylorTable:
+    """Remainders of J with its gradient and its Hessian along a random direction, at theta but off the nodes."""
+    at = _off_nodes(evaluator, theta)
+    base = evaluator(at)
+    direction = np.random.default_rng(seed).choice([-1.0, 1.0], size=len(at)) * _scales(base, at)
+    largest = _room(evaluator, at, direction)
+    steps: FloatArray = largest * 0.5 ** np.arange(8.0)
+    remainders = np.array([_remainders(evaluator, base, at, h, direction) for h in steps])
+    rounding = remainders < 1e3 * np.finfo(float).eps * max(abs(base.cost), float(remainders.max()))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        orders = np.where(rounding[1:], np.nan, np.log2(remainders[:-1] / remainders[1:]))
+    return TaylorTable(steps, remainders, orders, at)
+
+
+def observed_orders(orders: FloatArray) -> tuple[float, ...]:
+    """Median order of each remainder over the steps at which it is not yet rounding; NaN if it always is."""
+    return tuple(_median(orders[:, k]) for k in range(3))
+
+
+def orders_right(observed: tuple[float, ...]) -> bool:
+    """Whether they are 1, 2, 3 or more within 0.25, or beyond what can be seen."""
+    return all(order > k - 0.25 or np.isnan(order) for k, order in enumerate(observed, start=1))
+
+
+@dataclass(frozen=True, eq=False)
+class DerivativeCheck:
+    """Taylor table and gaps between the methods; print it.
+
+    Attributes
+    ----------
+    steps : (S,) array
+        Step lengths h.
+    remainders : (S, 3) array
+        ``|J(theta + h v) - J|``, the same less ``h g.v``, and the same less ``h^2/2 v'Hv``.
+    orders : (S - 1, 3) array
+        Observed orders in h, which are 1, 2 and 3 if J, g and H are right; NaN where a remainder is rounding.
+    gradient_gap, hessian_gap : float
+        Relative gap between the paper's equations (6)-(17) and the discretised cost's exact derivatives.
+    gradient_gap_halved, hessian_gap_halved : float
+        The same with every step halved: smaller by ``2**order`` of the integrator, down to rounding.
+    theta : (d,) array
+    stiff : bool
+        With the stiff solver the gaps are told but not judged: the paper's adjoints have boundary layers of their own
+        at transitions and samples, which a mesh refined for the state does not resolve.
+    """
+
+    steps: FloatArray
+    remainders: FloatArray
+    orders: FloatArray
+    gradient_gap: float
+    hessian_gap: float
+    gradient_gap_halved: float
+    hessian_gap_halved: float
+    theta: FloatArray
+    stiff: bool
+
+    @property
+    def observed_orders(self) -> tuple[float, ...]:
+        """Median order of each remainder over the steps at which it is not yet rounding; NaN if it always is."""
+        return observed_orders(self.orders)
+
+    @property
+    def passed(self) -> bool:
+        """Whether the orders are 1, 2, 3 within 0.25, or beyond what can be seen, and the methods agree to 1e-4."""
+        agree = self.stiff or max(self.gradient_gap, self.hessian_gap) < LARGEST_GAP
+        return orders_right(self.observed_orders) and agree
+
+    def __str__(self) -> str:
+        lines = ["Taylor remainders of J along a random direction", ""]
+        lines.append(f"{'h':>10}  {'J':>10} order  {'+ gradient':>10} order  {'+ Hessian':>10} order")
+        for k, (h, r) in enumerate(zip(self.steps, self.remainders, strict=True)):
+            cells = [f"{r[j]:10.2e} {'' if k == 0 else _order(self.orders[k - 1, j]):>5}" for j in range(3)]
+            lines.append(f"{h:10.1e}  " + "  ".join(cells))
+        lines.append("")
+        lines.append("Paper's equations (6)-(17) against the derivatives of the discretised cost, relative:")
+        lines.append(f"  gradient {self.gradient_gap:.1e}, with half the steps {self.gradient_gap_halved:.1e}")
+        lines.append(f"  Hessian  {self.hessian_gap:.1e}, with half the steps {self.hessian_gap_halved:.1e}")
+        verdict = "passed" if self.passed else "FAILED: the derivatives do not belong to the cost"
+        lines.append(
+            f"Observed orders {', '.join(f'{o:.2f}' for o in self.observed_orders)} (1, 2, 3 expected): {verdict}."
+        )
+        return "\n".join(lines)
+
+
+def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, seed: int = 0) -> DerivativeCheck:
+    """Check the gradient and the Hessian of a problem against its cost, and the two ways to find them.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : (d,) array_like, optional
+        The initial guess if left out. Transition times that lie on a node of the mesh, or on what a late sample sees,
+        are moved off it, since derivatives jump there.
+    seed : int, optional
+        Of the random direction.
+
+    Returns
+    -------
+    DerivativeCheck
+        Print it, or look at ``.passed``.
+
+    Raises
+    ------
+    ValueError
+        For a theta of the wrong shape or order, or a seed that is negative.
+    TypeError
+        If an argument is of the wrong type.
+    """
+    as_instance(problem, "problem", Problem, "an sf.Problem")
+    seed = as_seed(seed)
+    evaluator = evaluator_of(problem)
+    table = taylor_table(evaluator, problem.checked_theta(theta), seed=seed)
+    at = table.theta
+    gaps = derivative_gap(evaluator, at)
+    halved = derivative_gap(evaluator.divided(), at)
+    return DerivativeCheck(table.steps, table.remainders, table.orders, *gaps, *halved, at, problem.solver == "stiff")
+
+
+def derivative_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[float, float]:
+    """Relative gap of gradient and Hessian between the paper's equations and the discretised cost.
+
+    Unknowns are scaled to unit curvature each. Near a minimum the gradient vanishes; its gap is then relative to the
+    gradient that a change of all unknowns by 0.1 % would cause.
+    """
+    paper, discrete = evaluator(theta, method="adjoint"), evaluator(theta)
+    scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(discrete.hessian)), 1e-300))
+    small = 1e-3 * float(np.linalg.norm(theta / scale))
+    scales = np.outer(scale, scale)
+    return (
+        _gap(paper.gradient * scale, discrete.gradient * scale, small),
+        _gap(paper.hessian * scales, discrete.hessian * scales, 0.0),
+    )
+
+
+def _gap(a: FloatArray, b: FloatArray, floor: float) -> float:
+    return float(np.linalg.norm(a - b)) / max(float(np.linalg.norm(b)), floor, 1e-300)
+
+
+def _scales(base: Evaluation, theta: FloatArray) -> FloatArray:
+    """Changes of the unknowns that each change J by about as much as the others."""
+    curvature = np.abs(np.diag(base.hessian))
+    typical = np.where(theta != 0, np.abs(theta), 1.0)
+    return np.where(curvature > 0, 1.0 / np.sqrt(np.where(curvature > 0, curvature, 1.0)), typical)
+
+
+def _off_nodes(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
+    """theta with each transition time in the middle of the cell it is in, where J is smooth for longest."""
+    moved = theta.copy()
+    late = _late_times(evaluator, theta)
+    for i, nodes in enumerate(evaluator.breakpoints()):
+        if len(nodes):
+            nodes = np.union1d(nodes, late[i]) if i in late else nodes
+            k = int(np.clip(np.searchsorted(nodes, theta[i], side="right") - 1, 0, len(nodes) - 2))
+            moved[i] = 0.5 * (nodes[k] + nodes[k + 1])
+    return moved
+
+
+def _room(evaluator: Evaluator, theta: FloatArray, direction: FloatArray) -> float:
+    """Largest step that leaves every transition time in its cell, and every unknown near its size.
+
+    No transition may pass what a late sample sees, either, which moves with the delay.
+    """
+    room = 1e-2 * np.min(np.where(theta != 0, np.abs(theta), 1.0) / np.abs(direction))
+    for i, nodes in enumerate(evaluator.breakpoints()):
+        if len(nodes):
+            room = min(room, 0.9 * np.min(np.abs(nodes - theta[i])) / abs(direction[i]))
+    late, moved = _late_times(evaluator, theta), _late_times(evaluator, theta + direction)
+    for i, moments in late.items():
+        closing = np.maximum(np.abs(moved[i] - moments - direction[i]), 1e-300)
+        room = min(room, 0.9 * np.min(np.abs(moments - theta[i]) / closing))
+    return float(room)
+
+
+def _late_times(evaluator: Evaluator, theta: FloatArray) -> dict[int, FloatArray]:
+    """For each transition time in theta the moments that late samples of its run see, if there are any."""
+    problem = evaluator.problem
+    found: dict[int, FloatArray] = {}
+    for e, where in enumerate(problem.unknowns.times):
+        moments = problem.late_times(theta, e)
+        found |= {int(i): moments for i in where[where >= 0] if len(moments)}
+    return found
+
+
+def _remainders(
+    evaluator: Evaluator, base: Evaluation, theta: FloatArray, h: float, direction: FloatArray
+) -> tuple[float, float, float]:
+    zeroth = evaluator(theta + h * direction).cost - base.cost
+    first = zeroth - h * base.gradient @ direction
+    second = first - 0.5 * h**2 * direction @ base.hessian @ direction
+    return abs(zeroth), abs(float(first)), abs(float(second))
+
+
+def _median(orders: FloatArray) -> float:
+    finite = orders[np.isfinite(orders)]
+    return float(np.median(finite)) if len(finite) else np.nan
+
+
+def _order(order: float) -> str:
+    return "-" if np.isnan(order) else f"{order:.2f}"

@@ -1,0 +1,191 @@
+"""Bands of the fitted trajectory: how far states and outputs may lie from it, and where the next sample would fall.
+
+By the delta method: with X the exact derivative of a state or an output in theta at time t and C the covariance of
+theta, its standard error is sqrt(X C X'), and sqrt(X C X' + sigma^2) that of a new sample there ([1]_). The bands hold
+at each time by itself, not for the whole curve at once.
+
+At a transition X jumps (see `switchfit.uncertainty.sensitivity`): just before it the state does not depend on that
+transition time, just after it does. The linear approximation takes the mode that is active in the fit as the mode that
+is active, which within two standard errors of a transition time it need not be: `near_transition` says where that is.
+
+References
+----------
+.. [1] G. A. F. Seber, C. J. Wild, Nonlinear Regression, Wiley 1989, section 5.1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from switchfit.discretization.mesh import Mesh
+from switchfit.fit.result import Fit
+from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.parameter import unit_suffix
+from switchfit.problem.problem import Problem
+from switchfit.problem.validation import as_array, as_index
+from switchfit.uncertainty.sensitivity import Points, Sensitivity, sensitivity
+
+NEAR = 2.0
+"""Standard errors of a transition time within which a band is not to be trusted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """States and outputs of one experiment with their standard errors.
+
+    Attributes
+    ----------
+    times : (K,) array, in `time_unit`
+    states, state_errors : (K, n)
+    outputs, output_errors : (K, q)
+        What the reference signals see, then the Measurements; their standard errors.
+    noise : (K, q)
+        Standard deviation of one sample: sigma (of the sample nearest in time, where it differs), or where that is
+        unknown the root of the residual variance; NaN for reference signals.
+    state_names, state_units, output_names : tuple of str
+    time_unit : str
+        That of the experiment.
+    near_transition : (K,) bool
+        Within two standard errors of a transition time: the bands take no account of the other mode there.
+    fit : Fit
+    """
+
+    times: FloatArray
+    states: FloatArray
+    state_errors: FloatArray
+    outputs: FloatArray
+    output_errors: FloatArray
+    noise: FloatArray
+    state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    output_names: tuple[str, ...]
+    time_unit: str
+    near_transition: NDArray[np.bool_]
+    fit: Fit = field(repr=False)
+
+    def state_band(self, level: float = 0.95) -> FloatArray:
+        """Confidence band of the states at each time: (K, n, 2)."""
+        return _band(self.states, self.fit.quantile(level) * self.state_errors)
+
+    def output_band(self, level: float = 0.95) -> FloatArray:
+        """Confidence band of the outputs, of their mean without noise, at each time: (K, q, 2)."""
+        return _band(self.outputs, self.fit.quantile(level) * self.output_errors)
+
+    def prediction_band(self, level: float = 0.95) -> FloatArray:
+        """Where a new sample would fall at each time, noise included: (K, q, 2)."""
+        return _band(self.outputs, self.fit.quantile(level) * np.hypot(self.output_errors, self.noise))
+
+
+def _band(values: FloatArray, half: FloatArray) -> FloatArray:
+    return np.stack([values - half, values + half], axis=-1)
+
+
+def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 0) -> Prediction:
+    """States and outputs at any times with their standard errors and bands.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    times : (K,) array_like, optional
+        In any order, inside [t0, tf], in the experiment's time unit, at samples or between them; at a transition what
+        is just before it. Left out, all nodes of the mesh, each transition twice: with the state before and after it.
+    experiment : int, optional
+        Which experiment, from 0.
+
+    Returns
+    -------
+    Prediction
+
+    Raises
+    ------
+    TypeError
+        If this is no estimate, or an argument is of the wrong type.
+    ValueError
+        For times outside the horizon, an experiment that does not exist, or an estimate without a problem or without
+        a covariance.
+    """
+    fit: Fit = estimate
+    if not isinstance(fit, Fit):
+        raise TypeError(f"predict needs the result of sf.estimate; got {type(fit).__name__}. Fit the problem first.")
+    evaluator = estimate.evaluator_at_solution()
+    problem: Problem = evaluator.problem
+    experiment = as_index(experiment, "experiment", len(problem.experiments))
+    if times is None:
+        points = estimate.sensitivities[experiment].nodes
+    else:
+        asked = _checked_times(times, problem, experiment)
+        mesh = Mesh.from_times(np.concatenate([evaluator.meshes[experiment].times, asked]))
+        found: Sensitivity = sensitivity(problem, experiment, fit.theta, mesh)
+        points = found.at(asked)
+    return _prediction(fit, problem, experiment, points)
+
+
+def _prediction(fit: Fit, problem: Problem, e: int, points: Points) -> Prediction:
+    covariance = fit.covariance
+    if not np.isfinite(covariance).all():
+        raise ValueError(
+            "There are no bands without a covariance: the cost must be made of Measurements alone, with more values "
+            "than unknowns, and the Hessian positive definite. The report says what is missing."
+        )
+    trajectory = fit.trajectories[e]
+    names = [name for comparison in fit.comparisons[e] for name in comparison.names]
+    return Prediction(
+        points.times,
+        points.states,
+        _errors(points.states_d, covariance),
+        points.outputs,
+        _errors(points.outputs_d, covariance),
+        _noise(fit, problem, e, points.times),
+        trajectory.state_names,
+        trajectory.state_units,
+        tuple(names),
+        trajectory.time_unit,
+        _near(fit, problem, e, points.times),
+        fit,
+    )
+
+
+def _errors(derivative: FloatArray, covariance: FloatArray) -> FloatArray:
+    """``sqrt(X C X')`` of derivatives (K, q, d): (K, q)."""
+    variance = np.einsum("kqd,de,kqe->kq", derivative, covariance, derivative)
+    return np.sqrt(np.maximum(variance, 0.0))
+
+
+def _noise(fit: Fit, problem: Problem, e: int, times: FloatArray) -> FloatArray:
+    """Standard deviation of one sample of each output at each time: (K, q)."""
+    columns = [np.full((len(times), q), np.nan) for _, q in problem.structures[e].references]
+    for item, comparison in zip(_compared(problem, e), fit.comparisons[e], strict=True):
+        if isinstance(item, Measurements):
+            # Weights are 1 where sigma is unknown; a known one beside an unknown one is scaled like it.
+            unknown = 1.0 if fit.sigma_known else np.sqrt(fit.residual_variance)
+            sigma = np.broadcast_to(1.0 if comparison.sigma is None else comparison.sigma, item.values.shape) * unknown
+            columns.append(sigma[np.abs(times[:, None] - item.times[None]).argmin(1)])
+    return np.concatenate([np.zeros((len(times), 0)), *columns], axis=1)
+
+
+def _compared(problem: Problem, e: int) -> list[Any]:
+    """The data of experiment e that have a comparison, in its order."""
+    return [item for item in problem.experiments[e].data if isinstance(item, (Measurements, ReferenceSignal))]
+
+
+def _near(fit: Fit, problem: Problem, e: int, times: FloatArray) -> NDArray[np.bool_]:
+    where = problem.unknowns.times[e]
+    free = where[where >= 0]
+    reach = NEAR * fit.standard_errors[free]
+    return np.asarray((np.abs(times[:, None] - fit.theta[free][None]) <= reach[None]).any(1))
+
+
+def _checked_times(times: ArrayLike, problem: Problem, e: int) -> FloatArray:
+    asked = np.atleast_1d(as_array(times, "times"))
+    t0, tf = problem.experiments[e].t0, problem.experiments[e].tf
+    if asked.ndim != 1 or asked.size == 0 or not np.isfinite(asked).all():
+        raise ValueError(f"times must be finite numbers of shape (K,); got shape {asked.shape}.")
+    outside = (asked < t0) | (asked > tf)
+    if outside.any():
+        unit = unit_suffix(problem.experiments[e].time_unit)
+        raise ValueError(f"times must lie inside [t0, tf] = [{t0}, {tf}]{unit}; got {asked[outside][0]}.")
+    return asked

@@ -1,0 +1,658 @@
+"""Profile likelihoods: how much worse the fit becomes when one unknown is held and all others are fitted again.
+
+With J_p(v) the smallest cost at theta_k = v, the signed root of the likelihood ratio,
+
+    zeta(v) = sign(v - theta_k) sqrt(2 (J_p(v) - J) / s^2),      s^2 = 1 or, with sigma unknown, 2 J / (n - d),
+
+is standard normal at the true value to first order, Student's t with n - d degrees of freedom where sigma is unknown,
+so that ``|zeta| <= quantile`` is a confidence region ([1]_, [2]_). For a linear model zeta is the straight line
+``(v - theta_k) / standard error``, and the region is the quadratic interval. How much it bends is how wrong that is.
+
+zeta is what everything here works with: near linear, it tells how long the next step has to be, and where it crosses
+the quantile is found in a few more evaluations. An evaluation is one more fit, begun where the neighbouring one ended,
+with the unknown's lower and upper bound set to v: the program is the one the fit was made with.
+
+References
+----------
+.. [1] D. M. Bates, D. G. Watts, Nonlinear Regression Analysis and Its Applications, Wiley 1988, chapter 6.
+.. [2] W. Q. Meeker, L. A. Escobar, Teaching about approximate confidence regions based on maximum likelihood
+   estimation, The American Statistician 49 (1995) 48-53.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq, linprog, minimize_scalar
+
+from switchfit.engine.adaptive import refined_mesh
+from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.result import Fit
+from switchfit.fit.solution import constraints_of, minimized
+from switchfit.optimize import Status, solve_qp
+from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.problem import Problem
+from switchfit.problem.validation import as_callable, as_level, as_name, listed, shown
+from switchfit.report.uncertainty import plot_profile, profile_text
+from switchfit.runtime.progress import Progress, reporting
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+End = Literal["crossed", "limit", "flat", "failed", "stopped"]
+
+STEPS = 5
+"""Points between the estimate and the crossing of the threshold, on each side."""
+BEYOND = 1.15
+"""The march goes on until zeta is this many times the threshold ..."""
+LOOK_AHEAD = 3
+"""... and then looks this many times further out, each time twice as far, for a second region; as many times more while
+the cost falls on the way."""
+MOST_POINTS = 60
+"""On one side."""
+LONGEST_GROWTH = 2.5
+"""Factor by which a step may be longer than the one before."""
+FAR = 1e2
+"""A side is flat if nothing is crossed up to this many times the unknown's size or its standard error."""
+HALVINGS = 8
+"""Times a step is halved where the fit does not succeed."""
+LARGE_ERROR = 1e-2
+"""Error of zeta^2 by the integration, as a part of the threshold, above which the mesh is refined."""
+MOST_KINKS = 10
+"""Sample times at which a profile is evaluated, to show the kinks there."""
+ITERATIONS = 100
+"""Most of one fit along the profile."""
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """One fit with the unknown held at `value`; `slope` is the derivative of its cost in that value."""
+
+    value: float
+    cost: float
+    slope: float
+    theta: FloatArray
+    converged: bool
+
+
+class Trace:
+    """The points of a profile, and how more are made.
+
+    Attributes
+    ----------
+    points : list of Point
+        Ascending in value; the estimate's own among them.
+    ends : dict
+        How the march to the lower (-1) and to the upper (+1) side ended.
+    jumps : list of float
+        Where the threshold was crossed by a jump: the minimum of the others that was followed ends there.
+    interrupted : bool
+        No more is done.
+    coarse : bool
+        The mesh is too coarse at the ends.
+    """
+
+    def __init__(self, fit: Fit, evaluator: Evaluator, index: int) -> None:
+        self.fit, self.evaluator, self.index = fit, evaluator, index
+        self.constraints = constraints_of(evaluator.problem)
+        self.scale = fit.residual_variance if fit.sigma_known is False else 1.0
+        value = float(fit.theta[index])
+        self.centre = Point(value, evaluator(fit.theta).cost, 0.0, fit.theta, True)
+        self.points = [self.centre]
+        self.ends: dict[int, End] = {}
+        self.fits = 0
+        self.limits = {side: self._limit(side) for side in (-1, 1)}
+        self.interrupted = False
+        self.jumps: list[float] = []
+        self.coarse = False
+        self.told: Callable[[], bool] = lambda: False
+
+    # --- what the points say
+
+    def zeta(self, point: Point) -> float:
+        """Signed root of the likelihood ratio; 0 where the cost is below that of the estimate."""
+        root = np.sqrt(max(2 * (point.cost - self.centre.cost) / self.scale, 0.0))
+        return float(root if point.value > self.centre.value else -root)
+
+    def side(self, side: int) -> list[Point]:
+        """The points of one side from the estimate outwards, the estimate first."""
+        chosen = [q for q in self.points if side * (q.value - self.centre.value) >= 0]
+        return sorted(chosen, key=lambda q: side * q.value)
+
+    @property
+    def best(self) -> Point:
+        """The lowest of all."""
+        return min(self.points, key=lambda q: q.cost)
+
+    # --- making points
+
+    def _limit(self, side: int) -> float:
+        """How far the constraints let the unknown go."""
+        k, c = self.index, self.constraints
+        coupled = np.flatnonzero(np.any(c.A != 0, axis=0))
+        if k not in coupled:
+            return float((c.lower if side < 0 else c.upper)[k])
+        objective = np.where(coupled == k, -float(side), 0.0)
+        bounds = np.stack([c.lower, c.upper], axis=1)[coupled]
+        found = linprog(objective, -c.A[:, coupled], -c.b, bounds=bounds)
+        # The centre is feasible; rounding of the programme must not put a limit on the wrong side of it.
+        return side * max(side * float(found.x[coupled == k][0]), side * float(self.fit.theta[k]))
+
+    def _feasible(self, target: FloatArray, inside: FloatArray) -> FloatArray | None:
+        """The feasible point nearest to `target` with its value of the unknown, from one that is feasible without it.
+
+        None where there is none, which rounding may bring about at a limit.
+        """
+        k, c = self.index, self.constraints
+        value = target[k]
+        moved = np.clip(target, c.lower, c.upper)
+        moved[k] = value
+        if np.all(c.A @ moved >= c.b):
+            return moved
+        # What the unknown pushes away moves just as far as it has to: a programme in the others from a point that lies
+        # on the way from the inside to the end of what is allowed, which is feasible since the constraints are convex.
+        side = 1 if value > inside[k] else -1
+        extreme = self._extreme(side, inside)
+        span = extreme[k] - inside[k]
+        start = inside + (0.0 if span == 0 else (value - inside[k]) / span) * (extreme - inside)
+        start[k] = value
+        others = np.arange(len(start)) != k
+        size = np.maximum(np.abs(target), 1.0)[others]
+        normals = np.concatenate([c.A[:, others], np.eye(len(size)), -np.eye(len(size))])
+        slack = np.concatenate([c.A @ start - c.b, (start - c.lower)[others], (c.upper - start)[others]])
+        finite = np.isfinite(slack)
+        offset = (start - target)[others]
+        step = solve_qp(offset / size**2, np.diag(1 / size**2), normals[finite], -np.maximum(slack[finite], 0.0)).step
+        start[others] = np.clip(start[others] + step, c.lower[others], c.upper[others])
+        violated = c.A @ start - c.b
+        return start if np.all(violated >= -1e-9 * (1 + np.abs(c.b))) else None
+
+    def _extreme(self, side: int, inside: FloatArray) -> FloatArray:
+        """A feasible point at the limit; unknowns that no constraint couples with this one stay."""
+        c = self.constraints
+        coupled = np.flatnonzero(np.any(c.A != 0, axis=0))
+        objective = np.where(coupled == self.index, -float(side), 0.0)
+        bounds = np.stack([c.lower, c.upper], axis=1)[coupled]
+        found = inside.copy()
+        found[coupled] = linprog(objective, -c.A[:, coupled], -c.b, bounds=bounds).x
+        return found
+
+    def _fitted(self, value: float, start: FloatArray) -> Point | None:
+        """The point at `value`, fitted from `start`; None where that fails."""
+        lower, upper = self.constraints.lower.copy(), self.constraints.upper.copy()
+        lower[self.index] = upper[self.index] = value
+        held = replace(self.constraints, lower=lower, upper=upper)
+        self.fits += 1
+        tolerance = self.fit.tolerance
+        try:
+            result = minimized(self.evaluator, start, "exact", tolerance, ITERATIONS, constraints=held)
+        except ValueError:  # infeasible by rounding
+            return None
+        if result.status is Status.INTERRUPTED or self.told():
+            raise KeyboardInterrupt
+        if not np.isfinite(result.cost):
+            return None
+        # The others are optimal: their change contributes nothing to the derivative.
+        slope = float(result.gradient[self.index])
+        good = result.status.converged
+        return Point(value, result.cost, slope, result.theta, good)
+
+    def add(self, value: float, near: Point, before: Point | None = None) -> Point | None:
+        """A new point, from a neighbour or along the line through two of them; None where no fit succeeds."""
+        k = self.index
+        starts = []
+        if before is not None and before.value != near.value:
+            slope = (near.theta - before.theta) / (near.value - before.value)
+            starts.append(near.theta + (value - near.value) * slope)
+        starts += [near.theta.copy(), self.centre.theta.copy()]
+        best: Point | None = None
+        for start in starts:
+            start[k] = value
+            feasible = self._feasible(start, near.theta)
+            found = None if feasible is None else self._fitted(value, feasible)
+            if found is not None and (
+                best is None or (not found.converged, found.cost) < (not best.converged, best.cost)
+            ):
+                best = found
+            if best is not None and best.converged and not self._suspicious(best, near):
+                break
+        if best is not None:
+            self._insert(best)
+        return best
+
+    def _suspicious(self, point: Point, near: Point) -> bool:
+        """Whether zeta has risen so much faster than a straight line that this may be another, higher minimum."""
+        distance, reached = abs(point.value - self.centre.value), abs(near.value - self.centre.value)
+        if reached > 0:
+            expected = abs(self.zeta(near)) * distance / reached
+        else:
+            error = float(self.fit.standard_errors[self.index])
+            expected = distance / error if np.isfinite(error) and error > 0 else np.inf
+        return abs(self.zeta(point)) > 1.5 * expected + 0.5
+
+    def _insert(self, point: Point) -> None:
+        self.points = sorted([q for q in self.points if q.value != point.value] + [point], key=lambda q: q.value)
+
+    # --- marching
+
+    def march(self, side: int, threshold: float) -> None:
+        """Add points on one side until zeta has crossed the threshold, or there is a reason why it will not."""
+        if self.interrupted or self.ends.get(side) in ("limit", "flat", "failed"):
+            return
+        spacing = threshold / STEPS
+        points = self.side(side)
+        if len(points) > 1 and abs(self.zeta(points[-1])) >= BEYOND * threshold:
+            self.ends[side] = "crossed"
+            return
+        step = abs(points[-1].value - points[-2].value) if len(points) > 1 else self._first_step(side, spacing)
+        ahead = 0
+        self.ends[side] = "stopped"
+        for _ in range(MOST_POINTS):
+            last = points[-1]
+            height = abs(self.zeta(last))
+            if last.value == self.limits[side]:
+                self.ends[side] = "crossed" if abs(self.zeta(last)) >= threshold else "limit"
+                return self._dip(side)
+            if height >= BEYOND * threshold:
+                self.ends[side] = "crossed"
+                if ahead >= LOOK_AHEAD * (1 + (side * last.slope < 0)):
+                    return self._dip(side)
+                ahead += 1
+                step = abs(last.value - self.centre.value)
+            elif abs(last.value - self.centre.value) > self._far:
+                self.ends[side] = "flat"
+                return
+            new = self._next(side, points, step, spacing, threshold, looking=ahead > 0)
+            if new is None:
+                self.ends[side] = "crossed" if height >= threshold else "failed"
+                return self._dip(side)
+            if new.cost < last.cost - 1e-9 * abs(last.cost):
+                self._sweep_inward(side)
+            points = self.side(side)
+            gained = abs(self.zeta(new)) - height
+            growth = spacing / gained if gained > 0 else LONGEST_GROWTH
+            step = abs(new.value - last.value) * float(np.clip(growth, 0.4, LONGEST_GROWTH))
+        self.ends[side] = "flat" if self.ends[side] == "stopped" else self.ends[side]
+
+    def _next(
+        self, side: int, points: list[Point], step: float, spacing: float, threshold: float, *, looking: bool
+    ) -> Point | None:
+        """The next point outwards, nearer where a fit fails or zeta rises too much at once."""
+        last = points[-1]
+        before = points[-2] if len(points) > 1 else self._along_covariance(last)
+        limit = self.limits[side]
+        for attempt in range(HALVINGS):
+            value = last.value + side * step
+            if side * (value - limit) >= 0 or abs(value - limit) < 1e-3 * step:
+                value = limit
+            if value == last.value:
+                return None
+            new = self.add(value, last, before)
+            if new is not None and new.converged:
+                gained = abs(self.zeta(new)) - abs(self.zeta(last))
+                if looking or gained <= 2.5 * spacing or attempt == HALVINGS - 1:
+                    return new
+                if abs(self.zeta(new)) > 2 * threshold:
+                    self.points = [q for q in self.points if q is not new]
+                else:
+                    self._fill(last, new, spacing)
+                    return new
+                step *= float(np.clip(spacing / gained, 0.05, 0.5))
+            elif new is not None:
+                self.points = [q for q in self.points if q is not new]
+                step *= 0.5
+            else:
+                step *= 0.5
+            if step <= 1e-9 * max(abs(last.value), abs(self.centre.value), 1e-300):
+                return None
+        return None
+
+    def _fill(self, inner: Point, outer: Point, spacing: float) -> None:
+        """Points between two, evenly in zeta as far as a straight line tells."""
+        count = int(abs(self.zeta(outer) - self.zeta(inner)) / spacing)
+        previous: Point = inner
+        for part in np.arange(1, count) / count:
+            found = self.add(inner.value + float(part) * (outer.value - inner.value), previous)
+            previous = found if found is not None else previous
+
+    def _dip(self, side: int) -> None:
+        """Points at minima that the slopes tell of between points far apart."""
+        points = self.side(side)[1:]
+        for inner, outer in pairwise(points):
+            if side * inner.slope < 0 < side * outer.slope:
+                near = min((inner, outer), key=lambda q: q.cost)
+
+                def cost(value: float, near: Point = near) -> float:
+                    found = self.add(value, near)
+                    return np.inf if found is None else found.cost
+
+                bounds = sorted((inner.value, outer.value))
+                minimize_scalar(
+                    cost, bounds=bounds, method="bounded", options={"xatol": 1e-3 * (bounds[1] - bounds[0])}
+                )
+
+    def _sweep_inward(self, side: int) -> None:
+        """A branch that is lower further out may be lower further in as well: follow it back."""
+        outer, *inward = self.side(side)[:0:-1]
+        for inner in inward:
+            start = outer.theta.copy()
+            start[self.index] = inner.value
+            feasible = self._feasible(start, outer.theta)
+            found = None if feasible is None else self._fitted(inner.value, feasible)
+            if found is None or not found.converged or found.cost >= inner.cost - 1e-9 * abs(inner.cost):
+                return
+            self._insert(found)
+            outer = found
+
+    def _along_covariance(self, centre: Point) -> Point | None:
+        """A second point on the tangent of the path of the others at the estimate: theta moves along C e_k."""
+        column = self.fit.covariance[:, self.index]
+        if not (np.isfinite(column).all() and column[self.index] > 0):
+            return None
+        theta = centre.theta - column / column[self.index]
+        return Point(float(theta[self.index]), np.nan, np.nan, theta, True)
+
+    def _first_step(self, side: int, spacing: float) -> float:
+        """A length after which zeta should be the spacing: by the standard error; at a kink or a bound by the slope."""
+        k, size = self.index, self._size
+        error = self.fit.standard_errors[k]
+        if np.isfinite(error) and error > 0:
+            return float(spacing * error)
+        derivative = self.evaluator(self.centre.theta, side).gradient[k]
+        rate = 2 * max(side * float(derivative), 0.0) / self.scale  # of zeta^2
+        return min(spacing**2 / rate, 0.1 * size) if rate > 0 else 1e-2 * size
+
+    @property
+    def _size(self) -> float:
+        """A length of the unknown's own: what is allowed, or its value."""
+        span = self.limits[1] - self.limits[-1]
+        return float(span if np.isfinite(span) else abs(self.centre.value) or 1.0)
+
+    @property
+    def _far(self) -> float:
+        error = self.fit.standard_errors[self.index]
+        return FAR * max(abs(self.centre.value) or 1.0, float(error) if np.isfinite(error) else 0.0)
+
+    # --- where it crosses
+
+    def crossing(self, a: Point, b: Point, threshold: float) -> float:
+        """Where |zeta| is the threshold between two neighbouring points on different sides of it."""
+        found = {a.value: a, b.value: b}
+        inner = min((a, b), key=lambda q: abs(q.value - self.centre.value))
+
+        def excess(value: float) -> float:
+            point = found.get(value) or self.add(value, min(found.values(), key=lambda q: abs(q.value - value)))
+            if point is None:  # as if it were at the nearest one that could be fitted
+                point = min(found.values(), key=lambda q: abs(q.value - value))
+            found[value] = point
+            return abs(self.zeta(point)) - threshold
+
+        precision = 1e-7 * max(abs(b.value - a.value), abs(inner.value - self.centre.value))
+        root = float(brentq(excess, a.value, b.value, xtol=max(precision, 1e-300), rtol=1e-12))
+        if min(abs(abs(self.zeta(q)) - threshold) for q in found.values()) > 1e-3 * threshold:
+            self.jumps.append(root)
+        return root
+
+    def regions(self, threshold: float) -> list[tuple[float, float]]:
+        """All intervals found in which |zeta| is at most the threshold, ascending; open ends are infinite."""
+        points = list(self.points)
+        inside = [abs(self.zeta(q)) <= threshold for q in points]
+        low = self._open_end(-1) if inside[0] else None
+        found: list[tuple[float, float]] = []
+        for a, b, a_in, b_in in zip(points[:-1], points[1:], inside[:-1], inside[1:], strict=True):
+            if a_in != b_in:
+                edge = self.crossing(a, b, threshold)
+                if b_in:
+                    low = edge
+                elif low is not None:
+                    found.append((low, edge))
+                    low = None
+        return found if low is None else [*found, (low, self._open_end(1))]
+
+    def _open_end(self, side: int) -> float:
+        """Where a region ends that was not left on this side."""
+        end, last = self.ends.get(side, "stopped"), self.side(side)[-1].value
+        if end in ("limit", "crossed"):
+            return last
+        return float(side * np.inf) if end == "flat" else float("nan")
+
+    def edges(self, threshold: float) -> list[Point]:
+        """On each side the first point beyond the threshold, or the last one if there is none."""
+        sides = [self.side(side) for side in (-1, 1)]
+        return [next((q for q in points if abs(self.zeta(q)) >= threshold), points[-1]) for points in sides]
+
+    def integration_error(self, threshold: float) -> float:
+        """Largest error of zeta^2 by the integration where it crosses the threshold, by halving all steps."""
+        fine = self.evaluator.divided()
+        base = fine.cost(self.centre.theta) - self.centre.cost
+        ends = self.edges(threshold)
+        return max(abs(fine.cost(q.theta) - q.cost - base) * 2 / self.scale for q in ends)
+
+    def add_kinks(self, times: FloatArray, threshold: float) -> None:
+        """Points at the sample times up to the threshold, where the slope may jump, unless there are many."""
+        low, high = (q.value for q in self.edges(threshold))
+        inside = times[(times > low) & (times < high)]
+        for time in inside if len(inside) <= MOST_KINKS else ():
+            if all(q.value != time for q in self.points):
+                nearest = int(np.argmin([abs(q.value - time) for q in self.points]))
+                self.add(float(time), self.points[nearest])
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Profile likelihood of one unknown; print it, plot it, ask it for intervals at any level.
+
+    Attributes
+    ----------
+    name, unit : str
+    value : float
+        The estimate.
+    standard_error : float
+        From the exact Hessian; 0 where it is held, NaN where it is not known.
+    level : float
+        Up to which the profile was followed.
+    fit : Fit
+    sample_times : (K,)
+        For a transition time the sample times of its run, where the slope of the profile may jump; empty otherwise.
+    trace : Trace
+        The points, and how more are made.
+    """
+
+    name: str
+    unit: str
+    value: float
+    standard_error: float
+    level: float
+    fit: Fit
+    sample_times: FloatArray
+    trace: Trace
+
+    @property
+    def values(self) -> FloatArray:
+        """At which the unknown was held, ascending: (P,)."""
+        return np.array([q.value for q in self.trace.points])
+
+    @property
+    def costs(self) -> FloatArray:
+        """Smallest cost at each of the values: (P,)."""
+        return np.array([q.cost for q in self.trace.points])
+
+    @property
+    def thetas(self) -> FloatArray:
+        """All unknowns at each of the values: (P, d)."""
+        return np.array([q.theta for q in self.trace.points])
+
+    @property
+    def zeta(self) -> FloatArray:
+        """Signed root of the likelihood ratio at each of the values: (P,)."""
+        return np.array([self.trace.zeta(q) for q in self.trace.points])
+
+    @property
+    def converged(self) -> NDArray[np.bool_]:
+        """Which of the fits converged: (P,)."""
+        return np.array([q.converged for q in self.trace.points])
+
+    @property
+    def ends(self) -> tuple[str, str]:
+        """How the lower and the upper side ended.
+
+        "crossed": the threshold was crossed; "limit": a bound, or the order of the transition times, came first;
+        "flat": the cost does not rise, not identifiable on this side; "failed": no fit succeeded further out;
+        "stopped": interrupted.
+        """
+        return self.trace.ends.get(-1, "stopped"), self.trace.ends.get(1, "stopped")
+
+    @property
+    def lower_cost(self) -> FloatArray | None:
+        """Unknowns (d,) with a cost below that of the estimate, if any were found; begin a fit there."""
+        best = self.trace.best
+        better = best.cost < self.trace.centre.cost - 1e-6 * self.trace.scale
+        return best.theta.copy() if better else None
+
+    def regions(self, level: float | None = None) -> list[tuple[float, float]]:
+        """All confidence intervals found at a level: one, unless the profile has several minima.
+
+        Parameters
+        ----------
+        level : float, optional
+            Between 0 and 1; that of the profile if left out. The profile is followed further where it has to be.
+
+        Returns
+        -------
+        list of (low, high)
+            Where a side ends before the threshold is crossed, its end is the limit that the constraints set, infinite
+            where the cost does not rise, NaN where it could not be followed.
+        """
+        threshold = self.fit.quantile(self.level if level is None else level)
+        try:
+            for side in (-1, 1):
+                self.trace.march(side, threshold)
+            return self.trace.regions(threshold)
+        except KeyboardInterrupt:
+            return [(np.nan, np.nan)]
+
+    def interval(self, level: float | None = None) -> tuple[float, float]:
+        """The likelihood-ratio confidence interval that contains the estimate: (low, high).
+
+        Parameters
+        ----------
+        level : float, optional
+            As of `regions`.
+        """
+        regions = self.regions(level)
+        return next((r for r in regions if not (r[0] > self.value or r[1] < self.value)), regions[0])
+
+    def __str__(self) -> str:
+        return profile_text(self)
+
+    def plot(self) -> Figure:
+        """The likelihood ratio with its thresholds, and the quadratic approximation beside it."""
+        return plot_profile(self)
+
+
+def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress | None = None) -> Profile:
+    """Profile likelihood of one parameter or transition time.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Of a cost that is made of `Measurements` alone.
+    name : str
+        One of ``estimate.theta_names``.
+    level : float, between 0 and 1
+        Confidence level up to which the profile is followed; it is followed further when asked for a higher one.
+    callback : callable, optional
+        ``callback(done, total)`` after each fit, the total a guess; a true return value stops. Ctrl-C does as well;
+        what is done is returned.
+
+    Returns
+    -------
+    Profile
+
+    Raises
+    ------
+    TypeError
+        If this is no estimate, or an argument is of the wrong type.
+    ValueError
+        For an unknown that is not in theta, an estimate that has no problem, did not converge or has no noise model.
+
+    Notes
+    -----
+    Costs some twenty warm-started fits and compiles nothing, unless the mesh of the fit turns out too coarse at the
+    ends of the profile.
+    """
+    fit: Fit = estimate
+    if not isinstance(fit, Fit):
+        raise TypeError(f"profile needs the result of sf.estimate; got {type(fit).__name__}. Fit the problem first.")
+    if as_name(name, "name") not in fit.theta_names:
+        raise ValueError(f"there is no unknown {shown(name)}; there are {listed(fit.theta_names)}.")
+    level = as_level(level)
+    if callback is not None:
+        as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
+    evaluator = estimate.evaluator_at_solution()
+    _check(fit)
+    threshold = fit.quantile(level)
+    index = fit.theta_names.index(name)
+    times = _sample_times(evaluator, index)
+    report, end = reporting(callback, f"Profile of {name}")
+    trace = Trace(fit, evaluator, index)
+    try:
+        for _ in range(2):
+            trace.told = partial(_told, report, trace)
+            for side in (-1, 1):
+                trace.march(side, threshold)
+            trace.add_kinks(times, threshold)
+            if trace.integration_error(threshold) <= LARGE_ERROR * threshold**2:
+                break
+            trace.coarse = True
+            finer = _finer(evaluator.problem, trace, threshold) if trace.evaluator is evaluator else None
+            if finer is None:
+                break
+            trace = Trace(fit, finer, index)
+    except KeyboardInterrupt:
+        trace.interrupted = True
+    finally:
+        end()
+        trace.told = lambda: False
+    error = float(fit.standard_errors[index])
+    return Profile(name, fit.theta_units[index], trace.centre.value, error, level, fit, times, trace)
+
+
+def _finer(problem: Problem, trace: Trace, threshold: float) -> Evaluator | None:
+    """The problem on meshes that resolve both ends of a profile as well; None where these cannot be integrated."""
+    thetas = [trace.centre.theta, *(q.theta for q in trace.edges(threshold))]
+    try:
+        meshes = [refined_mesh(problem, e, *thetas, finer=2.0) for e in range(len(problem.experiments))]
+    except ValueError:
+        return None
+    return Evaluator(problem, meshes=meshes)
+
+
+def _told(report: Progress, trace: Trace) -> bool:
+    """Tell how many fits are done, of as many as a profile usually takes; whether to stop."""
+    return bool(report(trace.fits, max(2 * (STEPS + LOOK_AHEAD + 2), trace.fits)))
+
+
+def _check(fit: Fit) -> None:
+    if not fit.success:
+        raise ValueError(f"a profile begins at a minimum, and this fit has not found one: {fit.message}")
+    if fit.sigma_known is None:
+        raise ValueError("a profile needs a noise model: a cost made of Measurements alone, with sigma or without.")
+    if fit.sigma_known is False and fit.freedom < 1:
+        raise ValueError(f"sigma is unknown and {fit.samples} values are too few to estimate it beside the unknowns.")
+
+
+def _sample_times(evaluator: Evaluator, index: int) -> FloatArray:
+    """Sample times of the run whose transition time this unknown is; none for a parameter."""
+    problem = evaluator.problem
+    for experiment, where in zip(problem.experiments, problem.unknowns.times, strict=True):
+        if index in where:
+            times = [item.times for item in experiment.data if isinstance(item, Measurements)]
+            return np.unique(np.concatenate([np.zeros(0), *times]))
+    return np.zeros(0)

@@ -1,0 +1,272 @@
+"""Do the residuals look like the noise they are taken for: white, normal, of the size that sigma says?
+
+Each channel by itself, in the order of its samples that are not missing; for samples at irregular times a lag counts
+samples. Standardised residuals are z = (measured - fitted) / sigma, or over their own root mean square where sigma is
+unknown.
+
+- whiteness: Ljung and Box's Q = n (n + 2) sum_k r_k^2 / (n - k) over the first h lags, chi-square with h degrees of
+  freedom, h = min(10, n / 5) ([1]_, [2]_);
+- normality: Jarque and Bera's n / 6 (S^2 + (K - 3)^2 / 4), chi-square with 2 degrees of freedom ([3]_);
+- effective sample size: n (1 - r_1) / (1 + r_1), at most n: what n samples of a first-order autoregressive noise are
+  worth as independent ones.
+
+References
+----------
+.. [1] G. M. Ljung, G. E. P. Box, On a measure of lack of fit in time series models, Biometrika 65 (1978) 297-303.
+.. [2] R. J. Hyndman, G. Athanasopoulos, Forecasting: Principles and Practice, 3rd ed., section 5.4 (number of lags).
+.. [3] C. M. Jarque, A. K. Bera, A test for normality of observations and regression residuals, Int. Stat. Rev. 55
+   (1987) 163-172.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.special
+
+from switchfit.fit.trajectory import Comparison
+from switchfit.problem.data import FloatArray
+
+if TYPE_CHECKING:
+    from switchfit.fit.result import Fit
+
+UNLIKELY = 1e-3
+"""Probability below which a test counts as failed: with ten channels one false alarm in fifty fits."""
+
+SERIOUS = 1.2
+"""Factor by which correlated residuals make standard errors too small from which the report speaks of it: a 95 %
+interval that is too narrow by it covers 90 %."""
+
+FEWEST = 20
+"""Residuals that the tests need: below it the chi-square distributions are far from theirs."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelResiduals:
+    """The residuals of one channel of Measurements.
+
+    Attributes
+    ----------
+    experiment : int, from 0
+    name : str
+    times, values : (n,), (n,)
+        Sample times and standardised residuals of the samples that are not missing.
+    time_unit : str
+        That of the experiment.
+    sigma_known : bool
+    mean : float
+        Of the standardised residuals; 1 / sqrt(n) is its standard deviation if they are white.
+    rms : float
+        Of the standardised residuals: near 1 where sigma is right, 1 where it is unknown.
+    lags : int
+    autocorrelation : (lags,)
+        At lags 1, 2, ...
+    whiteness, normality : float
+        Probabilities of Ljung and Box's and of Jarque and Bera's statistic, or a larger one, if the residuals are
+        white and normal; NaN for fewer than 20.
+    skewness, kurtosis : float
+        0 and 3 for a normal distribution.
+    effective : float
+        Effective sample size.
+    outliers : int
+        Residuals beyond four standard deviations; a thousandth of one is expected in 16 samples.
+    """
+
+    experiment: int
+    name: str
+    times: FloatArray
+    values: FloatArray
+    time_unit: str
+    sigma_known: bool
+    mean: float
+    rms: float
+    lags: int
+    autocorrelation: FloatArray
+    whiteness: float
+    normality: float
+    skewness: float
+    kurtosis: float
+    effective: float
+    outliers: int
+
+    @property
+    def correlation(self) -> float:
+        """Correlation of neighbouring residuals, at lag 1; 0 where there is none."""
+        return float(self.autocorrelation[0]) if self.lags else 0.0
+
+    @property
+    def white(self) -> bool:
+        """Whether the test of whiteness is passed (or there are too few to tell)."""
+        return not self.whiteness < UNLIKELY
+
+    @property
+    def normal(self) -> bool:
+        """Whether the test of normality is passed (or there are too few to tell)."""
+        return not self.normality < UNLIKELY
+
+    @property
+    def narrowing(self) -> float:
+        """Factor by which standard errors that take the residuals as independent are too small."""
+        return float(np.sqrt(len(self.values) / self.effective))
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualDiagnostics:
+    """Tests of the residuals of all channels; print it.
+
+    Attributes
+    ----------
+    channels : tuple of ChannelResiduals
+    labels : tuple of str
+        Of each channel, with the experiment's name where there are several.
+    """
+
+    channels: tuple[ChannelResiduals, ...]
+    labels: tuple[str, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether all residuals look white and normal."""
+        return all(channel.white and channel.normal for channel in self.channels)
+
+    def __str__(self) -> str:
+        if not self.channels:
+            return "No residuals: the cost has no Measurements."
+        header = ("", "values", "rms", "mean", "lag 1", "worth", "P(white)", "P(normal)", "beyond 4")
+        rows = [header]
+        for label, c in zip(self.labels, self.channels, strict=True):
+            shown = (
+                f"{len(c.values)}",
+                f"{c.rms:.3g}",
+                f"{c.mean:+.2f}",
+                f"{c.correlation:+.2f}",
+                f"{c.effective:.0f}",
+            )
+            rows.append((label, *shown, _probability(c.whiteness), _probability(c.normality), f"{c.outliers}"))
+        widths = [max(len(row[k]) for row in rows) for k in range(len(header))]
+        lines = ["Standardised residuals"]
+        for first, *others in rows:
+            cells = [entry.rjust(width) for entry, width in zip(others, widths[1:], strict=True)]
+            lines.append("  ".join([f"  {first:<{widths[0]}}", *cells]))
+        return "\n".join([*lines, *(f"  - {sentence}" for sentence in self.sentences())])
+
+    def sentences(self) -> Iterator[str]:
+        """What fails, a sentence each."""
+        named = list(zip(self.labels, self.channels, strict=True))
+        alike = [(label, c) for label, c in named if not c.white and c.correlation > 0 and c.narrowing > SERIOUS]
+        if alike:
+            listed = _listed([f"{label} ({c.correlation:.2f})" for label, c in alike])
+            worst = max(c.narrowing for _, c in alike)
+            worth = sum(c.effective for _, c in alike)
+            of = sum(len(c.values) for _, c in alike)
+            yield (
+                f"Neighbouring residuals are correlated in {listed}: the model misses something there, or the samples "
+                f"were smoothed before. The {of} values are worth about {worth:.0f} independent ones: the standard "
+                f"errors, which take them as independent, are too small by a factor of up to {worst:.2g}."
+            )
+        heavy = [(label, c) for label, c in named if not c.normal and c.white]
+        if heavy:
+            listed = _listed(
+                [f"{label} (kurtosis {c.kurtosis:.1f}, {c.outliers} beyond 4 sigma)" for label, c in heavy]
+            )
+            yield (
+                f"The residuals are not normal in {listed}. Look for outliers; intervals from a bootstrap do not take "
+                "them as normal."
+            )
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - 6} more" if len(names) > 6 else ""
+    return ", ".join(names[:6]) + more
+
+
+def _probability(value: float) -> str:
+    return "-" if np.isnan(value) else f"{value:.3f}" if value >= 5e-4 else f"{value:.0e}"
+
+
+def diagnose(fit: Fit, labels: list[str] | None = None) -> ResidualDiagnostics:
+    """Test the residuals of a fit, channel by channel.
+
+    Parameters
+    ----------
+    fit : Fit
+    labels : list of str, optional
+        Names of the experiments; run1, run2, ... if left out.
+    """
+    runs = labels or [f"run{e + 1}" for e in range(len(fit.comparisons))]
+    single = len(fit.comparisons) == 1
+    channels, names = [], []
+    for e, comparisons in enumerate(fit.comparisons):
+        for comparison in comparisons:
+            if comparison.kind != "measurements":
+                continue
+            for k, name in enumerate(comparison.names):
+                if np.isfinite(comparison.measured[:, k]).sum() > 0:
+                    channels.append(of_channel(comparison, k, e, fit.trajectories[e].time_unit))
+                    names.append(name if single else f"{runs[e]} {name}")
+    return ResidualDiagnostics(tuple(channels), tuple(names))
+
+
+def of_channel(comparison: Comparison, k: int, experiment: int = 0, time_unit: str = "s") -> ChannelResiduals:
+    """Test one channel of a comparison.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    k : int
+        Which channel, from 0.
+    experiment : int, optional
+    time_unit : str, optional
+        Both are noted in the result.
+    """
+    raw = comparison.residuals[:, k]
+    there = np.isfinite(raw)
+    known = comparison.sigma is not None
+    size = comparison.sigma[there, k] if comparison.sigma is not None else np.sqrt(np.mean(raw[there] ** 2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = np.nan_to_num(raw[there] / size)
+    n = len(z)
+    lags = min(10, n // 5)
+    r = autocorrelation(z, lags)
+    spread = z - z.mean()
+    variance = float(np.mean(spread**2))
+    skewness, kurtosis = 0.0, 3.0
+    if variance > 0:
+        skewness = float(np.mean(spread**3)) / variance**1.5
+        kurtosis = float(np.mean(spread**4)) / variance**2
+    whiteness = normality = np.nan
+    if n >= FEWEST and variance > 0:
+        Q = n * (n + 2) * float(np.sum(r**2 / (n - np.arange(1, lags + 1))))
+        whiteness = float(scipy.special.chdtrc(lags, Q))
+        normality = float(scipy.special.chdtrc(2, n / 6 * (skewness**2 + (kurtosis - 3) ** 2 / 4)))
+    first = float(np.clip(r[0], -0.999, 0.999)) if lags else 0.0
+    root = np.sqrt(np.mean(z**2))
+    return ChannelResiduals(
+        experiment=experiment,
+        name=comparison.names[k],
+        times=comparison.times[there],
+        values=z,
+        time_unit=time_unit,
+        sigma_known=known,
+        mean=float(z.mean()),
+        rms=float(root),
+        lags=lags,
+        autocorrelation=r,
+        whiteness=whiteness,
+        normality=normality,
+        skewness=skewness,
+        kurtosis=kurtosis,
+        effective=min(n, n * (1 - first) / (1 + first)),
+        outliers=int(np.sum(np.abs(spread) > 4 * np.sqrt(variance))) if variance > 0 else 0,
+    )
+
+
+def autocorrelation(z: FloatArray, lags: int) -> FloatArray:
+    """Correlation of z (n,) with itself at lags 1 .. lags, about zero, where residuals should be: (lags,)."""
+    square = float(z @ z)
+    if square == 0:
+        return np.zeros(lags)
+    return np.array([float(z[k:] @ z[:-k]) / square for k in range(1, lags + 1)])
