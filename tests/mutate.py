@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-MODULE = Path("switchfit") / "derivatives" / "adjoint.py"
+MODULE = Path("switchfit") / "paper_adjoint.py"
 
 MUTANTS: dict[str, list[tuple[str, str]]] = {
     "sign of X, (8)": [("X = f_im1 - f_i  # (8)", "X = f_i - f_im1  # (8)")],

@@ -14,7 +14,7 @@ import pytest
 from scipy.optimize import nnls
 
 import switchfit as sf
-from switchfit.batch import monte_carlo as module
+from switchfit.batch import simulated as module
 from switchfit.batch.chunks import run_chunks
 from switchfit.batch.program import CHUNK, Varying, fit_chunk
 from switchfit.fit.evaluator import Evaluator, evaluator_of
@@ -589,7 +589,7 @@ def test_a_start_that_raises_an_error_is_listed(limit):
 
 
 def test_the_lowest_end_may_raise_an_error_when_it_is_fitted_again(monkeypatch):
-    from switchfit.batch import multistart as starts
+    from switchfit.batch import starts
 
     problem, calls = room(sf.Measurements(TIMES, measured_room(0), sigma=0.01)), []
 

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit import functions
 from switchfit.discretization.mesh import padded_length
 from switchfit.engine.adaptive import initial_state
 from switchfit.engine.native.program import _program_of
 from switchfit.fit.evaluator import derivatives, evaluator_of
 from switchfit.fit.trajectory import _block, _terminal
+from switchfit.problem import functions
 from switchfit.runtime.xla import SMALL_LOOPS
 
 # Nothing is compiled anew

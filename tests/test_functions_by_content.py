@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit import functions, reads
+from switchfit.problem import functions, reads
 from switchfit.problem.functions import trace_function
 
 SAMPLES = sf.Measurements([0.5, 1.0], [math.exp(-0.5), math.exp(-1.0)], sigma=0.1)

@@ -721,7 +721,7 @@ def doors(tmp_path, monkeypatch):
 
 OVERFLOWS = pytest.mark.filterwarnings("ignore:.*(overflow|invalid value|divide by zero):RuntimeWarning")
 """Near the largest double costs overflow: NumPy warns, the result is infinite and says so, and no call crashes."""
-LONG_RUNS = ("bootstrap", "logs", "monte_carlo", "multistart")
+LONG_RUNS = ("logs", "resampling", "simulated", "starts")
 STUDIES = ("Fits.", "MonteCarlo.", "Multistart.", "Bootstrap.")
 
 

@@ -5,7 +5,7 @@ import pytest
 from studies import MEASURED, MULTISTART, thermostat
 
 import switchfit as sf
-from switchfit.batch import monte_carlo as module
+from switchfit.batch import simulated as module
 
 
 def drawn(problem, truth, seed, run=0):

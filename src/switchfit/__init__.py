@@ -71,3 +71,8 @@ __all__ = [
     "profile",
     "simulate",
 ]
+
+
+def __dir__() -> list[str]:
+    """What is public, and nothing else: rooms are reached by their full names."""
+    return sorted([*__all__, "__version__"])

@@ -269,4 +269,5 @@ def initial_values(initial: Any) -> FloatArray:
 
 
 def of_kind(data: tuple[Any, ...], kind: type) -> list[Any]:
+    """The items of an experiment's data that are of a kind, in order."""
     return [item for item in data if isinstance(item, kind)]

@@ -1,1 +1,4 @@
-"""What a fit looks like: `text.report` for the terminal, `plot` for figures. Both know a `Fit` and nothing else."""
+"""Results for people: text, tables and figures. Results do not know this room.
+
+Imports `batch` and the rooms before it.
+"""

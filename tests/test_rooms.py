@@ -1,0 +1,114 @@
+"""The rooms of the library: each imports only those before it, and modules of its own without a circle."""
+
+from __future__ import annotations
+
+import ast
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+import switchfit as sf
+
+PACKAGE = Path(sf.__file__).parent
+
+LAYERS = (
+    "runtime",
+    "optimize",
+    "problem",
+    "models",
+    "discretization",
+    "engine",
+    "paper_adjoint",
+    "fit",
+    "uncertainty",
+    "estimation",
+    "batch",
+    "report",
+    "io",
+    "paper",
+    "cli",
+)
+"""From the bottom to the top; the package itself, which collects what is public, is above them all."""
+
+APART = {"optimize": set(), "models": {"problem"}}
+"""Rooms that may import less than all before them."""
+
+
+def name_of(path: Path) -> str:
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {name_of(path): path for path in sorted(PACKAGE.rglob("*.py"))}
+
+
+def imports_of(source: str) -> set[str]:
+    """Every module of ours that a source imports, anywhere in it, for types too."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "relative import"
+            base = node.module or ""
+            found |= {whole if (whole := f"{base}.{a.name}") in named() else base for a in node.names}
+        elif isinstance(node, ast.Import):
+            found |= {a.name for a in node.names}
+    return {name.removeprefix("switchfit").removeprefix(".") for name in found if name.split(".")[0] == "switchfit"}
+
+
+def named() -> set[str]:
+    return {f"switchfit.{name}" for name in MODULES}
+
+
+def room_of(module: str) -> str:
+    return module.split(".")[0]
+
+
+def violations(module: str, imported: set[str]) -> list[str]:
+    """Imports of rooms that come after the module's own, or that it may not know."""
+    own = room_of(module)
+    allowed = APART.get(own, set(LAYERS[: LAYERS.index(own)])) | {own}
+    return [f"{module} imports {other or 'switchfit'}" for other in imported if room_of(other) not in allowed]
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if name])
+def test_each_room_imports_only_those_before_it(module):
+    imported = imports_of(MODULES[module].read_text())
+    if module == "cli":
+        imported -= {""}  # it is a user of what is public
+    assert not violations(module, imported)
+
+
+def test_no_module_imports_itself_by_way_of_others():
+    graph = {}
+    for module, path in MODULES.items():
+        graph[module] = imports_of(path.read_text()) - {module, ""} if module else set()
+    list(TopologicalSorter(graph).static_order())  # raises CycleError
+
+
+def test_a_violation_is_found():
+    """In an import for types alone, inside a function, and of a whole package."""
+    for source in (
+        "if TYPE_CHECKING:\n    from switchfit.report.text import report",
+        "def f():\n    from switchfit.report import text",
+        "import switchfit.report.text",
+        "from switchfit import report",
+    ):
+        assert violations("fit.result", imports_of(source)), source
+    assert not violations("fit.result", imports_of("from switchfit.problem.data import FloatArray"))
+    assert violations("optimize.sqp", imports_of("from switchfit.runtime.files import write_atomically"))
+
+
+def test_every_room_is_in_the_list_and_says_what_belongs_in_it():
+    rooms = {room_of(name) for name in MODULES if name}
+    assert rooms == set(LAYERS)
+    for room in rooms:
+        source = MODULES[room].read_text()
+        assert ast.get_docstring(ast.parse(source)), room
+
+
+def test_only_what_is_public_is_shown_and_no_verb_is_a_module():
+    assert dir(sf) == sorted([*sf.__all__, "__version__"])
+    verbs = {name for name in sf.__all__ if name.islower()}
+    assert len(verbs) > 10
+    assert not verbs & {part for name in MODULES for part in name.split(".")}
