@@ -16,6 +16,7 @@ another (`_check_fit`): what was loaded can be printed and plotted, and has inte
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
@@ -33,6 +34,9 @@ from switchfit.runtime.files import write_atomically
 
 FORMAT = "switchfit fit"
 VERSION = 3
+
+DTYPE = re.compile(r"[<>|=]?[bifuU]\d+")
+"""What a dtype of numbers or text is called; NumPy has more names, some of them obsolete."""
 READABLE = (2, 3)
 
 LATER_FIELDS: dict[type, tuple[str, ...]] = {
@@ -219,12 +223,13 @@ def _array(value: Any, where: str) -> NDArray[Any]:
         return _assembled(_numbers(value, where), np.dtype(np.float64), where)
     if set(value) != {"dtype", "shape", "values"}:
         raise ValueError(f"{where} must be an array; got {_shown(value)}")
+    name = _checked(value["dtype"], str, where)
+    if not DTYPE.fullmatch(name):
+        raise ValueError(f"{where} has the dtype {name!r}, which is none of numbers or text")
     try:
-        dtype = np.dtype(_checked(value["dtype"], str, where))
+        dtype = np.dtype(name)
     except TypeError as error:
-        raise ValueError(f"{where} has the unknown dtype {value['dtype']!r}") from error
-    if dtype.kind not in "bifuU":
-        raise ValueError(f"{where} has the dtype {value['dtype']!r}, which is none of numbers or text")
+        raise ValueError(f"{where} has the unknown dtype {name!r}") from error
     values = _checked(value["values"], list, where)
     if dtype.kind == "f":
         values = _numbers(values, where)
