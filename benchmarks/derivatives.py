@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks import vehicle
 from benchmarks.report import Report
 from benchmarks.timing import ms, take_turns
-from switchfit.engine.native.program import native_experiment
+from switchfit.engine.native.experiment import native_experiment
 from switchfit.fit.evaluator import Evaluator
 
 COARSE = 58

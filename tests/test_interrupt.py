@@ -17,7 +17,8 @@ import switchfit as sf
 from switchfit.batch.chunks import run_chunks
 from switchfit.engine.adaptive import refined_mesh
 from switchfit.engine.native import driver, program
-from switchfit.engine.native.program import forget_programs, native_experiment
+from switchfit.engine.native.experiment import native_experiment
+from switchfit.engine.native.program import forget_programs
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.trajectory import runs_of
 

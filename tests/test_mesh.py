@@ -16,7 +16,7 @@ from switchfit.discretization.mesh import CHUNK, Mesh, chunk_count, padded_lengt
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import path_cost, propagate
 from switchfit.engine.adaptive import _solve, _solve_natively, fixed_nodes, refined_mesh
-from switchfit.engine.native.program import native_experiment
+from switchfit.engine.native.experiment import native_experiment
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.functions import float64
 

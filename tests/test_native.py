@@ -22,8 +22,9 @@ import switchfit as sf
 from switchfit.discretization.arguments import arguments_of
 from switchfit.engine.native import kernels, llvm
 from switchfit.engine.native import program as program_module
+from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.native.foreign import foreign_derivatives
-from switchfit.engine.native.program import forget_programs, native_experiment
+from switchfit.engine.native.program import forget_programs
 from switchfit.engine.native.scalars import Graph, Node
 from switchfit.engine.native.trace import Unsupported, traced
 from switchfit.fit.evaluator import Evaluator, evaluator_of

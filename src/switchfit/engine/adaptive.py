@@ -23,8 +23,9 @@ import scipy.integrate
 from switchfit.discretization.arguments import Arguments, arguments_of
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model, Piece
-from switchfit.engine.native.kernels import Adaptive
-from switchfit.engine.native.program import NativeExperiment, native_experiment
+from switchfit.engine.native.adaptive import Adaptive
+from switchfit.engine.native.experiment import NativeExperiment, native_experiment
+from switchfit.engine.native.templates import Order
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment, signals_of
 from switchfit.problem.functions import float64
@@ -115,7 +116,7 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
     ends = np.concatenate([[experiment.t0], tau, [experiment.tf]])
     inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
     steps = [np.array([experiment.t0])]
-    native = native_experiment(structure, whole, coarse.times, order=0)
+    native = native_experiment(structure, whole, coarse.times, order=Order.COST)
     x = _finite(
         _by_jax(initial_state, arguments, p, structure=structure.functions)
         if native is None

@@ -23,7 +23,8 @@ from switchfit.engine.jax.constraints import augmented
 from switchfit.engine.jax.first_order import first_order
 from switchfit.engine.jax.forward import forward_hessian
 from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
-from switchfit.engine.native.program import NativeExperiment, native_experiment, reason_for_jax
+from switchfit.engine.native.experiment import NativeExperiment, native_experiment, reason_for_jax
+from switchfit.engine.native.templates import Order
 from switchfit.fit.trajectory import cost_of, runs_of
 from switchfit.optimize.arrow import Arrow, ArrowLayout
 from switchfit.paper_adjoint import paper_derivatives
@@ -37,6 +38,12 @@ from switchfit.runtime.cache import compilation_cache
 Method = Literal["auto", "forward", "discrete-adjoint", "adjoint", "autodiff"]
 Matrix = Literal["exact", "gauss-newton", "none"]
 METHODS = ("auto", "forward", "discrete-adjoint", "adjoint", "autodiff")
+
+ORDERS: dict[Matrix, Order] = {
+    "exact": Order.HESSIAN,
+    "gauss-newton": Order.GAUSS_NEWTON,
+    "none": Order.GRADIENT,
+}
 
 FORWARD_UP_TO = 0
 """Unknowns of one experiment up to which second order forward is cheaper than the backward sweep. It never is: at one
@@ -110,7 +117,7 @@ class Evaluator:
         self.meshes = with_common_lengths(problem, given)
         self.arguments = [arguments_of(problem, e, mesh) for e, mesh in enumerate(self.meshes)]
         self._compiled: set[tuple[Method, Matrix]] = set()
-        self._native: dict[int, list[NativeExperiment | None]] = {}
+        self._native: dict[Order, list[NativeExperiment | None]] = {}
         self._on_device: list[Arguments] | None = None
         self._priors = problem.unknowns.priors if problem.unknowns.priors.any else None
 
@@ -150,13 +157,12 @@ class Evaluator:
         cost, value, gradient, slope, hessian = 0.0, 0.0, np.zeros(d), np.zeros(d), np.zeros((d, d))
         jacobian, c = np.zeros((count, d)), np.zeros(count)
         last = 0
-        for e, ((s, a, tau, p), (own, mine)) in enumerate(zip(self._each(theta), self.problem.own_places, strict=True)):
+        for e, (own, mine) in enumerate(self.problem.own_places):
             here = slice(last, last := last + self.problem.constraint_counts[e])
-            with float64(), compilation_cache():
-                found = constrained_derivatives(a, tau, p, float(side), multipliers[here], penalty[here], structure=s)
-            J, g, L, L_d, H, c_e, A = map(np.asarray, found)
-            cost, value = cost + float(J), value + float(L)
-            np.add.at(gradient, mine, g[own])
+            J, L_d, H, c_e, A = self._constrained(e, theta, side, multipliers[here], penalty[here])
+            cost += J
+            value += J + float(multipliers[here] @ c_e + 0.5 * penalty[here] @ c_e**2)
+            np.add.at(gradient, mine, (L_d - (multipliers[here] + penalty[here] * c_e) @ A)[own])
             np.add.at(slope, mine, L_d[own])
             np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
             np.add.at(jacobian[here].T, mine, A[:, own].T)
@@ -166,6 +172,23 @@ class Evaluator:
             cost, gradient = cost + float(J), gradient + g
             value, slope, hessian = value + float(J), slope + g, hessian + np.diag(h)
         return ConstrainedEvaluation(cost, gradient, value, slope, hessian, c, jacobian)
+
+    def _constrained(
+        self, e: int, theta: FloatArray, side: int, multipliers: FloatArray, penalty: FloatArray
+    ) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Of experiment e its cost, slope and Hessian of its augmented Lagrangian, constraints and their derivative."""
+        native = self._natives(Order.HESSIAN)[e]
+        found = (
+            None if native is None else native.constrained(*self.problem.vectors(theta, e), side, multipliers, penalty)
+        )
+        if found is not None:
+            H = found.hessian + (found.jacobian.T * penalty) @ found.jacobian
+            return found.cost, found.slope, H, found.constraints, found.jacobian
+        s, a, tau, p = self._each(theta)[e]
+        with float64(), compilation_cache():
+            result = constrained_derivatives(a, tau, p, float(side), multipliers, penalty, structure=s)
+        J, _, _, L_d, H, c, A = map(np.asarray, result)
+        return float(J), L_d, H, c, A
 
     def arrow(self, theta: FloatArray, side: int = 1, matrix: Matrix = "exact") -> ArrowEvaluation:
         """The same by the method "auto", in time and memory that are linear in the number of experiments."""
@@ -202,7 +225,7 @@ class Evaluator:
 
     def cost(self, theta: FloatArray) -> float:
         """J alone."""
-        natives = self._natives(0)
+        natives = self._natives(Order.COST)
         vectors = [self.problem.vectors(theta, e) for e in range(len(natives))]
         costs = [None if native is None else native.cost(*at) for native, at in zip(natives, vectors, strict=True)]
         known = [cost for cost in costs if cost is not None]
@@ -213,13 +236,11 @@ class Evaluator:
     @property
     def engine(self) -> Engine:
         """What evaluates cost, gradient and exact Hessian by the method "auto": machine code, or JAX and why."""
-        if self.problem.constraint_names:
-            return Engine("jax", "guards and terminal constraints have no machine code")
         given = zip(self.problem.structures, self.arguments, strict=True)
-        reasons = (reason_for_jax(structure, arguments, 2) for structure, arguments in given)
+        reasons = (reason_for_jax(structure, arguments, Order.HESSIAN) for structure, arguments in given)
         return Engine.of(next((reason for reason in reasons if reason is not None), None))
 
-    def _natives(self, order: int) -> list[NativeExperiment | None]:
+    def _natives(self, order: Order) -> list[NativeExperiment | None]:
         """What evaluates each experiment in machine code, None where nothing does; with derivatives up to an order."""
         if order not in self._native:
             given = zip(self.problem.structures, self.arguments, self.meshes, strict=True)
@@ -228,8 +249,8 @@ class Evaluator:
 
     def _results(self, theta: FloatArray, side: int, method: Method, matrix: Matrix) -> list[Any]:
         """Cost, gradient and Hessian of each experiment in its own unknowns, as NumPy arrays."""
-        if method == "auto" and matrix != "gauss-newton":
-            natives = [native for native in self._natives(2 if matrix == "exact" else 1) if native is not None]
+        if method == "auto":
+            natives = [native for native in self._natives(ORDERS[matrix]) if native is not None]
             if len(natives) == len(self.arguments):
                 found = [native(*self.problem.vectors(theta, e), side) for e, native in enumerate(natives)]
                 if None not in found:

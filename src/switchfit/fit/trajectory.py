@@ -18,7 +18,8 @@ from switchfit.discretization.mesh import CHUNK, Mesh, rows
 from switchfit.discretization.model import Model, Piece
 from switchfit.discretization.tableaus import step
 from switchfit.engine.adaptive import after_reset, initial_state, refined_mesh
-from switchfit.engine.native.program import NativeExperiment, native_experiment
+from switchfit.engine.native.experiment import NativeExperiment, native_experiment
+from switchfit.engine.native.templates import Order
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.functions import float64
 from switchfit.problem.losses import robust
@@ -207,7 +208,7 @@ def _simulated(problem: Problem, e: int, theta: FloatArray, mesh: Mesh, whole: A
     """Integrate experiment e over the rows of a mesh, mode by mode."""
     structure = problem.structures[e]
     tau, p = problem.vectors(theta, e)
-    native = native_experiment(structure, whole, mesh.times, order=0)
+    native = native_experiment(structure, whole, mesh.times, order=Order.COST)
     found = None if native is None else _natively(structure, native, mesh.times, tau, p)
     if found is not None:
         cost, segments, first_cell = found

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from switchfit.problem.data import (
 )
 from switchfit.problem.parameter import Parameter as Parameter
 from switchfit.problem.parameter import as_parameter
-from switchfit.problem.system import Guard, HybridSystem, ResetMap, as_state
+from switchfit.problem.system import HybridSystem, as_state
 from switchfit.problem.validation import as_instance, as_name, as_number, as_sequence, shown
 
 
@@ -165,16 +164,6 @@ class Experiment:
 def initial_state_of(system: HybridSystem, experiment: Experiment) -> Any:
     """The experiment's initial state, or the system's where it has none of its own."""
     return system.initial_state if experiment.initial_state is None else experiment.initial_state
-
-
-def reset_maps_of(system: HybridSystem, mode_sequence: Sequence[str]) -> tuple[ResetMap | None, ...]:
-    """The reset map of each of the N transitions of a mode sequence, None where the state is continuous."""
-    return tuple(system.reset_map(a, b) for a, b in pairwise(mode_sequence))
-
-
-def guards_of(system: HybridSystem, mode_sequence: Sequence[str]) -> tuple[Guard | None, ...]:
-    """The guard of each of the N transitions of a mode sequence, None where its time is free."""
-    return tuple(system.guard(a, b) for a, b in pairwise(mode_sequence))
 
 
 def signals_of(experiment: Experiment) -> tuple[PiecewisePolynomial, ...]:

@@ -22,7 +22,7 @@ from switchfit.problem.data import (
     TerminalConstraint,
     TerminalCost,
 )
-from switchfit.problem.experiment import Experiment, guards_of, initial_state_of, reset_maps_of
+from switchfit.problem.experiment import Experiment, initial_state_of
 from switchfit.problem.functions import Function, Shape, trace_function
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.system import HybridSystem
@@ -70,6 +70,9 @@ class Structure:
     terminal_constraints: tuple[Function, ...]
     input_shape: tuple[int, ...] | None
     solver: str
+    transitions: int  # most transitions of a sequence that its library has room for
+    reset_library: tuple[Function, ...]  # reset maps and guards that sequences of these modes may have
+    guard_library: tuple[Function, ...]
 
     @property
     def outputs(self) -> tuple[tuple[Function | None, int], ...]:
@@ -89,7 +92,24 @@ class Structure:
     @property
     def functions(self) -> Structure:
         """The same with one segment: what programs depend on that work in one mode at a time."""
-        return replace(self, mode_of_segment=(0,), reset_maps=(), guards=(), terminal_constraints=())
+        return replace(
+            self,
+            mode_of_segment=(0,),
+            reset_maps=(),
+            guards=(),
+            terminal_constraints=(),
+            transitions=0,
+            reset_library=(),
+            guard_library=(),
+        )
+
+    @cached_property
+    def library(self) -> Structure:
+        """What every sequence of these modes has in common: its reset maps and guards are those there are.
+
+        Machine code is written for a library; which mode, reset map and guard comes when, it reads at run time.
+        """
+        return replace(self, mode_of_segment=(), reset_maps=self.reset_library, guards=self.guard_library)
 
     @property
     def resets(self) -> tuple[int, ...]:
@@ -189,8 +209,13 @@ class _Tracer:
         return traced
 
 
-def structure_of(system: HybridSystem, experiment: Experiment, functions: Functions, solver: str) -> Structure:
-    """The structure of one experiment, its functions traced and checked.
+def structure_of(
+    system: HybridSystem, experiment: Experiment, functions: Functions, solver: str, transitions: int | None = None
+) -> Structure:
+    """Trace and check the functions of one experiment, and return its structure.
+
+    Given `transitions`, its library has all modes of the system and room for so many transitions; left out, those of
+    the experiment.
 
     Raises
     ------
@@ -198,7 +223,8 @@ def structure_of(system: HybridSystem, experiment: Experiment, functions: Functi
         Naming the mode or function, what it should return and what it returned.
     """
     trace = functions.of(experiment)
-    names = tuple(dict.fromkeys(experiment.mode_sequence))
+    used = system.modes if transitions is not None else set(experiment.mode_sequence)
+    names = tuple(name for name in system.modes if name in used)  # in the same order for every sequence
     initial = initial_state_of(system, experiment)
     x0 = trace(initial, (None,), None, "initial_state", "initial_state(p)") if callable(initial) else None
     if x0 is not None and (len(x0.shape) != 1 or x0.shape == (0,)):
@@ -210,9 +236,14 @@ def structure_of(system: HybridSystem, experiment: Experiment, functions: Functi
     inputs = None if experiment.inputs is None else tuple(experiment.inputs.values.shape[1:])
     in_mode, form = (at, "f(t, x, p)") if inputs is None else ((*at, inputs), "f(t, x, p, u)")
 
-    def transitions(kind: tuple[Callable[..., Any] | None, ...], shape: Shape, what: str, form: str) -> tuple[Any, ...]:
-        pairs = zip(kind, pairwise(experiment.mode_sequence), strict=True)
-        return tuple(None if g is None else trace(g, at, shape, f"{what} {pair}", form) for g, pair in pairs)
+    def at_transitions(
+        given: Mapping[tuple[str, str], Callable[..., Any]], shape: Shape, what: str, form: str
+    ) -> tuple[tuple[Function | None, ...], tuple[Function, ...]]:
+        """The function of each transition, None where there is none, and all that there may be."""
+        own = list(pairwise(experiment.mode_sequence))
+        here = given if transitions is not None else own
+        traced = {pair: trace(g, at, shape, f"{what} {pair}", form) for pair, g in given.items() if pair in here}
+        return tuple(traced.get(pair) for pair in own), tuple(dict.fromkeys(traced.values()))
 
     def observe(item: Measurements | ReferenceSignal, channels: int) -> Function | None:
         if item.observe is not None:
@@ -235,11 +266,13 @@ def structure_of(system: HybridSystem, experiment: Experiment, functions: Functi
             raise ValueError(
                 f"TerminalConstraint: psi(x, p) must return a number or an array of shape (m,); got shape {psi.shape}."
             )
+    reset_maps, reset_library = at_transitions(system.reset_maps, (n,), "reset map", "R(t, x, p)")
+    guards, guard_library = at_transitions(system.guards, (), "guard", "g(t, x, p)")
     structure = Structure(
         mode_names=names,
         modes=modes,
         mode_of_segment=tuple(names.index(mode) for mode in experiment.mode_sequence),
-        reset_maps=transitions(reset_maps_of(system, experiment.mode_sequence), (n,), "reset map", "R(t, x, p)"),
+        reset_maps=reset_maps,
         initial_state=x0,
         n=n,
         unknown_states=unknown,
@@ -248,19 +281,22 @@ def structure_of(system: HybridSystem, experiment: Experiment, functions: Functi
         references=tuple((observe(item, channels), channels) for item, channels in references),
         measurements=tuple(Sensor.of(item, observe(item, channels)) for item, channels in measurements),
         terminal=tuple(trace(item.phi, at[1:], (), "TerminalCost", "phi(x, p)") for item in items(TerminalCost)),
-        guards=transitions(guards_of(system, experiment.mode_sequence), (), "guard", "g(t, x, p)"),
+        guards=guards,
         terminal_constraints=constraints,
         input_shape=inputs,
         solver=solver,
+        transitions=len(reset_maps) if transitions is None else transitions,
+        reset_library=reset_library,
+        guard_library=guard_library,
     )
     asked = trace.asked.union(*(sensor.named for sensor in structure.measurements))
     # What is fixed costs nothing.
-    used = tuple(
+    parameters = tuple(
         (name, q.shape, not q.fixed)
         for name, q in trace.named.items()
         if name in asked or (q.fixed and name not in trace.hidden)
     )
-    return replace(structure, parameters=used)
+    return replace(structure, parameters=parameters)
 
 
 def initial_values(initial: Any) -> FloatArray:

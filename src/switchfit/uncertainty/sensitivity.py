@@ -26,7 +26,8 @@ from switchfit.discretization.mesh import CHUNK, Mesh, rows
 from switchfit.discretization.model import Model, Piece
 from switchfit.discretization.tableaus import step
 from switchfit.engine.adaptive import initial_state
-from switchfit.engine.native.program import native_experiment
+from switchfit.engine.native.experiment import native_experiment
+from switchfit.engine.native.templates import Order
 from switchfit.fit.trajectory import BLOCK
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.functions import float64
@@ -131,8 +132,8 @@ def _natively(
     Its derivatives are those at the ends of rows, which move where they are transitions. At the time at which such an
     end is they are less dx/dt.
     """
-    native = native_experiment(structure, whole, mesh.times, order=2)
-    fields = native_experiment(structure, whole, mesh.times, order=0)
+    native = native_experiment(structure, whole, mesh.times, order=Order.HESSIAN)
+    fields = native_experiment(structure, whole, mesh.times, order=Order.COST)
     if native is None or fields is None:
         return None
     found = native.simulated(tau, p)

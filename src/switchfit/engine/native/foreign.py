@@ -11,17 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from switchfit.discretization.arguments import Arguments
-from switchfit.engine.native.frame import workspace
-from switchfit.engine.native.kernels import Sizes, constants_of
+from switchfit.engine.native.experiment import places_in_library
 from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.program import program_of
+from switchfit.engine.native.templates import Order, Sizes, constants_of
+from switchfit.engine.native.workspace import GIVEN, constraint_rows, memory, sums
 from switchfit.problem.structure import Structure
 
 
 @cache  # what is registered must stay
-def _registered(structure: Structure, sizes: Sizes) -> tuple[str, Program] | None:
-    """Name of the operation for a structure; None where JAX has to do its work."""
-    program = program_of(structure, sizes, 2)
+def _registered(library: Structure, sizes: Sizes) -> tuple[str, Program] | None:
+    """Name of the operation for a library; None where JAX has to do its work."""
+    program = program_of(library, sizes, Order.HESSIAN)
     if isinstance(program, str):
         return None
     name = f"switchfit_{program.key[:32]}"
@@ -37,25 +38,41 @@ def foreign_derivatives(structure: Structure, arguments: Arguments, tau: Any, p:
 
     As `switchfit.fit.evaluator.derivatives` with the side +1; None where JAX has to do it.
     """
-    sizes = Sizes.of(structure, arguments)
-    registered = _registered(structure, sizes)
+    sizes, library = Sizes.of(structure, arguments), structure.library
+    late = any(sensor.delay is not None for sensor in structure.measurements)
+    registered = None if late or structure.N < sizes.N else _registered(library, sizes)
     if registered is None:
         return None
     name, _ = registered
-    n, D, width = sizes.n, sizes.D, sizes.width
+    N, D, width = sizes.N, sizes.D, sizes.width
     nodes = arguments.nodes
     cells = nodes.shape[0] - 1
     real_cells = jnp.sum(nodes[1:] > nodes[:-1])
     passed = jnp.sum(nodes[None] <= tau[:, None], axis=1)
-    first_cell = jnp.append(jnp.zeros(1, int), jnp.clip(passed - 1, 0, real_cells - 1))
-    constants = jnp.concatenate([*(jnp.ravel(a) for a in constants_of(arguments)), jnp.zeros(1)])
+    begins = jnp.clip(passed - 1, 0, real_cells - 1)
     units = np.zeros((D + 1, width))
     units[1:, :D] = np.eye(D)
-    given = [nodes, arguments.signals, constants, jnp.concatenate([tau, p]), first_cell, units]
+    count = max(constraint_rows(library, sizes)["count"], 1)
+    given: dict[str, Any] = {
+        "nodes": nodes,
+        "signals": arguments.signals,
+        "c": jnp.concatenate([*(jnp.ravel(a) for a in constants_of(arguments)), jnp.zeros(1)]),
+        "p": jnp.append(p, 0.0),
+        "bounds": jnp.concatenate([nodes[:1], tau, nodes[-1:]]),
+        "first_cell": jnp.concatenate([jnp.zeros(1, int), begins, jnp.full(1, cells - 1)]),
+        "multipliers": np.zeros(count),
+        "penalties": np.zeros(count),
+        "units": units,
+    }
+    given |= {key: np.array([*which, -1], dtype=np.int64) for key, which in places_in_library(structure).items()}
+    buffers = [given[key] for key in GIVEN]
     for samples in arguments.samples:
-        given += [samples.cell, samples.time, samples.value, samples.weight]
-    lengths = workspace(sizes, cells, bool(arguments.samples))
-    results = [jax.ShapeDtypeStruct((length,), np.float64) for length in lengths.values()]
-    sums = jax.ffi.ffi_call(name, results)(*given)[0]
-    cost = sums[n] + sums[-1]  # not a number where JAX has to look again, which the finisher of a batch lets it do
-    return cost, sums[n + 1 : n + 1 + D], sums[n + 1 + width : -1].reshape(D, width)[:, :D]
+        buffers += [*samples, np.zeros(1, dtype=np.int64)]
+    lengths = sums(library, sizes)
+    of_memory = sum(length.at(cells + N) for length in memory(library, sizes, Order.HESSIAN).values())
+    results = [jax.ShapeDtypeStruct((length,), np.float64) for length in (sum(lengths.values()), of_memory)]
+    totals = jax.ffi.ffi_call(name, results)(*buffers)[0]
+    ends = dict(zip(lengths, np.cumsum(list(lengths.values())).tolist(), strict=True))
+    J, g, H = (totals[ends[key] - lengths[key] : ends[key]] for key in ("J", "g", "H"))
+    cost = J[0] + totals[-1]  # not a number where JAX has to look again, which the finisher of a batch lets it do
+    return cost, g[:D], H.reshape(D, width)[:, :D]

@@ -6,9 +6,8 @@ Only a few fields of that frame are read. Where they stand is fixed by XLA's C i
 
 from __future__ import annotations
 
-from switchfit.engine.native.driver import POINTERS, Driver
-from switchfit.engine.native.kernels import STAGES, Sizes
-from switchfit.engine.native.scalars import CHECKED
+from switchfit.engine.native.driver import Driver
+from switchfit.engine.native.workspace import GIVEN, OF_SAMPLES, ZEROED, memory, sums
 
 MAJOR, MINOR = 0, 1
 """Version of the interface."""
@@ -19,87 +18,75 @@ EXTENSION, ARGUMENTS, RESULTS = 8, 72, 112
 DATA, DIMENSIONS = 24, 40
 """Bytes into a buffer: its data and its dimensions."""
 
-GIVEN = ("nodes", "signals", "c", "tau", "first_cell", "units")
-"""Arguments of the operation, before the samples."""
-
-
-def workspace(sizes: Sizes, cells: int, samples: bool) -> dict[str, int]:
-    """Lengths of the results of the operation; the first is what it is for."""
-    n, N, D, width, rows = sizes.n, sizes.N, sizes.D, sizes.width, cells + sizes.N
-    return {
-        "psi": n + 2 + width + D * width,
-        "states": (rows + 1 + N) * n,
-        "tangents": (rows + 1) * n * width,
-        "stages": rows * STAGES * n,
-        "stage_tangents": rows * STAGES * n * width,
-        "jumps": (rows + 1) * n if samples else n,
-        "reset_tangents": N * n * width + 1,
-        "entries": STAGES * (1 + n + sizes.M) ** 2,
-        "length": width,
-    }
-
 
 def handler(driver: Driver) -> str:
-    """The handler: it fills the table of pointers, and calls the driver."""
-    sizes, measurements = driver.sizes, len(driver.structure.measurements)
-    n, N, D, width = sizes.n, sizes.N, sizes.D, sizes.width
-    driver.line(f"%table = alloca [{len(POINTERS) + 4 * measurements} x i64]")
+    """The handler: it fills the table of pointers, and calls the driver.
+
+    Its arguments are those of `workspace.GIVEN`, then those of the samples; its results are all sums in one, and the
+    memory.
+    """
+    library, sizes = driver.library, driver.sizes
+    measurements = len(library.measurements)
+    driver.line(f"%table = alloca [{len(driver.names) + len(OF_SAMPLES) * measurements} x i64]")
     driver.line("%progress = alloca [3 x i64]")
-    extension = driver.let(f"load ptr, ptr {driver.into('%frame', EXTENSION)}")
+    extension = driver.load("ptr", driver.into("%frame", EXTENSION))
     driver.line(f"br i1 {driver.let(f'icmp eq ptr {extension}, null')}, label %run, label %asked")
-    driver.lines.append("asked:")
-    kind = driver.let(f"load i32, ptr {driver.into(extension, 8)}")
+    driver.label("asked")
+    kind = driver.load("i32", driver.into(extension, 8))
     driver.line(f"br i1 {driver.let(f'icmp eq i32 {kind}, 1')}, label %answer, label %run")
-    driver.lines.append("answer:")  # which version of the interface this is
-    metadata = driver.let(f"load ptr, ptr {driver.into(extension, 24)}")
+    driver.label("answer")  # which version of the interface this is
+    metadata = driver.load("ptr", driver.into(extension, 24))
     for offset, value in ((24, MAJOR), (28, MINOR), (32, 0)):
         driver.line(f"store i32 {value}, ptr {driver.into(metadata, offset)}")
     driver.line("ret ptr null")
-    driver.lines.append("run:")
-    given, made = (driver.let(f"load ptr, ptr {driver.into('%frame', place)}") for place in (ARGUMENTS, RESULTS))
+    driver.label("run")
+    given, made = (driver.load("ptr", driver.into("%frame", place)) for place in (ARGUMENTS, RESULTS))
 
     def data(buffers: str, k: int) -> tuple[str, str]:
         """Data and dimensions of a buffer."""
-        buffer = driver.let(f"load ptr, ptr {driver.into(buffers, 8 * k)}")
-        places = (driver.into(buffer, place) for place in (DATA, DIMENSIONS))
-        pointer, dimensions = (driver.let(f"load ptr, ptr {place}") for place in places)
+        buffer = driver.load("ptr", driver.into(buffers, 8 * k))
+        pointer, dimensions = (driver.load("ptr", driver.into(buffer, place)) for place in (DATA, DIMENSIONS))
         return pointer, dimensions
 
     found, shapes = {}, {}
     for k, name in enumerate(GIVEN):
         found[name], shapes[name] = data(given, k)
-    for k, name in enumerate(workspace(sizes, 0, False)):
-        found[name], shapes[name] = data(made, k)
-    nodes = driver.let(f"load i64, ptr {shapes['nodes']}")
-    cells = driver.let(f"sub i64 {nodes}, 1")
-    behind = driver.let(f"add i64 {cells}, {N + 1}")
-    found |= {
-        "p": driver.at(found["tau"], N),
-        "J": driver.at(found["psi"], n),
-        "g": driver.at(found["psi"], n + 1),
-        "H": driver.at(found["psi"], n + 1 + width),
-        CHECKED: driver.at(found["psi"], n + 1 + width + D * width),
-        "reset_states": driver.at(found["states"], behind, n),
-    }
-    for k, name in enumerate(POINTERS):
-        driver.line(f"store ptr {found.get(name, 'null')}, ptr {driver.at('%table', k)}")
+    last = driver.load("i64", driver.at(found["first_cell"], sizes.N + 1))
+    rows = driver.let(f"add i64 {last}, {sizes.N + 1}")
+
+    totals, place = data(made, 0)[0], 0
+    for name, size in sums(library, sizes).items():
+        found[name] = driver.at(totals, place)
+        place += size
+    zero(driver, totals, str(place))
+    between, offset = data(made, 1)[0], "0"
+    for name, length in memory(library, sizes, driver.order).items():
+        found[name] = driver.at(between, offset)
+        growing = driver.let(f"mul i64 {rows}, {length.each_row}")
+        count = driver.let(f"add i64 {growing}, {length.fixed}")
+        if name in ZEROED:
+            zero(driver, found[name], count)
+        offset = driver.let(f"add i64 {offset}, {count}")
+    for k, name in enumerate(driver.names):
+        driver.line(f"store ptr {found[name]}, ptr {driver.at('%table', k)}")
     counts = ""
     for k in range(measurements):
-        for m in range(4):
-            pointer, dimensions = data(given, len(GIVEN) + 4 * k + m)
-            driver.line(f"store ptr {pointer}, ptr {driver.at('%table', len(POINTERS) + 4 * k + m)}")
-        counts += f", i64 {driver.let(f'load i64, ptr {dimensions}')}"
-    jumps = driver.let(f"load i64, ptr {shapes['jumps']}")
-    for name, length in (("psi", str(n + 2 + width + D * width)), ("jumps", jumps)):
-        size = driver.let(f"mul i64 {length}, 8")
-        driver.line(f"call void @llvm.memset.p0.i64(ptr {found[name]}, i8 0, i64 {size}, i1 false)")
-    first = driver.let(f"load double, ptr {found['nodes']}")
-    last = driver.let(f"load double, ptr {driver.at(found['nodes'], cells)}")
+        for m in range(len(OF_SAMPLES)):
+            pointer, dimensions = data(given, len(GIVEN) + len(OF_SAMPLES) * k + m)
+            at = driver.at("%table", len(driver.names) + len(OF_SAMPLES) * k + m)
+            driver.line(f"store ptr {pointer}, ptr {at}")
+        counts += f", i64 {driver.load('i64', dimensions)}"
     driver.line("store [3 x i64] [i64 0, i64 0, i64 9223372036854775807], ptr %progress")  # all at once
-    driver.line(f"call void @evaluate(ptr %table, ptr %progress, i64 {cells}, double {first}, double {last}{counts})")
+    driver.line(f"call void @evaluate(ptr %table, ptr %progress{counts})")
     driver.line("ret ptr null")
     text = "\n".join(driver.lines)
     return (
         "declare void @llvm.memset.p0.i64(ptr, i8, i64, i1)\n"
         f"define ptr @xla_handler(ptr %frame) {{\nentry:\n{text}\n}}\n"
     )
+
+
+def zero(driver: Driver, pointer: str, count: str) -> None:
+    """Write zeros to `count` doubles."""
+    size = driver.let(f"mul i64 {count}, 8")
+    driver.line(f"call void @llvm.memset.p0.i64(ptr {pointer}, i8 0, i64 {size}, i1 false)")

@@ -1,0 +1,65 @@
+"""Nodes: what happens to the state at one moment, and what is paid for it there.
+
+start        ``x(t0) = x0(p)``
+reset        ``x(tau_i+) = R(tau_i, x(tau_i-), p)``
+sample       a cost of (t, x, p) at the end of a row; of a late sample at the end of a step of its own, which begins
+             with the row that holds ``t - delay(p)`` and ends there
+transition   costs of, and constraints on, ``(tau_i, x(tau_i-), p)``
+end          costs of, and constraints on, ``(x(tf), p)``
+
+Engines differentiate what is listed here, and know no kind by its name. All functions take (t, x, p); of a constraint
+engines add ``weight . c`` to the cost, with the weights of a Lagrangian.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from switchfit.discretization.model import Model
+from switchfit.problem.structure import Structure
+
+NodeFunction = Callable[[Any, Any, Any], Any]
+
+
+class TransitionKind(NamedTuple):
+    """A kind of node at transitions.
+
+    Attributes
+    ----------
+    name : str
+        The field of `Structure` that has its function for each transition, None where there is none.
+    constraint : bool
+        Whether its function has to be zero; else it is a cost.
+    """
+
+    name: str
+    constraint: bool
+
+
+AT_TRANSITIONS = (TransitionKind("guards", constraint=True),)
+"""All kinds of nodes at transitions."""
+
+
+def transition_function(model: Model, kind: TransitionKind, i: int) -> NodeFunction | None:
+    """Return the function of transition i (from 0) of a kind, which returns a number; None if it has none."""
+    function = getattr(model.structure, kind.name)[i]
+    return None if function is None else lambda t, x, p: function(t, x, model.parameters(p))
+
+
+def constrained_transitions(structure: Structure) -> list[tuple[TransitionKind, int]]:
+    """Return the constraints at transitions in the order of their values: kind and transition."""
+    kinds = [kind for kind in AT_TRANSITIONS if kind.constraint]
+    return [(kind, i) for kind in kinds for i, f in enumerate(getattr(structure, kind.name)) if f is not None]
+
+
+def end_cost(model: Model) -> NodeFunction | None:
+    """Return the sum of the terminal costs; None if there are none."""
+    return (lambda t, x, p: model.terminal(x, p)) if model.structure.terminal else None
+
+
+def end_constraints(model: Model) -> NodeFunction | None:
+    """Return all terminal constraints in one, which returns (m,); None if there are none."""
+    if not model.structure.terminal_constraints:
+        return None
+    return lambda t, x, p: model.terminal_constraint(x, p)

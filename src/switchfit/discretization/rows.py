@@ -1,0 +1,187 @@
+"""One row: one step of an explicit Runge-Kutta method, its derivatives along one direction, and its adjoint.
+
+With the stages ``X_j = x + h sum_l a_jl K_l``, ``K_j = f(t_j, X_j, p)`` at ``t_j = start + c_j h`` a row maps x to
+``x+ = x + h sum_j b_j K_j`` and costs ``L = h sum_j b_j ell(t_j, X_j, p)``. This is all there is to know of it, for
+both engines:
+
+tangent    along a direction in which x, p, start and end change by x', p', start', end', with ``h' = end' - start'``
+           and ``t_j' = start' + c_j h'``,
+
+           ``X_j' = x' + h sum_l a_jl K_l' + h' sum_l a_jl K_l``,  ``K_j' = D_1 f X_j' + D_2 f t_j' + D_p f p'``,
+           ``x+' = x' + h sum_j b_j K_j' + h' sum_j b_j K_j``;
+
+adjoint    with the derivative psi of the cost to go in x+,
+
+           ``w_j = h b_j psi + h sum_l a_lj mu_l``,  ``mu_j = D_x (w_j . f + h b_j ell)``,
+           ``psi_before = psi + sum_j mu_j``;
+
+second     with Z_j the derivative of (t_j, X_j, p) along theta and V what the length of the row multiplies,
+
+           ``D^2 = sum_j Z_j' D^2 (w_j . f + h b_j ell) Z_j + h' x V' + V' x h'``,
+           ``V = sum_j b_j (psi . K_j + ell_j) + sum_j mu_j . sum_l a_jl K_l``.
+
+Only rows that open or close a mode have times that depend on theta. Arrays may be those of JAX, which is mapped over
+directions and scanned over rows, or NumPy arrays of the nodes of a graph, whose vectors hold one entry an unknown, so
+that all directions are taken at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from switchfit.discretization.tableaus import Tableau
+from switchfit.problem.data import FloatArray
+
+Array = Any
+"""An array of JAX, or a NumPy array of nodes."""
+
+
+class Stages(NamedTuple):
+    """Of each stage its time (), state (n,) and slope (n,)."""
+
+    times: list[Array]
+    states: list[Array]
+    slopes: list[Array]
+
+
+def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, end: Array, x: Array) -> Stages:
+    """Compute the stages of a row from the state x (n,); ``f(t, x)`` is the vector field."""
+    h = end - start
+    found = Stages([], [], [])
+    for row, c in zip(tableau.a, tableau.c.tolist(), strict=True):
+        found.times.append(start + c * h)
+        found.states.append(_plus(x, h, combine(row, found.slopes)))
+        found.slopes.append(f(found.times[-1], found.states[-1]))
+    return found
+
+
+def end_of_row(tableau: Tableau, h: Array, x: Array, slopes: Sequence[Array]) -> Array:
+    """Return the state behind a row: (n,)."""
+    return _plus(x, h, combine(tableau.b, slopes))
+
+
+def cost_of_row(tableau: Tableau, h: Array, densities: Sequence[Array]) -> Array:
+    """Return the running cost of a row, ``h sum_j b_j ell_j``: ()."""
+    return h * combine(tableau.b, densities)
+
+
+class Tangent(NamedTuple):
+    """Derivatives along one direction: of the states and slopes of the stages, (n,) each, and of x+ (n,)."""
+
+    states: list[Array]
+    slopes: list[Array]
+    after: Array
+
+
+def tangent(
+    tableau: Tableau,
+    h: Array,
+    slopes: Sequence[Array],
+    f_x: Sequence[Array],
+    forcing: Sequence[Array],
+    x_d: Array,
+    h_d: Array,
+) -> Tangent:
+    """Differentiate a row along one direction.
+
+    Parameters
+    ----------
+    h : step length ()
+    slopes : s arrays (n,)
+    f_x : s arrays (n, n), D_1 f at each stage
+    forcing : s arrays (n,), ``D_2 f t_j' + D_p f p'``
+    x_d : (n,), derivative of the state before the row
+    h_d : (), derivative of the step length; None where it does not depend on theta
+    """
+    found = Tangent([], [], None)
+    for j in range(len(tableau.b)):
+        X_d = _plus(x_d, h, combine(tableau.a[j], found.slopes))
+        X_d = X_d if h_d is None else _plus(X_d, h_d, combine(tableau.a[j], slopes))
+        found.states.append(X_d)
+        found.slopes.append(times_vector(f_x[j], X_d) + forcing[j])
+    after = _plus(x_d, h, combine(tableau.b, found.slopes))
+    return found._replace(after=after if h_d is None else _plus(after, h_d, combine(tableau.b, slopes)))
+
+
+class Adjoint(NamedTuple):
+    """Derivatives of the cost to go from the start of a row.
+
+    Attributes
+    ----------
+    states : s arrays mu_j (n,), in the states of the stages
+    before : (n,), in the state before the row
+    times : s entries (), of ``w_j . f + h b_j ell`` in t_j
+    parameters : (M,), the sum of the same in p
+    """
+
+    states: list[Array]
+    before: Array
+    times: list[Array]
+    parameters: Array
+
+
+Pull = Callable[[int, Array, Array], tuple[Array, Array, Array]]
+"""``pull(j, w, hb)``: derivatives of ``w . f + hb ell`` at stage j in t (), x (n,) and p (M,)."""
+
+
+def adjoint(tableau: Tableau, h: Array, psi: Array, pull: Pull) -> Adjoint:
+    """Pull the costate psi (n,) behind a row back to its start."""
+    a, b = tableau.a.tolist(), tableau.b.tolist()
+    s = len(b)
+    mu: list[Array] = [None] * s
+    times: list[Array] = [None] * s
+    parameters: Array = 0.0
+    for j in reversed(range(s)):
+        later = combine([a[m][j] for m in range(j + 1, s)], mu[j + 1 :])
+        w = h * (_sum(b[j] * psi if b[j] else None, later))
+        times[j], mu[j], in_p = pull(j, w, h * b[j])
+        parameters = parameters + in_p
+    return Adjoint(mu, psi + sum(mu[1:], mu[0]), times, parameters)
+
+
+def length_factor(
+    tableau: Tableau, psi: Array, mu: Sequence[Array], slopes: Sequence[Array], densities: Sequence[Array]
+) -> Array:
+    """What the length of a row multiplies in the cost to go, V: (). Given K_j' and ell_j', its derivative.
+
+    V is linear in the slopes K_j (n,) and the densities ell_j ().
+    """
+    total: Array = 0.0
+    for j, b in enumerate(tableau.b.tolist()):
+        if b:
+            total = total + b * ((psi * slopes[j]).sum() + densities[j])
+        inside = combine(tableau.a[j], slopes)
+        if inside is not None:
+            total = total + (mu[j] * inside).sum()
+    return total
+
+
+def times_derivative(tableau: Tableau, start_d: Array, end_d: Array) -> list[Array]:
+    """Derivatives of the times of the stages, ``start' + c_j h'``: s entries ()."""
+    h_d = end_d - start_d
+    return [start_d + c * h_d for c in tableau.c.tolist()]
+
+
+def combine(weights: Sequence[float] | FloatArray, terms: Sequence[Array]) -> Array | None:
+    """Add terms with weights; zero weights cost nothing, and None is the sum of nothing."""
+    given = weights.tolist() if isinstance(weights, np.ndarray) else weights
+    parts = [w * term for w, term in zip(given, terms, strict=False) if w != 0.0]
+    return sum(parts[1:], parts[0]) if parts else None
+
+
+def times_vector(A: Array, v: Array) -> Array:
+    """``A v`` for small A (m, n) and v (n,): products and a sum, without the overhead of a call to a library."""
+    return (A * v).sum(-1)
+
+
+def _plus(x: Array, h: Array, slope: Array | None) -> Array:
+    return x if slope is None else x + h * slope
+
+
+def _sum(one: Array | None, other: Array | None) -> Array:
+    if one is None or other is None:
+        return other if one is None else one
+    return one + other

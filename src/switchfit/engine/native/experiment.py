@@ -1,0 +1,432 @@
+"""One experiment on one mesh, evaluated and simulated by machine code."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.discretization.arguments import Arguments, Samples
+from switchfit.discretization.nodes import AT_TRANSITIONS, constrained_transitions
+from switchfit.engine.native.adaptive import SLOPE
+from switchfit.engine.native.kernels import RESET, START
+from switchfit.engine.native.llvm import BUDGET, Program
+from switchfit.engine.native.program import PREFIX, program_of
+from switchfit.engine.native.scalars import CHECKED
+from switchfit.engine.native.templates import Order, Sizes, constants_of
+from switchfit.engine.native.workspace import (
+    OF_SAMPLES,
+    WHOLE_OF_SAMPLES,
+    constraint_rows,
+    memory,
+    pointers,
+    sums,
+)
+from switchfit.problem.data import FloatArray
+from switchfit.problem.structure import Structure
+
+
+def native_experiment(
+    structure: Structure, arguments: Arguments, times: FloatArray, order: Order
+) -> NativeExperiment | None:
+    """One experiment in machine code, on the mesh with the nodes `times`; None if there is a `reason_for_jax`."""
+    sizes = Sizes.of(structure, arguments)
+    program = program_of(structure.library, sizes, order)
+    return None if isinstance(program, str) else NativeExperiment(program, structure, sizes, arguments, times, order)
+
+
+def reason_for_jax(structure: Structure, arguments: Arguments, order: Order) -> str | None:
+    """Why JAX has to evaluate an experiment with derivatives of an order; None if machine code does."""
+    program = program_of(structure.library, Sizes.of(structure, arguments), order)
+    return program if isinstance(program, str) else None
+
+
+def places_in_library(structure: Structure) -> dict[str, list[int]]:
+    """Which mode of the library each segment has, and which reset map and other function each transition, else -1.
+
+    Segments that the sequence does not need have its last mode, and their transitions nothing.
+    """
+    library, idle = structure.library, structure.transitions - structure.N
+
+    def of(own: Sequence[Any], all_of_them: Sequence[Any]) -> list[int]:
+        return [-1 if f is None else all_of_them.index(f) for f in own] + [-1] * idle
+
+    modes = list(structure.mode_of_segment)
+    found = {"modes": modes + modes[-1:] * idle, "resets": of(structure.reset_maps, library.reset_maps)}
+    return found | {
+        kind.name: of(getattr(structure, kind.name), getattr(library, kind.name)) for kind in AT_TRANSITIONS
+    }
+
+
+class Simulated(NamedTuple):
+    """A simulation: R = cells + N rows, one after the other.
+
+    Attributes
+    ----------
+    cost : J
+    first_cell : (N + 1,) int, cell in which each segment begins
+    times, states, tangents : (R + 1,), (R + 1, n), (R + 1, n, D)
+        At t0, then at the end of each row, before a jump. The tangents, in second order, are derivatives at an end that
+        moves with theta where it is a transition.
+    reset_states, reset_tangents : (N, n), (N, n, D), behind the reset maps; meaningless where there is none
+    """
+
+    cost: float
+    first_cell: NDArray[np.int64]
+    times: FloatArray
+    states: FloatArray
+    reset_states: FloatArray
+    tangents: FloatArray
+    reset_tangents: FloatArray
+
+
+class Constrained(NamedTuple):
+    """Cost and constraints.
+
+    Attributes
+    ----------
+    cost : J
+    slope, hessian : (D,), (D, D), of ``J + weights . c``, the weights being ``multipliers + penalty c``
+    constraints, jacobian : c (m,) and its derivative (m, D)
+    """
+
+    cost: float
+    slope: FloatArray
+    hessian: FloatArray
+    constraints: FloatArray
+    jacobian: FloatArray
+
+
+class NativeExperiment:
+    """One experiment on one mesh in machine code.
+
+    Parameters
+    ----------
+    program : Program
+    structure : Structure
+    sizes : Sizes
+    arguments : Arguments
+        Padded or not.
+    times : (G + 1,) array
+        The nodes without the padding.
+    order : Order
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        structure: Structure,
+        sizes: Sizes,
+        arguments: Arguments,
+        times: FloatArray,
+        order: Order,
+    ) -> None:
+        library = structure.library
+        self.structure, self.sizes, self.order = structure, sizes, order
+        self._prefix = PREFIX[order]
+        self._workspace = program.workspace
+        N, D, width, cells = sizes.N, sizes.D, sizes.width, len(times) - 1
+        self._channels = sum(channels for _, channels in structure.outputs)
+        self._own = np.concatenate([np.arange(structure.N), np.arange(N, D)])  # its unknowns among the program's
+        self._all_own = structure.N == N
+        counts = [_count(samples) for samples in arguments.samples]
+        pointer, number = ctypes.c_void_p, ctypes.c_int64
+        self._program = program  # whose code must not go away
+        self._evaluate = program.function(f"{self._prefix}evaluate", pointer, pointer, *[number] * len(counts))
+        self._times, self._cells, self._counts = times, cells, counts
+        constants = [np.ravel(np.asarray(a, dtype=np.float64)) for a in constants_of(arguments)]
+        units = np.zeros((D + 1, width))
+        units[1:, :D] = np.eye(D)
+        self._bounds = np.concatenate([times[:1], np.full(N + 1, times[-1])])
+        self._first_cell = np.full(N + 2, cells - 1, dtype=np.int64)
+        self._first_cell[0] = 0
+        self._p = np.zeros(max(sizes.M, 1))
+        rows = constraint_rows(library, sizes)
+        own_rows = [rows[kind.name] + i for kind, i in constrained_transitions(structure)]
+        self._constraint_rows = np.array([*own_rows, *range(rows["end"], rows["count"])], dtype=np.intp)
+        self._weights = np.zeros((2, max(rows["count"], 1)))  # multipliers and penalties
+        lengths = sums(library, sizes)
+        self._sums = np.zeros(sum(lengths.values()))
+        arrays: dict[str, Any] = {
+            "nodes": np.ascontiguousarray(times),
+            "signals": np.ascontiguousarray(np.asarray(arguments.signals)[:cells]),
+            "c": np.concatenate([*constants, np.zeros(1)]),
+            "p": self._p,
+            "bounds": self._bounds,
+            "first_cell": self._first_cell,
+            "multipliers": self._weights[0],
+            "penalties": self._weights[1],
+            "units": units,
+        }
+        arrays |= {name: np.array(which, dtype=np.int64) for name, which in places_in_library(structure).items()}
+        arrays |= _parts(self._sums, lengths)
+        self._check = arrays[CHECKED]
+        self._lengths = {name: length.at(cells + N) for name, length in memory(library, sizes, order).items()}
+        self._size = sum(self._lengths.values())
+        self._memory = np.zeros(0)  # the workspace that the table points to
+        self._named: dict[str, Any] = arrays
+        self._pointers = pointers(library, sizes, order)
+        self._arrays = [arrays.get(name, self._memory) for name in self._pointers]
+        self._late: list[tuple[int, str, FloatArray, Any, Any]] = []
+        for k, (samples, count) in enumerate(zip(arguments.samples, counts, strict=True)):
+            given: dict[str, Any] = {}
+            for name, values in zip(OF_SAMPLES, [*samples, np.zeros(count)], strict=True):
+                kind = np.int64 if name in WHOLE_OF_SAMPLES else np.float64
+                given[name] = np.array(np.asarray(values)[:count], dtype=kind, order="C")
+            delay = structure.measurements[k].delay
+            if delay is not None:
+                self._late.append((k, delay, given["time"], given["cell"], given["segment"]))
+            self._arrays += given.values()
+        self._table = np.array([a.__array_interface__["data"][0] for a in self._arrays], dtype=np.uintp)
+        self._address = self._table.ctypes.data
+        self._progress = (ctypes.c_int64 * 3)()
+        self._result = self._named["g"][:D], self._named["H"].reshape(D, width)[:, :D]
+        self._delays = _places_of_delays(structure, arguments)
+
+    def __call__(self, tau: FloatArray, p: FloatArray, side: float) -> tuple[float, FloatArray, FloatArray] | None:
+        """J, its gradient (D,) and its Hessian (D, D), NaN without it.
+
+        None if a presumption was wrong: then JAX has to do it.
+        """
+        with self._workspace.lock:
+            self._run(tau, p, side)
+            if self._presumed_wrongly:
+                return None
+            g, H = self._result
+            if not self._all_own:
+                g, H = g[self._own], H[np.ix_(self._own, self._own)]
+            hessian = H.copy() if self.order >= Order.HESSIAN else np.full(H.shape, np.nan)
+            return float(self._named["J"][0]), g.copy(), hessian
+
+    def constrained(
+        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
+    ) -> Constrained | None:
+        """Cost, constraints and their derivatives; the multipliers and penalties are (m,).
+
+        None if a presumption was wrong.
+        """
+        where = self._constraint_rows
+        with self._workspace.lock:
+            self._weights[:, where] = multipliers, penalty
+            try:
+                self._run(tau, p, side)
+            finally:
+                self._weights[:] = 0.0
+            if self._presumed_wrongly:
+                return None
+            (g, H), own = self._result, self._own
+            c = self._named["constraints"][where]
+            A = self._named["jacobian"].reshape(-1, self.sizes.width)[where][:, own]
+            return Constrained(float(self._named["J"][0]), g[own], H[np.ix_(own, own)], c, A)
+
+    def program_at(self, tau: FloatArray, p: FloatArray) -> Callable[[], object]:
+        """The machine code alone, to be measured."""
+        self(tau, p, 1.0)
+        return lambda: self._in_pieces(self._evaluate, *self._counts)
+
+    @property
+    def _presumed_wrongly(self) -> bool:
+        """Whether a product with zero was left out whose other factor was not finite.
+
+        A cost that is not finite says enough as it is.
+        """
+        check = self._check.item(0)
+        return check != check and math.isfinite(self._named["J"].item(0))
+
+    def cost(self, tau: FloatArray, p: FloatArray) -> float | None:
+        """J alone; None if a presumption was wrong."""
+        with self._workspace.lock:
+            self._run(tau, p, 1.0)
+            return None if self._presumed_wrongly else float(self._named["J"][0])
+
+    def simulated(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
+        """States at all ends of rows, in second order with their derivatives; None if a presumption was wrong."""
+        with self._workspace.lock:
+            return self._simulated(tau, p)
+
+    def _simulated(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
+        self._run(tau, p, 1.0)
+        if self._presumed_wrongly:
+            return None
+        n, N, cells = self.sizes.n, self.structure.N, self._cells
+        first_cell = self._first_cell[: N + 1].copy()
+        firsts, lasts = first_cell.tolist(), [*first_cell[1:].tolist(), cells - 1]
+        ends = zip(firsts, lasts, [*tau.tolist(), self._times[-1]], strict=True)
+        inside = [np.append(self._times[first + 1 : last + 1], end) for first, last, end in ends]
+
+        def of_rows(name: str, count: int, *shape: int) -> FloatArray:
+            values = self._named[name].reshape(-1, *shape)[:count]
+            return np.array(values[..., self._own] if len(shape) > 1 else values)
+
+        behind = N if self.structure.library.reset_maps else 0
+        with_tangents = cells + N + 1 if self.order >= Order.HESSIAN else 0
+        return Simulated(
+            float(self._named["J"][0]),
+            first_cell,
+            np.concatenate([self._times[:1], *inside]),
+            of_rows("states", cells + N + 1, n),
+            of_rows("reset_states", behind, n),
+            of_rows("tangents", with_tangents, n, self.sizes.width),
+            of_rows("reset_tangents", behind, n, self.sizes.width),
+        )
+
+    def outputs(
+        self, times: FloatArray, states: FloatArray, p: FloatArray, tangents: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """What all sensors see, (L, q), and, where the derivatives (L, n, D) of the states are given, its own.
+
+        None if a presumption was wrong.
+        """
+        count, (n, width) = len(times), (self.sizes.n, self.sizes.width)
+        y, Y = np.zeros((count, self._channels)), np.zeros((count, self._channels, width))
+        Z = np.zeros((count, n, width) if tangents is not None else 0)
+        if tangents is not None:
+            Z[..., self._own] = tangents
+        if count:
+            self._p[: self.sizes.M] = p
+            pointer = ctypes.c_void_p
+            types = [pointer, pointer, ctypes.c_int64, *[pointer] * 5]
+            function = self._program.function(f"{self._prefix}all_outputs", *types)
+            given = [np.ascontiguousarray(times), np.ascontiguousarray(states), Z, y, Y]
+            self._check[0] = 0.0
+            self._in_pieces(function, count, *(a.ctypes.data for a in given))
+            if np.isnan(self._check[0]):
+                return None
+        return y, Y[..., self._own]
+
+    def initial_state(self, p: FloatArray) -> FloatArray:
+        """x(t0): (n,); NaN if a presumption was wrong."""
+        self._p[: self.sizes.M] = p
+        x = np.zeros(self.sizes.n)
+        return x + self._call("start", START, {"x": x})
+
+    def after_reset(self, i: int, t: float, x: FloatArray, p: FloatArray) -> FloatArray:
+        """State after the reset map of transition i (from 0): (n,); NaN if a presumption was wrong."""
+        self._p[: self.sizes.M] = p
+        which = int(self._named["resets"][i])
+        given = {"time": np.array([t]), "x": np.array(x, dtype=float), "x_after": np.zeros(self.sizes.n)}
+        given |= {"moves": self._named["units"][i + 1]}
+        return given["x_after"] + self._call(f"reset_{which}", RESET, given)
+
+    def slope(self, mode: int, t: float, y: FloatArray, p: FloatArray, cell: int | None = None) -> FloatArray:
+        """f and ell at t, y = (x, running cost so far): (n + 1,); NaN if a presumption was wrong.
+
+        With the signals of a cell; left out, of the one that holds t, or begins there.
+        """
+        self._p[: self.sizes.M] = p
+        if cell is None:
+            cell = min(max(int(self._times.searchsorted(t, "right")) - 1, 0), len(self._times) - 2)
+        moment, slope = np.array([t, self._times[cell]]), np.zeros(len(y))
+        signal = self._named["signals"][cell]
+        return slope + self._call(f"slope_{mode}", SLOPE, {"moment": moment, "signal": signal, "y": y, "K": slope})
+
+    def adaptive_steps(self, mode: int, state: FloatArray, y: FloatArray, p: FloatArray, most: int) -> FloatArray:
+        """Up to `most` steps of SciPy's RK45, from `state` and y, which change: the moments reached.
+
+        y is NaN if a presumption was wrong.
+
+        They may be fewer, even none: after some work that takes milliseconds it returns, to be called again.
+
+        Parameters
+        ----------
+        state : array
+            See `Adaptive`.
+        y : (n + 1,) array
+            State and running cost so far.
+        """
+        self._p[: self.sizes.M] = p
+        times, count = np.zeros(most), np.zeros(1, dtype=np.int64)
+        pointer, number = ctypes.c_void_p, ctypes.c_int64
+        types = [pointer, number, pointer, pointer, pointer, number, pointer]
+        solve = self._program.function(f"{self._prefix}adaptive_{mode}_steps", *types)
+        addresses = [a.ctypes.data for a in (state, y, times, count)]
+        self._check[0] = 0.0
+        solve(self._address, self._cells, *addresses[:3], most, addresses[3])
+        y += self._check[0]
+        return times[: count[0]]
+
+    def _call(self, name: str, order: tuple[str, ...], given: dict[str, FloatArray]) -> float:
+        """One of the straight lines; what is not given it finds where the driver does.
+
+        Returns 0, or NaN if a presumption was wrong.
+        """
+        check = np.zeros(1)
+        arrays = [given[key] if key in given else self._named.get(key) for key in order[:-1]]
+        addresses = [None if a is None else a.ctypes.data for a in (*arrays, check)]
+        self._program.function(f"{self._prefix}{name}", *[ctypes.c_void_p] * len(order))(*addresses)
+        return float(check[0])
+
+    def _run(self, tau: FloatArray, p: FloatArray, side: float) -> None:
+        N = self.structure.N
+        self._bounds[1 : N + 1] = tau
+        self._p[: self.sizes.M] = p
+        self._place(tau, side)
+        self._workspace.reserve(self._size)
+        if self._memory is not self._workspace.memory:
+            self._bind(self._workspace.memory)
+        self._sums[:] = 0.0
+        self._named["jumps"][:] = 0.0
+        if self._late:
+            self._named["late"][:] = 0.0
+            self._place_late(p)
+        self._in_pieces(self._evaluate, *self._counts)
+
+    def _in_pieces(self, function: Callable[..., object], *given: Any) -> None:
+        """Call a function of the driver until it is at its end; Ctrl-C is heard after each call."""
+        progress, address = self._progress, ctypes.addressof(self._progress)
+        progress[0] = progress[1] = 0
+        while progress[0] >= 0:
+            progress[2] = BUDGET
+            function(self._address, address, *given)
+
+    def _bind(self, workspace: FloatArray) -> None:
+        """Let the table point to another workspace."""
+        self._memory = workspace
+        found = _parts(workspace, self._lengths)
+        self._named |= found
+        for k, name in enumerate(self._pointers):
+            if name in found:
+                self._table[k] = found[name].ctypes.data
+
+    def _place(self, tau: FloatArray, side: float) -> None:
+        """The cells in which segments begin, as in `switchfit.discretization.mesh.rows`."""
+        N = self.structure.N
+        if N:
+            passed = self._times.searchsorted(tau, "right" if side > 0 else "left")
+            self._first_cell[1 : N + 1] = np.minimum(np.maximum(passed - 1, 0), self._cells - 1)
+
+    def _place_late(self, p: FloatArray) -> None:
+        """The rows with ``start < t - delay <= end``, by the cells and segments that hold the late samples."""
+        for _, name, times, cell, segment in self._late:
+            place, value = self._delays[name]
+            seen = times - (value if place is None else p[place])
+            cell[:] = np.clip(self._times.searchsorted(seen, "left") - 1, 0, self._cells - 1)
+            segment[:] = self._bounds[1 : self.structure.N + 1].searchsorted(seen, "left")
+
+
+def _parts(whole: FloatArray, lengths: dict[str, int]) -> dict[str, FloatArray]:
+    """Consecutive parts of an array by their names and lengths."""
+    ends = np.cumsum(list(lengths.values())).tolist()
+    return {name: whole[end - length : end] for (name, length), end in zip(lengths.items(), ends, strict=True)}
+
+
+def _places_of_delays(structure: Structure, arguments: Arguments) -> dict[str, tuple[int | None, float]]:
+    """Where in p each parameter of one number stands, or its value if it is fixed."""
+    found: dict[str, tuple[int | None, float]] = {}
+    fixed, position = iter(arguments.fixed), 0
+    for name, shape, free in structure.parameters:
+        value = np.nan if free else np.asarray(next(fixed))
+        if shape == ():
+            found[name] = (position if free else None, float(value))
+        position += int(np.prod(shape)) if free else 0
+    return found
+
+
+def _count(samples: Samples) -> int:
+    """Number of samples up to the last that has a value: what follows is padding."""
+    there = np.flatnonzero(np.asarray(samples.weight).any(1))
+    return int(there[-1]) + 1 if len(there) else 1
