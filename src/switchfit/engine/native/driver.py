@@ -450,6 +450,7 @@ class Driver:
             "x_after": found["late_state"],
             "Z_after": found["late_tangent"],
             "psi": found["late_psi"],
+            "jump": found["late_psi"],
             "J": found["late_J"],
         }
         work = self.call(f"late_time_{k}", LATE_TIME, given)
@@ -461,7 +462,7 @@ class Driver:
             self.line("br label %forward_end")
         self.label("forward_end")
         work += longest
-        at_end = {"x": found["late_state"], "Z": found["late_tangent"], "jump": found["late_psi"], "J": found["J"]}
+        at_end = {"x": found["late_state"], "Z": found["late_tangent"], "J": found["J"]}
         at_end |= {"time": self.at(found["late_row"], 1), "moves": found["late_closes"]}
         for entry in range(n):
             self.line(f"store double 0.0, ptr {self.at(found['late_psi'], entry)}")

@@ -48,17 +48,15 @@ def handler(driver: Driver) -> str:
         pointer, dimensions = (driver.load("ptr", driver.into(buffer, place)) for place in (DATA, DIMENSIONS))
         return pointer, dimensions
 
-    found, shapes = {}, {}
-    for k, name in enumerate(GIVEN):
-        found[name], shapes[name] = data(given, k)
+    found = {name: data(given, k)[0] for k, name in enumerate(GIVEN)}
     last = driver.load("i64", driver.at(found["first_cell"], sizes.N + 1))
     rows = driver.let(f"add i64 {last}, {sizes.N + 1}")
 
-    totals, place = data(made, 0)[0], 0
+    totals, first = data(made, 0)[0], 0
     for name, size in sums(library, sizes).items():
-        found[name] = driver.at(totals, place)
-        place += size
-    zero(driver, totals, str(place))
+        found[name] = driver.at(totals, first)
+        first += size
+    zero(driver, totals, str(first))
     between, offset = data(made, 1)[0], "0"
     for name, length in memory(library, sizes, driver.order).items():
         found[name] = driver.at(between, offset)

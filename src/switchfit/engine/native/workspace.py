@@ -76,8 +76,8 @@ def memory(library: Structure, sizes: Sizes, order: Order) -> dict[str, Length]:
     """Return the lengths of what lies between the parts of an evaluation."""
     n, N, width = sizes.n, sizes.N, sizes.width
     second, first = int(order >= Order.HESSIAN), int(order >= Order.GRADIENT)
-    resets, late = bool(library.reset_maps), any(sensor.delay is not None for sensor in library.measurements)
-    jumps = has_jumps(library)
+    resets, jumps = int(bool(library.reset_maps)), int(has_jumps(library))
+    late = int(any(sensor.delay is not None for sensor in library.measurements))
     return {
         "states": Length(n, n),
         "reset_states": Length(N * n * resets),
