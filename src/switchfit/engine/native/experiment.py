@@ -21,6 +21,7 @@ from switchfit.engine.native.templates import Order, Sizes, constants_of
 from switchfit.engine.native.workspace import (
     OF_SAMPLES,
     WHOLE_OF_SAMPLES,
+    ZEROED,
     constraint_rows,
     memory,
     pointers,
@@ -127,7 +128,7 @@ class NativeExperiment:
     ) -> None:
         library = structure.library
         self.structure, self.sizes, self.order = structure, sizes, order
-        self._prefix = PREFIX[order]
+        self._prefix, self._has_hessian = PREFIX[order], order >= Order.HESSIAN
         self._workspace = program.workspace
         N, D, width, cells = sizes.N, sizes.D, sizes.width, len(times) - 1
         self._channels = sum(channels for _, channels in structure.outputs)
@@ -145,6 +146,8 @@ class NativeExperiment:
         self._first_cell = np.full(N + 2, cells - 1, dtype=np.int64)
         self._first_cell[0] = 0
         self._p = np.zeros(max(sizes.M, 1))
+        self._own_p, self._tau = self._p[: sizes.M], self._bounds[1 : structure.N + 1]
+        self._begins = self._first_cell[1 : structure.N + 1]
         rows = constraint_rows(library, sizes)
         own_rows = [rows[kind.name] + i for kind, i in constrained_transitions(structure)]
         self._constraint_rows = np.array([*own_rows, *range(rows["end"], rows["count"])], dtype=np.intp)
@@ -164,9 +167,10 @@ class NativeExperiment:
         }
         arrays |= {name: np.array(which, dtype=np.int64) for name, which in places_in_library(structure).items()}
         arrays |= _parts(self._sums, lengths)
-        self._check = arrays[CHECKED]
+        self._check, self._J = arrays[CHECKED], arrays["J"]
         self._lengths = {name: length.at(cells + N) for name, length in memory(library, sizes, order).items()}
         self._size = sum(self._lengths.values())
+        self._zeroed: list[FloatArray] = []
         self._memory = np.zeros(0)  # the workspace that the table points to
         self._named: dict[str, Any] = arrays
         self._pointers = pointers(library, sizes, order)
@@ -199,8 +203,8 @@ class NativeExperiment:
             g, H = self._result
             if not self._all_own:
                 g, H = g[self._own], H[np.ix_(self._own, self._own)]
-            hessian = H.copy() if self.order >= Order.HESSIAN else np.full(H.shape, np.nan)
-            return float(self._named["J"][0]), g.copy(), hessian
+            hessian = H.copy() if self._has_hessian else np.full(H.shape, np.nan)
+            return self._J.item(0), g.copy(), hessian
 
     def constrained(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
@@ -221,7 +225,7 @@ class NativeExperiment:
             (g, H), own = self._result, self._own
             c = self._named["constraints"][where]
             A = self._named["jacobian"].reshape(-1, self.sizes.width)[where][:, own]
-            return Constrained(float(self._named["J"][0]), g[own], H[np.ix_(own, own)], c, A)
+            return Constrained(self._J.item(0), g[own], H[np.ix_(own, own)], c, A)
 
     def program_at(self, tau: FloatArray, p: FloatArray) -> Callable[[], object]:
         """The machine code alone, to be measured."""
@@ -235,13 +239,13 @@ class NativeExperiment:
         A cost that is not finite says enough as it is.
         """
         check = self._check.item(0)
-        return check != check and math.isfinite(self._named["J"].item(0))
+        return check != check and math.isfinite(self._J.item(0))
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float | None:
         """J alone; None if a presumption was wrong."""
         with self._workspace.lock:
             self._run(tau, p, 1.0)
-            return None if self._presumed_wrongly else float(self._named["J"][0])
+            return None if self._presumed_wrongly else self._J.item(0)
 
     def simulated(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
         """States at all ends of rows, in second order with their derivatives; None if a presumption was wrong."""
@@ -265,7 +269,7 @@ class NativeExperiment:
         behind = N if self.structure.library.reset_maps else 0
         with_tangents = cells + N + 1 if self.order >= Order.HESSIAN else 0
         return Simulated(
-            float(self._named["J"][0]),
+            self._J.item(0),
             first_cell,
             np.concatenate([self._times[:1], *inside]),
             of_rows("states", cells + N + 1, n),
@@ -287,7 +291,7 @@ class NativeExperiment:
         if tangents is not None:
             Z[..., self._own] = tangents
         if count:
-            self._p[: self.sizes.M] = p
+            self._own_p[:] = p
             pointer = ctypes.c_void_p
             types = [pointer, pointer, ctypes.c_int64, *[pointer] * 5]
             function = self._program.function(f"{self._prefix}all_outputs", *types)
@@ -300,13 +304,13 @@ class NativeExperiment:
 
     def initial_state(self, p: FloatArray) -> FloatArray:
         """x(t0): (n,); NaN if a presumption was wrong."""
-        self._p[: self.sizes.M] = p
+        self._own_p[:] = p
         x = np.zeros(self.sizes.n)
         return x + self._call("start", START, {"x": x})
 
     def after_reset(self, i: int, t: float, x: FloatArray, p: FloatArray) -> FloatArray:
         """State after the reset map of transition i (from 0): (n,); NaN if a presumption was wrong."""
-        self._p[: self.sizes.M] = p
+        self._own_p[:] = p
         which = int(self._named["resets"][i])
         given = {"time": np.array([t]), "x": np.array(x, dtype=float), "x_after": np.zeros(self.sizes.n)}
         given |= {"moves": self._named["units"][i + 1]}
@@ -317,7 +321,7 @@ class NativeExperiment:
 
         With the signals of a cell; left out, of the one that holds t, or begins there.
         """
-        self._p[: self.sizes.M] = p
+        self._own_p[:] = p
         if cell is None:
             cell = min(max(int(self._times.searchsorted(t, "right")) - 1, 0), len(self._times) - 2)
         moment, slope = np.array([t, self._times[cell]]), np.zeros(len(y))
@@ -338,7 +342,7 @@ class NativeExperiment:
         y : (n + 1,) array
             State and running cost so far.
         """
-        self._p[: self.sizes.M] = p
+        self._own_p[:] = p
         times, count = np.zeros(most), np.zeros(1, dtype=np.int64)
         pointer, number = ctypes.c_void_p, ctypes.c_int64
         types = [pointer, number, pointer, pointer, pointer, number, pointer]
@@ -361,17 +365,16 @@ class NativeExperiment:
         return float(check[0])
 
     def _run(self, tau: FloatArray, p: FloatArray, side: float) -> None:
-        N = self.structure.N
-        self._bounds[1 : N + 1] = tau
-        self._p[: self.sizes.M] = p
+        self._tau[:] = tau
+        self._own_p[:] = p
         self._place(tau, side)
         self._workspace.reserve(self._size)
         if self._memory is not self._workspace.memory:
             self._bind(self._workspace.memory)
         self._sums[:] = 0.0
-        self._named["jumps"][:] = 0.0
+        for part in self._zeroed:
+            part[:] = 0.0
         if self._late:
-            self._named["late"][:] = 0.0
             self._place_late(p)
         self._in_pieces(self._evaluate, *self._counts)
 
@@ -387,6 +390,7 @@ class NativeExperiment:
         """Let the table point to another workspace."""
         self._memory = workspace
         found = _parts(workspace, self._lengths)
+        self._zeroed = [found[name] for name in ZEROED if found[name].size]
         self._named |= found
         for k, name in enumerate(self._pointers):
             if name in found:
@@ -394,10 +398,9 @@ class NativeExperiment:
 
     def _place(self, tau: FloatArray, side: float) -> None:
         """The cells in which segments begin, as in `switchfit.discretization.mesh.rows`."""
-        N = self.structure.N
-        if N:
+        if len(tau):
             passed = self._times.searchsorted(tau, "right" if side > 0 else "left")
-            self._first_cell[1 : N + 1] = np.minimum(np.maximum(passed - 1, 0), self._cells - 1)
+            self._begins[:] = np.minimum(np.maximum(passed - 1, 0), self._cells - 1)
 
     def _place_late(self, p: FloatArray) -> None:
         """The rows with ``start < t - delay <= end``, by the cells and segments that hold the late samples."""
@@ -405,7 +408,7 @@ class NativeExperiment:
             place, value = self._delays[name]
             seen = times - (value if place is None else p[place])
             cell[:] = np.clip(self._times.searchsorted(seen, "left") - 1, 0, self._cells - 1)
-            segment[:] = self._bounds[1 : self.structure.N + 1].searchsorted(seen, "left")
+            segment[:] = self._tau.searchsorted(seen, "left")
 
 
 def _parts(whole: FloatArray, lengths: dict[str, int]) -> dict[str, FloatArray]:

@@ -57,14 +57,14 @@ def handler(driver: Driver) -> str:
         found[name] = driver.at(totals, first)
         first += size
     zero(driver, totals, str(first))
-    between, offset = data(made, 1)[0], "0"
+    between, position = data(made, 1)[0], "0"
     for name, length in memory(library, sizes, driver.order).items():
-        found[name] = driver.at(between, offset)
+        found[name] = driver.at(between, position)
         growing = driver.let(f"mul i64 {rows}, {length.each_row}")
         count = driver.let(f"add i64 {growing}, {length.fixed}")
         if name in ZEROED:
             zero(driver, found[name], count)
-        offset = driver.let(f"add i64 {offset}, {count}")
+        position = driver.let(f"add i64 {position}, {count}")
     for k, name in enumerate(driver.names):
         driver.line(f"store ptr {found[name]}, ptr {driver.at('%table', k)}")
     counts = ""
