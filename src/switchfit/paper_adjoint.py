@@ -48,6 +48,7 @@ optimiser uses, by the integrator's error; that the gap closes at the integrator
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -55,11 +56,13 @@ import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
+from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import row_ending_cell
 from switchfit.discretization.model import Model, Piece
 from switchfit.discretization.propagation import Path, at_cells, by_mode, path_cost, propagate
 from switchfit.discretization.tableaus import STIFF, Field, Tableau, combine
 from switchfit.engine.jax.late_samples import anchors, late_state_derivatives
+from switchfit.problem.structure import Structure
 
 Array = jax.Array
 
@@ -596,3 +599,11 @@ def where(condition: Array, one: Any, other: Any) -> Any:
 def pick(values: Any, *index: Any) -> Any:
     """``values[index]`` of a tuple of arrays."""
     return jax.tree.map(lambda a: a[index], values)
+
+
+@partial(jax.jit, static_argnames=("structure",))
+def evaluate_paper(
+    arguments: Arguments, tau: Array, p: Array, side: Array, *, structure: Structure
+) -> tuple[Array, Array, Array]:
+    """J, its gradient (D,) and its Hessian (D, D) of one experiment, as of `paper_derivatives`."""
+    return paper_derivatives(Model(structure, arguments), tau, p, side)

@@ -22,7 +22,7 @@ from switchfit.engine.adaptive import refined_mesh
 from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, checked_settings, estimate
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.trajectory import compared, runs_of
+from switchfit.fit.trajectory import compare
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_callable, as_count, as_instance, as_seed, shown
@@ -234,7 +234,9 @@ def _clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray | None]]
         which.append(kept)
     simulated = replace(problem, experiments=sampled)
     meshes = Evaluator(simulated, truth).meshes
-    _, comparisons = compared(simulated, truth, runs_of(simulated, truth, [mesh.divided() for mesh in meshes]))
+    _, comparisons = compare(
+        simulated, truth, Evaluator(simulated, meshes=[mesh.divided() for mesh in meshes]).simulate(truth)
+    )
     clean: list[list[FloatArray | None]] = [[None] * len(experiment.data) for experiment in problem.experiments]
     for e, (kept, found) in enumerate(zip(which, comparisons, strict=True)):
         for k, comparison in zip(kept, found, strict=True):

@@ -1,30 +1,52 @@
-"""What evaluates a cost and its derivatives: machine code of its own, or JAX, and why."""
+"""Which engine evaluates an experiment: machine code wherever it can, else JAX, and why."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+
+from switchfit.discretization.arguments import Arguments
+from switchfit.discretization.mesh import Mesh
+from switchfit.engine.jax.engine import JaxEngine
+from switchfit.engine.native.engine import NativeEngine
+from switchfit.engine.native.experiment import reason_for_jax
+from switchfit.engine.native.templates import Order
+from switchfit.engine.protocol import Engine, ExperimentEngine
+from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Structure
 
 
-@dataclass(frozen=True)
-class Engine:
-    """What evaluated a cost and its derivatives.
+def engine_of(problem: Problem, e: int, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
+    """Return what evaluates experiment e of a problem on a mesh, as `Problem.engine` asks.
 
-    Attributes
-    ----------
-    name : str
-        "native" for machine code, or "jax".
-    reason : str or None
-        Why JAX does it: what in the problem has no machine code. A reason that begins with "internal: " is a defect of
-        switchfit, not of the model. None for machine code.
+    Raises
+    ------
+    ValueError
+        If machine code is insisted on, and there is none: with the reason.
     """
+    structure = problem.structures[e]
+    by_jax = JaxEngine(structure, arguments, mesh)
+    if problem.engine == "jax":
+        return by_jax
+    return _native_or(by_jax, structure, arguments, mesh, insist=problem.engine == "native")
 
-    name: str
-    reason: str | None = None
 
-    @classmethod
-    def of(cls, reason: str | None) -> Engine:
-        """Machine code, unless there is a reason against it."""
-        return cls("native") if reason is None else cls("jax", reason)
+def _native_or(
+    by_jax: JaxEngine, structure: Structure, arguments: Arguments, mesh: Mesh, *, insist: bool
+) -> ExperimentEngine:
+    reason = reason_for_jax(structure, arguments, Order.HESSIAN)
+    if reason is None:
+        return NativeEngine(structure, arguments, mesh, by_jax)
+    if insist:
+        raise ValueError(f"engine='native' asks for machine code, but {reason}. Leave engine out to have JAX do it.")
+    by_jax.reason = reason
+    return by_jax
 
-    def __str__(self) -> str:
-        return "Evaluated in machine code." if self.reason is None else f"Evaluated by JAX: {self.reason}."
+
+def summarize(engines: Sequence[ExperimentEngine], names: Sequence[str]) -> Engine:
+    """Return one record for several experiments: "jax" if any is evaluated by JAX, with a reason that says which."""
+    records = [each.engine for each in engines]
+    by_jax = [(name, record) for name, record in zip(names, records, strict=True) if record.name == "jax"]
+    if not by_jax or len(by_jax) == len(records):
+        return records[0]
+    which = ", ".join(name for name, _ in by_jax)
+    return Engine("jax", f"{by_jax[0][1].reason} (in {which}; the other experiments run in machine code)")

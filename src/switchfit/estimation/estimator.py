@@ -21,7 +21,7 @@ from switchfit.fit.guards import on_guards
 from switchfit.fit.hidden import refuse_jumps
 from switchfit.fit.result import Certificate, Fit
 from switchfit.fit.solution import constraints_of, least_squares, message_of, minimized, plain, sigma_known
-from switchfit.fit.trajectory import compared, runs_of
+from switchfit.fit.trajectory import compare
 from switchfit.io.json import load_fit, save_fit
 from switchfit.optimize import IterationRecord, Result, Status, minimize_constrained
 from switchfit.optimize.sqp import HessianKind
@@ -285,11 +285,11 @@ def estimate(
         evaluations += result.evaluations
         theta = result.theta
         fine = evaluator.divided()
-        runs = runs_of(problem, theta, fine.meshes, fine.arguments)
+        simulations = fine.simulate(theta)
         error, output = worst_error(
             fine,
             theta,
-            runs,
+            simulations,
             cost=result.cost,
             first_cost=history[0].cost if history else 0.0,
             constraints=[value for _, value, _ in held],
@@ -300,7 +300,7 @@ def estimate(
         evaluator = _refined(fine, problem.checked_theta(start), theta, excess)
     if excess > 1 and result.status.converged and not problem.constraint_names:
         refuse_jumps(evaluator, theta)  # the error of steps across a jump does not vanish with their length
-    trajectories, comparisons = compared(problem, theta, runs)
+    trajectories, comparisons = compare(problem, theta, simulations)
     return _estimate(
         problem,
         evaluator,

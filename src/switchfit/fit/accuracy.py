@@ -23,9 +23,10 @@ import numpy as np
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.model import Model
+from switchfit.engine.protocol import Simulation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import smallest_cost
-from switchfit.fit.trajectory import Run, cost_of
+from switchfit.fit.trajectory import cost_of
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import float64
 from switchfit.problem.problem import Problem
@@ -56,7 +57,7 @@ def cost_error(problem: Problem, fine_cost: float, cost: float, first_cost: floa
 def worst_error(
     fine: Evaluator,
     theta: FloatArray,
-    runs: Sequence[Run],
+    simulations: Sequence[Simulation],
     *,
     cost: float,
     first_cost: float,
@@ -69,8 +70,8 @@ def worst_error(
     fine : Evaluator
         On the meshes of the fit with every cell halved.
     theta : (d,)
-    runs : list of Run
-        The simulation at theta on the meshes of `fine`.
+    simulations : list of Simulation
+        At theta on the meshes of `fine`.
     cost, first_cost : float
         J on the meshes of the fit, at theta and at the first guess.
     constraints : (m,)
@@ -82,26 +83,29 @@ def worst_error(
         An error that is not a number counts as the largest.
     """
     problem = fine.problem
-    errors = [IntegrationError(cost_error(problem, cost_of(problem, theta, runs), cost, first_cost), COST)]
+    errors = [IntegrationError(cost_error(problem, cost_of(problem, theta, simulations), cost, first_cost), COST)]
     if problem.constraint_names:
-        values, scales = constraint_values(fine, theta, runs)
+        values, scales = constraint_values(fine, theta, simulations)
         changes = np.abs(values - constraints) / np.where(scales > 0, scales, 1.0)
         errors += map(IntegrationError, changes.tolist(), problem.constraint_names)
     return max(errors, key=lambda found: np.inf if np.isnan(found.error) else found.error)
 
 
-def constraint_values(evaluator: Evaluator, theta: FloatArray, runs: Sequence[Run]) -> tuple[FloatArray, FloatArray]:
+def constraint_values(
+    evaluator: Evaluator, theta: FloatArray, simulations: Sequence[Simulation]
+) -> tuple[FloatArray, FloatArray]:
     """Return the guards and terminal constraints of a simulation and their scales: (m,) each.
 
     They follow from the states alone, so that nothing is compiled for the meshes of `evaluator`.
     """
     problem = evaluator.problem
     values, scales = [np.zeros(0)], [np.zeros(0)]
-    for e, (structure, arguments, run) in enumerate(zip(problem.structures, evaluator.arguments, runs, strict=True)):
+    given = zip(problem.structures, evaluator.arguments, simulations, strict=True)
+    for e, (structure, arguments, simulation) in enumerate(given):
         if structure.constrained:
             tau, p = problem.vectors(theta, e)
-            ends = np.stack([segment.after[-1] for segment in run.segments])
-            states = np.concatenate([states for segment in run.segments for states in (segment.before, segment.after)])
+            ends = np.stack([simulation.after[rows][-1] for rows in simulation.segments])
+            states = np.concatenate([simulation.before, simulation.after])
             with float64(), compilation_cache():
                 found = _constraint_values(arguments.without_mesh(), tau, ends, p, structure=structure)
             values.append(np.asarray(found[0]))

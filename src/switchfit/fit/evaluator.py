@@ -3,51 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import cached_property, partial
-from typing import Any, Literal
+from functools import cached_property
+from typing import Literal
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.discretization.arguments import Arguments, arguments_of
 from switchfit.discretization.mesh import Mesh, with_common_lengths
-from switchfit.discretization.model import Model
-from switchfit.discretization.propagation import path_cost, propagate
 from switchfit.engine.adaptive import refined_mesh
-from switchfit.engine.choice import Engine
-from switchfit.engine.jax.constraints import augmented
-from switchfit.engine.jax.first_order import first_order
-from switchfit.engine.jax.forward import forward_hessian
-from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
-from switchfit.engine.native.experiment import NativeExperiment, native_experiment, reason_for_jax
-from switchfit.engine.native.templates import Order
-from switchfit.fit.trajectory import cost_of, runs_of
+from switchfit.engine.choice import engine_of, summarize
+from switchfit.engine.jax.engine import JaxEngine
+from switchfit.engine.protocol import Derivatives, Engine, Matrix, Simulation
 from switchfit.optimize.arrow import Arrow, ArrowLayout
-from switchfit.paper_adjoint import paper_derivatives
+from switchfit.paper_adjoint import evaluate_paper
 from switchfit.problem.data import FloatArray
+from switchfit.problem.experiment import run_names
 from switchfit.problem.functions import float64
 from switchfit.problem.problem import Problem
-from switchfit.problem.structure import Structure
 from switchfit.problem.validation import as_choice, as_instance
 from switchfit.runtime.cache import compilation_cache
 
 Method = Literal["auto", "forward", "discrete-adjoint", "adjoint", "autodiff"]
-Matrix = Literal["exact", "gauss-newton", "none"]
 METHODS = ("auto", "forward", "discrete-adjoint", "adjoint", "autodiff")
-
-ORDERS: dict[Matrix, Order] = {
-    "exact": Order.HESSIAN,
-    "gauss-newton": Order.GAUSS_NEWTON,
-    "none": Order.GRADIENT,
-}
-
-FORWARD_UP_TO = 0
-"""Unknowns of one experiment up to which second order forward is cheaper than the backward sweep. It never is: at one
-unknown they tie, from two on the sweep is ahead (the scaling part of the benchmarks)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,11 +93,7 @@ class Evaluator:
         indices = range(len(problem.experiments))
         at = problem.initial_theta if theta is None else theta
         given = list(meshes) if meshes is not None else [refined_mesh(problem, e, at) for e in indices]
-        self.meshes = with_common_lengths(problem, given)
-        self.arguments = [arguments_of(problem, e, mesh) for e, mesh in enumerate(self.meshes)]
-        self._compiled: set[tuple[Method, Matrix]] = set()
-        self._native: dict[Order, list[NativeExperiment | None]] = {}
-        self._on_device: list[Arguments] | None = None
+        self.replace_arguments([arguments_of(problem, e, m) for e, m in enumerate(with_common_lengths(problem, given))])
         self._priors = problem.unknowns.priors if problem.unknowns.priors.any else None
 
     def divided(self, parts: int = 2) -> Evaluator:
@@ -159,7 +134,9 @@ class Evaluator:
         last = 0
         for e, (own, mine) in enumerate(self.problem.own_places):
             here = slice(last, last := last + self.problem.constraint_counts[e])
-            J, L_d, H, c_e, A = self._constrained(e, theta, side, multipliers[here], penalty[here])
+            at = self.problem.vectors(theta, e)
+            J, L_d, H, c_e, A = self.engines[e].constrained(*at, side, multipliers[here], penalty[here])
+            H = H + (A.T * penalty[here]) @ A
             cost += J
             value += J + float(multipliers[here] @ c_e + 0.5 * penalty[here] @ c_e**2)
             np.add.at(gradient, mine, (L_d - (multipliers[here] + penalty[here] * c_e) @ A)[own])
@@ -172,23 +149,6 @@ class Evaluator:
             cost, gradient = cost + float(J), gradient + g
             value, slope, hessian = value + float(J), slope + g, hessian + np.diag(h)
         return ConstrainedEvaluation(cost, gradient, value, slope, hessian, c, jacobian)
-
-    def _constrained(
-        self, e: int, theta: FloatArray, side: int, multipliers: FloatArray, penalty: FloatArray
-    ) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Of experiment e its cost, slope and Hessian of its augmented Lagrangian, constraints and their derivative."""
-        native = self._natives(Order.HESSIAN)[e]
-        found = (
-            None if native is None else native.constrained(*self.problem.vectors(theta, e), side, multipliers, penalty)
-        )
-        if found is not None:
-            H = found.hessian + (found.jacobian.T * penalty) @ found.jacobian
-            return found.cost, found.slope, H, found.constraints, found.jacobian
-        s, a, tau, p = self._each(theta)[e]
-        with float64(), compilation_cache():
-            result = constrained_derivatives(a, tau, p, float(side), multipliers, penalty, structure=s)
-        J, _, _, L_d, H, c, A = map(np.asarray, result)
-        return float(J), L_d, H, c, A
 
     def arrow(self, theta: FloatArray, side: int = 1, matrix: Matrix = "exact") -> ArrowEvaluation:
         """The same by the method "auto", in time and memory that are linear in the number of experiments."""
@@ -220,49 +180,36 @@ class Evaluator:
         """Work with other numbers from now on, on the meshes that they have."""
         self.arguments = list(arguments)
         self.meshes = [Mesh.from_times(np.asarray(own.nodes)) for own in arguments]
-        self._native.clear()
-        self._on_device = None
+        given = enumerate(zip(self.arguments, self.meshes, strict=True))
+        self.engines = [engine_of(self.problem, e, own, mesh) for e, (own, mesh) in given]
 
     def cost(self, theta: FloatArray) -> float:
         """J alone."""
-        natives = self._natives(Order.COST)
-        vectors = [self.problem.vectors(theta, e) for e in range(len(natives))]
-        costs = [None if native is None else native.cost(*at) for native, at in zip(natives, vectors, strict=True)]
-        known = [cost for cost in costs if cost is not None]
-        if len(known) < len(natives):
-            return cost_of(self.problem, theta, runs_of(self.problem, theta, self.meshes, self.arguments))
-        return sum(known, 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0]))
+        costs = [engine.cost(*self.problem.vectors(theta, e)) for e, engine in enumerate(self.engines)]
+        return sum(costs, 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0]))
 
     @property
     def engine(self) -> Engine:
         """What evaluates cost, gradient and exact Hessian by the method "auto": machine code, or JAX and why."""
-        given = zip(self.problem.structures, self.arguments, strict=True)
-        reasons = (reason_for_jax(structure, arguments, Order.HESSIAN) for structure, arguments in given)
-        return Engine.of(next((reason for reason in reasons if reason is not None), None))
+        return summarize(self.engines, run_names(self.problem.experiments))
 
-    def _natives(self, order: Order) -> list[NativeExperiment | None]:
-        """What evaluates each experiment in machine code, None where nothing does; with derivatives up to an order."""
-        if order not in self._native:
-            given = zip(self.problem.structures, self.arguments, self.meshes, strict=True)
-            self._native[order] = [native_experiment(s, a, mesh.times, order) for s, a, mesh in given]
-        return self._native[order]
+    def simulate(self, theta: FloatArray, *, tangents: bool = False) -> list[Simulation]:
+        """All experiments row by row, with their derivatives in their own unknowns if asked for."""
+        vectors = (self.problem.vectors(theta, e) for e in range(len(self.engines)))
+        return [engine.simulate(*at, tangents=tangents) for engine, at in zip(self.engines, vectors, strict=True)]
 
-    def _results(self, theta: FloatArray, side: int, method: Method, matrix: Matrix) -> list[Any]:
-        """Cost, gradient and Hessian of each experiment in its own unknowns, as NumPy arrays."""
+    def _results(self, theta: FloatArray, side: int, method: Method, matrix: Matrix) -> list[Derivatives]:
+        """Cost, gradient and Hessian of each experiment in its own unknowns."""
+        theta = np.asarray(theta, dtype=np.float64)
+        vectors = [self.problem.vectors(theta, e) for e in range(len(self.engines))]
         if method == "auto":
-            natives = [native for native in self._natives(ORDERS[matrix]) if native is not None]
-            if len(natives) == len(self.arguments):
-                found = [native(*self.problem.vectors(theta, e), side) for e, native in enumerate(natives)]
-                if None not in found:
-                    return found
-        compiled = (method, matrix) in self._compiled
-        with float64(), nullcontext() if compiled else compilation_cache():
-            results = [
-                derivatives(a, tau, p, float(side), structure=s, method=_resolve(method, s), matrix=matrix)
-                for s, a, tau, p in self._each(theta)
-            ]
-        self._compiled.add((method, matrix))
-        return [tuple(map(np.array, result)) for result in results]  # copies: what JAX owns cannot be written to
+            return [engine.derivatives(*at, side, matrix) for engine, at in zip(self.engines, vectors, strict=True)]
+        given = list(zip(self.problem.structures, self.arguments, self.meshes, vectors, strict=True))
+        if method == "adjoint":
+            with float64(), compilation_cache():
+                found = [evaluate_paper(a, *at, float(side), structure=s) for s, a, _, at in given]
+            return [Derivatives(float(J), np.array(g), np.array(H)) for J, g, H in found]
+        return [JaxEngine(s, a, mesh).derivatives(*at, side, matrix, method) for s, a, mesh, at in given]
 
     def breakpoints(self) -> list[FloatArray]:
         """For each entry of theta the nodes at which derivatives may jump: none for parameters."""
@@ -271,16 +218,6 @@ class Evaluator:
             for place in where[where >= 0]:
                 points[place] = mesh.times
         return points
-
-    def _each(self, theta: FloatArray) -> list[tuple[Structure, Arguments, FloatArray, FloatArray]]:
-        theta = np.asarray(theta, dtype=np.float64)
-        if self._on_device is None:
-            with float64():
-                self._on_device = jax.device_put(self.arguments)
-        return [
-            (structure, arguments, *self.problem.vectors(theta, e))
-            for e, (structure, arguments) in enumerate(zip(self.problem.structures, self._on_device, strict=True))
-        ]
 
 
 def evaluator_of(problem: Problem) -> Evaluator:
@@ -326,66 +263,3 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     as_instance(problem, "problem", Problem, "an sf.Problem")
     method = as_choice(method, "method", METHODS)
     return evaluator_of(problem)(problem.checked_theta(theta), method=method)
-
-
-def _resolve(method: Method, structure: Structure) -> Method:
-    if method != "auto":
-        return method
-    return "forward" if structure.N + structure.M <= FORWARD_UP_TO else "discrete-adjoint"
-
-
-@partial(jax.jit, static_argnames=("structure", "method", "matrix"))
-def derivatives(
-    arguments: Arguments,
-    tau: jax.Array,
-    p: jax.Array,
-    side: jax.Array,
-    *,
-    structure: Structure,
-    method: Method,
-    matrix: Matrix = "exact",
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Cost, gradient (D,) and Hessian (D, D) of one experiment in its N transition times and its p (M,), traced."""
-    model = Model(structure, arguments)
-    if method == "adjoint":
-        return paper_derivatives(model, tau, p, side)
-    if method == "autodiff":
-        return _autodiff(model, tau, p, side)
-    first = first_order(model, tau, p, side)
-    if matrix == "none":
-        return first.cost, first.gradient, jnp.full((first.gradient.size, first.gradient.size), jnp.nan)
-    if matrix == "gauss-newton":
-        return first.cost, first.gradient, gauss_newton_hessian(model, first, p)
-    second = forward_hessian if method == "forward" else adjoint_hessian
-    return first.cost, first.gradient, second(model, first, tau, p)
-
-
-@partial(jax.jit, static_argnames=("structure",))
-def constrained_derivatives(
-    arguments: Arguments,
-    tau: jax.Array,
-    p: jax.Array,
-    side: jax.Array,
-    multipliers: jax.Array,
-    penalty: jax.Array,
-    *,
-    structure: Structure,
-) -> tuple[jax.Array, ...]:
-    """Cost, gradient; augmented Lagrangian, its gradient and Hessian; constraints (m,), their derivatives (m, D)."""
-    model = Model(structure, arguments)
-    first = first_order(model, tau, p, side)
-    L, L_d, weights, c, A = augmented(model, first, tau, p, multipliers, penalty)
-    H = adjoint_hessian(model, first, tau, p, weights) + (A.T * penalty) @ A
-    return first.cost, first.gradient, L, L_d, H, c, A
-
-
-def _autodiff(model: Model, tau: jax.Array, p: jax.Array, side: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """J and its derivatives by JAX alone, forward over forward."""
-    N = model.structure.N
-
-    def cost(theta: jax.Array) -> jax.Array:
-        path = propagate(model, theta[:N], theta[N:], side)
-        return path_cost(model, path, theta[N:])
-
-    theta = jnp.concatenate([tau, p])
-    return cost(theta), jax.jacfwd(cost)(theta), jax.jacfwd(jax.jacfwd(cost))(theta)

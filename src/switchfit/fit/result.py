@@ -11,7 +11,7 @@ import numpy as np
 import scipy.special
 from numpy.typing import NDArray
 
-from switchfit.engine.choice import Engine
+from switchfit.engine.protocol import Engine
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord, Status
 from switchfit.problem.data import FloatArray

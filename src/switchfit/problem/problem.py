@@ -25,6 +25,7 @@ from switchfit.problem.system import HybridSystem
 from switchfit.problem.validation import (
     as_array,
     as_choice,
+    as_count,
     as_instance,
     as_name,
     as_number,
@@ -34,7 +35,7 @@ from switchfit.problem.validation import (
 )
 from switchfit.problem.variables import Variables
 
-GIVEN = ("system", "experiments", "parameters", "min_duration", "solver", "rtol", "atol")
+GIVEN = ("system", "experiments", "parameters", "min_duration", "solver", "rtol", "atol", "engine", "max_transitions")
 """What a `Problem` is built from."""
 
 SMALLEST_RTOL = 1e-13
@@ -112,6 +113,14 @@ class Problem:
         1e-8, its gradient and its Hessian of about 1e-7. Ten times smaller tolerances make these errors about ten times
         smaller or better, and take up to 1.6 times as many steps.
 
+    engine : {"auto", "native", "jax"}, optional
+        What evaluates the cost and its derivatives: machine code wherever the model has it and JAX otherwise; machine
+        code, with an error that says why where there is none; or JAX.
+    max_transitions : int, optional
+        Compile machine code for every sequence of the system's modes with up to so many transitions, so that problems
+        with other sequences, but the same functions, data and `max_transitions`, need no compilation of their own.
+        Left out, for the transitions and modes of the mode sequences.
+
     Raises
     ------
     ValueError
@@ -129,6 +138,8 @@ class Problem:
     solver: Literal["explicit", "stiff"] = "explicit"
     rtol: float = 1e-8
     atol: float = 1e-10
+    engine: Literal["auto", "native", "jax"] = "auto"
+    max_transitions: int | None = None
     unknowns: Unknowns = field(init=False)
     structures: tuple[Structure, ...] = field(init=False)
 
@@ -146,6 +157,13 @@ class Problem:
                         f"{listed(self.system.modes)}."
                     )
         object.__setattr__(self, "solver", as_choice(self.solver, "solver", ("explicit", "stiff")))
+        object.__setattr__(self, "engine", as_choice(self.engine, "engine", ("auto", "native", "jax")))
+        if self.max_transitions is not None:
+            longest = max(len(e.transition_times) for e in experiments)
+            most = as_count(self.max_transitions, "max_transitions")
+            if most < longest:
+                raise ValueError(f"max_transitions is {most}, but a mode_sequence has {longest} transitions.")
+            object.__setattr__(self, "max_transitions", most)
         for name in ("rtol", "atol"):
             object.__setattr__(self, name, as_positive(getattr(self, name), name))
         if not SMALLEST_RTOL <= self.rtol < 1:
@@ -162,7 +180,8 @@ class Problem:
         self._check_delays()
         targets = frozenset(name for e in experiments for name in e.parameter_map.values())
         functions = Functions(parameters, targets)
-        structures = tuple(structure_of(self.system, e, functions, self.solver) for e in experiments)
+        settings = functions, self.solver, self.max_transitions
+        structures = tuple(structure_of(self.system, e, *settings) for e in experiments)
         for structure in structures:
             self.system.check_labels_of(structure.n)
         object.__setattr__(self, "structures", structures)

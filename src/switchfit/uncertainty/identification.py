@@ -26,7 +26,7 @@ from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.hidden import refuse_hidden_switches
 from switchfit.fit.result import Fit, scaled_spectrum
 from switchfit.fit.solution import least_squares
-from switchfit.fit.trajectory import compared, runs_of
+from switchfit.fit.trajectory import compare
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 
@@ -243,7 +243,7 @@ def _before(problem: Problem) -> Identifiability:
 def _noise_free(problem: Problem, evaluator: Evaluator) -> Problem:
     """The problem with the values that its first guess produces; missing ones stay missing."""
     theta = problem.initial_theta
-    comparisons = compared(problem, theta, runs_of(problem, theta, evaluator.meshes, evaluator.arguments))[1]
+    comparisons = compare(problem, theta, evaluator.simulate(theta))[1]
     experiments = []
     for experiment, found in zip(problem.experiments, comparisons, strict=True):
         data = [

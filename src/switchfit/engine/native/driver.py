@@ -407,18 +407,9 @@ class Driver:
         self.line("%done = icmp sge i64 %more, %count")
         self.next_turn("%sample", "%done")
 
-    def late_samples(self, k: int, counts: list[int]) -> str:
-        """All samples of the k-th Measurements, which are late: each at the end of a row of its own.
-
-        `counts` are the numbers of entries of the second derivatives of such a row, by modes.
-        """
-        n, S, width, q = self.sizes.n, self.sizes.signals, self.sizes.width, self.library.measurements[k].channels
-        found, own = self.pointers(), self.samples_of(k)
-        before, left = self.resumed()
-        self.line("br label %loop")
-        self.label("loop")
-        self.line(f"%sample = phi i64 [{before}, %entry], [%more, %next]")
-        self.line(f"%budget = phi i64 [{left}, %entry], [%left, %next]")
+    def _late_row(self, k: int, found: dict[str, str], own: dict[str, str]) -> tuple[str, dict[str, str], str, int]:
+        """The row of a late sample, forward: the index of the row that holds its end, what it is given, mode, work."""
+        n, S, width = self.sizes.n, self.sizes.signals, self.sizes.width
         cell, segment = (self.load("i64", self.at(own[name], "%sample")) for name in ("cell", "segment"))
         row = self.let(f"add i64 {cell}, {segment}")
         first = self.let(f"icmp eq i64 {cell}, {self.load('i64', self.at(found['first_cell'], segment))}")
@@ -429,16 +420,15 @@ class Driver:
         start = self.let(f"select i1 {opens}, double {begins}, double {node}")
         for place, value in ((0, start), (2, node)):
             self.line(f"store double {value}, ptr {self.at(found['late_row'], place)}")
-        given = found | self._state(found, row) | self._sample(own, q)
+        given = found | self._state(found, row)
         if self.library.reset_maps:
             transition = self.let(f"sub i64 {opening}, 1")
             safe = self.let(f"select i1 {opens}, i64 {transition}, i64 0")
             which = self.load("i64", self.at(found["resets"], safe))
             behind = self.let(f"and i1 {opens}, {self.let(f'icmp sge i64 {which}, 0')}")
             for name, after, size in (("x", "reset_states", n), ("Z", "reset_tangents", n * width)):
-                given[name] = self.let(
-                    f"select i1 {behind}, ptr {self.at(found[after], safe, size)}, ptr {given[name]}"
-                )
+                jumped = self.at(found[after], safe, size)
+                given[name] = self.let(f"select i1 {behind}, ptr {jumped}, ptr {given[name]}")
         given |= {
             "time": self.at(own["time"], "%sample"),
             "row": found["late_row"],
@@ -461,8 +451,22 @@ class Driver:
             longest = max(longest, self.call(f"forward_late_{m}", FORWARD, given))
             self.line("br label %forward_end")
         self.label("forward_end")
-        work += longest
-        at_end = {"x": found["late_state"], "Z": found["late_tangent"], "J": found["J"]}
+        return row, given, mode, work + longest
+
+    def late_samples(self, k: int, counts: list[int]) -> str:
+        """All samples of the k-th Measurements, which are late: each at the end of a row of its own.
+
+        `counts` are the numbers of entries of the second derivatives of such a row, by modes.
+        """
+        n, q = self.sizes.n, self.library.measurements[k].channels
+        found, own = self.pointers(), self.samples_of(k)
+        before, left = self.resumed()
+        self.line("br label %loop")
+        self.label("loop")
+        self.line(f"%sample = phi i64 [{before}, %entry], [%more, %next]")
+        self.line(f"%budget = phi i64 [{left}, %entry], [%left, %next]")
+        row, given, mode, work = self._late_row(k, found, own)
+        at_end = {"x": found["late_state"], "Z": found["late_tangent"], "J": found["J"]} | self._sample(own, q)
         at_end |= {"time": self.at(found["late_row"], 1), "moves": found["late_closes"]}
         for entry in range(n):
             self.line(f"store double 0.0, ptr {self.at(found['late_psi'], entry)}")
@@ -483,6 +487,26 @@ class Driver:
         self.label("next")
         self._next_sample(work)
         return self.finished(f"internal i1 @samples_{k}({TABLE}, i64 %count, ptr %progress)", returns=False)
+
+    def late_states(self, k: int) -> str:
+        """The moments of which the samples of the k-th Measurements are, and the states then."""
+        n = self.sizes.n
+        found, own = self.pointers(), self.samples_of(k)
+        self.line("br label %loop")
+        self.label("loop")
+        self.line("%sample = phi i64 [0, %entry], [%more, %forward_end]")
+        self._late_row(k, found, own)
+        moment = self.load("double", self.at(found["late_row"], 1))
+        self.line(f"store double {moment}, ptr {self.at('%times', '%sample')}")
+        for entry in range(n):
+            value = self.load("double", self.at(found["late_state"], entry))
+            place = self.let(f"getelementptr inbounds double, ptr {self.at('%states', '%sample', n)}, i64 {entry}")
+            self.line(f"store double {value}, ptr {place}")
+        self.line("%more = add i64 %sample, 1")
+        self.line("%done = icmp sge i64 %more, %count")
+        self.line("br i1 %done, label %out, label %loop")
+        self.label("out")
+        return self.finished(f"void @late_states_{k}({TABLE}, i64 %count, ptr %times, ptr %states)")
 
     # Everything
 

@@ -27,6 +27,7 @@ from switchfit.engine.native.workspace import (
     pointers,
     sums,
 )
+from switchfit.engine.protocol import Constrained, Derivatives
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 
@@ -74,6 +75,7 @@ class Simulated(NamedTuple):
         At t0, then at the end of each row, before a jump. The tangents, in second order, are derivatives at an end that
         moves with theta where it is a transition.
     reset_states, reset_tangents : (N, n), (N, n, D), behind the reset maps; meaningless where there is none
+    late : for each Measurements that is late, by its place, the moments of which its samples are, and the states then
     """
 
     cost: float
@@ -83,23 +85,7 @@ class Simulated(NamedTuple):
     reset_states: FloatArray
     tangents: FloatArray
     reset_tangents: FloatArray
-
-
-class Constrained(NamedTuple):
-    """Cost and constraints.
-
-    Attributes
-    ----------
-    cost : J
-    slope, hessian : (D,), (D, D), of ``J + weights . c``, the weights being ``multipliers + penalty c``
-    constraints, jacobian : c (m,) and its derivative (m, D)
-    """
-
-    cost: float
-    slope: FloatArray
-    hessian: FloatArray
-    constraints: FloatArray
-    jacobian: FloatArray
+    late: dict[int, tuple[FloatArray, FloatArray]]
 
 
 class NativeExperiment:
@@ -138,7 +124,7 @@ class NativeExperiment:
         pointer, number = ctypes.c_void_p, ctypes.c_int64
         self._program = program  # whose code must not go away
         self._evaluate = program.function(f"{self._prefix}evaluate", pointer, pointer, *[number] * len(counts))
-        self._times, self._cells, self._counts = times, cells, counts
+        self.times, self._cells, self._counts = times, cells, counts
         constants = [np.ravel(np.asarray(a, dtype=np.float64)) for a in constants_of(arguments)]
         units = np.zeros((D + 1, width))
         units[1:, :D] = np.eye(D)
@@ -191,7 +177,7 @@ class NativeExperiment:
         self._result = self._named["g"][:D], self._named["H"].reshape(D, width)[:, :D]
         self._delays = _places_of_delays(structure, arguments)
 
-    def __call__(self, tau: FloatArray, p: FloatArray, side: float) -> tuple[float, FloatArray, FloatArray] | None:
+    def __call__(self, tau: FloatArray, p: FloatArray, side: float) -> Derivatives | None:
         """J, its gradient (D,) and its Hessian (D, D), NaN without it.
 
         None if a presumption was wrong: then JAX has to do it.
@@ -204,7 +190,7 @@ class NativeExperiment:
             if not self._all_own:
                 g, H = g[self._own], H[np.ix_(self._own, self._own)]
             hessian = H.copy() if self._has_hessian else np.full(H.shape, np.nan)
-            return self._J.item(0), g.copy(), hessian
+            return Derivatives(self._J.item(0), g.copy(), hessian)
 
     def constrained(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
@@ -259,8 +245,8 @@ class NativeExperiment:
         n, N, cells = self.sizes.n, self.structure.N, self._cells
         first_cell = self._first_cell[: N + 1].copy()
         firsts, lasts = first_cell.tolist(), [*first_cell[1:].tolist(), cells - 1]
-        ends = zip(firsts, lasts, [*tau.tolist(), self._times[-1]], strict=True)
-        inside = [np.append(self._times[first + 1 : last + 1], end) for first, last, end in ends]
+        ends = zip(firsts, lasts, [*tau.tolist(), self.times[-1]], strict=True)
+        inside = [np.append(self.times[first + 1 : last + 1], end) for first, last, end in ends]
 
         def of_rows(name: str, count: int, *shape: int) -> FloatArray:
             values = self._named[name].reshape(-1, *shape)[:count]
@@ -271,12 +257,22 @@ class NativeExperiment:
         return Simulated(
             self._J.item(0),
             first_cell,
-            np.concatenate([self._times[:1], *inside]),
+            np.concatenate([self.times[:1], *inside]),
             of_rows("states", cells + N + 1, n),
             of_rows("reset_states", behind, n),
             of_rows("tangents", with_tangents, n, self.sizes.width),
             of_rows("reset_tangents", behind, n, self.sizes.width),
+            {k: self._late_states(k, len(times)) for k, _, times, _, _ in self._late},
         )
+
+    def _late_states(self, k: int, count: int) -> tuple[FloatArray, FloatArray]:
+        """Of which moments the samples of the k-th Measurements are, (K,), and the states then, (K, n)."""
+        times, states = np.zeros(count), np.zeros((count, self.sizes.n))
+        pointer = ctypes.c_void_p
+        types = [pointer, ctypes.c_int64, pointer, pointer]
+        find = self._program.function(f"{self._prefix}late_states_{k}", *types)
+        find(self._address, count, times.ctypes.data, states.ctypes.data)
+        return times, states
 
     def outputs(
         self, times: FloatArray, states: FloatArray, p: FloatArray, tangents: FloatArray | None = None
@@ -323,8 +319,8 @@ class NativeExperiment:
         """
         self._own_p[:] = p
         if cell is None:
-            cell = min(max(int(self._times.searchsorted(t, "right")) - 1, 0), len(self._times) - 2)
-        moment, slope = np.array([t, self._times[cell]]), np.zeros(len(y))
+            cell = min(max(int(self.times.searchsorted(t, "right")) - 1, 0), len(self.times) - 2)
+        moment, slope = np.array([t, self.times[cell]]), np.zeros(len(y))
         signal = self._named["signals"][cell]
         return slope + self._call(f"slope_{mode}", SLOPE, {"moment": moment, "signal": signal, "y": y, "K": slope})
 
@@ -399,7 +395,7 @@ class NativeExperiment:
     def _place(self, tau: FloatArray, side: float) -> None:
         """The cells in which segments begin, as in `switchfit.discretization.mesh.rows`."""
         if len(tau):
-            passed = self._times.searchsorted(tau, "right" if side > 0 else "left")
+            passed = self.times.searchsorted(tau, "right" if side > 0 else "left")
             self._begins[:] = np.minimum(np.maximum(passed - 1, 0), self._cells - 1)
 
     def _place_late(self, p: FloatArray) -> None:
@@ -407,7 +403,7 @@ class NativeExperiment:
         for _, name, times, cell, segment in self._late:
             place, value = self._delays[name]
             seen = times - (value if place is None else p[place])
-            cell[:] = np.clip(self._times.searchsorted(seen, "left") - 1, 0, self._cells - 1)
+            cell[:] = np.clip(self.times.searchsorted(seen, "left") - 1, 0, self._cells - 1)
             segment[:] = self._tau.searchsorted(seen, "left")
 
 

@@ -69,11 +69,13 @@ def handler(driver: Driver) -> str:
         driver.line(f"store ptr {found[name]}, ptr {driver.at('%table', k)}")
     counts = ""
     for k in range(measurements):
+        shapes = []
         for m in range(len(OF_SAMPLES)):
             pointer, dimensions = data(given, len(GIVEN) + len(OF_SAMPLES) * k + m)
             at = driver.at("%table", len(driver.names) + len(OF_SAMPLES) * k + m)
             driver.line(f"store ptr {pointer}, ptr {at}")
-        counts += f", i64 {driver.load('i64', dimensions)}"
+            shapes.append(dimensions)
+        counts += f", i64 {driver.load('i64', shapes[0])}"
     driver.line("store [3 x i64] [i64 0, i64 0, i64 9223372036854775807], ptr %progress")  # all at once
     driver.line(f"call void @evaluate(ptr %table, ptr %progress{counts})")
     driver.line("ret ptr null")

@@ -88,6 +88,7 @@ def _write(module: Module, library: Structure, sizes: Sizes, order: Order) -> No
         if k in late:
             kernels.late_time(k)
             module.add(driver.late_samples(k, late_counts))
+            module.add(driver.late_states(k))
         else:
             module.add(driver.samples(k))
     if library.terminal:

@@ -1,0 +1,74 @@
+"""JAX as an engine: whatever the model does, on any device."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+
+import jax
+import numpy as np
+
+from switchfit.discretization.arguments import Arguments
+from switchfit.discretization.mesh import Mesh
+from switchfit.engine.jax.programs import Method, constrained_derivatives, derivatives
+from switchfit.engine.jax.simulation import simulate_by_jax
+from switchfit.engine.protocol import Constrained, Derivatives, Engine, Matrix, Simulation
+from switchfit.problem.data import FloatArray
+from switchfit.problem.functions import float64
+from switchfit.problem.structure import Structure
+from switchfit.runtime.cache import compilation_cache
+
+
+class JaxEngine:
+    """One experiment on one mesh by JAX.
+
+    Attributes
+    ----------
+    reason : str
+        Why machine code does not do it.
+    """
+
+    def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh) -> None:
+        self._structure, self._arguments, self._mesh = structure, arguments, mesh
+        self._on_device: Arguments | None = None
+        self._compiled: set[tuple[Method, Matrix]] = set()
+        self.reason = "engine='jax' asks for it"
+
+    @property
+    def engine(self) -> Engine:
+        """JAX, and why."""
+        return Engine("jax", self.reason)
+
+    def cost(self, tau: FloatArray, p: FloatArray) -> float:
+        """J alone."""
+        return self.simulate(tau, p, tangents=False).cost
+
+    def derivatives(
+        self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix, method: Method = "discrete-adjoint"
+    ) -> Derivatives:
+        """J and its derivatives, by one of the methods."""
+        compiled = (method, matrix) in self._compiled
+        with float64(), nullcontext() if compiled else compilation_cache():
+            given = self._given(), tau, p, float(side)
+            found = derivatives(*given, structure=self._structure, method=method, matrix=matrix)
+        self._compiled.add((method, matrix))
+        J, g, H = found
+        return Derivatives(float(J), np.array(g), np.array(H))  # copies: what JAX owns cannot be written to
+
+    def constrained(
+        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
+    ) -> Constrained:
+        """J and its constraints."""
+        with float64(), compilation_cache():
+            given = self._given(), tau, p, float(side), multipliers, penalty
+            J, slope, H, c, A = constrained_derivatives(*given, structure=self._structure)
+        return Constrained(float(J), np.array(slope), np.array(H), np.array(c), np.array(A))
+
+    def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
+        """All rows, with their derivatives if asked for."""
+        return simulate_by_jax(self._structure, self._arguments, self._mesh, tau, p, tangents)
+
+    def _given(self) -> Arguments:
+        if self._on_device is None:
+            with float64():
+                self._on_device = jax.device_put(self._arguments)
+        return self._on_device

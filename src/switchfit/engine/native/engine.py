@@ -1,0 +1,145 @@
+"""Machine code as an engine: one program for each order of derivatives that is asked for, and JAX where one presumed
+wrongly.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from switchfit.discretization.arguments import Arguments
+from switchfit.discretization.mesh import Mesh
+from switchfit.engine.native.experiment import NativeExperiment, native_experiment
+from switchfit.engine.native.templates import Order
+from switchfit.engine.protocol import (
+    Constrained,
+    Derivatives,
+    Engine,
+    ExperimentEngine,
+    Matrix,
+    Simulation,
+    Tangents,
+    with_samples,
+)
+from switchfit.problem.data import FloatArray
+from switchfit.problem.structure import Structure
+
+ORDERS: dict[Matrix, Order] = {
+    "exact": Order.HESSIAN,
+    "gauss-newton": Order.GAUSS_NEWTON,
+    "none": Order.GRADIENT,
+}
+
+
+class NativeEngine:
+    """One experiment on one mesh in machine code.
+
+    Parameters
+    ----------
+    structure : Structure
+    arguments : Arguments
+    mesh : Mesh
+    otherwise : ExperimentEngine
+        What does an evaluation in which a product with zero was left out whose other factor was not finite.
+    """
+
+    def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh, otherwise: ExperimentEngine) -> None:
+        self._structure, self._arguments, self._mesh, self._otherwise = structure, arguments, mesh, otherwise
+        self._experiments: dict[Order, NativeExperiment | None] = {}
+
+    @property
+    def engine(self) -> Engine:
+        """Machine code."""
+        return Engine("native")
+
+    def at(self, order: Order) -> NativeExperiment | None:
+        """The experiment with derivatives of an order; None if there is no machine code for that order alone."""
+        if order not in self._experiments:
+            self._experiments[order] = native_experiment(self._structure, self._arguments, self._mesh.times, order)
+        return self._experiments[order]
+
+    def cost(self, tau: FloatArray, p: FloatArray) -> float:
+        """J alone."""
+        native = self.at(Order.COST)
+        found = None if native is None else native.cost(tau, p)
+        return self._otherwise.cost(tau, p) if found is None else found
+
+    def derivatives(self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix) -> Derivatives:
+        """J and its derivatives."""
+        native = self.at(ORDERS[matrix])
+        found = None if native is None else native(tau, p, side)
+        return self._otherwise.derivatives(tau, p, side, matrix) if found is None else found
+
+    def constrained(
+        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
+    ) -> Constrained:
+        """J and its constraints."""
+        native = self.at(Order.HESSIAN)
+        found = None if native is None else native.constrained(tau, p, side, multipliers, penalty)
+        return self._otherwise.constrained(tau, p, side, multipliers, penalty) if found is None else found
+
+    def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
+        """All rows, with their derivatives if asked for."""
+        native, plain = self.at(Order.HESSIAN if tangents else Order.COST), self.at(Order.COST)
+        found = None
+        if native is not None and plain is not None:
+            found = _simulation(self._structure, self._arguments, native, plain, tau, p, tangents)
+        return self._otherwise.simulate(tau, p, tangents=tangents) if found is None else found
+
+
+def _simulation(
+    structure: Structure,
+    arguments: Arguments,
+    native: NativeExperiment,
+    plain: NativeExperiment,
+    tau: FloatArray,
+    p: FloatArray,
+    tangents: bool,
+) -> Simulation | None:
+    """All rows; None if a presumption was wrong.
+
+    Machine code has the derivatives at the ends of rows, which move where they are transitions. At the time at which
+    such an end is they are less dx/dt.
+    """
+    found = native.simulated(tau, p)
+    if found is None:
+        return None
+    first_cell, start, end = found.first_cell.astype(np.intp), found.times[:-1], found.times[1:]
+    opening = (first_cell + np.arange(len(first_cell)))[1:]  # rows that begin at a transition, where those before end
+    before, at_ends, fixed = found.states[:-1].copy(), found.tangents, found.tangents
+    for i in structure.resets:
+        before[opening[i]] = found.reset_states[i]
+    before_d = None
+    if tangents:
+        fixed, before_d = at_ends.copy(), at_ends[:-1].copy()
+        for i, row in enumerate(opening.tolist()):
+            if i in structure.resets:
+                before_d[row] = found.reset_tangents[i]
+            for derivative, at, state, segment in (
+                (before_d, row, before[row], i + 1),
+                (fixed, row, found.states[row], i),
+            ):
+                mode, cell = structure.mode_of_segment[segment], (row if segment > i else row - 1) - segment
+                slope = plain.slope(mode, tau[i], np.append(state, 0.0), p, cell)
+                derivative[at, :, i] -= slope[:-1]
+    seen = native.outputs(found.times, found.states, p, fixed if tangents else None)
+    behind = native.outputs(tau, before[opening], p, before_d[opening] if before_d is not None else None)
+    if seen is None or behind is None:
+        return None
+    y_before, y_before_d = seen[0][:-1].copy(), seen[1][:-1].copy()
+    y_before[opening], y_before_d[opening] = behind
+    simulation = Simulation(
+        cost=found.cost,
+        nodes=native.times,
+        first_cell=first_cell,
+        start=start,
+        end=end,
+        before=before,
+        after=found.states[1:],
+        y_before=y_before,
+        y_after=seen[0][1:],
+        tangents=None if before_d is None else Tangents(before_d, fixed[1:], y_before_d, seen[1][1:]),
+    )
+    late = {k: native.outputs(times, states, p) for k, (times, states) in found.late.items()}
+    if None in late.values():
+        return None
+    return with_samples(simulation, structure, arguments, {k: y[0] for k, y in late.items() if y is not None})

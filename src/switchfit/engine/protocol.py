@@ -1,0 +1,177 @@
+"""What an engine answers for one experiment on one mesh. Nobody outside this room asks which one it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.discretization.arguments import Arguments
+from switchfit.problem.data import FloatArray
+from switchfit.problem.structure import Structure
+
+Matrix = Literal["exact", "gauss-newton", "none"]
+"""What to return for the Hessian: itself, the Gauss-Newton matrix, or nothing."""
+
+
+@dataclass(frozen=True)
+class Engine:
+    """What evaluated a cost and its derivatives.
+
+    Attributes
+    ----------
+    name : str
+        "native" for machine code, or "jax".
+    reason : str or None
+        Why JAX does it: what in the problem has no machine code. A reason that begins with "internal: " is a defect of
+        switchfit, not of the model. None for machine code.
+    """
+
+    name: str
+    reason: str | None = None
+
+    @classmethod
+    def of(cls, reason: str | None) -> Engine:
+        """Machine code, unless there is a reason against it."""
+        return cls("native") if reason is None else cls("jax", reason)
+
+    def __str__(self) -> str:
+        return "Evaluated in machine code." if self.reason is None else f"Evaluated by JAX: {self.reason}."
+
+
+class Derivatives(NamedTuple):
+    """J, its gradient (D,) and its Hessian (D, D), which is NaN where it was not asked for."""
+
+    cost: float
+    gradient: FloatArray
+    hessian: FloatArray
+
+
+class Constrained(NamedTuple):
+    """Cost and constraints.
+
+    Attributes
+    ----------
+    cost : J
+    slope, hessian : (D,), (D, D), of ``J + weights . c``, the weights being ``multipliers + penalty c``
+    constraints, jacobian : c (m,) and its derivative (m, D)
+    """
+
+    cost: float
+    slope: FloatArray
+    hessian: FloatArray
+    constraints: FloatArray
+    jacobian: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """One experiment row by row, R = cells + N rows in the order of time.
+
+    Attributes
+    ----------
+    cost : float
+        J.
+    nodes : (G + 1,)
+        Of the mesh.
+    first_cell : (N + 1,) int
+        The cell in which each segment begins.
+    start, end : (R,)
+    before, after : (R, n)
+        States at the start and at the end of each row.
+    y_before, y_after : (R, q)
+        What the reference signals and the Measurements see there, in this order.
+    seen : tuple of (K, q), one a Measurements
+        What each sees at its samples, late ones included.
+    tangents : Simulation or None
+        Where asked for, the derivatives of `before`, `after`, `y_before` and `y_after` in the experiment's unknowns, at
+        fixed times: with D entries more in the last axis.
+    """
+
+    cost: float
+    nodes: FloatArray
+    first_cell: NDArray[np.intp]
+    start: FloatArray
+    end: FloatArray
+    before: FloatArray
+    after: FloatArray
+    y_before: FloatArray
+    y_after: FloatArray
+    seen: tuple[FloatArray, ...] = ()
+    tangents: Tangents | None = None
+
+    @property
+    def segments(self) -> list[slice]:
+        """The rows of each segment."""
+        first = self.first_cell + np.arange(len(self.first_cell))
+        ends = [*first[1:].tolist(), len(self.start)]
+        return [slice(a, b) for a, b in zip(first.tolist(), ends, strict=True)]
+
+    def row_ending(self, cells: NDArray[np.intp]) -> NDArray[np.intp]:
+        """The last row in each of some cells (K,): what stands before a jump there; -1 for cell -1."""
+        segment = (cells[:, None] >= self.first_cell[None, 1:]).sum(1)
+        return np.where(cells < 0, -1, cells + segment)
+
+
+class Tangents(NamedTuple):
+    """Derivatives of a `Simulation`: (R, n, D), (R, n, D), (R, q, D), (R, q, D)."""
+
+    before: FloatArray
+    after: FloatArray
+    y_before: FloatArray
+    y_after: FloatArray
+
+
+def with_samples(
+    simulation: Simulation, structure: Structure, arguments: Arguments, late: Mapping[int, FloatArray]
+) -> Simulation:
+    """Return the simulation with what each of the Measurements sees at its samples.
+
+    Parameters
+    ----------
+    simulation : Simulation
+    structure : Structure
+    arguments : Arguments
+    late : mapping
+        What all sensors see, (L, q), at the samples of each of the Measurements that is late, by its place.
+    """
+    seen, first = [], sum(q for _, q in structure.references)
+    for k, (samples, sensor) in enumerate(zip(arguments.samples, structure.measurements, strict=True)):
+        if sensor.delay is None:
+            row = simulation.row_ending(np.asarray(samples.cell))
+            y = np.where((row < 0)[:, None], simulation.y_before[:1], simulation.y_after[row])
+        else:
+            y = np.concatenate([late[k], np.repeat(late[k][-1:], len(samples.time) - len(late[k]), axis=0)])
+        seen.append(y[:, first : first + sensor.channels])
+        first += sensor.channels
+    return replace(simulation, seen=tuple(seen))
+
+
+class ExperimentEngine(Protocol):
+    """One experiment on one mesh, as functions of its transition times tau (N,) and its parameters p (M,)."""
+
+    @property
+    def engine(self) -> Engine:
+        """Which one it is, and why."""
+        ...
+
+    def cost(self, tau: FloatArray, p: FloatArray) -> float:
+        """J alone."""
+        ...
+
+    def derivatives(self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix) -> Derivatives:
+        """J and its derivatives; where a transition is at a node, those to its `side`, +1 or -1."""
+        ...
+
+    def constrained(
+        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
+    ) -> Constrained:
+        """J and its constraints; the multipliers and penalties are (m,)."""
+        ...
+
+    def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
+        """All rows, with their derivatives if asked for."""
+        ...
