@@ -19,8 +19,8 @@ from switchfit.engine.adaptive import refined_mesh
 from switchfit.engine.native import driver, program
 from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.native.program import forget_programs
-from switchfit.fit.evaluator import evaluator_of
-from switchfit.fit.trajectory import runs_of
+from switchfit.engine.native.templates import Order
+from switchfit.fit.evaluator import Evaluator, evaluator_of
 
 SLOW = """
 import sys, time
@@ -96,10 +96,13 @@ def test_evaluations_row_by_row_are_the_same_bit_by_bit(tau, row_by_row):
     nodes = np.unique(np.asarray(arguments.nodes))
 
     def found():
-        orders = [native_experiment(this.structure, arguments, nodes, order) for order in (0, 1, 2)]
+        orders = [
+            native_experiment(this.structure, arguments, nodes, order)
+            for order in (Order.COST, Order.GRADIENT, Order.HESSIAN)
+        ]
         simulated = orders[2].simulated(*given)
         seen = orders[2].outputs(simulated.times, simulated.states, given[1], simulated.tangents)
-        return [orders[0].cost(*given), *orders[1](*given, 1.0), *orders[2](*given, -1.0), *simulated, *seen]
+        return [orders[0].cost(*given), *orders[1](*given, 1.0), *orders[2](*given, -1.0), *simulated[:-1], *seen]
 
     expected = found()
     row_by_row()
@@ -111,10 +114,10 @@ def test_meshes_step_by_step_are_the_same(row_by_row):
     problem = problem_of("resets")
     theta = problem.initial_theta
     expected = refined_mesh(problem, 0, theta)
-    (cost,) = (run.cost for run in runs_of(problem, theta, [expected]))
+    cost = Evaluator(problem, meshes=[expected]).cost(theta)
     row_by_row()
     np.testing.assert_array_equal(refined_mesh(problem, 0, theta).times, expected.times)
-    assert [run.cost for run in runs_of(problem, theta, [expected])] == [cost]
+    assert Evaluator(problem, meshes=[expected]).cost(theta) == cost
 
 
 def test_an_evaluation_that_was_interrupted_leaves_nothing_behind(row_by_row):
@@ -122,7 +125,7 @@ def test_an_evaluation_that_was_interrupted_leaves_nothing_behind(row_by_row):
     evaluator = evaluator_of(problem_of("resets"))
     theta = evaluator.problem.initial_theta
     expected = evaluator(theta)
-    (native,) = evaluator._natives(2)
+    native = evaluator.engines[0].at(Order.HESSIAN)
     whole, calls = native._evaluate, []
 
     def interrupted(*given):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import inspect
 import logging
 import signal
-import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -19,20 +19,15 @@ from hypothesis import strategies as st
 from systems import KINDS, NODES, P0, case, problem_of, weighted
 
 import switchfit as sf
-from switchfit.discretization.arguments import arguments_of
 from switchfit.engine.native import kernels, llvm
 from switchfit.engine.native import program as program_module
 from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.native.foreign import foreign_derivatives
 from switchfit.engine.native.program import forget_programs
 from switchfit.engine.native.scalars import Graph, Node
-from switchfit.engine.native.templates import Order
 from switchfit.engine.native.trace import Unsupported, traced
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.trajectory import runs_of
 from switchfit.problem.functions import float64
-from switchfit.uncertainty.sensitivity import _by_blocks as sensitivities_by_blocks
-from switchfit.uncertainty.sensitivity import _natively as sensitivities_natively
 
 # Functions as scalars
 
@@ -264,7 +259,7 @@ def both(problem, relative=1e-11):
     """Cost, gradient and Hessian by machine code and by JAX at the guess, which must agree; J alone as well."""
     theta = problem.initial_theta
     evaluator = evaluator_of(problem)
-    assert all(native is not None for native in evaluator._natives(2)), "no machine code"
+    assert evaluator.engine.name == "native", evaluator.engine
     found = evaluator(theta)
     expected = evaluator(theta, method="discrete-adjoint")
     assert_close((found.cost, found.gradient, found.hessian), expected, relative)
@@ -323,7 +318,7 @@ def fixed(value):
 
 
 def test_one_unknown_and_none_in_an_experiment():
-    """Vectors of one entry; an experiment without unknowns of its own is left to JAX, and the others with it."""
+    """Vectors of one entry; an experiment without unknowns of its own is left to JAX, but not the others."""
     data = sf.Measurements(TIMES, VALUES, sigma=1.0)
     both(sf.Problem(PENDULUM, sf.Experiment(data, ("fall",), (), 0.0, 3.0), {"g": 1.0, "c": fixed([0.1, 0.2])}))
     runs = [
@@ -333,7 +328,10 @@ def test_one_unknown_and_none_in_an_experiment():
     problem = sf.Problem(PENDULUM, runs, {"g": fixed(1.0), "c": fixed([0.1, 0.2]), "other": sf.Parameter(2.0)})
     evaluator = evaluator_of(problem)
     theta = problem.initial_theta
-    assert evaluator._natives(2)[0] is None
+    assert [each.engine.name for each in evaluator.engines] == ["jax", "native"]
+    assert evaluator.engine.reason == (
+        "an experiment has no unknowns (in run1; the other experiments run in machine code)"
+    )
     assert evaluator(theta).cost == pytest.approx(evaluator(theta, method="discrete-adjoint").cost, rel=1e-12)
     assert evaluator.cost(theta) == pytest.approx(evaluator(theta).cost, rel=1e-12)
 
@@ -388,7 +386,7 @@ def test_a_model_that_has_no_scalar_form():
     run = sf.Experiment(data, ("a", "b"), (1.1,), 0.0, 3.0)
     problem = sf.Problem(sf.HybridSystem({"a": stiffness, "b": fall}, [0.4, 0.1]), run, FREE)
     evaluator = evaluator_of(problem)
-    assert evaluator._natives(2) == [None]
+    assert evaluator.engine.name == "jax"
     theta = problem.initial_theta
     found, expected = evaluator(theta), evaluator(theta, method="forward")
     np.testing.assert_allclose(found.hessian, expected.hessian, rtol=1e-9, atol=1e-9)
@@ -398,55 +396,32 @@ def test_a_model_that_has_no_scalar_form():
 
 def test_implicit_steps_are_left_to_jax():
     run = sf.Experiment(sf.Measurements(TIMES, VALUES, sigma=1.0), ("swing", "fall"), (1.1,), 0.0, 3.0)
-    assert evaluator_of(sf.Problem(PENDULUM, run, FREE, solver="stiff"))._natives(Order.HESSIAN) == [None]
+    assert evaluator_of(sf.Problem(PENDULUM, run, FREE, solver="stiff")).engine.name == "jax"
 
 
 # Simulations, sensitivities, batches
 
 
-@pytest.fixture
-def by_jax(monkeypatch):
-    """Simulations by JAX."""
+def assert_same_simulation(one, other, relative):
+    assert one.cost == pytest.approx(other.cost, rel=relative)
+    for column in ("nodes", "first_cell", "start", "end", "before", "after", "y_before", "y_after"):
+        found, expected = getattr(one, column), getattr(other, column)
+        np.testing.assert_allclose(found, expected, rtol=relative, atol=1e-12, err_msg=column)
+    for found, expected in zip(one.seen, other.seen, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=relative, atol=1e-12)
+    for found, expected in zip(one.tangents or (), other.tangents or (), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=relative, atol=1e-12)
 
-    def switch():
-        monkeypatch.setattr(sys.modules["switchfit.fit.trajectory"], "native_experiment", lambda *_, **__: None)
 
-    return switch
-
-
+@pytest.mark.parametrize("tangents", [False, True])
 @pytest.mark.parametrize("name", INSIDE)
-def test_simulations_are_those_of_jax(name, by_jax):
+def test_simulations_are_those_of_jax(name, tangents):
     problem = problem_of(name)
-    evaluator = evaluator_of(problem)
     theta = problem.initial_theta
-    (found,) = runs_of(problem, theta, evaluator.meshes)
-    by_jax()
-    (expected,) = runs_of(problem, theta, evaluator.meshes)
-    assert found.cost == pytest.approx(expected.cost, rel=1e-12)
-    for one, other in zip(found.segments, expected.segments, strict=True):
-        shown = other.end > other.start  # JAX's last segment has rows of padding
-        for column in one._fields:
-            np.testing.assert_allclose(
-                getattr(one, column), getattr(other, column)[shown], rtol=1e-12, atol=1e-13, err_msg=column
-            )
-    for one, other in zip(found.seen, expected.seen, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-13)
-
-
-@pytest.mark.parametrize("name", INSIDE)
-def test_sensitivities_are_those_of_jax(name):
-    problem = problem_of(name)
-    (mesh,) = evaluator_of(problem).meshes
-    given = problem.structures[0], arguments_of(problem, 0, mesh), mesh, *problem.vectors(problem.initial_theta, 0)
-    found, first = sensitivities_natively(*given)
-    expected, expected_first = sensitivities_by_blocks(*given)
-    np.testing.assert_array_equal(first, expected_first)
-    for one, other in zip(found, expected, strict=True):
-        shown = other.end > other.start
-        for side in ("before", "after"):
-            for column in one.before._fields:
-                a, b = getattr(getattr(one, side), column), getattr(getattr(other, side), column)[shown]
-                np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12, err_msg=f"{side} {column}")
+    (found,) = evaluator_of(problem).simulate(theta, tangents=tangents)
+    (expected,) = Evaluator(replace(problem, engine="jax")).simulate(theta, tangents=tangents)
+    assert (found.tangents is not None) is tangents
+    assert_same_simulation(found, expected, 1e-11)
 
 
 def test_inside_a_program_of_jax():

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.fit.evaluator import derivatives, evaluator_of
+from switchfit.engine.jax.programs import derivatives
+from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import message_of
-from switchfit.fit.trajectory import compared, runs_of
+from switchfit.fit.trajectory import compare
 from switchfit.problem.functions import float64
 from switchfit.problem.losses import LOSSES, influence, robust
 from switchfit.problem.priors import PriorTerms
@@ -46,7 +47,7 @@ def clean(delay=0.0):
     run = sf.Experiment(blank, ("free", "damped"), (1.23,), 0.0, 3.3)
     problem = sf.Problem(SYSTEM, run, TRUTH)
     theta = problem.initial_theta
-    return compared(problem, theta, runs_of(problem, theta, evaluator_of(problem).meshes))[1][0][0].fitted
+    return compare(problem, theta, evaluator_of(problem).simulate(theta))[1][0][0].fitted
 
 
 CLEAN = clean()

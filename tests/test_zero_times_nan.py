@@ -71,7 +71,7 @@ def test_both_engines_agree_on_what_is_not_a_number(name):
         theta = problem.initial_theta
         theta[-1] = b
         fast, slow = (evaluator(theta, method=method) for method in ("auto", "discrete-adjoint"))
-        assert all(native is not None for native in evaluator._natives(2))
+        assert evaluator.engine.name == "native", evaluator.engine
         assert (not np.isfinite([fast.cost, *fast.gradient, *fast.hessian.ravel()]).all()) == wrong
         for kind in ("cost", "gradient", "hessian"):
             one, other = np.atleast_1d(getattr(fast, kind)), np.atleast_1d(getattr(slow, kind))

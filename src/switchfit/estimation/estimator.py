@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.engine.adaptive import refined_mesh
-from switchfit.engine.choice import Engine
 from switchfit.fit.accuracy import worst_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.guards import on_guards
@@ -53,8 +52,6 @@ STOPPED = (Status.INTERRUPTED, Status.NONFINITE_START, Status.MAX_ITERATIONS)
 
 MOST_SENSITIVITIES = 2**28
 """Bytes that the derivatives of states and outputs at all nodes may take; beyond, figures have no bands."""
-
-GAUSS_NEWTON_ENGINE = Engine("jax", "the Gauss-Newton matrix has no machine code")
 
 ORDER = 5
 """Order of both integrators: what dividing the steps gains."""
@@ -413,7 +410,7 @@ def _estimate(
         least_squares=least_squares(problem),
         hessian_kind=hessian,
         tolerance=tolerance,
-        engine=GAUSS_NEWTON_ENGINE if hessian == "gauss-newton" else evaluator.engine,
+        engine=evaluator.engine,
         problem=problem,
         evaluator=evaluator,
         **rest,

@@ -50,7 +50,11 @@ def simulate_by_jax(
             if i > 0 and structure.reset_maps[i - 1] is not None:
                 through = partial(_through_reset, structure=structure, i=i - 1, tangents=tangents)
                 x, X = map(np.asarray, through(arguments, tau[i - 1], x, X, p))
-            here = slice(int(layout.first_chunk[i]) * CHUNK, int(layout.last_row[i]) + 1)
+            first = int(layout.first_chunk[i]) * CHUNK
+            count = int(layout.last_row[i]) + 1 - first
+            if i == structure.N:  # without the padding of the mesh
+                count = mesh.cells - int(layout.first_cell[i])
+            here = slice(first, first + count)
             pieces = Piece(whole.nodes[cell[here]], whole.signals[cell[here]])
             given = start[here], end[here], starts_d[here], ends_d[here], pieces
             x, X, added, columns = _segment(structure, arguments, mode, x, X, p, given, tangents)
