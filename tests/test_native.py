@@ -434,8 +434,14 @@ def test_inside_a_program_of_jax():
         assert_close(tuple(map(np.asarray, one(arguments, tau, P0))), expected)
         many = jax.jit(lambda a, taus, p: jax.lax.map(lambda t: foreign_derivatives(this.structure, a, t, p), taus))
         J, g, H = map(np.asarray, many(arguments, np.stack([tau, tau + 0.01]), P0))
-    assert_close((J[0], g[0], H[0]), expected)
-    assert_close((J[1], g[1], H[1]), this.discrete(arguments, tau + 0.01, P0))
+        at_once = jax.jit(
+            jax.vmap(lambda a, t, p: foreign_derivatives(this.structure, a, t, p), in_axes=(None, 0, None))
+        )
+        together = tuple(map(np.asarray, at_once(arguments, np.stack([tau, tau + 0.01]), P0)))
+    for k, shift in enumerate((0.0, 0.01)):
+        expected = this.discrete(arguments, tau + shift, P0)
+        assert_close((J[k], g[k], H[k]), expected)
+        assert_close(tuple(found[k] for found in together), expected)
 
 
 # The cache

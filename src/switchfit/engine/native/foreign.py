@@ -71,7 +71,7 @@ def foreign_derivatives(structure: Structure, arguments: Arguments, tau: Any, p:
     lengths = sums(library, sizes)
     of_memory = sum(length.at(cells + N) for length in memory(library, sizes, Order.HESSIAN).values())
     results = [jax.ShapeDtypeStruct((length,), np.float64) for length in (sum(lengths.values()), of_memory)]
-    totals = jax.ffi.ffi_call(name, results)(*buffers)[0]
+    totals = jax.ffi.ffi_call(name, results, vmap_method="expand_dims")(*buffers)[0]
     ends = dict(zip(lengths, np.cumsum(list(lengths.values())).tolist(), strict=True))
     J, g, H = (totals[ends[key] - lengths[key] : ends[key]] for key in ("J", "g", "H"))
     cost = J[0] + totals[-1]  # not a number where JAX has to look again, which the finisher of a batch lets it do

@@ -15,18 +15,23 @@ MAJOR, MINOR = 0, 1
 EXTENSION, ARGUMENTS, RESULTS = 8, 72, 112
 """Bytes into the frame: pointers to the first extension, to the arguments and to the results."""
 
-DATA, DIMENSIONS = 24, 40
-"""Bytes into a buffer: its data and its dimensions."""
+DATA, RANK, DIMENSIONS = 24, 32, 40
+"""Bytes into a buffer: its data, the number of its dimensions, and these."""
+
+RANKS = {"signals": 3, "units": 2, "value": 2, "weight": 2}
+"""Numbers of dimensions of what one experiment is given, where they are not 1."""
 
 
 def handler(driver: Driver) -> str:
-    """The handler: it fills the table of pointers, and calls the driver.
+    """The handler: it fills the table of pointers, and calls the driver, once for each of a batch.
 
     Its arguments are those of `workspace.GIVEN`, then those of the samples; its results are all sums in one, and the
-    memory.
+    memory. In a batch all of them have one dimension more, of length 1 where they are the same for all; the memory of
+    the first serves all, one after the other, and stays in the caches.
     """
     library, sizes = driver.library, driver.sizes
     measurements = len(library.measurements)
+    names = [*GIVEN, *(f"{name} {k}" for k in range(measurements) for name in OF_SAMPLES)]
     driver.line(f"%table = alloca [{len(driver.names) + len(OF_SAMPLES) * measurements} x i64]")
     driver.line("%progress = alloca [3 x i64]")
     extension = driver.load("ptr", driver.into("%frame", EXTENSION))
@@ -40,44 +45,61 @@ def handler(driver: Driver) -> str:
         driver.line(f"store i32 {value}, ptr {driver.into(metadata, offset)}")
     driver.line("ret ptr null")
     driver.label("run")
-    given, made = (driver.load("ptr", driver.into("%frame", place)) for place in (ARGUMENTS, RESULTS))
+    arguments, results = (driver.load("ptr", driver.into("%frame", place)) for place in (ARGUMENTS, RESULTS))
 
-    def data(buffers: str, k: int) -> tuple[str, str]:
-        """Data and dimensions of a buffer."""
-        buffer = driver.load("ptr", driver.into(buffers, 8 * k))
-        pointer, dimensions = (driver.load("ptr", driver.into(buffer, place)) for place in (DATA, DIMENSIONS))
-        return pointer, dimensions
+    def buffer(buffers: str, k: int) -> tuple[str, str, str]:
+        """Data, number of dimensions and dimensions of a buffer."""
+        pointer = driver.load("ptr", driver.into(buffers, 8 * k))
+        data, dimensions = (driver.load("ptr", driver.into(pointer, place)) for place in (DATA, DIMENSIONS))
+        return data, driver.load("i64", driver.into(pointer, RANK)), dimensions
 
-    found = {name: data(given, k)[0] for k, name in enumerate(GIVEN)}
+    totals, rank, dimensions = buffer(results, 0)
+    batched = driver.let(f"icmp eq i64 {rank}, 2")
+    leading = driver.let(f"zext i1 {batched} to i64")  # dimensions before those of one experiment
+    first = driver.load("i64", dimensions)
+    repeats = driver.let(f"select i1 {batched}, i64 {first}, i64 1")
+    between = buffer(results, 1)[0]
+    data, strides, lengths = {}, {}, {}
+    for k, name in enumerate(names):
+        data[name], _, dimensions = buffer(arguments, k)
+        size, own = "1", []
+        for axis in range(RANKS.get(name.split()[0], 1)):
+            place = driver.let(f"add i64 {leading}, {axis}")
+            own.append(driver.load("i64", driver.at(dimensions, place)))
+            size = driver.let(f"mul i64 {size}, {own[-1]}")
+        lengths[name] = own[0]
+        differs = driver.let(f"icmp sgt i64 {driver.load('i64', dimensions)}, 1")
+        both = driver.let(f"and i1 {batched}, {differs}")
+        strides[name] = driver.let(f"select i1 {both}, i64 {size}, i64 0")
+    driver.line("br label %loop")
+    driver.label("loop")
+    driver.line("%which = phi i64 [0, %run], [%following, %loop]")
+    found = {name: driver.at(data[name], driver.let(f"mul i64 %which, {strides[name]}")) for name in names}
     last = driver.load("i64", driver.at(found["first_cell"], sizes.N + 1))
     rows = driver.let(f"add i64 {last}, {sizes.N + 1}")
-
-    totals, first = data(made, 0)[0], 0
-    for name, size in sums(library, sizes).items():
-        found[name] = driver.at(totals, first)
-        first += size
-    zero(driver, totals, str(first))
-    between, position = data(made, 1)[0], "0"
-    for name, length in memory(library, sizes, driver.order).items():
-        found[name] = driver.at(between, position)
-        growing = driver.let(f"mul i64 {rows}, {length.each_row}")
-        count = driver.let(f"add i64 {growing}, {length.fixed}")
+    parts = sums(library, sizes)
+    own_totals, position = driver.at(totals, "%which", sum(parts.values())), 0
+    for name, length in parts.items():
+        found[name] = driver.at(own_totals, position)
+        position += length
+    zero(driver, own_totals, str(position))
+    place = "0"
+    for name, extent in memory(library, sizes, driver.order).items():
+        found[name] = driver.at(between, place)
+        growing = driver.let(f"mul i64 {rows}, {extent.each_row}")
+        count = driver.let(f"add i64 {growing}, {extent.fixed}")
         if name in ZEROED:
             zero(driver, found[name], count)
-        position = driver.let(f"add i64 {position}, {count}")
-    for k, name in enumerate(driver.names):
+        place = driver.let(f"add i64 {place}, {count}")
+    for k, name in enumerate([*driver.names, *names[len(GIVEN) :]]):
         driver.line(f"store ptr {found[name]}, ptr {driver.at('%table', k)}")
-    counts = ""
-    for k in range(measurements):
-        shapes = []
-        for m in range(len(OF_SAMPLES)):
-            pointer, dimensions = data(given, len(GIVEN) + len(OF_SAMPLES) * k + m)
-            at = driver.at("%table", len(driver.names) + len(OF_SAMPLES) * k + m)
-            driver.line(f"store ptr {pointer}, ptr {at}")
-            shapes.append(dimensions)
-        counts += f", i64 {driver.load('i64', shapes[0])}"
+    counts = "".join(f", i64 {lengths[f'{OF_SAMPLES[0]} {k}']}" for k in range(measurements))
     driver.line("store [3 x i64] [i64 0, i64 0, i64 9223372036854775807], ptr %progress")  # all at once
     driver.line(f"call void @evaluate(ptr %table, ptr %progress{counts})")
+    driver.line("%following = add i64 %which, 1")
+    driver.line(f"%more = icmp slt i64 %following, {repeats}")
+    driver.line("br i1 %more, label %loop, label %out")
+    driver.label("out")
     driver.line("ret ptr null")
     text = "\n".join(driver.lines)
     return (

@@ -1,0 +1,176 @@
+"""Both engines answer alike, whatever is asked; which one runs, and why; one program for many sequences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import switchfit as sf
+from switchfit.engine.native import program
+from switchfit.fit.evaluator import Evaluator, evaluator_of
+
+TIMES = np.linspace(0.0, 3.0, 16)
+VALUES = np.random.default_rng(5).normal(size=(16, 2))
+
+
+def swing(t, x, p):
+    return jnp.array([x[1], -p["k"] * jnp.sin(x[0]) - 0.2 * x[1]])
+
+
+def fall(t, x, p):
+    return jnp.array([x[1], -p["g"] + 0.1 * t * x[0]])
+
+
+def rest(t, x, p):
+    return -p["k"] * x
+
+
+MODES = {"swing": swing, "fall": fall, "rest": rest}
+BOUNCE = {("fall", "swing"): lambda t, x, p: jnp.array([x[0], -0.7 * p["k"] * x[1] + 0.1 * t])}
+GUARDS = {("swing", "fall"): lambda t, x, p: x[0] - 0.3 * p["k"] + 0.1 * t * x[1]}
+SYSTEM = sf.HybridSystem(MODES, [0.4, 0.1], BOUNCE)
+PARAMETERS = {"k": sf.Parameter(1.2, lower=0.1), "g": 0.8}
+
+
+def problem(data, sequence=("swing", "fall", "swing"), times=(1.1, 2.3), system=SYSTEM, parameters=None, **settings):
+    run = sf.Experiment(data, sequence, times, 0.0, 3.0)
+    return sf.Problem(system, run, PARAMETERS | (parameters or {}), **settings)
+
+
+def samples(**settings):
+    return sf.Measurements(TIMES, VALUES, **{"sigma": 0.5} | settings)
+
+
+DATA = {
+    "samples": samples(),
+    "robust, sigma a parameter": samples(loss="cauchy", loss_scale=1.5, sigma="s"),
+    "late": sf.Measurements(TIMES[2:], VALUES[2:], lambda t, x, p: x * (1 + 0.1 * t), sigma=0.5, delay="d"),
+    "late, robust": sf.Measurements(TIMES[2:], VALUES[2:], sigma="s", delay="d", loss="soft_l1"),
+    "reference, running": [
+        sf.ReferenceSignal.from_samples(TIMES, VALUES, weights=np.array([[2.0, 0.3], [0.3, 1.0]])),
+        sf.RunningCost(lambda t, x, p: x[0] ** 2 * x[1] ** 2 + p["k"] * t * x[0]),
+        sf.Measurements(TIMES[2:], VALUES[2:], sigma=0.5, delay="d"),
+    ],
+    "end": [samples(), sf.TerminalCost(lambda x, p: p["k"] * x[0] ** 2 * x[1])],
+}
+MORE = {"s": sf.Parameter(0.7, lower=0.1), "d": sf.Parameter(0.13, lower=0.0, upper=0.25)}
+
+
+def both(given):
+    """The evaluators of machine code and of JAX, on the same mesh."""
+    native = Evaluator(replace(given, engine="native"))
+    return native, Evaluator(replace(given, engine="jax"), meshes=native.meshes)
+
+
+@pytest.mark.parametrize("matrix", ["exact", "gauss-newton", "none"])
+@pytest.mark.parametrize("name", DATA)
+def test_derivatives_are_the_same(name, matrix):
+    given = problem(DATA[name], parameters=MORE)
+    native, by_jax = both(given)
+    for theta in (given.initial_theta, given.checked_theta([1.2, 1.2, 1.3, 0.7, 0.8, 0.2])):
+        found, expected = native(theta, matrix=matrix), by_jax(theta, matrix=matrix)
+        np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-12)
+        np.testing.assert_allclose(found.gradient, expected.gradient, rtol=1e-10, atol=1e-11)
+        np.testing.assert_allclose(found.hessian, expected.hessian, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["late", "reference, running"])
+def test_simulations_of_late_samples_are_the_same(name):
+    given = problem(DATA[name], parameters=MORE)
+    for found, expected in zip(*(each.simulate(given.initial_theta) for each in both(given)), strict=True):
+        assert found.cost == pytest.approx(expected.cost, rel=1e-12)
+        for one, other in zip(found.seen, expected.seen, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-12)
+
+
+def test_constraints_are_the_same():
+    data = [samples(), sf.TerminalConstraint(lambda x, p: jnp.array([x[0] * x[1] - 0.3, p["k"] * x[1] ** 2]))]
+    given = problem(data, system=sf.HybridSystem(MODES, [0.4, 0.1], BOUNCE, guards=GUARDS))
+    multipliers, penalty = np.array([0.7, -1.3, 0.4]), np.array([2.0, 0.5, 3.0])
+    found, expected = (each.constrained(given.initial_theta, 1, multipliers, penalty) for each in both(given))
+    for name in ("cost", "gradient", "value", "slope", "hessian", "constraints", "jacobian"):
+        one, other = getattr(found, name), getattr(expected, name)
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-10, err_msg=name)
+
+
+def programs():
+    return program._program_of.cache_info().misses
+
+
+def test_every_sequence_of_the_same_modes_runs_in_one_program():
+    first = problem(samples(), ("swing", "fall", "rest"))
+    evaluator_of(first)(first.initial_theta)
+    count = programs()
+    for sequence in (("fall", "rest", "swing"), ("rest", "swing", "fall")):
+        given = problem(samples(), sequence)
+        native, by_jax = both(given)
+        theta = given.initial_theta
+        np.testing.assert_allclose(native(theta).hessian, by_jax(theta).hessian, rtol=1e-9, atol=1e-9)
+    assert programs() == count
+
+
+SEQUENCES = {
+    ("swing",): (),
+    ("fall", "swing"): (1.3,),
+    ("swing", "fall", "swing"): (0.6, 2.2),
+    ("rest", "fall", "swing", "rest", "fall"): (0.5, 1.0, 1.7, 2.0),
+    ("swing", "swing", "rest"): (1.0, 1.0),
+}
+
+
+@pytest.mark.parametrize("data", ["samples", "late", "reference, running"])
+def test_sequences_of_any_length_run_in_a_program_with_room_for_them(data):
+    """Sequences with fewer transitions leave segments idle: same cost, derivatives, simulations, guards."""
+    system = sf.HybridSystem(MODES, [0.4, 0.1], BOUNCE, guards=GUARDS)
+    counts = []
+    for sequence, times in SEQUENCES.items():
+        given = problem(DATA[data], sequence, times, system, MORE, max_transitions=4)
+        native, by_jax = both(given)
+        theta = given.initial_theta
+        found, expected = native(theta), by_jax(theta)
+        np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-12)
+        np.testing.assert_allclose(found.gradient, expected.gradient, rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(found.hessian, expected.hessian, rtol=1e-9, atol=1e-8)
+        assert native.cost(theta) == pytest.approx(expected.cost, rel=1e-12)
+        for one, other in zip(*(each.simulate(theta, tangents=True) for each in (native, by_jax)), strict=True):
+            np.testing.assert_allclose(one.after, other.after, rtol=1e-11, atol=1e-12)
+            np.testing.assert_allclose(one.tangents.after, other.tangents.after, rtol=1e-10, atol=1e-11)
+        if given.constraint_names:
+            one, other = (each.constrained(theta, 1, 0.7, 2.0) for each in (native, by_jax))
+            np.testing.assert_allclose(one.jacobian, other.jacobian, rtol=1e-10, atol=1e-11)
+            np.testing.assert_allclose(one.hessian, other.hessian, rtol=1e-9, atol=1e-8)
+        counts.append(programs())
+    assert len(set(counts)) == 1
+
+
+def test_room_for_fewer_transitions_than_there_are_is_refused():
+    with pytest.raises(ValueError, match="max_transitions is 1, but a mode_sequence has 2 transitions"):
+        problem(samples(), max_transitions=1)
+
+
+def test_the_problem_says_which_engine_it_wants():
+    given = problem(samples())
+    assert evaluator_of(given).engine == evaluator_of(replace(given, engine="native")).engine
+    assert str(evaluator_of(replace(given, engine="jax")).engine) == "Evaluated by JAX: engine='jax' asks for it."
+    with pytest.raises(ValueError, match=r"engine must be one of auto, native, jax|engine"):
+        problem(samples(), engine="gpu")
+
+
+def test_machine_code_that_is_insisted_on_is_refused_with_the_reason():
+    given = problem(samples(), engine="native", solver="stiff")
+    with pytest.raises(ValueError, match="engine='native' asks for machine code, but solver='stiff' takes implicit"):
+        sf.estimate(given)
+
+
+def test_an_experiment_without_machine_code_does_not_send_the_others_to_jax():
+    hard = sf.HybridSystem(MODES | {"hard": lambda t, x, p: jnp.fft.fft(x).real * -p["k"]}, [0.4, 0.1])
+    runs = [sf.Experiment(samples(), (mode,), (), 0.0, 3.0) for mode in ("hard", "swing")]
+    given = sf.Problem(hard, runs, PARAMETERS)
+    evaluator = evaluator_of(given)
+    assert [each.engine.name for each in evaluator.engines] == ["jax", "native"]
+    assert "(in run1; the other experiments run in machine code)" in evaluator.engine.reason
+    expected = evaluator(given.initial_theta, method="discrete-adjoint")
+    np.testing.assert_allclose(evaluator(given.initial_theta).hessian, expected.hessian, rtol=1e-10, atol=1e-11)
