@@ -16,7 +16,7 @@ from test_report import made, several
 from test_save import CERTIFICATE, with_everything_odd, without_numbers
 
 import switchfit as sf
-from switchfit.io.json import save_fit
+from switchfit.estimation.saved import save_fit
 
 SIZES = [pytest.param(100, id="short"), pytest.param(12_000, id="long", marks=pytest.mark.fuzz)]
 ODD: tuple[Any, ...] = (
@@ -40,7 +40,7 @@ def saved() -> list[dict[str, Any]]:
 
 
 def _content(fit: sf.result.Fit) -> dict[str, Any]:
-    from switchfit.io.json import FORMAT, VERSION, _encoded
+    from switchfit.estimation.saved import FORMAT, VERSION, _encoded
 
     return json.loads(
         json.dumps({"format": FORMAT, "version": VERSION, "fit": _encoded(fit), "certificate": _encoded(CERTIFICATE)})

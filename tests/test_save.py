@@ -16,8 +16,8 @@ from hypothesis.extra import numpy as hnp
 from test_report import comparison_of, made, several, trajectory_of
 
 import switchfit as sf
+from switchfit.estimation.saved import FORMAT, VERSION, load_fit, save_fit
 from switchfit.fit.result import Certificate, Fit
-from switchfit.io.json import FORMAT, VERSION, load_fit, save_fit
 from switchfit.optimize import Status
 
 CERTIFICATE = Certificate(

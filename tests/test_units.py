@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
-from switchfit.io.json import load_fit, save_fit
+from switchfit.estimation.saved import load_fit, save_fit
 from switchfit.io.problem_file import load_problem
 from switchfit.io.summary import describe
 from switchfit.report.plot import plot_comparison, plot_fit, plot_modes, plot_residuals, plot_state
