@@ -123,11 +123,11 @@ def load_fit(path: Path) -> tuple[Fit, Certificate]:
 
 def _to_json(record: Any, kind: type) -> Any:
     """A dataclass by the fields of `kind` in terms of dict, list, str, int, finite float, bool and None."""
-    from pydantic_core import to_jsonable_python  # here, since importing it takes longer than a small fit
+    from pydantic_core import to_json  # here, since importing it takes longer than a small fit
 
     values = {f.name: getattr(record, f.name) for f in fields(kind)}
     named = {name: value.name if isinstance(value, Enum) else value for name, value in values.items()}
-    return to_jsonable_python(named, inf_nan_mode="strings", fallback=_array_to_json)
+    return json.loads(to_json(named, inf_nan_mode="strings", fallback=_array_to_json))
 
 
 def _array_to_json(value: Any) -> Any:
@@ -187,7 +187,7 @@ def _adapter(kind: type) -> Any:
 
 def _read_type(hint: Any) -> Any:
     """The type hint of a field as pydantic is to read it from JSON: arrays, names of statuses, lists for tuples."""
-    from pydantic import BeforeValidator, ConfigDict, PlainValidator, Strict, create_model
+    from pydantic import AfterValidator, BeforeValidator, ConfigDict, PlainValidator, Strict, create_model
 
     origin, inner = get_origin(hint), get_args(hint)
     if isinstance(hint, type) and is_dataclass(hint):
@@ -199,6 +199,8 @@ def _read_type(hint: Any) -> Any:
         return Annotated[Any, PlainValidator(partial(_array, np.dtype(get_args(inner[1])[0])))]
     if isinstance(hint, type) and issubclass(hint, Enum):
         return Annotated[Any, PlainValidator(partial(_member, hint))]
+    if hint is str:
+        return Annotated[str, AfterValidator(_text)]
     if hint is float:
         return Annotated[Any, PlainValidator(_number)]
     if origin is tuple:
@@ -207,7 +209,7 @@ def _read_type(hint: Any) -> Any:
     if origin in (UnionType, Union):
         return Union[tuple(_read_type(entry) for entry in inner)]  # noqa: UP007  # of a list that is known at run time
     if isinstance(origin, type) and issubclass(origin, Mapping):
-        return dict[str, _read_type(inner[1])]  # type: ignore[misc]
+        return dict[_read_type(str), _read_type(inner[1])]  # type: ignore[misc]
     return hint
 
 
@@ -292,8 +294,12 @@ def _checked(value: Any, kind: type) -> Any:
     if type(value) is not kind:
         words = {list: "a list", str: "a string", int: "an integer", bool: "true or false"}
         raise ValueError(f"must be {words[kind]}; got {_shown(value)}")
-    if isinstance(value, str):
-        value.encode()  # half of a surrogate pair can be written as JSON, but is no text
+    return _text(value) if isinstance(value, str) else value
+
+
+def _text(value: str) -> str:
+    """`value`; ValueError for half of a surrogate pair, which can be written as JSON, but is no text."""
+    value.encode()
     return value
 
 
@@ -327,8 +333,6 @@ def _sentence(error: Mapping[str, Any], content: Any, top: str) -> str:
         return f"{where} must have {error['ctx']['max_length']} entries; got {len(given)}"
     if kind in WORDS:
         return f"{where} must be {WORDS[kind]}; got {_shown(given)}"
-    if kind == "string_unicode":
-        return f"{where} must be text; surrogates not allowed"
     return f"{where}: {error['msg'][:1].lower()}{error['msg'][1:]}; got {_shown(given)}"
 
 
@@ -352,8 +356,7 @@ def _upgrade(content: dict[str, Any]) -> None:
         _upgrade_fit(content["fit"], content["version"])
         _upgrade_certificate(content["certificate"], content["fit"], content["version"])
     except (LookupError, TypeError, AttributeError) as error:
-        kind = type(error).__name__
-        raise ValueError(f"it is not what version {content['version']} holds ({kind}: {first_line(error)})") from error
+        raise ValueError(f"it is not what version {content['version']} holds ({first_line(error)})") from error
 
 
 def _upgrade_fit(fit: dict[str, Any], version: int) -> None:
