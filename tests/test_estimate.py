@@ -13,6 +13,7 @@ import scipy.stats
 import switchfit as sf
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import minimized
+from switchfit.fit.termination import termination_of
 
 # A capacitor that is charged through one resistor and discharged through another one
 
@@ -325,8 +326,8 @@ def test_a_fit_that_is_out_of_iterations_is_not_resumed_with_none_left():
 def test_a_fit_that_is_out_of_iterations_on_a_finer_mesh_says_how_many_there_were():
     problem = capacitor(voltage(TIMES))
     result = minimized(evaluator_of(problem), problem.initial_theta, "exact", 1e-7, 1)
-    stopped = replace(result, iterations=12, earlier=9)
-    assert "Stopped after 12 iterations, 9 of them before the mesh was refined, with" in stopped.message
+    stopped = termination_of(replace(result, iterations=12, earlier=9), problem)
+    assert "Stopped after 12 iterations, 9 of them before the mesh was refined, with" in str(stopped)
 
 
 def test_times_out_of_order_by_rounding_are_put_in_order():

@@ -162,7 +162,7 @@ def test_twenty_unknowns_over_eight_decades():
     found = analyse(H, np.eye(d), theta, names, ("",) * d, np.zeros(d, bool), cost, 0.02, "1 % of J", "solution")
     np.testing.assert_allclose(found.eigenvalues[[0, -1]], [1e-4, 1.9999], rtol=1e-6)
     (direction,) = found.directions
-    assert set(direction.unknowns) == {"p4", "p11"}
+    assert set(direction.names) == {"p4", "p11"}
     assert set(direction.summary.removesuffix(" trade off").split(" and ")) == {"p4", "p11"}
     assert np.flatnonzero(np.abs(direction.weights) > 1e-6).tolist() == [4, 11]
     # No unknown moves by more than its own size, so that J rises by less than asked for.

@@ -112,7 +112,7 @@ def load_fit(path: Path) -> tuple[Fit, Certificate]:
         _check_fit(fit)
         if version < VERSION:
             directions = after(fit, None).directions
-            certificate = replace(certificate, worst_unknowns=directions[0].unknowns if directions else ())
+            certificate = replace(certificate, worst_unknowns=directions[0].names if directions else ())
         return fit, certificate
     except (ValueError, OverflowError, RecursionError, MemoryError) as error:
         raise ValueError(f"{path} is damaged: {error}.") from error
@@ -353,18 +353,17 @@ def _place(loc: Iterable[Any], content: Any, top: str) -> str:
 def _upgrade(content: dict[str, Any]) -> None:
     """Bring the content of a file of version 2 or 3 to version 4, in place."""
     try:
-        _upgrade_fit(content["fit"], content["version"])
-        _upgrade_certificate(content["certificate"], content["fit"], content["version"])
+        _upgrade_fit(content["fit"])
+        _upgrade_certificate(content["certificate"], content["fit"])
     except (LookupError, TypeError, AttributeError) as error:
         raise ValueError(f"it is not what version {content['version']} holds ({first_line(error)})") from error
 
 
-def _upgrade_fit(fit: dict[str, Any], version: int) -> None:
+def _upgrade_fit(fit: dict[str, Any]) -> None:
     names, theta = fit["theta_names"], fit["theta"]
-    if version == 2:
-        for trajectory in fit["trajectories"]:
-            trajectory.setdefault("time_unit", "s")
-        fit.update({"engine": None, "idle": [], "integration_error_of": "J"} | fit)
+    for trajectory in fit["trajectories"]:
+        trajectory.setdefault("time_unit", "s")
+    fit.update({"engine": None, "idle": [], "integration_error_of": "J"} | fit)  # files of version 2 lack them
     fit["run_names"], fit["transition_places"] = _find_transitions(fit)
     units = {name.partition("[")[0]: unit for name, unit in zip(names, fit["theta_units"], strict=False)}
     fit["parameter_units"] = {name: units.get(name, "") for name in fit["parameters"]}
@@ -382,9 +381,8 @@ def _upgrade_fit(fit: dict[str, Any], version: int) -> None:
     fit |= {"earlier_iterations": 0, "smallest_eigenvalue": "NaN", "flat_direction": [], "violated": []}
 
 
-def _upgrade_certificate(certificate: dict[str, Any], fit: dict[str, Any], version: int) -> None:
-    if version == 2:
-        certificate.setdefault("integration_error_of", "J")
+def _upgrade_certificate(certificate: dict[str, Any], fit: dict[str, Any]) -> None:
+    certificate.setdefault("integration_error_of", "J")
     del certificate["worst_direction"]
     failures = [{"kind": "message", "subjects": [text], "figures": {}} for text in certificate["failures"]]
     certificate |= {"worst_unknowns": [], "active": fit["active"], "kinks": fit["kinks"], "failures": failures}

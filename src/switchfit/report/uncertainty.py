@@ -163,7 +163,7 @@ def write_direction(found: Identifiability, direction: Direction) -> str:
     """
     # A change that is described as its opposite where only that side is allowed.
     side = -1.0 if np.isnan(direction.rises[0]) and np.isfinite(direction.rises[1]) else 1.0
-    places = [found.theta_names.index(name) for name in direction.unknowns]
+    places = [found.theta_names.index(name) for name in direction.names]
     moves = join_words([_move(found, i, side * float(direction.change[i])) for i in places])
     rise = _RISES[found.meaning].format(f"{found.rise:.2g}") if found.rise > 0 else ""
     seen = _rises(direction, rise, found.cost) if found.tried else f", or the opposite, should raise J little; {rise}."

@@ -123,7 +123,7 @@ def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
         smallest_eigenvalue=free_curvature(fit).smallest,
         smallest_scaled_eigenvalue=smallest,
         condition_number=found.condition_number if len(scaled) else np.inf,
-        worst_unknowns=found.directions[0].unknowns if found.directions else (),
+        worst_unknowns=found.directions[0].names if found.directions else (),
         integration_error=fit.integration_error,
         integration_error_of=fit.integration_error_of,
         gradient_gap=float(gaps[0]),

@@ -75,7 +75,7 @@ class Direction:
         The change of theta that was tried, a multiple of the scaled eigenvector, in units.
     rises : (float, float)
         By how much J rises at theta + change and at theta - change; NaN where that is not allowed.
-    unknowns : tuple of str
+    names : tuple of str
         The unknowns that it mostly consists of, the one with the largest weight first.
     """
 
@@ -83,12 +83,12 @@ class Direction:
     weights: FloatArray
     change: FloatArray
     rises: tuple[float, float]
-    unknowns: tuple[str, ...]
+    names: tuple[str, ...]
 
     @property
     def summary(self) -> str:
         """The combination in words, such as "tau_2 and mu trade off"."""
-        return str(Combination(self.unknowns))
+        return str(Combination(self.names))
 
 
 @dataclass(frozen=True, eq=False)
