@@ -422,7 +422,7 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
         (("fit", "parameter_units"), {"mu": "1"}, "fit.parameter_units lacks the parameter 'g'"),
         (("fit", "fixed"), ["h"], "fit.fixed has the name 'h', which is none of fit.parameters"),
         (("fit", "idle"), ["h"], "fit.idle has the name 'h', which is none of fit.theta_names"),
-        (("fit", "active"), [{"kind": "bound"}], "fit.active[0].kind: input should be 'collapsed', "),
+        (("fit", "active"), [{"kind": "bound"}], "fit.active[0].kind must be 'collapsed', "),
         (("fit", "reason"), {"kind": "jump", "subjects": "mu", "figures": {}}, "fit.reason.subjects must be a list"),
         (("fit", "reason"), {"kind": "jump", "subjects": [], "figures": {"at": "a"}}, "fit.reason.figures.at"),
     ],

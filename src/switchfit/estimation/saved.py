@@ -333,7 +333,7 @@ def _sentence(error: Mapping[str, Any], content: Any, top: str) -> str:
         return f"{where} must have {error['ctx']['max_length']} entries; got {len(given)}"
     if kind in WORDS:
         return f"{where} must be {WORDS[kind]}; got {_shown(given)}"
-    return f"{where}: {error['msg'][:1].lower()}{error['msg'][1:]}; got {_shown(given)}"
+    return f"{where} must be {error['msg'].removeprefix('Input should be ')}; got {_shown(given)}"
 
 
 def _place(loc: Iterable[Any], content: Any, top: str) -> str:
