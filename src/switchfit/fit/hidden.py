@@ -40,9 +40,9 @@ def refuse_hidden_switches(evaluator: Evaluator, theta: FloatArray, gradient: Fl
     if hidden:
         spans = unknowns.parameters.items()
         name = next((name for name, span in spans if span.start <= hidden[0] < span.stop), unknowns.names[hidden[0]])
+        shown = ", ".join(unknowns.names[i] for i in hidden)
         raise ValueError(
-            f"the cost changes with {', '.join(unknowns.names[i] for i in hidden)}, but its derivative is zero wherever it was tried: "
-            f"{_advice(name)}"
+            f"the cost changes with {shown}, but its derivative is zero wherever it was tried: {_advice(name)}"
         )
 
 
