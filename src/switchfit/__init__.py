@@ -1,6 +1,5 @@
 """switchfit: when did the system switch mode, and what were its parameters?"""
 
-from switchfit import report as _report  # noqa: F401  # registers how results are written and drawn
 from switchfit.batch.fits import Fits
 from switchfit.batch.logs import estimate_many
 from switchfit.batch.resampling import Bootstrap, bootstrap
@@ -28,6 +27,10 @@ from switchfit.uncertainty.profiles import Profile, profile
 from switchfit.uncertainty.residuals import ChannelResiduals, ResidualDiagnostics
 
 compile_small_loops_whole()
+
+# The modules of this room register how results are written and drawn. The import comes last: a few levels deeper, as
+# they would be if this was the first, all other imports together take a tenth longer.
+from switchfit import report as _report  # noqa: E402, F401
 
 __version__ = "0.1.0"
 
