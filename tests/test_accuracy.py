@@ -54,7 +54,7 @@ def test_the_error_that_is_reported_is_that_of_the_end():
     assert fit.integration_error == pytest.approx(errors[worst], rel=0.1)
     assert f"{fit.integration_error:.1e}   (of terminal constraint {worst + 1}, relative" in str(fit)
     assert f"{fit.integration_error:.1e} (terminal constraint {worst + 1})" in str(fit.certificate)
-    assert f"the integration error of terminal constraint {worst + 1} is" in fit.certificate.failures[0]
+    assert f"the integration error of terminal constraint {worst + 1} is" in str(fit.certificate.failures[0])
 
 
 def test_the_error_does_not_depend_on_where_time_begins():

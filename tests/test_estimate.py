@@ -13,6 +13,7 @@ import scipy.stats
 import switchfit as sf
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import minimized
+from switchfit.fit.termination import termination_of
 
 # A capacitor that is charged through one resistor and discharged through another one
 
@@ -120,7 +121,10 @@ def test_a_bound_that_is_reached_is_named():
     found = sf.estimate(capacitor(voltage(TIMES), k=sf.Parameter(GUESS[1:], upper=[1.6, 5.0])))
     assert found.success
     assert found.parameters["k"][0] == 1.6
-    assert found.active == ("k[0] at its upper bound 1.6",)
+    (active,) = found.active
+    assert (active.kind, active.unknown, active.value) == ("upper bound", "k[0]", 1.6)
+    assert active.multiplier == pytest.approx(-found.gradient[1], rel=1e-9)
+    assert str(active) == "k[0] at its upper bound 1.6"
     assert "k[0] at its upper bound 1.6" in found.message
     assert found.gradient[1] < -1.0
     np.testing.assert_allclose(found.gradient[[0, 2]], 0.0, atol=1e-7)
@@ -133,14 +137,17 @@ def test_a_bound_on_a_transition_time():
     found = sf.estimate(capacitor(voltage(TIMES), tau=sf.Parameter(0.8, lower=0.7, upper=1.0)))
     assert found.success
     assert found.transition_times[0][0] == 0.7
-    assert found.active == ("tau_1 at its lower bound 0.7",)
+    assert list(map(str, found.active)) == ["tau_1 at its lower bound 0.7"]
 
 
 def test_a_minimum_duration_that_is_reached_is_named():
     found = sf.estimate(capacitor(voltage(TIMES), min_duration=0.75))
     assert found.success
     assert found.transition_times[0][0] == pytest.approx(0.75, abs=1e-12)
-    assert found.active == ("mode 1 ('charge') is at its minimum duration",)
+    (active,) = found.active
+    assert (active.kind, active.mode, active.position, active.value) == ("minimum duration", "charge", 0, 0.75)
+    assert active.multiplier == pytest.approx(found.gradient[0], rel=1e-9)
+    assert str(active) == "mode 1 ('charge') is at its minimum duration"
 
 
 # Kinks
@@ -166,10 +173,10 @@ def test_a_transition_that_ends_at_a_sample_is_reported_as_a_kink(guess):
     assert found.status is sf.Status.CONVERGED_AT_KINK
     assert found.success
     assert found.theta[0] == 0.5
-    ((name, left, right),) = found.kinks
-    assert name == "tau_1"
-    assert left == pytest.approx(-0.7, rel=1e-9)
-    assert right == pytest.approx(0.3, rel=1e-9)
+    (kink,) = found.kinks
+    assert (kink.unknown, kink.value) == ("tau_1", 0.5)
+    assert kink.left == pytest.approx(-0.7, rel=1e-9)
+    assert kink.right == pytest.approx(0.3, rel=1e-9)
     assert "kink of the cost: tau_1 = 0.5, where the derivative jumps from -7.0e-01 to 3.0e-01" in found.message
     assert found.optimality < 1e-12
     assert np.abs(found.gradient).max() > 0.1
@@ -319,8 +326,8 @@ def test_a_fit_that_is_out_of_iterations_is_not_resumed_with_none_left():
 def test_a_fit_that_is_out_of_iterations_on_a_finer_mesh_says_how_many_there_were():
     problem = capacitor(voltage(TIMES))
     result = minimized(evaluator_of(problem), problem.initial_theta, "exact", 1e-7, 1)
-    stopped = replace(result, iterations=12, earlier=9)
-    assert "Stopped after 12 iterations, 9 of them before the mesh was refined, with" in stopped.message
+    stopped = termination_of(replace(result, iterations=12, earlier=9), problem)
+    assert "Stopped after 12 iterations, 9 of them before the mesh was refined, with" in str(stopped)
 
 
 def test_times_out_of_order_by_rounding_are_put_in_order():
@@ -367,7 +374,9 @@ def test_a_mode_that_collapses_between_two_of_the_same_is_reported_as_such():
     assert found.success
     assert found.idle == ("tau_2", "tau_3", "leak")
     assert found.theta[1] == found.theta[2]
-    assert found.active == ("mode 3 ('drain') has collapsed to nothing",)
+    (active,) = found.active
+    assert (active.kind, active.mode, active.position) == ("collapsed", "drain", 2)
+    assert str(active) == "mode 3 ('drain') has collapsed to nothing"
     # All else is what it is without that mode, and so are the standard errors.
     known = [found.theta_names.index(name) for name in plain.theta_names]
     np.testing.assert_allclose(found.theta[known], plain.theta, rtol=1e-6)
@@ -390,7 +399,7 @@ def test_a_parameter_that_acts_only_in_a_mode_that_collapsed_at_the_start_is_nam
     assert found.status is sf.Status.COLLAPSED
     assert found.theta[0] == 0.0
     assert found.idle == ("leak",)
-    assert "mode 1 ('drain') has collapsed to nothing" in found.active
+    assert "mode 1 ('drain') has collapsed to nothing" in map(str, found.active)
 
 
 @pytest.mark.parametrize("rate", [0.8, 1.0])
@@ -528,7 +537,7 @@ def test_twenty_transitions_and_ten_parameters_on_two_thousand_nodes():
     found = sf.estimate(problem)
     assert found.success, found.message
     assert found.iterations <= 30
-    kinks = [found.theta_names.index(name) for name, *_ in found.kinks]
+    kinks = [found.theta_names.index(kink.unknown) for kink in found.kinks]
     free = np.setdiff1d(np.arange(30), kinks)
     assert len(kinks) < 10
     assert np.all(np.abs(found.theta - truth)[free] < 5 * found.standard_errors[free])

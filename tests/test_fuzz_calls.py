@@ -737,9 +737,10 @@ def cheap_doors(doors, monkeypatch):
 def test_the_doors_are_all_that_is_public(doors):
     """What is missing here is made by switchfit, not by users."""
     made_by_switchfit = {
-        "Bootstrap", "Certificate", "ChannelResiduals", "Comparison", "DerivativeCheck", "Direction", "Estimate",
-        "Evaluation", "Fits", "GuardedEvaluation", "Identifiability", "MonteCarlo", "Multistart", "Prediction",
-        "Profile", "ResidualDiagnostics", "Status", "Trajectory",
+        "ActiveConstraint", "Bootstrap", "Certificate", "ChannelResiduals", "Comparison", "DerivativeCheck",
+        "Direction", "Estimate", "Evaluation", "Fits", "GuardedEvaluation", "Identifiability", "Issue", "Kink",
+        "MonteCarlo", "Multistart", "Prediction", "Profile", "ResidualDiagnostics", "Status", "Termination",
+        "Trajectory",
     }  # fmt: skip
     assert set(sf.__all__) - made_by_switchfit <= set(doors)
 

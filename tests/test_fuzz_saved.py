@@ -16,7 +16,11 @@ from test_report import made, several
 from test_save import CERTIFICATE, with_everything_odd, without_numbers
 
 import switchfit as sf
-from switchfit.io.json import save_fit
+from switchfit.estimation.saved import save_fit
+from switchfit.fit.result import Fit
+from switchfit.fit.termination import Kink
+from switchfit.problem.constraints import ActiveConstraint
+from switchfit.uncertainty.certificate import Certificate
 
 SIZES = [pytest.param(100, id="short"), pytest.param(12_000, id="long", marks=pytest.mark.fuzz)]
 ODD: tuple[Any, ...] = (
@@ -33,17 +37,25 @@ def saved() -> list[dict[str, Any]]:
     """Contents of files of several kinds of fits."""
     constrained = made(
         constraints=(("x_1 at the end", 1e-9, 2.0),), priors={"mu": "normal(1, 2)"}, log_scaled=("mu",),
-        kinks=(("tau_1", -1.0, 1.0),), active=("mu at its lower bound 0.05",), saved_gauss_newton=np.eye(3) * 300.0,
+        kinks=(Kink("tau_1", 4.0, -1.0, 1.0),), active=(ActiveConstraint("lower bound", 0.05, "mu"),),
+        saved_gauss_newton=np.eye(3) * 300.0,
     )  # fmt: skip
     fits = [made(), made(sigma_known=False), several(3), without_numbers(), with_everything_odd(), constrained]
     return [_content(fit) for fit in fits]
 
 
-def _content(fit: sf.result.Fit) -> dict[str, Any]:
-    from switchfit.io.json import FORMAT, VERSION, _encoded
+def _content(fit: Fit) -> dict[str, Any]:
+    from switchfit.estimation.saved import FORMAT, VERSION, _to_json
 
     return json.loads(
-        json.dumps({"format": FORMAT, "version": VERSION, "fit": _encoded(fit), "certificate": _encoded(CERTIFICATE)})
+        json.dumps(
+            {
+                "format": FORMAT,
+                "version": VERSION,
+                "fit": _to_json(fit, Fit),
+                "certificate": _to_json(CERTIFICATE, Certificate),
+            }
+        )
     )
 
 

@@ -6,7 +6,7 @@ orders and by four methods that agree.
 
 import re
 import textwrap
-import types
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -17,8 +17,10 @@ import pytest
 import switchfit as sf
 from switchfit.engine.jax.programs import derivatives
 from switchfit.fit.evaluator import evaluator_of
-from switchfit.fit.solution import message_of
+from switchfit.fit.termination import termination_of
 from switchfit.fit.trajectory import compare
+from switchfit.optimize import Result
+from switchfit.optimize.diagnosis import Finding
 from switchfit.problem.functions import float64
 from switchfit.problem.losses import LOSSES, influence, robust
 from switchfit.problem.priors import PriorTerms
@@ -203,7 +205,7 @@ def test_covariance_of_a_robust_fit_is_the_inverse_of_its_hessian():
 def test_where_rho_bends_down_the_exact_hessian_is_indefinite_and_the_fit_converges():
     far = problem(k=3.5, loss="cauchy", loss_scale=1.0)
     assert np.linalg.eigvalsh(sf.evaluate(far).hessian).min() < 0
-    assert sf.estimate(far).status.successful
+    assert sf.estimate(far).status.is_strict_minimum
 
 
 # Priors
@@ -410,7 +412,8 @@ def test_a_logarithmic_scale_changes_the_path_and_the_intervals_alone():
 def test_a_logarithmic_scale_stays_positive_and_bounds_hold():
     found = sf.estimate(problem(k=sf.Parameter(2.0, lower=0.1, upper=2.05, scale="log")))
     assert found.theta[1] == 2.05
-    assert found.active == ("k at its upper bound 2.05",)
+    assert list(map(str, found.active)) == ["k at its upper bound 2.05"]
+    assert found.active[0].multiplier == pytest.approx(-found.gradient[1], rel=1e-9)
     assert found.standard_errors[1] == 0.0
     far = sf.estimate(problem(k=sf.Parameter(0.01, scale="log")), max_iterations=3)
     assert all(record.theta[1] > 0 for record in far.history)
@@ -436,8 +439,15 @@ def test_a_line_search_that_failed_tells_of_a_delay_that_is_estimated():
         unknowns = {"k": 1.0, "d": sf.Parameter(0.1, lower=0.0, upper=0.5)}
         return sf.Problem(system, sf.Experiment(data, ("on", "off"), (1.0,), 0.0, 3.0), unknowns)
 
-    failed = types.SimpleNamespace(status=sf.Status.LINE_SEARCH_FAILED, message="theta[0] stops.")
-    assert message_of(failed, problem("d")).startswith("tau_1 stops. A delay is estimated here: J has a kink")
-    assert message_of(failed, problem(0.1)) == "tau_1 stops."
-    done = types.SimpleNamespace(status=sf.Status.CONVERGED, message="theta[1] is fine.")
-    assert message_of(done, problem("d")) == "k is fine."
+    result = Result(
+        theta=np.array([1.0, 1.0, 0.1]), cost=1.0, gradient=np.zeros(3), hessian=np.eye(3), optimality=0.1,
+        iterations=1, evaluations=1, status=sf.Status.LINE_SEARCH_FAILED, active=(), multipliers=np.zeros(0), kinks=(),
+        free_basis=np.eye(3), free_eigenvalues=np.ones(3), smallest_eigenvalue=1.0, smallest_unscaled_eigenvalue=1.0,
+        flat_direction=np.zeros(3), tolerance=1e-7, history=(), reason=Finding("jump", 0.1, 1.0, 2.0, ((0, 1.5),)),
+    )  # fmt: skip
+    hint = "A delay is estimated here: J has a kink where a transition meets the moment of which a late sample is"
+    jump = "The cost jumps from 1 to 2 where tau_1 passes 1.5. The optimiser needs a cost that is continuous there."
+    assert f"from there. {jump} {hint}" in str(termination_of(result, problem("d")))
+    assert str(termination_of(result, problem(0.1))).endswith(jump)
+    done = replace(result, status=sf.Status.CONVERGED, reason=None)
+    assert hint not in str(termination_of(done, problem("d")))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -15,8 +16,11 @@ from matplotlib.figure import Figure
 
 import switchfit as sf
 from switchfit.fit.result import Fit
+from switchfit.fit.termination import Kink, Termination
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord, Status
+from switchfit.problem.constraints import ActiveConstraint
+from switchfit.report.numbers import rounded
 from switchfit.report.plot import (
     MODE_COLOURS,
     mode_colours,
@@ -27,7 +31,9 @@ from switchfit.report.plot import (
     plot_residuals,
     plot_transitions,
 )
-from switchfit.report.text import report, rounded, transitions_of, warnings_of
+from switchfit.report.text import report
+from switchfit.runtime.issue import Issue
+from switchfit.uncertainty.issues import find_issues
 
 
 def trajectory_of(modes=("stick", "slip", "stick"), times=(0.0, 4.0, 7.0, 10.0), nodes=9) -> Trajectory:
@@ -63,8 +69,12 @@ def made(**changes) -> Fit:
         theta=theta,
         lower=np.array([-np.inf, -np.inf, 0.05]),
         upper=np.array([np.inf, np.inf, 2.0]),
+        run_names=("run1",),
         transition_times=(theta[:2].copy(),),
+        transition_places=(np.array([0, 1]),),
         parameters={"mu": np.array(0.8), "g": np.array(9.81)},
+        parameter_units={"mu": "1", "g": "m/s^2"},
+        fixed=("g",),
         cost=28.0,
         gradient=np.array([1e-9, -2e-9, 0.0]),
         hessian=hessian,
@@ -72,7 +82,6 @@ def made(**changes) -> Fit:
         iterations=2,
         evaluations=4,
         status=Status.CONVERGED,
-        message="Converged: the optimality 2.0e-09 is below the tolerance 1.0e-07.",
         history=tuple(
             IterationRecord(k, cost, optimality, 1.0, theta - k, k + 1)
             for k, (cost, optimality) in enumerate([(900.0, 50.0), (30.0, 1e-2), (28.0, 2e-9)])
@@ -103,7 +112,9 @@ def several(count: int, names=None) -> Fit:
         theta=theta,
         lower=np.full(count + 1, -np.inf),
         upper=np.full(count + 1, np.inf),
+        run_names=tuple(names),
         transition_times=tuple(np.array([3.0 + 0.1 * e, 7.0]) for e in range(count)),
+        transition_places=tuple(np.array([e, -1]) for e in range(count)),
         gradient=np.zeros(count + 1),
         hessian=np.diag(np.linspace(100.0, 400.0, count + 1)),
         free_basis=np.eye(count + 1),
@@ -149,7 +160,7 @@ def test_unknowns_have_errors_units_guesses_and_modes():
     assert line_with(text, "tau_1  ") == "tau_1 4.000 ± 0.050 (1.3 %) s 3 stick -> slip"
     assert line_with(text, "tau_2  ") == "tau_2 7.00 ± 0.13 (1.8 %) s 8 slip -> stick"
     assert line_with(text, "mu  ") == "mu 0.800 ± 0.025 (3.1 %) 0.5"
-    assert line_with(text, "g  ") == "g 9.81"
+    assert line_with(text, "g  ") == "g 9.81 m/s^2"
     # correlation of tau_2 and mu: -cofactor / root of the product of the others
     assert line_with(text, "tau_2, mu") == f"tau_2, mu {-400 * 300 / np.sqrt(1e6 * 39600):+.3f}"
 
@@ -196,8 +207,89 @@ def test_what_failed_is_said_first():
         assert first.startswith(f"*** {statuses[status]}") if status in statuses else first == "Fit"
 
 
+MESSAGES = [
+    (
+        Termination(Status.CONVERGED_AT_KINK, kinks=(Kink("tau_1", 0.5, -0.7, 0.3),)),
+        "Converged at a kink of the cost: tau_1 = 0.5, where the derivative jumps from -7.0e-01 to 3.0e-01. The",
+    ),
+    (
+        Termination(Status.MAX_ITERATIONS, iterations=12, earlier_iterations=9, optimality=0.5, tolerance=1e-7),
+        "Stopped after 12 iterations, 9 of them before the mesh was refined, with optimality 5.0e-01 above the "
+        "tolerance 1.0e-07. Raise max_iterations",
+    ),
+    (Termination(Status.SADDLE, smallest_eigenvalue=-1.0), "has the eigenvalue -1.0e+00, and no step along it"),
+    (
+        Termination(Status.SINGULAR, flat_direction=(("a", 0.71), ("b", -0.7)), smallest_eigenvalue=1e-14),
+        "flat to second order along +0.71 a -0.7 b (scaled eigenvalue 1.0e-14): these unknowns are not identified.",
+    ),
+    (Termination(Status.COLLAPSED, idle=("tau_1", "leak")), "nor on what acts in it alone (tau_1, leak). Leave it"),
+    (
+        Termination(Status.INFEASIBLE, violated=(("terminal constraint 1", 1.5), ("terminal constraint 2", -2.0))),
+        "The constraints are not met: terminal constraint 1 = 1.50e+00; terminal constraint 2 = -2.00e+00. Start",
+    ),
+    (Termination(Status.INTERRUPTED, iterations=3), "Interrupted after 3 iterations with"),
+    (Termination(Status.NONFINITE_START), "not finite at the starting point"),
+    (Termination.of_error("KeyError: 3."), "The fit ended with an error, and was left where it was. KeyError: 3."),
+    (
+        Termination(Status.CONVERGED, active=(ActiveConstraint("lower bound", 0.05, "mu"),)),
+        ". Active: mu at its lower bound 0.05.",
+    ),
+]
+
+
+@pytest.mark.parametrize(("ended", "words"), MESSAGES, ids=[ended.status.name for ended, _ in MESSAGES])
+def test_messages(ended, words):
+    assert words in str(ended)
+
+
+@pytest.mark.parametrize(
+    ("reason", "words"),
+    [
+        (
+            Issue("wrong slope", ("k",), {"before": -4.0, "after": 4.0, "derivatives": (-2.0,), "differences": (2.0,)}),
+            "along that direction it says -4, differences of the cost say 4; it is wrong in k (derivative -2, "
+            "differences 2). Check the derivatives.",
+        ),
+        (
+            Issue("jump", ("k",), {"before": 0.49, "after": 2.49, "at": (0.3,)}),
+            "The cost jumps from 0.49 to 2.49 where k passes 0.3. The optimiser needs",
+        ),
+        (
+            Issue("jump", ("k", "c"), {"before": 0.49, "after": 2.49, "at": (0.3, 1.0)}),
+            "where the step passes k = 0.3, c = 1. The optimiser needs",
+        ),
+        (
+            Issue("kink", ("k",), {"before": -1.0, "after": 3.0, "at": (0.3,)}),
+            "but there is a kink close by, near k = 0.3: along that direction the slope jumps from -1 to 3.",
+        ),
+        (Issue("rounding", (), {"noise": 1e-3}), "is less than its rounding error, 1.0e-03. Scale the unknowns"),
+        (Issue("valley", (), {"condition": 1e9}), "(condition number of the scaled Hessian 1.0e+09). Start elsewhere"),
+        (Issue("valley", (), {"condition": 1e9, "delayed": 1.0}), "'gauss-newton'. A delay is estimated here: J has"),
+    ],
+)
+def test_reasons_of_a_line_search_that_failed(reason, words):
+    text = str(Termination(Status.LINE_SEARCH_FAILED, reason=reason))
+    assert text.startswith("The line search found no decrease of the cost along a descent direction (optimality ")
+    assert words in text
+    assert ("Check the derivatives" in text) == (reason.kind == "wrong slope")
+
+
+def test_every_status_has_a_message():
+    for status in Status:
+        assert len(str(Termination(status))) > 40
+
+
+def test_success_is_that_of_the_status():
+    """It has one meaning: also where other numbers fit as well, and where a mode has collapsed."""
+    for status in Status:
+        assert made(status=status).success == status.successful
+    assert Status.SINGULAR.successful
+    assert not Status.SINGULAR.is_strict_minimum
+    assert not Status.SADDLE.successful
+
+
 def test_long_messages_are_wrapped():
-    text = report(made(message="word " * 60))
+    text = report(made(status=Status.ERROR, reason=Issue("error", ("word " * 60,))))
     assert max(len(line) for line in text.splitlines()) <= 100
     assert text.count("word") == 60
 
@@ -237,6 +329,10 @@ def test_a_channel_without_a_single_value():
     assert line_with(report(made(comparisons=((comparison,),))), "X  ") == "X 0 m"
 
 
+def warnings_of(fit: Fit) -> list[str]:
+    return [str(issue) for issue in find_issues(fit)]
+
+
 def only_warning(fit: Fit) -> str:
     warnings = warnings_of(fit)
     assert len(warnings) == 1, warnings
@@ -246,29 +342,56 @@ def only_warning(fit: Fit) -> str:
 
 
 def test_warning_of_a_bound():
-    fit = made(active=("mu at its upper bound 0.8",), free_basis=np.eye(3)[:, :2], cost=28.5)
+    fit = made(active=(ActiveConstraint("upper bound", 0.8, "mu"),), free_basis=np.eye(3)[:, :2], cost=28.5)
     assert only_warning(fit).startswith("mu is at its upper bound 0.8: it has no standard error")
     assert line_with(report(fit), "mu  ") == "mu 0.8 held 0.5 AT UPPER BOUND"
-    lower = made(active=("mu at its lower bound 0.8",), free_basis=np.eye(3)[:, :2], cost=28.5)
+    lower = made(active=(ActiveConstraint("lower bound", 0.8, "mu"),), free_basis=np.eye(3)[:, :2], cost=28.5)
     assert "AT LOWER BOUND" in line_with(report(lower), "mu  ")
 
 
 def test_warning_of_a_collapsed_mode():
-    fit = made(active=("mode 2 ('slip') has collapsed to nothing",))
+    fit = made(active=(ActiveConstraint("collapsed", 0.0, mode="slip", position=1),))
     assert only_warning(fit).startswith("Mode 2 ('slip') has collapsed to nothing: the data want no such mode there.")
 
 
 def test_warning_of_a_shortest_duration():
-    fit = made(active=("mode 2 ('slip') of run1 is at its minimum duration",))
+    fit = made(active=(ActiveConstraint("minimum duration", 0.5, mode="slip", position=1, run="run1"),))
     assert only_warning(fit).startswith("Mode 2 ('slip') of run1 is at its minimum duration: the data would have it")
 
 
-def test_warning_of_another_constraint():
-    assert only_warning(made(active=("something else",))) == "Active constraint: something else."
+@pytest.mark.parametrize("mode", ["collapsed", "fuel bound low", "at its lower bound"])
+def test_a_mode_gets_the_remedy_of_its_constraint_whatever_it_is_called(mode):
+    fit = made(active=(ActiveConstraint("minimum duration", 0.5, mode=mode, position=1),))
+    expected = f"Mode 2 ({mode!r}) is at its minimum duration: the data would have it shorter. Lower min_duration"
+    assert only_warning(fit).startswith(expected)
+
+
+@pytest.mark.parametrize("name", ["collapsed_area", "minimum duration", "tau_heat"])
+def test_a_parameter_at_its_bound_gets_the_remedy_of_a_bound_whatever_it_is_called(name):
+    fit = made(
+        theta_names=("tau_1", "tau_2", name), parameters={name: np.array(0.8)}, parameter_units={name: ""}, fixed=(),
+        active=(ActiveConstraint("lower bound", 0.8, name),), free_basis=np.eye(3)[:, :2], cost=28.5,
+    )  # fmt: skip
+    assert only_warning(fit).startswith(f"{name} is at its lower bound 0.8: it has no standard error")
+    assert line_with(report(fit), f"{name}  ").endswith("AT LOWER BOUND")
+
+
+def test_a_parameter_is_no_transition_time_whatever_it_is_called():
+    """It is higher or lower, not later or earlier; idle, it acts in collapsed modes alone."""
+    a, b = np.array([0.0, 3.0, 500.0]), np.array([1.0, 0.0, 0.0])
+    hessian = np.outer(a, a) + np.outer(b, b) + np.diag([0.0, 1e-3, 0.0])
+    changes = {
+        "theta_names": ("tau_1", "tau_2", "tau_heat"), "parameters": {"tau_heat": np.array(0.8)},
+        "parameter_units": {"tau_heat": ""}, "fixed": (),
+    }  # fmt: skip
+    said = " ".join(report(made(**changes, hessian=hessian)).split())
+    assert re.search(r"tau_heat and tau_2 trade off [^:]*: tau_heat \S+ higher and tau_2 \S+ s earlier,", said), said
+    (warning,) = [text for text in warnings_of(made(**changes, idle=("tau_heat",))) if "collapsed" in text]
+    assert warning.startswith("tau_heat: acts only in modes that have collapsed.")
 
 
 def test_warning_of_a_kink():
-    fit = made(kinks=(("tau_1", -3.0, 5.0),), free_basis=np.eye(3)[:, 1:], cost=28.5)
+    fit = made(kinks=(Kink("tau_1", 4.0, -3.0, 5.0),), free_basis=np.eye(3)[:, 1:], cost=28.5)
     assert only_warning(fit).startswith("tau_1 is at a kink of the cost, where its derivative jumps from -3.0e+00 to")
     assert line_with(report(fit), "tau_1  ") == "tau_1 4 held s 3 stick -> slip, AT A KINK"
 
@@ -356,9 +479,9 @@ def test_warning_of_a_large_integration_error():
 # --- several experiments ----------------------------------------------------------------------------------------------
 
 
-def test_transitions_are_found_in_theta_by_name():
+def test_transitions_have_their_places_in_theta():
     fit = several(2, names=["dry", "wet"])
-    assert [(t.run, t.name, t.index, t.before, t.after) for t in transitions_of(fit)] == [
+    assert [(t.run, t.name, t.index, t.before, t.after) for t in fit.transitions] == [
         ("dry", "dry.tau_1", 0, "stick", "slip"),
         ("dry", "dry.tau_2", None, "slip", "stick"),
         ("wet", "wet.tau_1", 1, "stick", "slip"),
@@ -372,10 +495,10 @@ def test_transitions_are_found_in_theta_by_name():
 
 def test_transitions_of_one_experiment_with_the_first_fixed():
     fit = made(
-        theta_names=("tau_2", "tau_1"), theta_units=("s", ""), theta=np.array([7.0, 4.0]),
-        initial_theta=np.ones(2), hessian=np.eye(2), free_basis=np.eye(2),
+        theta_names=("tau_2", "tau_1"), transition_places=(np.array([-1, 0]),), theta_units=("s", ""),
+        theta=np.array([7.0, 4.0]), initial_theta=np.ones(2), hessian=np.eye(2), free_basis=np.eye(2),
     )  # fmt: skip
-    assert [(t.name, t.index) for t in transitions_of(fit)] == [("tau_1", None), ("tau_2", 0)]
+    assert [(t.name, t.index) for t in fit.transitions] == [("tau_1", None), ("tau_2", 0)]
 
 
 def test_many_experiments_are_cut_short():
@@ -394,7 +517,7 @@ def test_correlations_are_the_largest_first_and_at_most_ten():
     fit = made(
         theta_names=names, theta_units=("",) * d, theta=np.arange(d) + 1.0, initial_theta=np.ones(d),
         lower=np.full(d, -np.inf), upper=np.full(d, np.inf), hessian=factor @ factor.T, free_basis=np.eye(d),
-        parameters={name: np.array(1.0) for name in names},
+        parameters={name: np.array(1.0) for name in names}, fixed=(), transition_places=(np.array([-1, -1]),),
     )  # fmt: skip
     section = report(fit).split("Correlations above 0.1\n")[1].split("\n\n")[0].splitlines()
     sizes = [abs(float(line.split()[-1])) for line in section[:10]]
@@ -404,8 +527,9 @@ def test_correlations_are_the_largest_first_and_at_most_ten():
 
 
 def test_array_parameters_that_are_fixed_are_abbreviated():
-    text = report(made(parameters={"mu": np.array(0.8), "table": np.arange(100.0)}))
-    assert line_with(text, "table") == "table [ 0., 1., ..., 98., 99.]"
+    parameters, units = {"mu": np.array(0.8), "table": np.arange(100.0)}, {"mu": "1", "table": "K"}
+    text = report(made(parameters=parameters, parameter_units=units, fixed=("table",)))
+    assert line_with(text, "table") == "table [ 0., 1., ..., 98., 99.] K"
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------
@@ -506,7 +630,13 @@ def test_names_of_short_modes_are_turned_or_left_out():
 def test_modes_too_short_for_a_name_are_in_the_legend():
     trajectory = trajectory_of(("a", "b", "collapsed", "c"), (0.0, 4.0, 4.01, 4.01, 10.0))
     times = np.array([4.0, 4.01, 4.01])
-    fit = made(trajectories=(trajectory,), comparisons=((),), transition_times=(times,), sigma_known=None)
+    fit = made(
+        trajectories=(trajectory,),
+        comparisons=((),),
+        transition_times=(times,),
+        transition_places=(np.array([0, 1, -1]),),
+        sigma_known=None,
+    )
     assert [text.get_text() for text in plot_fit(fit).legends[0].get_texts()] == ["fitted", "transition", "b"]
 
 
@@ -587,7 +717,8 @@ def test_a_system_without_transitions():
     trajectory = trajectory_of(("only",), (0.0, 10.0))
     fit = made(
         theta_names=("mu",), theta_units=("",), theta=np.array([0.8]), initial_theta=np.ones(1), hessian=np.eye(1),
-        transition_times=(np.zeros(0),), free_basis=np.eye(1), trajectories=(trajectory,),
+        transition_times=(np.zeros(0),), transition_places=(np.zeros(0, int),), free_basis=np.eye(1),
+        trajectories=(trajectory,),
         comparisons=((comparison_of(trajectory),),),
     )  # fmt: skip
     assert line_with(report(fit), "experiment") == "experiment only, 0 to 10 s"

@@ -438,7 +438,7 @@ def test_by_blocks_a_fit_is_the_same():
     problem = tanks(6)
     evaluator = evaluator_of(problem)
     full, blocks = (minimized(evaluator, problem.initial_theta, "exact", 1e-7, 200, by_blocks=b) for b in (False, True))
-    assert blocks.successful
+    assert blocks.status.is_strict_minimum
     np.testing.assert_allclose(blocks.theta, full.theta, rtol=1e-8, atol=1e-9)
     at, arrow = evaluator(full.theta), evaluator.arrow(full.theta)
     assert arrow.cost == at.cost

@@ -16,22 +16,30 @@ from hypothesis.extra import numpy as hnp
 from test_report import comparison_of, made, several, trajectory_of
 
 import switchfit as sf
-from switchfit.fit.result import Certificate, Fit
-from switchfit.io.json import FORMAT, VERSION, load_fit, save_fit
+from switchfit.estimation.saved import FORMAT, VERSION, load_fit, save_fit
+from switchfit.fit.result import Fit
+from switchfit.fit.termination import Kink
 from switchfit.optimize import Status
+from switchfit.problem.constraints import ActiveConstraint
+from switchfit.runtime.issue import Issue
+from switchfit.uncertainty.certificate import Certificate
 
 CERTIFICATE = Certificate(
     optimality=2e-9,
     smallest_eigenvalue=np.nan,
     smallest_scaled_eigenvalue=0.1,
     condition_number=np.inf,
-    worst_direction="tau_1 and mu trade off",
+    worst_unknowns=("tau_1", "mu"),
     integration_error=1e-12,
     gradient_gap=5e-324,
     hessian_gap=1.7976931348623157e308,
     taylor_orders=(np.nan, 2.0, 3.0),
-    active=("mu at its lower bound 0.05", "mode 1 ('ü\"\\') has collapsed to nothing"),
-    failures=("the Taylor orders are wrong",),
+    active=(
+        ActiveConstraint("lower bound", 0.05, "mu", multiplier=3.0),
+        ActiveConstraint("collapsed", 0.0, mode='ü"\\', position=0, multiplier=np.nan),
+    ),
+    kinks=(Kink("tau_1", 4.0, -1.0, np.inf),),
+    failures=(Issue("Taylor orders", figures={"orders": (np.nan, 1.0, 2.0)}),),
 )
 
 
@@ -81,9 +89,12 @@ def with_everything_odd() -> Fit:
     return made(
         parameters={"scalar": np.array(-0.0), "matrix": np.array([[5e-324, 1 / 3], [-np.inf, 1e308]]),
                     "none": np.zeros((2, 0, 3)), "one": np.array([0.1 + 0.2])},
+        parameter_units={"scalar": "1", "matrix": "°C", "none": "", "one": "m"}, fixed=("scalar", "none"),
         trajectories=(trajectory,), comparisons=((comparison, empty),), transition_times=(np.array([-0.0, 7.0]),),
-        kinks=(("tau_1", -1.5, 2.5),), active=("a", "b"), sigma_known=None, theta_units=("", "°C", "m/s²"),
-        free_basis=np.zeros((3, 0)),
+        kinks=(Kink("tau_1", -0.0, -1.5, 2.5),), active=CERTIFICATE.active, flat_direction=(("mu", -0.7),),
+        sigma_known=None, theta_units=("", "°C", "m/s²"),
+        free_basis=np.zeros((3, 0)), status=Status.LINE_SEARCH_FAILED, violated=(("x at the end", np.nan),),
+        reason=Issue("jump", ("mu",), {"before": 1.0, "after": np.inf, "at": (0.1 + 0.2,)}),
     )  # fmt: skip
 
 
@@ -114,8 +125,8 @@ FLOATS = st.floats(allow_nan=False) | st.just(np.nan)
 def test_any_array_comes_back_to_the_bit(tmp_path_factory, numbers, labels, cost):
     trajectory = replace(trajectory_of(("m",), (0.0, 1.0), nodes=len(labels)), modes=labels)
     fit = made(
-        parameters={"p": numbers}, cost=cost, trajectories=(trajectory,), comparisons=((),),
-        transition_times=(np.zeros(0),),
+        parameters={"p": numbers}, parameter_units={"p": ""}, fixed=(), cost=cost, trajectories=(trajectory,),
+        comparisons=((),), transition_places=(np.zeros(0, int),), transition_times=(np.zeros(0),),
     )  # fmt: skip
     assert_same(fit, round_trip(fit, tmp_path_factory.getbasetemp())[0])
 
@@ -131,9 +142,9 @@ def test_the_file_is_strict_and_readable(tmp_path):
     assert (content["format"], content["version"]) == (FORMAT, VERSION)
     assert content["fit"]["theta"] == [4.0, 7.0, 0.8]
     assert content["fit"]["hessian"][1] == [20.0, 100.0, 300.0]
-    assert content["fit"]["lower"] == ["-inf", "-inf", 0.05]
+    assert content["fit"]["lower"] == ["-Infinity", "-Infinity", 0.05]
     assert content["fit"]["status"] == "CONVERGED"
-    assert content["certificate"]["smallest_eigenvalue"] == "nan"
+    assert content["certificate"]["smallest_eigenvalue"] == "NaN"
     assert '    "theta": [4.0, 7.0, 0.8],\n' in text
 
 
@@ -169,6 +180,83 @@ def test_a_real_fit_comes_back(tmp_path):
     assert_same(estimate.certificate, loaded.certificate)
     assert str(loaded) == str(estimate)
     np.testing.assert_array_equal(loaded.standard_errors, estimate.standard_errors)
+
+
+# --- files of earlier versions ----------------------------------------------------------------------------------------
+
+EARLIER = Path(__file__).parent / "saved" / "version_3.json"
+"""A fit of two runs that ended at a bound and at a kink, as version 3 wrote it, beside the report that was printed."""
+
+
+def earlier(tmp_path, version=3, **changes) -> Path:
+    """The file of version 3 with some entries of its fit changed, or as version 2 would have written it."""
+    content = json.loads(EARLIER.read_text(encoding="utf-8"))
+    content["version"] = version
+    content["fit"] |= changes
+    if version == 2:
+        for trajectory in content["fit"]["trajectories"]:
+            del trajectory["time_unit"]
+        for name in ("engine", "idle", "integration_error_of"):
+            del content["fit"][name]
+        del content["certificate"]["integration_error_of"]
+    (tmp_path / "earlier.json").write_text(json.dumps(content))
+    return tmp_path / "earlier.json"
+
+
+def test_a_file_of_version_3_prints_the_report_that_it_printed_then():
+    loaded = sf.Estimate.load(EARLIER)
+    assert f"{loaded}\n\n{loaded.certificate}\n" == EARLIER.with_suffix(".txt").read_text(encoding="utf-8")
+
+
+def test_sentences_of_version_3_become_data(tmp_path):
+    said = ["q at its upper bound 0.78", "mode 3 ('fill') of wet has collapsed to nothing"]
+    said.append("mode 2 ('drain') of dry is at its minimum duration")
+    fit, certificate = load_fit(earlier(tmp_path, active=said))
+    assert [(c.kind, c.unknown, c.mode, c.position, c.run) for c in fit.active] == [
+        ("upper bound", "q", "", None, ""),
+        ("collapsed", "", "fill", 2, "wet"),
+        ("minimum duration", "", "drain", 1, "dry"),
+    ]
+    assert list(map(str, fit.active)) == said
+    assert fit.active[0].value == 0.78
+    assert [(kink.unknown, kink.value) for kink in fit.kinks] == [("wet.tau_4", pytest.approx(2.7))]
+    assert fit.run_names == ("dry", "wet")
+    assert [places.tolist() for places in fit.transition_places] == [[-1, 0], [1, 2, 3, 4]]
+    assert fit.is_time.tolist() == [True] * 5 + [False] * 2
+    assert fit.fixed == ("area",)
+    assert certificate.worst_direction == "wet.tau_2 and wet.tau_3 trade off"
+
+
+def test_a_file_of_version_2_lacks_what_came_with_version_3(tmp_path):
+    fit, certificate = load_fit(earlier(tmp_path, version=2))
+    assert {trajectory.time_unit for trajectory in fit.trajectories} == {"s"}
+    assert (fit.engine, fit.idle, fit.integration_error_of, certificate.integration_error_of) == (None, (), "J", "J")
+    assert fit.message.startswith("Converged, but the cost is flat to second order along -0.73 wet.tau_2 -0.69 wet")
+
+
+def test_a_file_of_an_earlier_version_is_saved_as_one_of_this(tmp_path):
+    before = load_fit(EARLIER)
+    after = round_trip(*before[:1], tmp_path, before[1])
+    assert_same(before[0], after[0])
+    assert_same(before[1], after[1])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"active": ["area at its upper bound 0.78"]}, "fit.active[0] is no constraint of this fit; got"),
+        ({"active": [["q"]]}, "it is not what version 3 holds (TypeError: unhashable type: 'list')"),
+        ({"kinks": [["tau", 1.0, 2.0]]}, "fit.kinks has the name 'tau', which is none of fit.theta_names"),
+        ({"theta_names": None}, "it is not what version 3 holds (TypeError: "),
+        ({"colour": "red"}, "fit has the unknown entry 'colour'"),
+        ({"message": 3}, "fit.reason.subjects[0] must be a string; got 3"),
+    ],
+)
+def test_what_is_damaged_in_a_file_of_version_3(changes, message, tmp_path):
+    path = earlier(tmp_path, **changes)
+    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+        load_fit(path)
+    assert str(caught.value).startswith(f"{path} is damaged: ")
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
@@ -228,15 +316,18 @@ def test_a_missing_file(tmp_path):
     [
         (b"", "no valid JSON"),
         (b"PK\x03\x04\xff\xfe", "no valid JSON"),
-        (b'{"format": "switchfit fit", "version": 3, "fit"', "no valid JSON"),
+        (b'{"format": "switchfit fit", "version": 4, "fit"', "no valid JSON"),
         (b'{"format": "switchfit fit", "version": NaN}', "no valid JSON \\(it contains NaN\\)"),
         (b"[" * 100_000, "no valid JSON"),
         (b'{"format": "switchfit fit", "version": 2, "version": 2}', "it has the entry 'version' twice"),
         (b"[1, 2]", 'no entry "format": "switchfit fit"'),
         (b'{"theta": [1.0]}', 'no entry "format": "switchfit fit"'),
-        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads the versions 2 and 3"),
-        (b'{"format": "switchfit fit", "version": 1}', "of version 1; this switchfit reads the versions 2 and 3"),
-        (b'{"format": "switchfit fit", "version": 3}', "is damaged: fit must be an object; got null"),
+        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads the versions 2, 3 and 4"),
+        (b'{"format": "switchfit fit", "version": 1}', "of version 1; this switchfit reads the versions 2, 3 and 4"),
+        (b'{"format": "switchfit fit", "version": 4}', "is damaged: fit must be an object; got null"),
+        (b'{"format": "switchfit fit", "version": 3}', "is damaged: it is not what version 3 holds .KeyError: 'fit'"),
+        (b'{"format": "switchfit fit", "version": 3, "fit": [], "certificate": {}}', "is not what version 3 holds"),
+        (b'{"format": "switchfit fit", "version": true}', "of version True; this switchfit reads"),
     ],
 )
 def test_what_is_no_saved_fit(text, message, tmp_path):
@@ -251,7 +342,7 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
     [
         (("fit", "cost"), None, "fit.cost must be a number, or one of"),
         (("fit", "cost"), True, "fit.cost must be a number"),
-        (("fit", "cost"), "12.5", 'fit.cost must be a number, or one of "nan", "inf", "-inf"; got "12.5"'),
+        (("fit", "cost"), "12.5", 'fit.cost must be a number, or one of "NaN", "Infinity", "-Infinity"; got "12.5"'),
         (("fit", "cost"), 10**400, "int too large to convert to float"),
         (("fit", "theta"), [1.0, None], "fit.theta must be a number"),
         (("fit", "theta"), "abc", "fit.theta must be a number"),
@@ -280,9 +371,10 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
         (("fit", "status"), None, "fit.status must be one of CONVERGED, "),
         (("fit", "iterations"), 2.5, "fit.iterations must be an integer; got 2.5"),
         (("fit", "sigma_known"), 1, "fit.sigma_known must be true or false; got 1"),
-        (("fit", "message"), ["a"], 'fit.message must be a string; got ["a"]'),
+        (("fit", "hessian_kind"), ["a"], 'fit.hessian_kind must be a string; got ["a"]'),
         (("fit", "active"), "abc", "fit.active must be a list"),
-        (("fit", "kinks"), [["tau_1", 1.0]], "fit.kinks[0] must have 3 entries; got 2"),
+        (("fit", "kinks"), [["tau_1", 1.0]], 'fit.kinks[0] must be an object; got ["tau_1", 1.0]'),
+        (("fit", "constraints"), [["a", 1.0]], "fit.constraints[0][2] is missing"),
         (("fit", "parameters"), [], "fit.parameters must be an object; got []"),
         (("fit", "history", 1), {"iteration": 0}, "fit.history[1].cost is missing"),
         (("fit", "trajectories", 0, "modes"), 3, "fit.trajectories[0].modes must be an array of str_; got"),
@@ -306,7 +398,11 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
         (("fit", "history", 1, "theta"), [1.0], "fit.history[1].theta must have the shape (3,)"),
         (("fit", "free_basis"), [[1.0]], "fit.free_basis must have 3 rows and at most as many columns"),
         (("fit", "free_basis"), [[1.0], [1.0], [0.0]], "fit.free_basis must have orthonormal columns"),
-        (("fit", "kinks"), [["nu", 1.0, 2.0]], "fit.kinks has the name 'nu', which is none of fit.theta_names"),
+        (
+            ("fit", "kinks"),
+            [{"unknown": "nu", "value": 0, "left": -1, "right": 1}],
+            "fit.kinks has the name 'nu', which is none of fit.theta_names",
+        ),
         (("fit", "trajectories"), [], "fit.trajectories must have one entry or more; got none"),
         (("fit", "comparisons"), [], "fit.comparisons must have the shape (1,), since fit.trajectories has 1 entries"),
         (("fit", "transition_times"), [[4.0]], "fit.trajectories[0].segments must have the shape (3,)"),
@@ -320,7 +416,16 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
         (("fit", "comparisons", 0, 0, "kind"), "x", 'kind must be "measurements" or "reference"; got "x"'),
         (("fit", "comparisons", 0, 0, "sigma"), [0.1], "fit.comparisons[0][0].sigma must have the shape (30, 2)"),
         (("fit", "comparisons", 0, 0, "curve"), [[0.1]], "curve must have the shape (27, 2)"),
-        (("fit", "message"), "\ud800", "surrogates not allowed"),
+        (("fit", "hessian_kind"), "\ud800", "surrogates not allowed"),
+        (("fit", "run_names"), [], "fit.run_names must have the shape (1,), since fit.trajectories has 1 entries"),
+        (("fit", "transition_places", 0, "values"), [0, 3], "fit.transition_places[0] must lie between -1 and 2"),
+        (("fit", "transition_places"), [{"dtype": "<i8", "shape": [1], "values": [0]}], "as fit.transition_times[0]"),
+        (("fit", "parameter_units"), {"mu": "1"}, "fit.parameter_units lacks the parameter 'g'"),
+        (("fit", "fixed"), ["h"], "fit.fixed has the name 'h', which is none of fit.parameters"),
+        (("fit", "idle"), ["h"], "fit.idle has the name 'h', which is none of fit.theta_names"),
+        (("fit", "active"), [{"kind": "bound"}], "fit.active[0].kind must be 'collapsed', "),
+        (("fit", "reason"), {"kind": "jump", "subjects": "mu", "figures": {}}, "fit.reason.subjects must be a list"),
+        (("fit", "reason"), {"kind": "jump", "subjects": [], "figures": {"at": "a"}}, "fit.reason.figures.at"),
     ],
 )
 def test_what_is_damaged(place, value, message, tmp_path):

@@ -116,7 +116,7 @@ def test_constrained_quadratics_satisfy_kkt(seed, d):
     A = rng.normal(size=(2 * d, d))
     constraints = rows(A, A @ start - rng.uniform(0, 1, 2 * d), start - 1.0, start + rng.uniform(0, 1, d))
     result = minimize(quadratic(H, rng.normal(size=d) * 3), start, constraints=constraints, tolerance=1e-9)
-    assert result.successful, result.message
+    assert result.status.is_strict_minimum, result.status
     assert_feasible(result, constraints)
     lam = result.multipliers
     assert np.all(lam >= 0.0)
@@ -162,7 +162,7 @@ def test_rate_is_quadratic_on_a_face_although_the_full_hessian_is_indefinite():
 
     constraints = LinearConstraints.box([-3.0, 0.2], [3.0, 0.9], unknowns=["x", "y"])
     result = minimize(smooth(function), [0.5, 0.5], constraints=constraints, tolerance=1e-13)
-    assert result.successful
+    assert result.status.is_strict_minimum
     errors = np.array([abs(record.theta[0] - np.log(0.1)) for record in result.history])
     local = errors[(errors < 0.3) & (errors > 1e-15)]
     assert local.size >= 3
@@ -193,7 +193,7 @@ def test_a_large_constant_in_the_cost_does_not_stall_newton():
         return J + 1e6, g, H
 
     result = minimize(smooth(function), [-1.2, 1.0], constraints=free(2), tolerance=1e-12)
-    assert result.successful
+    assert result.status.is_strict_minimum
     assert result.optimality < 1e-12
 
 
@@ -225,7 +225,7 @@ def test_steepest_descent_reaches_the_tolerance_at_condition_1000():
         return Value(value.cost, value.gradient, None)
 
     result = minimize(without_hessian, np.zeros(4), constraints=free(4), hessian="none", max_iterations=20000)
-    assert result.status is Status.CONVERGED, result.message
+    assert result.status is Status.CONVERGED, result.status
     assert result.optimality < 1e-7
     assert np.isnan(result.hessian).all()
     assert 50 < result.iterations < 10000
@@ -240,7 +240,7 @@ def test_steepest_descent_respects_constraints():
         hessian="none",
         max_iterations=2000,
     )
-    assert result.successful
+    assert result.status.is_strict_minimum
     assert_feasible(result, constraints)
     np.testing.assert_allclose(result.theta, -0.25, atol=1e-7)
 
@@ -257,7 +257,6 @@ def test_collapsed_ordering_is_exact_and_named():
     result = minimize(quadratic(H, np.array([5.1, 4.3, 7.7])), [1.1, 2.3, 3.7], constraints=constraints)
     assert result.status is Status.CONVERGED
     assert result.active == ("tau_1 <= tau_2 (mode 'slip' collapsed)",)
-    assert "collapsed" in result.message
     # How many units in the last place it takes to be feasible depends on how the processor's BLAS rounds the step.
     assert 0.0 <= result.theta[1] - result.theta[0] <= 4 * np.spacing(result.theta[1])
     assert result.multipliers[0] > 0.1
@@ -306,7 +305,7 @@ def test_nonconvex_polynomials_end_feasible_at_second_order_points(seed, d):
     order = np.diff(np.eye(d), axis=0)
     constraints = rows(order, np.zeros(d - 1), np.full(d, -1.0), np.full(d, 1.0)) if d > 1 else rows([[1.0]], [-1.0])
     result = minimize(smooth(function), start, constraints=constraints, tolerance=1e-9)
-    assert result.successful, result.message
+    assert result.status.is_strict_minimum, result.status
     assert_feasible(result, constraints)
     costs = [record.cost for record in result.history]
     assert np.all(np.diff(costs) <= 1e-13 * np.abs(costs[0]) + 1e-13)
@@ -326,7 +325,7 @@ def test_absolute_value_ends_exactly_on_its_kink(start, curvature, hessian):
 
     evaluate = with_kinks(function, [[0.7]], [1.0])
     result = minimize(evaluate, [start], constraints=free(1), breakpoints=[[0.7]], hessian=hessian)
-    assert result.status is Status.CONVERGED_AT_KINK, result.message
+    assert result.status is Status.CONVERGED_AT_KINK, result.status
     assert result.theta[0] == 0.7
     assert result.optimality == 0.0
     assert result.iterations <= 60
@@ -334,7 +333,6 @@ def test_absolute_value_ends_exactly_on_its_kink(start, curvature, hessian):
     assert index == 0
     assert left == pytest.approx(-1.0 + 0.7 * curvature)
     assert right == pytest.approx(1.0 + 0.7 * curvature)
-    assert "0.7" in result.message
     assert result.free_basis.shape == (1, 0)
 
 
@@ -357,7 +355,7 @@ def test_coupled_kink_and_smooth_coordinate():
     )
     for start in ([-4.0, 3.0], [1.0, -2.0], [0.0, 0.0], [5.0, 5.0]):
         result = minimize(evaluate, start, constraints=free(2), breakpoints=breakpoints, tolerance=1e-11)
-        assert result.status is Status.CONVERGED_AT_KINK, result.message
+        assert result.status is Status.CONVERGED_AT_KINK, result.status
         assert result.theta[0] == 1.0
         # With x = 1 held, y solves 1.5 (1 − 1.3) + 2 (y − 2) = 0.
         assert result.theta[1] == pytest.approx(2.225, rel=1e-11)
@@ -397,7 +395,7 @@ def test_many_small_kinks_under_constraints(seed, d):
     )
     start = np.sort(np.round(rng.uniform(0, 10, d), 1))
     result = minimize(evaluate, start, constraints=constraints, breakpoints=breakpoints)
-    assert result.successful, result.message
+    assert result.status.is_strict_minimum, result.status
     assert result.iterations <= 60
     assert_feasible(result, constraints)
     assert_no_descent(evaluate, result, constraints, breakpoints)
@@ -418,7 +416,7 @@ def test_collapsed_pair_on_a_common_kink(seed):
     evaluate = with_kinks(lambda t: (0.5 * (t - centre) @ (t - centre), t - centre, H), breakpoints, [0.3, 0.3])
     constraints = rows([[-1.0, 1.0]], [0.0])
     result = minimize(evaluate, np.sort(rng.uniform(-2, 4, 2)), constraints=constraints, breakpoints=breakpoints)
-    assert result.successful, result.message
+    assert result.status.is_strict_minimum, result.status
     np.testing.assert_array_equal(result.theta, [1.0, 1.0])
     assert_no_descent(evaluate, result, constraints, breakpoints)
 
@@ -449,7 +447,7 @@ def test_optimality_at_a_corner_is_the_steepest_descent_over_all_orthants(seed, 
         steepest = max(steepest, kkt_residual(gradient, gradient, np.vstack([order, np.diag(signs)]))[0])
     result = corner(left, right)
     assert result.optimality == pytest.approx(steepest, abs=1e-12)
-    assert result.successful == (steepest <= 1e-12)
+    assert result.status.is_strict_minimum == (steepest <= 1e-12)
 
 
 @settings(max_examples=60, deadline=None)
@@ -478,7 +476,7 @@ def test_collapsed_group_leaves_its_concave_kinks_together(unit):
 
     constraints = rows([[-1.0, 1.0]], [0.0])
     result = minimize(evaluate, np.zeros(2), constraints=constraints, breakpoints=[[0.0], [0.0]], tolerance=1e-9 / unit)
-    assert result.status is Status.CONVERGED, result.message
+    assert result.status is Status.CONVERGED, result.status
     np.testing.assert_allclose(result.theta / unit, 0.3, rtol=1e-12)
 
 
@@ -508,7 +506,7 @@ def test_nonconvex_costs_with_kinks_of_all_sizes(seed, d, hessian):
         max_iterations=5000,
         tolerance=1e-6,
     )
-    assert result.successful, result.message
+    assert result.status.is_strict_minimum, result.status
     assert_feasible(result, constraints)
     if hessian == "exact":
         assert result.iterations < 50
@@ -559,7 +557,7 @@ def test_piecewise_smooth_nonquadratic_chain():
     evaluate = with_kinks(function, breakpoints, [np.full(21, 0.02), np.full(21, 0.05)])
     for start in ([-6.0, 9.0], [9.5, -9.5], [2.0, 2.0], [0.0, 0.1]):
         result = minimize(evaluate, start, constraints=free(2), breakpoints=breakpoints)
-        assert result.successful, result.message
+        assert result.status.is_strict_minimum, result.status
         assert_no_descent(evaluate, result, free(2), breakpoints)
         assert result.iterations < 40
 
@@ -586,9 +584,8 @@ def test_a_saddle_that_cannot_be_left_is_reported():
 
     result = minimize(smooth(function), [0.0, 0.0], constraints=free(2))
     assert result.status is Status.SADDLE
-    assert not result.successful
+    assert not result.status.is_strict_minimum
     assert result.smallest_eigenvalue == pytest.approx(-1.0)
-    assert "-1.0e+00" in result.message
 
 
 def test_flat_direction_is_singular_and_named():
@@ -601,8 +598,7 @@ def test_flat_direction_is_singular_and_named():
     result = minimize(smooth(function), [1e-3, 1e3, 1.0], constraints=free(3))
     assert result.status is Status.SINGULAR
     assert abs(result.smallest_eigenvalue) < 1e-12
-    assert "theta[1]" in result.message
-    assert "theta[2]" not in result.message
+    np.testing.assert_allclose(np.abs(result.flat_direction), [0.0, 1.0, 0.0], atol=1e-5)
 
 
 def test_unknown_without_effect_is_singular():
@@ -624,7 +620,6 @@ def test_infinite_and_undefined_regions_are_backed_away_from():
     assert result.theta[0] == pytest.approx(2 / 3, rel=1e-8)
     start = minimize(smooth(function), [1.5], constraints=free(1))
     assert start.status is Status.NONFINITE_START
-    assert "not finite" in start.message
     assert np.isnan(start.cost)
 
 
@@ -633,17 +628,17 @@ def test_max_iterations():
     assert result.status is Status.MAX_ITERATIONS
     assert result.iterations == 3
     assert len(result.history) == 4
-    assert "after 3 iterations" in result.message
     assert minimize(smooth(rosenbrock), [1.0, 1.0], constraints=free(2), max_iterations=0).status is Status.CONVERGED
 
 
 def test_line_search_fails_on_a_wrong_gradient():
     result = minimize(smooth(lambda t: (t @ t, -2 * t, 2 * np.eye(2))), [1.0, 1.0], constraints=free(2))
     assert result.status is Status.LINE_SEARCH_FAILED
-    assert not result.successful
+    assert not result.status.is_strict_minimum
     np.testing.assert_array_equal(result.theta, [1.0, 1.0])
     assert result.evaluations < 100
-    assert "it says -4, differences of the cost say 4" in result.message
+    assert result.reason.kind == "wrong slope"
+    assert (result.reason.before, result.reason.after) == pytest.approx((-4.0, 4.0))
 
 
 def test_the_entry_of_the_gradient_that_is_wrong_is_named():
@@ -651,8 +646,8 @@ def test_the_entry_of_the_gradient_that_is_wrong_is_named():
         smooth(lambda t: (t @ t, np.array([2.0, -2.0]) * t, 2 * np.eye(2))), [1.0, 1.0], constraints=free(2)
     )
     assert result.status is Status.LINE_SEARCH_FAILED
-    assert "it is wrong in theta[1] (derivative -2, differences 2). Check the derivatives." in result.message
-    assert "theta[0]" not in result.message
+    assert result.reason.kind == "wrong slope"
+    assert np.array(result.reason.entries) == pytest.approx(np.array([[1, -2.0, 2.0]]))
 
 
 def test_a_kink_that_nobody_named_is_seen_and_the_derivatives_are_not_blamed():
@@ -663,8 +658,8 @@ def test_a_kink_that_nobody_named_is_seen_and_the_derivatives_are_not_blamed():
 
     result = minimize(smooth(function), [0.0, 0.0], constraints=free(2))
     assert result.status is Status.LINE_SEARCH_FAILED
-    assert "derivatives are right, but there is a kink close by, near theta[0] = 0.3:" in result.message
-    assert "check the derivatives" not in result.message.lower()
+    assert result.reason.kind == "kink"
+    assert np.array(result.reason.places) == pytest.approx(np.array([[0, 0.3]]))
 
 
 def test_a_jump_of_the_cost_is_seen():
@@ -675,7 +670,9 @@ def test_a_jump_of_the_cost_is_seen():
 
     result = minimize(smooth(function), [0.0, 0.0], constraints=free(2))
     assert result.status is Status.LINE_SEARCH_FAILED
-    assert "The cost jumps from 0.49 to 2.49 where theta[0] passes 0.3" in result.message
+    assert result.reason.kind == "jump"
+    assert (result.reason.before, result.reason.after) == pytest.approx((0.49, 2.49))
+    assert np.array(result.reason.places) == pytest.approx(np.array([[0, 0.3]]))
 
 
 def test_a_decrease_below_the_rounding_of_the_cost_is_told_as_such():
@@ -684,7 +681,8 @@ def test_a_decrease_below_the_rounding_of_the_cost_is_told_as_such():
 
     result = minimize(smooth(function), [0.0], constraints=free(1))
     assert result.status is Status.LINE_SEARCH_FAILED
-    assert "less than its rounding error" in result.message
+    assert result.reason.kind == "rounding"
+    assert result.reason.noise == pytest.approx(4096 * 2.0**-52 * 1e12)
 
 
 def test_a_line_search_that_failed_begins_anew():
@@ -744,7 +742,7 @@ def test_coincident_times_are_equal_bit_for_bit(seed):
     result = minimize(
         quadratic(np.eye(d), wanted), np.sort(rng.uniform(0.5, 9.5, d)), constraints=constraints, size=np.full(d, 10.0)
     )
-    assert result.successful
+    assert result.status.is_strict_minimum
     gaps = A @ result.theta - b
     assert np.all((gaps == 0.0) | (gaps > 1e-9))
     assert len(result.active) == np.sum(gaps == 0.0)
@@ -771,13 +769,12 @@ def test_what_is_idle_is_held_and_its_curvature_not_asked_for():
     start = [0.3, 0.62, 3.0]
     result = minimize(smooth(function), start, constraints=constraints, idle=idle, size=np.ones(3))
     assert result.status is Status.COLLAPSED
-    assert result.status.converged
-    assert not result.successful
+    assert result.status.successful
+    assert not result.status.is_strict_minimum
     assert result.idle == (0, 1)
     assert result.optimality < 1e-12
     np.testing.assert_allclose(np.abs(result.free_basis), [[0.0], [0.0], [1.0]], atol=1e-12)
     assert result.smallest_eigenvalue == pytest.approx(1.0)
-    assert "(theta[0], theta[1])" in result.message
     assert result.iterations < 10
 
 
@@ -791,8 +788,8 @@ def test_the_limit_of_precision_is_a_success():
         return 1.0 + J, g + 1e-13 * rng.normal(size=2), H
 
     result = minimize(smooth(noisy), [-1.2, 1.0], constraints=free(2), tolerance=1e-17)
-    assert result.status is Status.CONVERGED_PRECISION, result.message
-    assert result.successful
+    assert result.status is Status.CONVERGED_PRECISION, result.status
+    assert result.status.is_strict_minimum
     assert result.optimality < 1e-10
     assert result.iterations < 100
 
@@ -819,7 +816,7 @@ def test_interrupt_in_evaluate_and_in_callback():
         assert result.status is Status.INTERRUPTED
         assert result.cost == min(record.cost for record in result.history)
         assert result.cost < rosenbrock([-1.2, 1.0])[0]
-        assert "Interrupted after" in result.message
+        assert result.iterations > 0
     assert second.iterations == third.iterations == 2
 
 

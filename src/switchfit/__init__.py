@@ -8,15 +8,18 @@ from switchfit.batch.starts import Multistart, multistart
 from switchfit.estimation.estimator import Estimate, estimate
 from switchfit.fit.evaluator import Evaluation, evaluate
 from switchfit.fit.guards import GuardedEvaluation, evaluate_on_guards
-from switchfit.fit.result import Certificate
+from switchfit.fit.termination import Kink, Termination
 from switchfit.fit.trajectory import Comparison, Trajectory, simulate
 from switchfit.optimize import Status
+from switchfit.problem.constraints import ActiveConstraint
 from switchfit.problem.data import Input, Measurements, ReferenceSignal, RunningCost, TerminalConstraint, TerminalCost
 from switchfit.problem.experiment import Experiment, Parameter
 from switchfit.problem.priors import LogNormal, Normal
 from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
+from switchfit.runtime.issue import Issue
 from switchfit.runtime.xla import compile_small_loops_whole
+from switchfit.uncertainty.certificate import Certificate
 from switchfit.uncertainty.derivative_check import DerivativeCheck, check_derivatives
 from switchfit.uncertainty.identification import Direction, Identifiability, identifiability
 from switchfit.uncertainty.prediction import Prediction, predict
@@ -25,9 +28,14 @@ from switchfit.uncertainty.residuals import ChannelResiduals, ResidualDiagnostic
 
 compile_small_loops_whole()
 
+# The modules of this room register how results are written and drawn. The import comes last: a few levels deeper, as
+# they would be if this was the first, all other imports together take a tenth longer.
+from switchfit import report as _report  # noqa: E402, F401
+
 __version__ = "0.1.0"
 
 __all__ = [
+    "ActiveConstraint",
     "Bootstrap",
     "Certificate",
     "ChannelResiduals",
@@ -42,6 +50,8 @@ __all__ = [
     "HybridSystem",
     "Identifiability",
     "Input",
+    "Issue",
+    "Kink",
     "LogNormal",
     "Measurements",
     "MonteCarlo",
@@ -57,6 +67,7 @@ __all__ = [
     "Status",
     "TerminalConstraint",
     "TerminalCost",
+    "Termination",
     "Trajectory",
     "bootstrap",
     "check_derivatives",

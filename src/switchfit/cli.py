@@ -326,7 +326,7 @@ def _import_figures() -> None:
 
 def _save(estimate: Any, path: Path, *, complete: bool) -> None:
     """Save an estimate; not `complete` leaves the paper's equations out of its certificate, which take seconds."""
-    from switchfit.io.json import save_fit
+    from switchfit.estimation.saved import save_fit
     from switchfit.uncertainty.certificate import certify
 
     save_fit(estimate.complete(), estimate.certificate if complete else certify(estimate, None), path)

@@ -33,7 +33,7 @@ def redo_unresolved(
     meshes : sequence of Mesh
     tolerance, max_iterations : as of `estimate`
     """
-    converged = [status.name for status in Status if status.converged]
+    converged = [status.name for status in Status if status.successful]
     failed = np.flatnonzero(~np.isin(chunk.status, [*converged, Status.ERROR.name]))
     if not failed.size:
         return chunk

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -23,6 +22,7 @@ from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_path
+from switchfit.runtime.presentation import text_of
 from switchfit.runtime.progress import reporting
 
 
@@ -88,7 +88,7 @@ class Fits:
     @cached_property
     def success(self) -> NDArray[np.bool_]:
         """Which of them converged: (R,)."""
-        good = [status.name for status in Status if status.converged]
+        good = [status.name for status in Status if status.successful]
         return np.isin(self.status, good)
 
     @property
@@ -111,22 +111,7 @@ class Fits:
         return interval(self.theta, half, np.isin(self.theta_names, self.log_scaled))
 
     def __str__(self) -> str:
-        return "\n".join(self._summary())
-
-    def _summary(self) -> list[str]:
-        count, good = len(self), int(self.success.sum())
-        each = 1e3 * self.seconds / max(count, 1)
-        lines = [f"{count} fits in {self.seconds:.1f} s ({each:.2f} ms each), {good} converged"]
-        if count < self.requested:
-            lines.append(f"STOPPED: {self.requested - count} of {self.requested} fits were not done")
-        lines += [f"  {number:>8} {name}" for name, number in Counter(self.status.tolist()).most_common()]
-        if good:
-            spent = self.iterations[self.success]
-            lines.append(f"iterations: median {np.median(spent):.0f}, most {spent.max()}")
-        if good < count:
-            lines.append("not converged (all of them in .failures):")
-            lines += [f"  run {run}: {message}" for run, message in self.failures[:3]]
-        return lines
+        return text_of(self)
 
 
 def check_long_run(client: Any, folder: Any, callback: Any) -> None:

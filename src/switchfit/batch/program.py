@@ -29,7 +29,8 @@ from switchfit.engine.jax.programs import derivatives
 from switchfit.engine.native.foreign import foreign_derivatives
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import inverse_on
-from switchfit.fit.solution import constraints_of, message_of, minimized
+from switchfit.fit.solution import constraints_of, minimized
+from switchfit.fit.termination import Termination, termination_of
 from switchfit.optimize import Status
 from switchfit.optimize.qp import nearest_feasible
 from switchfit.optimize.traced import Constraints, Outcome, minimize_traced
@@ -340,7 +341,7 @@ def error_message(error: BaseException) -> str:
         text = raised[-1] if raised else text
     else:
         text = f"{type(error).__name__}: {text}"
-    return Status.ERROR.value.format(error=" ".join(text.split())[:LONGEST_ERROR])
+    return str(Termination.of_error(" ".join(text.split())[:LONGEST_ERROR]))
 
 
 def with_errors(chunk: Chunk, errors: Mapping[int, BaseException]) -> Chunk:
@@ -421,7 +422,7 @@ def _finished(
         found["iterations"][k] = result.iterations
         found["evaluations"][k] += result.evaluations
         status[k] = result.status.name
-        message[k] = message_of(result, problem)
+        message[k] = str(termination_of(result, problem))
         free[k] = result.free_basis.shape[1]
         covariance[k] = inverse_on(result.free_basis, result.hessian)
     return Chunk(**found, status=status.astype(str), message=message.astype(str), free=free, covariance=covariance)

@@ -50,7 +50,7 @@ from switchfit.fit.solution import plain
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_count, as_level, as_seed
-from switchfit.report.batch import plot_bootstrap, table_of_bootstrap
+from switchfit.runtime.presentation import figure_of
 from switchfit.uncertainty.residuals import autocorrelation
 from switchfit.uncertainty.sensitivity import sample_derivatives
 
@@ -128,13 +128,9 @@ class Bootstrap(Fits):
             found[k] = (2 * self.estimate[k] - high, 2 * self.estimate[k] - low) if method == "basic" else (low, high)
         return found
 
-    def __str__(self) -> str:
-        what = f"{self.resample} of {self.block} samples" if self.resample == "blocks" else self.resample
-        return "\n".join([*self._summary(), f"resampled: {what}", "", *table_of_bootstrap(self)])
-
     def plot(self) -> Figure:
         """Histogram of the estimates of each unknown with its interval, as a matplotlib Figure."""
-        return plot_bootstrap(self)
+        return figure_of(self)
 
 
 def bootstrap(

@@ -26,7 +26,7 @@ from switchfit.fit.trajectory import compare
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_callable, as_count, as_instance, as_seed, shown
-from switchfit.report.batch import plot_monte_carlo, table_of_monte_carlo
+from switchfit.runtime.presentation import figure_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -73,12 +73,9 @@ class MonteCarlo(Fits):
         inside = (low <= self.truth) & (self.truth <= high)
         return np.where(np.isnan(low).any(0), np.nan, inside.mean(0))
 
-    def __str__(self) -> str:
-        return "\n".join([*self._summary(), "", *table_of_monte_carlo(self)])
-
     def plot(self) -> Figure:
         """Histogram of the estimates of each unknown with the truth, as a matplotlib Figure."""
-        return plot_monte_carlo(self)
+        return figure_of(self)
 
 
 def monte_carlo(

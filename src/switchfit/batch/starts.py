@@ -25,10 +25,9 @@ from switchfit.fit.solution import constraints_of
 from switchfit.optimize import Status
 from switchfit.optimize.qp import solve_qp
 from switchfit.problem.data import FloatArray
-from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_count, as_instance, as_seed, listed
-from switchfit.report.batch import plot_waterfall
+from switchfit.runtime.presentation import figure_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -63,18 +62,9 @@ class Multistart(Fits):
     clusters: NDArray[np.int64]
     best: Estimate | None
 
-    def __str__(self) -> str:
-        lines = [*self._summary(), "", f"{int(self.clusters.max(initial=-1)) + 1} minima:"]
-        for k in range(min(int(self.clusters.max(initial=-1)) + 1, 10)):
-            here = np.flatnonzero(self.clusters == k)
-            columns = zip(self.theta_names, self.theta[here[0]], self.theta_units, strict=True)
-            place = ", ".join(f"{name} = {value:.6g}{unit_suffix(unit)}" for name, value, unit in columns)
-            lines.append(f"  J = {self.cost[here].min():.9g}  {len(here):>5} starts  {place}")
-        return "\n".join(lines)
-
     def plot(self) -> Figure:
         """Waterfall: the cost at the end of every start, ascending, as a matplotlib Figure."""
-        return plot_waterfall(self)
+        return figure_of(self)
 
 
 def multistart(

@@ -14,24 +14,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.engine.adaptive import refined_mesh
+from switchfit.estimation.saved import load_fit, save_fit
 from switchfit.fit.accuracy import worst_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.guards import on_guards
 from switchfit.fit.hidden import refuse_jumps
-from switchfit.fit.result import Certificate, Fit
-from switchfit.fit.solution import constraints_of, least_squares, message_of, minimized, plain, sigma_known
+from switchfit.fit.result import Fit
+from switchfit.fit.solution import constraints_of, least_squares, minimized, plain, sigma_known
+from switchfit.fit.termination import termination_of
 from switchfit.fit.trajectory import compare
-from switchfit.io.json import load_fit, save_fit
 from switchfit.optimize import IterationRecord, Result, Status, minimize_constrained
 from switchfit.optimize.sqp import HessianKind
 from switchfit.problem.data import FloatArray
+from switchfit.problem.experiment import run_names
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_callable, as_choice, as_count, as_flag, as_instance, as_path, as_positive
-from switchfit.report.plot import LARGEST_FIGURE, Bands, plot_fit
-from switchfit.report.text import report, run_names, standard_errors_of
-from switchfit.report.uncertainty import plot_diagnostics
+from switchfit.problem.validation import as_callable, as_choice, as_count, as_instance, as_path, as_positive
+from switchfit.runtime.presentation import figure_of, text_of
 from switchfit.runtime.progress import Progress
-from switchfit.uncertainty.certificate import certify
+from switchfit.uncertainty.certificate import Certificate, certify
 from switchfit.uncertainty.identification import Identifiability, identifiability
 from switchfit.uncertainty.prediction import Prediction, predict
 from switchfit.uncertainty.profiles import Profile, profile
@@ -75,17 +75,22 @@ class Estimate(Fit):
             return self.saved_certificate
         return certify(self, None if self.problem is None else Evaluator(self.problem, theta=self.theta))
 
+    @property
+    def known_certificate(self) -> Certificate | None:
+        """The certificate, if it was loaded or asked for before; None if it would have to be computed."""
+        return self.saved_certificate or self.__dict__.get("certificate")
+
     @cached_property
     def gauss_newton(self) -> FloatArray | None:
         """The Gauss-Newton matrix ``sum (D h / sigma)' (D h / sigma)``: (d, d); None where it is not known."""
         if self.saved_gauss_newton is not None or self.sigma_known is None or self.problem is None:
             return self.saved_gauss_newton
-        if plain(self.problem) and self._sensitivities_fit():
+        if plain(self.problem) and self.has_room_for_sensitivities():
             return gauss_newton_of(sample_derivatives(self.problem, self.sensitivities))
         return self.evaluator_at_solution()(self.theta, matrix="gauss-newton").hessian
 
-    def _sensitivities_fit(self) -> bool:
-        """Whether the derivatives at all nodes take less memory than is worth it."""
+    def has_room_for_sensitivities(self) -> bool:
+        """Whether the derivatives of states and outputs at all nodes take less memory than `MOST_SENSITIVITIES`."""
         rows = sum(len(mesh.nodes) for mesh in self.evaluator_at_solution().meshes)
         width = max(
             t.states.shape[1] + sum(len(c.names) for c in run)
@@ -126,8 +131,7 @@ class Estimate(Fit):
         return profile(self, name, level=level, callback=callback)
 
     def __str__(self) -> str:
-        known = self.saved_certificate or self.__dict__.get("certificate")
-        return report(self, known, self.identifiability)
+        return text_of(self)
 
     def plot(self, *, bands: bool = True, level: float = 0.95) -> Any:
         """Measured against fitted over time with the modes shaded, as a matplotlib Figure.
@@ -140,10 +144,7 @@ class Estimate(Fit):
         level : float, between 0 and 1
             Of the bands.
         """
-        quantile = self.quantile(level)
-        drawn = as_flag(bands, "bands") and self.problem is not None and np.isfinite(standard_errors_of(self)).all()
-        shown = range(min(len(self.trajectories), LARGEST_FIGURE)) if drawn and self._sensitivities_fit() else range(0)
-        return plot_fit(self, [Bands.of(predict(self, experiment=e), quantile, level) for e in shown])
+        return figure_of(self, bands=bands, level=level)
 
     def predict(self, times: ArrayLike | None = None, *, experiment: int = 0) -> Prediction:
         """States and outputs at any times with their standard errors and bands, see `switchfit.predict`.
@@ -158,11 +159,11 @@ class Estimate(Fit):
     @property
     def residuals(self) -> ResidualDiagnostics:
         """Tests of the residuals, channel by channel: whiteness, normality, effective sample size."""
-        return diagnose(self, run_names(self))
+        return diagnose(self)
 
     def plot_residuals(self) -> Any:
         """Residuals in time, their autocorrelation and their quantiles, as a matplotlib Figure."""
-        return plot_diagnostics(self.residuals)
+        return figure_of(self.residuals)
 
     @cached_property
     def identifiability(self) -> Identifiability:
@@ -295,7 +296,7 @@ def estimate(
         if result.status in STOPPED or attempt == REFINEMENTS or not excess > 1:
             break
         evaluator = _refined(fine, problem.checked_theta(start), theta, excess)
-    if excess > 1 and result.status.converged and not problem.constraint_names:
+    if excess > 1 and result.status.successful and not problem.constraint_names:
         refuse_jumps(evaluator, theta)  # the error of steps across a jump does not vanish with their length
     trajectories, comparisons = compare(problem, theta, simulations)
     return _estimate(
@@ -304,7 +305,6 @@ def estimate(
         replace(result, iterations=earlier + result.iterations, earlier=earlier),
         history,
         hessian,
-        tolerance,
         initial_theta=problem.checked_theta(start),
         evaluations=evaluations,
         trajectories=trajectories,
@@ -375,7 +375,6 @@ def _estimate(
     result: Result,
     history: list[IterationRecord],
     hessian: HessianKind,
-    tolerance: float,
     **rest: Any,
 ) -> Estimate:
     """Collect what the optimiser found into an Estimate, with the exact Hessian whatever it worked with."""
@@ -384,32 +383,29 @@ def _estimate(
     exact = result.hessian
     if hessian in ("gauss-newton", "none") and np.isfinite(result.cost):
         exact = evaluator(result.theta).hessian
+    ended = replace(termination_of(result, problem), iterations=max(len(history) - 1, 0))
     return Estimate(
+        **vars(ended),
         theta_names=unknowns.names,
         theta_units=unknowns.units,
         theta=result.theta,
         lower=unknowns.lower,
         upper=unknowns.upper,
+        run_names=tuple(run_names(problem.experiments)),
         transition_times=tuple(times),
+        transition_places=unknowns.times,
         parameters={name: np.array(value) for name, value in parameters.items()},
-        cost=result.cost,
+        parameter_units={name: parameter.unit for name, parameter in problem.parameters.items()},
+        fixed=tuple(name for name, parameter in problem.parameters.items() if parameter.fixed),
         gradient=result.gradient,
         hessian=exact,
-        optimality=result.optimality,
-        iterations=max(len(history) - 1, 0),
-        status=result.status,
-        message=message_of(result, problem),
         history=tuple(history),
-        active=result.active,
-        kinks=tuple((unknowns.names[i], left, right) for i, left, right in result.kinks),
         free_basis=result.free_basis,
         sigma_known=sigma_known(problem),
         priors={name: text for name, text in zip(unknowns.names, unknowns.priors.texts(), strict=True) if text},
         log_scaled=unknowns.log_names,
-        idle=tuple(unknowns.names[i] for i in result.idle),
         least_squares=least_squares(problem),
         hessian_kind=hessian,
-        tolerance=tolerance,
         engine=evaluator.engine,
         problem=problem,
         evaluator=evaluator,

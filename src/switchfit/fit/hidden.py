@@ -32,16 +32,17 @@ def refuse_hidden_switches(evaluator: Evaluator, theta: FloatArray, gradient: Fl
         At theta. Nothing is evaluated where no entry is 0.
     """
     unknowns = evaluator.problem.unknowns
-    is_time = np.isin(np.arange(len(theta)), np.concatenate([*unknowns.times, np.zeros(0)]))
-    suspects = np.flatnonzero((gradient == 0.0) & ~is_time)
-    if not suspects.size:
+    suspects = np.flatnonzero((gradient == 0.0) & ~unknowns.is_time).tolist()
+    if not suspects:
         return
     base = evaluator(theta, matrix="none").cost
-    hidden = [unknowns.names[i] for i in suspects if _hidden(evaluator, theta, int(i), base)]
+    hidden = [i for i in suspects if _hidden(evaluator, theta, i, base)]
     if hidden:
+        spans = unknowns.parameters.items()
+        name = next((name for name, span in spans if span.start <= hidden[0] < span.stop), unknowns.names[hidden[0]])
+        shown = ", ".join(unknowns.names[i] for i in hidden)
         raise ValueError(
-            f"the cost changes with {', '.join(hidden)}, but its derivative is zero wherever it was tried: "
-            f"{_advice(hidden[0])}"
+            f"the cost changes with {shown}, but its derivative is zero wherever it was tried: {_advice(name)}"
         )
 
 
@@ -55,20 +56,19 @@ def refuse_jumps(evaluator: Evaluator, theta: FloatArray) -> None:
         Where a line search has failed.
     """
     unknowns = evaluator.problem.unknowns
-    for span in unknowns.parameters.values():
+    for name, span in unknowns.parameters.items():
         for i in range(span.start, span.stop):
             jump = _jump(evaluator, theta, i)
             if jump is not None:
                 place, finding = jump
                 raise ValueError(
                     f"the cost jumps from {finding.before:.8g} to {finding.after:.8g} where {unknowns.names[i]} passes "
-                    f"{place:.8g}, which its derivative knows nothing of: {_advice(unknowns.names[i])}"
+                    f"{place:.8g}, which its derivative knows nothing of: {_advice(name)}"
                 )
 
 
-def _advice(unknown: str) -> str:
+def _advice(name: str) -> str:
     """What a function does with such a parameter, and what to write instead."""
-    name = unknown.partition("[")[0]
     return (
         f'a function decides by comparing with it, as in jnp.where(t < p["{name}"], a, b), and derivatives do not see '
         "where such a switch happens. If it is a moment, make it a transition time: a mode for a and a mode for b, "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Literal, NamedTuple
 
@@ -12,93 +12,45 @@ import scipy.special
 from numpy.typing import NDArray
 
 from switchfit.engine.protocol import Engine
+from switchfit.fit.termination import Kink, Termination
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord, Status
+from switchfit.problem.constraints import ActiveConstraint
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_choice, as_level
+from switchfit.runtime.issue import Issue
 
 CovarianceKind = Literal["exact", "gauss-newton"]
 
 
 @dataclass(frozen=True)
-class Certificate:
-    """How the numbers of a fit were checked.
+class Transition:
+    """One transition of one experiment.
 
     Attributes
     ----------
-    optimality : float
-        KKT residual at the solution.
-    smallest_eigenvalue : float
-        Of the Hessian on the free directions; positive: the second-order sufficient condition holds. NaN if
-        nothing is free.
-    smallest_scaled_eigenvalue : float
-        The same with the unknowns scaled to unit curvature each: 1 is perfectly, 0 not at all determined.
-    condition_number : float
-        Of that scaled Hessian.
-    worst_direction : str
-        The worst-determined direction in words.
-    integration_error : float
-        Largest relative change by halving all steps of J, the guards and the terminal constraints: of J relative to J,
-        or to 1e-3 of the first J where that is more; of a constraint relative to what the
-        states make of it as they go through their ranges in the run.
-    gradient_gap, hessian_gap : float
-        Relative gap between the paper's equations (6)-(17) and the exact derivatives of the discretised cost; NaN
-        where that was not checked.
-    taylor_orders : tuple of float
-        Orders of the remainders of J, of J with its gradient and of J with its Hessian along a random direction: at
-        least 1, 2, 3 where the derivatives are right (2, 2, 3 at a minimum, where the gradient vanishes); NaN where a
-        remainder is rounding, or where that was not checked.
-    active : tuple of str
-        Constraints that hold with equality, collapsed modes and bounds among them, and kinks.
-    failures : tuple of str
-        What of all this is not as it has to be; nothing: the certificate is good.
-    integration_error_of : str
-        The output that has the `integration_error`: "J", or the name of a guard or terminal constraint.
+    experiment : int, from 0
+    run : str
+        The experiment's name; empty where there is only one.
+    name : str
+        As in `Fit.theta_names`.
+    time : float
+    unit : str
+        That of the experiment's times.
+    before, after : str
+        The modes that it joins.
+    index : int or None
+        Its place in theta; None where it is fixed.
     """
 
-    optimality: float
-    smallest_eigenvalue: float
-    smallest_scaled_eigenvalue: float
-    condition_number: float
-    worst_direction: str
-    integration_error: float
-    gradient_gap: float
-    hessian_gap: float
-    taylor_orders: tuple[float, ...]
-    active: tuple[str, ...]
-    failures: tuple[str, ...]
-    integration_error_of: str = "J"
-
-    @property
-    def passed(self) -> bool:
-        """Whether nothing that was checked failed."""
-        return not self.failures
-
-    def __str__(self) -> str:
-        rows = [
-            ("KKT residual", f"{self.optimality:.2e}"),
-            ("smallest Hessian eigenvalue, free directions", f"{self.smallest_eigenvalue:.4g}"),
-            ("  with unknowns scaled to unit curvature", f"{self.smallest_scaled_eigenvalue:.4g}"),
-            ("  condition number of that", f"{self.condition_number:.3g}"),
-            ("  worst-determined direction", self.worst_direction),
-            ("largest integration error, relative", f"{self.integration_error:.1e} ({self.integration_error_of})"),
-            ("paper's gradient against discretised, relative", _gap(self.gradient_gap)),
-            ("paper's Hessian against discretised, relative", _gap(self.hessian_gap)),
-            ("Taylor orders of J, with gradient, with Hessian", _orders(self.taylor_orders)),
-            ("active constraints", "; ".join(self.active) or "none"),
-            ("verdict", f"FAILED: {'; '.join(self.failures)}" if self.failures else "passed"),
-        ]
-        return "\n".join(f"{label:<48} {value}" for label, value in rows)
-
-
-def _gap(gap: float) -> str:
-    return "not checked" if np.isnan(gap) else f"{gap:.1e}"
-
-
-def _orders(orders: tuple[float, ...]) -> str:
-    if np.isnan(orders).all():
-        return "not checked"
-    return ", ".join("rounding" if np.isnan(order) else f"{order:.2f}" for order in orders)
+    experiment: int
+    run: str
+    name: str
+    time: float
+    unit: str
+    before: str
+    after: str
+    index: int | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,20 +61,25 @@ class Fit:
     ----------
     theta_names, theta_units : tuple of str
     initial_theta, theta, lower, upper : (d,)
+    run_names : tuple of str, one an experiment
+        Its name, or run1, run2, ...
     transition_times : tuple of (N,) arrays, one an experiment, fixed ones included
+    transition_places : tuple of (N,) int arrays, one an experiment
+        Where in theta each transition time stands; -1 where it is fixed.
     parameters : dict of name -> array, fixed ones included
+    parameter_units : dict of name -> str, fixed ones included
+    fixed : tuple of str
+        Names of the parameters that are fixed.
     cost : float
     gradient, hessian : (d,), (d, d), exact at theta
     optimality : float
         KKT residual; the norm of the gradient where no constraint is active.
     iterations, evaluations : int
     status : Status
-    message : str
-        The status as a sentence with what to do.
     history : tuple of IterationRecord
-    active : tuple of str
-        Constraints that hold with equality.
-    kinks : tuple of (name, left derivative, right derivative)
+    active : tuple of ActiveConstraint
+        Bounds, and shortest durations of modes, that hold with equality.
+    kinks : tuple of Kink
         Unknowns that ended where the derivative jumps through zero.
     free_basis : (d, k)
         Orthonormal basis of the directions that constraints and kinks leave free.
@@ -155,6 +112,16 @@ class Fit:
         Unknowns on which J does not depend because modes have collapsed: the transition times of a mode of no duration
         between two stretches of the same mode, and parameters that act in collapsed modes alone. Their values say
         nothing, and they are not in `free_basis`.
+    earlier_iterations : int
+        Iterations before the mesh was refined for the last time.
+    smallest_eigenvalue : float
+        Of the Hessian on the free directions, each unknown scaled to unit curvature, as the optimiser found it.
+    flat_direction : tuple of (str, float)
+        The unknowns that its eigenvector mostly consists of, and their parts in it.
+    violated : tuple of (str, float)
+        Guards and terminal constraints that are not met, and their values.
+    reason : Issue or None
+        Why the line search failed, or the error with which the fit ended.
     """
 
     theta_names: tuple[str, ...]
@@ -163,8 +130,12 @@ class Fit:
     theta: FloatArray
     lower: FloatArray
     upper: FloatArray
+    run_names: tuple[str, ...]
     transition_times: tuple[FloatArray, ...]
+    transition_places: tuple[NDArray[np.intp], ...]
     parameters: Mapping[str, FloatArray]
+    parameter_units: Mapping[str, str]
+    fixed: tuple[str, ...]
     cost: float
     gradient: FloatArray
     hessian: FloatArray
@@ -172,10 +143,9 @@ class Fit:
     iterations: int
     evaluations: int
     status: Status
-    message: str
     history: tuple[IterationRecord, ...]
-    active: tuple[str, ...]
-    kinks: tuple[tuple[str, float, float], ...]
+    active: tuple[ActiveConstraint, ...]
+    kinks: tuple[Kink, ...]
     free_basis: FloatArray
     trajectories: tuple[Trajectory, ...]
     comparisons: tuple[tuple[Comparison, ...], ...]
@@ -192,14 +162,61 @@ class Fit:
     engine: Engine | None = None
     integration_error_of: str = "J"
     idle: tuple[str, ...] = ()
+    earlier_iterations: int = 0
+    smallest_eigenvalue: float = np.nan
+    flat_direction: tuple[tuple[str, float], ...] = ()
+    violated: tuple[tuple[str, float], ...] = ()
+    reason: Issue | None = None
 
     @property
     def success(self) -> bool:
-        """Whether the fit converged; with `Status.SINGULAR` to a point from which J is flat in some direction.
+        """Whether the fit converged, which is `Status.successful`: it found a point near which nothing decreases J.
 
-        With `Status.COLLAPSED` J is flat in nothing but what a mode of no duration leaves undetermined.
+        With `Status.SINGULAR` J is flat in some direction from there, with `Status.COLLAPSED` in nothing but what a
+        mode of no duration leaves undetermined; ``status.is_strict_minimum`` is False with these two.
         """
-        return self.status.converged
+        return self.status.successful
+
+    @property
+    def termination(self) -> Termination:
+        """How the fit ended: what its message is made of."""
+        return Termination(**{f.name: getattr(self, f.name) for f in fields(Termination)})
+
+    @property
+    def message(self) -> str:
+        """How the fit ended as a sentence or two, with what to do."""
+        return str(self.termination)
+
+    @property
+    def is_time(self) -> NDArray[np.bool_]:
+        """Which of the unknowns are transition times: (d,)."""
+        found = np.zeros(len(self.theta_names), dtype=bool)
+        for places in self.transition_places:
+            found[places[places >= 0]] = True
+        return found
+
+    @property
+    def transitions(self) -> list[Transition]:
+        """All transitions, experiment by experiment, fixed ones included."""
+        single = len(self.trajectories) == 1
+        found = []
+        each = zip(self.run_names, self.trajectories, self.transition_times, self.transition_places, strict=True)
+        for e, (run, trajectory, times, places) in enumerate(each):
+            modes = [mode for mode, _, _ in trajectory.mode_spans]
+            for i, (time, place) in enumerate(zip(times.tolist(), places.tolist(), strict=True)):
+                found.append(
+                    Transition(
+                        experiment=e,
+                        run="" if single else run,
+                        name=f"{'' if single else f'{run}.'}tau_{i + 1}",
+                        time=time,
+                        unit=trajectory.time_unit,
+                        before=modes[i],
+                        after=modes[i + 1],
+                        index=place if place >= 0 else None,
+                    )
+                )
+        return found
 
     @property
     def trajectory(self) -> Trajectory:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,8 +12,10 @@ from numpy.typing import NDArray
 from switchfit.fit.collapsed import idle_unknowns
 from switchfit.fit.evaluator import ArrowEvaluation, Evaluation, Evaluator
 from switchfit.fit.hidden import refuse_hidden_switches, refuse_jumps
+from switchfit.fit.termination import linear_constraints_of
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
 from switchfit.optimize.arrow import Arrow
+from switchfit.optimize.diagnosis import Finding
 from switchfit.optimize.sqp import HessianKind
 from switchfit.problem.data import FloatArray, Measurements, TerminalConstraint
 from switchfit.problem.problem import Problem
@@ -37,12 +38,7 @@ class CostAndGradient:
 def constraints_of(problem: Problem) -> LinearConstraints:
     """Ordering, minimum durations and bounds of a problem as the optimiser takes them."""
     unknowns = problem.unknowns
-    names = [
-        *unknowns.constraint_names,
-        *(f"{name} at its lower bound {value:g}" for name, value in zip(unknowns.names, unknowns.lower, strict=True)),
-        *(f"{name} at its upper bound {value:g}" for name, value in zip(unknowns.names, unknowns.upper, strict=True)),
-    ]
-    return LinearConstraints(unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, tuple(names))
+    return LinearConstraints(unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, linear_constraints_of(problem))
 
 
 def minimized(
@@ -88,9 +84,6 @@ def minimized(
     def idle(z: FloatArray, everything: bool) -> NDArray[np.bool_]:
         return idle_unknowns(evaluator, z if identity else _outward(variables, constraints, z), everything)
 
-    is_time = np.zeros(len(theta), dtype=int)
-    for where in problem.unknowns.times:
-        is_time[where[where >= 0]] = 1
     told = callback
     if callback is not None and not identity:
         told = lambda record: callback(_told(variables, constraints, record))  # noqa: E731
@@ -100,7 +93,7 @@ def minimized(
         constraints=constraints if identity else _constraints_inward(variables, constraints),
         breakpoints=evaluator.breakpoints(),
         hessian=hessian,
-        blocks=is_time,
+        blocks=unknowns.is_time.astype(int),
         tolerance=tolerance,
         max_iterations=max_iterations,
         callback=told,
@@ -142,22 +135,30 @@ def _told(variables: Variables, constraints: LinearConstraints, record: Iteratio
 def _result_outward(variables: Variables, constraints: LinearConstraints, result: Result) -> Result:
     """The optimiser's result in theta; its optimality and its eigenvalues stay those of its own variables."""
     theta = _outward(variables, constraints, result.theta)
+    slopes = variables.slopes(theta)[0]
+    rows = np.ones(len(constraints.b))  # these join transition times alone, which are not changed
     gradient, hessian = variables.derivatives_outward(theta, result.gradient, result.hessian)
     history = tuple(_told(variables, constraints, record) for record in result.history)
-    return replace(result, theta=theta, gradient=gradient, hessian=hessian, history=history)
+    return replace(
+        result,
+        theta=theta,
+        gradient=gradient,
+        hessian=hessian,
+        history=history,
+        multipliers=result.multipliers / np.concatenate([rows, slopes, slopes]),
+        reason=None if result.reason is None else _reason_outward(variables, result.theta, slopes, result.reason),
+    )
 
 
-def message_of(result: Result, problem: Problem) -> str:
-    """The optimiser's message with the unknowns called by their names, and what a delay may have to do with it."""
-    names = problem.unknowns.names
-    message = re.sub(r"theta\[(\d+)\]", lambda match: names[int(match.group(1))], result.message)
-    data = [item for run in problem.experiments for item in run.data]
-    if result.status is Status.LINE_SEARCH_FAILED and any(isinstance(getattr(d, "delay", None), str) for d in data):
-        message += (
-            " A delay is estimated here: J has a kink where a transition meets the moment of which a late sample "
-            "is, and the fit may have ended at one. Fix the delay at its estimate to see."
-        )
-    return message
+def _reason_outward(variables: Variables, z: FloatArray, slopes: FloatArray, found: Finding) -> Finding:
+    """Why the line search failed, in theta in place of the optimiser's variables z (d,); `slopes`: dtheta/dz (d,)."""
+    places = []
+    for i, value in found.places:
+        there = z.copy()
+        there[i] = value
+        places.append((i, float(variables.outward(there)[i])))
+    entries = [(i, stated / float(slopes[i]), measured / float(slopes[i])) for i, stated, measured in found.entries]
+    return replace(found, places=tuple(places), entries=tuple(entries))
 
 
 def smallest_cost(problem: Problem) -> float:

@@ -10,6 +10,7 @@ from switchfit.problem.data import Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
+from switchfit.report.tables import format_table
 
 
 def describe(problem: Problem) -> str:
@@ -21,16 +22,14 @@ def describe(problem: Problem) -> str:
     """
     lines = [describe_experiments(problem.experiments)]
     unknowns = problem.unknowns
-    width = max(len(name) for name in unknowns.names)
-    lines.append("Unknowns, first guess and bounds")
+    rows = []
     numbers = (unknowns.initial, unknowns.lower, unknowns.upper)
     columns = (unknowns.names, unknowns.units, *numbers, unknowns.priors.texts(), unknowns.log)
     for name, unit, value, lower, upper, prior, log in zip(*columns, strict=True):
-        unit = "" if unit == "1" else f" {unit}"
-        bounds = "" if np.isinf(lower) and np.isinf(upper) else f"   in [{lower:.6g}, {upper:.6g}]"
-        known = f"   prior: {prior}" if prior else ""
-        lines.append(f"  {name:<{width}}  {value:.6g}{unit}{bounds}{known}{'   (log scale)' if log else ''}")
-    return "\n".join(lines)
+        bounds = "" if np.isinf(lower) and np.isinf(upper) else f"in [{lower:.6g}, {upper:.6g}]"
+        known, scale = f"prior: {prior}" if prior else "", "(log scale)" if log else ""
+        rows.append((name, f"{value:.6g}{unit_suffix(unit)}", bounds, known, scale))
+    return "\n".join([*lines, "Unknowns, first guess and bounds", *format_table(rows, "<<<<<")])
 
 
 def describe_experiments(experiments: Sequence[Experiment]) -> str:

@@ -176,7 +176,7 @@ def _finished(
     basis = np.linalg.qr(free * scaling[:, None])[0] if free.shape[1] else free
     values, vectors = np.linalg.eigh(basis.T @ (here.hessian / np.outer(scaling, scaling)) @ basis)
     violated = [
-        f"{name} = {value:.2e}"
+        (name, float(value))
         for name, value, size in zip(names, here.constraints, unit, strict=True)
         if not abs(value) <= MET * size
     ]
@@ -199,7 +199,7 @@ def _finished(
         smallest_unscaled_eigenvalue=float(unscaled[0]) if len(values) else np.nan,
         flat_direction=lowest / max(float(np.linalg.norm(lowest)), np.finfo(float).tiny),
         history=tuple(history),
-        violated="; ".join(violated),
+        violated=tuple(violated),
     )
     return ConstrainedResult(final, here.constraints, multipliers)
 

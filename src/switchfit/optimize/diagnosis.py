@@ -32,12 +32,24 @@ class Finding:
     before, after : float
         J on both sides of a jump; the slope on both sides of a kink; the slope and the difference quotient where the
         slope is wrong.
+    places : tuple of (int, float)
+        Coordinates of the jump or the kink, and where each of them is there.
+    entries : tuple of (int, float, float)
+        Coordinates whose derivative is wrong: the derivative, and the difference quotient.
+    noise : float
+        Rounding error of J, where that is the reason.
+    condition : float
+        Condition number of the scaled Hessian, where a valley is the reason.
     """
 
     kind: Literal["wrong slope", "jump", "kink", "rounding", "valley"]
     at: float = 0.0
     before: float = np.nan
     after: float = np.nan
+    places: tuple[tuple[int, float], ...] = ()
+    entries: tuple[tuple[int, float, float], ...] = ()
+    noise: float = np.nan
+    condition: float = np.nan
 
 
 def find_reason(line: Line, noise: float, smooth: float) -> Finding:

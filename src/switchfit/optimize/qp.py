@@ -55,8 +55,8 @@ class LinearConstraints:
         Their right-hand sides.
     lower, upper : array, shape (d,)
         Bounds; infinite where there is none.
-    names : sequence of str, length m + 2 d
-        What to call each row, then each lower bound, then each upper bound, in messages.
+    names : sequence, length m + 2 d
+        What to call each row, then each lower bound, then each upper bound: text, or anything that prints as such.
 
     Raises
     ------
@@ -68,7 +68,7 @@ class LinearConstraints:
     b: FloatArray
     lower: FloatArray
     upper: FloatArray
-    names: tuple[str, ...]
+    names: tuple[object, ...]
 
     def __post_init__(self) -> None:
         lower = np.atleast_1d(np.asarray(self.lower, dtype=float))

@@ -91,58 +91,44 @@ class Evaluation(Protocol):
 
 
 class Status(Enum):
-    """How a minimisation ended: a sentence with the remedy, to be filled in by `Result.message`."""
+    """How a minimisation ended, and what that means."""
 
-    CONVERGED = "Converged: the optimality {optimality:.1e} is below the tolerance {tolerance:.1e}."
+    CONVERGED = "The optimality is below the tolerance, and the curvature on the free directions is positive."
     CONVERGED_PRECISION = (
-        "Converged to the limit of double precision: the optimality {optimality:.1e} is above the tolerance "
-        "{tolerance:.1e}, but the decrease still predicted is below the rounding error of the cost {cost:.6e}. "
-        "Ask for a larger tolerance."
+        "The decrease that is still predicted is below the rounding error of the cost, although the optimality is "
+        "above the tolerance."
     )
     CONVERGED_AT_KINK = (
-        "Converged at a kink of the cost: {kinks}. The one-sided derivatives have opposite signs, so this is a "
-        "minimiser although no gradient vanishes there; covariances do not apply to such an unknown."
+        "The one-sided derivatives have opposite signs at a kink of the cost: a minimiser where no gradient vanishes."
     )
-    MAX_ITERATIONS = (
-        "Stopped after {iterations} iterations{earlier} with optimality {optimality:.1e} above the tolerance "
-        "{tolerance:.1e}. "
-        "Raise max_iterations, use hessian='exact', or start closer."
-    )
+    MAX_ITERATIONS = "All iterations were done before the optimality was below the tolerance."
     LINE_SEARCH_FAILED = (
-        "The line search found no decrease of the cost along a descent direction (optimality {optimality:.1e}), nor "
-        "did it after a fresh start from there. {reason}"
+        "The line search found no decrease along a descent direction, nor did it after a fresh start from there."
     )
-    INTERRUPTED = "Interrupted after {iterations} iterations with optimality {optimality:.1e}: the best point so far."
-    NONFINITE_START = (
-        "The cost or its derivatives are not finite at the starting point. Start elsewhere, or check the model there."
-    )
-    SADDLE = (
-        "A stationary point but no minimum: the scaled Hessian on the free directions has the eigenvalue "
-        "{smallest_eigenvalue:.1e}, and no step along it decreased the cost. Start elsewhere."
-    )
-    SINGULAR = (
-        "Converged, but the cost is flat to second order along {direction} (scaled eigenvalue "
-        "{smallest_eigenvalue:.1e}): these unknowns are not identified. Fix one of them or add data."
-    )
+    INTERRUPTED = "The callback, or Ctrl-C, stopped it; the result is the best point so far."
+    NONFINITE_START = "The cost or its derivatives are not finite at the starting point."
+    SADDLE = "A stationary point with negative curvature from which no step decreased the cost: no minimum."
+    SINGULAR = "Converged to a point from which the cost is flat to second order in some direction."
     COLLAPSED = (
-        "Converged (optimality {optimality:.1e}), with a mode that has no duration: the cost depends neither on where "
-        "it would stand nor on what acts in it alone ({idle}). Leave it out of mode_sequence, start from another "
-        "guess, or give min_duration."
+        "Converged with a mode of no duration: the cost depends neither on where it would stand nor on what acts in "
+        "it alone."
     )
-    INFEASIBLE = (
-        "The constraints are not met: {violated}. Start nearer to a point that meets them, or check that one can."
-    )
-    ERROR = "The fit ended with an error, and was left where it was. {error}"
+    INFEASIBLE = "A guard or a terminal constraint is not met."
+    ERROR = "The fit ended with an error, and was left where it was."
 
     @property
     def successful(self) -> bool:
-        """Whether the point is a local minimiser as far as second-order conditions can tell."""
-        return self in (Status.CONVERGED, Status.CONVERGED_PRECISION, Status.CONVERGED_AT_KINK)
+        """Whether it converged, to a point near which nothing decreases the cost; `Estimate.success` is the same.
+
+        Also where that point is not the only one: where the cost is flat in some direction (`SINGULAR`), or a mode has
+        collapsed (`COLLAPSED`). `is_strict_minimum` leaves these out.
+        """
+        return self.is_strict_minimum or self in (Status.SINGULAR, Status.COLLAPSED)
 
     @property
-    def converged(self) -> bool:
-        """Whether the minimisation ended as it should: also where J is flat in some direction, or a mode collapsed."""
-        return self.successful or self in (Status.SINGULAR, Status.COLLAPSED)
+    def is_strict_minimum(self) -> bool:
+        """Whether the point is the only minimiser nearby, as far as second-order conditions can tell."""
+        return self in (Status.CONVERGED, Status.CONVERGED_PRECISION, Status.CONVERGED_AT_KINK)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,8 +183,8 @@ class Result:
         one, the norm of the gradient if nothing is active.
     iterations, evaluations : int
     status : Status
-    active : tuple of str
-        Names of the constraints that hold with equality.
+    active : tuple
+        Those of `LinearConstraints.names` whose constraints hold with equality.
     multipliers : array, shape (m + 2 d,)
         Of rows, lower and upper bounds, in the order of `LinearConstraints.names`.
     kinks : tuple of (int, float, float)
@@ -216,13 +202,13 @@ class Result:
         The tolerance asked for.
     history : tuple of IterationRecord
         The start and every iteration.
-    violated : str
+    violated : tuple of (str, float)
         Equality constraints that are not met, with their values.
     idle : tuple of int
         Coordinates on which J does not depend at theta, by the word of the caller's `idle`, and those that active rows
         tie to them; they are not in `free_basis`.
-    reason : str
-        What was seen where the line search failed, and what to do.
+    reason : Finding or None
+        What was seen where the line search failed; None where it did not.
     earlier : int
         How many of the iterations belong to minimisations before, which this one resumed.
     """
@@ -235,7 +221,7 @@ class Result:
     iterations: int
     evaluations: int
     status: Status
-    active: tuple[str, ...]
+    active: tuple[object, ...]
     multipliers: FloatArray
     kinks: tuple[tuple[int, float, float], ...]
     free_basis: FloatArray
@@ -245,40 +231,10 @@ class Result:
     flat_direction: FloatArray
     tolerance: float
     history: tuple[IterationRecord, ...]
-    violated: str = ""
+    violated: tuple[tuple[str, float], ...] = ()
     idle: tuple[int, ...] = ()
-    reason: str = ""
+    reason: Finding | None = None
     earlier: int = 0
-
-    @property
-    def successful(self) -> bool:
-        """Whether the status is one of the successful ones."""
-        return self.status.successful
-
-    @property
-    def message(self) -> str:
-        """The status as a sentence with this result's numbers and names."""
-        kinks = ", ".join(
-            f"theta[{i}] = {self.theta[i]:.10g}, where the derivative jumps from {left:.1e} to {right:.1e}"
-            for i, left, right in self.kinks
-        )
-        order = np.argsort(-np.abs(self.flat_direction), kind="stable")
-        largest = [i for i in order if abs(self.flat_direction[i]) > 0.1][:4]
-        direction = " ".join(f"{self.flat_direction[i]:+.2g} theta[{i}]" for i in largest) or "no direction"
-        sentence = self.status.value.format(
-            optimality=self.optimality,
-            tolerance=self.tolerance,
-            cost=self.cost,
-            iterations=self.iterations,
-            smallest_eigenvalue=self.smallest_eigenvalue,
-            kinks=kinks,
-            direction=direction,
-            violated=self.violated,
-            idle=", ".join(f"theta[{i}]" for i in self.idle),
-            reason=self.reason,
-            earlier=f", {self.earlier} of them before the mesh was refined," if self.earlier else "",
-        )
-        return sentence + (f" Active: {'; '.join(self.active)}." if self.active else "")
 
 
 # --- the problem and its points ---------------------------------------------------------------------------------------
@@ -523,7 +479,7 @@ class _State:
     restarts: int = 0
     careful: bool = False  # the next step is taken with the diagonal of the Hessian alone
     status: Status | None = None
-    reason: str = ""  # why it failed, where it did
+    reason: Finding | None = None  # why it failed, where it did
 
 
 @dataclass(frozen=True, eq=False)
@@ -606,8 +562,8 @@ def _stalled(oracle: _Oracle, state: _State, direction: _Direction) -> _State:
     return replace(state, status=Status.LINE_SEARCH_FAILED, reason=_reason(oracle, state, direction))
 
 
-def _reason(oracle: _Oracle, state: _State, direction: _Direction) -> str:
-    """What J is like along the direction that failed, in words."""
+def _reason(oracle: _Oracle, state: _State, direction: _Direction) -> Finding:
+    """What J is like along the direction that failed, and which coordinates make it so."""
     problem, theta = oracle.problem, state.point.theta
     noise = NOISE * max(abs(state.point.cost), 0.01 * state.cost_scale)
 
@@ -621,33 +577,17 @@ def _reason(oracle: _Oracle, state: _State, direction: _Direction) -> str:
     found = find_reason(line, noise, min([*marks, 1.0]))
     at = theta + found.at * direction.step
     if found.kind == "wrong slope":
-        return (
-            f"The gradient does not belong to the cost: along that direction it says {found.before:.3g}, differences "
-            f"of the cost say {found.after:.3g}{_wrong_entries(oracle, state, noise)}. Check the derivatives."
-        )
+        return replace(found, entries=_wrong_entries(oracle, state, noise))
     if found.kind == "jump":
-        who = _who_jumps(oracle, theta, direction.step, found, noise)
-        return (
-            f"The cost jumps from {found.before:.8g} to {found.after:.8g} where {who}. The optimiser needs a cost that "
-            "is continuous there."
-        )
+        return replace(found, places=_who_jumps(oracle, theta, direction.step, found))
     if found.kind == "kink":
-        where = ", ".join(f"theta[{i}] = {at[i]:.8g}" for i in _who_bends(oracle, theta, direction.step, found))
-        return (
-            f"The derivatives are right, but there is a kink close by, near {where}: along that direction the slope "
-            f"jumps from {found.before:.3g} to {found.after:.3g}. Start elsewhere, or fix what is at the kink there."
-        )
+        bent = _who_bends(oracle, theta, direction.step, found)
+        return replace(found, places=tuple((i, float(at[i])) for i in bent))
     if found.kind == "rounding":
-        return (
-            "The derivatives are right, but what the cost can still fall along that direction is less than its "
-            f"rounding error, {noise:.1e}. Scale the unknowns to be of size one, or ask for a larger tolerance."
-        )
+        return replace(found, noise=noise)
     curvature = _curvature(problem, state, state.point.active).eigenvalues
-    condition = curvature[-1] / curvature[0] if curvature.size and curvature[0] > 0.0 else np.inf
-    return (
-        "The derivatives are right, but the cost has a narrow valley there (condition number of the scaled Hessian "
-        f"{condition:.1e}). Start elsewhere, fix one of the unknowns that trade off, or take hessian='gauss-newton'."
-    )
+    positive = curvature.size > 0 and curvature[0] > 0.0
+    return replace(found, condition=float(curvature[-1] / curvature[0]) if positive else np.inf)
 
 
 def _next_breakpoint(points: FloatArray, x: float, step: float) -> float:
@@ -658,8 +598,8 @@ def _next_breakpoint(points: FloatArray, x: float, step: float) -> float:
     return float(np.min((ahead - x) / step, initial=np.inf))
 
 
-def _wrong_entries(oracle: _Oracle, state: _State, noise: float) -> str:
-    """The coordinates whose derivative differences of J do not confirm, in words."""
+def _wrong_entries(oracle: _Oracle, state: _State, noise: float) -> tuple[tuple[int, float, float], ...]:
+    """Up to four coordinates whose derivative is not that of J: (coordinate, derivative, difference quotient)."""
     theta, problem = state.point.theta, oracle.problem
     breakpoints = dict(problem.breakpoints)
     wrong = []
@@ -676,9 +616,9 @@ def _wrong_entries(oracle: _Oracle, state: _State, noise: float) -> str:
             measured = wrong_slope(line, noise, smooth)
             if measured is not None:
                 stated = state.point.plus.gradient[i]
-                wrong.append(f"theta[{i}] (derivative {stated:.3g}, differences {measured / unit[i]:.3g})")
+                wrong.append((int(i), float(stated), float(measured / unit[i])))
                 break
-    return f"; it is wrong in {', '.join(wrong[:4])}" if wrong else ""
+    return tuple(wrong[:4])
 
 
 def _who_bends(oracle: _Oracle, theta: FloatArray, step: FloatArray, found: Finding) -> list[int]:
@@ -692,8 +632,11 @@ def _who_bends(oracle: _Oracle, theta: FloatArray, step: FloatArray, found: Find
     return [i for i in moving if jumps[i] > 0.1 * jumps.max()][:4]
 
 
-def _who_jumps(oracle: _Oracle, theta: FloatArray, step: FloatArray, found: Finding, noise: float) -> str:
-    """The coordinate whose change by a hair across a jump of J makes it jump, in words."""
+def _who_jumps(oracle: _Oracle, theta: FloatArray, step: FloatArray, found: Finding) -> tuple[tuple[int, float], ...]:
+    """The coordinate whose change by a hair across a jump of J makes it jump, with its value there.
+
+    Up to four coordinates that the step moves, where none of them does so alone.
+    """
     width = max(2.0**-40 * found.at, 1e-15)
     before, after = theta + (found.at - width) * step, theta + (found.at + width) * step
     base = oracle.sample(before, 1)
@@ -706,8 +649,8 @@ def _who_jumps(oracle: _Oracle, theta: FloatArray, step: FloatArray, found: Find
             and there is not None
             and abs(there.cost - base.cost) > 0.5 * abs(found.after - found.before)
         ):
-            return f"theta[{i}] passes {after[i]:.8g}"
-    return "the step passes " + ", ".join(f"theta[{i}] = {after[i]:.8g}" for i in np.flatnonzero(step)[:4])
+            return ((int(i), float(after[i])),)
+    return tuple((int(i), float(after[i])) for i in np.flatnonzero(step)[:4])
 
 
 def _finish(oracle: _Oracle, state: _State, status: Status) -> _State:

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.problem.constraints import Constraint
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment, initial_state_of, run_names
 from switchfit.problem.lengths import common_lengths
@@ -58,7 +59,7 @@ class Unknowns:
     initial_states : for each experiment the positions in theta of the entries of its initial state, -1 where it is not
         estimated: (n,) int arrays; (0,) where it is a function
     A, b : ordering and minimum durations as ``A theta >= b``, (m, d) and (m,)
-    constraint_names : what each row means when it is active
+    rows : tuple of Constraint, what each row of A theta >= b is
     priors : PriorTerms
     log : (d,) bool, whether an unknown is estimated on a logarithmic scale
     """
@@ -73,17 +74,22 @@ class Unknowns:
     initial_states: tuple[NDArray[np.intp], ...]
     A: FloatArray
     b: FloatArray
-    constraint_names: tuple[str, ...]
+    rows: tuple[Constraint, ...]
     priors: PriorTerms
     log: NDArray[np.bool_]
 
     @cached_property
+    def is_time(self) -> NDArray[np.bool_]:
+        """Which of the unknowns are transition times: (d,)."""
+        found = np.zeros(len(self.names), dtype=bool)
+        for where in self.times:
+            found[where[where >= 0]] = True
+        return found
+
+    @cached_property
     def variables(self) -> Variables:
         """What the optimiser works with: transition times as they are, other unknowns scaled or their logarithms."""
-        is_time = np.zeros(len(self.names), dtype=bool)
-        for where in self.times:
-            is_time[where[where >= 0]] = True
-        return Variables.of(self.initial, self.lower, self.upper, self.log, keep=is_time)
+        return Variables.of(self.initial, self.lower, self.upper, self.log, keep=self.is_time)
 
     @property
     def log_names(self) -> tuple[str, ...]:
@@ -556,11 +562,11 @@ def _index(k: tuple[int, ...]) -> str:
 
 def _ordering(
     experiments: tuple[Experiment, ...], where: list[NDArray[np.intp]], d: int, dwell: float
-) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
+) -> tuple[FloatArray, FloatArray, tuple[Constraint, ...]]:
     """Rows ``tau_{i+1} - tau_i >= min_duration`` for every mode of every experiment with a free end."""
     if not (np.isfinite(dwell) and dwell >= 0):
         raise ValueError(f"min_duration must be zero or positive; got {dwell}.")
-    rows, bounds, names = [], [], []
+    rows, bounds, constraints = [], [], []
     labels = run_names(experiments)
     if dwell > 0:
         units = {name: experiment.time_unit for name, experiment in zip(labels, experiments, strict=True)}
@@ -587,6 +593,13 @@ def _ordering(
                     bound -= sign * knot
             rows.append(row)
             bounds.append(bound)
-            state = "has collapsed to nothing" if dwell == 0 else "is at its minimum duration"
-            names.append(f"mode {i + 1} ({mode!r}){run} {state}")
-    return np.array(rows).reshape(len(rows), d), np.array(bounds), tuple(names)
+            constraints.append(
+                Constraint(
+                    kind="collapsed" if dwell == 0 else "minimum duration",
+                    value=dwell,
+                    mode=mode,
+                    position=i,
+                    run="" if len(experiments) == 1 else labels[e],
+                )
+            )
+    return np.array(rows).reshape(len(rows), d), np.array(bounds), tuple(constraints)

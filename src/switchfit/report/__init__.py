@@ -1,4 +1,9 @@
 """Results for people: text, tables and figures. Results do not know this room.
 
-Imports `batch` and the rooms before it.
+Its modules register how each kind of result is written and drawn (`switchfit.runtime.presentation`), which is why
+`switchfit` imports all of them. Imports `batch` and the rooms before it.
 """
+
+from switchfit.report import batch, plot, sentences, text, uncertainty
+
+__all__ = ["batch", "plot", "sentences", "text", "uncertainty"]

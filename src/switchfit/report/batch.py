@@ -2,31 +2,110 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from switchfit.batch.fits import Fits
+from switchfit.batch.resampling import Bootstrap
+from switchfit.batch.simulated import MonteCarlo
+from switchfit.batch.starts import Multistart
 from switchfit.problem.data import FloatArray
+from switchfit.problem.parameter import unit_suffix
+from switchfit.report.tables import format_table
+from switchfit.runtime.presentation import figure_of, text_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from switchfit.batch.fits import Fits
-    from switchfit.batch.resampling import Bootstrap
-    from switchfit.batch.simulated import MonteCarlo
-    from switchfit.batch.starts import Multistart
-
 ESTIMATE, TRUTH, NORMAL = "#4a7fb5", "#b2182b", "#222222"
 CLUSTER_COLOURS = ("#b2182b", "#4a7fb5", "#e0a030", "#5c9e5c", "#8a5fa3", "#777777")
 COLUMNS = 3
+LISTED_MINIMA = 10
 BOOTSTRAP_TITLES = {
     "residuals": "Bootstrap of residuals",
     "wild": "Bootstrap of residuals with random signs",
     "blocks": "Bootstrap of blocks of residuals",
     "runs": "Bootstrap of runs",
 }
+
+
+def summary_of(fits: Fits) -> list[str]:
+    """How many fits were done, how they ended, and the first that did not converge.
+
+    Parameters
+    ----------
+    fits : Fits
+    """
+    count, good = len(fits), int(fits.success.sum())
+    each = 1e3 * fits.seconds / max(count, 1)
+    lines = [f"{count} fits in {fits.seconds:.1f} s ({each:.2f} ms each), {good} converged"]
+    if count < fits.requested:
+        lines.append(f"STOPPED: {fits.requested - count} of {fits.requested} fits were not done")
+    endings = Counter(fits.status.tolist()).most_common()
+    lines += format_table([(str(number), name) for name, number in endings], "><", indent="    ")
+    if good:
+        spent = fits.iterations[fits.success]
+        lines.append(f"iterations: median {np.median(spent):.0f}, most {spent.max()}")
+    if good < count:
+        lines.append("not converged (all of them in .failures):")
+        lines += [f"  run {run}: {message}" for run, message in fits.failures[:3]]
+    return lines
+
+
+@text_of.register(Fits)
+def write_fits(fits: Fits) -> str:
+    """How the fits ended.
+
+    Parameters
+    ----------
+    fits : Fits
+    """
+    return "\n".join(summary_of(fits))
+
+
+@text_of.register(MonteCarlo)
+def write_monte_carlo(study: MonteCarlo) -> str:
+    """How the fits ended, and a line for each unknown.
+
+    Parameters
+    ----------
+    study : MonteCarlo
+    """
+    return "\n".join([*summary_of(study), "", *table_of_monte_carlo(study)])
+
+
+@text_of.register(Bootstrap)
+def write_bootstrap(study: Bootstrap) -> str:
+    """How the fits ended, what was resampled, and a line for each unknown.
+
+    Parameters
+    ----------
+    study : Bootstrap
+    """
+    what = f"{study.resample} of {study.block} samples" if study.resample == "blocks" else study.resample
+    return "\n".join([*summary_of(study), f"resampled: {what}", "", *table_of_bootstrap(study)])
+
+
+@text_of.register(Multistart)
+def write_multistart(study: Multistart) -> str:
+    """How the fits ended, and a line for each of the ten lowest minima.
+
+    Parameters
+    ----------
+    study : Multistart
+    """
+    minima = int(study.clusters.max(initial=-1)) + 1
+    rows = []
+    for k in range(min(minima, LISTED_MINIMA)):
+        here = np.flatnonzero(study.clusters == k)
+        columns = zip(study.theta_names, study.theta[here[0]], study.theta_units, strict=True)
+        place = ", ".join(f"{name} = {value:.6g}{unit_suffix(unit)}" for name, value, unit in columns)
+        rows.append((f"J = {study.cost[here].min():.9g}", f"{len(here)} starts", place))
+    return "\n".join([*summary_of(study), "", f"{minima} minima:", *format_table(rows, "<><")])
 
 
 def table_of_monte_carlo(study: MonteCarlo) -> list[str]:
@@ -52,17 +131,7 @@ def table_of_monte_carlo(study: MonteCarlo) -> list[str]:
             study.theta_names, study.theta_units, study.truth, bias, spread, reported, coverage, strict=True
         )
     ]
-    return _table([header, *rows])
-
-
-def _table(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Rows with their columns aligned to the right, the first one to the left."""
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    lines = []
-    for first, *others in rows:
-        aligned = [entry.rjust(width) for entry, width in zip(others, widths[1:], strict=True)]
-        lines.append("  ".join([first.ljust(widths[0]), *aligned]).rstrip())
-    return lines
+    return format_table([header, *rows], "<" + ">" * 6, indent="")
 
 
 def table_of_bootstrap(study: Bootstrap) -> list[str]:
@@ -78,9 +147,10 @@ def table_of_bootstrap(study: Bootstrap) -> list[str]:
             continue
         low, high = study.intervals()[k]
         rows.append((label, f"{value:.6g}", f"{bias:+.2e}", f"{error:.3e}", f"[{low:.6g}, {high:.6g}]"))
-    return _table(rows)
+    return format_table(rows, "<" + ">" * 4, indent="")
 
 
+@figure_of.register(Bootstrap)
 def plot_bootstrap(study: Bootstrap) -> Figure:
     """A histogram an unknown: estimates of the resampled data, the estimate, and its 95 % interval."""
     from matplotlib.figure import Figure
@@ -125,6 +195,7 @@ def _histogram_axis(study: Fits, k: int, limits: tuple[float, float], ax: Axes) 
     ax.locator_params(axis="x", nbins=4)
 
 
+@figure_of.register(MonteCarlo)
 def plot_monte_carlo(study: MonteCarlo) -> Figure:
     """A histogram an unknown: estimates, truth, and the normal density of the reported standard error."""
     from matplotlib.figure import Figure
@@ -160,6 +231,7 @@ def plot_monte_carlo(study: MonteCarlo) -> Figure:
     return figure
 
 
+@figure_of.register(Multistart)
 def plot_waterfall(study: Multistart) -> Figure:
     """Final cost of every start, ascending, above the best; starts that ended together share a colour."""
     from matplotlib.figure import Figure

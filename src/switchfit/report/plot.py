@@ -15,11 +15,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord
 from switchfit.problem.data import FloatArray
-from switchfit.report.text import run_names, standard_errors_of, time_label, transitions_of, unit_of
+from switchfit.problem.validation import as_flag
+from switchfit.report.numbers import time_label, unit_of
+from switchfit.runtime.presentation import figure_of
+from switchfit.uncertainty.prediction import predict
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -75,6 +79,25 @@ class Bands:
             np.stack([outputs - errors[1], outputs + errors[1]], axis=-1),
             level,
         )
+
+
+@figure_of.register(Estimate)
+def plot_estimate(estimate: Estimate, *, bands: bool = True, level: float = 0.95) -> Figure:
+    """As `plot_fit`, with bands of what is fitted where there is a model and a covariance.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    bands : bool, optional
+    level : float, between 0 and 1
+        Of the bands.
+    """
+    quantile = estimate.quantile(level)
+    known = estimate.problem is not None and bool(np.isfinite(estimate.standard_errors).all())
+    if not (as_flag(bands, "bands") and known and estimate.has_room_for_sensitivities()):
+        return plot_fit(estimate)
+    shown = range(min(len(estimate.trajectories), LARGEST_FIGURE))
+    return plot_fit(estimate, [Bands.of(predict(estimate, experiment=e), quantile, level) for e in shown])
 
 
 def plot_fit(fit: Fit, bands: Sequence[Bands] = ()) -> Figure:
@@ -318,8 +341,8 @@ def _draw_experiment(fit: Fit, e: int, block: Any, rows: int, colours: Mapping[s
     with_data = panels[0][0] is not None
     ratios = [3.0, 1.2] * rows if with_data else [1.0] * rows
     grid = block.add_gridspec(len(ratios), 1, height_ratios=ratios)
-    errors = standard_errors_of(fit)
-    here = [t for t in transitions_of(fit) if t.experiment == e]
+    errors = fit.standard_errors
+    here = [t for t in fit.transitions if t.experiment == e]
     times = [t.time for t in here]
     spread = [np.nan if t.index is None else float(errors[t.index]) for t in here]
     axes: list[Axes] = []
@@ -340,7 +363,7 @@ def _draw_experiment(fit: Fit, e: int, block: Any, rows: int, colours: Mapping[s
             ax.set_xlabel("")
     block.align_ylabels(axes)
     if len(fit.trajectories) > 1:
-        block.suptitle(run_names(fit)[e], fontsize="medium", fontweight="bold")
+        block.suptitle(fit.run_names[e], fontsize="medium", fontweight="bold")
 
 
 def _draw_bands(fit: Fit, e: int, axes: Sequence[Axes], bands: Bands) -> None:
@@ -419,8 +442,8 @@ def _transition_handles(fit: Fit) -> dict[str, Any]:
     if not any(len(times) for times in fit.transition_times):
         return {}
     handles: dict[str, Any] = {"transition": Line2D([], [], color=TRANSITION, linewidth=0.9)}
-    errors = standard_errors_of(fit)
-    if any(t.index is not None and errors[t.index] > 0 for t in transitions_of(fit)):
+    errors = fit.standard_errors
+    if any(t.index is not None and errors[t.index] > 0 for t in fit.transitions):
         handles["± standard error"] = Patch(color=TRANSITION, alpha=0.22, linewidth=0)
     return handles
 

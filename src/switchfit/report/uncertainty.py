@@ -2,34 +2,241 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.special
 
-from switchfit.report.plot import LARGEST_FIGURE
-from switchfit.report.text import rounded, time_label
+from switchfit.problem.parameter import unit_suffix
+from switchfit.report.numbers import rounded, time_label
+from switchfit.report.sentences import join_words
+from switchfit.report.tables import format_table
+from switchfit.runtime.presentation import figure_of, text_of
+from switchfit.uncertainty.certificate import Certificate
+from switchfit.uncertainty.derivative_check import DerivativeCheck
+from switchfit.uncertainty.identification import Direction, Identifiability
+from switchfit.uncertainty.profiles import Profile
+from switchfit.uncertainty.residuals import ChannelResiduals, ResidualDiagnostics
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from switchfit.uncertainty.profiles import Profile
-    from switchfit.uncertainty.residuals import ChannelResiduals, ResidualDiagnostics
-
 LINE, QUADRATIC, THRESHOLD, SHADE = "#b2182b", "#777777", "#333333", "#4a7fb5"
+WIDTH = 100
 LEVELS = (0.683, 0.95, 0.99)
 """Whose thresholds a profile's figure shows, up to the one it was followed to."""
+LARGEST_FIGURE = 10
+"""Channels that one figure shows."""
 
 
-def profile_text(profile: Profile) -> str:
+# --- certificate ------------------------------------------------------------------------------------------------------
+
+
+@text_of.register(Certificate)
+def write_certificate(certificate: Certificate) -> str:
+    """Every check with its number, and the verdict.
+
+    Parameters
+    ----------
+    certificate : Certificate
+    """
+    held = "; ".join(map(str, [*certificate.active, *certificate.kinks]))
+    failures = "; ".join(map(str, certificate.failures))
+    error = f"{certificate.integration_error:.1e} ({certificate.integration_error_of})"
+    rows = [
+        ("KKT residual", f"{certificate.optimality:.2e}"),
+        ("smallest Hessian eigenvalue, free directions", f"{certificate.smallest_eigenvalue:.4g}"),
+        ("  with unknowns scaled to unit curvature", f"{certificate.smallest_scaled_eigenvalue:.4g}"),
+        ("  condition number of that", f"{certificate.condition_number:.3g}"),
+        ("  worst-determined direction", certificate.worst_direction),
+        ("largest integration error, relative", error),
+        ("paper's gradient against discretised, relative", _gap(certificate.gradient_gap)),
+        ("paper's Hessian against discretised, relative", _gap(certificate.hessian_gap)),
+        ("Taylor orders of J, with gradient, with Hessian", _orders(certificate.taylor_orders)),
+        ("active constraints", held or "none"),
+        ("verdict", f"FAILED: {failures}" if failures else "passed"),
+    ]
+    return "\n".join(format_table(rows, "<<", indent=""))
+
+
+def _gap(gap: float) -> str:
+    return "not checked" if np.isnan(gap) else f"{gap:.1e}"
+
+
+def _orders(orders: tuple[float, ...]) -> str:
+    if np.isnan(orders).all():
+        return "not checked"
+    return ", ".join("rounding" if np.isnan(order) else f"{order:.2f}" for order in orders)
+
+
+# --- derivatives ------------------------------------------------------------------------------------------------------
+
+
+@text_of.register(DerivativeCheck)
+def write_derivative_check(check: DerivativeCheck) -> str:
+    """The Taylor table, the gaps between the methods, and the verdict.
+
+    Parameters
+    ----------
+    check : DerivativeCheck
+    """
+    rows = [["h", "J", "order", "+ gradient", "order", "+ Hessian", "order"]]
+    for k, (h, remainders) in enumerate(zip(check.steps, check.remainders, strict=True)):
+        orders = [""] * 3 if k == 0 else [_order(order) for order in check.orders[k - 1]]
+        cells = [text for r, order in zip(remainders, orders, strict=True) for text in (f"{r:.2e}", order)]
+        rows.append([f"{h:.1e}", *cells])
+    verdict = "passed" if check.passed else "FAILED: the derivatives do not belong to the cost"
+    observed = ", ".join(f"{order:.2f}" for order in check.observed_orders)
+    lines = [
+        "Taylor remainders of J along a random direction",
+        "",
+        *format_table(rows, ">" * 7),
+        "",
+        "Paper's equations (6)-(17) against the derivatives of the discretised cost, relative:",
+        f"  gradient {check.gradient_gap:.1e}, with half the steps {check.gradient_gap_halved:.1e}",
+        f"  Hessian  {check.hessian_gap:.1e}, with half the steps {check.hessian_gap_halved:.1e}",
+        f"Observed orders {observed} (1, 2, 3 expected): {verdict}.",
+    ]
+    return "\n".join(lines)
+
+
+def _order(order: float) -> str:
+    return "-" if np.isnan(order) else f"{order:.2f}"
+
+
+# --- identifiability --------------------------------------------------------------------------------------------------
+
+_PLACES = {"solution": "At the solution", "first guess": "At the first guess"}
+_RISES = {
+    "noise": "noise hides {} (95 %)",
+    "1 % of J": "1 % of J is {}",
+    "1 % of variation": "a change of all that is measured by 1 % of how it varies does {}",
+}
+
+
+@text_of.register(Identifiability)
+def write_identifiability(found: Identifiability) -> str:
+    """How many unknowns the data determine, and the combinations that they determine badly.
+
+    Parameters
+    ----------
+    found : Identifiability
+    """
+    count = len(found.theta_names) - len(found.held)
+    where = _PLACES[found.where]
+    sentences = []
+    if found.without:
+        sentences.append(f"{where} the cost does not depend on {', '.join(found.without)}, to second order.")
+    if found.idle:
+        sentences.append(
+            f"{where} the cost does not depend on {', '.join(found.idle)}, because a mode has collapsed: leave it out "
+            "of mode_sequence."
+        )
+    if not count:
+        sentences.append(f"{where} constraints, kinks and collapsed modes hold all unknowns.")
+    elif found.undetermined == 0:
+        sentences.append(
+            f"{where} the data determine all {count} unknowns; condition number of the scaled Hessian "
+            f"{found.condition_number:.3g}."
+        )
+    elif found.undetermined > len(found.without):
+        many = found.undetermined - len(found.without)
+        what = "one combination" if many == 1 else f"{many} combinations"
+        sentences.append(f"{where} the data do not determine {what} of the {count} unknowns.")
+    lines = [line for sentence in sentences for line in textwrap.wrap(sentence, WIDTH)]
+    for direction in found.directions if count else ():
+        sentence = write_direction(found, direction)
+        lines += textwrap.wrap(sentence, WIDTH, initial_indent="  - ", subsequent_indent="    ")
+    return "\n".join(lines)
+
+
+def write_direction(found: Identifiability, direction: Direction) -> str:
+    """Which unknowns trade off along a direction, the change that was tried, and by how much J rises.
+
+    Parameters
+    ----------
+    found : Identifiability
+    direction : Direction
+        One of ``found.directions``.
+    """
+    # A change that is described as its opposite where only that side is allowed.
+    side = -1.0 if np.isnan(direction.rises[0]) and np.isfinite(direction.rises[1]) else 1.0
+    places = [found.theta_names.index(name) for name in direction.names]
+    moves = join_words([_move(found, i, side * float(direction.change[i])) for i in places])
+    rise = _RISES[found.meaning].format(f"{found.rise:.2g}") if found.rise > 0 else ""
+    seen = _rises(direction, rise, found.cost) if found.tried else f", or the opposite, should raise J little; {rise}."
+    return f"{direction.summary} (scaled eigenvalue {direction.eigenvalue:.2g}): {moves}{seen}"
+
+
+def _move(found: Identifiability, i: int, change: float) -> str:
+    """A change in words: later or earlier for a transition time, higher or lower for anything else."""
+    up, down = ("later", "earlier") if found.is_time[i] else ("higher", "lower")
+    size = f"{abs(change):.2g}{unit_suffix(found.theta_units[i])}"
+    return f"{found.theta_names[i]} {size} {up if change > 0 else down}"
+
+
+def _rises(direction: Direction, rise: str, cost: float) -> str:
+    """What was found on both sides of a change, the end of a sentence."""
+    finite = [r for r in direction.rises if np.isfinite(r)]
+    if not finite:
+        return ": J could not be evaluated there."
+    worst = max(finite)
+    related = np.isfinite(cost) and abs(worst) < 10 * abs(cost)  # a part of a J near 0 says nothing
+    relative = f" ({100 * worst / abs(cost):.2g} %)" if related else ""
+    both = ", or the opposite," if len(finite) == 2 else ""
+    return f"{both} raises J by {worst:.2g}{relative}" + (f"; {rise}." if rise else ".")
+
+
+# --- residuals --------------------------------------------------------------------------------------------------------
+
+
+@text_of.register(ResidualDiagnostics)
+def write_diagnostics(diagnostics: ResidualDiagnostics) -> str:
+    """A line for each channel, and what fails.
+
+    Parameters
+    ----------
+    diagnostics : ResidualDiagnostics
+    """
+    if not diagnostics.channels:
+        return "No residuals: the cost has no Measurements."
+    rows = [["", "values", "rms", "mean", "lag 1", "worth", "P(white)", "P(normal)", "beyond 4"]]
+    for label, channel in zip(diagnostics.labels, diagnostics.channels, strict=True):
+        rows.append(
+            [
+                label,
+                f"{len(channel.values)}",
+                f"{channel.rms:.3g}",
+                f"{channel.mean:+.2f}",
+                f"{channel.correlation:+.2f}",
+                f"{channel.effective:.0f}",
+                _probability(channel.whiteness),
+                _probability(channel.normality),
+                f"{channel.outliers}",
+            ]
+        )
+    lines = ["Standardised residuals", *format_table(rows, "<" + ">" * 8)]
+    return "\n".join([*lines, *(f"  - {issue}" for issue in diagnostics.issues)])
+
+
+def _probability(value: float) -> str:
+    return "-" if np.isnan(value) else f"{value:.3f}" if value >= 5e-4 else f"{value:.0e}"
+
+
+# --- profiles ---------------------------------------------------------------------------------------------------------
+
+
+@text_of.register(Profile)
+def write_profile(profile: Profile) -> str:
     """The estimate, both intervals, how each side ended, and what to be wary of.
 
     Parameters
     ----------
     profile : Profile
     """
-    unit = "" if profile.unit in ("", "1") else f" {profile.unit}"
+    unit = unit_suffix(profile.unit)
     value, error, _ = rounded(profile.value, profile.standard_error)
     percent = f"{100 * profile.level:.3g} %"
     low, high = profile.interval()
@@ -71,7 +278,7 @@ def profile_notes(profile: Profile) -> list[str]:
     profile : Profile
     """
     notes = []
-    unit = "" if profile.unit in ("", "1") else f" {profile.unit}"
+    unit = unit_suffix(profile.unit)
     for side, end, limit in zip(("downward", "upward"), profile.ends, profile.trace.limits.values(), strict=True):
         if end == "limit":
             notes.append(f"{side} the limit {limit:.6g} comes before the threshold: the interval is one-sided")
@@ -106,6 +313,7 @@ def profile_notes(profile: Profile) -> list[str]:
     return notes
 
 
+@figure_of.register(Profile)
 def plot_profile(profile: Profile) -> Figure:
     """A figure of one profile.
 
@@ -183,6 +391,7 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     return ax
 
 
+@figure_of.register(ResidualDiagnostics)
 def plot_diagnostics(diagnostics: ResidualDiagnostics) -> Figure:
     """A row a channel: residuals in time, their autocorrelation, and their quantiles against those of a normal one.
 

@@ -1,14 +1,19 @@
-"""How the numbers of a fit were checked, computed anew from the fit and not taken from the optimiser's word."""
+"""How the numbers of a fit were checked: computed again from the fit, not taken from the optimiser."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.result import Certificate, Fit, free_curvature
+from switchfit.fit.result import Fit, free_curvature
+from switchfit.fit.termination import Kink
 from switchfit.optimize import Status
+from switchfit.problem.constraints import ActiveConstraint
+from switchfit.runtime.issue import Issue
+from switchfit.runtime.presentation import text_of
 from switchfit.uncertainty.derivative_check import (
     LARGEST_GAP,
     derivative_gap,
@@ -16,13 +21,78 @@ from switchfit.uncertainty.derivative_check import (
     orders_right,
     taylor_table,
 )
-from switchfit.uncertainty.identification import after
+from switchfit.uncertainty.identification import Combination, after
 
 LARGE_INTEGRATION_ERROR = 1e-6
 """Relative error of J or of a constraint by halving the steps above which a fit has fewer digits than it seems."""
 
 NEGATIVE = -1e-8
 """Eigenvalues of the scaled Hessian below this are negative curvature, not rounding."""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """How the numbers of a fit were checked.
+
+    Attributes
+    ----------
+    optimality : float
+        KKT residual at the solution.
+    smallest_eigenvalue : float
+        Of the Hessian on the free directions; positive: the second-order sufficient condition holds. NaN if
+        nothing is free.
+    smallest_scaled_eigenvalue : float
+        The same with the unknowns scaled to unit curvature each: 1 is perfectly, 0 not at all determined.
+    condition_number : float
+        Of that scaled Hessian.
+    worst_unknowns : tuple of str
+        The unknowns that the worst-determined direction mostly consists of, the one with the largest part first.
+    integration_error : float
+        Largest relative change by halving all steps of J, the guards and the terminal constraints: of J relative to J,
+        or to 1e-3 of the first J where that is more; of a constraint relative to what the
+        states make of it as they go through their ranges in the run.
+    gradient_gap, hessian_gap : float
+        Relative gap between the paper's equations (6)-(17) and the exact derivatives of the discretised cost; NaN
+        where that was not checked.
+    taylor_orders : tuple of float
+        Orders of the remainders of J, of J with its gradient and of J with its Hessian along a random direction: at
+        least 1, 2, 3 where the derivatives are right (2, 2, 3 at a minimum, where the gradient vanishes); NaN where a
+        remainder is rounding, or where that was not checked.
+    active : tuple of ActiveConstraint
+        Constraints that hold with equality, collapsed modes and bounds among them.
+    kinks : tuple of Kink
+    failures : tuple of Issue
+        What of all this is not as it has to be; empty where the certificate is good.
+    integration_error_of : str
+        The output that has the `integration_error`: "J", or the name of a guard or terminal constraint.
+    """
+
+    optimality: float
+    smallest_eigenvalue: float
+    smallest_scaled_eigenvalue: float
+    condition_number: float
+    worst_unknowns: tuple[str, ...]
+    integration_error: float
+    gradient_gap: float
+    hessian_gap: float
+    taylor_orders: tuple[float, ...]
+    active: tuple[ActiveConstraint, ...]
+    kinks: tuple[Kink, ...]
+    failures: tuple[Issue, ...]
+    integration_error_of: str = "J"
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing that was checked failed."""
+        return not self.failures
+
+    @property
+    def worst_direction(self) -> str:
+        """The worst-determined direction in words, such as "tau_2 and mu trade off"; "none" if nothing is free."""
+        return str(Combination(self.worst_unknowns))
+
+    def __str__(self) -> str:
+        return text_of(self)
 
 
 def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
@@ -48,36 +118,35 @@ def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
         orders = observed_orders(taylor_table(evaluator, fit.theta).orders)
     stiff = evaluator is not None and evaluator.problem.solver == "stiff"
     smallest = float(scaled[0]) if len(scaled) else np.nan
-    kinks = tuple(f"{name} at a kink ({left:.1e}, {right:.1e})" for name, left, right in fit.kinks)
     return Certificate(
         optimality=fit.optimality,
         smallest_eigenvalue=free_curvature(fit).smallest,
         smallest_scaled_eigenvalue=smallest,
         condition_number=found.condition_number if len(scaled) else np.inf,
-        worst_direction=found.directions[0].summary if found.directions else "none",
+        worst_unknowns=found.directions[0].names if found.directions else (),
         integration_error=fit.integration_error,
         integration_error_of=fit.integration_error_of,
         gradient_gap=float(gaps[0]),
         hessian_gap=float(gaps[1]),
         taylor_orders=orders,
-        active=fit.active + kinks,
+        active=fit.active,
+        kinks=fit.kinks,
         failures=tuple(_failures(fit, smallest, gaps, orders, stiff=stiff)),
     )
 
 
 def _failures(
     fit: Fit, smallest: float, gaps: tuple[float, float], orders: tuple[float, ...], *, stiff: bool
-) -> Iterator[str]:
-    """What is not as it has to be."""
+) -> Iterator[Issue]:
+    """The checks that failed."""
     if fit.status is not Status.CONVERGED_PRECISION and not fit.optimality <= fit.tolerance:
-        yield f"the KKT residual {fit.optimality:.1e} is above the tolerance {fit.tolerance:.1e}"
+        yield Issue("optimality", figures={"optimality": fit.optimality, "tolerance": fit.tolerance})
     if smallest < NEGATIVE:
-        yield f"the Hessian has a negative eigenvalue on the free directions ({smallest:.1e}, scaled)"
+        yield Issue("negative curvature", figures={"eigenvalue": smallest})
     if not fit.integration_error <= LARGE_INTEGRATION_ERROR:
-        yield f"the integration error of {fit.integration_error_of} is {fit.integration_error:.1e}, relative"
+        yield Issue("integration error", (fit.integration_error_of,), {"error": fit.integration_error})
     if max(gaps) > LARGEST_GAP and not stiff:
-        yield f"the paper's equations differ from the derivatives of J by {max(gaps):.1e}, relative"
+        yield Issue("derivative gap", figures={"gap": max(gaps)})
     # The first order says nothing at a minimum, where the gradient vanishes.
     if not orders_right((np.nan, *orders[1:])):
-        shown = ", ".join(f"{order:.2f}" for order in orders)
-        yield f"the Taylor orders are {shown} instead of (any), 2, 3 or more: gradient or Hessian do not belong to J"
+        yield Issue("Taylor orders", figures={"orders": orders})

@@ -12,6 +12,7 @@ from switchfit.fit.evaluator import Evaluation, Evaluator, evaluator_of
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_instance, as_seed
+from switchfit.runtime.presentation import text_of
 
 LARGEST_GAP = 1e-4
 """Relative gap between the paper's equations and the discretised cost's derivatives that is still the integrator's."""
@@ -94,20 +95,7 @@ class DerivativeCheck:
         return orders_right(self.observed_orders) and agree
 
     def __str__(self) -> str:
-        lines = ["Taylor remainders of J along a random direction", ""]
-        lines.append(f"{'h':>10}  {'J':>10} order  {'+ gradient':>10} order  {'+ Hessian':>10} order")
-        for k, (h, r) in enumerate(zip(self.steps, self.remainders, strict=True)):
-            cells = [f"{r[j]:10.2e} {'' if k == 0 else _order(self.orders[k - 1, j]):>5}" for j in range(3)]
-            lines.append(f"{h:10.1e}  " + "  ".join(cells))
-        lines.append("")
-        lines.append("Paper's equations (6)-(17) against the derivatives of the discretised cost, relative:")
-        lines.append(f"  gradient {self.gradient_gap:.1e}, with half the steps {self.gradient_gap_halved:.1e}")
-        lines.append(f"  Hessian  {self.hessian_gap:.1e}, with half the steps {self.hessian_gap_halved:.1e}")
-        verdict = "passed" if self.passed else "FAILED: the derivatives do not belong to the cost"
-        lines.append(
-            f"Observed orders {', '.join(f'{o:.2f}' for o in self.observed_orders)} (1, 2, 3 expected): {verdict}."
-        )
-        return "\n".join(lines)
+        return text_of(self)
 
 
 def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, seed: int = 0) -> DerivativeCheck:
@@ -221,7 +209,3 @@ def _remainders(
 def _median(orders: FloatArray) -> float:
     finite = orders[np.isfinite(orders)]
     return float(np.median(finite)) if len(finite) else np.nan
-
-
-def _order(order: float) -> str:
-    return "-" if np.isnan(order) else f"{order:.2f}"

@@ -14,13 +14,13 @@ Before a fit the same is done with data as the first guess itself would produce 
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import scipy.special
+from numpy.typing import NDArray
 
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.hidden import refuse_hidden_switches
@@ -29,6 +29,7 @@ from switchfit.fit.solution import least_squares
 from switchfit.fit.trajectory import compare
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
+from switchfit.runtime.presentation import text_of
 
 WEAK = 0.05
 """Scaled eigenvalues below this are told: standard errors along them are 4.5 times those of each unknown alone."""
@@ -39,8 +40,25 @@ NAMED = 0.2
 UNDETERMINED = 1e-10
 """Scaled eigenvalues below this are zero."""
 HALVINGS = 20
-WIDTH = 100
-HIDDEN, ONE_PERCENT = "noise hides {} (95 %)", "1 % of J is {}"
+Meaning = Literal["noise", "1 % of J", "1 % of variation"]
+"""What a rise of J is: what noise hides in 95 % of all cases, 1 % of J, or what a change of all that is measured by 1 %
+of how it varies makes of J."""
+
+
+@dataclass(frozen=True)
+class Combination:
+    """Unknowns that trade off, or one that is by itself; print it for the words.
+
+    Attributes
+    ----------
+    unknowns : tuple of str
+        The one with the largest part first.
+    """
+
+    unknowns: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return text_of(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,18 +75,20 @@ class Direction:
         The change of theta that was tried, a multiple of the scaled eigenvector, in units.
     rises : (float, float)
         By how much J rises at theta + change and at theta - change; NaN where that is not allowed.
-    summary : str
-        "tau_2 and mu trade off".
-    sentence : str
-        The same with the change, and what was found.
+    names : tuple of str
+        The unknowns that it mostly consists of, the one with the largest weight first.
     """
 
     eigenvalue: float
     weights: FloatArray
     change: FloatArray
     rises: tuple[float, float]
-    summary: str
-    sentence: str
+    names: tuple[str, ...]
+
+    @property
+    def summary(self) -> str:
+        """The combination in words, such as "tau_2 and mu trade off"."""
+        return str(Combination(self.names))
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +97,9 @@ class Identifiability:
 
     Attributes
     ----------
-    theta_names : tuple of str
+    theta_names, theta_units : tuple of str
+    is_time : (d,) bool
+        Which of the unknowns are transition times.
     eigenvalues : (k,)
         Ascending, of the Hessian scaled to unit curvature of each unknown, on the directions that nothing holds.
     vectors : (d, k)
@@ -90,22 +112,31 @@ class Identifiability:
         The badly determined ones, at most three, and the worst one at any rate.
     rise : float
         Of J, for which the changes are chosen.
-    meaning : str
-        What that rise is, with {} where its size belongs.
-    where : str
+    meaning : {"noise", "1 % of J", "1 % of variation"}
+        What that rise is: what noise hides in 95 % of all cases, 1 % of J, or what a change of all that is measured by
+        1 % of how it varies makes of J.
+    where : {"solution", "first guess"}
+    cost : float
+        J there, to which a rise is related; NaN where it is not.
+    tried : bool
+        Whether J was evaluated along the directions.
     idle : tuple of str
         Unknowns on which the cost does not depend because modes have collapsed, as in `Fit.idle`.
     """
 
     theta_names: tuple[str, ...]
+    theta_units: tuple[str, ...]
+    is_time: NDArray[np.bool_]
     eigenvalues: FloatArray
     vectors: FloatArray
     without: tuple[str, ...]
     held: tuple[str, ...]
     directions: tuple[Direction, ...]
     rise: float
-    meaning: str
-    where: str
+    meaning: Meaning
+    where: Literal["solution", "first guess"]
+    cost: float
+    tried: bool
     idle: tuple[str, ...] = ()
 
     @property
@@ -121,31 +152,7 @@ class Identifiability:
         return len(self.without) + int(np.sum(self.eigenvalues < UNDETERMINED))
 
     def __str__(self) -> str:
-        count = len(self.theta_names) - len(self.held)
-        lines = []
-        if self.without:
-            lines.append(f"{self.where} the cost does not depend on {', '.join(self.without)}, to second order.")
-        if self.idle:
-            lines.append(
-                f"{self.where} the cost does not depend on {', '.join(self.idle)}, because a mode has collapsed: leave "
-                "it out of mode_sequence."
-            )
-        if not count:
-            lines.append(f"{self.where} constraints, kinks and collapsed modes hold all unknowns.")
-            return "\n".join(part for line in lines for part in textwrap.wrap(line, WIDTH))
-        if self.undetermined == 0:
-            lines.append(
-                f"{self.where} the data determine all {count} unknowns; condition number of the scaled Hessian "
-                f"{self.condition_number:.3g}."
-            )
-        elif self.undetermined > len(self.without):
-            many = self.undetermined - len(self.without)
-            what = "one combination" if many == 1 else f"{many} combinations"
-            lines.append(f"{self.where} the data do not determine {what} of the {count} unknowns.")
-        shown = [part for line in lines for part in textwrap.wrap(line, WIDTH)]
-        for direction in self.directions:
-            shown += textwrap.wrap(direction.sentence, WIDTH, initial_indent="  - ", subsequent_indent="    ")
-        return "\n".join(shown)
+        return text_of(self)
 
 
 def identifiability(subject: Any) -> Identifiability:
@@ -182,11 +189,12 @@ def after(fit: Fit, evaluator: Evaluator | None) -> Identifiability:
     fit : Fit
     evaluator : Evaluator or None
     """
+    meaning: Meaning
     if fit.sigma_known is None:
-        rise, meaning = 0.01 * abs(fit.cost), ONE_PERCENT
+        rise, meaning = 0.01 * abs(fit.cost), "1 % of J"
     else:
         scale = fit.residual_variance if fit.sigma_known is False and fit.freedom > 0 else 1.0
-        rise, meaning = 0.5 * scale * fit.quantile(0.95) ** 2, HIDDEN
+        rise, meaning = 0.5 * scale * fit.quantile(0.95) ** 2, "noise"
     cost = None if evaluator is None else lambda theta: evaluator(theta).cost
     found = analyse(
         fit.hessian,
@@ -194,10 +202,11 @@ def after(fit: Fit, evaluator: Evaluator | None) -> Identifiability:
         fit.theta,
         fit.theta_names,
         fit.theta_units,
+        fit.is_time,
         cost,
         rise,
         meaning,
-        "At the solution",
+        "solution",
         allowed=None if evaluator is None else _allowed(evaluator.problem),
         base=fit.cost,
     )
@@ -210,31 +219,33 @@ def _before(problem: Problem) -> Identifiability:
     own = evaluator_of(problem)
     refuse_hidden_switches(own, theta, own(theta).gradient)
     items = [item for run in problem.experiments for item in run.data]
+    meaning: Meaning
     if all(isinstance(item, Measurements) for item in items):
         clean = _noise_free(problem, own)
         evaluator = Evaluator(clean, meshes=own.meshes)
         # Where sigma is a parameter J has no minimum without noise; its expected Hessian is Gauss-Newton's.
         hessian = evaluator(theta, matrix="exact" if least_squares(problem) else "gauss-newton").hessian
         if all(item.sigma is not None for item in items):
-            rise, meaning = 0.5 * float(scipy.special.ndtri(0.975)) ** 2, HIDDEN
+            rise, meaning = 0.5 * float(scipy.special.ndtri(0.975)) ** 2, "noise"
         else:
-            rise, meaning = 1e-4 * _variation(clean), "a change of all that is measured by 1 % of how it varies does {}"
+            rise, meaning = 1e-4 * _variation(clean), "1 % of variation"
         base = np.nan
     else:
         evaluator = own
         here = own(theta, matrix="gauss-newton")
         hessian, base = here.hessian, here.cost
-        rise, meaning = 0.01 * abs(here.cost), ONE_PERCENT
+        rise, meaning = 0.01 * abs(here.cost), "1 % of J"
     return analyse(
         hessian,
         np.eye(len(theta)),
         theta,
         unknowns.names,
         unknowns.units,
+        unknowns.is_time,
         lambda at: evaluator(at).cost,
         rise,
         meaning,
-        "At the first guess",
+        "first guess",
         allowed=_allowed(problem),
         base=base,
     )
@@ -281,10 +292,11 @@ def analyse(
     theta: FloatArray,
     names: tuple[str, ...],
     units: tuple[str, ...],
+    is_time: NDArray[np.bool_],
     cost: Callable[[FloatArray], float] | None,
     rise: float,
-    meaning: str,
-    where: str,
+    meaning: Meaning,
+    where: Literal["solution", "first guess"],
     *,
     allowed: Callable[[FloatArray], bool] | None = None,
     base: float = np.nan,
@@ -298,14 +310,13 @@ def analyse(
         Orthonormal basis of the directions that nothing holds.
     theta : (d,)
     names, units : tuple of str
+    is_time : (d,) bool
+        Which of the unknowns are transition times.
     cost : callable ``theta -> J``, or None
         None: nothing is tried.
     rise : float
         Of J, for which changes of theta are chosen.
-    meaning : str
-        What that rise is, with {} where its size belongs.
-    where : str
-        "At the solution", to begin sentences with.
+    meaning, where : as of `Identifiability`
     allowed : callable ``theta -> bool``, optional
         Whether theta satisfies the constraints.
     base : float, optional
@@ -314,7 +325,8 @@ def analyse(
     free = np.abs(basis).max(1, initial=0.0) > 1e-9
     held = tuple(n for n, f in zip(names, free, strict=True) if not f)
     if not free.any() or not np.isfinite(hessian).all():
-        return Identifiability(names, np.zeros(0), np.zeros((len(names), 0)), (), held, (), rise, meaning, where)
+        nothing = np.zeros(0), np.zeros((len(names), 0)), (), held, ()
+        return Identifiability(names, units, is_time, *nothing, rise, meaning, where, base, cost is not None)
     flat = np.all(hessian == 0.0, axis=1).tolist()
     without = tuple(n for n, f, nothing in zip(names, free, flat, strict=True) if f and nothing)
     spectrum = scaled_spectrum(hessian, basis)
@@ -329,16 +341,10 @@ def analyse(
         v = vectors[:, k]
         v = v * np.sign(v[np.argmax(np.abs(v))])
         change, rises = _tried(spectrum.size * v, float(values[k]), theta, cost, rise, allowed)
-        told = meaning.format(f"{rise:.2g}") if rise > 0 else ""
         strong = [i for i in np.argsort(-np.abs(v), kind="stable") if abs(v[i]) > NAMED * np.abs(v).max()]
-        who = f"{_and([names[i] for i in strong])} trade off" if len(strong) > 1 else f"{names[strong[0]]} by itself"
-        # A change that is told as its opposite where only that side is allowed.
-        side = -1.0 if np.isnan(rises[0]) and np.isfinite(rises[1]) else 1.0
-        moves = _and([_moved(names[i], units[i], side * change[i]) for i in strong])
-        found = _found(rises, told, base) if cost is not None else f", or the opposite, should raise J little; {told}."
-        sentence = f"{who} (scaled eigenvalue {values[k]:.2g}): {moves}{found}"
-        directions.append(Direction(float(values[k]), v, change, rises, who, sentence))
-    return Identifiability(names, values, vectors, without, held, tuple(directions), rise, meaning, where)
+        directions.append(Direction(float(values[k]), v, change, rises, tuple(names[i] for i in strong)))
+    found = values, vectors, without, held, tuple(directions)
+    return Identifiability(names, units, is_time, *found, rise, meaning, where, base, cost is not None)
 
 
 def _tried(
@@ -370,27 +376,3 @@ def _tried(
             break
         change = 0.5 * change
     return change, rises
-
-
-def _found(rises: tuple[float, float], told: str, base: float) -> str:
-    """What was found on both sides of a change, the end of a sentence."""
-    finite = [r for r in rises if np.isfinite(r)]
-    if not finite:
-        return ": J could not be evaluated there."
-    worst = max(finite)
-    related = np.isfinite(base) and abs(worst) < 10 * abs(base)  # of a J near 0 nothing is a part
-    relative = f" ({100 * worst / abs(base):.2g} %)" if related else ""
-    both = ", or the opposite," if len(finite) == 2 else ""
-    return f"{both} raises J by {worst:.2g}{relative}" + (f"; {told}." if told else ".")
-
-
-def _moved(name: str, unit: str, change: float) -> str:
-    """A change in words: later or earlier for a transition time, higher or lower for anything else."""
-    is_time = name.rpartition(".")[2].startswith("tau_")
-    word = ("later" if change > 0 else "earlier") if is_time else ("higher" if change > 0 else "lower")
-    shown = "" if unit in ("", "1") else f" {unit}"
-    return f"{name} {abs(change):.2g}{shown} {word}"
-
-
-def _and(parts: list[str]) -> str:
-    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

@@ -39,7 +39,7 @@ from switchfit.optimize import Status, solve_qp
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_name, listed, shown
-from switchfit.report.uncertainty import plot_profile, profile_text
+from switchfit.runtime.presentation import figure_of, text_of
 from switchfit.runtime.progress import Progress, reporting
 
 if TYPE_CHECKING:
@@ -200,7 +200,7 @@ class Trace:
             return None
         # The others are optimal: their change contributes nothing to the derivative.
         slope = float(result.gradient[self.index])
-        good = result.status.converged
+        good = result.status.successful
         return Point(value, result.cost, slope, result.theta, good)
 
     def add(self, value: float, near: Point, before: Point | None = None) -> Point | None:
@@ -549,11 +549,11 @@ class Profile:
         return next((r for r in regions if not (r[0] > self.value or r[1] < self.value)), regions[0])
 
     def __str__(self) -> str:
-        return profile_text(self)
+        return text_of(self)
 
     def plot(self) -> Figure:
         """The likelihood ratio with its thresholds, and the quadratic approximation beside it."""
-        return plot_profile(self)
+        return figure_of(self)
 
 
 def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress | None = None) -> Profile:

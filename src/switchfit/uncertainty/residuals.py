@@ -20,18 +20,16 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.special
 
+from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
-
-if TYPE_CHECKING:
-    from switchfit.fit.result import Fit
+from switchfit.runtime.issue import Issue
+from switchfit.runtime.presentation import text_of
 
 UNLIKELY = 1e-3
 """Probability below which a test counts as failed: with ten channels one false alarm in fifty fits."""
@@ -132,71 +130,40 @@ class ResidualDiagnostics:
         """Whether all residuals look white and normal."""
         return all(channel.white and channel.normal for channel in self.channels)
 
-    def __str__(self) -> str:
-        if not self.channels:
-            return "No residuals: the cost has no Measurements."
-        header = ("", "values", "rms", "mean", "lag 1", "worth", "P(white)", "P(normal)", "beyond 4")
-        rows = [header]
-        for label, c in zip(self.labels, self.channels, strict=True):
-            shown = (
-                f"{len(c.values)}",
-                f"{c.rms:.3g}",
-                f"{c.mean:+.2f}",
-                f"{c.correlation:+.2f}",
-                f"{c.effective:.0f}",
-            )
-            rows.append((label, *shown, _probability(c.whiteness), _probability(c.normality), f"{c.outliers}"))
-        widths = [max(len(row[k]) for row in rows) for k in range(len(header))]
-        lines = ["Standardised residuals"]
-        for first, *others in rows:
-            cells = [entry.rjust(width) for entry, width in zip(others, widths[1:], strict=True)]
-            lines.append("  ".join([f"  {first:<{widths[0]}}", *cells]))
-        return "\n".join([*lines, *(f"  - {sentence}" for sentence in self.sentences())])
-
-    def sentences(self) -> Iterator[str]:
-        """What fails, a sentence each."""
+    @property
+    def issues(self) -> list[Issue]:
+        """What fails: channels whose residuals are correlated, and channels whose residuals are not normal."""
+        found = []
         named = list(zip(self.labels, self.channels, strict=True))
         alike = [(label, c) for label, c in named if not c.white and c.correlation > 0 and c.narrowing > SERIOUS]
         if alike:
-            listed = _listed([f"{label} ({c.correlation:.2f})" for label, c in alike])
-            worst = max(c.narrowing for _, c in alike)
-            worth = sum(c.effective for _, c in alike)
-            of = sum(len(c.values) for _, c in alike)
-            yield (
-                f"Neighbouring residuals are correlated in {listed}: the model misses something there, or the samples "
-                f"were smoothed before. The {of} values are worth about {worth:.0f} independent ones: the standard "
-                f"errors, which take them as independent, are too small by a factor of up to {worst:.2g}."
-            )
+            figures: dict[str, float | tuple[float, ...]] = {
+                "correlation": tuple(c.correlation for _, c in alike),
+                "values": float(sum(len(c.values) for _, c in alike)),
+                "effective": float(sum(c.effective for _, c in alike)),
+                "narrowing": max(c.narrowing for _, c in alike),
+            }
+            found.append(Issue("correlated residuals", tuple(label for label, _ in alike), figures))
         heavy = [(label, c) for label, c in named if not c.normal and c.white]
         if heavy:
-            listed = _listed(
-                [f"{label} (kurtosis {c.kurtosis:.1f}, {c.outliers} beyond 4 sigma)" for label, c in heavy]
-            )
-            yield (
-                f"The residuals are not normal in {listed}. Look for outliers; intervals from a bootstrap do not take "
-                "them as normal."
-            )
+            figures = {
+                "kurtosis": tuple(c.kurtosis for _, c in heavy),
+                "outliers": tuple(float(c.outliers) for _, c in heavy),
+            }
+            found.append(Issue("residuals not normal", tuple(label for label, _ in heavy), figures))
+        return found
+
+    def __str__(self) -> str:
+        return text_of(self)
 
 
-def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - 6} more" if len(names) > 6 else ""
-    return ", ".join(names[:6]) + more
-
-
-def _probability(value: float) -> str:
-    return "-" if np.isnan(value) else f"{value:.3f}" if value >= 5e-4 else f"{value:.0e}"
-
-
-def diagnose(fit: Fit, labels: list[str] | None = None) -> ResidualDiagnostics:
+def diagnose(fit: Fit) -> ResidualDiagnostics:
     """Test the residuals of a fit, channel by channel.
 
     Parameters
     ----------
     fit : Fit
-    labels : list of str, optional
-        Names of the experiments; run1, run2, ... if left out.
     """
-    runs = labels or [f"run{e + 1}" for e in range(len(fit.comparisons))]
     single = len(fit.comparisons) == 1
     channels, names = [], []
     for e, comparisons in enumerate(fit.comparisons):
@@ -206,7 +173,7 @@ def diagnose(fit: Fit, labels: list[str] | None = None) -> ResidualDiagnostics:
             for k, name in enumerate(comparison.names):
                 if np.isfinite(comparison.measured[:, k]).sum() > 0:
                     channels.append(of_channel(comparison, k, e, fit.trajectories[e].time_unit))
-                    names.append(name if single else f"{runs[e]} {name}")
+                    names.append(name if single else f"{fit.run_names[e]} {name}")
     return ResidualDiagnostics(tuple(channels), tuple(names))
 
 

@@ -1,0 +1,161 @@
+"""How a fit ended, as data: what the report makes its message of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from switchfit.optimize import Result, Status
+from switchfit.optimize.diagnosis import Finding
+from switchfit.problem.constraints import ActiveConstraint, Constraint
+from switchfit.problem.data import Measurements
+from switchfit.problem.problem import Problem
+from switchfit.runtime.issue import Issue
+from switchfit.runtime.presentation import text_of
+
+NAMED = 4
+"""Unknowns of a flat direction that are named."""
+
+SMALL_WEIGHT = 0.1
+"""Unknowns with a weight below this in a direction of unit length are not named."""
+
+
+@dataclass(frozen=True)
+class Kink:
+    """An unknown that ended where the derivative of the cost jumps through zero; print it for a short sentence.
+
+    Attributes
+    ----------
+    unknown : str
+    value : float
+        Where the kink is.
+    left, right : float
+        The derivatives of J on both sides of it.
+    """
+
+    unknown: str
+    value: float
+    left: float
+    right: float
+
+    def __str__(self) -> str:
+        return text_of(self)
+
+
+@dataclass(frozen=True)
+class Termination:
+    """How a fit ended; print it for the message. The fields are those of `Fit` of the same names.
+
+    Attributes
+    ----------
+    status : Status
+    cost, optimality, tolerance : float
+    iterations, earlier_iterations : int
+        All of them, and those before the mesh was refined for the last time.
+    active : tuple of ActiveConstraint
+    kinks : tuple of Kink
+    idle : tuple of str
+    smallest_eigenvalue : float
+        Of the Hessian on the free directions, each unknown scaled to unit curvature; NaN if nothing is free.
+    flat_direction : tuple of (str, float)
+        The unknowns that the eigenvector of it mostly consists of, and their parts in it.
+    violated : tuple of (str, float)
+        Guards and terminal constraints that are not met, and their values.
+    reason : Issue or None
+        Why the line search failed, or the error with which the fit ended.
+    """
+
+    status: Status
+    cost: float = np.nan
+    optimality: float = np.nan
+    tolerance: float = np.nan
+    iterations: int = 0
+    earlier_iterations: int = 0
+    active: tuple[ActiveConstraint, ...] = ()
+    kinks: tuple[Kink, ...] = ()
+    idle: tuple[str, ...] = ()
+    smallest_eigenvalue: float = np.nan
+    flat_direction: tuple[tuple[str, float], ...] = ()
+    violated: tuple[tuple[str, float], ...] = ()
+    reason: Issue | None = None
+
+    @classmethod
+    def of_error(cls, text: str) -> Termination:
+        """Of a fit that an error ended; `text` says which."""
+        return cls(Status.ERROR, reason=Issue("error", (text,)))
+
+    def __str__(self) -> str:
+        return text_of(self)
+
+
+def termination_of(result: Result, problem: Problem) -> Termination:
+    """How a fit ended, from what the optimiser found.
+
+    Parameters
+    ----------
+    result : Result
+        In theta, its constraints called by the problem's.
+    problem : Problem
+    """
+    names = problem.unknowns.names
+    parts = np.abs(result.flat_direction)
+    largest = [i for i in np.argsort(-parts, kind="stable").tolist() if parts[i] > SMALL_WEIGHT][:NAMED]
+    return Termination(
+        status=result.status,
+        cost=result.cost,
+        optimality=result.optimality,
+        tolerance=result.tolerance,
+        iterations=result.iterations,
+        earlier_iterations=result.earlier,
+        active=_active(result, problem),
+        kinks=tuple(Kink(names[i], float(result.theta[i]), left, right) for i, left, right in result.kinks),
+        idle=tuple(names[i] for i in result.idle),
+        smallest_eigenvalue=result.smallest_eigenvalue,
+        flat_direction=tuple((names[i], float(result.flat_direction[i])) for i in largest),
+        violated=result.violated,
+        reason=None if result.reason is None else _reason(result.reason, problem),
+    )
+
+
+def linear_constraints_of(problem: Problem) -> tuple[Constraint, ...]:
+    """Order and durations, then all lower bounds, then all upper bounds, infinite ones included."""
+    unknowns = problem.unknowns
+    lower = map(partial(Constraint, "lower bound"), unknowns.lower.tolist(), unknowns.names)
+    upper = map(partial(Constraint, "upper bound"), unknowns.upper.tolist(), unknowns.names)
+    return *unknowns.rows, *lower, *upper
+
+
+def _active(result: Result, problem: Problem) -> tuple[ActiveConstraint, ...]:
+    if not result.active:
+        return ()
+    multipliers = dict(zip(linear_constraints_of(problem), result.multipliers.tolist(), strict=True))
+    found = [constraint for constraint in result.active if isinstance(constraint, Constraint)]
+    return tuple(ActiveConstraint(**vars(constraint), multiplier=multipliers[constraint]) for constraint in found)
+
+
+def _reason(found: Finding, problem: Problem) -> Issue:
+    """Why the line search failed, with the unknowns called by their names."""
+    names = problem.unknowns.names
+    figures: dict[str, float | tuple[float, ...]] = {}
+    subjects: tuple[str, ...] = ()
+    if found.kind in ("wrong slope", "jump", "kink"):
+        figures |= {"before": found.before, "after": found.after}
+    if found.kind == "wrong slope":
+        subjects = tuple(names[i] for i, _, _ in found.entries)
+        figures |= {
+            "derivatives": tuple(stated for _, stated, _ in found.entries),
+            "differences": tuple(measured for _, _, measured in found.entries),
+        }
+    elif found.kind in ("jump", "kink"):
+        subjects = tuple(names[i] for i, _ in found.places)
+        figures["at"] = tuple(value for _, value in found.places)
+    elif found.kind == "rounding":
+        figures["noise"] = found.noise
+    elif found.kind == "valley":
+        figures["condition"] = found.condition
+    delays = {item.delay for run in problem.experiments for item in run.data if isinstance(item, Measurements)}
+    if any(isinstance(delay, str) for delay in delays):
+        figures["delayed"] = 1.0
+    return Issue(found.kind, subjects, figures)

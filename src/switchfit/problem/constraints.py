@@ -1,0 +1,59 @@
+"""The linear constraints on theta as data: order and durations of the modes, and bounds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from switchfit.runtime.presentation import text_of
+
+ConstraintKind = Literal["collapsed", "minimum duration", "lower bound", "upper bound"]
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """A linear constraint; print it for what it says when it is active.
+
+    Attributes
+    ----------
+    kind : {"collapsed", "minimum duration", "lower bound", "upper bound"}
+        "collapsed" is a minimum duration of 0: the mode lasts no time where it is active.
+    value : float
+        The minimum duration in the time unit of the run, or the bound in the unit of the unknown.
+    unknown : str
+        Name of the unknown that has the bound; empty for a duration.
+    mode : str
+        Name of the mode that has the duration; empty for a bound.
+    position : int or None
+        Where in the mode sequence that mode stands, from 0; None for a bound.
+    run : str
+        Name of the experiment that has the mode; empty for a bound, and where there is one experiment.
+    """
+
+    kind: ConstraintKind
+    value: float
+    unknown: str = ""
+    mode: str = ""
+    position: int | None = None
+    run: str = ""
+
+    def __str__(self) -> str:
+        return text_of(self)
+
+
+@dataclass(frozen=True)
+class ActiveConstraint(Constraint):
+    """A linear constraint that holds with equality at a solution; print it for a short sentence.
+
+    Attributes
+    ----------
+    kind, value, unknown, mode, position, run : as of `Constraint`
+    multiplier : float
+        Its Lagrange multiplier, 0 or more: by how much J falls per unit by which the constraint is relaxed. NaN
+        in a fit that was loaded from a file of an earlier version, which does not hold it.
+    """
+
+    multiplier: float = 0.0
+
+    def __str__(self) -> str:
+        return text_of(self)

@@ -1,0 +1,22 @@
+"""The one function that lays out tables of text."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+def format_table(rows: Sequence[Sequence[str]], alignment: str, *, indent: str = "  ") -> list[str]:
+    """Return rows as lines with their columns aligned, two spaces between them; columns without an entry are left out.
+
+    Parameters
+    ----------
+    rows : sequence of sequences of str, of the same length each
+        A header is a row like others.
+    alignment : str
+        A character for each column: "<" aligns it to the left, ">" to the right.
+    indent : str, optional
+        What every line begins with.
+    """
+    columns = [k for k in range(len(alignment)) if any(row[k] for row in rows)]
+    widths = {k: max(len(row[k]) for row in rows) for k in columns}
+    return [(indent + "  ".join(f"{row[k]:{alignment[k]}{widths[k]}}" for k in columns)).rstrip() for row in rows]

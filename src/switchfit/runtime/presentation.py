@@ -1,0 +1,36 @@
+"""How results are written and drawn, without their knowing who does it.
+
+Results are data. Their ``__str__`` and ``plot`` call `text_of` and `figure_of`, and the modules of `switchfit.report`
+register a function for each kind of result. So the report depends on the results, and no result on the report.
+"""
+
+from __future__ import annotations
+
+from functools import singledispatch
+from typing import Any
+
+
+@singledispatch
+def text_of(result: Any) -> str:
+    """Return a result as plain text, one line or several without a newline at the end.
+
+    Parameters
+    ----------
+    result : object
+        Of a kind that a module of `switchfit.report` has registered.
+    """
+    raise TypeError(f"no module of switchfit.report writes a {type(result).__name__}; register one with text_of.")
+
+
+@singledispatch
+def figure_of(result: Any, **settings: Any) -> Any:
+    """Return the figure of a result, a matplotlib Figure.
+
+    Parameters
+    ----------
+    result : object
+        Of a kind that a module of `switchfit.report` has registered.
+    settings
+        What that kind of figure can be given.
+    """
+    raise TypeError(f"no module of switchfit.report draws a {type(result).__name__}; register one with figure_of.")

@@ -1,0 +1,119 @@
+"""What a reader should know before believing the numbers of a fit, as data; the report makes sentences of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import scipy.special
+
+from switchfit.fit.result import Fit, disagreement, free_curvature
+from switchfit.runtime.issue import Issue
+from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
+from switchfit.uncertainty.residuals import diagnose
+
+BARELY_DETERMINED = 1e-6
+"""Smallest eigenvalue of the scaled Hessian below which there is a warning; correlations of 0.999999 give it."""
+UNSEEN = 100.0
+"""The same factor from which the Gauss-Newton matrix counts as singular rather than different: as for a transition at
+which the vector field does not jump, such as a block that comes to rest."""
+UNLIKELY = 1e-3
+"""Probability of the residual variance below which there is a warning, if it is 10 % off as well."""
+DIFFERENT = 1.2
+"""Factor between the standard errors of the two Hessians, of any combination of the unknowns, above which there is a
+warning: a 95 % interval that is too narrow by it covers 90 %, one too wide 98 %."""
+
+
+def find_issues(fit: Fit) -> list[Issue]:
+    """Return what a reader should know before believing the numbers, in the order in which the report says it.
+
+    Parameters
+    ----------
+    fit : Fit
+    """
+    sources = (_active, _idle, _kinks, _undetermined, _without_errors, _noise, _residuals, _covariances, _integration)
+    return [issue for source in sources for issue in source(fit)]
+
+
+def _active(fit: Fit) -> Iterator[Issue]:
+    """Constraints that hold with equality."""
+    for constraint in fit.active:
+        if constraint.position is not None:
+            figures = {"position": float(constraint.position), "value": constraint.value}
+            kind = "mode collapsed" if constraint.kind == "collapsed" else constraint.kind
+            yield Issue(kind, (constraint.mode, constraint.run), figures)
+        elif constraint.unknown not in fit.idle:
+            yield Issue(constraint.kind, (constraint.unknown,), {"value": constraint.value})
+
+
+def _idle(fit: Fit) -> Iterator[Issue]:
+    """Unknowns on which the cost does not depend, because a mode has collapsed."""
+    times = {name for name, is_time in zip(fit.theta_names, fit.is_time.tolist(), strict=True) if is_time}
+    for kind, names in (
+        ("idle times", tuple(name for name in fit.idle if name in times)),
+        ("idle parameters", tuple(name for name in fit.idle if name not in times)),
+    ):
+        if names:
+            yield Issue(kind, names)
+
+
+def _kinks(fit: Fit) -> Iterator[Issue]:
+    """Unknowns at which the derivative jumps through zero."""
+    for kink in fit.kinks:
+        yield Issue("at a kink", (kink.unknown,), {"left": kink.left, "right": kink.right})
+
+
+def _undetermined(fit: Fit) -> Iterator[Issue]:
+    """A direction along which the cost hardly changes."""
+    curvature = free_curvature(fit)
+    if len(curvature.scaled) and abs(smallest := float(curvature.scaled[0])) < BARELY_DETERMINED:
+        yield Issue("hardly determined", curvature.weakest, {"eigenvalue": smallest})
+
+
+def _without_errors(fit: Fit) -> Iterator[Issue]:
+    """Why there are no standard errors."""
+    if np.isfinite(fit.standard_errors).all():
+        return
+    k = fit.free_basis.shape[1]
+    if not np.isfinite(fit.hessian).all():
+        yield Issue("no errors: not finite")
+    elif fit.sigma_known is None:
+        yield Issue("no errors: no noise model")
+    elif fit.sigma_known is False and fit.samples <= k:
+        yield Issue("no errors: too few samples", figures={"samples": float(fit.samples), "unknowns": float(k)})
+    else:
+        smallest = float(np.min(free_curvature(fit).scaled, initial=np.inf))
+        yield Issue("no errors: not positive definite", figures={"eigenvalue": smallest})
+
+
+def _noise(fit: Fit) -> Iterator[Issue]:
+    """Where sigma is known and the residuals contradict it: 2 J should be chi-square distributed."""
+    variance = fit.residual_variance
+    if not (fit.success and fit.sigma_known and np.isfinite(variance)):
+        return
+    freedom = fit.freedom
+    below, above = scipy.special.chdtr(freedom, 2 * fit.cost), scipy.special.chdtrc(freedom, 2 * fit.cost)
+    if 2 * min(below, above) > UNLIKELY or abs(variance - 1) < 0.1:
+        return
+    yield Issue("sigma too small" if variance > 1 else "sigma too large", figures={"chi-square": variance})
+
+
+def _residuals(fit: Fit) -> Iterator[Issue]:
+    """Residuals that are no white, normal noise."""
+    if fit.success and fit.sigma_known is not None:
+        yield from diagnose(fit).issues
+
+
+def _covariances(fit: Fit) -> Iterator[Issue]:
+    """Where the exact Hessian and the Gauss-Newton matrix give different standard errors."""
+    found = disagreement(fit) if fit.success else None
+    if found is not None and found.factor > DIFFERENT:
+        kind = "known to second order" if found.factor > UNSEEN else "covariances differ"
+        figures = {"factor": found.factor, "exact": found.exact, "Gauss-Newton": found.gauss_newton}
+        yield Issue(kind, (found.name,), figures)
+
+
+def _integration(fit: Fit) -> Iterator[Issue]:
+    """A trajectory that is not accurate enough."""
+    if not fit.integration_error <= LARGE_INTEGRATION_ERROR:
+        yield Issue("large integration error", (fit.integration_error_of,), {"error": fit.integration_error})
