@@ -24,7 +24,7 @@ from switchfit.fit.solution import constraints_of, least_squares, message_of, mi
 from switchfit.fit.trajectory import compared, runs_of
 from switchfit.io.json import load_fit, save_fit
 from switchfit.optimize import IterationRecord, Result, Status, minimize_constrained
-from switchfit.optimize.sqp import HessianKind
+from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_choice, as_count, as_flag, as_instance, as_path, as_positive

@@ -15,7 +15,7 @@ from switchfit.fit.evaluator import ArrowEvaluation, Evaluation, Evaluator
 from switchfit.fit.hidden import refuse_hidden_switches, refuse_jumps
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
 from switchfit.optimize.arrow import Arrow
-from switchfit.optimize.sqp import HessianKind
+from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray, Measurements, TerminalConstraint
 from switchfit.problem.problem import Problem
 from switchfit.problem.variables import Variables

@@ -21,8 +21,17 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from switchfit.optimize.qp import EIGENVALUE_FLOOR, EIGENVALUE_REPLACEMENT, EPS
-from switchfit.optimize.sqp import ARMIJO, ARMIJO_ACROSS, EXTRA_ITERATIONS, LONGEST_STEP, NEGLIGIBLE_STEP, NOISE
+from switchfit.optimize.algebra import (
+    ARMIJO,
+    ARMIJO_ACROSS,
+    EIGENVALUE_FLOOR,
+    EIGENVALUE_REPLACEMENT,
+    EPS,
+    EXTRA_ITERATIONS,
+    LONGEST_STEP,
+    NEGLIGIBLE_STEP,
+    NOISE,
+)
 
 Array = jax.Array
 
