@@ -31,6 +31,8 @@ def refuse_hidden_switches(evaluator: Evaluator, theta: FloatArray, gradient: Fl
     gradient : (d,)
         At theta. Nothing is evaluated where no entry is 0.
     """
+    if gradient.all():
+        return
     unknowns = evaluator.problem.unknowns
     is_time = np.isin(np.arange(len(theta)), np.concatenate([*unknowns.times, np.zeros(0)]))
     suspects = np.flatnonzero((gradient == 0.0) & ~is_time)

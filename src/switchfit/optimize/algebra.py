@@ -7,6 +7,7 @@ traced; there the two programs differ, and `switchfit.optimize.traced` says at e
 
 from __future__ import annotations
 
+import math
 from typing import Any, Protocol
 
 import numpy as np
@@ -34,6 +35,8 @@ NEGLIGIBLE_STEP = 1e-10
 EXTRA_ITERATIONS = 5
 #: Newton steps up to this multiple of the unknowns' size are never shortened by changing the Hessian.
 LONGEST_STEP = 1e3
+#: Sizes below this count as unknown: their squares vanish.
+SMALLEST = 1e-150
 #: Rounds of equilibration after which the scaling of an indefinite matrix is good enough.
 EQUILIBRATIONS = 20
 
@@ -91,6 +94,13 @@ def project_on_row(theta: Array, normal: Array, bound: Array, movable: Array, xp
     return violation, theta + movable * ((violation + margin) / xp.where(square > 0.0, square, 1.0))
 
 
+def is_finite(array: FloatArray) -> bool:
+    """Return whether all entries are finite; NumPy alone."""
+    flat = array.reshape(-1)
+    # The sum of squares says so at once, unless it overflows.
+    return math.isfinite(flat.dot(flat)) or bool(np.isfinite(flat).all())
+
+
 def press_on_bounds(step: Array, low: Array, high: Array, multipliers: Array, xp: Any = np) -> Array:
     """Return the step (d,) of a programme, exactly on each of its bounds (d,) that has a multiplier (m + 2 d,).
 
@@ -122,9 +132,8 @@ def flatness(scale: Array, cost_scale: Array, xp: Any = np) -> Array:
     cost_scale : float
         Size of J.
     """
-    square = scale * scale
-    known = square > 0.0
-    return xp.where(known, EPS * cost_scale / xp.where(known, square, 1.0), 0.0)
+    size = xp.where(scale > SMALLEST, scale, xp.inf)
+    return (EPS * cost_scale) / (size * size)
 
 
 def curvature_floor(scale: Array, cost_scale: Array, slopes: Array, xp: Any = np) -> Array:

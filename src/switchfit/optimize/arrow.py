@@ -17,9 +17,9 @@ Runs with fewer than k own unknowns are padded with unknowns that are zero: ones
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from switchfit.optimize.algebra import EIGENVALUE_FLOOR, FloatArray, positive_eigenvalues, press_on_bounds
 from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.dense import Dense, convexify, split_space
-from switchfit.optimize.matrix import Curvature, ModelStep, Room, diagonal_scaling
+from switchfit.optimize.matrix import Curvature, ModelStep, Room, Spectrum, diagonal_scaling
 from switchfit.optimize.qp import QPSolution, newton_step, solve_whitened
 
 IntArray = NDArray[np.intp]
@@ -215,13 +215,15 @@ class Arrow:
         free = np.ones(d, dtype=bool) if room.free is None else room.free
         pressed = pressed * free
         floor = np.zeros(d) if floor is None else floor * free
-        convex = convexify_arrow(self.held(free), pressed[np.any(pressed != 0.0, axis=1)], floor)
-        bounds = np.where(free, room.lower, -np.inf), np.where(free, -room.upper, -np.inf)
-        offsets = np.concatenate([-room.slack, *bounds])
+        kept = self.held(free)
+        convex = convexify_arrow(kept, pressed[np.any(pressed != 0.0, axis=1)], floor)
+        lower, upper = room.bounds
+        offsets = room.offsets.copy()
+        offsets[-2 * d :][~np.concatenate([free, free])] = -np.inf
         solution = solve_arrow_qp(gradient * free, convex, room.constraints, offsets)
         multipliers = solution.multipliers
-        step = np.where(free, press_on_bounds(solution.step, room.lower, room.upper, multipliers), 0.0)
-        return ModelStep(step, np.where(free, convex @ step, self @ step), multipliers)
+        step = np.where(free, press_on_bounds(solution.step, lower, upper, multipliers), 0.0)
+        return ModelStep(step, np.where(free, convex @ step, self @ step), multipliers, convex is kept)
 
     def curvature(
         self, constraints: LinearConstraints, rows: NDArray[np.intp], held: NDArray[np.bool_], flat: FloatArray
@@ -231,26 +233,29 @@ class Arrow:
         The smallest eigenvalue alone, where only bounds are active and it is positive. All other cases are rare enough
         to be left to the algebra of full matrices.
         """
-        found = self._smallest_curvature(constraints, rows, held, flat)
-        return Dense(self.dense()).curvature(constraints, rows, held, flat) if found is None else found
-
-    def _smallest_curvature(
-        self, constraints: LinearConstraints, rows: NDArray[np.intp], held: NDArray[np.bool_], flat: FloatArray
-    ) -> Curvature | None:
         m, d = constraints.b.size, held.size
         if np.any(rows < m) or not self.finite:
-            return None
-        held = held.copy()
-        held[(rows - m) % d] = True
+            return Dense(self.dense()).curvature(constraints, rows, held, flat)
+        left_out = held.copy()
+        left_out[(rows - m) % d] = True
+        in_full = partial(self._spectrum_in_full, constraints, rows, held, flat)
+        return Curvature(np.eye(d)[:, ~left_out], partial(self._spectrum, left_out, flat, in_full))
+
+    def _spectrum(self, held: NDArray[np.bool_], flat: FloatArray, in_full: Callable[[], Spectrum]) -> Spectrum:
+        """The smallest eigenvalues without the coordinates held (d,), or, where one is not positive, all of them."""
         kept = self.held(~held)
         scaling = diagonal_scaling(kept, flat)
         smallest, lowest = _smallest_eigenvalue(kept.scaled(scaling), ~held)
         unscaled, _ = _smallest_eigenvalue(kept, ~held)
         if lowest is None or held.all():
-            return None
+            return in_full()
         lowest = lowest / scaling
-        basis = np.eye(d)[:, ~held]
-        return Curvature(basis, np.array([smallest]), np.array([unscaled]), lowest / np.linalg.norm(lowest))
+        return Spectrum(np.array([smallest]), np.array([unscaled]), lowest / np.linalg.norm(lowest))
+
+    def _spectrum_in_full(
+        self, constraints: LinearConstraints, rows: NDArray[np.intp], held: NDArray[np.bool_], flat: FloatArray
+    ) -> Spectrum:
+        return Dense(self.dense()).curvature(constraints, rows, held, flat).spectrum
 
 
 @dataclass(frozen=True, eq=False)

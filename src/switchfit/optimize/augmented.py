@@ -23,7 +23,7 @@ import numpy as np
 
 from switchfit.optimize.algebra import FloatArray
 from switchfit.optimize.dense import Dense, split_space
-from switchfit.optimize.matrix import diagonal_scaling
+from switchfit.optimize.matrix import Curvature, Spectrum, diagonal_scaling
 from switchfit.optimize.sqp import minimize
 from switchfit.optimize.status import Callback, IterationRecord, Result, Status
 
@@ -188,6 +188,8 @@ def _finished(
         status = Status.INFEASIBLE
     unscaled = np.linalg.eigvalsh(free.T @ here.hessian @ free)
     lowest = basis @ vectors[:, 0] / scaling if len(values) else np.zeros(d)
+    length = max(float(np.linalg.norm(lowest)), np.finfo(float).tiny)
+    spectrum = Spectrum(np.asarray(values), np.asarray(unscaled), lowest / length)
     final = replace(
         result,
         cost=here.cost,
@@ -196,11 +198,7 @@ def _finished(
         iterations=history[-1].iteration if history else 0,
         evaluations=evaluations,
         status=status,
-        free_basis=free,
-        free_eigenvalues=values,
-        smallest_eigenvalue=float(values[0]) if len(values) else np.nan,
-        smallest_unscaled_eigenvalue=float(unscaled[0]) if len(values) else np.nan,
-        flat_direction=lowest / max(float(np.linalg.norm(lowest)), np.finfo(float).tiny),
+        curvature=Curvature(free, spectrum.itself),
         history=tuple(history),
         violated="; ".join(violated),
     )

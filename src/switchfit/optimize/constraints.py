@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,7 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import FloatArray
+from switchfit.optimize.algebra import EPS, FloatArray
+
+NONE = np.zeros(0, dtype=np.intp)
+"""No places."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +98,11 @@ class LinearConstraints:
         return np.asarray(self.lower < self.upper)
 
     @cached_property
+    def all_movable(self) -> bool:
+        """Whether no unknown is held by its bounds."""
+        return bool(self.movable.all())
+
+    @cached_property
     def normals(self) -> FloatArray:
         """Inward normals of rows, lower and upper bounds, shape (m + 2 d, d)."""
         identity = np.eye(self.size)
@@ -154,6 +163,26 @@ class LinearConstraints:
         """Absolute values of A, shape (m, d), and b, shape (m,)."""
         return np.abs(self.A), np.abs(self.b)
 
+    @cached_property
+    def _largest_sizes(self) -> tuple[float, float]:
+        """Largest sum of the absolute values of a row of A, and largest absolute value of b."""
+        A, b = self.sizes
+        return float(np.max(A.sum(1), initial=0.0)), float(np.max(b, initial=0.0))
+
+    def are_far(self, slack: FloatArray, *sizes: FloatArray) -> bool:
+        """Whether none of the constraints holds with equality, nor nearly, as at most points.
+
+        Parameters
+        ----------
+        slack : array, shape (m + 2 d,)
+            Of a theta.
+        sizes : arrays, shape (d,)
+            Of the unknowns; rounding is a part of the largest of each.
+        """
+        A, b = self._largest_sizes
+        reach = sum(math.sqrt(size.dot(size)) for size in sizes)
+        return bool(slack.min() > 32 * EPS * (b + max(A, 1.0) * reach))
+
     def active(self, slack: FloatArray, size: FloatArray) -> NDArray[np.intp]:
         """Places, ascending, of the constraints that hold with equality up to rounding.
 
@@ -162,6 +191,6 @@ class LinearConstraints:
         slack : array, shape (m + 2 d,)
             Of a theta.
         size : array, shape (d,)
-            Sizes of the unknowns, of which rounding is a part.
+            Of the unknowns; rounding is a part of it.
         """
         return np.asarray(algebra.is_active(slack, size, *self.sizes).nonzero()[0])

@@ -8,6 +8,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,11 +18,12 @@ from switchfit.optimize.algebra import (
     EIGENVALUE_FLOOR,
     EPS,
     FloatArray,
+    is_finite,
     positive_eigenvalues,
     press_on_bounds,
 )
 from switchfit.optimize.constraints import LinearConstraints
-from switchfit.optimize.matrix import Curvature, ModelStep, Room, diagonal_scaling
+from switchfit.optimize.matrix import Curvature, ModelStep, Room, Spectrum, diagonal_scaling
 from switchfit.optimize.qp import CholeskyFactor, is_definite, newton_step, solve_whitened
 
 
@@ -50,7 +52,7 @@ class Dense:
     @property
     def finite(self) -> bool:
         """Whether all entries are."""
-        return bool(np.isfinite(self.array).all())
+        return is_finite(self.array)
 
     def dense(self) -> FloatArray:
         """The matrix in full: (d, d)."""
@@ -93,27 +95,26 @@ class Dense:
         self, gradient: FloatArray, room: Room, pressed: FloatArray, floor: FloatArray | None
     ) -> ModelStep:
         """Minimise ``gᵀd + ½ dᵀBd`` inside `room`; see `switchfit.optimize.matrix.SymmetricMatrix`."""
-        slack, low, high = room.slack, room.lower, room.upper
         if room.free is None:
-            return _minimize(self.array, gradient, room.constraints.normals, slack, low, high, pressed, floor)
+            return _minimize(self.array, gradient, room.constraints.normals, room.offsets, pressed, floor)
         part = np.flatnonzero(room.free)
-        d, m = len(self.array), slack.size
+        d, m = len(self.array), room.constraints.b.size
         step = np.zeros(d)
         if part.size == 0:
-            return ModelStep(step, np.zeros(d), None)
+            return ModelStep(step, np.zeros(d), None, True)
         # What is held is left out of the programme.
         kept = np.concatenate([np.arange(m), m + part, m + d + part])
         normals = room.constraints.normals[kept][:, part]
         block, rest = self.array[np.ix_(part, part)], None if floor is None else floor[part]
-        found = _minimize(block, gradient[part], normals, slack, low[part], high[part], pressed[:, part], rest)
+        found = _minimize(block, gradient[part], normals, room.offsets[kept], pressed[:, part], rest)
         step[part] = found.step
         product = self.array[:, part] @ found.step
         product[part] = found.product
         if found.multipliers is None:
-            return ModelStep(step, product, None)
+            return ModelStep(step, product, None, found.definite)
         multipliers = np.zeros(m + 2 * d)
         multipliers[kept] = found.multipliers
-        return ModelStep(step, product, multipliers)
+        return ModelStep(step, product, multipliers, found.definite)
 
     def curvature(
         self, constraints: LinearConstraints, rows: NDArray[np.intp], held: NDArray[np.bool_], flat: FloatArray
@@ -121,44 +122,65 @@ class Dense:
         """Curvature in the null space of constraints; see `switchfit.optimize.matrix.SymmetricMatrix`."""
         d = len(self.array)
         free = np.flatnonzero(~held)
+        if free.size == d and rows.size == 0:
+            return Curvature(np.eye(d), partial(_spectrum, self.array, flat))
         normals = constraints.rows(rows)[:, free]
-        whole = free.size == d and rows.size == 0
-        basis = np.eye(d) if whole else np.zeros((d, 0)) if free.size == 0 else np.eye(d)[:, free] @ null_space(normals)
-        count = basis.shape[1]
-        if count == 0 or not self.finite:
-            nothing = np.full(count, np.nan)
-            return Curvature(basis, nothing, nothing, np.zeros(d))
-        block = self.array if whole else self.array[np.ix_(free, free)]
-        scaling = diagonal_scaling(Dense(block), flat[free])
-        scaled = block / (scaling[:, None] * scaling)
-        null = basis if whole else null_space(normals / scaling)
-        values, vectors = np.linalg.eigh(scaled if whole else null.T @ scaled @ null)
-        lowest = np.zeros(d)
-        lowest[free] = null @ vectors[:, 0] / scaling
-        unscaled = np.linalg.eigvalsh(block if whole else basis.T @ self.array @ basis)
-        return Curvature(basis, np.asarray(values), np.asarray(unscaled), lowest / np.linalg.norm(lowest))
+        null = null_space(normals) if free.size else np.zeros((0, 0))
+        basis = np.zeros((d, null.shape[1]))
+        basis[free] = null
+        return Curvature(basis, partial(_spectrum_on, self.array, flat, basis, free, normals))
+
+
+def _spectrum(array: FloatArray, flat: FloatArray) -> Spectrum:
+    """Eigenvalues of a matrix (d, d) with all directions free."""
+    if not is_finite(array):
+        return _no_spectrum(*array.shape)
+    scaling = diagonal_scaling(Dense(array), flat)
+    values, vectors = np.linalg.eigh(array / (scaling[:, None] * scaling))
+    lowest = vectors[:, 0] / scaling
+    return Spectrum(values, np.asarray(np.linalg.eigvalsh(array), float), lowest / np.linalg.norm(lowest))
+
+
+def _spectrum_on(
+    array: FloatArray, flat: FloatArray, basis: FloatArray, free: NDArray[np.intp], normals: FloatArray
+) -> Spectrum:
+    """Eigenvalues of a matrix (d, d) on the null space of normals in the free coordinates, whose basis is given."""
+    d, count = basis.shape
+    if count == 0 or not is_finite(array):
+        return _no_spectrum(d, count)
+    block = array[np.ix_(free, free)]
+    scaling = diagonal_scaling(Dense(block), flat[free])
+    null = null_space(normals / scaling)
+    values, vectors = np.linalg.eigh(null.T @ (block / (scaling[:, None] * scaling)) @ null)
+    lowest = np.zeros(d)
+    lowest[free] = null @ vectors[:, 0] / scaling
+    return Spectrum(
+        values, np.asarray(np.linalg.eigvalsh(basis.T @ array @ basis), float), lowest / np.linalg.norm(lowest)
+    )
+
+
+def _no_spectrum(d: int, count: int) -> Spectrum:
+    nothing = np.full(count, np.nan)
+    return Spectrum(nothing, nothing, np.zeros(d))
 
 
 def _minimize(
     hessian: FloatArray,
     gradient: FloatArray,
     normals: FloatArray,
-    slack: FloatArray,
-    lower: FloatArray,
-    upper: FloatArray,
+    offsets: FloatArray,
     pressed: FloatArray,
     floor: FloatArray | None,
 ) -> ModelStep:
     """The programme of `Dense.minimize_model` in unknowns that are all free."""
     convex, factor = convexify_and_factor(hessian, pressed, floor)
     step = newton_step(gradient, convex, factor)
-    inside = (step >= lower).all() and (step <= upper).all() and (normals[: slack.size] @ step >= -slack).all()
-    if inside:
-        return ModelStep(step, convex @ step, None)
-    offsets = np.concatenate([-slack, lower, -upper])
+    if (normals @ step >= offsets).all():
+        return ModelStep(step, convex @ step, None, convex is hessian)
     step, multipliers = solve_whitened(gradient, convex, factor, normals, offsets)
-    step = press_on_bounds(step, lower, upper, multipliers)
-    return ModelStep(step, convex @ step, multipliers)
+    d = gradient.size
+    step = press_on_bounds(step, offsets[-2 * d : -d], -offsets[-d:], multipliers)
+    return ModelStep(step, convex @ step, multipliers, convex is hessian)
 
 
 def null_space(normals: FloatArray) -> FloatArray:

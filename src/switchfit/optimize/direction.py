@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.optimize.algebra import FloatArray
+from switchfit.optimize.constraints import NONE
 from switchfit.optimize.dense import Dense
 from switchfit.optimize.kinks import release
 from switchfit.optimize.matrix import Room, SymmetricMatrix
@@ -21,11 +22,15 @@ from switchfit.optimize.state import State
 
 
 class Direction(NamedTuple):
-    """Step d (d,) of the quadratic programme with its slope gᵀd and its predicted reduction −(gᵀd + ½dᵀBd)."""
+    """Step d (d,) of the quadratic programme with its slope gᵀd and its predicted reduction −(gᵀd + ½dᵀBd).
+
+    `regular`: no constraint is active, no coordinate is held or at a kink, and H is positive definite.
+    """
 
     step: FloatArray
     slope: float
     reduction: float
+    regular: bool
 
 
 def find_direction(problem: Problem, state: State, piece: tuple[FloatArray, FloatArray] | None = None) -> Direction:
@@ -71,31 +76,34 @@ def _solve_on_sides(
     gradient, hessian = point.derivatives(sides)
     room = _room(problem, state, sides, piece)
     matrix, floor = _model(problem, state, hessian, room.free)
-    pressing = (point.multipliers > 0.0).nonzero()[0]
+    pressing = (point.multipliers > 0.0).nonzero()[0] if point.active.size else NONE
     found = matrix.minimize_model(gradient, room, constraints.rows(pressing), floor)
+    regular = found.definite and matrix is hessian and room.free is None and point.is_interior
     slope = float(gradient @ found.step)
     force = -found.product
     if found.multipliers is not None:
         force = constraints.A.T @ found.multipliers[: constraints.b.size] - found.product
-    return Direction(found.step, slope, -(slope + 0.5 * float(found.step @ found.product))), force
+    return Direction(found.step, slope, -(slope + 0.5 * float(found.step @ found.product)), regular), force
 
 
 def _room(problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[FloatArray, FloatArray] | None) -> Room:
     """Where the step may go: inside the constraints and the piece, and to the given sides of kinks."""
     point, constraints = state.point, problem.constraints
     m, d = constraints.b.size, constraints.size
-    inside = np.maximum(point.slack, 0.0)
+    offsets = -np.maximum(point.slack, 0.0)
     if point.active.size:
-        inside[point.active[point.active < m]] = 0.0
-    lower, upper = -inside[m : m + d], inside[m + d :]
+        offsets[point.active[point.active < m]] = 0.0
     if piece is not None:
-        lower, upper = np.minimum(piece[0] - point.theta, 0.0), np.maximum(piece[1] - point.theta, 0.0)
+        offsets[m : m + d] = np.minimum(piece[0] - point.theta, 0.0)
+        offsets[m + d :] = np.minimum(point.theta - piece[1], 0.0)
+    if point.kink is None and point.idle is None and constraints.all_movable:
+        return Room(constraints, offsets, None)
     free = constraints.movable if point.idle is None else constraints.movable & ~point.idle
     if point.kink is not None:
-        lower[point.kink & (sides > 0)] = 0.0
-        upper[point.kink & (sides < 0)] = 0.0
+        offsets[m : m + d][point.kink & (sides > 0)] = 0.0
+        offsets[m + d :][point.kink & (sides < 0)] = 0.0
         free = ~(point.kink & (sides == 0)) & free
-    return Room(constraints, inside[:m], lower, upper, None if free.all() else free)
+    return Room(constraints, offsets, None if free.all() else free)
 
 
 def _model(

@@ -46,7 +46,7 @@ def explain_failure(oracle: Oracle, state: State, direction: Direction) -> str:
             "The derivatives are right, but what the cost can still fall along that direction is less than its "
             f"rounding error, {noise:.1e}. Scale the unknowns to be of size one, or ask for a larger tolerance."
         )
-    curvature = curvature_at(problem, state, state.point.active).eigenvalues
+    curvature = curvature_at(problem, state, state.point.active).spectrum.eigenvalues
     condition = curvature[-1] / curvature[0] if curvature.size and curvature[0] > 0.0 else np.inf
     return (
         "The derivatives are right, but the cost has a narrow valley there (condition number of the scaled Hessian "

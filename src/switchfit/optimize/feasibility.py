@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,8 +12,8 @@ from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.problem import Problem
 
 
-def feasible_start(problem: Problem, theta: FloatArray) -> FloatArray:
-    """Return the start (d,) with violations of the size of rounding removed; ValueError for larger ones."""
+def feasible_start(problem: Problem, theta: FloatArray) -> Trial:
+    """Return the start theta (d,) with violations of the size of rounding removed; ValueError for larger ones."""
     constraints = problem.constraints
     if not np.isfinite(theta).all():
         raise ValueError(f"theta0 is not finite: {theta}")
@@ -25,31 +27,44 @@ def feasible_start(problem: Problem, theta: FloatArray) -> FloatArray:
         if violated.size:
             worst = [f"{constraints.names[i]} (by {-slack[i]:.3g})" for i in violated[:5]]
             raise ValueError(f"The start violates {', '.join(worst)}; start at a feasible point.")
-    return move(problem, theta, np.zeros_like(theta))
+    return move(problem, theta, np.zeros_like(theta), np.abs(theta))
 
 
-def move(problem: Problem, theta: FloatArray, step: FloatArray) -> FloatArray:
+class Trial(NamedTuple):
+    """A feasible theta (d,) with its slack (m + 2 d,), and whether it is known to be far from all constraints."""
+
+    theta: FloatArray
+    slack: FloatArray
+    far: bool
+
+    @classmethod
+    def at(cls, constraints: LinearConstraints, theta: FloatArray) -> Trial:
+        """At a theta (d,) that is feasible."""
+        return cls(theta, constraints.slack(theta), False)
+
+
+def move(problem: Problem, theta: FloatArray, step: FloatArray, scale: FloatArray) -> Trial:
     """Return theta + step (d,), feasible, and bit for bit on a bound, breakpoint or row that it reaches up to rounding.
 
     Rounding is measured by the typical size of an unknown too: a time that is 1e-30 after the start of the horizon is
-    at its start, and no step along it could ever be told from none.
+    at its start, and no step along it could ever be told from none. `scale` (d,) is the size of the unknowns so far,
+    that of theta included.
     """
     constraints = problem.constraints
-    lower, upper = constraints.lower, constraints.upper
     moved = theta + step
+    on_breakpoint = problem.breakpoints.snap(moved, theta, step, problem.size)
+    slack = constraints.slack(moved)
+    if constraints.are_far(slack, scale, step, moved, problem.size):
+        return Trial(moved, slack, True)
+    lower, upper = constraints.lower, constraints.upper
     reach = np.maximum(np.maximum(np.abs(theta), np.abs(step)), np.abs(moved))
     near = np.maximum((8 * EPS) * ((step != 0.0) * reach), problem.rounding)
-    on_breakpoint = []
-    for i, mark in problem.breakpoints.nearest(moved):
-        if abs(mark - moved[i]) <= near[i]:
-            moved[i] = mark
-            on_breakpoint.append(i)
     moved = np.where(moved - near <= lower, lower, np.where(moved + near >= upper, upper, moved))
     if (constraints.A @ moved - constraints.b > problem.row_rounding).all():
-        return moved
+        return Trial.at(constraints, moved)
     pinned = (moved == lower) | (moved == upper)
     pinned[on_breakpoint] = True
-    return snap_to_rows(problem, _repair(constraints, moved, pinned), pinned)
+    return Trial.at(constraints, snap_to_rows(problem, _repair(constraints, moved, pinned), pinned))
 
 
 def snap_to_rows(problem: Problem, theta: FloatArray, pinned: NDArray[np.bool_], reach: float = 16 * EPS) -> FloatArray:

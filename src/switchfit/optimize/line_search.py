@@ -64,15 +64,16 @@ def _attempt(oracle: Oracle, state: State, direction: Direction, alpha: float, f
     smaller KKT residual counts, or a cost below every earlier one.
     """
     point, lowest = state.point, state.lowest_cost
-    theta = move(oracle.problem, point.theta, direction.step if alpha == 1.0 else alpha * direction.step)
-    if (theta == point.theta).all():
+    step = direction.step if alpha == 1.0 else alpha * direction.step
+    there = move(oracle.problem, point.theta, step, state.scale)
+    if (there.theta == point.theta).all():
         return None
-    first = oracle.first(theta)
+    first = oracle.first(there)
     noise = NOISE * abs(point.cost)
     decrease = -alpha * direction.slope
     if first is None or not cost_allows(first.cost, point.cost, lowest, decrease, noise, fraction):
         return None
-    trial = oracle.complete(theta, first, state.scale)
+    trial = oracle.complete(there, first, state.scale)
     if trial is None:
         return None
     if not optimality_allows(trial.optimality, point.optimality, trial.cost, lowest, decrease, noise):
@@ -88,10 +89,10 @@ def _blind_step(oracle: Oracle, state: State, direction: Direction) -> Accepted 
     noise = NOISE * state.cost_scale
     if direction.reduction > noise:
         return None
-    theta = move(oracle.problem, state.point.theta, direction.step)
-    if np.array_equal(theta, state.point.theta):
+    there = move(oracle.problem, state.point.theta, direction.step, state.scale)
+    if np.array_equal(there.theta, state.point.theta):
         return None
-    trial = oracle.point(theta, state.scale)
+    trial = oracle.point(there, state.scale)
     if trial is None or trial.cost > state.lowest_cost + noise or trial.optimality > 0.5 * state.point.optimality:
         return None
     return Accepted(trial, 1.0)

@@ -6,7 +6,9 @@ at the entries of a matrix.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
@@ -22,19 +24,21 @@ class Room(NamedTuple):
     Attributes
     ----------
     constraints : LinearConstraints
-    slack : array, shape (m,)
-        Rows leave ``A d >= -slack``; not negative.
-    lower, upper : array, shape (d,)
-        ``lower <= d <= upper``, with zero in between.
+    offsets : array, shape (m + 2 d,)
+        Rows, lower and upper bounds leave ``N d >= offsets`` with their normals N; not positive.
     free : array of bool, shape (d,), or None
         Unknowns that may move at all; None if all may.
     """
 
     constraints: LinearConstraints
-    slack: FloatArray
-    lower: FloatArray
-    upper: FloatArray
+    offsets: FloatArray
     free: NDArray[np.bool_] | None
+
+    @property
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper bounds of the step: (d,) each."""
+        d = self.constraints.size
+        return self.offsets[-2 * d : -d], -self.offsets[-d:]
 
 
 class ModelStep(NamedTuple):
@@ -47,11 +51,36 @@ class ModelStep(NamedTuple):
         B d, with the rows of H for unknowns that are not free.
     multipliers : array, shape (m + 2 d,), or None
         Of rows, lower and upper bounds; None where none of them presses.
+    definite : bool
+        Whether H was positive definite as it is on the free unknowns: B is H there.
     """
 
     step: FloatArray
     product: FloatArray
     multipliers: FloatArray | None
+    definite: bool
+
+
+class Spectrum(NamedTuple):
+    """Eigenvalues of a Hessian on the free directions.
+
+    Attributes
+    ----------
+    eigenvalues : array, shape (k,)
+        Ascending, of the diagonally scaled Hessian; of an arrow the smallest alone. NaN where there is no Hessian.
+    unscaled : array, shape (k,)
+        The same of the Hessian as it is.
+    lowest : array, shape (d,)
+        The direction of the smallest scaled eigenvalue, of unit length in theta.
+    """
+
+    eigenvalues: FloatArray
+    unscaled: FloatArray
+    lowest: FloatArray
+
+    def itself(self) -> Spectrum:
+        """The spectrum, for a `Curvature` whose spectrum is known."""
+        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,26 +91,26 @@ class Curvature:
     ----------
     basis : array, shape (d, k)
         Orthonormal basis of these directions.
-    eigenvalues : array, shape (k,)
-        Ascending, of the diagonally scaled Hessian on them; of an arrow the smallest alone.
-    unscaled : array, shape (k,)
-        The same of the Hessian as it is.
-    lowest : array, shape (d,)
-        The direction of the smallest scaled eigenvalue, of unit length in theta.
+    find_spectrum : callable
+        Returns the `Spectrum`, which is found when it is asked for: at an ordinary minimum nobody does.
     idle : array of bool, shape (d,), or None
         Coordinates left out as idle, beside those of the point.
     """
 
     basis: FloatArray
-    eigenvalues: FloatArray
-    unscaled: FloatArray
-    lowest: FloatArray
+    find_spectrum: Callable[[], Spectrum]
     idle: NDArray[np.bool_] | None = None
+
+    @cached_property
+    def spectrum(self) -> Spectrum:
+        """Eigenvalues and the lowest direction."""
+        return self.find_spectrum()
 
     @property
     def smallest(self) -> float:
         """Smallest scaled eigenvalue; infinite on no directions, NaN where there is no Hessian."""
-        return float(self.eigenvalues[0]) if self.eigenvalues.size else np.inf
+        values = self.spectrum.eigenvalues
+        return float(values[0]) if values.size else np.inf
 
 
 class SymmetricMatrix(Protocol):

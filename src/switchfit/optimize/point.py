@@ -13,9 +13,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import FloatArray
+from switchfit.optimize.algebra import FloatArray, is_finite
 from switchfit.optimize.arrow import Arrow
+from switchfit.optimize.constraints import NONE
 from switchfit.optimize.dense import Dense
+from switchfit.optimize.feasibility import Trial
 from switchfit.optimize.kinks import steepest_descent
 from switchfit.optimize.matrix import Curvature, SymmetricMatrix
 from switchfit.optimize.problem import Problem
@@ -76,6 +78,11 @@ class Point:
         return self.plus.cost
 
     @property
+    def is_interior(self) -> bool:
+        """Whether no constraint is active and no coordinate at a kink."""
+        return self.active.size == 0 and self.kink is None
+
+    @property
     def largest_derivative(self) -> float:
         """Largest one-sided derivative of all unknowns, in size."""
         return float(self.largest_slopes.max())
@@ -122,26 +129,28 @@ class Oracle:
         cost, gradient = float(value.cost), np.asarray(value.gradient, dtype=float).reshape(d)
         given = np.full((d, d), np.nan) if value.hessian is None else value.hessian
         hessian: SymmetricMatrix = given if isinstance(given, Arrow) else Dense.of(given, d)
-        if not (math.isfinite(cost) and np.isfinite(gradient).all()):
+        if not (math.isfinite(cost) and is_finite(gradient)):
             return None
         if self.problem.uses_hessian and not hessian.finite:
             return None
         return Sample(cost, gradient, hessian)
 
-    def first(self, theta: FloatArray) -> Sample | None:
-        """The evaluation that suffices to judge the cost at theta (d,)."""
-        kink, side = self._sides(theta)
-        return self.sample(theta, -1 if kink is None and side is not self._no_side and (side < 0).any() else 1)
+    def first(self, trial: Trial) -> Sample | None:
+        """The evaluation that suffices to judge the cost."""
+        kink, side = self._sides(trial.theta)
+        return self.sample(trial.theta, -1 if kink is None and side is not self._no_side and (side < 0).any() else 1)
 
-    def complete(self, theta: FloatArray, first: Sample, scale: FloatArray) -> Point | None:
+    def complete(self, trial: Trial, first: Sample, scale: FloatArray) -> Point | None:
         """The point: the other side is evaluated only if some coordinate is on a breakpoint and has room there.
 
         `scale` (d,) is the size of the unknowns so far. None if the other side is not finite.
         """
+        theta, slack = trial.theta, trial.slack
         kink, side = self._sides(theta)
         problem, constraints = self.problem, self.problem.constraints
-        slack = constraints.slack(theta)
-        active = constraints.active(slack, np.maximum(np.maximum(scale, problem.size), np.abs(theta)))
+        active = NONE
+        if not trial.far:
+            active = constraints.active(slack, np.maximum(np.maximum(scale, problem.size), np.abs(theta)))
         idle = None if active.size == 0 else self._idle(theta, active)
         if idle is not None and kink is not None:
             kink &= ~idle
@@ -162,10 +171,10 @@ class Oracle:
             multipliers[active] = values
         return Point(theta, plus, minus, kink, side, slack, active, optimality, multipliers, downhill, idle)
 
-    def point(self, theta: FloatArray, scale: FloatArray) -> Point | None:
-        """The point at theta (d,), evaluated; None if J is not finite there."""
-        first = self.first(theta)
-        return None if first is None else self.complete(theta, first, scale)
+    def point(self, trial: Trial, scale: FloatArray) -> Point | None:
+        """The point at a trial, evaluated; None if J is not finite there."""
+        first = self.first(trial)
+        return None if first is None else self.complete(trial, first, scale)
 
     def _idle(self, theta: FloatArray, active: NDArray[np.intp]) -> NDArray[np.bool_] | None:
         """Coordinates on which J does not depend while the active rows stay active: (d,); None if there are none."""

@@ -165,10 +165,20 @@ class Breakpoints:
             if (k := bisect_left(points, values[i])) < len(points) and points[k] == values[i]
         ]
 
-    def nearest(self, theta: FloatArray) -> list[tuple[int, float]]:
-        """Coordinates of theta (d,) that have breakpoints, each with the nearest of them."""
-        values = theta.tolist()
-        return [(i, _nearest(points, values[i])) for i, points in self.of_coordinates]
+    def snap(self, moved: FloatArray, theta: FloatArray, step: FloatArray, size: FloatArray) -> list[int]:
+        """Put coordinates of ``moved = theta + step`` (d,) onto the breakpoints that they reach up to rounding.
+
+        Rounding is a part of what is added, and of the typical `size` (d,). Returns the coordinates that were near one.
+        """
+        found = []
+        for i, points in self.of_coordinates:
+            x, by = float(moved[i]), float(step[i])
+            mark = _nearest(points, x)
+            reach = max(abs(float(theta[i])), abs(by), abs(x)) if by != 0.0 else 0.0
+            if abs(mark - x) <= 8 * EPS * max(reach, float(size[i])):
+                moved[i] = mark
+                found.append(i)
+        return found
 
     def crossed(self, theta: FloatArray, step: FloatArray) -> int:
         """Largest number of breakpoints that a coordinate passes strictly inside a step (d,)."""

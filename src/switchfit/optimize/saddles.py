@@ -6,7 +6,7 @@ import numpy as np
 
 from switchfit.optimize.algebra import ARMIJO, NEGLIGIBLE_STEP, NOISE, FloatArray, is_negligible
 from switchfit.optimize.direction import find_direction
-from switchfit.optimize.feasibility import move, snap_to_rows
+from switchfit.optimize.feasibility import Trial, move, snap_to_rows
 from switchfit.optimize.point import Oracle
 from switchfit.optimize.state import Accepted, State, curvature_at
 
@@ -26,7 +26,7 @@ def close_gaps(oracle: Oracle, state: State) -> State:
     theta = snap_to_rows(problem, point.theta, np.zeros(point.theta.size, dtype=bool), NEGLIGIBLE_STEP)
     if np.array_equal(theta, point.theta):
         return state
-    closed = oracle.point(theta, state.scale)
+    closed = oracle.point(Trial.at(problem.constraints, theta), state.scale)
     if closed is None or closed.cost > point.cost + NOISE * state.cost_scale:
         return state
     after = state.advanced(Accepted(closed, 1.0), problem.tolerance)
@@ -47,7 +47,7 @@ def escape(oracle: Oracle, state: State) -> Accepted | None:
         curvature = curvature_at(problem, state, rows)
         if not curvature.smallest < NEGATIVE_CURVATURE:
             continue
-        for ray in (curvature.lowest, -curvature.lowest):
+        for ray in (curvature.spectrum.lowest, -curvature.spectrum.lowest):
             accepted = _descend_along(oracle, state, ray)
             if accepted is not None:
                 return accepted
@@ -71,10 +71,10 @@ def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | 
         decrease = -0.5 * bending * length**2
         if decrease <= NOISE * abs(point.cost) or length == 0.0:
             return None
-        theta = move(problem, point.theta, length * ray)
-        first = oracle.first(theta)
+        there = move(problem, point.theta, length * ray, state.scale)
+        first = oracle.first(there)
         if first is not None and first.cost < point.cost - ARMIJO * decrease:
-            trial = oracle.complete(theta, first, state.scale)
+            trial = oracle.complete(there, first, state.scale)
             if trial is not None:
                 return Accepted(trial, length)
         length *= 0.5

@@ -32,8 +32,9 @@ from switchfit.optimize.algebra import EIGENVALUE_FLOOR, EPS, EXTRA_ITERATIONS, 
 from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.direction import Direction, find_direction
 from switchfit.optimize.failure import explain_failure
-from switchfit.optimize.feasibility import feasible_start
+from switchfit.optimize.feasibility import Trial, feasible_start
 from switchfit.optimize.line_search import search
+from switchfit.optimize.matrix import Curvature, Spectrum
 from switchfit.optimize.point import Oracle
 from switchfit.optimize.problem import Evaluate, HessianKind, Idle, Problem
 from switchfit.optimize.saddles import NEGATIVE_CURVATURE, close_gaps, escape
@@ -113,11 +114,11 @@ def minimize(
     problem = Problem.of(
         evaluate, start, constraints, breakpoints, hessian, blocks, tolerance, max_iterations, size, idle
     )
-    theta = feasible_start(problem, start)
+    trial = feasible_start(problem, start)
     oracle = Oracle(problem)
-    point = oracle.point(theta, np.abs(theta))
+    point = oracle.point(trial, np.abs(trial.theta))
     if point is None:
-        return _nonfinite_start(oracle, theta)
+        return _nonfinite_start(oracle, trial.theta)
     state = State.at(point)
     history = [_record(oracle, state)]
     try:
@@ -138,7 +139,7 @@ def _step(oracle: Oracle, state: State) -> State:
     problem = oracle.problem
     direction = find_direction(problem, state)
     if _is_settled(problem, state, direction):
-        return _finish(oracle, state, Status.CONVERGED)
+        return _finish(oracle, state, direction, Status.CONVERGED)
     if state.iteration >= problem.max_iterations:
         return replace(state, status=Status.MAX_ITERATIONS)
     accepted = search(oracle, state, direction)
@@ -159,30 +160,35 @@ def _is_settled(problem: Problem, state: State, direction: Direction) -> bool:
 def _stalled(oracle: Oracle, state: State, direction: Direction) -> State:
     """The line search found nothing: tell convergence and the limit of precision from failure."""
     if state.point.optimality <= oracle.problem.tolerance:
-        return _finish(oracle, state, Status.CONVERGED)
+        return _finish(oracle, state, direction, Status.CONVERGED)
     floor = state.gradient_scale
     if oracle.problem.uses_hessian:
         floor = max(floor, float(np.max(abs(state.point.plus.hessian) @ state.scale)))
     below_rounding = direction.reduction <= 10 * NOISE * state.cost_scale
     if below_rounding and state.point.optimality <= 1e5 * EPS * floor:
-        return _finish(oracle, state, Status.CONVERGED_PRECISION)
+        return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)
     # Near a saddle, where slopes are lost in rounding, its negative curvature still leads away.
     escaped = escape(oracle, state) if oracle.problem.uses_hessian and below_rounding else None
     if escaped is not None:
         return state.advanced(escaped, oracle.problem.tolerance)
     if state.restarts < RESTARTS and not state.careful:
-        point = oracle.point(state.point.theta, np.abs(state.point.theta))
+        theta = state.point.theta
+        point = oracle.point(Trial.at(oracle.problem.constraints, theta), np.abs(theta))
         if point is not None:
             fresh = State.at(point)
             return replace(fresh, iteration=state.iteration, restarts=state.restarts + 1, careful=True)
     return replace(state, status=Status.LINE_SEARCH_FAILED, reason=explain_failure(oracle, state, direction))
 
 
-def _finish(oracle: Oracle, state: State, status: Status) -> State:
+def _finish(oracle: Oracle, state: State, direction: Direction, status: Status) -> State:
     """At a KKT point: leave a saddle if possible, otherwise classify the point by its free curvature."""
     problem = oracle.problem
     if problem.uses_hessian or state.point.plus.hessian.finite:
-        state = close_gaps(oracle, state)
+        closed = close_gaps(oracle, state)
+        if closed is state and direction.regular:
+            # The programme's matrix was H itself: its scaled eigenvalues are above EIGENVALUE_FLOOR.
+            return replace(state, status=status)
+        state = closed
         accepted = escape(oracle, state) if state.iteration < problem.max_iterations else None
         if accepted is not None:
             return state.advanced(accepted, problem.tolerance)
@@ -226,11 +232,7 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
         active=tuple(problem.constraints.names[i] for i in point.active),
         multipliers=point.multipliers,
         kinks=tuple((int(i), float(point.minus.gradient[i]), float(point.plus.gradient[i])) for i in held),
-        free_basis=curvature.basis,
-        free_eigenvalues=curvature.eigenvalues,
-        smallest_eigenvalue=float(curvature.eigenvalues[0]) if curvature.eigenvalues.size else np.nan,
-        smallest_unscaled_eigenvalue=float(curvature.unscaled[0]) if curvature.unscaled.size else np.nan,
-        flat_direction=curvature.lowest,
+        curvature=curvature,
         tolerance=problem.tolerance,
         history=history,
         idle=idle_coordinates(problem, state),
@@ -253,11 +255,7 @@ def _nonfinite_start(oracle: Oracle, theta: FloatArray) -> Result:
         active=(),
         multipliers=np.zeros(len(oracle.problem.constraints.names)),
         kinks=(),
-        free_basis=np.zeros((d, 0)),
-        free_eigenvalues=np.zeros(0),
-        smallest_eigenvalue=np.nan,
-        smallest_unscaled_eigenvalue=np.nan,
-        flat_direction=np.zeros(d),
+        curvature=Curvature(np.zeros((d, 0)), Spectrum(np.zeros(0), np.zeros(0), np.zeros(d)).itself),
         tolerance=oracle.problem.tolerance,
         history=(),
     )

@@ -9,6 +9,7 @@ from enum import Enum
 import numpy as np
 
 from switchfit.optimize.algebra import FloatArray
+from switchfit.optimize.matrix import Curvature
 
 
 class Status(Enum):
@@ -122,15 +123,8 @@ class Result:
         Of rows, lower and upper bounds, in the order of `LinearConstraints.names`.
     kinks : tuple of (int, float, float)
         Coordinate, left and right derivative, where the solution sits at a kink.
-    free_basis : array, shape (d, k)
-        Orthonormal basis of the directions left free by active constraints and kinks.
-    free_eigenvalues : array, shape (k,)
-        Eigenvalues, ascending, of the diagonally scaled Hessian on the free directions; the smallest alone where the
-        Hessian has the shape of an arrow.
-    smallest_eigenvalue, smallest_unscaled_eigenvalue : float
-        The smallest of these, and that of ``free_basisᵀ H free_basis``; NaN if there are none.
-    flat_direction : array, shape (d,)
-        Eigenvector, in theta and of unit length, that belongs to `smallest_eigenvalue`.
+    curvature : Curvature
+        The Hessian on the directions left free by active constraints and kinks.
     tolerance : float
         The tolerance asked for.
     history : tuple of IterationRecord
@@ -157,11 +151,7 @@ class Result:
     active: tuple[str, ...]
     multipliers: FloatArray
     kinks: tuple[tuple[int, float, float], ...]
-    free_basis: FloatArray
-    free_eigenvalues: FloatArray
-    smallest_eigenvalue: float
-    smallest_unscaled_eigenvalue: float
-    flat_direction: FloatArray
+    curvature: Curvature
     tolerance: float
     history: tuple[IterationRecord, ...]
     violated: str = ""
@@ -175,21 +165,54 @@ class Result:
         return self.status.successful
 
     @property
+    def free_basis(self) -> FloatArray:
+        """Orthonormal basis of the directions left free by active constraints and kinks, shape (d, k)."""
+        return self.curvature.basis
+
+    @property
+    def free_eigenvalues(self) -> FloatArray:
+        """Eigenvalues, ascending, of the diagonally scaled Hessian on the free directions, shape (k,).
+
+        The smallest alone where the Hessian has the shape of an arrow.
+        """
+        return self.curvature.spectrum.eigenvalues
+
+    @property
+    def smallest_eigenvalue(self) -> float:
+        """The smallest of these; NaN if there are none."""
+        values = self.free_eigenvalues
+        return float(values[0]) if values.size else np.nan
+
+    @property
+    def smallest_unscaled_eigenvalue(self) -> float:
+        """The smallest eigenvalue of ``free_basisᵀ H free_basis``; NaN if there are none."""
+        values = self.curvature.spectrum.unscaled
+        return float(values[0]) if values.size else np.nan
+
+    @property
+    def flat_direction(self) -> FloatArray:
+        """Eigenvector, in theta and of unit length, that belongs to `smallest_eigenvalue`, shape (d,)."""
+        return self.curvature.spectrum.lowest
+
+    @property
     def message(self) -> str:
         """The status as a sentence with this result's numbers and names."""
         kinks = ", ".join(
             f"theta[{i}] = {self.theta[i]:.10g}, where the derivative jumps from {left:.1e} to {right:.1e}"
             for i, left, right in self.kinks
         )
-        order = np.argsort(-np.abs(self.flat_direction), kind="stable")
-        largest = [i for i in order if abs(self.flat_direction[i]) > 0.1][:4]
-        direction = " ".join(f"{self.flat_direction[i]:+.2g} theta[{i}]" for i in largest) or "no direction"
+        direction, smallest = "", np.nan
+        if self.status in (Status.SADDLE, Status.SINGULAR):  # no others ask for eigenvalues
+            smallest = self.smallest_eigenvalue
+            order = np.argsort(-np.abs(self.flat_direction), kind="stable")
+            largest = [i for i in order if abs(self.flat_direction[i]) > 0.1][:4]
+            direction = " ".join(f"{self.flat_direction[i]:+.2g} theta[{i}]" for i in largest) or "no direction"
         sentence = self.status.value.format(
             optimality=self.optimality,
             tolerance=self.tolerance,
             cost=self.cost,
             iterations=self.iterations,
-            smallest_eigenvalue=self.smallest_eigenvalue,
+            smallest_eigenvalue=smallest,
             kinks=kinks,
             direction=direction,
             violated=self.violated,
