@@ -16,12 +16,11 @@ from numpy.typing import ArrayLike
 from switchfit.engine.adaptive import refined_mesh
 from switchfit.engine.choice import Engine
 from switchfit.fit.accuracy import worst_error
-from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.fit.evaluator import Evaluator, Simulation, evaluator_of
 from switchfit.fit.guards import on_guards
 from switchfit.fit.hidden import refuse_jumps
 from switchfit.fit.result import Certificate, Fit
 from switchfit.fit.solution import constraints_of, least_squares, message_of, minimized, plain, sigma_known
-from switchfit.fit.trajectory import compared, runs_of
 from switchfit.io.json import load_fit, save_fit
 from switchfit.optimize import IterationRecord, Result, Status, minimize_constrained
 from switchfit.optimize.problem import HessianKind
@@ -67,6 +66,22 @@ class Estimate(Fit):
     saved_certificate: Certificate | None = None
     problem: Problem | None = None
     evaluator: Evaluator | None = None
+
+    def simulate_later(self, simulation: Simulation) -> None:
+        """Take `trajectories` and `comparisons` from a simulation when they are asked for; many fits are not."""
+        for name in ("trajectories", "comparisons"):
+            del self.__dict__[name]
+        self.__dict__["_simulation"] = simulation
+
+    def __getattr__(self, name: str) -> Any:
+        """`trajectories` and `comparisons` at the first access: all other attributes are there."""
+        simulation = self.__dict__.get("_simulation")
+        if simulation is None or name not in ("trajectories", "comparisons"):
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
+        trajectories, comparisons = simulation.compare()
+        self.__dict__.update(trajectories=trajectories, comparisons=comparisons)
+        self.__dict__.pop("_simulation", None)
+        return self.__dict__[name]
 
     @cached_property
     def certificate(self) -> Certificate:
@@ -285,11 +300,9 @@ def estimate(
         evaluations += result.evaluations
         theta = result.theta
         fine = evaluator.divided()
-        runs = runs_of(problem, theta, fine.meshes, fine.arguments)
+        simulation = Simulation(fine, theta)
         error, output = worst_error(
-            fine,
-            theta,
-            runs,
+            simulation,
             cost=result.cost,
             first_cost=history[0].cost if history else 0.0,
             constraints=[value for _, value, _ in held],
@@ -300,8 +313,7 @@ def estimate(
         evaluator = _refined(fine, problem.checked_theta(start), theta, excess)
     if excess > 1 and result.status.converged and not problem.constraint_names:
         refuse_jumps(evaluator, theta)  # the error of steps across a jump does not vanish with their length
-    trajectories, comparisons = compared(problem, theta, runs)
-    return _estimate(
+    found = _estimate(
         problem,
         evaluator,
         replace(result, iterations=earlier + result.iterations, earlier=earlier),
@@ -310,13 +322,15 @@ def estimate(
         tolerance,
         initial_theta=problem.checked_theta(start),
         evaluations=evaluations,
-        trajectories=trajectories,
-        comparisons=comparisons,
+        trajectories=(),
+        comparisons=(),
         integration_error=float(error),
         integration_error_of=output,
         seconds=time.perf_counter() - began,
         constraints=held,
     )
+    found.simulate_later(simulation)
+    return found
 
 
 def checked_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:

@@ -23,9 +23,9 @@ import numpy as np
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.model import Model
-from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.evaluator import Evaluator, Simulation
 from switchfit.fit.solution import smallest_cost
-from switchfit.fit.trajectory import Run, cost_of
+from switchfit.fit.trajectory import Run
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import float64
 from switchfit.problem.problem import Problem
@@ -54,9 +54,7 @@ def cost_error(problem: Problem, fine_cost: float, cost: float, first_cost: floa
 
 
 def worst_error(
-    fine: Evaluator,
-    theta: FloatArray,
-    runs: Sequence[Run],
+    fine: Simulation,
     *,
     cost: float,
     first_cost: float,
@@ -66,11 +64,8 @@ def worst_error(
 
     Parameters
     ----------
-    fine : Evaluator
-        On the meshes of the fit with every cell halved.
-    theta : (d,)
-    runs : list of Run
-        The simulation at theta on the meshes of `fine`.
+    fine : Simulation
+        At theta, on the meshes of the fit with every cell halved.
     cost, first_cost : float
         J on the meshes of the fit, at theta and at the first guess.
     constraints : (m,)
@@ -81,10 +76,10 @@ def worst_error(
     IntegrationError
         An error that is not a number counts as the largest.
     """
-    problem = fine.problem
-    errors = [IntegrationError(cost_error(problem, cost_of(problem, theta, runs), cost, first_cost), COST)]
+    problem = fine.evaluator.problem
+    errors = [IntegrationError(cost_error(problem, fine.cost, cost, first_cost), COST)]
     if problem.constraint_names:
-        values, scales = constraint_values(fine, theta, runs)
+        values, scales = constraint_values(fine.evaluator, fine.theta, fine.runs)
         changes = np.abs(values - constraints) / np.where(scales > 0, scales, 1.0)
         errors += map(IntegrationError, changes.tolist(), problem.constraint_names)
     return max(errors, key=lambda found: np.inf if np.isnan(found.error) else found.error)

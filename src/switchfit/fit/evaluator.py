@@ -24,7 +24,7 @@ from switchfit.engine.jax.first_order import first_order
 from switchfit.engine.jax.forward import forward_hessian
 from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
 from switchfit.engine.native.program import NativeExperiment, native_experiment, reason_for_jax
-from switchfit.fit.trajectory import cost_of, runs_of
+from switchfit.fit.trajectory import Comparison, Run, Trajectory, compared, cost_of, runs_of
 from switchfit.optimize.arrow import Arrow, ArrowLayout
 from switchfit.paper_adjoint import paper_derivatives
 from switchfit.problem.data import FloatArray
@@ -202,13 +202,17 @@ class Evaluator:
 
     def cost(self, theta: FloatArray) -> float:
         """J alone."""
-        natives = self._natives(0)
-        vectors = [self.problem.vectors(theta, e) for e in range(len(natives))]
-        costs = [None if native is None else native.cost(*at) for native, at in zip(natives, vectors, strict=True)]
-        known = [cost for cost in costs if cost is not None]
-        if len(known) < len(natives):
-            return cost_of(self.problem, theta, runs_of(self.problem, theta, self.meshes, self.arguments))
-        return sum(known, 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0]))
+        return Simulation(self, theta).cost
+
+    def native_cost(self, theta: FloatArray) -> float | None:
+        """J alone, by machine code; None if not all experiments have any, or it presumed wrongly."""
+        total = 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0])
+        for e, native in enumerate(self._natives(0)):
+            cost = None if native is None else native.cost(*self.problem.vectors(theta, e))
+            if cost is None:
+                return None
+            total += cost
+        return total
 
     @property
     def engine(self) -> Engine:
@@ -260,6 +264,36 @@ class Evaluator:
             (structure, arguments, *self.problem.vectors(theta, e))
             for e, (structure, arguments) in enumerate(zip(self.problem.structures, self._on_device, strict=True))
         ]
+
+
+class Simulation:
+    """A problem simulated at one theta, as far as it has been asked for: J alone takes half of a trajectory's time.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+        Whose meshes are taken.
+    theta : (d,)
+    """
+
+    def __init__(self, evaluator: Evaluator, theta: FloatArray) -> None:
+        self.evaluator, self.theta = evaluator, theta
+
+    @cached_property
+    def cost(self) -> float:
+        """J."""
+        known = None if "runs" in self.__dict__ else self.evaluator.native_cost(self.theta)
+        return cost_of(self.evaluator.problem, self.theta, self.runs) if known is None else known
+
+    @cached_property
+    def runs(self) -> list[Run]:
+        """All states and outputs, one an experiment."""
+        evaluator = self.evaluator
+        return runs_of(evaluator.problem, self.theta, evaluator.meshes, evaluator.arguments)
+
+    def compare(self) -> tuple[tuple[Trajectory, ...], tuple[tuple[Comparison, ...], ...]]:
+        """Trajectories and measured against fitted of all experiments."""
+        return compared(self.evaluator.problem, self.theta, self.runs)
 
 
 def evaluator_of(problem: Problem) -> Evaluator:

@@ -7,7 +7,6 @@ traced; there the two programs differ, and `switchfit.optimize.traced` says at e
 
 from __future__ import annotations
 
-import math
 from typing import Any, Protocol
 
 import numpy as np
@@ -92,13 +91,6 @@ def project_on_row(theta: Array, normal: Array, bound: Array, movable: Array, xp
     margin = EPS * (xp.abs(normal) @ xp.abs(theta))
     square = movable @ movable
     return violation, theta + movable * ((violation + margin) / xp.where(square > 0.0, square, 1.0))
-
-
-def is_finite(array: FloatArray) -> bool:
-    """Return whether all entries are finite; NumPy alone."""
-    flat = array.reshape(-1)
-    # The sum of squares says so at once, unless it overflows.
-    return math.isfinite(flat.dot(flat)) or bool(np.isfinite(flat).all())
 
 
 def press_on_bounds(step: Array, low: Array, high: Array, multipliers: Array, xp: Any = np) -> Array:

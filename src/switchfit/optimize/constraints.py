@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -169,19 +168,18 @@ class LinearConstraints:
         A, b = self.sizes
         return float(np.max(A.sum(1), initial=0.0)), float(np.max(b, initial=0.0))
 
-    def are_far(self, slack: FloatArray, *sizes: FloatArray) -> bool:
+    def are_far(self, slack: FloatArray, size: float) -> bool:
         """Whether none of the constraints holds with equality, nor nearly, as at most points.
 
         Parameters
         ----------
         slack : array, shape (m + 2 d,)
             Of a theta.
-        sizes : arrays, shape (d,)
-            Of the unknowns; rounding is a part of the largest of each.
+        size : float
+            Of the largest unknown; rounding is a part of it.
         """
         A, b = self._largest_sizes
-        reach = sum(math.sqrt(size.dot(size)) for size in sizes)
-        return bool(slack.min() > 32 * EPS * (b + max(A, 1.0) * reach))
+        return bool(slack.min() > 32 * EPS * (b + max(A, 1.0) * size))
 
     def active(self, slack: FloatArray, size: FloatArray) -> NDArray[np.intp]:
         """Places, ascending, of the constraints that hold with equality up to rounding.

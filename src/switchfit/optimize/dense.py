@@ -18,7 +18,6 @@ from switchfit.optimize.algebra import (
     EIGENVALUE_FLOOR,
     EPS,
     FloatArray,
-    is_finite,
     positive_eigenvalues,
     press_on_bounds,
 )
@@ -52,7 +51,7 @@ class Dense:
     @property
     def finite(self) -> bool:
         """Whether all entries are."""
-        return is_finite(self.array)
+        return bool(np.isfinite(self.array).all())
 
     def dense(self) -> FloatArray:
         """The matrix in full: (d, d)."""
@@ -133,7 +132,7 @@ class Dense:
 
 def _spectrum(array: FloatArray, flat: FloatArray) -> Spectrum:
     """Eigenvalues of a matrix (d, d) with all directions free."""
-    if not is_finite(array):
+    if not Dense(array).finite:
         return _no_spectrum(*array.shape)
     scaling = diagonal_scaling(Dense(array), flat)
     values, vectors = np.linalg.eigh(array / (scaling[:, None] * scaling))
@@ -146,7 +145,7 @@ def _spectrum_on(
 ) -> Spectrum:
     """Eigenvalues of a matrix (d, d) on the null space of normals in the free coordinates, whose basis is given."""
     d, count = basis.shape
-    if count == 0 or not is_finite(array):
+    if count == 0 or not Dense(array).finite:
         return _no_spectrum(d, count)
     block = array[np.ix_(free, free)]
     scaling = diagonal_scaling(Dense(block), flat[free])

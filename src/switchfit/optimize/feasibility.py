@@ -54,7 +54,7 @@ def move(problem: Problem, theta: FloatArray, step: FloatArray, scale: FloatArra
     moved = theta + step
     on_breakpoint = problem.breakpoints.snap(moved, theta, step, problem.size)
     slack = constraints.slack(moved)
-    if constraints.are_far(slack, scale, step, moved, problem.size):
+    if constraints.are_far(slack, float((scale + np.abs(step)).max()) + problem.largest_size):
         return Trial(moved, slack, True)
     lower, upper = constraints.lower, constraints.upper
     reach = np.maximum(np.maximum(np.abs(theta), np.abs(step)), np.abs(moved))

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import FloatArray, is_finite
+from switchfit.optimize.algebra import FloatArray
 from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.constraints import NONE
 from switchfit.optimize.dense import Dense
@@ -129,7 +129,7 @@ class Oracle:
         cost, gradient = float(value.cost), np.asarray(value.gradient, dtype=float).reshape(d)
         given = np.full((d, d), np.nan) if value.hessian is None else value.hessian
         hessian: SymmetricMatrix = given if isinstance(given, Arrow) else Dense.of(given, d)
-        if not (math.isfinite(cost) and is_finite(gradient)):
+        if not (math.isfinite(cost) and np.isfinite(gradient).all()):
             return None
         if self.problem.uses_hessian and not hessian.finite:
             return None

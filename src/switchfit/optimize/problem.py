@@ -110,6 +110,11 @@ class Problem:
         return np.asarray(16 * EPS * self.row_size)
 
     @cached_property
+    def largest_size(self) -> float:
+        """The largest typical size of a coordinate."""
+        return float(self.size.max())
+
+    @cached_property
     def rounding(self) -> FloatArray:
         """Rounding error of each coordinate, if it is of its typical size: (d,)."""
         return np.asarray(8 * EPS * self.size)
