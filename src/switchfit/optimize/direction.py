@@ -90,8 +90,9 @@ def _room(problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[
     """Where the step may go: inside the constraints and the piece, and to the given sides of kinks."""
     point, constraints = state.point, problem.constraints
     m, d = constraints.b.size, constraints.size
-    offsets = -np.maximum(point.slack, 0.0)
+    offsets = -point.slack
     if point.active.size:
+        offsets = np.minimum(offsets, 0.0)
         offsets[point.active[point.active < m]] = 0.0
     if piece is not None:
         offsets[m : m + d] = np.minimum(piece[0] - point.theta, 0.0)

@@ -219,7 +219,7 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
     problem, point = oracle.problem, state.point
     gradient, hessian = point.derivatives(point.reported_sides)
     curvature = curvature_at(problem, state, point.active)
-    held = np.flatnonzero(state.genuine_kinks)
+    held = () if point.kink is None else np.flatnonzero(state.genuine_kinks)
     return Result(
         theta=point.theta,
         cost=point.cost,
@@ -229,7 +229,7 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
         iterations=state.iteration,
         evaluations=oracle.evaluations,
         status=status,
-        active=tuple(problem.constraints.names[i] for i in point.active),
+        active=tuple(problem.constraints.names[i] for i in point.active.tolist()),
         multipliers=point.multipliers,
         kinks=tuple((int(i), float(point.minus.gradient[i]), float(point.plus.gradient[i])) for i in held),
         curvature=curvature,
