@@ -5,9 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from switchfit.optimize import minimize
-from switchfit.optimize.arrow import Arrow, ArrowFactor, ArrowLayout, arrow_scaling, convexify_arrow, solve_arrow_qp
-from switchfit.optimize.qp import LinearConstraints, diagonal_scaling, solve_qp, split_space
+from switchfit.optimize import LinearConstraints, minimize, solve_qp
+from switchfit.optimize.arrow import Arrow, ArrowFactor, ArrowLayout, convexify_arrow, solve_arrow_qp
+from switchfit.optimize.dense import Dense, split_space
+from switchfit.optimize.matrix import diagonal_scaling
 
 PLACES = [np.array([0, 1, 2, 9, 10]), np.array([3, 4, 9, 10]), np.array([5, 6, 7, 10, 9]), np.array([8, 9])]
 LAYOUT = ArrowLayout.of(11, PLACES)
@@ -84,7 +85,7 @@ def test_operations_are_those_of_the_full_matrix(seed):
     mixed = np.where(pair > 0, full, np.where(pair < 0, other, 0.5 * (full + other)))
     np.testing.assert_allclose(arrow.mixed(arrow_of(other), sides).dense(), mixed, rtol=1e-14)
     floor = rng.uniform(0.0, 1.0, 11)
-    np.testing.assert_allclose(arrow_scaling(arrow, floor), diagonal_scaling(full, floor), rtol=1e-12)
+    np.testing.assert_allclose(diagonal_scaling(arrow, floor), diagonal_scaling(Dense(full), floor), rtol=1e-12)
     assert arrow.finite
     assert not arrow_of(np.where(full == full[0, 0], np.nan, full)).finite
 
@@ -142,7 +143,7 @@ def test_what_is_made_positive_definite(seed):
     full = random_matrix(rng, lowest=-(10.0 ** rng.uniform(-2, 2)))
     convex = convexify_arrow(arrow_of(full), NONE, NO_FLOOR).dense()
     assert np.linalg.eigvalsh(convex)[0] > 0.0
-    scale = diagonal_scaling(full)
+    scale = diagonal_scaling(Dense(full))
     assert np.linalg.cond(convex / np.outer(scale, scale)) < 1e7
 
 

@@ -88,8 +88,9 @@ def _padded_samples(item: Measurements, length: int, mesh: Mesh) -> Samples:
 
 def _signals_by_cell(experiment: Experiment, mesh: Mesh) -> FloatArray:
     """Every signal as a cubic in each cell, in powers of the time since the cell's first node: (G, 4, S)."""
+    signals = [by_cell(signal, mesh) for signal in signals_of(experiment)]
     none = np.zeros((len(mesh.nodes) - 1, 4, 0))
-    return np.concatenate([none, *(by_cell(signal, mesh) for signal in signals_of(experiment))], axis=2)
+    return signals[0] if len(signals) == 1 else np.concatenate([none, *signals], axis=2)
 
 
 def by_cell(signal: PiecewisePolynomial, mesh: Mesh) -> FloatArray:

@@ -47,7 +47,11 @@ class Mesh:
     @classmethod
     def from_times(cls, times: FloatArray) -> Mesh:
         """The mesh whose nodes are `times`, in any order and with repetitions."""
-        nodes = np.unique(times)
+        return cls.padded(np.unique(times))
+
+    @classmethod
+    def padded(cls, nodes: FloatArray) -> Mesh:
+        """The mesh with these nodes, which increase strictly, and padding of a usual length."""
         cells = len(nodes) - 1
         padding = np.full(padded_length(cells) - cells, nodes[-1])
         return cls(np.concatenate([nodes, padding]), cells)
@@ -64,9 +68,10 @@ class Mesh:
     def divided(self, parts: int = 2) -> Mesh:
         """The mesh with every cell cut into equal parts."""
         nodes = self.times
-        return Mesh.from_times(
-            np.concatenate([nodes[:-1] + np.diff(nodes) * k / parts for k in range(parts)] + [nodes])
-        )
+        inside = nodes[:-1, None] + np.diff(nodes)[:, None] * np.arange(parts) / parts
+        divided = np.append(inside, nodes[-1])
+        # Equal parts of a cell as short as rounding may coincide.
+        return Mesh.padded(divided) if (divided[1:] > divided[:-1]).all() else Mesh.from_times(divided)
 
     def cell_ending_at(self, times: FloatArray) -> NDArray[np.intp]:
         """Index of the cell that ends at each of `times`, which must be nodes; -1 for t0."""

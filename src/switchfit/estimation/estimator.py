@@ -22,9 +22,9 @@ from switchfit.fit.hidden import refuse_jumps
 from switchfit.fit.result import Fit
 from switchfit.fit.solution import constraints_of, least_squares, minimized, plain, sigma_known
 from switchfit.fit.termination import termination_of
-from switchfit.fit.trajectory import compare
+from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.optimize import IterationRecord, Result, Status, minimize_constrained
-from switchfit.optimize.sqp import HessianKind
+from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import run_names
 from switchfit.problem.problem import Problem
@@ -64,6 +64,22 @@ class Estimate(Fit):
     saved_certificate: Certificate | None = None
     problem: Problem | None = None
     evaluator: Evaluator | None = None
+
+    def simulate_later(self, simulation: SimulatedProblem) -> None:
+        """Take `trajectories` and `comparisons` from a simulation when they are asked for; many fits are not."""
+        for name in ("trajectories", "comparisons"):
+            del self.__dict__[name]
+        self.__dict__["_simulation"] = simulation
+
+    def __getattr__(self, name: str) -> Any:
+        """`trajectories` and `comparisons` at the first access: all other attributes are there."""
+        simulation = self.__dict__.get("_simulation")
+        if simulation is None or name not in ("trajectories", "comparisons"):
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
+        trajectories, comparisons = simulation.compare()
+        self.__dict__.update(trajectories=trajectories, comparisons=comparisons)
+        self.__dict__.pop("_simulation", None)
+        return self.__dict__[name]
 
     @cached_property
     def certificate(self) -> Certificate:
@@ -283,11 +299,9 @@ def estimate(
         evaluations += result.evaluations
         theta = result.theta
         fine = evaluator.divided()
-        simulations = fine.simulate(theta)
+        simulation = SimulatedProblem(fine, theta)
         error, output = worst_error(
-            fine,
-            theta,
-            simulations,
+            simulation,
             cost=result.cost,
             first_cost=history[0].cost if history else 0.0,
             constraints=[value for _, value, _ in held],
@@ -298,8 +312,7 @@ def estimate(
         evaluator = _refined(fine, problem.checked_theta(start), theta, excess)
     if excess > 1 and result.status.successful and not problem.constraint_names:
         refuse_jumps(evaluator, theta)  # the error of steps across a jump does not vanish with their length
-    trajectories, comparisons = compare(problem, theta, simulations)
-    return _estimate(
+    found = _estimate(
         problem,
         evaluator,
         replace(result, iterations=earlier + result.iterations, earlier=earlier),
@@ -307,13 +320,15 @@ def estimate(
         hessian,
         initial_theta=problem.checked_theta(start),
         evaluations=evaluations,
-        trajectories=trajectories,
-        comparisons=comparisons,
+        trajectories=(),
+        comparisons=(),
         integration_error=float(error),
         integration_error_of=output,
         seconds=time.perf_counter() - began,
         constraints=held,
     )
+    found.simulate_later(simulation)
+    return found
 
 
 def checked_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:

@@ -26,7 +26,7 @@ from switchfit.discretization.model import Model
 from switchfit.engine.protocol import Simulation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import smallest_cost
-from switchfit.fit.trajectory import cost_of
+from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import float64
 from switchfit.problem.problem import Problem
@@ -55,9 +55,7 @@ def cost_error(problem: Problem, fine_cost: float, cost: float, first_cost: floa
 
 
 def worst_error(
-    fine: Evaluator,
-    theta: FloatArray,
-    simulations: Sequence[Simulation],
+    fine: SimulatedProblem,
     *,
     cost: float,
     first_cost: float,
@@ -67,11 +65,8 @@ def worst_error(
 
     Parameters
     ----------
-    fine : Evaluator
-        On the meshes of the fit with every cell halved.
-    theta : (d,)
-    simulations : list of Simulation
-        At theta on the meshes of `fine`.
+    fine : SimulatedProblem
+        At theta, on the meshes of the fit with every cell halved.
     cost, first_cost : float
         J on the meshes of the fit, at theta and at the first guess.
     constraints : (m,)
@@ -82,10 +77,10 @@ def worst_error(
     IntegrationError
         An error that is not a number counts as the largest.
     """
-    problem = fine.problem
-    errors = [IntegrationError(cost_error(problem, cost_of(problem, theta, simulations), cost, first_cost), COST)]
+    problem = fine.evaluator.problem
+    errors = [IntegrationError(cost_error(problem, fine.cost, cost, first_cost), COST)]
     if problem.constraint_names:
-        values, scales = constraint_values(fine, theta, simulations)
+        values, scales = constraint_values(fine.evaluator, fine.theta, fine.simulations)
         changes = np.abs(values - constraints) / np.where(scales > 0, scales, 1.0)
         errors += map(IntegrationError, changes.tolist(), problem.constraint_names)
     return max(errors, key=lambda found: np.inf if np.isnan(found.error) else found.error)

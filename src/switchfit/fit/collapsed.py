@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.fit.evaluator import Evaluator
-from switchfit.optimize.qp import EPS
+from switchfit.optimize.algebra import EPS
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem

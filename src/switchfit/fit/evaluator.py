@@ -215,8 +215,9 @@ class Evaluator:
         """For each entry of theta the nodes at which derivatives may jump: none for parameters."""
         points = [np.zeros(0)] * len(self.problem.theta_names)
         for mesh, where in zip(self.meshes, self.problem.unknowns.times, strict=True):
-            for place in where[where >= 0]:
-                points[place] = mesh.times
+            times = mesh.times
+            for place in where[where >= 0].tolist():
+                points[place] = times
         return points
 
 

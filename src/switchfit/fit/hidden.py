@@ -31,6 +31,8 @@ def refuse_hidden_switches(evaluator: Evaluator, theta: FloatArray, gradient: Fl
     gradient : (d,)
         At theta. Nothing is evaluated where no entry is 0.
     """
+    if gradient.all():
+        return
     unknowns = evaluator.problem.unknowns
     suspects = np.flatnonzero((gradient == 0.0) & ~unknowns.is_time).tolist()
     if not suspects:

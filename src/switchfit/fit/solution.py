@@ -16,7 +16,7 @@ from switchfit.fit.termination import linear_constraints_of
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
 from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.diagnosis import Finding
-from switchfit.optimize.sqp import HessianKind
+from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray, Measurements, TerminalConstraint
 from switchfit.problem.problem import Problem
 from switchfit.problem.variables import Variables

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +13,7 @@ from switchfit.discretization.arguments import arguments_of
 from switchfit.engine.adaptive import refined_mesh
 from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation
+from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_index, as_instance
@@ -122,6 +124,36 @@ def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: in
     engine = engine_of(problem, experiment, arguments_of(problem, experiment, mesh), mesh)
     simulation = engine.simulate(*problem.vectors(checked, experiment), tangents=False)
     return _trajectory(problem, experiment, simulation)
+
+
+class SimulatedProblem:
+    """A problem simulated at one theta, as far as it has been asked for: J alone takes half of a trajectory's time.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+        Whose meshes are taken.
+    theta : (d,)
+    """
+
+    def __init__(self, evaluator: Evaluator, theta: FloatArray) -> None:
+        self.evaluator, self.theta = evaluator, theta
+
+    @cached_property
+    def cost(self) -> float:
+        """J."""
+        if "simulations" in self.__dict__:
+            return cost_of(self.evaluator.problem, self.theta, self.simulations)
+        return self.evaluator.cost(self.theta)
+
+    @cached_property
+    def simulations(self) -> list[Simulation]:
+        """All states and outputs, one an experiment."""
+        return self.evaluator.simulate(self.theta)
+
+    def compare(self) -> tuple[tuple[Trajectory, ...], tuple[tuple[Comparison, ...], ...]]:
+        """Return the trajectories and measured against fitted of all experiments."""
+        return compare(self.evaluator.problem, self.theta, self.simulations)
 
 
 def cost_of(problem: Problem, theta: FloatArray, simulations: Sequence[Simulation]) -> float:

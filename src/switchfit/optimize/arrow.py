@@ -7,33 +7,28 @@ Two unknowns of different runs never meet in one term of J, so that with the own
         (           H_R   G_R )
         ( G_1' ...  G_R'  C   )
 
-What `switchfit.optimize.sqp` does with a Hessian is done here block by block, at a cost that is linear in the number R
-of runs: products, the Cholesky factorisation (own unknowns first, then the Schur complement
-``C - sum_e G_e' H_e^-1 G_e`` of the shared ones), the quadratic programme, and making H positive definite. Constraints
-join unknowns of one run at most, so that they keep this shape.
+What the SQP does with a Hessian (`switchfit.optimize.matrix.SymmetricMatrix`) is done here block by block, at a cost
+that is linear in the number R of runs: products, the Cholesky factorisation (own unknowns first, then the Schur
+complement ``C - sum_e G_e' H_e^-1 G_e`` of the shared ones), the quadratic programme, and making H positive definite.
+Constraints join unknowns of one run at most, so that they keep this shape.
 
 Runs with fewer than k own unknowns are padded with unknowns that are zero: ones on the diagonal, nothing beside it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.optimize.qp import (
-    EIGENVALUE_FLOOR,
-    EIGENVALUE_REPLACEMENT,
-    FloatArray,
-    LinearConstraints,
-    QPSolution,
-    convexify,
-    solve_whitened,
-    split_space,
-)
+from switchfit.optimize.algebra import EIGENVALUE_FLOOR, FloatArray, positive_eigenvalues, press_on_bounds
+from switchfit.optimize.constraints import LinearConstraints
+from switchfit.optimize.dense import Dense, convexify, split_space
+from switchfit.optimize.matrix import Curvature, ModelStep, Room, Spectrum, diagonal_scaling
+from switchfit.optimize.qp import QPSolution, newton_step, solve_whitened
 
 IntArray = NDArray[np.intp]
 
@@ -205,6 +200,63 @@ class Arrow:
     def _parts(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         return self.blocks, self.borders, self.corner
 
+    def is_definite_on(self, free: NDArray[np.bool_] | None) -> bool:
+        """Whether it is positive definite on the free unknowns (d,) of bool, or on all."""
+        return ArrowFactor.of(self if free is None else self.held(free)) is not None
+
+    def minimize_model(
+        self, gradient: FloatArray, room: Room, pressed: FloatArray, floor: FloatArray | None
+    ) -> ModelStep:
+        """Minimise ``gᵀd + ½ dᵀBd`` inside `room`; see `switchfit.optimize.matrix.SymmetricMatrix`.
+
+        What is held keeps its place, with a step of zero.
+        """
+        d = self.layout.size
+        free = np.ones(d, dtype=bool) if room.free is None else room.free
+        pressed = pressed * free
+        floor = np.zeros(d) if floor is None else floor * free
+        kept = self.held(free)
+        convex = convexify_arrow(kept, pressed[np.any(pressed != 0.0, axis=1)], floor)
+        lower, upper = room.bounds
+        offsets = room.offsets.copy()
+        offsets[-2 * d :][~np.concatenate([free, free])] = -np.inf
+        solution = solve_arrow_qp(gradient * free, convex, room.constraints, offsets)
+        multipliers = solution.multipliers
+        step = np.where(free, press_on_bounds(solution.step, lower, upper, multipliers), 0.0)
+        return ModelStep(step, np.where(free, convex @ step, self @ step), multipliers, convex is kept)
+
+    def curvature(
+        self, constraints: LinearConstraints, rows: NDArray[np.intp], held: NDArray[np.bool_], flat: FloatArray
+    ) -> Curvature:
+        """Curvature in the null space of constraints; see `switchfit.optimize.matrix.SymmetricMatrix`.
+
+        The smallest eigenvalue alone, where only bounds are active and it is positive. All other cases are rare enough
+        to be left to the algebra of full matrices.
+        """
+        m, d = constraints.b.size, held.size
+        if np.any(rows < m) or not self.finite:
+            return Dense(self.dense()).curvature(constraints, rows, held, flat)
+        left_out = held.copy()
+        left_out[(rows - m) % d] = True
+        in_full = partial(self._spectrum_in_full, constraints, rows, held, flat)
+        return Curvature(np.eye(d)[:, ~left_out], partial(self._spectrum, left_out, flat, in_full))
+
+    def _spectrum(self, held: NDArray[np.bool_], flat: FloatArray, in_full: Callable[[], Spectrum]) -> Spectrum:
+        """The smallest eigenvalues without the coordinates held (d,), or, where one is not positive, all of them."""
+        kept = self.held(~held)
+        scaling = diagonal_scaling(kept, flat)
+        smallest, lowest = _smallest_eigenvalue(kept.scaled(scaling), ~held)
+        unscaled, _ = _smallest_eigenvalue(kept, ~held)
+        if lowest is None or held.all():
+            return in_full()
+        lowest = lowest / scaling
+        return Spectrum(np.array([smallest]), np.array([unscaled]), lowest / np.linalg.norm(lowest))
+
+    def _spectrum_in_full(
+        self, constraints: LinearConstraints, rows: NDArray[np.intp], held: NDArray[np.bool_], flat: FloatArray
+    ) -> Spectrum:
+        return Dense(self.dense()).curvature(constraints, rows, held, flat).spectrum
+
 
 @dataclass(frozen=True, eq=False)
 class ArrowFactor:
@@ -283,8 +335,7 @@ def solve_arrow_qp(
     if factor is None:
         raise ValueError("the matrix of the quadratic programme is not positive definite; convexify it first")
     multipliers = np.zeros(offsets.size)
-    step = -factor.solve(gradient)
-    step -= factor.solve(gradient + matrix @ step)
+    step = newton_step(gradient, matrix, factor)
     working = np.zeros(0, dtype=np.intp)
     for _ in range(MAX_ROUNDS):
         gap = constraints.slopes(step) - offsets
@@ -301,21 +352,6 @@ def solve_arrow_qp(
     return QPSolution(step, multipliers)
 
 
-def arrow_scaling(hessian: Arrow, floor: FloatArray) -> FloatArray:
-    """As `switchfit.optimize.qp.diagonal_scaling`: (d,)."""
-    size = abs(hessian)
-    largest = size.largest_in_rows()
-    square = np.maximum(size.diagonal(), floor)
-    square = np.where(square > 0.0, square, np.where(largest > 0.0, largest, 1.0))
-    scaling = np.sqrt(square)
-    for _ in range(20):
-        largest = size.scaled(scaling).largest_in_rows()
-        if np.all(largest <= 1.0 + 1e-9):
-            break
-        scaling = scaling * np.sqrt(np.maximum(largest, 1.0))
-    return scaling
-
-
 def convexify_arrow(hessian: Arrow, normals: FloatArray, floor: FloatArray) -> Arrow:
     """Positive definite B of the same shape that equals H wherever H can be kept.
 
@@ -330,10 +366,10 @@ def convexify_arrow(hessian: Arrow, normals: FloatArray, floor: FloatArray) -> A
     normals : (r, d)
         Normals of the constraints expected to be active; each joins unknowns of one run, or shared ones.
     floor : (d,)
-        See `switchfit.optimize.qp.diagonal_scaling`.
+        See `switchfit.optimize.matrix.diagonal_scaling`.
     """
     layout = hessian.layout
-    scaling = arrow_scaling(hessian, floor)
+    scaling = diagonal_scaling(hessian, floor)
     scaled = hessian.scaled(scaling)
     if ArrowFactor.of(scaled.plus_diagonal(-EIGENVALUE_FLOOR)) is not None:
         return hessian
@@ -365,8 +401,8 @@ def _convex_blocks(scaled: Arrow, pressed: FloatArray) -> tuple[FloatArray, Floa
     values, vectors = np.linalg.eigh(scaled.blocks)
     # An eigenvalue that is replaced is made large enough for the shared unknowns not to lose their own curvature to it.
     coupling = (np.swapaxes(vectors, 1, 2) @ scaled.borders) ** 2
-    replaced = np.maximum(np.maximum(np.abs(values), EIGENVALUE_REPLACEMENT), 2.0 * coupling.sum(2))
-    changed = np.where(values > EIGENVALUE_FLOOR, values, replaced)
+    positive = positive_eigenvalues(values)
+    changed = np.where(values > EIGENVALUE_FLOOR, values, np.maximum(positive, 2.0 * coupling.sum(2)))
     convex = (vectors * changed[:, None, :]) @ np.swapaxes(vectors, 1, 2)
     indefinite = values[:, 0] <= EIGENVALUE_FLOOR
     blocks = np.where(indefinite[:, None, None], 0.5 * (convex + np.swapaxes(convex, 1, 2)), scaled.blocks)
@@ -379,3 +415,19 @@ def _convex_blocks(scaled: Arrow, pressed: FloatArray) -> tuple[FloatArray, Floa
         rows = split_space(normals)[1]
         across[e] = rows @ rows.T
     return blocks, across
+
+
+def _smallest_eigenvalue(matrix: Arrow, free: NDArray[np.bool_]) -> tuple[float, FloatArray | None]:
+    """Smallest eigenvalue on the free coordinates, and its eigenvector, by inverse iteration; None if it is not > 0."""
+    factor = ArrowFactor.of(matrix)
+    if factor is None:
+        return np.nan, None
+    vector = np.where(free, np.random.default_rng(0).normal(size=free.size), 0.0)
+    value = np.inf
+    for _ in range(1000):
+        vector = vector / np.linalg.norm(vector)
+        vector = np.where(free, factor.solve(vector), 0.0)
+        before, value = value, 1.0 / float(np.linalg.norm(vector))
+        if abs(value - before) <= 1e-8 * value:
+            break
+    return value, vector / np.linalg.norm(vector)

@@ -21,8 +21,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from switchfit.optimize.qp import FloatArray, diagonal_scaling, split_space
-from switchfit.optimize.sqp import Callback, IterationRecord, Result, Status, minimize
+from switchfit.optimize.algebra import FloatArray
+from switchfit.optimize.dense import Dense, split_space
+from switchfit.optimize.matrix import Curvature, Spectrum, diagonal_scaling
+from switchfit.optimize.sqp import minimize
+from switchfit.optimize.status import Callback, IterationRecord, Result, Status
 
 #: The first penalty, in units of the curvature of J along the constraints.
 PENALTY = 10.0
@@ -172,7 +175,7 @@ def _finished(
     here = evaluate(result.theta, side, multipliers, np.zeros(len(names)))
     left = here.jacobian @ result.free_basis
     free = result.free_basis @ split_space(left)[0] if np.isfinite(left).all() else result.free_basis
-    scaling = diagonal_scaling(here.hessian, np.zeros(d)) if np.isfinite(here.hessian).all() else np.ones(d)
+    scaling = diagonal_scaling(Dense(here.hessian), np.zeros(d)) if np.isfinite(here.hessian).all() else np.ones(d)
     basis = np.linalg.qr(free * scaling[:, None])[0] if free.shape[1] else free
     values, vectors = np.linalg.eigh(basis.T @ (here.hessian / np.outer(scaling, scaling)) @ basis)
     violated = [
@@ -185,6 +188,8 @@ def _finished(
         status = Status.INFEASIBLE
     unscaled = np.linalg.eigvalsh(free.T @ here.hessian @ free)
     lowest = basis @ vectors[:, 0] / scaling if len(values) else np.zeros(d)
+    length = max(float(np.linalg.norm(lowest)), np.finfo(float).tiny)
+    spectrum = Spectrum(np.asarray(values), np.asarray(unscaled), lowest / length)
     final = replace(
         result,
         cost=here.cost,
@@ -193,11 +198,7 @@ def _finished(
         iterations=history[-1].iteration if history else 0,
         evaluations=evaluations,
         status=status,
-        free_basis=free,
-        free_eigenvalues=values,
-        smallest_eigenvalue=float(values[0]) if len(values) else np.nan,
-        smallest_unscaled_eigenvalue=float(unscaled[0]) if len(values) else np.nan,
-        flat_direction=lowest / max(float(np.linalg.norm(lowest)), np.finfo(float).tiny),
+        curvature=Curvature(free, spectrum.itself),
         history=tuple(history),
         violated=tuple(violated),
     )

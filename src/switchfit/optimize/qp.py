@@ -1,4 +1,4 @@
-"""Linear constraints, convex quadratic programmes and the algebra the SQP needs around them.
+"""Strictly convex quadratic programmes.
 
 Every quadratic programme here is strictly convex with a feasible zero step,
 
@@ -21,164 +21,19 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import qr
+from numpy.typing import NDArray
 from scipy.linalg.lapack import dgeqp3, dpotrf, dpotrs, dtrtrs
-from scipy.optimize import lsq_linear, nnls
+from scipy.optimize import nnls
 
-FloatArray = NDArray[np.float64]
+from switchfit.optimize.algebra import FloatArray
+from switchfit.optimize.constraints import LinearConstraints
 
-EPS = float(np.finfo(np.float64).eps)
-#: Eigenvalues of the diagonally scaled Hessian below this count as zero.
-EIGENVALUE_FLOOR = 1e-10
-#: What such an eigenvalue is replaced by in the quadratic programme: small, but steps along it stay within reason.
-EIGENVALUE_REPLACEMENT = 1e-4
 #: Feasibility and sign tolerance of the whitened problem, whose quantities are all of order one.
 _WHITE_TOLERANCE = 1e-12
-
-
-@dataclass(frozen=True, eq=False)
-class LinearConstraints:
-    """Linear inequalities and bounds, ``A theta >= b`` and ``lower <= theta <= upper``, each with a name.
-
-    Parameters
-    ----------
-    A : array, shape (m, d)
-        Rows of the inequalities; m may be zero.
-    b : array, shape (m,)
-        Their right-hand sides.
-    lower, upper : array, shape (d,)
-        Bounds; infinite where there is none.
-    names : sequence, length m + 2 d
-        What to call each row, then each lower bound, then each upper bound: text, or anything that prints as such.
-
-    Raises
-    ------
-    ValueError
-        If shapes disagree, a number is NaN, a lower bound exceeds its upper bound, or names are missing.
-    """
-
-    A: FloatArray
-    b: FloatArray
-    lower: FloatArray
-    upper: FloatArray
-    names: tuple[object, ...]
-
-    def __post_init__(self) -> None:
-        lower = np.atleast_1d(np.asarray(self.lower, dtype=float))
-        d = lower.size
-        A = np.asarray(self.A, dtype=float)
-        fields = {
-            "A": A.reshape(0, d) if A.size == 0 else A,
-            "b": np.asarray(self.b, dtype=float).reshape(-1),
-            "lower": lower,
-            "upper": np.atleast_1d(np.asarray(self.upper, dtype=float)),
-            "names": tuple(self.names),
-        }
-        for key, value in fields.items():
-            object.__setattr__(self, key, value)
-        self._validate()
-
-    def _validate(self) -> None:
-        m, d = self.b.size, self.lower.size
-        if self.A.shape != (m, d) or self.lower.shape != (d,) or self.upper.shape != (d,):
-            shapes = f"A {self.A.shape}, b {self.b.shape}, lower {self.lower.shape}, upper {self.upper.shape}"
-            raise ValueError(f"shapes of the constraints disagree: {shapes}; expected (m, d), (m,), (d,), (d,)")
-        if len(self.names) != m + 2 * d:
-            raise ValueError(
-                f"got {len(self.names)} names for {m} rows and 2 x {d} bounds; give one for each of the {m + 2 * d}: "
-                "rows, then lower bounds, then upper bounds"
-            )
-        if not (np.isfinite(self.A).all() and np.isfinite(self.b).all()):
-            raise ValueError("A and b of the constraints must be finite; leave out rows that do not constrain")
-        wrong = np.flatnonzero(~(self.lower <= self.upper))
-        if wrong.size:
-            i = int(wrong[0])
-            raise ValueError(
-                f"lower bound {self.lower[i]} is not below upper bound {self.upper[i]} "
-                f"({self.names[m + i]!r}, {self.names[m + d + i]!r})"
-            )
-
-    @classmethod
-    def box(cls, lower: ArrayLike, upper: ArrayLike, *, unknowns: Sequence[str] | None = None) -> LinearConstraints:
-        """Bounds alone, named after the unknowns (``theta[i]`` if these have no names)."""
-        low = np.atleast_1d(np.asarray(lower, dtype=float))
-        labels = [f"theta[{i}]" for i in range(low.size)] if unknowns is None else list(unknowns)
-        names = [f"{label} at lower bound" for label in labels] + [f"{label} at upper bound" for label in labels]
-        return cls(np.zeros((0, low.size)), np.zeros(0), low, np.asarray(upper, dtype=float), tuple(names))
-
-    @property
-    def size(self) -> int:
-        """Number of unknowns, d."""
-        return self.lower.size
-
-    @cached_property
-    def movable(self) -> NDArray[np.bool_]:
-        """Which unknowns their bounds leave any room, shape (d,)."""
-        return np.asarray(self.lower < self.upper)
-
-    @cached_property
-    def normals(self) -> FloatArray:
-        """Inward normals of rows, lower and upper bounds, shape (m + 2 d, d)."""
-        identity = np.eye(self.size)
-        return np.vstack([self.A, identity, -identity])
-
-    def exact_rows(self, index: NDArray[np.intp]) -> list[tuple[int, int, float]]:
-        """Of the given rows of A those that can hold with equality in floating point.
-
-        ``(i, -1, value)`` for a row that holds where theta_i is the value; ``(i, j, 0.0)`` for ``theta_i >= theta_j``.
-        """
-        return [self._exact[k] for k in index.tolist() if k in self._exact]
-
-    @cached_property
-    def _exact(self) -> dict[int, tuple[int, int, float]]:
-        found = {}
-        for k, (row, bound) in enumerate(zip(self.A, self.b.tolist(), strict=True)):
-            places = np.flatnonzero(row)
-            if np.any(np.abs(row[places]) != 1.0):
-                continue
-            if places.size == 1:
-                found[k] = (int(places[0]), -1, bound * float(row[places[0]]))
-            elif places.size == 2 and bound == 0.0 and row[places].sum() == 0.0:
-                found[k] = (int(np.argmax(row)), int(np.argmin(row)), 0.0)
-        return found
-
-    def rows(self, index: NDArray[np.intp]) -> FloatArray:
-        """The normals at the given places, shape (k, d)."""
-        m, d = self.b.size, self.size
-        chosen = np.zeros((index.size, d))
-        if index.size == 0:
-            return chosen
-        in_A = index < m
-        chosen[in_A] = self.A[index[in_A]]
-        bounds = np.flatnonzero(~in_A)
-        place = index[bounds] - m
-        chosen[bounds, place % d] = np.where(place < d, 1.0, -1.0)
-        return chosen
-
-    @property
-    def row_norms(self) -> FloatArray:
-        """Lengths of the normals, shape (m + 2 d,)."""
-        return np.concatenate([np.linalg.norm(self.A, axis=1), np.ones(2 * self.size)])
-
-    def slopes(self, step: FloatArray) -> FloatArray:
-        """Products of the normals with a step, shape (m + 2 d,)."""
-        return np.concatenate([self.A @ step, step, -step])
-
-    def slack(self, theta: FloatArray) -> FloatArray:
-        """How far theta is inside each constraint, shape (m + 2 d,); negative where violated."""
-        return np.concatenate([self.A @ theta - self.b, theta - self.lower, self.upper - theta])
-
-    def rounding(self, scale: FloatArray) -> FloatArray:
-        """Size of the rounding error of `slack` at unknowns of size `scale`, shape (m + 2 d,)."""
-        rows = 16 * EPS * (np.abs(self.b) + np.abs(self.A) @ scale)
-        return np.concatenate([rows, np.zeros(2 * self.size)])
 
 
 def nearest_feasible(constraints: LinearConstraints, theta: FloatArray) -> FloatArray:
@@ -238,9 +93,8 @@ def solve_qp(gradient: FloatArray, matrix: FloatArray, normals: FloatArray, offs
     multipliers = np.zeros(offsets.size)
     if gradient.size == 0 or not np.any(gradient):
         return QPSolution(np.zeros(gradient.size), multipliers)
-    factor = _Factor.of(matrix)
-    step = -factor.solve(gradient)
-    step -= factor.solve(gradient + matrix @ step)
+    factor = CholeskyFactor.of(matrix)
+    step = newton_step(gradient, matrix, factor)
     if (normals @ step >= offsets).all():
         return QPSolution(step, multipliers)
     return QPSolution(*solve_whitened(gradient, matrix, factor, normals, offsets))
@@ -257,11 +111,22 @@ class Factor(Protocol):
         """D⁻¹ L⁻ᵀ v."""
         ...
 
+    def solve(self, vector: FloatArray) -> FloatArray:
+        """B⁻¹ v."""
+        ...
+
 
 class Matrix(Protocol):
     """What can be multiplied with a vector."""
 
     def __matmul__(self, vector: FloatArray, /) -> Any: ...
+
+
+def newton_step(gradient: FloatArray, matrix: Matrix, factor: Factor) -> FloatArray:
+    """Return −B⁻¹g (d,), refined once: the residual is computed with B itself, not with its factor."""
+    step = -factor.solve(gradient)
+    step -= factor.solve(gradient + matrix @ step)
+    return step
 
 
 def solve_whitened(
@@ -284,21 +149,36 @@ def solve_whitened(
 
 
 @dataclass(frozen=True, eq=False)
-class _Factor:
-    """The factorisation B = D L Lᵀ D, with the root of B's diagonal for D."""
+class CholeskyFactor:
+    """The factorisation B = D L Lᵀ D of a full matrix.
+
+    Attributes
+    ----------
+    diagonal : array, shape (d,)
+        D: the root of B's diagonal, or larger where its entries count as none.
+    lower : array, shape (d, d)
+        L, zero above its diagonal.
+    """
 
     diagonal: FloatArray
     lower: FloatArray
 
     @classmethod
-    def of(cls, matrix: FloatArray) -> _Factor:
+    def of(cls, matrix: FloatArray) -> CholeskyFactor:
+        """The factorisation of a matrix (d, d); ValueError if it is not positive definite."""
         variances = matrix.diagonal()
         if np.all(variances > 0.0):
             diagonal = np.sqrt(variances)
-            lower, failed = dpotrf(matrix / (diagonal[:, None] * diagonal), lower=1)
-            if not failed:
-                return cls(diagonal, lower)
+            found = cls.of_scaled(matrix / (diagonal[:, None] * diagonal), diagonal)
+            if found is not None:
+                return found
         raise ValueError("the matrix of the quadratic programme is not positive definite; convexify it first")
+
+    @classmethod
+    def of_scaled(cls, scaled: FloatArray, diagonal: FloatArray) -> CholeskyFactor | None:
+        """The factorisation of D S D (d, d) from S and D; None if S is not positive definite."""
+        lower, failed = dpotrf(scaled, lower=1)
+        return None if failed else cls(diagonal, lower)
 
     def solve(self, vector: FloatArray) -> FloatArray:
         """B⁻¹ v."""
@@ -311,6 +191,11 @@ class _Factor:
     def unwhiten(self, vector: FloatArray) -> FloatArray:
         """D⁻¹ L⁻ᵀ v."""
         return _solve_triangular(self.lower, vector, lower=1, trans=1) / self.diagonal
+
+
+def is_definite(matrix: FloatArray) -> bool:
+    """Whether a symmetric matrix (d, d) has a Cholesky factorisation."""
+    return not dpotrf(matrix, lower=1)[1]
 
 
 def _solve_triangular(matrix: FloatArray, right: FloatArray, lower: int = 0, trans: int = 0) -> FloatArray:
@@ -473,208 +358,3 @@ def _refine(
     refined = multipliers.copy()
     refined[working] += change
     return e + correction, refined
-
-
-def diagonal_scaling(hessian: FloatArray, floor: FloatArray | None = None) -> FloatArray:
-    """Positive D, shape (d,), for which D⁻¹ H D⁻¹ has rows of largest entry about one.
-
-    For a positive semi-definite H this is the root of the diagonal (Jacobi), so that everything computed in the
-    scaled variables is the same whatever the units of the unknowns. Where off-diagonal entries are larger, as they
-    may be in an indefinite H, a few rounds of symmetric equilibration follow.
-
-    Parameters
-    ----------
-    hessian : array, shape (d, d)
-        H, symmetric.
-    floor : array, shape (d,), optional
-        Diagonal entries too small to matter, below which D² does not go.
-    """
-    size = np.abs(hessian)
-    square = size.diagonal().copy()
-    if floor is not None:
-        square = np.maximum(square, floor)
-    empty = square <= 0.0
-    if empty.any():
-        square[empty] = size.max(axis=1, initial=0.0)[empty]
-        square[square <= 0.0] = 1.0
-    scaling = np.sqrt(square)
-    for _ in range(20):
-        largest = (size / (scaling[:, None] * scaling)).max(axis=1, initial=0.0)
-        if (largest <= 1.0 + 1e-9).all():
-            break
-        scaling = scaling * np.sqrt(np.maximum(largest, 1.0))
-    return scaling
-
-
-def split_space(normals: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Orthonormal bases of the null space, shape (d, d - r), and of the row space, shape (d, r), of the normals."""
-    d = normals.shape[1]
-    if normals.shape[0] == 0:
-        return np.eye(d), np.zeros((d, 0))
-    lengths = np.linalg.norm(normals, axis=1)
-    rows = normals[lengths > 0.0] / lengths[lengths > 0.0, None]
-    if rows.shape[0] == 0:
-        return np.eye(d), np.zeros((d, 0))
-    Q, R, _ = qr(rows.T, mode="full", pivoting=True)
-    rank = int(np.sum(np.abs(np.diag(R)) > 1e-11))
-    return Q[:, rank:], Q[:, :rank]
-
-
-def convexify(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None = None) -> FloatArray:
-    """Positive definite B that equals H wherever H can be kept.
-
-    In scaled variables, with Z the directions free of the (presumably) active constraints and Y their normals: a
-    positive definite H is kept; otherwise ZᵀHZ is kept if it is positive definite, which leaves Newton's step on the
-    face unspoiled, and only the Schur complement on Y has its eigenvalues replaced by their absolute values. If
-    ZᵀHZ is not positive definite either, its eigenvalues are treated in the same way.
-
-    Parameters
-    ----------
-    hessian : array, shape (d, d)
-        H, symmetric.
-    normals : array, shape (k, d)
-        Normals of the constraints expected to be active.
-    floor : array, shape (d,), optional
-        See `diagonal_scaling`.
-
-    References
-    ----------
-    .. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, sections 3.4 and 16.7.
-    """
-    if hessian.size == 0:
-        return hessian
-    scaling = diagonal_scaling(hessian, floor)
-    weight = scaling[:, None] * scaling
-    scaled = hessian / weight
-    if not dpotrf(scaled - EIGENVALUE_FLOOR * np.eye(scaled.shape[0]))[1]:
-        return hessian
-    free, blocked = split_space(normals / scaling)
-    if blocked.shape[1] == 0 or free.shape[1] == 0:
-        return _absolute(scaled) * weight
-    top = _absolute(free.T @ scaled @ free)
-    cross = free.T @ scaled @ blocked
-    tie = cross.T @ np.linalg.solve(top, cross)
-    bottom = _absolute(blocked.T @ scaled @ blocked - tie) + tie
-    basis = np.hstack([free, blocked])
-    convex = basis @ np.block([[top, cross], [cross.T, bottom]]) @ basis.T
-    values = np.linalg.eigvalsh(convex)
-    # A nearly singular Z'HZ makes the tie huge, and the smallest eigenvalue rounding.
-    if values[0] < max(0.1 * EIGENVALUE_FLOOR, 64 * EPS * values[-1]):
-        return _absolute(scaled) * weight
-    return 0.5 * (convex + convex.T) * weight
-
-
-def _absolute(matrix: FloatArray) -> FloatArray:
-    """The matrix with eigenvalues that are not positive replaced by absolute values; itself if there are none."""
-    symmetric = 0.5 * (matrix + matrix.T)
-    values, vectors = np.linalg.eigh(symmetric)
-    if values.size == 0 or values[0] > EIGENVALUE_FLOOR:
-        return symmetric
-    changed = np.where(values > EIGENVALUE_FLOOR, values, np.maximum(np.abs(values), EIGENVALUE_REPLACEMENT))
-    convex = (vectors * changed) @ vectors.T
-    return np.asarray(0.5 * (convex + convex.T))
-
-
-def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tuple[float, FloatArray]:
-    """Distance of the gradient from the cone of the active constraints, and the multipliers that attain it.
-
-    min over lam >= 0 and low <= g <= high of ‖g − Nᵀ lam‖₂, where low = high except at coordinates held at a kink.
-
-    Parameters
-    ----------
-    low, high : array, shape (d,)
-        The interval of one-sided derivatives.
-    normals : array, shape (k, d)
-        Inward normals N of the active constraints.
-
-    Returns
-    -------
-    residual : float
-    multipliers : array, shape (k,)
-    """
-    if normals.shape[0] == 0:
-        return float(np.linalg.norm(low if low is high else np.clip(0.0, low, high))), np.zeros(0)
-    size = float(max(np.max(np.abs(low), initial=0.0), np.max(np.abs(high), initial=0.0)))
-    if size == 0.0:
-        return 0.0, np.zeros(normals.shape[0])
-    wide = np.flatnonzero(high > low)
-    lengths = np.linalg.norm(normals, axis=1)
-    lengths = np.where(lengths > 0.0, lengths, 1.0)
-    unit = normals / lengths[:, None]
-    if wide.size == 0:
-        multipliers = _cone_projection(unit, low / size)
-        shift = np.zeros(0)
-    else:
-        multipliers, shift = _box_projection(unit, low / size, (high - low)[wide] / size, wide)
-    gradient = low / size
-    gradient[wide] += shift
-    residual = size * float(np.linalg.norm(gradient - unit.T @ multipliers))
-    return residual, size * multipliers / lengths
-
-
-def _cone_projection(unit: FloatArray, gradient: FloatArray) -> FloatArray:
-    """Argument of min over lam >= 0 of ‖g − Nᵀ lam‖.
-
-    SciPy's nnls is fast, but from version 1.15 on its answer may be wrong for dependent rows, and its residual with it
-    (https://github.com/scipy/scipy/issues/25389), so that the answer is checked.
-    """
-    if gradient.size == 0:
-        return np.zeros(unit.shape[0])
-    try:
-        multipliers = np.asarray(nnls(unit.T, gradient, maxiter=10 * unit.shape[0] + 30)[0])
-    except RuntimeError:
-        multipliers = np.full(unit.shape[0], np.nan)
-    pull = unit @ (gradient - unit.T @ multipliers)
-    wrong = np.where(multipliers > 0.0, np.abs(pull), pull)
-    if np.all(wrong <= 1e-12 * (1.0 + np.max(multipliers))):
-        return multipliers
-    return np.asarray(lsq_linear(unit.T, gradient, bounds=(0.0, np.inf), method="bvls").x)
-
-
-def _box_projection(
-    unit: FloatArray, low: FloatArray, width: FloatArray, wide: NDArray[np.intp]
-) -> tuple[FloatArray, FloatArray]:
-    """Arguments of min over lam >= 0, 0 <= s <= width of ‖low + s − Nᵀ lam‖: lam and s.
-
-    With s inside its interval a coordinate puts no condition on lam, at an end of it an ordinary one: nonnegative
-    least squares with the coordinates so labelled, until the labels agree with the solution. Should they cycle, a
-    general (less accurate) solver has its say too.
-    """
-    label = np.zeros(wide.size)  # −1 and +1: at the lower and upper end
-    candidates = []
-    for _ in range(3 * wide.size + 5):
-        target = low.copy()
-        target[wide] += np.where(label > 0, width, 0.0)
-        fitted = np.ones(low.size, dtype=bool)
-        fitted[wide] = label != 0.0
-        multipliers = _cone_projection(unit[:, fitted], target[fitted])
-        above = (unit.T @ multipliers - low)[wide]
-        shifts = np.clip(above, 0.0, width)
-        candidates.append((multipliers, shifts))
-        relabelled = np.where(above > width, 1.0, np.where(above < 0.0, -1.0, 0.0))
-        if np.array_equal(relabelled, label):
-            return multipliers, shifts
-        label = relabelled
-    candidates.append(_bounded_least_squares(unit, low, width, wide))
-    return min(candidates, key=lambda pair: _distance(unit, low, wide, *pair))
-
-
-def _distance(
-    unit: FloatArray, low: FloatArray, wide: NDArray[np.intp], multipliers: FloatArray, shifts: FloatArray
-) -> float:
-    """‖low + s − Nᵀ lam‖."""
-    difference = low - unit.T @ multipliers
-    difference[wide] += shifts
-    return float(np.linalg.norm(difference))
-
-
-def _bounded_least_squares(
-    unit: FloatArray, low: FloatArray, width: FloatArray, wide: NDArray[np.intp]
-) -> tuple[FloatArray, FloatArray]:
-    """The problem of `_box_projection` by a general solver."""
-    k, d = unit.shape
-    columns = np.zeros((d, wide.size))
-    columns[wide, np.arange(wide.size)] = -1.0
-    upper = np.concatenate([np.full(k, np.inf), width])
-    solution = lsq_linear(np.hstack([unit.T, columns]), low, bounds=(np.zeros(k + wide.size), upper), method="bvls").x
-    return np.maximum(solution[:k], 0.0), np.clip(solution[k:], 0.0, width)

@@ -10,6 +10,11 @@ negligible next step; everything else is to be finished by `minimize`, from `Out
 Every function here is for one fit; `jax.lax.map` or `jax.vmap` make many of it. The loop evaluates J once a turn, at
 the point that is to be judged: fits in lockstep then never wait for another one's line search, and the program, which
 consists of little else than J, is compiled once.
+
+The formulas are those of `switchfit.optimize.algebra`. Three things are written anew, since a traced program has arrays
+of fixed shapes and does not stop early for one fit of many: nonnegative least squares with masks in place of index sets
+(`nonnegative_minimum`), the quadratic programme by its dual, with all rows in place of those that matter, and a Hessian
+that is made positive definite as a whole, not on the face of the active constraints.
 """
 
 from __future__ import annotations
@@ -21,8 +26,15 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from switchfit.optimize.qp import EIGENVALUE_FLOOR, EIGENVALUE_REPLACEMENT, EPS
-from switchfit.optimize.sqp import ARMIJO, ARMIJO_ACROSS, EXTRA_ITERATIONS, LONGEST_STEP, NEGLIGIBLE_STEP, NOISE
+from switchfit.optimize import algebra
+from switchfit.optimize.algebra import (
+    ARMIJO,
+    ARMIJO_ACROSS,
+    EIGENVALUE_FLOOR,
+    EQUILIBRATIONS,
+    EXTRA_ITERATIONS,
+    NOISE,
+)
 
 Array = jax.Array
 
@@ -54,7 +66,7 @@ class Constraints(NamedTuple):
 
     def slack(self, theta: Array) -> Array:
         """Of rows, lower and upper bounds: (m + 2 d,)."""
-        return jnp.concatenate([self.A @ theta - self.b, theta - self.lower, self.upper - theta])
+        return algebra.slack(self, theta, jnp)
 
     @property
     def normals(self) -> Array:
@@ -152,7 +164,7 @@ def minimize_traced(
             lowest=jnp.minimum(state.lowest, cost),
         )
         step, slope = _direction(moved, constraints)
-        negligible = jnp.all(jnp.abs(step) <= NEGLIGIBLE_STEP * moved.scale)
+        negligible = algebra.is_negligible(step, moved.scale, jnp)
         stationary = (optimality <= tolerance) & (negligible | (below >= EXTRA_ITERATIONS))
         done = stationary | (moved.iterations >= max_iterations)
         return moved._replace(step=step, slope=slope, stationary=stationary, done=done)
@@ -176,11 +188,9 @@ def minimize_traced(
         noise = NOISE * jnp.abs(state.cost)
         decrease = -state.length * state.slope
         fraction = jnp.where(jnp.any(piece(theta) != piece(state.theta)), ARMIJO_ACROSS, ARMIJO)
-        said = decrease > noise  # otherwise comparing costs says nothing
         lower = (
-            (cost <= state.lowest + noise)
-            & (~said | (cost <= state.cost - fraction * decrease))
-            & (said | (optimality < state.optimality) | (cost < state.lowest))
+            algebra.cost_allows(cost, state.cost, state.lowest, decrease, noise, fraction)
+            & algebra.optimality_allows(optimality, state.optimality, cost, state.lowest, decrease, noise)
             & jnp.any(theta != state.theta)
         )
         finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(hessian))
@@ -191,7 +201,7 @@ def minimize_traced(
 
     state = lax.while_loop(lambda state: ~state.done, turn, _not_begun(start))
     interior = ~jnp.any(_active(constraints, state.theta, state.scale))
-    scaling = _scaling(state.hessian, _flatness(state))
+    scaling = _scaling(state.hessian, algebra.flatness(state.scale, state.cost_scale, jnp))
     smallest = jnp.linalg.eigvalsh(jnp.nan_to_num(state.hessian / jnp.outer(scaling, scaling)))[0]
     settled = state.stationary & interior & (smallest > EIGENVALUE_FLOOR)
     return Outcome(*state[:7], settled)
@@ -225,8 +235,7 @@ def _not_begun(start: Array) -> _State:
 def _active(constraints: Constraints, theta: Array, scale: Array) -> Array:
     """Which constraints hold with equality up to rounding: (m + 2 d,) bool."""
     size = jnp.maximum(jnp.maximum(scale, constraints.size), jnp.abs(theta))
-    rows = 16 * EPS * (jnp.abs(constraints.b) + jnp.abs(constraints.A) @ size)
-    return constraints.slack(theta) <= jnp.concatenate([rows, jnp.zeros(2 * theta.shape[0])])
+    return algebra.is_active(constraints.slack(theta), size, jnp.abs(constraints.A), jnp.abs(constraints.b), jnp)
 
 
 def _kkt_residual(constraints: Constraints, theta: Array, scale: Array, gradient: Array) -> Array:
@@ -234,17 +243,12 @@ def _kkt_residual(constraints: Constraints, theta: Array, scale: Array, gradient
     active = _active(constraints, theta, scale)
 
     def constrained() -> Array:
-        normals = _unit_rows(constraints.normals)
+        normals, _ = algebra.unit_rows(constraints.normals, jnp)
         size = jnp.maximum(jnp.max(jnp.abs(gradient)), jnp.finfo(float).tiny)
         multipliers = nonnegative_minimum(normals @ normals.T, -normals @ (gradient / size), active)
         return jnp.linalg.norm(gradient - size * multipliers @ normals)
 
     return lax.cond(jnp.any(active), constrained, lambda: jnp.linalg.norm(gradient))
-
-
-def _unit_rows(rows: Array) -> Array:
-    norms = jnp.linalg.norm(rows, axis=1, keepdims=True)
-    return rows / jnp.where(norms > 0, norms, 1.0)
 
 
 def nonnegative_minimum(matrix: Array, vector: Array, allowed: Array) -> Array:
@@ -288,29 +292,21 @@ def nonnegative_minimum(matrix: Array, vector: Array, allowed: Array) -> Array:
     return lax.while_loop(lambda state: ~state[3] & (state[2] < 3 * k + 10), body, start)[0]
 
 
-def _flatness(state: _State) -> Array:
-    square = state.scale**2
-    return jnp.where(square > 0.0, EPS * state.cost_scale / jnp.where(square > 0.0, square, 1.0), 0.0)
-
-
 def _scaling(hessian: Array, floor: Array) -> Array:
-    """As `switchfit.optimize.qp.diagonal_scaling`: (d,)."""
+    """As `switchfit.optimize.matrix.diagonal_scaling`, all rounds of it: (d,)."""
     size = jnp.abs(hessian)
-    largest = jnp.max(size, axis=1)
-    square = jnp.maximum(jnp.diagonal(size), floor)
-    square = jnp.where(square > 0.0, square, jnp.where(largest > 0.0, largest, 1.0))
 
     def equilibrate(_: int, scaling: Array) -> Array:
-        return scaling * jnp.sqrt(jnp.maximum(jnp.max(size / jnp.outer(scaling, scaling), axis=1), 1.0))
+        return algebra.equilibrate(scaling, jnp.max(size / jnp.outer(scaling, scaling), axis=1), jnp)
 
-    return lax.fori_loop(0, 20, equilibrate, jnp.sqrt(square))
+    start = algebra.jacobi_scaling(jnp.maximum(jnp.diagonal(size), floor), jnp.max(size, axis=1), jnp)
+    return lax.fori_loop(0, EQUILIBRATIONS, equilibrate, start)
 
 
 def _direction(state: _State, constraints: Constraints) -> tuple[Array, Array]:
     """Step (d,) of the quadratic programme, and its slope gᵀd."""
     theta, gradient = state.theta, state.gradient
-    size = jnp.where(state.scale > 0.0, state.scale, 1.0)
-    floor = jnp.maximum(_flatness(state), jnp.abs(gradient) / (LONGEST_STEP * size))
+    floor = algebra.curvature_floor(state.scale, state.cost_scale, jnp.abs(gradient), jnp)
     scaling = _scaling(state.hessian, floor)
     scaled = state.hessian / jnp.outer(scaling, scaling)
     identity = jnp.eye(theta.shape[0])
@@ -318,8 +314,7 @@ def _direction(state: _State, constraints: Constraints) -> tuple[Array, Array]:
 
     def absolute() -> Array:
         values, vectors = jnp.linalg.eigh(scaled)
-        changed = jnp.maximum(jnp.abs(values), EIGENVALUE_REPLACEMENT)
-        return (vectors * jnp.where(values > EIGENVALUE_FLOOR, values, changed)) @ vectors.T
+        return (vectors * algebra.positive_eigenvalues(values, jnp)) @ vectors.T
 
     matrix = lax.cond(definite, lambda: scaled, absolute)
     factor = jnp.linalg.cholesky(matrix)
@@ -337,17 +332,13 @@ def _direction(state: _State, constraints: Constraints) -> tuple[Array, Array]:
         # In white variables e = Lᵀ D d: minimise ½‖e − e_0‖² subject to G e >= c with unit rows, by its dual.
         normals = constraints.normals
         rows = jax.scipy.linalg.solve_triangular(factor, (normals / scaling).T, lower=True).T
-        norms = jnp.linalg.norm(rows, axis=1)
-        norms = jnp.where(norms > 0.0, norms, 1.0)
-        unit, gap = rows / norms[:, None], (normals @ newton - offsets) / norms
+        unit, norms = algebra.unit_rows(rows, jnp)
+        gap = (normals @ newton - offsets) / norms
         allowed = jnp.isfinite(gap)
         length = jnp.maximum(jnp.max(jnp.where(allowed, jnp.abs(gap), 0.0)), jnp.finfo(float).tiny)
         multipliers = nonnegative_minimum(unit @ unit.T, jnp.where(allowed, gap / length, 0.0), allowed)
         back = jax.scipy.linalg.solve_triangular(factor, length * multipliers @ unit, lower=True, trans=1)
-        m, d = constraints.b.shape[0], theta.shape[0]
-        step = newton + back / scaling
-        step = jnp.where(multipliers[m : m + d] > 0.0, low, jnp.where(multipliers[m + d :] > 0.0, high, step))
-        return jnp.clip(step, low, high)
+        return algebra.press_on_bounds(newton + back / scaling, low, high, multipliers, jnp)
 
     feasible = jnp.all(constraints.normals @ newton >= offsets)
     step = lax.cond(feasible, lambda: newton, constrained)
@@ -359,9 +350,8 @@ def _moved(constraints: Constraints, theta: Array, step: Array) -> Array:
 
     def project(i: int, moved: Array) -> Array:
         normal, bound = constraints.A[i], constraints.b[i]
-        violation = bound - normal @ moved
-        correction = normal * (violation + EPS * (jnp.abs(normal) @ jnp.abs(moved))) / (normal @ normal)
-        return jnp.where(violation > 0.0, moved + correction, moved)
+        violation, projected = algebra.project_on_row(moved, normal, bound, normal, jnp)
+        return jnp.where(violation > 0.0, projected, moved)
 
     moved = jnp.clip(theta + step, constraints.lower, constraints.upper)
     rows = constraints.b.shape[0]

@@ -1,0 +1,184 @@
+"""Formulas that the SQP shares with its traced version: constraints at a point, scales, and when a step is accepted.
+
+Each is written once, for NumPy and for JAX: `xp` is the module whose arrays it is given, and constraints are anything
+with ``A`` (m, d), ``b`` (m,), ``lower`` and ``upper`` (d,). What needs sets of changing size, or stops early, cannot be
+traced; there the two programs differ, and `switchfit.optimize.traced` says at each place why.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Array = Any
+"""An array of NumPy or of JAX."""
+
+EPS = float(np.finfo(np.float64).eps)
+#: Eigenvalues of the diagonally scaled Hessian below this count as zero.
+EIGENVALUE_FLOOR = 1e-10
+#: What such an eigenvalue is replaced by in the quadratic programme: small, but steps along it stay within reason.
+EIGENVALUE_REPLACEMENT = 1e-4
+#: Fraction of the predicted linear decrease that a step must achieve (Armijo).
+ARMIJO = 1e-4
+#: The same for a step across a breakpoint, where the prediction may be wrong however short the step.
+ARMIJO_ACROSS = 0.1
+#: Differences of costs below this part of the cost say nothing: where residuals are small beside what is measured, the
+#: rounding of a sum of their squares is a few hundred units, and a search by costs takes many short steps at the end.
+NOISE = 4096 * EPS
+#: A step below this part of the unknowns' size is negligible.
+NEGLIGIBLE_STEP = 1e-10
+#: Iterations spent on making the last step negligible once the optimality is below the tolerance.
+EXTRA_ITERATIONS = 5
+#: Newton steps up to this multiple of the unknowns' size are never shortened by changing the Hessian.
+LONGEST_STEP = 1e3
+#: Sizes below this count as unknown: their squares vanish.
+SMALLEST = 1e-150
+#: Rounds of equilibration after which the scaling of an indefinite matrix is good enough.
+EQUILIBRATIONS = 20
+
+
+class HasConstraints(Protocol):
+    """``A theta >= b`` and ``lower <= theta <= upper``, in arrays of NumPy or of JAX."""
+
+    @property
+    def A(self) -> Any: ...
+    @property
+    def b(self) -> Any: ...
+    @property
+    def lower(self) -> Any: ...
+    @property
+    def upper(self) -> Any: ...
+
+
+# --- constraints at a point -------------------------------------------------------------------------------------------
+
+
+def slack(constraints: HasConstraints, theta: Array, xp: Any = np) -> Array:
+    """Return how far theta (d,) is inside rows, lower and upper bounds: (m + 2 d,); negative where violated."""
+    rows = constraints.A @ theta - constraints.b
+    return xp.concatenate([rows, theta - constraints.lower, constraints.upper - theta])
+
+
+def is_active(slack: Array, size: Array, abs_A: Array, abs_b: Array, xp: Any = np) -> Array:
+    """Return which constraints hold with equality up to the rounding of the rows: (m + 2 d,) of bool.
+
+    Parameters
+    ----------
+    slack : (m + 2 d,)
+    size : (d,)
+        Sizes of the unknowns, of which rounding is a part.
+    abs_A, abs_b : (m, d), (m,)
+        Absolute values of the constraints' rows and right-hand sides.
+    """
+    rounding = 16 * EPS * (abs_b + abs_A @ size)
+    return slack <= xp.concatenate([rounding, xp.zeros(2 * size.shape[0])])
+
+
+def project_on_row(theta: Array, normal: Array, bound: Array, movable: Array, xp: Any = np) -> tuple[Array, Array]:
+    """Return the violation of the row ``normal . theta >= bound``, and theta moved onto it, an ulp to its inside.
+
+    Parameters
+    ----------
+    theta, normal : (d,)
+    bound : ()
+    movable : (d,)
+        The normal with zeros for what must stay where it is.
+    """
+    violation = bound - normal @ theta
+    margin = EPS * (xp.abs(normal) @ xp.abs(theta))
+    square = movable @ movable
+    return violation, theta + movable * ((violation + margin) / xp.where(square > 0.0, square, 1.0))
+
+
+def press_on_bounds(step: Array, low: Array, high: Array, multipliers: Array, xp: Any = np) -> Array:
+    """Return the step (d,) of a programme, exactly on each of its bounds (d,) that has a multiplier (m + 2 d,).
+
+    Kinks depend on it, whatever rounding did to the step.
+    """
+    d = step.shape[0]
+    m = multipliers.shape[0] - 2 * d
+    at_low, at_high = multipliers[m : m + d] > 0.0, multipliers[m + d :] > 0.0
+    return xp.minimum(xp.maximum(xp.where(at_low, low, xp.where(at_high, high, step)), low), high)
+
+
+def unit_rows(rows: Array, xp: Any = np) -> tuple[Array, Array]:
+    """Return rows (k, d) of unit length, and their lengths (k,); a row of zeros stays one, with the length 1."""
+    lengths = xp.sqrt((rows * rows).sum(1))
+    lengths = xp.where(lengths > 0.0, lengths, 1.0)
+    return rows / lengths[:, None], lengths
+
+
+# --- scales -----------------------------------------------------------------------------------------------------------
+
+
+def flatness(scale: Array, cost_scale: Array, xp: Any = np) -> Array:
+    """Return diagonal Hessian entries so small that changing an unknown by its size changes J by rounding only: (d,).
+
+    Parameters
+    ----------
+    scale : (d,)
+        Sizes of the unknowns; zero where none is known.
+    cost_scale : float
+        Size of J.
+    """
+    size = xp.where(scale > SMALLEST, scale, xp.inf)
+    return (EPS * cost_scale) / (size * size)
+
+
+def curvature_floor(scale: Array, cost_scale: Array, slopes: Array, xp: Any = np) -> Array:
+    """Return the curvature below which an unknown's counts as none: (d,).
+
+    Where J is nearly linear in an unknown, with a derivative of the size `slopes` (d,), its step is limited too.
+    """
+    size = xp.where(scale > 0.0, scale, 1.0)
+    return xp.maximum(flatness(scale, cost_scale, xp), slopes / (LONGEST_STEP * size))
+
+
+def jacobi_scaling(diagonal: Array, largest_in_rows: Array, xp: Any = np) -> Array:
+    """Return the root of a matrix's diagonal (d,); where it is not positive, of the row's largest entry, or 1: (d,)."""
+    square = xp.where(diagonal > 0.0, diagonal, xp.where(largest_in_rows > 0.0, largest_in_rows, 1.0))
+    return xp.sqrt(square)
+
+
+def equilibrate(scaling: Array, largest_in_rows: Array, xp: Any = np) -> Array:
+    """Return a scaling (d,) grown where the rows of the matrix scaled by it have entries above 1."""
+    return scaling * xp.sqrt(xp.maximum(largest_in_rows, 1.0))
+
+
+def positive_eigenvalues(values: Array, xp: Any = np) -> Array:
+    """Return eigenvalues with those that are not positive replaced by their absolute values, or more."""
+    replaced = xp.maximum(xp.abs(values), EIGENVALUE_REPLACEMENT)
+    return xp.where(values > EIGENVALUE_FLOOR, values, replaced)
+
+
+def is_negligible(step: Array, scale: Array, xp: Any = np) -> Any:
+    """Return whether a step (d,) is negligible beside unknowns of the size (d,)."""
+    return xp.all(xp.abs(step) <= NEGLIGIBLE_STEP * scale)
+
+
+# --- when a step is accepted ------------------------------------------------------------------------------------------
+# Where the predicted decrease is below the rounding error of J, comparing costs says nothing (Hager & Zhang 2005):
+# then a smaller KKT residual counts, or a cost below every earlier one.
+
+
+def cost_allows(cost: Any, before: Any, lowest: Any, decrease: Any, noise: Any, fraction: Any) -> Any:
+    """Return whether a trial's cost allows it, its optimality aside.
+
+    Parameters
+    ----------
+    cost, before, lowest : float
+        J at the trial, at the point it starts from, and the lowest so far.
+    decrease, noise : float
+        Predicted linear decrease, and the rounding error of J.
+    fraction : float
+        Of the decrease, which has to be achieved.
+    """
+    return (cost <= lowest + noise) & ((decrease <= noise) | (cost <= before - fraction * decrease))
+
+
+def optimality_allows(optimality: Any, before: Any, cost: Any, lowest: Any, decrease: Any, noise: Any) -> Any:
+    """Return whether a trial's optimality allows it: it has to fall where costs are not compared."""
+    return (decrease > noise) | (optimality < before) | (cost < lowest)

@@ -1,0 +1,281 @@
+"""Full matrices as Hessians: the quadratic programme, what makes them positive definite, and curvature.
+
+References
+----------
+.. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, sections 3.4 and 16.7.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import qr
+
+from switchfit.optimize.algebra import (
+    EIGENVALUE_FLOOR,
+    EPS,
+    FloatArray,
+    positive_eigenvalues,
+    press_on_bounds,
+)
+from switchfit.optimize.constraints import LinearConstraints
+from switchfit.optimize.matrix import Curvature, ModelStep, Room, Spectrum, diagonal_scaling
+from switchfit.optimize.qp import CholeskyFactor, is_definite, newton_step, solve_whitened
+
+
+@dataclass(frozen=True, eq=False)
+class Dense:
+    """A symmetric matrix held in full.
+
+    Attributes
+    ----------
+    array : array, shape (d, d)
+    """
+
+    array: FloatArray
+
+    @classmethod
+    def of(cls, entries: ArrayLike, d: int) -> Dense:
+        """The symmetric part of a matrix (d, d)."""
+        array = np.asarray(entries, dtype=float).reshape(d, d)
+        return cls(0.5 * (array + array.T))
+
+    @classmethod
+    def identity(cls, d: int, factor: float) -> Dense:
+        """A multiple of the identity (d, d)."""
+        return cls(factor * np.eye(d))
+
+    @property
+    def finite(self) -> bool:
+        """Whether all entries are."""
+        return bool(np.isfinite(self.array).all())
+
+    def dense(self) -> FloatArray:
+        """The matrix in full: (d, d)."""
+        return self.array
+
+    def diagonal(self) -> FloatArray:
+        """Its diagonal: (d,)."""
+        return self.array.diagonal()
+
+    def largest_in_rows(self) -> FloatArray:
+        """Largest entry of each row, with its sign: (d,)."""
+        return np.asarray(self.array.max(axis=1, initial=0.0))
+
+    def __matmul__(self, vector: FloatArray) -> FloatArray:
+        return np.asarray(self.array @ vector)
+
+    def __abs__(self) -> Dense:
+        return Dense(np.abs(self.array))
+
+    def scaled(self, scaling: FloatArray) -> Dense:
+        """D⁻¹ H D⁻¹ for a diagonal D (d,)."""
+        return Dense(self.array / (scaling[:, None] * scaling))
+
+    def masked(self, labels: FloatArray) -> Dense:
+        """The matrix without the entries that join unknowns of different labels (d,)."""
+        return Dense(self.array * (labels[:, None] == labels))
+
+    def mixed(self, minus: Dense, sides: FloatArray) -> Dense:
+        """This matrix where two unknowns are to the right (sides 1), `minus` to the left (-1), else their mean."""
+        pair = sides[:, None] + sides
+        right, left = self.array, minus.array
+        return Dense(np.where(pair > 0, right, np.where(pair < 0, left, 0.5 * (right + left))))
+
+    def is_definite_on(self, free: NDArray[np.bool_] | None) -> bool:
+        """Whether it is positive definite on the free unknowns (d,) of bool, or on all."""
+        part = self.array if free is None else self.array[np.ix_(free, free)]
+        return bool(np.all(np.linalg.eigvalsh(part) > 0.0))
+
+    def minimize_model(
+        self, gradient: FloatArray, room: Room, pressed: FloatArray, floor: FloatArray | None
+    ) -> ModelStep:
+        """Minimise ``gᵀd + ½ dᵀBd`` inside `room`; see `switchfit.optimize.matrix.SymmetricMatrix`."""
+        if room.free is None:
+            return _minimize(self.array, gradient, room.constraints.normals, room.offsets, pressed, floor)
+        part = np.flatnonzero(room.free)
+        d, m = len(self.array), room.constraints.b.size
+        step = np.zeros(d)
+        if part.size == 0:
+            return ModelStep(step, np.zeros(d), None, True)
+        # What is held is left out of the programme.
+        kept = np.concatenate([np.arange(m), m + part, m + d + part])
+        normals = room.constraints.normals[kept][:, part]
+        block, rest = self.array[np.ix_(part, part)], None if floor is None else floor[part]
+        found = _minimize(block, gradient[part], normals, room.offsets[kept], pressed[:, part], rest)
+        step[part] = found.step
+        product = self.array[:, part] @ found.step
+        product[part] = found.product
+        if found.multipliers is None:
+            return ModelStep(step, product, None, found.definite)
+        multipliers = np.zeros(m + 2 * d)
+        multipliers[kept] = found.multipliers
+        return ModelStep(step, product, multipliers, found.definite)
+
+    def curvature(
+        self, constraints: LinearConstraints, rows: NDArray[np.intp], held: NDArray[np.bool_], flat: FloatArray
+    ) -> Curvature:
+        """Curvature in the null space of constraints; see `switchfit.optimize.matrix.SymmetricMatrix`."""
+        d = len(self.array)
+        free = np.flatnonzero(~held)
+        if free.size == d and rows.size == 0:
+            return Curvature(np.eye(d), partial(_spectrum, self.array, flat))
+        normals = constraints.rows(rows)[:, free]
+        null = null_space(normals) if free.size else np.zeros((0, 0))
+        basis = np.zeros((d, null.shape[1]))
+        basis[free] = null
+        return Curvature(basis, partial(_spectrum_on, self.array, flat, basis, free, normals))
+
+
+def _spectrum(array: FloatArray, flat: FloatArray) -> Spectrum:
+    """Eigenvalues of a matrix (d, d) with all directions free."""
+    if not Dense(array).finite:
+        return _no_spectrum(*array.shape)
+    scaling = diagonal_scaling(Dense(array), flat)
+    values, vectors = np.linalg.eigh(array / (scaling[:, None] * scaling))
+    lowest = vectors[:, 0] / scaling
+    return Spectrum(values, np.asarray(np.linalg.eigvalsh(array), float), lowest / np.linalg.norm(lowest))
+
+
+def _spectrum_on(
+    array: FloatArray, flat: FloatArray, basis: FloatArray, free: NDArray[np.intp], normals: FloatArray
+) -> Spectrum:
+    """Eigenvalues of a matrix (d, d) on the null space of normals in the free coordinates, whose basis is given."""
+    d, count = basis.shape
+    if count == 0 or not Dense(array).finite:
+        return _no_spectrum(d, count)
+    block = array[np.ix_(free, free)]
+    scaling = diagonal_scaling(Dense(block), flat[free])
+    null = null_space(normals / scaling)
+    values, vectors = np.linalg.eigh(null.T @ (block / (scaling[:, None] * scaling)) @ null)
+    lowest = np.zeros(d)
+    lowest[free] = null @ vectors[:, 0] / scaling
+    return Spectrum(
+        values, np.asarray(np.linalg.eigvalsh(basis.T @ array @ basis), float), lowest / np.linalg.norm(lowest)
+    )
+
+
+def _no_spectrum(d: int, count: int) -> Spectrum:
+    nothing = np.full(count, np.nan)
+    return Spectrum(nothing, nothing, np.zeros(d))
+
+
+def _minimize(
+    hessian: FloatArray,
+    gradient: FloatArray,
+    normals: FloatArray,
+    offsets: FloatArray,
+    pressed: FloatArray,
+    floor: FloatArray | None,
+) -> ModelStep:
+    """The programme of `Dense.minimize_model` in unknowns that are all free."""
+    convex, factor = convexify_and_factor(hessian, pressed, floor)
+    step = newton_step(gradient, convex, factor)
+    if (normals @ step >= offsets).all():
+        return ModelStep(step, convex @ step, None, convex is hessian)
+    step, multipliers = solve_whitened(gradient, convex, factor, normals, offsets)
+    d = gradient.size
+    step = press_on_bounds(step, offsets[-2 * d : -d], -offsets[-d:], multipliers)
+    return ModelStep(step, convex @ step, multipliers, convex is hessian)
+
+
+def null_space(normals: FloatArray) -> FloatArray:
+    """Orthonormal basis of the null space of normals (k, d): shape (d, d - r)."""
+    return split_space(normals)[0]
+
+
+def split_space(normals: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Orthonormal bases of the null space, shape (d, d - r), and of the row space, shape (d, r), of the normals."""
+    d = normals.shape[1]
+    if normals.shape[0] == 0:
+        return np.eye(d), np.zeros((d, 0))
+    lengths = np.linalg.norm(normals, axis=1)
+    rows = normals[lengths > 0.0] / lengths[lengths > 0.0, None]
+    if rows.shape[0] == 0:
+        return np.eye(d), np.zeros((d, 0))
+    Q, R, _ = qr(rows.T, mode="full", pivoting=True)
+    rank = int(np.sum(np.abs(np.diag(R)) > 1e-11))
+    return Q[:, rank:], Q[:, :rank]
+
+
+def convexify(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None = None) -> FloatArray:
+    """Positive definite B that equals H wherever H can be kept.
+
+    In scaled variables, with Z the directions free of the (presumably) active constraints and Y their normals: a
+    positive definite H is kept; otherwise ZᵀHZ is kept if it is positive definite, which leaves Newton's step on the
+    face unspoiled, and only the Schur complement on Y has its eigenvalues replaced by their absolute values. If
+    ZᵀHZ is not positive definite either, its eigenvalues are treated in the same way.
+
+    Parameters
+    ----------
+    hessian : array, shape (d, d)
+        H, symmetric.
+    normals : array, shape (k, d)
+        Normals of the constraints expected to be active.
+    floor : array, shape (d,), optional
+        See `diagonal_scaling`.
+
+    References
+    ----------
+    .. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, sections 3.4 and 16.7.
+    """
+    return convexify_and_factor(hessian, normals, floor)[0] if hessian.size else hessian
+
+
+def convexify_and_factor(
+    hessian: FloatArray, normals: FloatArray, floor: FloatArray | None
+) -> tuple[FloatArray, CholeskyFactor]:
+    """The matrix B of `convexify` and its factorisation; d > 0."""
+    square = hessian.diagonal() if floor is None else np.maximum(hessian.diagonal(), floor)
+    if square.min() > 0.0:
+        # A positive definite matrix needs no more than Jacobi's scaling.
+        scaling = np.sqrt(square)
+        scaled = hessian / (scaling[:, None] * scaling)
+        factor = CholeskyFactor.of_scaled(scaled, scaling) if is_definite(_shifted(scaled)) else None
+        if factor is not None:
+            return hessian, factor
+    convex = _convex(hessian, normals, floor)
+    return convex, CholeskyFactor.of(convex)
+
+
+def _shifted(matrix: FloatArray) -> FloatArray:
+    """The matrix less what counts as no curvature on its diagonal."""
+    shifted = matrix.copy()
+    shifted.reshape(-1)[:: len(matrix) + 1] -= EIGENVALUE_FLOOR
+    return shifted
+
+
+def _convex(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None) -> FloatArray:
+    """B for a matrix that is not positive definite, or was not found to be with Jacobi's scaling."""
+    scaling = diagonal_scaling(Dense(hessian), floor)
+    weight = scaling[:, None] * scaling
+    scaled = hessian / weight
+    if is_definite(_shifted(scaled)):
+        return hessian
+    free, blocked = split_space(normals / scaling)
+    if blocked.shape[1] == 0 or free.shape[1] == 0:
+        return _absolute(scaled) * weight
+    top = _absolute(free.T @ scaled @ free)
+    cross = free.T @ scaled @ blocked
+    tie = cross.T @ np.linalg.solve(top, cross)
+    bottom = _absolute(blocked.T @ scaled @ blocked - tie) + tie
+    basis = np.hstack([free, blocked])
+    convex = basis @ np.block([[top, cross], [cross.T, bottom]]) @ basis.T
+    values = np.linalg.eigvalsh(convex)
+    # A nearly singular Z'HZ makes the tie huge, and the smallest eigenvalue rounding.
+    if values[0] < max(0.1 * EIGENVALUE_FLOOR, 64 * EPS * values[-1]):
+        return _absolute(scaled) * weight
+    return 0.5 * (convex + convex.T) * weight
+
+
+def _absolute(matrix: FloatArray) -> FloatArray:
+    """The matrix with eigenvalues that are not positive replaced by absolute values; itself if there are none."""
+    symmetric = 0.5 * (matrix + matrix.T)
+    values, vectors = np.linalg.eigh(symmetric)
+    if values.size == 0 or values[0] > EIGENVALUE_FLOOR:
+        return symmetric
+    convex = (vectors * positive_eigenvalues(values)) @ vectors.T
+    return np.asarray(0.5 * (convex + convex.T))

@@ -1,0 +1,122 @@
+"""The direction of an iteration: a convex quadratic programme in the step.
+
+Its matrix is the exact Hessian, made positive definite only in the subspace where it has to be (Newton), its blocks,
+Gauss-Newton's matrix, or a multiple of the identity (steepest descent). It starts from the sides of the steepest
+descent, so that its step descends wherever the optimality is positive.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.optimize.algebra import FloatArray
+from switchfit.optimize.constraints import NONE
+from switchfit.optimize.dense import Dense
+from switchfit.optimize.kinks import release
+from switchfit.optimize.matrix import Room, SymmetricMatrix
+from switchfit.optimize.problem import Problem
+from switchfit.optimize.state import State
+
+
+class Direction(NamedTuple):
+    """Step d (d,) of the quadratic programme with its slope gᵀd and its predicted reduction −(gᵀd + ½dᵀBd).
+
+    `regular`: no constraint is active, no coordinate is held or at a kink, and H is positive definite.
+    """
+
+    step: FloatArray
+    slope: float
+    reduction: float
+    regular: bool
+
+
+def find_direction(problem: Problem, state: State, piece: tuple[FloatArray, FloatArray] | None = None) -> Direction:
+    """Return the step of the quadratic programme, with the best sides for coordinates on a kink.
+
+    A coordinate on a kink is held (0) or confined to one side (+1, -1). Afterwards the force that holds it follows
+    from the programme's multipliers; where it is outside [g₋, g₊] that coordinate, the worst one first, is released
+    to the other side, and the programme is solved again, as long as that helps.
+
+    Parameters
+    ----------
+    problem : Problem
+    state : State
+    piece : pair of arrays, shape (d,), optional
+        Bounds to keep to, narrower than those of the problem.
+    """
+    point = state.point
+    sides = point.downhill
+    best, force = _solve_on_sides(problem, state, sides, piece)
+    if point.kink is None:
+        return best
+    for _ in range(2 * int(point.kink.sum())):
+        left, right = point.minus.gradient, point.plus.gradient
+        released = release(sides, point.kink, left, right, best.step, force, state.scale)
+        if released is None:
+            break
+        sides = released
+        direction, force = _solve_on_sides(problem, state, sides, piece)
+        if direction.reduction <= best.reduction:
+            break
+        best = direction
+    return best
+
+
+def _solve_on_sides(
+    problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[FloatArray, FloatArray] | None
+) -> tuple[Direction, FloatArray]:
+    """The quadratic programme with kinks held or confined as `sides` say, and the force on each coordinate.
+
+    The force is Aᵀ lam − B d: at a coordinate that does not move, the derivative that would balance the others.
+    """
+    point, constraints = state.point, problem.constraints
+    gradient, hessian = point.derivatives(sides)
+    room = _room(problem, state, sides, piece)
+    matrix, floor = _model(problem, state, hessian, room.free)
+    pressing = (point.multipliers > 0.0).nonzero()[0] if point.active.size else NONE
+    found = matrix.minimize_model(gradient, room, constraints.rows(pressing), floor)
+    regular = found.definite and matrix is hessian and room.free is None and point.is_interior
+    slope = float(gradient @ found.step)
+    force = -found.product
+    if found.multipliers is not None:
+        force = constraints.A.T @ found.multipliers[: constraints.b.size] - found.product
+    return Direction(found.step, slope, -(slope + 0.5 * float(found.step @ found.product)), regular), force
+
+
+def _room(problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[FloatArray, FloatArray] | None) -> Room:
+    """Where the step may go: inside the constraints and the piece, and to the given sides of kinks."""
+    point, constraints = state.point, problem.constraints
+    m, d = constraints.b.size, constraints.size
+    offsets = -point.slack
+    if point.active.size:
+        offsets = np.minimum(offsets, 0.0)
+        offsets[point.active[point.active < m]] = 0.0
+    if piece is not None:
+        offsets[m : m + d] = np.minimum(piece[0] - point.theta, 0.0)
+        offsets[m + d :] = np.minimum(point.theta - piece[1], 0.0)
+    if point.kink is None and point.idle is None and constraints.all_movable:
+        return Room(constraints, offsets, None)
+    free = constraints.movable if point.idle is None else constraints.movable & ~point.idle
+    if point.kink is not None:
+        offsets[m : m + d][point.kink & (sides > 0)] = 0.0
+        offsets[m + d :][point.kink & (sides < 0)] = 0.0
+        free = ~(point.kink & (sides == 0)) & free
+    return Room(constraints, offsets, None if free.all() else free)
+
+
+def _model(
+    problem: Problem, state: State, hessian: SymmetricMatrix, free: NDArray[np.bool_] | None
+) -> tuple[SymmetricMatrix, FloatArray | None]:
+    """The matrix of the programme, to be made positive definite, and the curvature of each unknown that counts as none.
+
+    After a failed line search each unknown is taken by itself.
+    """
+    d = state.point.theta.size
+    descent = problem.hessian == "descent-first" and not hessian.is_definite_on(free)
+    if descent or not problem.uses_hessian:
+        return Dense.identity(d, 1.0 / state.metric), None
+    labels = np.arange(d, dtype=float) if state.careful else problem.labels
+    return hessian if labels is None else hessian.masked(labels), state.floor

@@ -1,0 +1,94 @@
+"""Why a line search failed: what J is like along the direction, and which unknowns have to do with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from switchfit.optimize.algebra import NOISE, FloatArray
+from switchfit.optimize.diagnosis import Finding, find_reason, wrong_slope
+from switchfit.optimize.direction import Direction
+from switchfit.optimize.point import Oracle
+from switchfit.optimize.state import State, curvature_at
+
+
+def explain_failure(oracle: Oracle, state: State, direction: Direction) -> Finding:
+    """Find what J is like along the direction that failed, and which coordinates make it so."""
+    problem, theta = oracle.problem, state.point.theta
+    noise = NOISE * max(abs(state.point.cost), 0.01 * state.cost_scale)
+
+    def line(fraction: float) -> tuple[float, float] | None:
+        if fraction == 0.0:
+            return state.point.cost, direction.slope
+        sample = oracle.sample(theta + fraction * direction.step, 1)
+        return None if sample is None else (sample.cost, float(sample.gradient @ direction.step))
+
+    found = find_reason(line, noise, min(problem.breakpoints.next_on(theta, direction.step), 1.0))
+    at = theta + found.at * direction.step
+    if found.kind == "wrong slope":
+        return replace(found, entries=_wrong_entries(oracle, state, noise))
+    if found.kind == "jump":
+        return replace(found, places=_who_jumps(oracle, theta, direction.step, found))
+    if found.kind == "kink":
+        bent = _who_bends(oracle, theta, direction.step, found)
+        return replace(found, places=tuple((i, float(at[i])) for i in bent))
+    if found.kind == "rounding":
+        return replace(found, noise=noise)
+    curvature = curvature_at(problem, state, state.point.active).spectrum.eigenvalues
+    positive = curvature.size > 0 and curvature[0] > 0.0
+    return replace(found, condition=float(curvature[-1] / curvature[0]) if positive else np.inf)
+
+
+def _wrong_entries(oracle: Oracle, state: State, noise: float) -> tuple[tuple[int, float, float], ...]:
+    """Up to four coordinates whose derivative is not that of J: (coordinate, derivative, difference quotient)."""
+    theta, problem = state.point.theta, oracle.problem
+    wrong = []
+    for i in np.flatnonzero(problem.constraints.movable):
+        for sign in (1.0, -1.0):
+            unit = np.zeros(theta.size)
+            unit[i] = sign * 0.01 * max(abs(theta[i]), problem.size[i], 1e-3)
+
+            def line(fraction: float, unit: FloatArray = unit) -> tuple[float, float] | None:
+                sample = oracle.sample(theta + fraction * unit, 1)
+                return None if sample is None else (sample.cost, float(sample.gradient @ unit))
+
+            smooth = min(problem.breakpoints.next_on(theta, unit), 1.0)
+            measured = wrong_slope(line, noise, smooth)
+            if measured is not None:
+                stated = state.point.plus.gradient[i]
+                wrong.append((int(i), float(stated), float(measured / unit[i])))
+                break
+    return tuple(wrong[:4])
+
+
+def _who_bends(oracle: Oracle, theta: FloatArray, step: FloatArray, found: Finding) -> list[int]:
+    """The coordinates along which the derivative of J jumps at a kink on the line."""
+    width = max(2.0**-40 * found.at, 1e-15)
+    sides = [oracle.sample(theta + (found.at + w) * step, 1) for w in (-width, width)]
+    moving = np.flatnonzero(step).tolist()
+    if sides[0] is None or sides[1] is None:
+        return moving[:4]
+    jumps = np.abs((sides[1].gradient - sides[0].gradient) * step)
+    return [i for i in moving if jumps[i] > 0.1 * jumps.max()][:4]
+
+
+def _who_jumps(oracle: Oracle, theta: FloatArray, step: FloatArray, found: Finding) -> tuple[tuple[int, float], ...]:
+    """The coordinate whose change by a hair across a jump of J makes it jump, with its value there.
+
+    Up to four coordinates that the step moves, where none of them does so alone.
+    """
+    width = max(2.0**-40 * found.at, 1e-15)
+    before, after = theta + (found.at - width) * step, theta + (found.at + width) * step
+    base = oracle.sample(before, 1)
+    for i in np.flatnonzero(before != after) if base is not None else ():
+        moved = before.copy()
+        moved[i] = after[i]
+        there = oracle.sample(moved, 1)
+        if (
+            base is not None
+            and there is not None
+            and abs(there.cost - base.cost) > 0.5 * abs(found.after - found.before)
+        ):
+            return ((int(i), float(after[i])),)
+    return tuple((int(i), float(after[i])) for i in np.flatnonzero(step)[:4])

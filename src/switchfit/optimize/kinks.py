@@ -1,0 +1,136 @@
+"""Kinks: coordinates that sit on a breakpoint, with a left derivative g₋ and a right derivative g₊.
+
+To first order J is separable there, so such a coordinate is held, or released to the side to which the steepest
+feasible direction moves it. The multipliers of the quadratic programme say when a held coordinate is to be released
+because others move.
+
+A side is +1 or -1 for a coordinate that moves, or may move, to the right or left, and 0 for one that is held.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.optimize.algebra import EPS, FloatArray
+from switchfit.optimize.kkt import kkt_residual
+
+#: All combinations of sides are compared for up to this many concave kinks that constraints couple.
+MANY_CONCAVE_KINKS = 6
+
+
+def steepest_descent(
+    left: FloatArray,
+    right: FloatArray,
+    kink: NDArray[np.bool_] | None,
+    side: NDArray[np.int_],
+    normals: FloatArray,
+    idle: NDArray[np.bool_] | None,
+) -> tuple[float, FloatArray, NDArray[np.int_]]:
+    """Return the steepest descent over feasible directions of length one, its multipliers, and each coordinate's side.
+
+    At a convex kink, g₋ <= g₊, the rate of change is the maximum of g v over [g₋, g₊], at a concave one the minimum of
+    g₋ v and g₊ v. With one of the two chosen for every concave kink J' is thus convex and its steepest descent is the
+    KKT residual; that of J' itself is the largest over the choices.
+
+    Parameters
+    ----------
+    left, right : array, shape (d,)
+        One-sided derivatives; the same object where there is only one of them.
+    kink : array of bool, shape (d,), or None
+        Coordinates at a kink; None if there are none.
+    side : array of int, shape (d,)
+        The only side there is of other coordinates on a breakpoint, 0 elsewhere.
+    normals : array, shape (k, d)
+        Of the active constraints.
+    idle : array of bool, shape (d,), or None
+        Coordinates that do not move.
+
+    Returns
+    -------
+    residual : float
+    multipliers : array, shape (k,)
+    sides : array of int, shape (d,)
+    """
+    smooth = left is right
+    if idle is not None:
+        left, right, normals = left * ~idle, right * ~idle, normals * ~idle
+    if smooth:
+        return *kkt_residual(right, right, normals), side
+    kink = np.zeros(left.size, dtype=bool) if kink is None else kink
+    alone = np.where((left <= 0.0) & (right >= 0.0), 0, np.where(-right >= left, 1, -1))
+    convex = kink & (left < right)
+    best = -1.0
+    for sides in _choices(np.where(kink, alone, side), kink & (left > right), normals):
+        gradient = np.where(sides > 0, right, left)
+        low, high = np.where(convex, left, gradient), np.where(convex, right, gradient)
+        residual, values = kkt_residual(low, high, normals)
+        if residual > best:
+            best, multipliers = residual, values
+            pull = normals.T @ values
+            steepest = pull - np.clip(pull, low, high)
+            moving = kink & (np.abs(steepest) > 1e-12 * (np.abs(left) + np.abs(right)))
+            downhill = np.where(moving, np.where(steepest > 0.0, 1, -1), sides)
+    return best, multipliers, downhill
+
+
+def _choices(sides: NDArray[np.int_], concave: NDArray[np.bool_], normals: FloatArray) -> Iterator[NDArray[np.int_]]:
+    """The given sides, then others for the concave kinks: alone each takes its steeper side, a constraint may differ.
+
+    All to the right and all to the left suffice to find a descent where constraints keep coordinates in order: the
+    extreme directions move a group of them, all to one side.
+    """
+    yield sides
+    coupled = np.flatnonzero(concave & np.any(normals != 0.0, axis=0))
+    few = coupled.size <= MANY_CONCAVE_KINKS
+    for choice in product((1, -1), repeat=coupled.size) if few else [(1,), (-1,)]:
+        changed = sides.copy()
+        changed[coupled] = choice
+        if not np.array_equal(changed, sides):
+            yield changed
+
+
+def release(
+    sides: NDArray[np.int_],
+    kink: NDArray[np.bool_],
+    left: FloatArray,
+    right: FloatArray,
+    step: FloatArray,
+    force: FloatArray,
+    scale: FloatArray,
+) -> NDArray[np.int_] | None:
+    """Return the sides with the coordinate released that a force farthest outside [g₋, g₊] holds at its kink.
+
+    Parameters
+    ----------
+    sides : array of int, shape (d,)
+    kink : array of bool, shape (d,)
+    left, right : array, shape (d,)
+        One-sided derivatives.
+    step, force : array, shape (d,)
+        Solution of the programme on these sides, and what holds each coordinate there.
+    scale : array, shape (d,)
+        Sizes of the unknowns, zero where none is known.
+
+    Returns
+    -------
+    array of int, shape (d,), or None
+        None if no coordinate is to be released.
+    """
+    tolerance = 1e-13 * (np.abs(left) + np.abs(right))
+    size = np.where(scale > 0.0, scale, 1.0)
+    relative = np.abs(step) / size
+    pinned = kink & (relative <= 8 * EPS * max(1.0, float(np.max(relative))))
+    to_right = np.where(pinned & (sides <= 0), force - right - tolerance, 0.0)
+    to_left = np.where(pinned & (sides >= 0), left - force - tolerance, 0.0)
+    # In units of J, or unknowns of different units could not be compared.
+    worth = np.maximum(to_right, to_left) * size
+    worst = int(np.argmax(worth))
+    if worth[worst] <= 0.0:
+        return None
+    changed = sides.copy()
+    changed[worst] = 1 if to_right[worst] > to_left[worst] else -1
+    return changed

@@ -1,0 +1,98 @@
+"""The line search: the full step first, even across breakpoints, then inside the present smooth piece.
+
+If the full step fails and crosses breakpoints, the programme is solved again inside the present smooth piece, where J
+is smooth and backtracking must succeed.
+
+References
+----------
+.. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapter 3.
+.. [2] W. W. Hager, H. Zhang, A new conjugate gradient method with guaranteed descent and an efficient line search,
+   SIAM J. Optim. 16 (2005) 170-192 (line searches below the rounding error of the cost).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from switchfit.optimize.algebra import ARMIJO, ARMIJO_ACROSS, NOISE, cost_allows, optimality_allows
+from switchfit.optimize.direction import Direction, find_direction
+from switchfit.optimize.feasibility import move
+from switchfit.optimize.point import Oracle
+from switchfit.optimize.state import Accepted, State
+
+#: Shortened steps across breakpoints are tried while they still cross this many.
+MANY_BREAKPOINTS = 3
+MAX_BACKTRACKS = 60
+
+
+def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
+    """Return a step that decreases J: across breakpoints if that works, otherwise inside the present smooth piece."""
+    problem, theta = oracle.problem, state.point.theta
+    breakpoints, constraints = problem.breakpoints, problem.constraints
+    alpha = 1.0
+    crossed = breakpoints.crossed(theta, direction.step)
+    while crossed > 0:
+        accepted = _attempt(oracle, state, direction, alpha, ARMIJO_ACROSS)
+        if accepted is not None:
+            return accepted
+        alpha *= 0.5
+        crossed = breakpoints.crossed(theta, alpha * direction.step)
+        if crossed < MANY_BREAKPOINTS:
+            piece = breakpoints.piece(theta, constraints.lower, constraints.upper)
+            direction = find_direction(problem, state, piece)
+            break
+    return _backtrack(oracle, state, direction)
+
+
+def _backtrack(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
+    """Armijo backtracking from the full step ([1]_, algorithm 3.1)."""
+    alpha = 1.0
+    for k in range(MAX_BACKTRACKS):
+        accepted = _attempt(oracle, state, direction, alpha, ARMIJO)
+        if accepted is not None:
+            return accepted
+        alpha *= 0.5 if k < 5 else 0.25
+        if k > 5 and alpha * -direction.slope < 0.01 * NOISE * abs(state.point.cost):
+            break
+    return _blind_step(oracle, state, direction)
+
+
+def _attempt(oracle: Oracle, state: State, direction: Direction, alpha: float, fraction: float) -> Accepted | None:
+    """The point at step length alpha if it is acceptable.
+
+    Where the predicted decrease is below the rounding error of J, comparing costs says nothing ([2]_): then a
+    smaller KKT residual counts, or a cost below every earlier one.
+    """
+    point, lowest = state.point, state.lowest_cost
+    step = direction.step if alpha == 1.0 else alpha * direction.step
+    there = move(oracle.problem, point.theta, step, state.scale)
+    if (there.theta == point.theta).all():
+        return None
+    first = oracle.first(there)
+    noise = NOISE * abs(point.cost)
+    decrease = -alpha * direction.slope
+    if first is None or not cost_allows(first.cost, point.cost, lowest, decrease, noise, fraction):
+        return None
+    trial = oracle.complete(there, first, state.scale)
+    if trial is None:
+        return None
+    if not optimality_allows(trial.optimality, point.optimality, trial.cost, lowest, decrease, noise):
+        return None
+    return Accepted(trial, alpha)
+
+
+def _blind_step(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
+    """The full step on the word of the derivatives, where J is a small difference of large terms.
+
+    The rounding error of such a J is that of the largest cost seen, not of J; the KKT residual has to halve.
+    """
+    noise = NOISE * state.cost_scale
+    if direction.reduction > noise:
+        return None
+    there = move(oracle.problem, state.point.theta, direction.step, state.scale)
+    if np.array_equal(there.theta, state.point.theta):
+        return None
+    trial = oracle.point(there, state.scale)
+    if trial is None or trial.cost > state.lowest_cost + noise or trial.optimality > 0.5 * state.point.optimality:
+        return None
+    return Accepted(trial, 1.0)

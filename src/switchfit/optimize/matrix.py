@@ -1,0 +1,204 @@
+"""What the SQP needs of a Hessian, whatever its shape: one protocol for full matrices and for arrows.
+
+`switchfit.optimize.dense.Dense` and `switchfit.optimize.arrow.Arrow` have these methods; nothing else in the SQP looks
+at the entries of a matrix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.optimize.algebra import EQUILIBRATIONS, FloatArray, equilibrate, jacobi_scaling
+from switchfit.optimize.constraints import LinearConstraints
+
+
+class Room(NamedTuple):
+    """Where a step d from a point may go.
+
+    Attributes
+    ----------
+    constraints : LinearConstraints
+    offsets : array, shape (m + 2 d,)
+        Rows, lower and upper bounds leave ``N d >= offsets`` with their normals N; not positive.
+    free : array of bool, shape (d,), or None
+        Unknowns that may move at all; None if all may.
+    """
+
+    constraints: LinearConstraints
+    offsets: FloatArray
+    free: NDArray[np.bool_] | None
+
+    @property
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper bounds of the step: (d,) each."""
+        d = self.constraints.size
+        return self.offsets[-2 * d : -d], -self.offsets[-d:]
+
+
+class ModelStep(NamedTuple):
+    """Solution of the quadratic programme of an iteration.
+
+    Attributes
+    ----------
+    step : array, shape (d,)
+    product : array, shape (d,)
+        B d, with the rows of H for unknowns that are not free.
+    multipliers : array, shape (m + 2 d,), or None
+        Of rows, lower and upper bounds; None where none of them presses.
+    definite : bool
+        Whether H was positive definite as it is on the free unknowns: B is H there.
+    """
+
+    step: FloatArray
+    product: FloatArray
+    multipliers: FloatArray | None
+    definite: bool
+
+
+class Spectrum(NamedTuple):
+    """Eigenvalues of a Hessian on the free directions.
+
+    Attributes
+    ----------
+    eigenvalues : array, shape (k,)
+        Ascending, of the diagonally scaled Hessian; of an arrow the smallest alone. NaN where there is no Hessian.
+    unscaled : array, shape (k,)
+        The same of the Hessian as it is.
+    lowest : array, shape (d,)
+        The direction of the smallest scaled eigenvalue, of unit length in theta.
+    """
+
+    eigenvalues: FloatArray
+    unscaled: FloatArray
+    lowest: FloatArray
+
+    def itself(self) -> Spectrum:
+        """The spectrum, for a `Curvature` whose spectrum is known."""
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class Curvature:
+    """Hessian on the free directions.
+
+    Attributes
+    ----------
+    basis : array, shape (d, k)
+        Orthonormal basis of these directions.
+    find_spectrum : callable
+        Returns the `Spectrum`, which is found when it is asked for: at an ordinary minimum nobody does.
+    idle : array of bool, shape (d,), or None
+        Coordinates left out as idle, beside those of the point.
+    """
+
+    basis: FloatArray
+    find_spectrum: Callable[[], Spectrum]
+    idle: NDArray[np.bool_] | None = None
+
+    @cached_property
+    def spectrum(self) -> Spectrum:
+        """Eigenvalues and the lowest direction."""
+        return self.find_spectrum()
+
+    @property
+    def smallest(self) -> float:
+        """Smallest scaled eigenvalue; infinite on no directions, NaN where there is no Hessian."""
+        values = self.spectrum.eigenvalues
+        return float(values[0]) if values.size else np.inf
+
+
+class SymmetricMatrix(Protocol):
+    """A symmetric matrix H, (d, d)."""
+
+    @property
+    def finite(self) -> bool:
+        """Whether all entries are."""
+        ...
+
+    def dense(self) -> FloatArray:
+        """The matrix in full: (d, d)."""
+        ...
+
+    def diagonal(self) -> FloatArray:
+        """Its diagonal: (d,)."""
+        ...
+
+    def largest_in_rows(self) -> FloatArray:
+        """Largest entry of each row, with its sign: (d,)."""
+        ...
+
+    def __matmul__(self, vector: FloatArray, /) -> FloatArray: ...
+
+    def __abs__(self) -> Self: ...
+
+    def scaled(self, scaling: FloatArray, /) -> Self:
+        """D⁻¹ H D⁻¹ for a diagonal D (d,)."""
+        ...
+
+    def masked(self, labels: FloatArray, /) -> Self:
+        """The matrix without the entries that join unknowns of different labels (d,)."""
+        ...
+
+    def mixed(self, minus: Any, sides: FloatArray, /) -> Self:
+        """This matrix where two unknowns are to the right (sides 1), `minus` to the left (-1), else their mean."""
+        ...
+
+    def is_definite_on(self, free: NDArray[np.bool_] | None, /) -> bool:
+        """Whether it is positive definite on the free unknowns (d,) of bool, or on all."""
+        ...
+
+    def minimize_model(
+        self, gradient: FloatArray, room: Room, pressed: FloatArray, floor: FloatArray | None, /
+    ) -> ModelStep:
+        """Minimise ``gᵀd + ½ dᵀBd`` inside `room`, where B is H made positive definite on the free unknowns.
+
+        Parameters
+        ----------
+        gradient : array, shape (d,)
+        room : Room
+        pressed : array, shape (k, d)
+            Normals of the constraints expected to be active: on their face B is H wherever it can be.
+        floor : array, shape (d,), or None
+            Curvature of each unknown that counts as none.
+        """
+        ...
+
+    def curvature(
+        self, constraints: LinearConstraints, rows: NDArray[np.intp], held: NDArray[np.bool_], flat: FloatArray, /
+    ) -> Curvature:
+        """Curvature, unmodified, in the null space of the constraints at `rows`, without the coordinates held (d,).
+
+        Diagonal entries below `flat` (d,) count as zero.
+        """
+        ...
+
+
+def diagonal_scaling(matrix: SymmetricMatrix, floor: FloatArray | None = None) -> FloatArray:
+    """Positive D, shape (d,), for which D⁻¹ H D⁻¹ has rows of largest entry about one.
+
+    For a positive semi-definite H this is the root of the diagonal (Jacobi), so that everything computed in the
+    scaled variables is the same whatever the units of the unknowns. Where off-diagonal entries are larger, as they
+    may be in an indefinite H, a few rounds of symmetric equilibration follow.
+
+    Parameters
+    ----------
+    matrix : SymmetricMatrix
+        H.
+    floor : array, shape (d,), optional
+        Diagonal entries too small to matter, below which D² does not go.
+    """
+    size = abs(matrix)
+    diagonal = size.diagonal() if floor is None else np.maximum(size.diagonal(), floor)
+    scaling: FloatArray = jacobi_scaling(diagonal, size.largest_in_rows())
+    for _ in range(EQUILIBRATIONS):
+        largest = size.scaled(scaling).largest_in_rows()
+        if (largest <= 1.0 + 1e-9).all():
+            break
+        scaling = equilibrate(scaling, largest)
+    return scaling

@@ -1,0 +1,196 @@
+"""Points of the minimisation: one or two evaluations of J, and the first-order conditions there.
+
+Along v, J changes at the rate J'(v) = Σ (g₊ max(v, 0) + g₋ min(v, 0)), with g₋ = g₊ off the kinks. A point is optimal
+when no feasible v has J'(v) < 0, and the steepest descent −J'(v) over ‖v‖₂ <= 1 measures how far it is from that.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.optimize.algebra import FloatArray
+from switchfit.optimize.arrow import Arrow
+from switchfit.optimize.constraints import NONE
+from switchfit.optimize.dense import Dense
+from switchfit.optimize.feasibility import Trial
+from switchfit.optimize.kinks import steepest_descent
+from switchfit.optimize.matrix import Curvature, SymmetricMatrix
+from switchfit.optimize.problem import Problem
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One evaluation: cost, gradient, shape (d,), and Hessian, symmetric."""
+
+    cost: float
+    gradient: FloatArray
+    hessian: SymmetricMatrix
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A feasible point with its one-sided derivatives and first-order conditions.
+
+    Attributes
+    ----------
+    theta : array, shape (d,)
+    plus, minus : Sample
+        Derivatives to the right of breakpoints and to the left; the same object away from breakpoints.
+    kink : array of bool, shape (d,), or None
+        Coordinates on a breakpoint with room on both sides; None if there are none.
+    side : array of int, shape (d,)
+        The only side there is, for a coordinate on a breakpoint and a bound; otherwise 0.
+    slack : array, shape (m + 2 d,)
+        Of rows, lower and upper bounds.
+    active : array of int
+        Places of the constraints that hold with equality.
+    optimality : float
+    multipliers : array, shape (m + 2 d,)
+    downhill : array of int, shape (d,)
+        Like side, and for each kink the side to descend to, 0 to hold it.
+    idle : array of bool, shape (d,), or None
+        Coordinates that are held because J does not depend on them; None if there are none.
+    curvatures : dict
+        Curvatures found already, by the constraints' places.
+    """
+
+    theta: FloatArray
+    plus: Sample
+    minus: Sample
+    kink: NDArray[np.bool_] | None
+    side: NDArray[np.int_]
+    slack: FloatArray
+    active: NDArray[np.intp]
+    optimality: float
+    multipliers: FloatArray
+    downhill: NDArray[np.int_]
+    idle: NDArray[np.bool_] | None
+    curvatures: dict[bytes, Curvature] = field(default_factory=dict)
+
+    @property
+    def cost(self) -> float:
+        """J, which is the same on all sides."""
+        return self.plus.cost
+
+    @property
+    def is_interior(self) -> bool:
+        """Whether no constraint is active and no coordinate at a kink."""
+        return self.active.size == 0 and self.kink is None
+
+    @property
+    def largest_derivative(self) -> float:
+        """Largest one-sided derivative of all unknowns, in size."""
+        return float(self.largest_slopes.max())
+
+    @cached_property
+    def largest_slopes(self) -> FloatArray:
+        """Larger of the two one-sided derivatives of each unknown, in size: (d,)."""
+        right = np.abs(self.plus.gradient)
+        return right if self.plus is self.minus else np.maximum(right, np.abs(self.minus.gradient))
+
+    @property
+    def reported_sides(self) -> NDArray[np.int_]:
+        """The right-hand side for every coordinate on a breakpoint that has one: (d,)."""
+        return self.side if self.kink is None else np.where(self.kink, 1, self.side)
+
+    def derivatives(self, sides: NDArray[np.int_]) -> tuple[FloatArray, SymmetricMatrix]:
+        """Gradient and Hessian on the given sides (+1, -1; 0 for their mean).
+
+        An entry of the Hessian that joins a left and a right coordinate is known from neither evaluation: the mean.
+        """
+        plus, minus = self.plus, self.minus
+        if plus is minus:
+            return plus.gradient, plus.hessian
+        gradient = np.where(sides > 0, plus.gradient, minus.gradient)
+        gradient = np.where(sides == 0, 0.5 * (plus.gradient + minus.gradient), gradient)
+        return gradient, plus.hessian.mixed(minus.hessian, sides.astype(float))
+
+
+class Oracle:
+    """The caller's function with a counter; turns unknowns into points and refuses what is not finite."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.evaluations = 0
+        d = problem.constraints.size
+        self._no_side: NDArray[np.int_] = np.zeros(d, dtype=int)
+        self._no_multipliers = np.zeros(len(problem.constraints.names))
+
+    def sample(self, theta: FloatArray, side: int) -> Sample | None:
+        """Evaluate once; None if the cost or a derivative that is needed is not finite."""
+        self.evaluations += 1
+        value = self.problem.evaluate(theta.copy(), side)
+        d = theta.size
+        cost, gradient = float(value.cost), np.asarray(value.gradient, dtype=float).reshape(d)
+        given = np.full((d, d), np.nan) if value.hessian is None else value.hessian
+        hessian: SymmetricMatrix = given if isinstance(given, Arrow) else Dense.of(given, d)
+        if not (math.isfinite(cost) and np.isfinite(gradient).all()):
+            return None
+        if self.problem.uses_hessian and not hessian.finite:
+            return None
+        return Sample(cost, gradient, hessian)
+
+    def first(self, trial: Trial) -> Sample | None:
+        """The evaluation that suffices to judge the cost."""
+        kink, side = self._sides(trial.theta)
+        return self.sample(trial.theta, -1 if kink is None and side is not self._no_side and (side < 0).any() else 1)
+
+    def complete(self, trial: Trial, first: Sample, scale: FloatArray) -> Point | None:
+        """The point: the other side is evaluated only if some coordinate is on a breakpoint and has room there.
+
+        `scale` (d,) is the size of the unknowns so far. None if the other side is not finite.
+        """
+        theta, slack = trial.theta, trial.slack
+        kink, side = self._sides(theta)
+        problem, constraints = self.problem, self.problem.constraints
+        active = NONE
+        if not trial.far:
+            active = constraints.active(slack, np.maximum(np.maximum(scale, problem.size), np.abs(theta)))
+        idle = None if active.size == 0 else self._idle(theta, active)
+        if idle is not None and kink is not None:
+            kink &= ~idle
+            kink = kink if kink.any() else None
+        plus = minus = first
+        if kink is not None or (side is not self._no_side and (side < 0).any() and (side > 0).any()):
+            other = self.sample(theta, -1)
+            if other is None:
+                return None
+            minus = other
+        left, right = minus.gradient, plus.gradient
+        if active.size == 0 and plus is minus:
+            optimality, multipliers, downhill = math.sqrt(right.dot(right)), self._no_multipliers, side
+        else:
+            normals = constraints.rows(active)
+            optimality, values, downhill = steepest_descent(left, right, kink, side, normals, idle)
+            multipliers = np.zeros(len(constraints.names))
+            multipliers[active] = values
+        return Point(theta, plus, minus, kink, side, slack, active, optimality, multipliers, downhill, idle)
+
+    def point(self, trial: Trial, scale: FloatArray) -> Point | None:
+        """The point at a trial, evaluated; None if J is not finite there."""
+        first = self.first(trial)
+        return None if first is None else self.complete(trial, first, scale)
+
+    def _idle(self, theta: FloatArray, active: NDArray[np.intp]) -> NDArray[np.bool_] | None:
+        """Coordinates on which J does not depend while the active rows stay active: (d,); None if there are none."""
+        if self.problem.idle is None or not self.problem.rows_hold(active):
+            return None
+        idle = self.problem.idle(theta.copy(), False)
+        return idle if idle.any() else None
+
+    def _sides(self, theta: FloatArray) -> tuple[NDArray[np.bool_] | None, NDArray[np.int_]]:
+        """`Point.kink` and `Point.side` at theta."""
+        met = self.problem.breakpoints.met(theta)
+        if not met:
+            return None, self._no_side
+        kink, side = np.zeros(theta.size, dtype=bool), np.zeros(theta.size, dtype=int)
+        lower, upper = self.problem.constraints.lower, self.problem.constraints.upper
+        for i in met:
+            room = int(theta[i] < upper[i]) - int(theta[i] > lower[i])
+            kink[i], side[i] = room == 0 and lower[i] < upper[i], room
+        return kink if kink.any() else None, side

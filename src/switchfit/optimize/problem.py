@@ -1,0 +1,234 @@
+"""What is minimised, as the steps of the SQP see it: the caller's function, constraints, breakpoints, settings."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, Protocol, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from switchfit.optimize.algebra import EPS, FloatArray
+from switchfit.optimize.arrow import Arrow
+from switchfit.optimize.constraints import LinearConstraints
+
+HessianKind = Literal["exact", "descent-first", "block-diagonal", "gauss-newton", "none"]
+
+
+class Evaluation(Protocol):
+    """What the caller's function returns: cost J, gradient, shape (d,), and Hessian, shape (d, d) or an `Arrow`."""
+
+    @property
+    def cost(self) -> float: ...
+    @property
+    def gradient(self) -> FloatArray: ...
+    @property
+    def hessian(self) -> FloatArray | Arrow | None: ...
+
+
+Evaluate = Callable[[FloatArray, int], Evaluation]
+"""``evaluate(theta, side)``, see `switchfit.optimize.minimize`."""
+Idle = Callable[[FloatArray, bool], NDArray[np.bool_]]
+"""``idle(theta, everything)``, see `switchfit.optimize.minimize`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A problem with all settings checked.
+
+    Attributes
+    ----------
+    evaluate : callable
+    constraints : LinearConstraints
+    breakpoints : Breakpoints
+    hessian : HessianKind
+    labels : array, shape (d,), or None
+        Labels of the blocks, where the Hessian is cut into blocks.
+    tolerance, max_iterations : float, int
+    size : array, shape (d,)
+        Typical size of each coordinate, zero where only its values tell.
+    idle : callable or None
+    """
+
+    evaluate: Evaluate
+    constraints: LinearConstraints
+    breakpoints: Breakpoints
+    hessian: HessianKind
+    labels: FloatArray | None
+    tolerance: float
+    max_iterations: int
+    size: FloatArray
+    idle: Idle | None
+
+    @classmethod
+    def of(
+        cls,
+        evaluate: Evaluate,
+        theta: FloatArray,
+        constraints: LinearConstraints,
+        breakpoints: Sequence[ArrayLike] | None,
+        hessian: HessianKind,
+        blocks: ArrayLike | None,
+        tolerance: float,
+        max_iterations: int,
+        size: ArrayLike | None,
+        idle: Idle | None,
+    ) -> Problem:
+        """The arguments of `switchfit.optimize.minimize`, checked."""
+        d = constraints.size
+        if theta.shape != (d,):
+            raise ValueError(f"theta0 has shape {theta.shape}, the constraints expect ({d},)")
+        if d == 0:
+            raise ValueError("there is nothing to minimise over: theta0 is empty")
+        if hessian not in get_args(HessianKind):
+            raise ValueError(f"hessian is {hessian!r}; choose one of {', '.join(get_args(HessianKind))}")
+        if not tolerance >= 0.0 or max_iterations < 0:
+            raise ValueError(f"tolerance {tolerance} and max_iterations {max_iterations} must not be negative")
+        return cls(
+            evaluate=evaluate,
+            constraints=constraints,
+            breakpoints=Breakpoints.of(breakpoints, d),
+            hessian=hessian,
+            labels=_labels(hessian, blocks, d),
+            tolerance=tolerance,
+            max_iterations=max_iterations,
+            size=np.zeros(d) if size is None else np.broadcast_to(np.asarray(size, dtype=float), (d,)),
+            idle=idle,
+        )
+
+    @cached_property
+    def row_size(self) -> FloatArray:
+        """Size of what the rows of the constraints add up, of which rounding is a part: (m,)."""
+        return np.asarray(self.constraints.sizes[0] @ self.size)
+
+    @cached_property
+    def row_rounding(self) -> FloatArray:
+        """Rounding error of the rows: (m,)."""
+        return np.asarray(16 * EPS * self.row_size)
+
+    @cached_property
+    def largest_size(self) -> float:
+        """The largest typical size of a coordinate."""
+        return float(self.size.max())
+
+    @cached_property
+    def rounding(self) -> FloatArray:
+        """Rounding error of each coordinate, if it is of its typical size: (d,)."""
+        return np.asarray(8 * EPS * self.size)
+
+    @property
+    def uses_hessian(self) -> bool:
+        """Whether the Hessian stands in the quadratic programme."""
+        return self.hessian != "none"
+
+    def rows_hold(self, active: NDArray[np.intp]) -> bool:
+        """Whether rows are among the active constraints, and not bounds alone; these are in ascending order."""
+        return bool(active.size and active[0] < self.constraints.b.size)
+
+
+@dataclass(frozen=True, eq=False)
+class Breakpoints:
+    """Values of coordinates where the derivatives of J may jump: the coordinate, and its values in ascending order.
+
+    Lists of numbers: bisecting a list takes a tenth of the time of a NumPy call, and it is done for one number at a
+    time.
+    """
+
+    of_coordinates: tuple[tuple[int, list[float]], ...]
+
+    @classmethod
+    def of(cls, given: Sequence[ArrayLike] | None, d: int) -> Breakpoints:
+        """One array for each of d coordinates, checked; coordinates may share one, which is read once."""
+        given = [()] * d if given is None else given
+        if len(given) != d:
+            raise ValueError(
+                f"got breakpoints for {len(given)} coordinates, expected {d}; give an empty array for none"
+            )
+        read: dict[int, list[float]] = {}
+        found = []
+        for i, points in enumerate(given):
+            if id(points) not in read:
+                array = np.asarray(points, dtype=float).reshape(-1)
+                if not (np.isfinite(array).all() and (array[1:] > array[:-1]).all()):
+                    raise ValueError(
+                        f"the breakpoints of coordinate {i} must be finite and strictly increasing; use np.unique"
+                    )
+                read[id(points)] = array.tolist()
+            if read[id(points)]:
+                found.append((i, read[id(points)]))
+        return cls(tuple(found))
+
+    def met(self, theta: FloatArray) -> list[int]:
+        """Coordinates of theta (d,) that sit exactly on one of their breakpoints."""
+        values = theta.tolist()
+        return [
+            i
+            for i, points in self.of_coordinates
+            if (k := bisect_left(points, values[i])) < len(points) and points[k] == values[i]
+        ]
+
+    def snap(self, moved: FloatArray, theta: FloatArray, step: FloatArray, size: FloatArray) -> list[int]:
+        """Put coordinates of ``moved = theta + step`` (d,) onto the breakpoints that they reach up to rounding.
+
+        Rounding is a part of what is added, and of the typical `size` (d,). Returns the coordinates that were near one.
+        """
+        found = []
+        for i, points in self.of_coordinates:
+            x, by = float(moved[i]), float(step[i])
+            mark = _nearest(points, x)
+            reach = max(abs(float(theta[i])), abs(by), abs(x)) if by != 0.0 else 0.0
+            if abs(mark - x) <= 8 * EPS * max(reach, float(size[i])):
+                moved[i] = mark
+                found.append(i)
+        return found
+
+    def crossed(self, theta: FloatArray, step: FloatArray) -> int:
+        """Largest number of breakpoints that a coordinate passes strictly inside a step (d,)."""
+        largest = 0
+        starts, ends = theta.tolist(), (theta + step).tolist()
+        for i, points in self.of_coordinates:
+            low, high = (starts[i], ends[i]) if starts[i] <= ends[i] else (ends[i], starts[i])
+            largest = max(largest, bisect_left(points, high) - bisect_right(points, low))
+        return largest
+
+    def piece(self, theta: FloatArray, lower: FloatArray, upper: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The smooth piece around theta: bounds (d,) tightened to the next breakpoint on either side."""
+        low, high = lower.copy(), upper.copy()
+        for i, points in self.of_coordinates:
+            below, above = bisect_left(points, theta[i]), bisect_right(points, theta[i])
+            if below > 0:
+                low[i] = max(low[i], points[below - 1])
+            if above < len(points):
+                high[i] = min(high[i], points[above])
+        return low, high
+
+    def next_on(self, theta: FloatArray, step: FloatArray) -> float:
+        """Fraction of a step (d,) up to the first breakpoint that a coordinate meets; infinite if none does."""
+        fractions = [_next(points, float(theta[i]), float(step[i])) for i, points in self.of_coordinates]
+        return min(fractions, default=np.inf)
+
+
+def _nearest(points: list[float], x: float) -> float:
+    above = bisect_left(points, x)
+    if above == len(points) or (above > 0 and x - points[above - 1] <= points[above] - x):
+        above -= 1
+    return points[above]
+
+
+def _next(points: list[float], x: float, step: float) -> float:
+    """Fraction of a step of one coordinate up to the next breakpoint that it meets; infinite if it meets none."""
+    k = bisect_right(points, x) if step > 0.0 else bisect_left(points, x) - 1
+    return (points[k] - x) / step if step != 0.0 and 0 <= k < len(points) else np.inf
+
+
+def _labels(hessian: HessianKind, blocks: ArrayLike | None, d: int) -> FloatArray | None:
+    """Labels of the blocks; None unless the Hessian is to be cut into blocks."""
+    if hessian != "block-diagonal":
+        return None
+    labels = np.asarray(blocks)
+    if blocks is None or labels.shape != (d,):
+        raise ValueError(f"hessian='block-diagonal' needs blocks, an integer label for each of the {d} coordinates")
+    return labels.astype(float)

@@ -1,0 +1,152 @@
+"""The state of a minimisation between two iterations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.optimize import algebra
+from switchfit.optimize.algebra import EIGENVALUE_FLOOR, FloatArray
+from switchfit.optimize.diagnosis import Finding
+from switchfit.optimize.matrix import Curvature
+from switchfit.optimize.point import Point
+from switchfit.optimize.problem import Problem
+from switchfit.optimize.status import Status
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The best point so far, and what has been seen.
+
+    Attributes
+    ----------
+    point : Point
+    iteration : int
+    step_length : float
+        Of the last iteration.
+    metric : float
+        Steepest descent: B = I / metric.
+    settled : int
+        Iterations since the optimality fell below the tolerance.
+    scale : array, shape (d,)
+        Largest ``|theta_i|`` seen.
+    cost_scale, gradient_scale : float
+        Largest ``|J|`` and largest derivative seen.
+    lowest_cost : float
+    restarts : int
+    careful : bool
+        The next step is taken with the diagonal of the Hessian alone.
+    status : Status or None
+    reason : Finding or None
+        Why it failed, where it did.
+    """
+
+    point: Point
+    iteration: int = 0
+    step_length: float = 0.0
+    metric: float = 1.0
+    settled: int = 0
+    scale: FloatArray = field(default_factory=lambda: np.zeros(0))
+    cost_scale: float = 0.0
+    gradient_scale: float = 0.0
+    lowest_cost: float = np.inf
+    restarts: int = 0
+    careful: bool = False
+    status: Status | None = None
+    reason: Finding | None = None
+
+    @classmethod
+    def at(cls, point: Point) -> State:
+        """The state before the first iteration."""
+        return cls(
+            point=point,
+            metric=1.0 / max(1.0, point.optimality),
+            scale=np.abs(point.theta),
+            cost_scale=abs(point.cost),
+            gradient_scale=point.largest_derivative,
+            lowest_cost=point.cost,
+        )
+
+    def advanced(self, accepted: Accepted, tolerance: float) -> State:
+        """The state after an accepted step."""
+        point, alpha = accepted.point, accepted.step_length
+        return State(
+            point=point,
+            iteration=self.iteration + 1,
+            step_length=alpha,
+            metric=self.metric * (2.0 if alpha >= 1.0 else alpha),
+            settled=self.settled + 1 if point.optimality <= tolerance else 0,
+            scale=np.maximum(self.scale, np.abs(point.theta)),
+            cost_scale=max(self.cost_scale, abs(point.cost)),
+            gradient_scale=max(self.gradient_scale, point.largest_derivative),
+            lowest_cost=min(self.lowest_cost, point.cost),
+            restarts=self.restarts,
+        )
+
+    @property
+    def flatness(self) -> FloatArray:
+        """Curvature of each unknown that is rounding: (d,)."""
+        return np.asarray(algebra.flatness(self.scale, self.cost_scale))
+
+    @property
+    def floor(self) -> FloatArray:
+        """Curvature of each unknown that counts as none in the quadratic programme: (d,)."""
+        return np.asarray(algebra.curvature_floor(self.scale, self.cost_scale, self.point.largest_slopes))
+
+    @property
+    def genuine_kinks(self) -> NDArray[np.bool_]:
+        """Coordinates on a breakpoint whose derivative really jumps upwards there: (d,)."""
+        point = self.point
+        if point.kink is None:
+            return np.zeros(point.theta.size, dtype=bool)
+        jump = point.plus.gradient - point.minus.gradient
+        return np.asarray(point.kink & (jump > 1e-12 * self.gradient_scale))
+
+
+@dataclass(frozen=True, eq=False)
+class Accepted:
+    """The point of a step that was accepted, and the fraction of the proposed step that it took."""
+
+    point: Point
+    step_length: float
+
+
+def curvature_at(problem: Problem, state: State, rows: NDArray[np.intp]) -> Curvature:
+    """Return the curvature of J, unmodified, in the null space of the constraints at `rows` and off the kinks."""
+    known = state.point.curvatures
+    key = rows.tobytes()
+    if key not in known:
+        known[key] = _curvature_on(problem, state, rows)
+    return known[key]
+
+
+def _curvature_on(problem: Problem, state: State, rows: NDArray[np.intp]) -> Curvature:
+    point, constraints = state.point, problem.constraints
+    hessian, flat = point.derivatives(point.reported_sides)[1], state.flatness
+    held = state.genuine_kinks | ~constraints.movable
+    held = held if point.idle is None else held | point.idle
+    found = hessian.curvature(constraints, rows, held, flat)
+    if problem.idle is not None and problem.rows_hold(point.active):
+        bounds = point.active[point.active >= constraints.b.size]
+        loose = np.any(point.multipliers[bounds] <= 1e-10 * state.gradient_scale)  # bounds that hold nothing back
+        if found.smallest <= EIGENVALUE_FLOOR or loose:
+            idle = problem.idle(point.theta.copy(), True) & ~held
+            if idle.any():
+                found = replace(hessian.curvature(constraints, rows, held | idle, flat), idle=idle)
+    return found
+
+
+def idle_coordinates(problem: Problem, state: State) -> tuple[int, ...]:
+    """Return the coordinates on which J does not depend at the state's point, and those that rows tie to them."""
+    point = state.point
+    found = curvature_at(problem, state, point.active).idle
+    alone = set() if found is None else set(np.flatnonzero(found).tolist())
+    if point.idle is None:
+        return tuple(sorted(alone))
+    idle = set(np.flatnonzero(point.idle).tolist())
+    ties = [{i, j} for i, j, _ in problem.constraints.exact_rows(point.active) if j >= 0]
+    for _ in ties:
+        idle |= {k for tie in ties if tie & idle for k in tie}
+    return tuple(sorted(idle | alone))

@@ -1,0 +1,177 @@
+"""What a minimisation returns: its status, its history and its result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+
+from switchfit.optimize.algebra import FloatArray
+from switchfit.optimize.diagnosis import Finding
+from switchfit.optimize.matrix import Curvature
+
+
+class Status(Enum):
+    """How a minimisation ended, and what that means."""
+
+    CONVERGED = "The optimality is below the tolerance, and the curvature on the free directions is positive."
+    CONVERGED_PRECISION = (
+        "The decrease that is still predicted is below the rounding error of the cost, although the optimality is "
+        "above the tolerance."
+    )
+    CONVERGED_AT_KINK = (
+        "The one-sided derivatives have opposite signs at a kink of the cost: a minimiser where no gradient vanishes."
+    )
+    MAX_ITERATIONS = "All iterations were done before the optimality was below the tolerance."
+    LINE_SEARCH_FAILED = (
+        "The line search found no decrease along a descent direction, nor did it after a fresh start from there."
+    )
+    INTERRUPTED = "The callback, or Ctrl-C, stopped it; the result is the best point so far."
+    NONFINITE_START = "The cost or its derivatives are not finite at the starting point."
+    SADDLE = "A stationary point with negative curvature from which no step decreased the cost: no minimum."
+    SINGULAR = "Converged to a point from which the cost is flat to second order in some direction."
+    COLLAPSED = (
+        "Converged with a mode of no duration: the cost depends neither on where it would stand nor on what acts in "
+        "it alone."
+    )
+    INFEASIBLE = "A guard or a terminal constraint is not met."
+    ERROR = "The fit ended with an error, and was left where it was."
+
+    @property
+    def successful(self) -> bool:
+        """Whether it converged, to a point near which nothing decreases the cost; `Estimate.success` is the same.
+
+        Also where that point is not the only one: where the cost is flat in some direction (`SINGULAR`), or a mode has
+        collapsed (`COLLAPSED`). `is_strict_minimum` leaves these out.
+        """
+        return self.is_strict_minimum or self in (Status.SINGULAR, Status.COLLAPSED)
+
+    @property
+    def is_strict_minimum(self) -> bool:
+        """Whether the point is the only minimiser nearby, as far as second-order conditions can tell."""
+        return self in (Status.CONVERGED, Status.CONVERGED_PRECISION, Status.CONVERGED_AT_KINK)
+
+
+@dataclass(frozen=True, eq=False)
+class IterationRecord:
+    """One line of the history.
+
+    Attributes
+    ----------
+    iteration : int, 0 for the start
+    cost, optimality : float
+    step : float
+        The fraction of the proposed step that was taken.
+    theta : array, shape (d,)
+    evaluations : int, all calls up to then
+    """
+
+    iteration: int
+    cost: float
+    optimality: float
+    step: float
+    theta: FloatArray
+    evaluations: int
+
+    def counted_on(self, last: IterationRecord | None) -> IterationRecord:
+        """This record of a minimisation that was resumed, counted on from the last record before; None: the first."""
+        if last is None:
+            return self
+        return replace(self, iteration=self.iteration + last.iteration, evaluations=self.evaluations + last.evaluations)
+
+
+Callback = Callable[[IterationRecord], object]
+"""Gets each `IterationRecord`; a true return value stops the minimisation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """Outcome of `minimize`.
+
+    Attributes
+    ----------
+    theta : array, shape (d,)
+        The best point found; feasible.
+    cost : float
+    gradient : array, shape (d,)
+        Right-hand derivatives at a coordinate that is on a breakpoint (left-hand at an upper bound).
+    hessian : array, shape (d, d)
+        As evaluated there, not modified; NaN if the caller gives none.
+    optimality : float
+        KKT residual, min over multipliers of ‖g − Aᵀ lam‖₂: the steepest descent along feasible directions of length
+        one, the norm of the gradient if nothing is active.
+    iterations, evaluations : int
+    status : Status
+    active : tuple
+        Those of `LinearConstraints.names` whose constraints hold with equality.
+    multipliers : array, shape (m + 2 d,)
+        Of rows, lower and upper bounds, in the order of `LinearConstraints.names`.
+    kinks : tuple of (int, float, float)
+        Coordinate, left and right derivative, where the solution sits at a kink.
+    curvature : Curvature
+        The Hessian on the directions left free by active constraints and kinks.
+    tolerance : float
+        The tolerance asked for.
+    history : tuple of IterationRecord
+        The start and every iteration.
+    violated : tuple of (str, float)
+        Equality constraints that are not met, with their values.
+    idle : tuple of int
+        Coordinates on which J does not depend at theta, by the word of the caller's `idle`, and those that active rows
+        tie to them; they are not in `free_basis`.
+    reason : Finding or None
+        What was seen where the line search failed; None where it did not.
+    earlier : int
+        How many of the iterations belong to minimisations before, which this one resumed.
+    """
+
+    theta: FloatArray
+    cost: float
+    gradient: FloatArray
+    hessian: FloatArray
+    optimality: float
+    iterations: int
+    evaluations: int
+    status: Status
+    active: tuple[object, ...]
+    multipliers: FloatArray
+    kinks: tuple[tuple[int, float, float], ...]
+    curvature: Curvature
+    tolerance: float
+    history: tuple[IterationRecord, ...]
+    violated: tuple[tuple[str, float], ...] = ()
+    idle: tuple[int, ...] = ()
+    reason: Finding | None = None
+    earlier: int = 0
+
+    @property
+    def free_basis(self) -> FloatArray:
+        """Orthonormal basis of the directions left free by active constraints and kinks, shape (d, k)."""
+        return self.curvature.basis
+
+    @property
+    def free_eigenvalues(self) -> FloatArray:
+        """Eigenvalues, ascending, of the diagonally scaled Hessian on the free directions, shape (k,).
+
+        The smallest alone where the Hessian has the shape of an arrow.
+        """
+        return self.curvature.spectrum.eigenvalues
+
+    @property
+    def smallest_eigenvalue(self) -> float:
+        """The smallest of these; NaN if there are none."""
+        values = self.free_eigenvalues
+        return float(values[0]) if values.size else np.nan
+
+    @property
+    def smallest_unscaled_eigenvalue(self) -> float:
+        """The smallest eigenvalue of ``free_basisᵀ H free_basis``; NaN if there are none."""
+        values = self.curvature.spectrum.unscaled
+        return float(values[0]) if values.size else np.nan
+
+    @property
+    def flat_direction(self) -> FloatArray:
+        """Eigenvector, in theta and of unit length, that belongs to `smallest_eigenvalue`, shape (d,)."""
+        return self.curvature.spectrum.lowest
