@@ -1,8 +1,9 @@
 """Fits of one model to many data sets or from many starts, in one compiled program.
 
-On a CPU the program takes the fits of a chunk one after the other: each stays in the processor's cache, a fit that has
-converged costs nothing more, and chunks run side by side, one a core. (In lockstep, 4 or 16 at a time, a fit takes 1.7
-times as long.) On a GPU all fits of a chunk go in lockstep. Either way each is the same function of its data and start.
+On a CPU chunks run side by side, one a core. Where machine code evaluates J, `SLOTS` fits of a chunk are under way at a
+time, so that the optimiser's small matrices are many in one call; a fit that is done makes room for the next one at
+once, and none waits for another. Where JAX does, they go one after the other: each stays in the processor's cache. On a
+GPU all fits of a chunk go in lockstep. In each case a fit is the same function of its data and start.
 
 What `minimize_traced` does not treat is finished by `minimize`, as in a single fit.
 """
@@ -11,7 +12,7 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,15 +26,14 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
-from switchfit.engine.jax.programs import derivatives
-from switchfit.engine.native.foreign import foreign_derivatives
+from switchfit.engine.choice import memory_of, runs_natively, traced_derivatives
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import inverse_on
 from switchfit.fit.solution import constraints_of, minimized
 from switchfit.fit.termination import Termination, termination_of
 from switchfit.optimize import Status
 from switchfit.optimize.qp import nearest_feasible
-from switchfit.optimize.traced import Constraints, Outcome, minimize_traced
+from switchfit.optimize.traced import Constraints, Outcome, State, begin, minimize_traced, outcome_of, take_turn
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import float64
 from switchfit.problem.priors import PriorTerms
@@ -42,8 +42,14 @@ from switchfit.problem.structure import Structure
 from switchfit.problem.variables import Variables
 from switchfit.runtime.cache import compilation_cache
 
-CHUNK = 32
+CHUNK = 128
 """Fits that one call of the program takes on a CPU."""
+
+SLOTS = 32
+"""Fits that are under way at a time, where machine code evaluates J."""
+
+LARGEST_MEMORY = 2**27
+"""Bytes that the evaluations of all slots may take."""
 
 CHUNK_IN_LOCKSTEP = 1024
 """The same on a GPU, where they go in lockstep."""
@@ -78,6 +84,7 @@ class Layout:
     places: tuple[tuple[int, ...], ...]  # of the N transition times and M parameters, -1 where fixed
     varying: tuple[int, ...]
     lockstep: bool
+    slots: int  # fits under way at a time, where machine code evaluates J; else 0
     tolerance: float
     max_iterations: int
 
@@ -169,17 +176,19 @@ def fit_chunk(
     """
     unknowns = problem.unknowns
     lockstep = in_lockstep() if lockstep is None else lockstep
+    evaluator = Evaluator(problem, meshes=meshes)
+    natively = not lockstep and problem.engine != "jax" and runs_natively(problem.structures, evaluator.arguments)
     layout = Layout(
         problem.structures,
         tuple(tuple(int(k) for k in places) for places in problem.places),
         varying.places,
         lockstep,
+        _slots(evaluator) if natively else 0,
         tolerance,
         max_iterations // 2,  # what it does not settle has as many left for the optimiser that finishes it
     )
     count = len(starts)
     size = max(count, chunk_size(lockstep))
-    evaluator = Evaluator(problem, meshes=meshes)
     variables = unknowns.variables
     bounds = variables.inward(unknowns.lower), variables.inward(unknowns.upper)
     constraints = (unknowns.A, unknowns.b, *bounds, variables.sizes_inward(problem.sizes))
@@ -246,7 +255,8 @@ def _fits(
 ) -> Outcome:
     """Outcomes of the first `count` fits."""
 
-    def fit(own: tuple[jax.Array, ...], start: jax.Array) -> Outcome:
+    def functions(own: tuple[jax.Array, ...]) -> tuple[Any, Any]:
+        """What `minimize_traced` is given for the fit with some numbers of its own: evaluate and piece."""
         here = replaced(arguments, layout.varying, own)
 
         def evaluate(z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -266,23 +276,78 @@ def _fits(
             ]
             return jnp.stack([*cells, jnp.zeros((), int)])
 
-        found = minimize_traced(
-            evaluate, start, constraints, piece, tolerance=layout.tolerance, max_iterations=layout.max_iterations
-        )
+        return evaluate, piece
+
+    settings: Any = {"tolerance": layout.tolerance, "max_iterations": layout.max_iterations}
+
+    def outward(found: Outcome) -> Outcome:
         theta = unscaled.theta(found.theta)
         gradient, hessian = unscaled.variables.derivatives_outward(theta, found.gradient, found.hessian, jnp)
         return found._replace(theta=theta, gradient=gradient, hessian=hessian)
 
+    def fit(own: tuple[jax.Array, ...], start: jax.Array) -> Outcome:
+        evaluate, piece = functions(own)
+        return outward(minimize_traced(evaluate, start, constraints, piece, **settings))
+
+    def turn(own: tuple[jax.Array, ...], state: State) -> State:
+        evaluate, piece = functions(own)
+        return take_turn(state, evaluate, constraints, piece, **settings)
+
     if layout.lockstep:
         return jax.vmap(fit)(values, starts)
+    shapes = jax.eval_shape(fit, tuple(value[0] for value in values), starts[0])
+    empty = jax.tree.map(lambda s: jnp.zeros((len(starts), *s.shape), s.dtype), shapes)
+    if layout.slots:
+        finish = jax.vmap(lambda state: outward(outcome_of(state, constraints)))
+        return _in_slots(layout.slots, jax.vmap(turn), finish, values, starts, count, empty)
 
     def one(k: jax.Array, outcomes: Outcome) -> Outcome:
         outcome = fit(tuple(value[k] for value in values), starts[k])
         return jax.tree.map(lambda all_, new: all_.at[k].set(new), outcomes, outcome)
 
-    shapes = jax.eval_shape(fit, tuple(value[0] for value in values), starts[0])
-    empty = jax.tree.map(lambda s: jnp.zeros((len(starts), *s.shape), s.dtype), shapes)
     return lax.fori_loop(0, count, one, empty)
+
+
+def _in_slots(
+    slots: int,
+    turn: Callable[[tuple[jax.Array, ...], State], State],
+    finish: Callable[[State], Outcome],
+    values: tuple[jax.Array, ...],
+    starts: jax.Array,
+    count: jax.Array,
+    outcomes: Outcome,
+) -> Outcome:
+    """Outcomes of the first `count` fits, some of which are under way at a time, each in a slot until it is done."""
+    last = len(starts) - 1
+
+    def fresh(which: jax.Array) -> State:
+        return jax.vmap(begin)(starts[jnp.minimum(which, last)])
+
+    def body(carried: tuple[jax.Array, jax.Array, State, Outcome]) -> tuple[jax.Array, jax.Array, State, Outcome]:
+        which, following, states, outcomes = carried
+        here = jnp.minimum(which, last)
+        states = turn(tuple(value[here] for value in values), states)
+        done = states.done & (which < count)
+        place = jnp.where(done, which, last + 1)  # the others are dropped
+        found = finish(states)
+        outcomes = jax.tree.map(lambda all_, new: all_.at[place].set(new, mode="drop"), outcomes, found)
+        which = jnp.where(done, following + jnp.cumsum(done) - 1, which)
+
+        def chosen(new: jax.Array, old: jax.Array) -> jax.Array:
+            return jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+        return which, following + done.sum(), jax.tree.map(chosen, fresh(which), states), outcomes
+
+    which = jnp.arange(slots)
+    begun = which, jnp.asarray(slots), fresh(which), outcomes
+    return lax.while_loop(lambda carried: jnp.any(carried[0] < count), body, begun)[3]
+
+
+def _slots(evaluator: Evaluator) -> int:
+    """How many fits may be under way at a time: fewer where each takes much memory."""
+    given = zip(evaluator.problem.structures, evaluator.arguments, strict=True)
+    largest = max(memory_of(structure, arguments) for structure, arguments in given)
+    return int(np.clip(LARGEST_MEMORY // largest, 1, SLOTS))
 
 
 def _total(
@@ -308,10 +373,10 @@ def _total(
             given: tuple[Arguments, jax.Array, jax.Array], structure: Structure = structure
         ) -> tuple[jax.Array, jax.Array, jax.Array]:
             own, tau, p = given
-            natively = None if layout.lockstep else foreign_derivatives(structure, own, tau, p)
-            if natively is not None:
-                return natively
-            return derivatives(own, tau, p, jnp.ones(()), structure=structure, method="discrete-adjoint")
+            found: tuple[jax.Array, jax.Array, jax.Array] = traced_derivatives(
+                structure, own, tau, p, natively=layout.slots > 0
+            )
+            return found
 
         operands = (given, tau, extended[where[:, N:]])
         if len(group) == 1:

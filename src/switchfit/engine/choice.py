@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.jax.engine import JaxEngine
+from switchfit.engine.jax.programs import derivatives
 from switchfit.engine.native.engine import NativeEngine
 from switchfit.engine.native.experiment import reason_for_jax
-from switchfit.engine.native.templates import Order
+from switchfit.engine.native.foreign import can_be_foreign, foreign_derivatives
+from switchfit.engine.native.templates import Order, Sizes
+from switchfit.engine.native.workspace import memory
 from switchfit.engine.protocol import Engine, ExperimentEngine
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
@@ -50,3 +56,25 @@ def summarize(engines: Sequence[ExperimentEngine], names: Sequence[str]) -> Engi
         return records[0]
     which = ", ".join(name for name, _ in by_jax)
     return Engine("jax", f"{by_jax[0][1].reason} (in {which}; the other experiments run in machine code)")
+
+
+def runs_natively(structures: Sequence[Structure], arguments: Sequence[Arguments]) -> bool:
+    """Return whether machine code evaluates all experiments inside a program of JAX."""
+    given = zip(structures, arguments, strict=True)
+    return all(can_be_foreign(s) and reason_for_jax(s, a, Order.HESSIAN) is None for s, a in given)
+
+
+def traced_derivatives(structure: Structure, arguments: Arguments, tau: Any, p: Any, *, natively: bool) -> Any:
+    """Return cost, gradient (D,) and Hessian (D, D) of one experiment inside a program of JAX.
+
+    By machine code, which runs on a CPU, where `runs_natively` says so; else by JAX.
+    """
+    if natively:
+        return foreign_derivatives(structure, arguments, tau, p)
+    return derivatives(arguments, tau, p, jnp.ones(()), structure=structure, method="discrete-adjoint")
+
+
+def memory_of(structure: Structure, arguments: Arguments) -> int:
+    """Return how many bytes an evaluation of one experiment by machine code works in."""
+    sizes, rows = Sizes.of(structure, arguments), len(arguments.nodes) - 1 + structure.N
+    return 8 * sum(length.at(rows) for length in memory(structure.library, sizes, Order.HESSIAN).values())

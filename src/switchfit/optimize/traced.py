@@ -98,7 +98,7 @@ class Outcome(NamedTuple):
     settled: Array
 
 
-class _State(NamedTuple):
+class State(NamedTuple):
     """The point that was accepted last, the step tried from it, and what has been seen."""
 
     theta: Array
@@ -146,7 +146,24 @@ def minimize_traced(
     Outcome
     """
 
-    def accept(state: _State, cost: Array, gradient: Array, hessian: Array, theta: Array, optimality: Array) -> _State:
+    def turn(state: State) -> State:
+        return take_turn(state, evaluate, constraints, piece, tolerance=tolerance, max_iterations=max_iterations)
+
+    return outcome_of(lax.while_loop(lambda state: ~state.done, turn, begin(start)), constraints)
+
+
+def take_turn(
+    state: State,
+    evaluate: TracedEvaluate,
+    constraints: Constraints,
+    piece: Callable[[Array], Array],
+    *,
+    tolerance: float,
+    max_iterations: int,
+) -> State:
+    """Evaluate J once, at the point that is to be judged, and judge it; arguments as of `minimize_traced`."""
+
+    def accept(state: State, cost: Array, gradient: Array, hessian: Array, theta: Array, optimality: Array) -> State:
         first = state.evaluations == 1
         below = jnp.where(first | (optimality > tolerance), 0, state.below + 1)
         moved = state._replace(
@@ -169,7 +186,7 @@ def minimize_traced(
         done = stationary | (moved.iterations >= max_iterations)
         return moved._replace(step=step, slope=slope, stationary=stationary, done=done)
 
-    def refuse(state: _State, *_: Array) -> _State:
+    def refuse(state: State, *_: Array) -> State:
         trials = state.trials + 1
         length = state.length * jnp.where(trials <= 5, 0.5, 0.25)
         unsaid = state.length * -state.slope <= NOISE * jnp.abs(state.cost)
@@ -180,7 +197,7 @@ def minimize_traced(
         crawling = refused > CRAWLING[0] + CRAWLING[1] * state.iterations
         return state._replace(length=length, trials=trials, done=hopeless | crawling, stationary=stationary)
 
-    def turn(state: _State) -> _State:
+    def judged(state: State) -> State:
         theta = _moved(constraints, state.theta, state.length * state.step)
         cost, gradient, hessian = evaluate(theta)
         hessian = 0.5 * (hessian + hessian.T)
@@ -199,7 +216,11 @@ def minimize_traced(
         after = lax.cond(finite & (first | lower), accept, refuse, state, cost, gradient, hessian, theta, optimality)
         return after._replace(done=after.done | (first & ~finite))
 
-    state = lax.while_loop(lambda state: ~state.done, turn, _not_begun(start))
+    return judged(state)
+
+
+def outcome_of(state: State, constraints: Constraints) -> Outcome:
+    """Return what was found where a fit is done."""
     interior = ~jnp.any(_active(constraints, state.theta, state.scale))
     scaling = _scaling(state.hessian, algebra.flatness(state.scale, state.cost_scale, jnp))
     smallest = jnp.linalg.eigvalsh(jnp.nan_to_num(state.hessian / jnp.outer(scaling, scaling)))[0]
@@ -207,11 +228,11 @@ def minimize_traced(
     return Outcome(*state[:7], settled)
 
 
-def _not_begun(start: Array) -> _State:
+def begin(start: Array) -> State:
     """The state before the first evaluation, which is accepted whatever it gives, if it is finite."""
     d = start.shape[0]
     infinite, none = jnp.full((), jnp.inf), jnp.zeros((), int)
-    return _State(
+    return State(
         theta=start,
         cost=infinite,
         gradient=jnp.full(d, jnp.nan),
@@ -303,7 +324,7 @@ def _scaling(hessian: Array, floor: Array) -> Array:
     return lax.fori_loop(0, EQUILIBRATIONS, equilibrate, start)
 
 
-def _direction(state: _State, constraints: Constraints) -> tuple[Array, Array]:
+def _direction(state: State, constraints: Constraints) -> tuple[Array, Array]:
     """Step (d,) of the quadratic programme, and its slope gᵀd."""
     theta, gradient = state.theta, state.gradient
     floor = algebra.curvature_floor(state.scale, state.cost_scale, jnp.abs(gradient), jnp)

@@ -20,11 +20,11 @@ from switchfit.problem.structure import Structure
 
 
 @cache  # what is registered must stay
-def _registered(library: Structure, sizes: Sizes) -> tuple[str, Program] | None:
-    """Name of the operation for a library; None where JAX has to do its work."""
+def _registered(library: Structure, sizes: Sizes) -> tuple[str, Program]:
+    """Name of the operation for a library."""
     program = program_of(library, sizes, Order.HESSIAN)
     if isinstance(program, str):
-        return None
+        raise ValueError(f"there is no machine code: {program}")
     name = f"switchfit_{program.key[:32]}"
     new_capsule = ctypes.pythonapi.PyCapsule_New
     new_capsule.restype, new_capsule.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
@@ -33,17 +33,19 @@ def _registered(library: Structure, sizes: Sizes) -> tuple[str, Program] | None:
     return name, program
 
 
+def can_be_foreign(structure: Structure) -> bool:
+    """Whether an experiment has what the operation knows: no late samples, and a program for itself alone."""
+    late = any(sensor.delay is not None for sensor in structure.measurements)
+    return not late and structure.transitions == structure.N
+
+
 def foreign_derivatives(structure: Structure, arguments: Arguments, tau: Any, p: Any) -> Any:
     """Cost, gradient (D,) and Hessian (D, D) of one experiment, inside a JAX program that runs on a CPU.
 
-    As `switchfit.fit.evaluator.derivatives` with the side +1; None where JAX has to do it.
+    With the side +1, for an experiment that `can_be_foreign` and for which there is machine code.
     """
     sizes, library = Sizes.of(structure, arguments), structure.library
-    late = any(sensor.delay is not None for sensor in structure.measurements)
-    registered = None if late or structure.N < sizes.N else _registered(library, sizes)
-    if registered is None:
-        return None
-    name, _ = registered
+    name, _ = _registered(library, sizes)
     N, D, width = sizes.N, sizes.D, sizes.width
     nodes = arguments.nodes
     cells = nodes.shape[0] - 1
