@@ -255,13 +255,13 @@ def _fits(
 ) -> Outcome:
     """Outcomes of the first `count` fits."""
 
-    def functions(own: tuple[jax.Array, ...]) -> tuple[Any, Any]:
+    def functions(own: tuple[jax.Array, ...], idle: Any = False) -> tuple[Any, Any]:
         """What `minimize_traced` is given for the fit with some numbers of its own: evaluate and piece."""
         here = replaced(arguments, layout.varying, own)
 
         def evaluate(z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             theta = unscaled.theta(z)
-            J, g, H = _total(layout, here, times, theta)
+            J, g, H = _total(layout, here, times, theta, idle)
             prior, prior_g, prior_h = unscaled.priors.evaluate(theta, jnp)
             given = unscaled.variables.derivatives_inward(theta, g + prior_g, H + jnp.diag(prior_h), jnp)
             return J + prior, *given
@@ -289,8 +289,8 @@ def _fits(
         evaluate, piece = functions(own)
         return outward(minimize_traced(evaluate, start, constraints, piece, **settings))
 
-    def turn(own: tuple[jax.Array, ...], state: State) -> State:
-        evaluate, piece = functions(own)
+    def turn(own: tuple[jax.Array, ...], state: State, idle: jax.Array) -> State:
+        evaluate, piece = functions(own, idle)
         return take_turn(state, evaluate, constraints, piece, **settings)
 
     if layout.lockstep:
@@ -310,7 +310,7 @@ def _fits(
 
 def _in_slots(
     slots: int,
-    turn: Callable[[tuple[jax.Array, ...], State], State],
+    turn: Callable[[tuple[jax.Array, ...], State, jax.Array], State],
     finish: Callable[[State], Outcome],
     values: tuple[jax.Array, ...],
     starts: jax.Array,
@@ -326,7 +326,7 @@ def _in_slots(
     def body(carried: tuple[jax.Array, jax.Array, State, Outcome]) -> tuple[jax.Array, jax.Array, State, Outcome]:
         which, following, states, outcomes = carried
         here = jnp.minimum(which, last)
-        states = turn(tuple(value[here] for value in values), states)
+        states = turn(tuple(value[here] for value in values), states, which >= count)
         done = states.done & (which < count)
         place = jnp.where(done, which, last + 1)  # the others are dropped
         found = finish(states)
@@ -351,7 +351,7 @@ def _slots(evaluator: Evaluator) -> int:
 
 
 def _total(
-    layout: Layout, arguments: tuple[Arguments, ...], times: tuple[jax.Array, ...], theta: jax.Array
+    layout: Layout, arguments: tuple[Arguments, ...], times: tuple[jax.Array, ...], theta: jax.Array, idle: Any
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Cost, gradient and Hessian of all experiments together.
 
@@ -374,7 +374,7 @@ def _total(
         ) -> tuple[jax.Array, jax.Array, jax.Array]:
             own, tau, p = given
             found: tuple[jax.Array, jax.Array, jax.Array] = traced_derivatives(
-                structure, own, tau, p, natively=layout.slots > 0
+                structure, own, tau, p, idle, natively=layout.slots > 0
             )
             return found
 

@@ -64,13 +64,16 @@ def runs_natively(structures: Sequence[Structure], arguments: Sequence[Arguments
     return all(can_be_foreign(s) and reason_for_jax(s, a, Order.HESSIAN) is None for s, a in given)
 
 
-def traced_derivatives(structure: Structure, arguments: Arguments, tau: Any, p: Any, *, natively: bool) -> Any:
+def traced_derivatives(
+    structure: Structure, arguments: Arguments, tau: Any, p: Any, idle: Any, *, natively: bool
+) -> Any:
     """Return cost, gradient (D,) and Hessian (D, D) of one experiment inside a program of JAX.
 
-    By machine code, which runs on a CPU, where `runs_natively` says so; else by JAX.
+    By machine code, which runs on a CPU, where `runs_natively` says so; else by JAX. What is returned says nothing where
+    it is `idle`, which costs nothing by machine code.
     """
     if natively:
-        return foreign_derivatives(structure, arguments, tau, p)
+        return foreign_derivatives(structure, arguments, tau, p, idle)
     return derivatives(arguments, tau, p, jnp.ones(()), structure=structure, method="discrete-adjoint")
 
 

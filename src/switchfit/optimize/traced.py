@@ -41,7 +41,7 @@ Array = jax.Array
 MAX_TRIALS = 30
 """Fractions of a step that are tried."""
 
-CRAWLING = (30, 2)
+CRAWLING = (12, 1)
 """A fit that has refused more fractions of steps than this, plus this many an iteration, has met a kink and is left to
 `minimize`. Fits that settle refuse a dozen at most; at a kink they would go on by hundreds, to no end."""
 
