@@ -198,11 +198,13 @@ def scatter(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any, com
     return result
 
 
-def added(graph: Graph, add: Callable[[Any, Any], Any]) -> Combine:
+def added(graph: Graph, add: Callable[[Any, Any], Any], of_integers: bool) -> Combine:
     """Return how an update is added where a condition holds."""
 
     def combine(here: Any, old: Any, update: Any) -> Any:
-        if isinstance(old, Integer) or isinstance(update, Integer) or not isinstance(here, Node):
+        if not isinstance(here, Node):
+            return add(old, update) if here else old
+        if of_integers:
             return choose(graph, here, add(old, update), old)
         return add(old, choose(graph, here, update, 0.0))
 

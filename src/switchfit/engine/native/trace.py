@@ -19,7 +19,7 @@ import jax
 import numpy as np
 from jax._src import source_info_util
 
-from switchfit.engine.native.entries import Integer, Unsupported, choose, less
+from switchfit.engine.native.entries import Integer, Unsupported, choose, is_traced, less
 from switchfit.engine.native.indexing import added, dynamic_slice, dynamic_update_slice, gather, scatter
 from switchfit.engine.native.integers import OF_INTEGERS, from_double, invert
 from switchfit.engine.native.matrices import MATRICES
@@ -158,7 +158,7 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
     if name in CALLS:
         inner = params[CALLS[name]]
         if not known and _is_search(equation):
-            return [np.asarray(search(graph, *args, right="lt_to" in _primitives(inner.jaxpr)), dtype=object)]
+            return [np.asarray(search(graph, *args[:2], right="lt_to" in _primitives(inner.jaxpr)), dtype=object)]
         if hasattr(inner, "consts"):
             return _run(graph, inner.jaxpr, inner.consts, args)
         return _run(graph, inner, (), args)
@@ -219,13 +219,16 @@ def _check_type(dtype: np.dtype[Any]) -> None:
 
 
 def _is_search(equation: Any) -> bool:
-    """Whether JAX searches one sorted array with a loop, as `jnp.interp` does as well."""
-    if equation.params.get("name") != "_searchsorted_scan_impl" or len(equation.invars) != 2:
+    """Whether JAX searches one sorted array with a loop, as `jnp.interp` does as well.
+
+    Behind the array and the numbers come tangents, which an index does not depend on.
+    """
+    if equation.params.get("name") != "_searchsorted_scan_impl" or len(equation.invars) < 2:
         return False
-    table, query = (variable.aval for variable in equation.invars)
+    table, query = (variable.aval for variable in equation.invars[:2])
     sides = {"lt_to", "le_to"} & set(_primitives(equation.params["jaxpr"].jaxpr))
-    types = table.dtype == query.dtype == np.float64
-    return bool(types and table.ndim == 1 and equation.outvars[0].aval.shape == query.shape and len(sides) == 1)
+    types = table.dtype == query.dtype == np.float64 and len(equation.outvars) == len(sides) == 1
+    return bool(types and table.ndim == 1 and equation.outvars[0].aval.shape == query.shape)
 
 
 def _primitives(jaxpr: Any) -> Iterator[str]:
@@ -622,48 +625,35 @@ ARRAYS: dict[str, Callable[..., Any]] = {
 """Operations on whole arrays."""
 
 
-def _scatter(combine: Callable[..., Any]) -> Callable[..., Any]:
-    """A scatter that combines old entries with updates: `combine` takes the operation of JAX on two entries."""
+def _scatter(name: str | None) -> Callable[..., Any]:
+    """A scatter that combines old entries with updates by an operation, or replaces them."""
 
-    def changed(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any) -> Any:
-        def operation(name: str) -> Callable[..., Any]:
-            return _meaning(graph, name, {}, equation.outvars[0].aval.dtype)
+    def scattered(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any) -> Any:
+        dtype = equation.outvars[0].aval.dtype
 
-        return scatter(graph, equation, a, indices, updates, combine(graph, operation))
+        def apply(old: Any, update: Any) -> Any:
+            if name == "add" and not is_traced(old) and not is_traced(update):
+                return old + update
+            return _meaning(graph, str(name), {}, dtype)(old, update)
 
-    return changed
+        def combine(here: Any, old: Any, update: Any) -> Any:
+            return choose(graph, here, update if name is None else apply(old, update), old)
 
+        how = added(graph, apply, dtype.kind in "iu") if name == "add" else combine
+        return scatter(graph, equation, a, indices, updates, how)
 
-def _replaced(graph: Graph, operation: Callable[[str], Callable[..., Any]]) -> Callable[..., Any]:
-    return lambda here, old, update: choose(graph, here, update, old)
-
-
-def _added(graph: Graph, operation: Callable[[str], Callable[..., Any]]) -> Callable[..., Any]:
-    return added(graph, lambda old, update: _sum(operation, old, update))
-
-
-def _sum(operation: Callable[[str], Callable[..., Any]], old: Any, update: Any) -> Any:
-    known = not isinstance(old, Node | Integer) and not isinstance(update, Node | Integer)
-    return old + update if known else operation("add")(old, update)
-
-
-def _combined(name: str) -> Callable[..., Any]:
-    def combine(graph: Graph, operation: Callable[[str], Callable[..., Any]]) -> Callable[..., Any]:
-        apply = operation(name)
-        return lambda here, old, update: choose(graph, here, apply(old, update), old)
-
-    return combine
+    return scattered
 
 
 INDEXED: dict[str, Callable[..., Any]] = {
     "gather": gather,
     "dynamic_slice": dynamic_slice,
     "dynamic_update_slice": dynamic_update_slice,
-    "scatter": _scatter(_replaced),
-    "scatter-add": _scatter(_added),
-    "scatter-mul": _scatter(_combined("mul")),
-    "scatter-max": _scatter(_combined("max")),
-    "scatter-min": _scatter(_combined("min")),
+    "scatter": _scatter(None),
+    "scatter-add": _scatter("add"),
+    "scatter-mul": _scatter("mul"),
+    "scatter-max": _scatter("max"),
+    "scatter-min": _scatter("min"),
 }
 """Operations at indices."""
 
