@@ -130,7 +130,7 @@ class _Window:
 def _windows(
     graph: Graph, shape: Sequence[int], indices: Any, sizes: Sequence[int], numbers: Any, inside: Any, many: int
 ) -> Iterator[_Window]:
-    """All windows of a gather or scatter; `inside` are the axes of the array of windows (of `many`) that lie in them."""
+    """All windows of a gather or scatter; `inside`: axes in the windows, of the `many` of the array of all windows."""
     gathers = hasattr(numbers, "start_index_map")
     axes = numbers.start_index_map if gathers else numbers.scatter_dims_to_operand_dims
     batched = dict(

@@ -13,11 +13,14 @@ import numpy as np
 from switchfit.engine.native.entries import Unsupported, both, choose, e_number, equal, pick
 from switchfit.engine.native.scalars import Graph, Objects
 
-MOST_ROWS_TO_PIVOT = 6
-"""Rows of a matrix in an LU factorization. Selections decide on each pivot, and all further work is done on selections."""
+MOST_ROWS_TO_PIVOT = 5
+"""Rows of a matrix in an LU factorization, whose pivots are chosen by selections."""
 
-MOST_ROWS = 12
-"""Rows of a matrix in a Cholesky factorization or a triangular system."""
+MOST_ROWS = 6
+"""Rows of a matrix in a Cholesky factorization, or of a triangular system that depends on the state."""
+
+MOST_KNOWN_ROWS = 30
+"""Rows of a triangular system whose matrix is known."""
 
 
 def _for_each(function: Callable[..., tuple[Any, ...]], *arrays: Any) -> list[Any]:
@@ -29,10 +32,7 @@ def _for_each(function: Callable[..., tuple[Any, ...]], *arrays: Any) -> list[An
 
 def lu(graph: Graph, equation: Any, a: Any) -> list[Any]:
     """As `jax.lax.linalg.lu`: L and U in one matrix, the row that each step exchanges, and the order of the rows."""
-    if min(a.shape[-2:]) > MOST_ROWS_TO_PIVOT or max(a.shape[-2:]) > MOST_ROWS:
-        raise Unsupported(
-            f"factorizes a matrix of {a.shape[-2]} x {a.shape[-1]} (limit: {MOST_ROWS_TO_PIVOT} x {MOST_ROWS_TO_PIVOT})"
-        )
+    _check_rows(max(a.shape[-2:]), MOST_ROWS_TO_PIVOT)
     return _for_each(lambda matrix: _lu(graph, matrix), a)
 
 
@@ -43,22 +43,18 @@ def _lu(graph: Graph, matrix: Objects) -> tuple[Any, ...]:
     pivots: Any = np.empty(min(rows, columns), dtype=object)
     for k in range(min(rows, columns)):
         pivots[k] = _largest(graph, a[:, k], k)
-        if not isinstance(pivots[k], int):
+        if pivots[k] != k:
             a = _exchanged(graph, a, k, pivots[k])
             order = _exchanged(graph, order[:, None], k, pivots[k])[:, 0]
         pivot = a[k, k]
         # LAPACK leaves a column of zeros as it is.
-        inverse = 1.0 / _number(graph, choose(graph, graph.apply("eq", pivot, 0.0), 1.0, pivot))
+        inverse = graph.apply("div", 1.0, choose(graph, graph.apply("eq", pivot, 0.0), 1.0, pivot))
         for i in range(k + 1, rows):
             a[i, k] = graph.apply("mul", a[i, k], inverse)
             a[i, k + 1 :] = [
                 graph.apply("sub", a[i, j], graph.apply("mul", a[i, k], a[k, j])) for j in range(k + 1, columns)
             ]
     return a, pivots, order
-
-
-def _number(graph: Graph, value: Any) -> Any:
-    return graph.apply("add", value, 0.0)
 
 
 def _largest(graph: Graph, column: Objects, k: int) -> Any:
@@ -74,8 +70,11 @@ def _largest(graph: Graph, column: Objects, k: int) -> Any:
 
 
 def _exchanged(graph: Graph, a: Any, k: int, other: Any) -> Any:
-    """Rows with row k and another one, an `Integer` from k on, in each other's place."""
+    """Rows with row k and another one from k on, which is known or an `Integer`, in each other's place."""
     result = a.copy()
+    if isinstance(other, int):
+        result[[k, other]] = a[[other, k]]
+        return result
     for i in range(k + 1, len(a)):
         result[i] = [choose(graph, equal(graph, other, i), up, down) for up, down in zip(a[k], a[i], strict=True)]
     result[k] = [pick(graph, column.tolist(), other) for column in a[other.low : other.high + 1].T]
@@ -84,13 +83,13 @@ def _exchanged(graph: Graph, a: Any, k: int, other: Any) -> Any:
 
 def cholesky(graph: Graph, equation: Any, a: Any) -> list[Any]:
     """As `jax.lax.linalg.cholesky` of a symmetric matrix; all is NaN if it is not positive definite."""
-    _check(a.shape[-1])
+    _check_rows(a.shape[-1], MOST_ROWS)
     return _for_each(lambda matrix: (_cholesky(graph, matrix),), a)
 
 
-def _check(rows: int) -> None:
-    if rows > MOST_ROWS:
-        raise Unsupported(f"works with a matrix of {rows} x {rows} (limit: {MOST_ROWS} x {MOST_ROWS})")
+def _check_rows(rows: int, most: int) -> None:
+    if rows > most:
+        raise Unsupported(f"works with a matrix of {rows} rows (limit: {most})")
 
 
 def _cholesky(graph: Graph, matrix: Objects) -> Objects:
@@ -106,7 +105,6 @@ def _cholesky(graph: Graph, matrix: Objects) -> Objects:
             L[i, j] = graph.apply("mul", rest[i - j], inverse)
     for i in range(n):
         L[i, : i + 1] = [choose(graph, positive, entry, float("nan")) for entry in L[i, : i + 1]]
-        # What is above the diagonal is NaN as well in JAX only where it is then set to zero.
     return L
 
 
@@ -120,7 +118,7 @@ def _sum_of_products(graph: Graph, a: Any, b: Any) -> Any:
 def triangular_solve(graph: Graph, equation: Any, a: Any, b: Any) -> list[Any]:
     """As `jax.lax.linalg.triangular_solve`."""
     params = equation.params
-    _check(a.shape[-1])
+    _check_rows(a.shape[-1], MOST_ROWS if a.dtype == object else MOST_KNOWN_ROWS)
     lower = params["lower"] != params["transpose_a"]
 
     def solve(matrix: Objects, right: Objects) -> tuple[Any, ...]:

@@ -8,7 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.engine.native.entries import Integer, Unsupported, both, choose, e_number, equal, is_traced, less
+from switchfit.engine.native.entries import (
+    MOST_CHOICES,
+    MOST_ROWS_OF_TABLE,
+    Integer,
+    Unsupported,
+    both,
+    choose,
+    e_number,
+    equal,
+    is_traced,
+    less,
+)
 from switchfit.engine.native.scalars import Graph, Node, as_objects
 
 MOST_SORTED = 16
@@ -74,17 +85,25 @@ def _is_behind(graph: Graph, kinds: list[str], one: Entries, other: Entries) -> 
 
 
 def top_k(graph: Graph, equation: Any, a: Any) -> list[Any]:
-    """As `jax.lax.top_k`: the largest entries and where they are, NaN first, the first of several that are equal."""
+    """As `jax.lax.top_k`: the largest entries and where they are, NaN first, the first of several that are equal.
+
+    Other than in a sort, 0.0 is larger than -0.0: the reciprocal of each entry, which is moved with it, tells.
+    """
     k, kind = equation.params["k"], equation.invars[0].aval.dtype.kind
 
     def behind(one: Entries, other: Entries) -> Any:
-        return _is_behind(graph, [kind], other, one)
+        found = _is_behind(graph, [kind], other, one)
+        if kind != "f":
+            return found
+        zeros = graph.apply("and", graph.apply("eq", one[0], other[0]), graph.apply("lt", one[2], other[2]))
+        return graph.apply("or", found, zeros)
 
     shape = (*a.shape[:-1], k)
     values, places = np.empty((2, int(np.prod(shape[:-1])), k), dtype=object)
     for row, to, at in zip(a.reshape(-1, a.shape[-1]), values, places, strict=True):
-        found = _sorted(graph, list(zip(row.tolist(), range(len(row)), strict=True)), behind, k)[:k]
-        to[:], at[:] = (as_objects(column) for column in zip(*found, strict=True))
+        reciprocals = [graph.apply("div", 1.0, value) if kind == "f" else 0 for value in row]
+        found = _sorted(graph, list(zip(row.tolist(), range(len(row)), reciprocals, strict=True)), behind, k)[:k]
+        to[:], at[:], _ = (as_objects(column) for column in zip(*found, strict=True))
     return [values.reshape(shape), places.reshape(shape)]
 
 
@@ -116,6 +135,9 @@ def search(graph: Graph, table: Any, query: Any, right: bool) -> Any:
 def _search(graph: Graph, table: list[Any], x: Any, right: bool) -> Any:
     """By the comparisons that JAX makes, along all ways that they may take."""
 
+    if len(table) > MOST_CHOICES:
+        raise Unsupported(f"searches {len(table)} numbers that depend on the state (limit: {MOST_CHOICES})")
+
     def between(low: int, high: int, turns: int) -> Any:
         if turns == 0:
             return high
@@ -131,6 +153,8 @@ def _search(graph: Graph, table: list[Any], x: Any, right: bool) -> Any:
 def _search_constants(graph: Graph, table: Any, x: Any, right: bool) -> Any:
     """By halving, with the table in memory: log2 K turns, which do not depend on what they find."""
     K = len(table)
+    if K > MOST_ROWS_OF_TABLE:
+        raise Unsupported(f"searches a table of {K} entries (limit: {MOST_ROWS_OF_TABLE})")
     turns = K.bit_length()
     padded = np.concatenate([table, np.full(2**turns - 1 - K, np.inf)])
     found: Any = graph.constant(0.0)

@@ -29,8 +29,8 @@ from switchfit.engine.native.sorting import SORTING, compare_in_order, search
 __all__ = ["Unsupported", "traced"]
 
 
-MOST_NODES = 50_000
-"""Operations of one function beyond which compiling them one by one takes too long."""
+MOST_NODES = 10_000
+"""Operations of one function beyond which compiling takes too long: at this size 20 s, and the time grows faster."""
 
 MOST_TURNS = 100_000
 """Turns of a loop beyond which it is not followed."""
@@ -102,7 +102,9 @@ def _located(error: Unsupported, equation: Any) -> Unsupported:
     inner = equation.params.get("jaxpr") if equation.primitive.name in ("jit", "pjit") else None
     name = None if inner is None else _public_name(inner.jaxpr)
     if name is not None:
-        more = "" if error.what.startswith("calls ") else f", which {error.what}"
+        calls, _, why = error.what.partition(", which ")
+        why = why if calls.startswith("calls ") else error.what
+        more = f", which {why}" if why else ""
         return Unsupported(f"calls {name}{more}", _line_of(equation))
     return Unsupported(error.what, error.where or _line_of(equation))
 
