@@ -160,7 +160,8 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
     if name in CALLS:
         inner = params[CALLS[name]]
         if not known and _is_search(equation):
-            return [np.asarray(search(graph, *args[:2], right="lt_to" in _primitives(inner.jaxpr)), dtype=object)]
+            places = search(graph, args[0], args[1], right="lt_to" in _primitives(inner.jaxpr))
+            return [np.asarray(places, dtype=object)]
         if hasattr(inner, "consts"):
             return _run(graph, inner.jaxpr, inner.consts, args)
         return _run(graph, inner, (), args)
