@@ -419,7 +419,9 @@ TABLES: dict[str, Function] = {
     "interp of one entry": lambda x: jnp.interp(x, TABLE_T[:1], TABLE_Y[:1]) * x,
     "interp of states": lambda x: jnp.interp(x[0], np.array([-1.0, 0.5, 1.0]), x * x),
     "interp between states": lambda x: jnp.interp(x, jnp.cumsum(jnp.abs(x) + 0.1), x * x),
-    "searchsorted among equals": lambda x: sum(jnp.searchsorted(LEVELS, x, side=s) * x for s in ("left", "right")),
+    "searchsorted among equals": lambda x: sum(
+        weight * jnp.searchsorted(LEVELS, x, side=side) + x for weight, side in ((2.0, "left"), (5.0, "right"))
+    ),
     "searchsorted of NaN": lambda x: jnp.searchsorted(LEVELS, jnp.where(x > 0.5, x, jnp.nan), side="right") * x,
     "searchsorted for infinity": lambda x: jnp.searchsorted(LEVELS, jnp.where(x > 0.5, x, jnp.inf), side="right") * x,
     "searchsorted among states": lambda x: jnp.searchsorted(x, x[::-1]) * x,
