@@ -212,6 +212,14 @@ DECISIONS: dict[str, Function] = {
     "cond of several": lambda x: sum(lax.cond(x[0] > 0.8, lambda v: (v, v**2), lambda v: (v**3, 1.0 * v), x)),
     "cond of something known": lambda x: lax.cond(True, jnp.sin, jnp.cos, x),
     "switch": lambda x: lax.switch(1, [jnp.sin, jnp.cos], x),
+    "switch by the state": lambda x: lax.switch((3 * x[0]).astype(int), [jnp.sin, jnp.cos, jnp.exp], x),
+    "integers of all kinds": lambda x: (
+        ((3 * x).astype(int) // 2 + (5 * x).astype(int) % 3 - (7 * x).astype(int) ** 2 + abs((-3 * x).astype(int))) * x
+    ),
+    "division of integers by zero": lambda x: lax.div((30 * x).astype(int), (3 * x).astype(int)) * x,
+    "remainder of integers by zero": lambda x: lax.rem((30 * x).astype(int), (3 * x).astype(int)) * x,
+    "integers have no negative zero": lambda x: jnp.arctan2(((0.4 * x).astype(int) * -3).astype(float), -1.0) * x,
+    "integers of NaN": lambda x: jnp.where(x > 0.5, x, jnp.nan).astype(int) * x,
     "switch by a count": lambda x: lax.switch(jnp.sum(x > 0.5), [jnp.sin, jnp.cos, jnp.exp], x),
     "nested cond": lambda x: lax.cond(
         x[0] > 0.5, lambda v: lax.cond(v[1] > 0.5, jnp.sin, jnp.cos, v), lambda v: v**2, x
@@ -321,6 +329,31 @@ PLACES: dict[str, Function] = {
     "boolean index": lambda x: x[(x[0] > 0.5).astype(int)] * x,
     "dynamic_slice": lambda x: lax.dynamic_slice(x, (1,), (2,)),
     "dynamic_slice by the state": lambda x: lax.dynamic_slice(x, (jnp.sum(x > 0.5),), (1,)),
+    "dynamic_slice of a matrix by the state": lambda x: lax.dynamic_slice(
+        jnp.outer(x, x), (jnp.argmax(x), jnp.argmin(x)), (2, 1)
+    ),
+    "dynamic_update_slice by the state": lambda x: lax.dynamic_update_slice(
+        jnp.outer(x, x), 3 * jnp.outer(x, x)[:2, :2], (jnp.argmax(x), jnp.sum(x > 1))
+    ),
+    "take by the state": lambda x: jnp.take(x, (3 * x).astype(int)),
+    "take wrapped": lambda x: jnp.take(x, (3 * x).astype(int), mode="wrap"),
+    "take of columns": lambda x: jnp.take(jnp.outer(x, x), (3 * x).astype(int), axis=1, mode="clip"),
+    "take_along_axis by the state": lambda x: jnp.take_along_axis(
+        jnp.outer(x, jnp.sin(x)), jnp.argsort(jnp.outer(x, x), axis=1), axis=1
+    ),
+    "at get with a fill by the state": lambda x: x.at[(3 * x).astype(int)].get(mode="fill", fill_value=2.5),
+    "at get with NaN by the state": lambda x: x.at[(3 * x).astype(int)].get(mode="fill"),
+    "at set by the state": lambda x: x.at[(3 * x[0]).astype(int)].set(9 * x[1]),
+    "at add by the state": lambda x: x.at[(3 * x).astype(int)].add(x**2),
+    "at multiply by the state": lambda x: x.at[(2 * x[0]).astype(int)].multiply(9 * x[1]),
+    "at max by the state": lambda x: x.at[(2 * x[0]).astype(int)].max(9 * x[1]),
+    "at min by the state": lambda x: x.at[(2 * x).astype(int)].min(9 * x[1]),
+    "at set dropped": lambda x: x.at[(3 * x).astype(int)].set(7.0, mode="drop"),
+    "at set clipped": lambda x: x.at[(3 * x[:1]).astype(int)].set(x[1:2], mode="clip"),
+    "row set by the state": lambda x: jnp.outer(x, x).at[jnp.argmax(x)].set(x),
+    "column added by the state": lambda x: jnp.outer(x, x).at[:, jnp.argmax(x)].add(x**3),
+    "count of places": lambda x: jnp.bincount((3 * jnp.abs(x)).astype(int), length=4) * x[0],
+    "roll by the state": lambda x: jnp.roll(x, jnp.argmax(x)),
     "dynamic_update_slice": lambda x: lax.dynamic_update_slice(x, x[:2], (1,)),
     "dynamic index in dim": lambda x: lax.dynamic_index_in_dim(x, 1, keepdims=False) * x,
     "index table": lambda x: x[jnp.array([0, 1, 2])[jnp.array([2, 1, 0])]],
@@ -345,6 +378,156 @@ PLACES: dict[str, Function] = {
     "ravel a dict": lambda x: jax.flatten_util.ravel_pytree({"a": x[0], "b": x[1:]})[0],
     "optimization_barrier": lambda x: sum(lax.optimization_barrier((x, 2 * x, x**2))),
     "stop_gradient": lambda x: lax.stop_gradient(x) * x,
+}
+
+
+def knots(count):
+    """A table that rises, with a knot at 0 and at 1; and values."""
+    random = np.random.default_rng(count)
+    t = np.sort(random.uniform(-2.0, 2.0, count))
+    t[count // 3], t[count // 3 + 1 :] = 0.0, np.sort(random.uniform(0.1, 2.0, count - count // 3 - 1))
+    t[2 * count // 3] = 1.0
+    return np.sort(t), random.normal(size=count)
+
+
+KNOTS = {count: knots(count) for count in (5, 50, 500)}
+LEVELS = np.array([-0.5, -0.5, 0.0, 0.0, 1.0, 1.0, 1.0, np.inf])
+MAP = np.random.default_rng(7).normal(size=(12, 9))
+
+
+def bilinear(x):
+    """A map of two variables, between its nodes."""
+    u, v = 3.0 + 2.0 * x[0], 4.0 - 2.0 * x[1]
+    i, j = jnp.floor(u).astype(int), jnp.floor(v).astype(int)
+    a, b, z = u - i, v - j, jnp.asarray(MAP)
+    return (1 - b) * (z[i, j] * (1 - a) + z[i + 1, j] * a) + b * (z[i, j + 1] * (1 - a) + z[i + 1, j + 1] * a)
+
+
+TABLES: dict[str, Function] = {
+    **{f"interp of {n}": partial(lambda t, y, x: jnp.interp(x, t, y), *KNOTS[n]) for n in KNOTS},
+    **{
+        f"searchsorted {side} of {n}": partial(
+            lambda t, side, x: jnp.searchsorted(t, x, side=side) * x, KNOTS[n][0], side
+        )
+        for n in KNOTS
+        for side in ("left", "right")
+    },
+    "interp with ends": lambda x: jnp.interp(3 * x, TABLE_T, TABLE_Y, left=-7.0, right=9.0),
+    "interp extrapolated": lambda x: jnp.interp(4 * x, TABLE_T, TABLE_Y, left="extrapolate", right="extrapolate"),
+    "interp of a period": lambda x: jnp.interp(9 * x, TABLE_T, TABLE_Y, period=1.5),
+    "interp of NaN": lambda x: jnp.interp(jnp.where(x > 0.5, x, jnp.nan), TABLE_T, TABLE_Y),
+    "interp of one entry": lambda x: jnp.interp(x, TABLE_T[:1], TABLE_Y[:1]) * x,
+    "interp of states": lambda x: jnp.interp(x[0], np.array([-1.0, 0.5, 1.0]), x * x),
+    "interp between states": lambda x: jnp.interp(x, jnp.cumsum(jnp.abs(x) + 0.1), x * x),
+    "searchsorted among equals": lambda x: sum(
+        weight * jnp.searchsorted(LEVELS, x, side=side) + x for weight, side in ((2.0, "left"), (5.0, "right"))
+    ),
+    "searchsorted of NaN": lambda x: jnp.searchsorted(LEVELS, jnp.where(x > 0.5, x, jnp.nan), side="right") * x,
+    "searchsorted for infinity": lambda x: jnp.searchsorted(LEVELS, jnp.where(x > 0.5, x, jnp.inf), side="right") * x,
+    "searchsorted among states": lambda x: jnp.searchsorted(x, x[::-1]) * x,
+    "searchsorted unrolled": lambda x: jnp.searchsorted(TABLE_T, x, method="scan_unrolled") * x,
+    "searchsorted by sorting": lambda x: jnp.searchsorted(TABLE_T, x, method="sort") * x,
+    "searchsorted by comparing": lambda x: jnp.searchsorted(TABLE_T, x, method="compare_all") * x,
+    "digitize": lambda x: jnp.digitize(x, TABLE_T) * x,
+    "step table": lambda x: jnp.asarray(TABLE_Y)[jnp.floor(x).astype(int)] * x,
+    "step table of 32 bits": lambda x: jnp.asarray(TABLE_Y)[jnp.floor(3 * x).astype(jnp.int32)] * x,
+    "step table of 8 bits": lambda x: jnp.asarray(TABLE_Y)[(400 * x).astype(jnp.int8)] * x,
+    "step table without sign": lambda x: jnp.asarray(TABLE_Y)[(3 * x).astype(jnp.uint32)] * x,
+    "table of integers": lambda x: jnp.asarray([3, 1, 2, 7, 9, 11])[(3 * x).astype(int)] * x,
+    "table of booleans": lambda x: jnp.where(jnp.asarray(TABLE_Y > 0)[(3 * x).astype(int)], x, -x),
+    "table with infinity": lambda x: jnp.exp(-jnp.asarray([0.5, 1.0, np.inf])[(3 * x).astype(int)]) * x,
+    "map": bilinear,
+    "map_coordinates of two": lambda x: jax.scipy.ndimage.map_coordinates(
+        jnp.asarray(MAP), [3 * x, 2 * x[::-1]], order=1, mode="nearest"
+    ),
+    "histogram": lambda x: jnp.histogram(x, bins=np.array([-1.0, 0.0, 0.5, 1.5]))[0] * x,
+    "too many integers": lambda x: ((3 * x).astype(jnp.uint32) - 1) * x,
+    "too large a table": lambda x: jnp.interp(x, np.arange(200_000.0), np.arange(200_000.0)),
+    "too many states": lambda x: jnp.interp(x, jnp.arange(70.0) * (1 + x[0] ** 2), np.arange(70.0)),
+}
+
+
+def matrix(size):
+    """A matrix (size, size) with small entries on its diagonal, so that rows have to be exchanged."""
+    first, second, third = np.random.default_rng(size).normal(size=(3, size, size))
+    np.fill_diagonal(first, 0.01)
+    return lambda x: first + x[0] * second + jnp.sin(x[1]) * x[2] * third
+
+
+def positive(size):
+    return lambda x: matrix(size)(x) @ matrix(size)(x).T + jnp.eye(size)
+
+
+def right(size):
+    return np.random.default_rng(size + 100).normal(size=size)
+
+
+def banded(x):
+    """A matrix of which the structure says where pivots are."""
+    return jnp.array([[0.0, x[0], 0.0], [2.0, 0.0, 0.0], [0.0, x[1], 1.0 + x[2] ** 2]])
+
+
+MATRICES: dict[str, Function] = {
+    **{f"solve {n}": lambda x, n=n: jnp.linalg.solve(matrix(n)(x), right(n) * x[1]) for n in range(1, 7)},
+    **{f"inv {n}": lambda x, n=n: jnp.linalg.inv(matrix(n)(x)) for n in range(1, 6)},
+    **{f"det {n}": lambda x, n=n: jnp.linalg.det(matrix(n)(x)) * x for n in range(1, 7)},
+    **{f"slogdet {n}": lambda x, n=n: jnp.stack(jnp.linalg.slogdet(matrix(n)(x))) for n in range(1, 7)},
+    **{f"cholesky {n}": lambda x, n=n: jnp.linalg.cholesky(positive(n)(x)) for n in (1, 2, 3, 4, 5)},
+    **{
+        f"positive definite system {n}": lambda x, n=n: jax.scipy.linalg.solve(
+            positive(n)(x), right(n) * x[0], assume_a="pos"
+        )
+        for n in (1, 2, 4, 5, 6)
+    },
+    "cholesky 7": lambda x: jnp.linalg.cholesky(positive(7)(x))[-1],
+    "upper cholesky": lambda x: jax.scipy.linalg.cholesky(positive(3)(x)),
+    "cholesky of an indefinite matrix": lambda x: jnp.linalg.cholesky(matrix(3)(x)),
+    "cho_solve": lambda x: jax.scipy.linalg.cho_solve((jnp.diag(x + 2.0) + A, True), x),
+    "solve of a singular matrix": lambda x: jnp.linalg.solve(
+        jnp.array([[1.0, 2.0], [2.0, 4.0]]) * (1.0 + jnp.floor(jnp.abs(x[0]))), x[:2]
+    ),
+    "solve of several": lambda x: jnp.linalg.solve(matrix(3)(x), A * x),
+    "solve of a batch": lambda x: jnp.linalg.solve(jnp.stack([matrix(3)(x), matrix(3)(2 * x)]), (A * x)[:2, :, None]),
+    "solve in vmap": lambda x: jax.vmap(lambda s: jnp.linalg.solve(matrix(3)(s * x), x))(np.array([1.0, 2.0])),
+    "solve with structure": lambda x: jnp.linalg.solve(banded(x + 2.0), x),
+    "solve with a known matrix of 10": lambda x: jnp.linalg.solve(matrix(10)(np.ones(3)), right(10) * x[0]),
+    "solve_triangular": lambda x: jax.scipy.linalg.solve_triangular(matrix(4)(x) + jnp.eye(4), right(4) * x[0]),
+    "solve_triangular, lower": lambda x: jax.scipy.linalg.solve_triangular(A * x, x, lower=True, trans=1),
+    "solve_triangular, unit diagonal": lambda x: jax.scipy.linalg.solve_triangular(A * x, x, unit_diagonal=True),
+    "triangular_solve from the right": lambda x: lax.linalg.triangular_solve(A * x, A, left_side=False, lower=True),
+    "lu_factor": lambda x: jax.scipy.linalg.lu_factor(matrix(3)(x))[0],
+    "lu": lambda x: jnp.stack(jax.scipy.linalg.lu(matrix(3)(x))),
+    "lu of zeros": lambda x: lax.linalg.lu(matrix(3)(x) * jnp.array([0.0, 1.0, 1.0]))[0],
+}
+
+random_values = np.random.default_rng(5).normal(size=(16, 3))
+
+
+def some(count):
+    """As many numbers, with equal ones among them where the state has such."""
+    return lambda x: jnp.concatenate([x, random_values @ x])[:count]
+
+
+ORDER: dict[str, Function] = {
+    **{f"sort {n}": lambda x, n=n: jnp.sort(some(n)(x)) for n in (2, 5, 8, 16, 17)},
+    **{f"argsort {n}": lambda x, n=n: some(n)(x)[jnp.argsort(some(n)(x))] * jnp.argsort(-some(n)(x)) for n in (2, 8)},
+    "sort descending": lambda x: jnp.sort(x, descending=True),
+    "sort with NaN": lambda x: jnp.sort(jnp.where(x > 0.5, x, jnp.nan)),
+    "sort of rows": lambda x: jnp.sort(jnp.outer(x, np.array([1.0, -1.0, 2.0])), axis=0),
+    "sort of integers": lambda x: jnp.sort((3 * x).astype(int)) * x,
+    "sort of booleans": lambda x: jnp.sort(x > 0.5) * x,
+    "sort of pairs": lambda x: lax.sort((jnp.floor(2 * x), x * np.arange(3.0)))[1],
+    "lexsort": lambda x: x[jnp.lexsort((x, jnp.floor(x)))],
+    "sort by two keys": lambda x: lax.sort((jnp.floor(x), -x, x * np.arange(3.0)), num_keys=2)[2],
+    "median 5": lambda x: jnp.median(some(5)(x)),
+    "percentile": lambda x: jnp.percentile(some(6)(x), 40.0),
+    "quantile by the state": lambda x: jnp.quantile(some(6)(x), jax.nn.sigmoid(x[0])),
+    "nanmedian": lambda x: jnp.nanmedian(jnp.where(x > 0.5, x, jnp.nan)),
+    "top_k 4": lambda x: lax.top_k(some(6)(x), 4)[0] * lax.top_k(some(6)(x), 4)[1],
+    "top_k with NaN": lambda x: lax.top_k(jnp.where(x > 0.5, x, jnp.nan), 2)[0],
+    "argpartition": lambda x: x[jnp.argpartition(x, 1)],
+    "largest by its place": lambda x: x[jnp.argmax(x)],
+    "entry of a matrix by places": lambda x: jnp.outer(x, x)[jnp.argmin(x), jnp.argmax(-x)] * x,
 }
 
 LOOPS: dict[str, Function] = {
@@ -375,6 +558,7 @@ LOOPS: dict[str, Function] = {
     "jacobian inside": lambda x: jax.jacfwd(lambda y: y**2)(x),
     "jvp inside": lambda x: jax.jvp(jnp.sin, (x,), (x,))[1],
     "linearize": lambda x: jax.linearize(jnp.sin, x)[1](x),
+    "fori_loop with an index": lambda x: lax.fori_loop(0, 4, lambda i, y: y + x[(i + jnp.argmax(x)) % 3], 0.0) * x,
     "custom_root": lambda x: lax.custom_root(
         lambda y: y**3 + y - x, x, lambda f, y: newton(x), lambda g, y: y / g(jnp.ones(3))
     ),
@@ -397,6 +581,7 @@ SPECIAL: dict[str, Function] = {
     },
     "nn.glu": lambda x: nn.glu(jnp.concatenate([x, x[:1]])),
     "nn.one_hot": lambda x: nn.one_hot(1, 3) * x,
+    "nn.one_hot by the state": lambda x: nn.one_hot(jnp.argmax(x), 3) * x,
     "nn.gelu exact": lambda x: nn.gelu(x, approximate=False),
     "erf": special.erf,
     "erfc": special.erfc,
@@ -442,6 +627,9 @@ FUNCTIONS: dict[str, Function] = {
         ("decisions", DECISIONS),
         ("arrays", ARRAYS),
         ("places", PLACES),
+        ("tables", TABLES),
+        ("matrices", MATRICES),
+        ("order", ORDER),
         ("loops", LOOPS),
         ("special", SPECIAL),
     )
@@ -454,47 +642,29 @@ FALLS_BACK = {
     "rounding: copysign": "calls jnp.copysign",
     "rounding: signbit": "calls jnp.signbit",
     "decisions: mean of booleans": "converts what depends on the state to float32",
-    "decisions: integer division": "calls jnp.floor_divide, which does integer arithmetic (div)",
-    "decisions: integer remainder": "calls jnp.remainder, which does integer arithmetic (rem)",
     "decisions: bits": "does integer arithmetic (and) with what depends on the state",
     "decisions: shift": "does integer arithmetic (shift_left) with what depends on the state",
-    "decisions: unsigned integers": "converts what depends on the state to uint32",
-    "decisions: integer powers": "does integer arithmetic (integer_pow) with what depends on the state",
-    "decisions: large integers": "does integer arithmetic with what depends on the state",
-    "decisions: truncated": "converts what depends on the state to int64",
-    "arrays: inv": "calls jnp.linalg.inv",
-    "arrays: solve": "calls jnp.linalg.solve",
-    "arrays: solve with a known matrix": "calls jnp.linalg.solve",
-    "arrays: cholesky": "calls jnp.linalg.cholesky",
     "arrays: eigh": "calls jnp.linalg.eigh",
     "arrays: svd": "calls jnp.linalg.svd",
     "arrays: qr": "calls jnp.linalg.qr",
-    "arrays: expm": "calls jax.scipy.linalg.expm",
+    "arrays: expm": "calls jax.scipy.linalg.expm, which takes more than 10000 operations",
     "arrays: cumlogsumexp": "calls jax.lax.cumlogsumexp",
     "arrays: convolve": "calls jnp.convolve",
     "arrays: correlate": "calls jnp.correlate",
-    "arrays: sort": "calls jnp.sort",
-    "arrays: argsort": "calls jnp.argsort, which does integer arithmetic (sort) with what depends on the state",
-    "arrays: argmax": "takes an index that depends on the state",
-    "arrays: median": "calls jnp.median",
-    "arrays: quantile": "calls jnp.quantile",
-    "arrays: top_k": "calls jax.lax.top_k",
-    "arrays: searchsorted": "calls jnp.searchsorted",
-    "arrays: interp": "calls jnp.interp",
-    "arrays: map_coordinates": "calls map_coordinates, which converts what depends on the state to int32",
     "arrays: fft": "calls jnp.fft, which converts what depends on the state to complex128",
     "arrays: complex": "converts what depends on the state to complex128",
-    "places: at multiply": "calls jax.lax.scatter-mul",
-    "places: at max": "calls jax.lax.scatter-max",
-    "places: at get with a fill": "takes an index out of range",
-    "places: index out of range": "takes an index out of range",
-    "places: take_along_axis": "calls jnp.take_along_axis, which takes indices in batches",
-    "places: boolean index": "takes an index that depends on the state",
-    "places: dynamic_slice by the state": "takes an index that depends on the state",
+    "tables: too large a table": "calls jnp.interp, which searches a table of 200000 entries (limit: 100000)",
+    "tables: too many states": "calls jnp.interp, which searches 70 numbers that depend on the state (limit: 64)",
+    "matrices: solve 6": "calls jnp.linalg.solve, which works with a matrix of 6 rows (limit: 5)",
+    "matrices: det 6": "calls jnp.linalg.det, which works with a matrix of 6 rows (limit: 5)",
+    "matrices: slogdet 6": "calls jnp.linalg.slogdet, which works with a matrix of 6 rows (limit: 5)",
+    "matrices: cholesky 7": "calls jnp.linalg.cholesky, which works with a matrix of 7 rows (limit: 6)",
+    "matrices: positive definite system 6": "takes more than 10000 operations",
+    "order: sort 17": "calls jnp.sort, which sorts 17 numbers that depend on the state (limit: 16)",
     "loops: known while": "cannot be traced with its derivatives: ValueError",
     "loops: while": "cannot be traced with its derivatives: ValueError",
     "loops: fori_loop as long as the state says": "cannot be traced with its derivatives: ValueError",
-    "loops: long": "takes more than 50000 operations",
+    "loops: long": "takes more than 10000 operations",
     "loops: custom_vjp": "cannot be traced with its derivatives: TypeError",
     "loops: debug print": "calls jax.lax.debug_print",
     "loops: callback": "cannot be traced with its derivatives: ValueError",
@@ -519,6 +689,9 @@ FALLS_BACK = {
 }
 """Functions that JAX has to evaluate, and why."""
 
+LEFT_AT_SOME_POINTS = ("decisions: large integers", "tables: too many integers")
+"""Functions with integers that leave their type: JAX evaluates the points where they do."""
+
 ZERO_TIMES_INFINITY = (
     "arithmetic: divide",
     "arithmetic: divide by itself",
@@ -538,6 +711,9 @@ ZERO_TIMES_INFINITY = (
     "elementary: rsqrt",
     "elementary: sqrt",
     "elementary: unguarded sqrt",
+    "matrices: solve of a singular matrix",
+    "matrices: solve_triangular, lower",
+    "matrices: triangular_solve from the right",
     "special: bessel_jn",
 )
 """Functions of which JAX says NaN for an entry of a derivative that is 0: a tangent of 0 times an infinite slope."""

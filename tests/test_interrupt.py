@@ -151,7 +151,7 @@ WRONG = {
     "grows": lambda t, x, p: 50.0 * p["a"] * x**3,
 }
 
-NO_SCALAR_FORM = {name: (lambda t, x, p, f=f: jnp.sort(f(t, x, p))) for name, f in WRONG.items()}
+NO_SCALAR_FORM = {name: (lambda t, x, p, f=f: jnp.copysign(f(t, x, p), f(t, x, p))) for name, f in WRONG.items()}
 
 SCRIPT = """
 import sys, warnings

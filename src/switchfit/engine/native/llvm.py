@@ -20,6 +20,7 @@ from typing import Any
 import llvmlite
 import llvmlite.binding as llvm
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.engine.native.scalars import LOGIC, Node, needed
 from switchfit.runtime.cache import read_code, usable_folder, write_code
@@ -29,6 +30,7 @@ INTRINSICS = {
     "abs": "fabs",
     "floor": "floor",
     "ceil": "ceil",
+    "trunc": "trunc",
     "rint": "rint",
     "round": "round",
     "max": "maximum",
@@ -45,7 +47,7 @@ FROM_LIBM = {
 }
 """Functions of the C library."""
 
-EFFORT = {"div": 4, "sqrt": 4, **dict.fromkeys(FROM_LIBM, 20)}
+EFFORT = {"div": 4, "sqrt": 4, "lookup": 3, **dict.fromkeys(FROM_LIBM, 20)}
 """What operations cost where it is not about as much as an addition."""
 
 BUDGET = 20_000_000
@@ -153,6 +155,12 @@ class _Writer:
             return "<" + ", ".join(entries) + ">"
         if op == "zeros":
             return "zeroinitializer"
+        if op == "table":
+            return self._table(args[0].values)
+        if op == "lookup":
+            index = self.emit(f"fptosi double {self.value(args[1])} to i64")
+            address = self.emit(f"getelementptr inbounds double, ptr {self.value(args[0])}, i64 {index}")
+            return self.emit(f"load double, ptr {address}, align 8")
         kind = self._type(node)
         a = [self._as(argument, node.vector) for argument in args]
         if op in BINARY:
@@ -171,6 +179,14 @@ class _Writer:
         memory = "" if op in INTRINSICS else " memory(none) nounwind willreturn"
         self.module.declare(name, f"declare double @{name}({types}){memory}")
         return self.emit(f"call double @{name}({given})")
+
+    def _table(self, values: NDArray[np.float64]) -> str:
+        """The name of a constant array, which the functions of a module share."""
+        name = f"table.{hashlib.sha256(values.tobytes()).hexdigest()[:16]}"
+        entries = ", ".join(f"double {literal(value)}" for value in values.tolist())
+        kind = f"[{len(values)} x double]"
+        self.module.declare(name, f"@{name} = private unnamed_addr constant {kind} [{entries}], align 8")
+        return f"@{name}"
 
     def store(self, pointer: str, offset: int, node: Node) -> None:
         if node.truth:

@@ -41,6 +41,7 @@ FOLDED: dict[str, Callable[..., Any]] = {
     "abs": abs,
     "floor": np.floor,
     "ceil": np.ceil,
+    "trunc": np.trunc,
     "rint": np.rint,
     "round": lambda a: np.copysign(np.floor(abs(a)) + (abs(a) - np.floor(abs(a)) >= 0.5), a),
     "sqrt": np.sqrt,
@@ -82,11 +83,31 @@ COMPARISONS = ("lt", "le", "eq", "ne")
 LOGIC = ("and", "or", "xor", "not")
 """From truth values to a truth value."""
 
+WHOLE = ("floor", "ceil", "rint", "round", "trunc")
+"""From a double to an integer, as a double."""
+
 COMMUTATIVE = ("add", "mul", "eq", "ne", "and", "or", "xor", "max", "min")
 
 
 CHECKED = "check"
 """Pointer to what is not a number once a presumption was wrong."""
+
+
+class Table:
+    """Constant numbers in memory; equal ones are one."""
+
+    __slots__ = ("_key", "values")
+
+    def __init__(self, values: NDArray[np.float64]) -> None:
+        self.values = np.array(values, dtype=np.float64)
+        self.values.flags.writeable = False
+        self._key = self.values.tobytes()
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Table) and other._key == self._key
 
 
 class Node:
@@ -95,8 +116,8 @@ class Node:
     Attributes
     ----------
     index : its place in the graph, after those of its arguments
-    op : an operation of `FOLDED`, "const" or "load"
-    args : its arguments; the number of a constant; (pointer, offset) of what is loaded
+    op : an operation of `FOLDED`, "const", "load", "table" (numbers in memory) or "lookup" (one of them)
+    args : its arguments; the number of a constant; (pointer, offset) of what is loaded; the `Table`; (table, index)
     vector, truth : whether it is a vector; whether it is a truth value, else it is a double or doubles
     """
 
@@ -192,6 +213,18 @@ class Graph:
         """Neighbours in memory: (count,)."""
         return as_objects([self.load(pointer, offset + k, vector) for k in range(count)])
 
+    def lookup(self, table: NDArray[np.float64], index: Node) -> Node:
+        """Return the entry of a constant table (K,) at an index that is an integer from 0 to K - 1.
+
+        The caller makes sure that it is: machine code reads the memory without another look.
+        """
+        constant = Table(table)
+        return self.apply("lookup", self._node("table", (constant,), False), index)
+
+    def require(self, condition: Node) -> None:
+        """Leave an evaluation to JAX where a truth value is false, by way of what is presumed finite."""
+        self.presume(self.apply("div", 1.0, self.apply("select", condition, 1.0, 0.0)))
+
     def unit(self, position: int) -> Node:
         """The vector with one 1."""
         return self._node("unit", (position,), True)
@@ -221,6 +254,10 @@ class Graph:
             if each.index in self._finite or each.op in ("const", "load", "unit", "zeros") or each.truth:
                 continue
             self._finite.add(each.index)
+            if each.op == "lookup":  # at an index, which is finite
+                if not np.isfinite(each.args[0].args[0].values).all():
+                    self.presumed[each.index] = each
+                continue
             if each.op in MAY_FAIL and not (each.op == "div" and each.args[1].number):
                 if each.vector:  # a vector divided by a scalar
                     self.presume(self.apply("div", 1.0, each.args[1]))
@@ -276,6 +313,32 @@ class Graph:
                 return args[1] if args[0].number else args[2]
             if args[1] is args[2]:
                 return args[1]
+            if self._is_zero_in_any_case(*args):
+                return args[2]
+        elif op == "trunc" and a.op in WHOLE:
+            return a
+        elif op == "lookup":
+            if b.number is not None:
+                return self.constant(a.args[0].values[int(b.number)])
+        elif op in COMPARISONS and (a.op == "lookup" or b.op == "lookup"):
+            return self._compared_table(op, a, b)
+        return None
+
+    def _is_zero_in_any_case(self, condition: Node, yes: Node, no: Node) -> bool:
+        """Return whether 0.0 is chosen in place of an entry of a table that is 0.0 already, and never -0.0."""
+        if no.op != "lookup" or yes.number != 0.0 or condition.op != "eq" or no not in condition.args:
+            return False
+        table = no.args[0].args[0].values
+        return condition.args[1 - condition.args.index(no)].number == 0.0 and not np.signbit(table[table == 0.0]).any()
+
+    def _compared_table(self, op: str, a: Node, b: Node) -> Node | None:
+        """Return what is true of all entries of a table: that none is NaN, or below a number."""
+        if a is b or (a.op == b.op and a.args[1] is b.args[1]) or "const" in (a.op, b.op):
+            sides = [node.args[0].args[0].values if node.op == "lookup" else node.number for node in (a, b)]
+            if np.size(sides[0]) == np.size(sides[1]) or 1 in map(np.size, sides):
+                found = FOLDED[op](*sides)
+                if found.all() or not found.any():
+                    return self.constant(bool(found.all()))
         return None
 
     def _node(self, op: str, args: tuple[Any, ...], vector: bool, key: tuple[Any, ...] | None = None) -> Node:
@@ -349,7 +412,9 @@ class Template:
                 made[node.index] = value if isinstance(value, Node) else graph.constant(value)
             elif node.op == "const":
                 made[node.index] = graph.constant(node.args[0])
-            else:
+            elif node.op == "lookup":
+                made[node.index] = graph.lookup(node.args[0].args[0].values, made[node.args[1].index])
+            elif node.op != "table":
                 made[node.index] = graph.apply(node.op, *(made[a.index] for a in node.args))
         for node in presumed:
             graph.presume(made[node.index])

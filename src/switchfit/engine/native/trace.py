@@ -4,16 +4,14 @@ JAX has differentiated by then; what happens here is bookkeeping. Whatever moves
 so on) leaves no trace. What has no meaning here (loops of unknown length, random numbers, solvers) raises
 `Unsupported`.
 
-An array is a NumPy array of numbers where all its entries are known, else an object array. Its entries are then Python
-numbers, nodes (doubles, or truth values if the array is boolean), or, if the array is one of integers, `Integer`.
+An array is a NumPy array of numbers where all its entries are known, else an object array of what `entries` says.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cache, partial, reduce
 from typing import Any
 
@@ -21,30 +19,18 @@ import jax
 import numpy as np
 from jax._src import source_info_util
 
-from switchfit.engine.native.scalars import COMPARISONS, FOLDED, LOGIC, Graph, Node, Objects, Template, as_objects
+from switchfit.engine.native.entries import Integer, Unsupported, choose, is_traced, less
+from switchfit.engine.native.indexing import added, dynamic_slice, dynamic_update_slice, gather, scatter
+from switchfit.engine.native.integers import OF_INTEGERS, from_double, invert
+from switchfit.engine.native.matrices import MATRICES
+from switchfit.engine.native.scalars import FOLDED, LOGIC, Graph, Node, Objects, Template, as_objects
+from switchfit.engine.native.sorting import SORTING, compare_in_order, search
+
+__all__ = ["Unsupported", "traced"]
 
 
-class Unsupported(Exception):  # noqa: N818  # control flow, not an error: the caller falls back to JAX
-    """A function that cannot be written as a straight line of scalars.
-
-    Attributes
-    ----------
-    what : str
-        What it does, as the rest of a sentence that begins with the function: "calls jnp.sort".
-    where : str or None
-        File and line of the user's code, if known.
-    """
-
-    def __init__(self, what: str, where: str | None = None) -> None:
-        super().__init__(what, where)
-        self.what, self.where = what, where
-
-    def __str__(self) -> str:
-        return self.what if self.where is None else f"{self.what} ({self.where})"
-
-
-MOST_NODES = 50_000
-"""Operations of one function beyond which compiling them one by one takes too long."""
+MOST_NODES = 10_000
+"""Operations of one function beyond which compiling takes too long: at this size 20 s, and the time grows faster."""
 
 MOST_TURNS = 100_000
 """Turns of a loop beyond which it is not followed."""
@@ -116,7 +102,9 @@ def _located(error: Unsupported, equation: Any) -> Unsupported:
     inner = equation.params.get("jaxpr") if equation.primitive.name in ("jit", "pjit") else None
     name = None if inner is None else _public_name(inner.jaxpr)
     if name is not None:
-        more = "" if error.what.startswith("calls ") else f", which {error.what}"
+        calls, _, why = error.what.partition(", which ")
+        why = why if calls.startswith("calls ") else error.what
+        more = f", which {why}" if why else ""
         return Unsupported(f"calls {name}{more}", _line_of(equation))
     return Unsupported(error.what, error.where or _line_of(equation))
 
@@ -171,13 +159,16 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
     known = all(a.dtype != object for a in args)
     if name in CALLS:
         inner = params[CALLS[name]]
+        if not known and _is_search(equation):
+            places = search(graph, args[0], args[1], right="lt_to" in _primitives(inner.jaxpr))
+            return [np.asarray(places, dtype=object)]
         if hasattr(inner, "consts"):
             return _run(graph, inner.jaxpr, inner.consts, args)
         return _run(graph, inner, (), args)
     if known and name in INDEXED:  # rows of tangents: XLA would take 60 ms to compile each
         with suppress(Unsupported):
             dtype = equation.outvars[0].aval.dtype
-            return [np.asarray(INDEXED[name](equation, *args)).astype(dtype)]
+            return [np.asarray(INDEXED[name](graph, equation, *args)).astype(dtype)]
     if known and name not in MOVES and name not in NUMPY:
         return _evaluated(equation, args)
     if name in LOOPS:
@@ -190,10 +181,13 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
         if name == "convert_element_type" and args[0].dtype.kind == "f" and dtype.kind in "iu":
             return _evaluated(equation, args)  # NumPy and JAX differ where a number does not fit
         return [np.asarray(NUMPY[name](params, *args)).astype(dtype).reshape(shapes[0])]
+    if name in WRITTEN_OUT:
+        for variable in equation.invars:
+            _check_type(variable.aval.dtype)
+        return [np.asarray(a, dtype=object) for a in WRITTEN_OUT[name](graph, equation, *args)]
     if name in INDEXED:
-        if any(a.dtype == object for a in args[1:2]):
-            raise Unsupported("takes an index that depends on the state")
-        return [np.asarray(INDEXED[name](equation, *args), dtype=object)]
+        _check_type(equation.outvars[0].aval.dtype)
+        return [np.asarray(INDEXED[name](graph, equation, *args), dtype=object)]
     if name in ARRAYS:
         return [np.asarray(ARRAYS[name](graph, equation, *args), dtype=object)]
     meaning = _meaning(graph, name, params, equation.invars[-1].aval.dtype)
@@ -209,15 +203,43 @@ def _evaluated(equation: Any, args: list[Any]) -> list[Any]:
 
 def _meaning(graph: Graph, name: str, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
     """What an operation does to entries of arrays of a type."""
-    tables = {"f": MEANINGS, "b": OF_TRUTH, "i": OF_INTEGERS}
-    if dtype.kind not in tables or (dtype.kind == "f" and dtype != np.float64):
-        raise Unsupported(f"has numbers of type {dtype} that depend on the state")
-    table = tables[dtype.kind]
+    _check_type(dtype)
+    if dtype.kind in "iu":
+        if name in OF_INTEGERS:
+            return OF_INTEGERS[name](graph, params, dtype)
+        if name == "select_n":
+            return _select(graph, params)
+        raise Unsupported(f"does integer arithmetic ({name}) with what depends on the state")
+    table = MEANINGS if dtype.kind == "f" else OF_TRUTH
     if name in table:
         return table[name](graph, params)
-    if dtype.kind == "i":
-        raise Unsupported(f"does integer arithmetic ({name}) with what depends on the state")
     raise Unsupported(f"calls {OTHER_NAMES.get(name, f'jax.lax.{name}')}")
+
+
+def _check_type(dtype: np.dtype[Any]) -> None:
+    if dtype.kind not in "fbiu" or (dtype.kind == "f" and dtype != np.float64):
+        raise Unsupported(f"has numbers of type {dtype} that depend on the state")
+
+
+def _is_search(equation: Any) -> bool:
+    """Whether JAX searches one sorted array with a loop, as `jnp.interp` does as well.
+
+    Behind the array and the numbers come tangents, which an index does not depend on.
+    """
+    if equation.params.get("name") != "_searchsorted_scan_impl" or len(equation.invars) < 2:
+        return False
+    table, query = (variable.aval for variable in equation.invars[:2])
+    sides = {"lt_to", "le_to"} & set(_primitives(equation.params["jaxpr"].jaxpr))
+    types = table.dtype == query.dtype == np.float64 and len(equation.outvars) == len(sides) == 1
+    return bool(types and table.ndim == 1 and equation.outvars[0].aval.shape == query.shape)
+
+
+def _primitives(jaxpr: Any) -> Iterator[str]:
+    for equation in jaxpr.eqns:
+        yield equation.primitive.name
+        for value in equation.params.values():
+            if hasattr(value, "jaxpr"):
+                yield from _primitives(value.jaxpr)
 
 
 OTHER_NAMES = {"while": "jax.lax.while_loop", "eigh": "jnp.linalg.eigh", "eig": "jnp.linalg.eig", "fft": "jnp.fft"}
@@ -273,13 +295,27 @@ def _cond(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
         return branches[int(np.clip(choice, 0, len(branches) - 1))]()
     results, *others = (branch() for branch in branches)
     for k, values in enumerate(others, start=1):
-        beyond = choice if isinstance(choice, Node) else graph.apply("le", float(k), choice.node)
-        select = np.frompyfunc(partial(_either, graph, beyond), 2, 1)
+        beyond = choice if isinstance(choice, Node) else invert(graph, less(graph, choice, k))
+        select = np.frompyfunc(partial(choose, graph, beyond), 2, 1)
         results = [np.asarray(select(yes, no), dtype=object) for yes, no in zip(values, results, strict=True)]
     return results
 
 
-LOOPS: dict[str, Callable[[Graph, Any, list[Any]], list[Any]]] = {"scan": _scan, "while": _while, "cond": _cond}
+def _linear_solve(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
+    """A linear system, by the solver that comes with it; its derivatives have been taken before."""
+    lengths, jaxprs = equation.params["const_lengths"], equation.params["jaxprs"]
+    before = lengths.matvec + lengths.vecmat
+    right = before + lengths.solve + (lengths.transpose_solve if jaxprs.transpose_solve is not None else 0)
+    solve = jaxprs.solve
+    return _run(graph, solve.jaxpr, solve.consts, [*args[before : before + lengths.solve], *args[right:]])
+
+
+LOOPS: dict[str, Callable[[Graph, Any, list[Any]], list[Any]]] = {
+    "scan": _scan,
+    "while": _while,
+    "cond": _cond,
+    "custom_linear_solve": _linear_solve,
+}
 
 CALLS = {
     "jit": "jaxpr",
@@ -325,23 +361,6 @@ def _pad(params: Any, a: Any, value: Any) -> Any:
     ]
 
 
-def _dynamic_slice(params: Any, a: Any, *starts: Any) -> Any:
-    if any(s.dtype == object for s in starts):
-        raise Unsupported("takes an index that depends on the state")
-    sizes = params["slice_sizes"]
-    first = [int(np.clip(s, 0, n - size)) for s, n, size in zip(starts, a.shape, sizes, strict=True)]
-    return a[tuple(slice(f, f + size) for f, size in zip(first, sizes, strict=True))]
-
-
-def _dynamic_update_slice(params: Any, a: Any, update: Any, *starts: Any) -> Any:
-    if any(s.dtype == object for s in starts):
-        raise Unsupported("takes an index that depends on the state")
-    first = [int(np.clip(s, 0, n - size)) for s, n, size in zip(starts, a.shape, update.shape, strict=True)]
-    result = a.astype(object if object in (a.dtype, update.dtype) else a.dtype)
-    result[tuple(slice(f, f + size) for f, size in zip(first, update.shape, strict=True))] = update
-    return result
-
-
 def _split(params: Any, a: Any) -> Any:
     return np.split(a, np.cumsum(params["sizes"])[:-1], axis=params["axis"])
 
@@ -353,8 +372,6 @@ MOVES: dict[str, Callable[..., Any]] = {
     "expand_dims": lambda params, a: np.expand_dims(a, tuple(params["dimensions"])),
     "transpose": lambda params, a: np.transpose(a, params["permutation"]),
     "slice": _slice,
-    "dynamic_slice": _dynamic_slice,
-    "dynamic_update_slice": _dynamic_update_slice,
     "concatenate": lambda params, *a: np.concatenate(a, axis=params["dimension"]),
     "pad": _pad,
     "rev": lambda params, a: np.flip(a, params["dimensions"]),
@@ -409,6 +426,8 @@ def _convert_number(graph: Graph, params: Any) -> Callable[[Any], Any]:
         return lambda a: a
     if kind.kind == "b":
         return lambda a: graph.apply("ne", a, 0.0)
+    if kind.kind in "iu":
+        return from_double(graph, kind)
     raise Unsupported(f"converts what depends on the state to {kind}")
 
 
@@ -434,21 +453,13 @@ def _select(graph: Graph, params: Any) -> Callable[..., Any]:
         if not isinstance(which, Node | Integer):
             return cases[int(which)]
         if isinstance(which, Node):
-            return _either(graph, which, cases[1], cases[0])
+            return choose(graph, which, cases[1], cases[0])
         result = cases[0]
         for k, case in enumerate(cases[1:], start=1):
-            result = _either(graph, graph.apply("le", float(k), which.node), case, result)
+            result = choose(graph, less(graph, which, k), result, case)
         return result
 
     return select
-
-
-def _either(graph: Graph, condition: Node, yes: Any, no: Any) -> Any:
-    """One of two numbers, truth values or integers."""
-    if isinstance(yes, Integer) or isinstance(no, Integer) or (_is_known_integer(yes) and _is_known_integer(no)):
-        one, other = Integer.of(graph, yes), Integer.of(graph, no)
-        return Integer(graph.apply("select", condition, one.node, other.node), max(one.bound, other.bound))
-    return graph.apply("select", condition, yes, no)
 
 
 def _round(graph: Graph, params: Any) -> Callable[[Any], Any]:
@@ -481,6 +492,8 @@ MEANINGS: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
     "sign": _sign,
     "round": _round,
     "clamp": lambda graph, params: lambda low, a, high: graph.apply("min", graph.apply("max", a, low), high),
+    "lt_to": lambda graph, params: partial(compare_in_order, graph, "lt"),
+    "le_to": lambda graph, params: partial(compare_in_order, graph, "le"),
     "is_finite": lambda graph, params: lambda a: graph.apply("eq", a - a, 0.0),
 }
 """Operations on each entry of arrays of doubles."""
@@ -499,8 +512,8 @@ def _convert_truth(graph: Graph, params: Any) -> Callable[[Any], Any]:
         return lambda a: a
     if kind == np.float64:
         return lambda a: graph.apply("select", a, 1.0, 0.0)
-    if kind.kind == "i":
-        return lambda a: _either(graph, a, 1, 0) if isinstance(a, Node) else int(a)
+    if kind.kind in "iu":
+        return lambda a: choose(graph, a, 1, 0) if isinstance(a, Node) else int(a)
     raise Unsupported(f"converts what depends on the state to {kind}")
 
 
@@ -518,88 +531,6 @@ OF_TRUTH: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
     "select_n": _select,
 }
 """Operations on each entry of arrays of truth values."""
-
-
-# Integers
-
-
-@dataclass(frozen=True, slots=True)
-class Integer:
-    """An integer that depends on the state, as a double, and a bound on its size: below 2**53 doubles are exact."""
-
-    node: Node
-    bound: float
-
-    @classmethod
-    def of(cls, graph: Graph, value: Any) -> Integer:
-        """A known integer, or one that is such already."""
-        return value if isinstance(value, Integer) else cls(graph.constant(float(value)), abs(float(value)))
-
-
-def _is_known_integer(value: Any) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool)
-
-
-LARGEST_INTEGER = 2.0**31 - 1
-"""Bound beyond which integers that depend on the state are left to JAX: some types would overflow."""
-
-GROWTH: dict[str, Callable[..., float]] = {
-    "add": lambda a, b: a + b,
-    "sub": lambda a, b: a + b,
-    "mul": lambda a, b: a * b,
-    "neg": lambda a: a,
-    "abs": lambda a: a,
-    "max": max,
-    "min": max,
-}
-"""Bounds of results from bounds of arguments."""
-
-
-def _whole(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
-    def meaning(graph: Graph, params: Any) -> Callable[..., Any]:
-        def apply(*given: Any) -> Integer:
-            args = [Integer.of(graph, a) for a in given]
-            bound = GROWTH[op](*(a.bound for a in args))
-            if bound > LARGEST_INTEGER:
-                raise Unsupported("does integer arithmetic with what depends on the state")
-            return Integer(graph.apply(op, *(a.node for a in args)), bound)
-
-        return apply
-
-    return meaning
-
-
-def _clamped(graph: Graph, params: Any) -> Callable[..., Any]:
-    smaller, larger = (OF_INTEGERS[name](graph, params) for name in ("min", "max"))
-    return lambda low, a, high: smaller(larger(a, low), high)
-
-
-def _compared(name: str) -> Callable[[Graph, Any], Callable[..., Any]]:
-    def meaning(graph: Graph, params: Any) -> Callable[..., Any]:
-        compare = MEANINGS[name](graph, params)
-        return lambda a, b: compare(Integer.of(graph, a).node, Integer.of(graph, b).node)
-
-    return meaning
-
-
-def _convert_integer(graph: Graph, params: Any) -> Callable[[Any], Any]:
-    kind = np.dtype(params["new_dtype"])
-    if kind.kind == "i" and kind.itemsize >= 4:
-        return lambda a: a
-    if kind in (np.float64, bool):
-        convert = _convert_number(graph, params)
-        return lambda a: convert(Integer.of(graph, a).node)
-    raise Unsupported(f"converts what depends on the state to {kind}")
-
-
-OF_INTEGERS: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
-    **{op: _whole(op) for op in GROWTH},
-    **{name: _compared(name) for name in (*COMPARISONS, "gt", "ge")},
-    "convert_element_type": _convert_integer,
-    "select_n": _select,
-    "clamp": _clamped,
-}
-"""Operations on each entry of arrays of integers."""
 
 
 # Whole arrays
@@ -669,7 +600,7 @@ def _first(name: str) -> Callable[..., Any]:
                 if dtype.kind == "f":
                     undefined = graph.apply("and", graph.apply("ne", value, value), graph.apply("eq", best, best))
                     better = graph.apply("or", better, undefined)
-                best, found = _either(graph, better, value, best), _either(graph, better, k, found)
+                best, found = choose(graph, better, value, best), choose(graph, better, k, found)
             return found
 
         rows = np.moveaxis(a, axis, -1)
@@ -697,51 +628,37 @@ ARRAYS: dict[str, Callable[..., Any]] = {
 """Operations on whole arrays."""
 
 
-def _windows(equation: Any, shape: tuple[int, ...], indices: Any, many: Any) -> Any:
-    """Pairs of places: a window of an array of a shape, and where it stands among `many` windows.
+def _scatter(name: str | None) -> Callable[..., Any]:
+    """A scatter that combines old entries with updates by an operation, or replaces them."""
 
-    As `jax.lax.gather` and `jax.lax.scatter` have it, for known indices.
-    """
-    numbers, params = equation.params["dimension_numbers"], equation.params
-    if equation.primitive.name == "gather":
-        inside, dropped, starts = numbers.offset_dims, numbers.collapsed_slice_dims, numbers.start_index_map
-        batched = numbers.operand_batching_dims
-        sizes = params["slice_sizes"]
-    else:
-        inside, dropped = numbers.update_window_dims, numbers.inserted_window_dims
-        starts, batched = numbers.scatter_dims_to_operand_dims, numbers.operand_batching_dims
-        lengths = iter([many[k] for k in inside])
-        sizes = [1 if k in (*dropped, *batched) else next(lengths) for k in range(len(shape))]
-    if batched:
-        raise Unsupported("takes indices in batches")
-    outside = [k for k in range(len(many)) if k not in inside]
-    for place in np.ndindex(*indices.shape[:-1]):
-        first = [0] * len(shape)
-        for axis, start in zip(starts, indices[place], strict=True):
-            first[axis] = int(start)
-        if any(f < 0 or f + size > n for f, size, n in zip(first, sizes, shape, strict=True)):
-            raise Unsupported("takes an index out of range")
-        window = tuple(f if k in dropped else slice(f, f + sizes[k]) for k, f in enumerate(first))
-        among: list[Any] = [slice(None)] * len(many)
-        for axis, k in zip(outside, place, strict=True):
-            among[axis] = k
-        yield window, tuple(among)
+    def scattered(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any) -> Any:
+        dtype = equation.outvars[0].aval.dtype
+
+        def apply(old: Any, update: Any) -> Any:
+            if name == "add" and not is_traced(old) and not is_traced(update):
+                return old + update
+            return _meaning(graph, str(name), {}, dtype)(old, update)
+
+        def combine(here: Any, old: Any, update: Any) -> Any:
+            return choose(graph, here, update if name is None else apply(old, update), old)
+
+        how = added(graph, apply, dtype.kind in "iu") if name == "add" else combine
+        return scatter(graph, equation, a, indices, updates, how)
+
+    return scattered
 
 
-def _gather(equation: Any, a: Any, indices: Any) -> Any:
-    result = np.empty(equation.outvars[0].aval.shape, dtype=object)
-    for window, among in _windows(equation, a.shape, indices, result.shape):
-        result[among] = a[window]
-    return result
+INDEXED: dict[str, Callable[..., Any]] = {
+    "gather": gather,
+    "dynamic_slice": dynamic_slice,
+    "dynamic_update_slice": dynamic_update_slice,
+    "scatter": _scatter(None),
+    "scatter-add": _scatter("add"),
+    "scatter-mul": _scatter("mul"),
+    "scatter-max": _scatter("max"),
+    "scatter-min": _scatter("min"),
+}
+"""Operations at indices."""
 
-
-def _scatter(equation: Any, a: Any, indices: Any, updates: Any) -> Any:
-    result = a.astype(object)
-    for window, among in _windows(equation, a.shape, indices, updates.shape):
-        added = equation.primitive.name == "scatter-add"
-        result[window] = result[window] + updates[among] if added else updates[among]
-    return result
-
-
-INDEXED: dict[str, Callable[..., Any]] = {"gather": _gather, "scatter-add": _scatter, "scatter": _scatter}
-"""Operations at known indices."""
+WRITTEN_OUT: dict[str, Callable[..., list[Any]]] = {**MATRICES, **SORTING}
+"""Operations that are loops in JAX, up to some size; each returns a list of arrays."""

@@ -1,0 +1,192 @@
+"""What the entries of a traced array are, and the choices among them that are made at run time.
+
+An entry is a Python number, a node (a double, or a truth value in an array of booleans), or an `Integer`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from switchfit.engine.native.scalars import Graph, Node
+
+
+class Unsupported(Exception):  # noqa: N818  # control flow, not an error: the caller falls back to JAX
+    """A function that cannot be written as a straight line of scalars.
+
+    Attributes
+    ----------
+    what : str
+        What it does, as the rest of a sentence that begins with the function: "calls jnp.sort".
+    where : str or None
+        File and line of the user's code, if known.
+    """
+
+    def __init__(self, what: str, where: str | None = None) -> None:
+        super().__init__(what, where)
+        self.what, self.where = what, where
+
+    def __str__(self) -> str:
+        return self.what if self.where is None else f"{self.what} ({self.where})"
+
+
+MOST_CHOICES = 64
+"""Entries that depend on the state among which an index chooses: each takes a comparison and a selection."""
+
+MOST_SELECTIONS = 4
+"""Known entries among which an index chooses by selections; more are looked up in memory."""
+
+MOST_ROWS_OF_TABLE = 100_000
+"""Known entries of a table in memory: it is written into the machine code, 2 MB of text for this size."""
+
+
+@dataclass(frozen=True, slots=True)
+class Integer:
+    """An integer that depends on the state.
+
+    Attributes
+    ----------
+    node : Node
+        Its value, as a double; it is finite, and never -0.0.
+    low, high : int
+        Between which it is, inclusive: far below 2**53, so that arithmetic with doubles is exact.
+    """
+
+    node: Node
+    low: int
+    high: int
+
+    @classmethod
+    def of(cls, graph: Graph, value: Any) -> Integer:
+        """Return a known integer, or a truth value, or what is an `Integer` already, as one."""
+        if isinstance(value, Integer):
+            return value
+        if isinstance(value, Node):
+            return cls(graph.apply("select", value, 1.0, 0.0), 0, 1)
+        return cls(graph.constant(float(value)), int(value), int(value))
+
+
+def is_traced(value: Any) -> bool:
+    """Return whether an entry is a node or an integer that depends on the state."""
+    return isinstance(value, Node | Integer)
+
+
+def _is_known_integer(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+
+
+def choose(graph: Graph, condition: Any, yes: Any, no: Any) -> Any:
+    """Return one of two entries of the same type; what the condition is may be known."""
+    if isinstance(condition, Node) and condition.number is not None:
+        condition = condition.number
+    if not isinstance(condition, Node):
+        return yes if condition else no
+    if isinstance(yes, Integer) or isinstance(no, Integer) or (_is_known_integer(yes) and _is_known_integer(no)):
+        one, other = Integer.of(graph, yes), Integer.of(graph, no)
+        node = graph.apply("select", condition, one.node, other.node)
+        return Integer(node, min(one.low, other.low), max(one.high, other.high))
+    return graph.apply("select", condition, yes, no)
+
+
+def less(graph: Graph, a: Any, b: Any) -> Any:
+    """Return whether a < b for integers, which may be known from their bounds."""
+    if not is_traced(a) and not is_traced(b):
+        return bool(a < b)
+    one, other = Integer.of(graph, a), Integer.of(graph, b)
+    if one.high < other.low:
+        return True
+    if one.low >= other.high:
+        return False
+    return graph.apply("lt", one.node, other.node)
+
+
+def equal(graph: Graph, a: Any, b: Any) -> Any:
+    """Return whether a == b for integers, which may be known from their bounds."""
+    if not is_traced(a) and not is_traced(b):
+        return bool(a == b)
+    one, other = Integer.of(graph, a), Integer.of(graph, b)
+    if one.high < other.low or other.high < one.low:
+        return False
+    if one.low == one.high == other.low == other.high:
+        return True
+    return graph.apply("eq", one.node, other.node)
+
+
+def both(graph: Graph, a: Any, b: Any) -> Any:
+    """Return whether both of two conditions hold; either may be known."""
+    if isinstance(a, Node) and isinstance(b, Node):
+        return graph.apply("and", a, b)
+    known, other = (b, a) if isinstance(a, Node) else (a, b)
+    return other if known else False
+
+
+def clamp(graph: Graph, index: Any, low: int, high: int) -> Any:
+    """Return an integer, moved into a range; an int if that is known."""
+    if not isinstance(index, Integer):
+        return min(max(int(index), low), high)
+    result: Any = index
+    if index.low < low:
+        result = choose(graph, less(graph, result, low), low, result)
+        result = Integer(result.node, low, max(index.high, low)) if isinstance(result, Integer) else result
+    if index.high > high and isinstance(result, Integer):
+        result = choose(graph, less(graph, high, result), high, result)
+        result = Integer(result.node, max(index.low, low), high) if isinstance(result, Integer) else result
+    if isinstance(result, Integer) and result.low == result.high:
+        return result.low
+    return int(result) if not isinstance(result, Integer) else result
+
+
+def pick(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
+    """Return the entry for the value of an index: the first one is for `index.low`, the last one for `index.high`.
+
+    Neighbours that are equal count as one, so that a row of zeros around a number takes two selections. Known numbers
+    are looked up in memory, where it takes as long for many as for few.
+    """
+    starts = [k for k in range(len(entries)) if k == 0 or not _is_same(entries[k - 1], entries[k])]
+    if len(starts) == 1:
+        return entries[0]
+    if len(starts) > MOST_SELECTIONS and not any(is_traced(e) and e_number(e) is None for e in entries):
+        return _looked_up(graph, [e_number(e) if is_traced(e) else e for e in entries], index)
+    if len(starts) > MOST_CHOICES:
+        raise Unsupported(
+            f"takes one of {len(starts)} numbers by an index that depends on the state (limit: {MOST_CHOICES})"
+        )
+
+    def chosen(runs: list[int]) -> Any:
+        if len(runs) == 1:
+            return entries[runs[0]]
+        middle = len(runs) // 2
+        before = less(graph, index, index.low + runs[middle])
+        return choose(graph, before, chosen(runs[:middle]), chosen(runs[middle:]))
+
+    return chosen(starts)
+
+
+def e_number(entry: Any) -> Any:
+    """Return the number that an entry is; None if it depends on the state."""
+    return entry.number if isinstance(entry, Node) else None
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    if one is other:
+        return True
+    if isinstance(one, Integer) or isinstance(other, Integer):
+        return isinstance(one, Integer) and isinstance(other, Integer) and one.node is other.node
+    one, other = (e.number if isinstance(e, Node) and e.number is not None else e for e in (one, other))
+    if isinstance(one, Node) or isinstance(other, Node):
+        return False
+    return bool((one == other and np.signbit(one) == np.signbit(other)) or (one != one and other != other))
+
+
+def _looked_up(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
+    if len(entries) > MOST_ROWS_OF_TABLE:
+        raise Unsupported(f"looks up numbers in a table of {len(entries)} entries (limit: {MOST_ROWS_OF_TABLE})")
+    node = graph.lookup(np.array(entries, dtype=float), index.node - float(index.low))
+    if all(isinstance(e, bool | np.bool_) for e in entries):
+        return graph.apply("ne", node, 0.0)
+    if all(_is_known_integer(e) for e in entries):
+        return Integer(node, int(min(entries)), int(max(entries)))
+    return node

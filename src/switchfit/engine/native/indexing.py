@@ -1,0 +1,211 @@
+"""Entries taken from arrays, and put into them, at indices that may depend on the state: gather, scatter and slices.
+
+Which entry it is, selections decide at run time (`entries.pick`). Indices out of range are treated as JAX does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+from jax.lax import GatherScatterMode
+
+from switchfit.engine.native.entries import (
+    MOST_CHOICES,
+    Integer,
+    Unsupported,
+    both,
+    choose,
+    clamp,
+    e_number,
+    equal,
+    is_traced,
+    less,
+    pick,
+)
+from switchfit.engine.native.integers import OF_INTEGERS, invert
+from switchfit.engine.native.scalars import Graph, Node, Objects, as_objects
+
+Combine = Callable[[Any, Any, Any], Any]
+"""(condition, old entry, update) -> new entry."""
+
+
+def take(graph: Graph, a: Any, starts: Sequence[Any], sizes: Sequence[int]) -> Any:
+    """Return a window of an array: (sizes); each start is in range, an int or an `Integer`."""
+    moving = [k for k, start in enumerate(starts) if isinstance(start, Integer)]
+    a = a[tuple(_reach(start, size) for start, size in zip(starts, sizes, strict=True))]
+    if len(moving) > 1 and not any(is_traced(e) and e_number(e) is None for e in a.reshape(-1)):
+        return _from_table(graph, a, [starts[k] for k in moving], moving, sizes)
+    for axis in moving:
+        rows = np.moveaxis(a, axis, 0)
+        window = np.empty((sizes[axis], *rows.shape[1:]), dtype=object)
+        for place in np.ndindex(*window.shape):
+            candidates = rows[(slice(place[0], place[0] + len(rows) - sizes[axis] + 1), *place[1:])]
+            window[place] = pick(graph, candidates.tolist(), starts[axis])
+        a = np.moveaxis(window, 0, axis)
+    return a
+
+
+def _reach(start: Any, size: int) -> slice:
+    """All places that a window may reach."""
+    return slice(start.low, start.high + size) if isinstance(start, Integer) else slice(start, start + size)
+
+
+def _from_table(graph: Graph, a: Any, starts: list[Integer], moving: list[int], sizes: Sequence[int]) -> Objects:
+    """A window of a known array that moves along several axes: one index into all candidates for each entry."""
+    multiply, add, subtract = (OF_INTEGERS[op](graph, {}, np.dtype(np.int64)) for op in ("mul", "add", "sub"))
+    spans = [start.high - start.low + 1 for start in starts]
+    index: Any = 0
+    for start, span in zip(starts, spans, strict=True):
+        index = add(multiply(index, span), subtract(start, start.low))
+    index = Integer(index.node, 0, int(np.prod(spans)) - 1)
+    window = np.empty(sizes, dtype=object)
+    for place in np.ndindex(*sizes):
+        reached = tuple(
+            slice(place[k], place[k] + spans[moving.index(k)]) if k in moving else place[k] for k in range(a.ndim)
+        )
+        window[place] = pick(graph, a[reached].reshape(-1).tolist(), index)
+    return window
+
+
+def put(graph: Graph, a: Objects, starts: Sequence[Any], window: Any, combine: Combine, condition: Any = True) -> None:
+    """Change a window of an array of objects in place, at starts that are in range where the condition holds."""
+    ranges = [range(s.low, s.high + 1) if isinstance(s, Integer) else (s,) for s in starts]
+    count = int(np.prod([len(r) for r in ranges]))
+    if count > MOST_CHOICES:
+        raise Unsupported(
+            f"changes one of {count} numbers at an index that depends on the state (limit: {MOST_CHOICES})"
+        )
+    for first in product(*ranges):
+        here = condition
+        for start, value in zip(starts, first, strict=True):
+            here = both(graph, here, equal(graph, start, value))
+        if here is False:
+            continue
+        for place in np.ndindex(*window.shape):
+            at = tuple(f + k for f, k in zip(first, place, strict=True))
+            a[at] = combine(here, a[at], window[place])
+
+
+def dynamic_slice(graph: Graph, equation: Any, a: Any, *starts: Any) -> Any:
+    """As `jax.lax.dynamic_slice`: a window that does not fit is moved inside."""
+    sizes = equation.params["slice_sizes"]
+    return take(graph, a, _moved_inside(graph, starts, a.shape, sizes), sizes)
+
+
+def dynamic_update_slice(graph: Graph, equation: Any, a: Any, update: Any, *starts: Any) -> Any:
+    """As `jax.lax.dynamic_update_slice`."""
+    result = a.astype(object)
+    inside = _moved_inside(graph, starts, a.shape, update.shape)
+    put(graph, result, inside, update, lambda here, old, new: choose(graph, here, new, old))
+    return result
+
+
+def _moved_inside(graph: Graph, starts: Sequence[Any], shape: Sequence[int], sizes: Sequence[int]) -> list[Any]:
+    return [clamp(graph, s.item(), 0, n - size) for s, n, size in zip(starts, shape, sizes, strict=True)]
+
+
+@dataclass(frozen=True)
+class _Window:
+    """One of the windows that a gather or a scatter moves.
+
+    Attributes
+    ----------
+    starts : list
+        Where it begins along each axis of the operand, moved into range.
+    fits : bool or Node
+        Whether nothing had to be moved.
+    among : tuple
+        Its place in the array of all windows; entries along slices are those of `kept` axes.
+    """
+
+    starts: list[Any]
+    fits: Any
+    among: tuple[Any, ...]
+
+
+def _windows(
+    graph: Graph, shape: Sequence[int], indices: Any, sizes: Sequence[int], numbers: Any, inside: Any, many: int
+) -> Iterator[_Window]:
+    """All windows of a gather or scatter; `inside`: axes in the windows, of the `many` of the array of all windows."""
+    gathers = hasattr(numbers, "start_index_map")
+    axes = numbers.start_index_map if gathers else numbers.scatter_dims_to_operand_dims
+    batched = dict(
+        zip(
+            numbers.operand_batching_dims,
+            numbers.start_indices_batching_dims if gathers else numbers.scatter_indices_batching_dims,
+            strict=True,
+        )
+    )
+    outside = [k for k in range(many) if k not in inside]
+    for place in np.ndindex(*indices.shape[:-1]):
+        starts: list[Any] = [place[batched[axis]] if axis in batched else 0 for axis in range(len(shape))]
+        for axis, start in zip(axes, indices[place], strict=True):
+            starts[axis] = start
+        fits: Any = True
+        for axis, (start, n, size) in enumerate(zip(starts, shape, sizes, strict=True)):
+            fits = both(graph, fits, invert(graph, less(graph, start, 0)))
+            fits = both(graph, fits, invert(graph, less(graph, n - size, start)))
+            starts[axis] = clamp(graph, start, 0, n - size)
+        among: list[Any] = [slice(None)] * many
+        for axis, k in zip(outside, place, strict=True):
+            among[axis] = k
+        yield _Window(starts, fits, tuple(among))
+
+
+def gather(graph: Graph, equation: Any, a: Any, indices: Any) -> Any:
+    """As `jax.lax.gather`."""
+    params, out = equation.params, equation.outvars[0].aval
+    numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
+    dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
+    result = np.empty(out.shape, dtype=object)
+    for window in _windows(graph, a.shape, indices, sizes, numbers, numbers.offset_dims, len(out.shape)):
+        taken = np.squeeze(take(graph, a, window.starts, sizes), axis=dropped)
+        if params["mode"] == GatherScatterMode.FILL_OR_DROP and window.fits is not True:
+            fill = _fill_value(params["fill_value"], out.dtype)
+            filled = [choose(graph, window.fits, value, fill) for value in taken.reshape(-1).tolist()]
+            taken = as_objects(filled).reshape(taken.shape)
+        result[window.among] = taken if taken.ndim else taken.item()
+    return result
+
+
+def _fill_value(given: Any, dtype: np.dtype[Any]) -> Any:
+    """What JAX takes for an index out of range: NaN, True, or the largest unsigned or smallest signed integer."""
+    if given is not None:
+        return np.asarray(given, dtype).item()
+    if dtype.kind in "iu":
+        return int(np.iinfo(dtype).max if dtype.kind == "u" else np.iinfo(dtype).min)
+    return True if dtype.kind == "b" else float("nan")
+
+
+def scatter(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any, combine: Combine) -> Any:
+    """As `jax.lax.scatter` and its kin."""
+    params = equation.params
+    numbers = params["dimension_numbers"]
+    inside, dropped = numbers.update_window_dims, (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
+    lengths = iter([updates.shape[k] for k in inside])
+    sizes = [1 if k in dropped else next(lengths) for k in range(a.ndim)]
+    result = a.astype(object)
+    for window in _windows(graph, a.shape, indices, sizes, numbers, inside, updates.ndim):
+        fits = True if params["mode"] == GatherScatterMode.CLIP else window.fits
+        if fits is False:
+            continue
+        update = np.asarray(updates[window.among], dtype=object).reshape(sizes)
+        put(graph, result, window.starts, update, combine, fits)
+    return result
+
+
+def added(graph: Graph, add: Callable[[Any, Any], Any], of_integers: bool) -> Combine:
+    """Return how an update is added where a condition holds."""
+
+    def combine(here: Any, old: Any, update: Any) -> Any:
+        if not isinstance(here, Node):
+            return add(old, update) if here else old
+        if of_integers:
+            return choose(graph, here, add(old, update), old)
+        return add(old, choose(graph, here, update, 0.0))
+
+    return combine

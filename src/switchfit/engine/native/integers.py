@@ -1,0 +1,199 @@
+"""Arithmetic with integers that depend on the state, as doubles.
+
+Each `Integer` knows between which bounds it is. Where a result might leave its type, or be too large for doubles to be
+exact, the graph requires at run time that it does not (`Graph.require`), and JAX evaluates the point where it does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from switchfit.engine.native.entries import Integer, Unsupported, choose, clamp, equal, less
+from switchfit.engine.native.scalars import Graph, Node
+
+Meaning = Callable[[Graph, Any, np.dtype[Any]], Callable[..., Any]]
+"""From a graph, the parameters of an operation of JAX and the type of its result: what it does to entries."""
+
+LARGEST = 2**51
+"""Bound below which sums, products and quotients of doubles are exact for integers."""
+
+
+def _bounds(dtype: np.dtype[Any]) -> tuple[int, int]:
+    info = np.iinfo(dtype)
+    return max(info.min, -LARGEST), min(info.max, LARGEST)
+
+
+def within(graph: Graph, node: Node, low: int, high: int, dtype: np.dtype[Any]) -> Any:
+    """Return what is between two bounds as an integer of a type; it is clamped, as memory may be read there."""
+    least, most = _bounds(dtype)
+    if high < least or low > most:
+        raise Unsupported(f"does arithmetic with integers beyond {most}")
+    found = Integer(node, low, high)
+    inside = clamp(graph, found, least, most)
+    if low < least or high > most:
+        graph.require(graph.apply("eq", node, Integer.of(graph, inside).node))
+    return inside
+
+
+def _from_bounds(op: str, bounds: Callable[..., tuple[int, int]]) -> Meaning:
+    def meaning(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
+        def apply(*given: Any) -> Any:
+            args = [Integer.of(graph, a) for a in given]
+            low, high = bounds(*((a.low, a.high) for a in args))
+            node = _without_sign_of_zero(graph, graph.apply(op, *(a.node for a in args)), low, high, op)
+            return within(graph, node, low, high, dtype)
+
+        return apply
+
+    return meaning
+
+
+def _without_sign_of_zero(graph: Graph, node: Node, low: int, high: int, op: str) -> Node:
+    if op not in ("mul", "neg", "trunc") or low > 0 or high < 0 or node.op == "const":
+        return node if node.number != 0.0 else graph.constant(0.0)
+    return graph.apply("select", graph.apply("eq", node, 0.0), 0.0, node)
+
+
+def _product(a: tuple[int, int], b: tuple[int, int]) -> tuple[int, int]:
+    corners = [x * y for x, y in product(a, b)]
+    return min(corners), max(corners)
+
+
+def _absolute(a: tuple[int, int]) -> tuple[int, int]:
+    return (0 if a[0] <= 0 <= a[1] else min(map(abs, a))), max(map(abs, a))
+
+
+def _quotient(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
+    """Towards zero; -1 for a division by zero."""
+
+    def divide(one: Any, other: Any) -> Any:
+        a, b = Integer.of(graph, one), Integer.of(graph, other)
+        largest = max(abs(a.low), abs(a.high), 1)
+        node = graph.apply("trunc", a.node / b.node)
+        found = within(
+            graph, _without_sign_of_zero(graph, node, -largest, largest, "trunc"), *_signs(a, b, largest), dtype
+        )
+        return choose(graph, equal(graph, b, 0), -1, found)
+
+    return divide
+
+
+def _signs(a: Integer, b: Integer, largest: int) -> tuple[int, int]:
+    return (0, largest) if a.low >= 0 and b.low >= 0 else (-largest, largest)
+
+
+def _remainder(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
+    """With the sign of the dividend; the dividend itself for a division by zero."""
+
+    def remainder(one: Any, other: Any) -> Any:
+        a, b = Integer.of(graph, one), Integer.of(graph, other)
+        nonzero = Integer.of(graph, choose(graph, equal(graph, b, 0), 1, b))
+        largest = max(abs(b.low), abs(b.high)) - 1
+        node = a.node - nonzero.node * graph.apply("trunc", a.node / nonzero.node)
+        low, high = (0 if a.low >= 0 else -max(largest, 0)), (0 if a.high <= 0 else max(largest, 0))
+        return choose(graph, equal(graph, b, 0), a, Integer(node, low, high))
+
+    return remainder
+
+
+def _power(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
+    multiply = OF_INTEGERS["mul"](graph, params, dtype)
+
+    def power(a: Any) -> Any:
+        result: Any = 1
+        for _ in range(int(params["y"])):
+            result = multiply(result, a)
+        return result
+
+    return power
+
+
+def _sign(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
+    return lambda a: choose(graph, less(graph, a, 0), -1, choose(graph, less(graph, 0, a), 1, 0))
+
+
+def _smaller(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
+    def smaller(a: Any, b: Any) -> Any:
+        one, other = Integer.of(graph, a), Integer.of(graph, b)
+        found = choose(graph, less(graph, one, other), one, other)
+        return Integer(found.node, min(one.low, other.low), min(one.high, other.high))
+
+    return smaller
+
+
+def _larger(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
+    def larger(a: Any, b: Any) -> Any:
+        one, other = Integer.of(graph, a), Integer.of(graph, b)
+        found = choose(graph, less(graph, one, other), other, one)
+        return Integer(found.node, max(one.low, other.low), max(one.high, other.high))
+
+    return larger
+
+
+def _clamped(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
+    smaller, larger = _smaller(graph, params, dtype), _larger(graph, params, dtype)
+    return lambda low, a, high: smaller(larger(a, low), high)
+
+
+def _convert(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
+    kind = np.dtype(params["new_dtype"])
+    if kind.kind in "iu":
+        return lambda a: _of_type(graph, Integer.of(graph, a), kind)
+    if kind == np.float64:
+        return lambda a: Integer.of(graph, a).node
+    if kind.kind == "b":
+        return lambda a: invert(graph, equal(graph, a, 0))
+    raise Unsupported(f"converts what depends on the state to {kind}")
+
+
+def _of_type(graph: Graph, a: Integer, kind: np.dtype[Any]) -> Any:
+    return within(graph, a.node, a.low, a.high, kind)
+
+
+def invert(graph: Graph, condition: Any) -> Any:
+    """Return whether a condition does not hold; it may be known."""
+    return graph.apply("not", condition) if isinstance(condition, Node) else not condition
+
+
+def from_double(graph: Graph, kind: np.dtype[Any]) -> Callable[[Any], Any]:
+    """Return how doubles become integers of a type: towards zero, NaN is 0, and what does not fit is the bound."""
+    least, most = _bounds(kind)
+
+    def convert(a: Any) -> Integer:
+        rounded = graph.apply("trunc", a)
+        number = graph.apply("select", graph.apply("lt", 0.0, graph.apply("abs", rounded)), rounded, 0.0)
+        if kind.itemsize == 8:
+            graph.require(graph.apply("le", graph.apply("abs", number), float(most)))
+        number = graph.apply("select", graph.apply("lt", number, float(least)), float(least), number)
+        number = graph.apply("select", graph.apply("lt", float(most), number), float(most), number)
+        return Integer(number, least, most)
+
+    return convert
+
+
+OF_INTEGERS: dict[str, Meaning] = {
+    "add": _from_bounds("add", lambda a, b: (a[0] + b[0], a[1] + b[1])),
+    "sub": _from_bounds("sub", lambda a, b: (a[0] - b[1], a[1] - b[0])),
+    "mul": _from_bounds("mul", _product),
+    "neg": _from_bounds("neg", lambda a: (-a[1], -a[0])),
+    "abs": _from_bounds("abs", _absolute),
+    "div": _quotient,
+    "rem": _remainder,
+    "integer_pow": _power,
+    "sign": _sign,
+    "max": _larger,
+    "min": _smaller,
+    "clamp": _clamped,
+    "lt": lambda graph, params, dtype: lambda a, b: less(graph, a, b),
+    "gt": lambda graph, params, dtype: lambda a, b: less(graph, b, a),
+    "le": lambda graph, params, dtype: lambda a, b: invert(graph, less(graph, b, a)),
+    "ge": lambda graph, params, dtype: lambda a, b: invert(graph, less(graph, a, b)),
+    "eq": lambda graph, params, dtype: lambda a, b: equal(graph, a, b),
+    "ne": lambda graph, params, dtype: lambda a, b: invert(graph, equal(graph, a, b)),
+    "convert_element_type": _convert,
+}
+"""Operations on each entry of arrays of integers; comparisons too."""
