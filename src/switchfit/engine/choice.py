@@ -69,8 +69,8 @@ def traced_derivatives(
 ) -> Any:
     """Return cost, gradient (D,) and Hessian (D, D) of one experiment inside a program of JAX.
 
-    By machine code, which runs on a CPU, where `runs_natively` says so; else by JAX. What is returned says nothing where
-    it is `idle`, which costs nothing by machine code.
+    By machine code, which runs on a CPU, where `runs_natively` says so; else by JAX. Where it is `idle` what is
+    returned says nothing, and machine code does nothing.
     """
     if natively:
         return foreign_derivatives(structure, arguments, tau, p, idle)

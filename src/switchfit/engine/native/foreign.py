@@ -42,7 +42,8 @@ def can_be_foreign(structure: Structure) -> bool:
 def foreign_derivatives(structure: Structure, arguments: Arguments, tau: Any, p: Any, idle: Any = False) -> Any:
     """Cost, gradient (D,) and Hessian (D, D) of one experiment, inside a JAX program that runs on a CPU.
 
-    Nothing is evaluated, and what is returned says nothing, if it is `idle`. With the side +1, for an experiment that `can_be_foreign` and for which there is machine code.
+    With the side +1, for an experiment that `can_be_foreign` and for which there is machine code. Nothing is evaluated,
+    and what is returned says nothing, if it is `idle`.
     """
     sizes, library = Sizes.of(structure, arguments), structure.library
     name, _ = _registered(library, sizes)
