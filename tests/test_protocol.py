@@ -117,7 +117,7 @@ SEQUENCES = {
     ("fall", "swing"): (1.3,),
     ("swing", "fall", "swing"): (0.6, 2.2),
     ("rest", "fall", "swing", "rest", "fall"): (0.5, 1.0, 1.7, 2.0),
-    ("swing", "swing", "rest"): (1.0, 1.0),
+    ("swing", "swing", "rest"): (1.0, 1.4),
 }
 
 
