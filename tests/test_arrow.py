@@ -276,3 +276,15 @@ def test_saddle_points_are_left():
     found = minimize(lambda theta, side: saddle(theta, side, True), start, constraints=box)
     assert found.status.is_strict_minimum
     assert abs(found.theta[0]) == pytest.approx(np.sqrt(0.5), rel=1e-6)
+
+
+def test_steepest_descent_goes_on_until_an_arrow_is_positive_definite():
+    """As with full matrices: the first steps are those of descent, whose length is that of the metric."""
+    box, start = LinearConstraints.box(np.full(11, -9.0), np.full(11, 9.0)), np.linspace(-3.0, 3.0, 11)
+    full, arrow = (
+        minimize(lambda theta, side, a=a: rugged(theta, a), start, constraints=box, hessian="descent-first")
+        for a in (False, True)
+    )
+    assert np.linalg.eigvalsh(rugged(start, False).hessian)[0] < 0.0
+    np.testing.assert_allclose(arrow.history[1].theta, full.history[1].theta, atol=1e-12)
+    assert arrow.optimality < 1e-7

@@ -11,7 +11,7 @@ import scipy.optimize
 import scipy.stats
 
 import switchfit as sf
-from switchfit.fit.evaluator import evaluator_of
+from switchfit.fit.evaluator import Simulation, evaluator_of
 from switchfit.fit.solution import minimized
 from switchfit.fit.termination import termination_of
 
@@ -296,6 +296,22 @@ def test_a_callback_that_returns_nothing_sees_all_iterations():
         list(range(found.iterations + 1)),
         list(range(1, found.iterations + 1)),
     )
+
+
+def test_trajectories_are_simulated_when_they_are_asked_for(monkeypatch):
+    simulated = []
+    compare = Simulation.compare
+    monkeypatch.setattr(Simulation, "compare", lambda self: simulated.append(self) or compare(self))
+    fit = sf.estimate(capacitor(voltage(TIMES)))
+    assert not simulated
+    shown = fit.trajectories
+    assert fit.trajectories is shown
+    assert type(shown) is tuple
+    assert replace(fit, seconds=0.0).comparisons is fit.comparisons
+    assert len(simulated) == 1
+    np.testing.assert_array_equal(fit.comparisons[0][0].times, TIMES)
+    with pytest.raises(AttributeError, match="no attribute 'trajectorys'"):
+        fit.trajectorys  # noqa: B018
 
 
 def test_too_few_iterations():

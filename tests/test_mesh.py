@@ -361,3 +361,12 @@ def test_a_mesh_for_several_thetas_is_as_dense_as_the_densest():
     assert counts[2] == counts[3]
     assert counts[1] <= counts[2] <= counts[1] + counts[0]
     assert refined_mesh(problem, 0, early, finer=2.0).cells == pytest.approx(2 * counts[0], rel=0.1)
+
+
+@pytest.mark.parametrize("parts", [2, 3, 5])
+def test_equal_parts_of_a_cell_as_short_as_rounding_are_one(parts):
+    for nodes in (np.array([1.0, np.nextafter(1.0, 2.0), 2.0]), np.array([0.0, 0.3, 1.0])):
+        mesh = Mesh.from_times(nodes).divided(parts)
+        ends = [a + (b - a) * k / parts for a, b in pairwise(nodes.tolist()) for k in range(parts)]
+        np.testing.assert_array_equal(mesh.times, sorted({*ends, nodes[-1]}))
+        assert mesh.cells == len(mesh.times) - 1

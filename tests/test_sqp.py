@@ -861,3 +861,33 @@ def test_start_infeasible_by_rounding_is_repaired():
     result = minimize(quadratic(np.eye(2), np.ones(2)), start, constraints=constraints)
     assert result.status is Status.CONVERGED
     assert_feasible(result, constraints)
+
+
+@settings(max_examples=60, deadline=None)
+@given(SEEDS, st.integers(1, 6))
+def test_a_regular_minimum_has_the_curvature_that_its_status_says(seed, d):
+    """At an interior point with a definite programme no eigenvalue is looked at: they are positive all the same."""
+    rng = np.random.default_rng(seed)
+    Q = np.linalg.qr(rng.normal(size=(d, d)))[0]
+    values = 10.0 ** rng.uniform(-13, 1, d)
+    scale = 10.0 ** rng.uniform(-3, 3, d)
+    H = scale[:, None] * ((Q * values) @ Q.T) * scale
+    result = minimize(quadratic(0.5 * (H + H.T), rng.normal(size=d)), rng.normal(size=d), constraints=free(d))
+    if result.status is Status.CONVERGED:
+        assert result.smallest_eigenvalue > 1e-10
+    if result.status is Status.SINGULAR:
+        assert result.smallest_eigenvalue <= 1e-10
+
+
+@settings(max_examples=100, deadline=None)
+@given(SEEDS, st.integers(1, 5), st.integers(0, 4), st.floats(-18, 0))
+def test_far_from_all_constraints_means_that_none_is_active(seed, d, m, log_distance):
+    rng = np.random.default_rng(seed)
+    A, theta, scale = rng.normal(size=(m, d)), rng.normal(size=d), np.abs(rng.normal(size=d)) * 10.0
+    distance = 10.0**log_distance
+    constraints = rows(A, A @ theta - distance, theta - distance, theta + 1.0) if m else free(d)
+    slack, size = constraints.slack(theta), np.maximum(scale, np.abs(theta))
+    if constraints.are_far(slack, float(size.max())):
+        assert constraints.active(slack, size).size == 0
+    elif m == 0:
+        raise AssertionError("nothing is near")
