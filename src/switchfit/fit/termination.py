@@ -100,7 +100,10 @@ def termination_of(result: Result, problem: Problem) -> Termination:
     problem : Problem
     """
     names = problem.unknowns.names
-    parts = np.abs(result.flat_direction)
+    smallest, direction = np.nan, np.zeros(len(names))
+    if result.status in (Status.SADDLE, Status.SINGULAR):  # eigenvalues take time, and no other status asks for them
+        smallest, direction = result.smallest_eigenvalue, result.flat_direction
+    parts = np.abs(direction)
     largest = [i for i in np.argsort(-parts, kind="stable").tolist() if parts[i] > SMALL_WEIGHT][:NAMED]
     return Termination(
         status=result.status,
@@ -112,8 +115,8 @@ def termination_of(result: Result, problem: Problem) -> Termination:
         active=_active(result, problem),
         kinks=tuple(Kink(names[i], float(result.theta[i]), left, right) for i, left, right in result.kinks),
         idle=tuple(names[i] for i in result.idle),
-        smallest_eigenvalue=result.smallest_eigenvalue,
-        flat_direction=tuple((names[i], float(result.flat_direction[i])) for i in largest),
+        smallest_eigenvalue=smallest,
+        flat_direction=tuple((names[i], float(direction[i])) for i in largest),
         violated=result.violated,
         reason=None if result.reason is None else _reason(result.reason, problem),
     )
