@@ -344,9 +344,33 @@ def test_only_the_exact_hessian_knows_constraints(kind):
         sf.estimate(tank(), hessian=kind)
 
 
-def test_batches_refuse_constraints():
-    with pytest.raises(ValueError, match="Monte Carlo takes no guards and no terminal constraints"):
-        sf.monte_carlo(tank(), 3)
+def bouncing(values):
+    """A ball whose height is measured; it bounces where that is zero."""
+    fly = {"fly": lambda t, x, p: jnp.array([x[1], -9.81])}
+    bounce = {("fly", "fly"): lambda t, x, p: jnp.array([x[0], -p["e"] * x[1]])}
+    ground = {("fly", "fly"): lambda t, x, p: x[0]}
+    system = sf.HybridSystem(fly, [1.0, 0.0], bounce, guards=ground)
+    data = sf.Measurements(np.linspace(0.05, 1.0, 20), values, lambda t, x, p: x[:1], sigma=0.01)
+    return sf.Problem(system, sf.Experiment(data, ("fly", "fly"), (0.5,), 0.0, 1.0), {"e": sf.Parameter(0.7)})
+
+
+def test_batches_take_guards():
+    """Each fit is the one that `estimate` finds; the estimates scatter as their standard errors say."""
+    blank = bouncing(np.zeros((20, 1)))
+    study = sf.monte_carlo(blank, 12, theta=[0.4, 0.8], seed=1)
+    fall = np.sqrt(2 / 9.81)
+    assert study.truth[0] == pytest.approx(fall, rel=1e-9)  # moved onto its guard
+    assert study.success.all()
+    np.testing.assert_allclose(study.theta[:, 0], fall, rtol=1e-9)  # the guard alone says when
+    scatter = (study.theta[:, 1] - 0.8) / study.standard_errors[:, 1]
+    assert 0.4 < scatter.std() < 2.0
+    values = [
+        sf.simulate(blank, [fall, 0.8]).states[:1, :1] + np.random.default_rng(k).normal(size=(20, 1)) for k in (1, 2)
+    ]
+    several = [bouncing(value) for value in values]
+    together = sf.estimate_many(several)
+    for found, problem in zip(together.theta, several, strict=True):
+        np.testing.assert_allclose(found, sf.estimate(problem).theta, rtol=1e-7)
 
 
 @pytest.mark.parametrize(

@@ -151,14 +151,8 @@ def repeat(
     Raises
     ------
     ValueError
-        For a problem with guards or terminal constraints, or one with a switch that is hidden in a function, with which
-        no fit could be right.
+        For a problem with a switch that is hidden in a function, with which no fit could be right.
     """
-    if problem.constraint_names:
-        raise ValueError(
-            f"{title} takes no guards and no terminal constraints; this problem has {problem.constraint_names[0]!r}. "
-            "Call sf.estimate for one fit after the other."
-        )
     _refuse_hidden_switches(problem)
     progress, end = reporting(callback, title)
     try:

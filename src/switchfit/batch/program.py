@@ -28,8 +28,9 @@ from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.choice import memory_of, runs_natively, traced_derivatives
 from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.guards import on_guards_if_near
 from switchfit.fit.result import inverse_on
-from switchfit.fit.solution import constraints_of, minimized
+from switchfit.fit.solution import constraints_of, minimized, minimized_with_constraints
 from switchfit.fit.termination import Termination, termination_of
 from switchfit.optimize import Status
 from switchfit.optimize.qp import nearest_feasible
@@ -174,6 +175,10 @@ def fit_chunk(
     lockstep : bool, optional
         Whether to run all fits in lockstep; decided by the device if left out.
     """
+    if problem.constraint_names:  # which the program does not know
+        evaluator = Evaluator(problem, meshes=meshes)
+        outcome = _not_begun(np.asarray(starts, dtype=float))
+        return _finished(problem, evaluator, varying, outcome, tolerance, max_iterations)
     unknowns = problem.unknowns
     lockstep = in_lockstep() if lockstep is None else lockstep
     evaluator = Evaluator(problem, meshes=meshes)
@@ -476,7 +481,10 @@ def _finished(
                 evaluator.replace_arguments(replaced(base, varying.places, [jnp.asarray(value) for value in values]))
             left = max_iterations - int(found["iterations"][k])
             start = nearest_feasible(constraints, found["theta"][k])
-            result = minimized(evaluator, start, "exact", tolerance, left, constraints=constraints)
+            if problem.constraint_names:
+                result, _ = minimized_with_constraints(evaluator, on_guards_if_near(evaluator, start), tolerance, left)
+            else:
+                result = minimized(evaluator, start, "exact", tolerance, left, constraints=constraints)
         except Exception as error:  # whatever it is, it must not end the other fits
             status[k], message[k] = Status.ERROR.name, error_message(error)
             free[k] = 0

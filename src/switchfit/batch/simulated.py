@@ -21,7 +21,8 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refined_mesh
 from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, checked_settings, estimate
 from switchfit.fit.accuracy import cost_error
-from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.fit.guards import on_guards_if_near
 from switchfit.fit.trajectory import compare
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.problem import Problem
@@ -132,7 +133,8 @@ def monte_carlo(
 
     Notes
     -----
-    All fits share one mesh, which resolves the trajectories at the start and at the truth.
+    All fits share one mesh, which resolves the trajectories at the start and at the truth. Transition times that have
+    guards are moved onto them in the truth.
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     runs, seed = as_count(runs, "runs", at_least=1), as_seed(seed)
@@ -142,7 +144,7 @@ def monte_carlo(
     began = time.perf_counter()
     given = None if theta is None else problem.checked_theta(theta)
     begin = None if start is None else problem.checked_theta(start, "start")
-    truth = estimate(problem).theta if given is None else given
+    truth = estimate(problem).theta if given is None else on_guards_if_near(evaluator_of(problem), given)
     begin = truth if begin is None else begin
     found, error = simulated(
         problem,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,13 +16,20 @@ from switchfit.engine.adaptive import refined_mesh
 from switchfit.estimation.saved import load_fit, save_fit
 from switchfit.fit.accuracy import worst_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.guards import on_guards
+from switchfit.fit.guards import on_guards_if_near
 from switchfit.fit.hidden import refuse_jumps
 from switchfit.fit.result import Fit
-from switchfit.fit.solution import constraints_of, least_squares, minimized, plain, sigma_known
+from switchfit.fit.solution import (
+    constraints_of,
+    least_squares,
+    minimized,
+    minimized_with_constraints,
+    plain,
+    sigma_known,
+)
 from switchfit.fit.termination import termination_of
 from switchfit.fit.trajectory import SimulatedProblem
-from switchfit.optimize import IterationRecord, Result, Status, minimize_constrained
+from switchfit.optimize import IterationRecord, Result, Status
 from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import run_names
@@ -291,7 +297,7 @@ def estimate(
         told = None if callback is None else lambda record, last=last: callback(record.counted_on(last))
         earlier = max(len(history) - 1, 0)
         if problem.constraint_names:
-            result, held = _minimized_with_constraints(evaluator, theta, tolerance, max_iterations, told)
+            result, held = minimized_with_constraints(evaluator, theta, tolerance, max_iterations, told)
         else:
             result = minimized(evaluator, theta, hessian, tolerance, max_iterations, told, constraints)
         records = [record.counted_on(last) for record in result.history]
@@ -340,37 +346,10 @@ def _beginning(problem: Problem, start: ArrayLike | None) -> tuple[FloatArray, E
     """Where a fit begins (d,), guarded transitions on their guards if that is near, and the meshes for it."""
     theta = problem.checked_theta(start, "start")
     evaluator = evaluator_of(problem) if start is None else Evaluator(problem, theta)
-    if any(structure.guarded for structure in problem.structures):
-        with suppress(ValueError):  # if there is no such point nearby, the optimiser may find one farther off
-            theta = on_guards(evaluator, theta)
-            evaluator = Evaluator(problem, theta)
+    placed = on_guards_if_near(evaluator, theta)
+    if not np.array_equal(placed, theta):
+        theta, evaluator = placed, Evaluator(problem, placed)
     return theta, evaluator
-
-
-def _minimized_with_constraints(
-    evaluator: Evaluator,
-    theta: FloatArray,
-    tolerance: float,
-    max_iterations: int,
-    callback: Callable[[IterationRecord], object] | None,
-) -> tuple[Result, tuple[tuple[str, float, float], ...]]:
-    """One run of the optimiser with guards and terminal constraints: its result, and each with value and multiplier."""
-    problem = evaluator.problem
-    names = problem.constraint_names
-    found = minimize_constrained(
-        evaluator.constrained,
-        theta,
-        names,
-        tolerance=tolerance,
-        max_iterations=max_iterations,
-        callback=callback,
-        constraints=constraints_of(problem),
-        breakpoints=evaluator.breakpoints(),
-        size=problem.sizes,
-        scale=problem.elapsed(theta),
-    )
-    values, multipliers = found.constraints.tolist(), found.multipliers.tolist()
-    return found.result, tuple(zip(names, values, multipliers, strict=True))
 
 
 def _refined(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:

@@ -8,6 +8,7 @@ A guard makes tau_i a function of the other unknowns q: ``c(tau(q), q) = 0``. By
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -128,6 +129,18 @@ def on_guards(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
         "reach a guard there, or grazes it. Give transition_times nearer to where the guards vanish (sf.simulate shows "
         "the states), or another mode_sequence."
     )
+
+
+def on_guards_if_near(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
+    """Return `theta` on its guards as of `on_guards`, or as it is where there are none, or no such point is near.
+
+    The optimiser may find one that is farther off.
+    """
+    if not any(structure.guarded for structure in evaluator.problem.structures):
+        return theta
+    with suppress(ValueError):
+        return on_guards(evaluator, theta)
+    return theta
 
 
 def _fraction(problem: Problem, theta: FloatArray, step: FloatArray) -> float:

@@ -13,7 +13,7 @@ from switchfit.fit.collapsed import idle_unknowns
 from switchfit.fit.evaluator import ArrowEvaluation, Evaluation, Evaluator
 from switchfit.fit.hidden import refuse_hidden_switches, refuse_jumps
 from switchfit.fit.termination import linear_constraints_of
-from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
+from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize, minimize_constrained
 from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.diagnosis import Finding
 from switchfit.optimize.problem import HessianKind
@@ -103,6 +103,35 @@ def minimized(
     if result.status is Status.LINE_SEARCH_FAILED:
         refuse_jumps(evaluator, result.theta if identity else _outward(variables, constraints, result.theta))
     return result if identity else _result_outward(variables, constraints, result)
+
+
+def minimized_with_constraints(
+    evaluator: Evaluator,
+    theta: FloatArray,
+    tolerance: float,
+    max_iterations: int,
+    callback: Callable[[IterationRecord], object] | None = None,
+) -> tuple[Result, tuple[tuple[str, float, float], ...]]:
+    """One run of the optimiser with guards and terminal constraints; arguments as of `estimate`.
+
+    Returns its result, and each constraint with its value and its multiplier.
+    """
+    problem = evaluator.problem
+    names = problem.constraint_names
+    found = minimize_constrained(
+        evaluator.constrained,
+        theta,
+        names,
+        tolerance=tolerance,
+        max_iterations=max_iterations,
+        callback=callback,
+        constraints=constraints_of(problem),
+        breakpoints=evaluator.breakpoints(),
+        size=problem.sizes,
+        scale=problem.elapsed(theta),
+    )
+    values, multipliers = found.constraints.tolist(), found.multipliers.tolist()
+    return found.result, tuple(zip(names, values, multipliers, strict=True))
 
 
 def _outward(variables: Variables, constraints: LinearConstraints, z: FloatArray) -> FloatArray:

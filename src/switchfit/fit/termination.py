@@ -58,7 +58,8 @@ class Termination:
     kinks : tuple of Kink
     idle : tuple of str
     smallest_eigenvalue : float
-        Of the Hessian on the free directions, each unknown scaled to unit curvature; NaN if nothing is free.
+        Of the Hessian on the free directions, each unknown scaled to unit curvature, where the status is SADDLE or
+        SINGULAR; else NaN.
     flat_direction : tuple of (str, float)
         The unknowns that the eigenvector of it mostly consists of, and their parts in it.
     violated : tuple of (str, float)
