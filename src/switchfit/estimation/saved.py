@@ -17,6 +17,7 @@ versions 2 and 3, which held sentences in place of data, are brought to version 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from enum import Enum
@@ -43,6 +44,10 @@ READABLE = (2, 3, 4)
 
 NUMBERS = ("NaN", "Infinity", "-Infinity", "nan", "inf", "-inf")
 """Strings that stand for numbers; the latter three in files before version 4."""
+
+
+DTYPES = re.compile("[<>|=]?[bifuU][0-9]+", re.ASCII)
+"""Types of arrays of numbers or text, as NumPy names them in a file."""
 
 
 def save_fit(fit: Fit, certificate: Certificate, path: Path) -> None:
@@ -249,12 +254,13 @@ def _described_array(value: dict[str, Any]) -> NDArray[Any]:
     """An array from its dtype, shape and values."""
     if set(value) != {"dtype", "shape", "values"}:
         raise ValueError(f"must be an array; got {_shown(value)}")
+    name = _checked(value["dtype"], str)
+    if not DTYPES.fullmatch(name):  # NumPy knows others, some of which it only warns of
+        raise ValueError(f"has the dtype {name!r}, which is none of numbers or text")
     try:
-        dtype = np.dtype(_checked(value["dtype"], str))
+        dtype = np.dtype(name)
     except TypeError as error:
-        raise ValueError(f"has the unknown dtype {value['dtype']!r}") from error
-    if dtype.kind not in "bifuU":
-        raise ValueError(f"has the dtype {value['dtype']!r}, which is none of numbers or text")
+        raise ValueError(f"has the unknown dtype {name!r}") from error
     values = _checked(value["values"], list)
     if dtype.kind == "f":
         values = _numbers(values)
