@@ -40,13 +40,14 @@ from switchfit.uncertainty.identification import after
 
 FORMAT = "switchfit fit"
 VERSION = 4
-
-DTYPE = re.compile(r"[<>|=]?[bifuU]\d+")
-"""What a dtype of numbers or text is called; NumPy has more names, some of them obsolete."""
 READABLE = (2, 3, 4)
 
 NUMBERS = ("NaN", "Infinity", "-Infinity", "nan", "inf", "-inf")
 """Strings that stand for numbers; the latter three in files before version 4."""
+
+
+DTYPES = re.compile("[<>|=]?[bifuU][0-9]+", re.ASCII)
+"""Types of arrays of numbers or text, as NumPy names them in a file."""
 
 
 def save_fit(fit: Fit, certificate: Certificate, path: Path) -> None:
@@ -254,7 +255,7 @@ def _described_array(value: dict[str, Any]) -> NDArray[Any]:
     if set(value) != {"dtype", "shape", "values"}:
         raise ValueError(f"must be an array; got {_shown(value)}")
     name = _checked(value["dtype"], str)
-    if not DTYPE.fullmatch(name):
+    if not DTYPES.fullmatch(name):  # NumPy knows others, some of which it only warns of
         raise ValueError(f"has the dtype {name!r}, which is none of numbers or text")
     try:
         dtype = np.dtype(name)
