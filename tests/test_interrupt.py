@@ -16,7 +16,7 @@ from systems import NODES, P0, case, problem_of
 import switchfit as sf
 from switchfit.batch.chunks import run_chunks
 from switchfit.engine.adaptive import refined_mesh
-from switchfit.engine.native import driver, program
+from switchfit.engine.native import driver, experiment
 from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.native.program import forget_programs
 from switchfit.engine.native.templates import Order
@@ -80,7 +80,7 @@ def row_by_row(monkeypatch):
 
     def switch():
         forget_programs()
-        monkeypatch.setattr(program, "BUDGET", 1)
+        monkeypatch.setattr(experiment, "BUDGET", 1)
         monkeypatch.setattr(driver, "BUDGET", 1)
 
     yield switch
