@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.fit.evaluator import derivatives, evaluator_of
+from switchfit.engine.jax.programs import derivatives
+from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import message_of
 from switchfit.fit.trajectory import compared, runs_of
 from switchfit.problem.functions import float64

@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
+from switchfit.engine.jax.programs import derivatives
 from switchfit.engine.native.foreign import foreign_derivatives
-from switchfit.fit.evaluator import Evaluator, derivatives
+from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import inverse_on
 from switchfit.fit.solution import constraints_of, message_of, minimized
 from switchfit.optimize import Status

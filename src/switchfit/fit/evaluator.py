@@ -9,20 +9,15 @@ from functools import cached_property, partial
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.discretization.arguments import Arguments, arguments_of
 from switchfit.discretization.mesh import Mesh, with_common_lengths
 from switchfit.discretization.model import Model
-from switchfit.discretization.propagation import path_cost, propagate
 from switchfit.engine.adaptive import refined_mesh
 from switchfit.engine.choice import Engine
-from switchfit.engine.jax.constraints import augmented
-from switchfit.engine.jax.first_order import first_order
-from switchfit.engine.jax.forward import forward_hessian
-from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
+from switchfit.engine.jax.programs import Matrix, constrained_derivatives, derivatives
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment, reason_for_jax
 from switchfit.engine.native.templates import Order
 from switchfit.fit.trajectory import cost_of, runs_of
@@ -36,7 +31,6 @@ from switchfit.problem.validation import as_choice, as_instance
 from switchfit.runtime.cache import compilation_cache
 
 Method = Literal["auto", "forward", "discrete-adjoint", "adjoint", "autodiff"]
-Matrix = Literal["exact", "gauss-newton", "none"]
 METHODS = ("auto", "forward", "discrete-adjoint", "adjoint", "autodiff")
 
 ORDERS: dict[Matrix, Order] = {
@@ -44,10 +38,6 @@ ORDERS: dict[Matrix, Order] = {
     "gauss-newton": Order.GAUSS_NEWTON,
     "none": Order.GRADIENT,
 }
-
-FORWARD_UP_TO = 0
-"""Unknowns of one experiment up to which second order forward is cheaper than the backward sweep. It never is: at one
-unknown they tie, from two on the sweep is ahead (the scaling part of the benchmarks)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +177,7 @@ class Evaluator:
         s, a, tau, p = self._each(theta)[e]
         with float64(), compilation_cache():
             result = constrained_derivatives(a, tau, p, float(side), multipliers, penalty, structure=s)
-        J, _, _, L_d, H, c, A = map(np.asarray, result)
+        J, L_d, H, c, A = map(np.asarray, result)
         return float(J), L_d, H, c, A
 
     def arrow(self, theta: FloatArray, side: int = 1, matrix: Matrix = "exact") -> ArrowEvaluation:
@@ -255,10 +245,13 @@ class Evaluator:
                 found = [native(*self.problem.vectors(theta, e), side) for e, native in enumerate(natives)]
                 if None not in found:
                     return found
+        of_jax = "discrete-adjoint" if method == "auto" else method
         compiled = (method, matrix) in self._compiled
         with float64(), nullcontext() if compiled else compilation_cache():
             results = [
-                derivatives(a, tau, p, float(side), structure=s, method=_resolve(method, s), matrix=matrix)
+                _by_the_paper(a, tau, p, float(side), structure=s)
+                if method == "adjoint"
+                else derivatives(a, tau, p, float(side), structure=s, method=of_jax, matrix=matrix)
                 for s, a, tau, p in self._each(theta)
             ]
         self._compiled.add((method, matrix))
@@ -328,64 +321,9 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     return evaluator_of(problem)(problem.checked_theta(theta), method=method)
 
 
-def _resolve(method: Method, structure: Structure) -> Method:
-    if method != "auto":
-        return method
-    return "forward" if structure.N + structure.M <= FORWARD_UP_TO else "discrete-adjoint"
-
-
-@partial(jax.jit, static_argnames=("structure", "method", "matrix"))
-def derivatives(
-    arguments: Arguments,
-    tau: jax.Array,
-    p: jax.Array,
-    side: jax.Array,
-    *,
-    structure: Structure,
-    method: Method,
-    matrix: Matrix = "exact",
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Cost, gradient (D,) and Hessian (D, D) of one experiment in its N transition times and its p (M,), traced."""
-    model = Model(structure, arguments)
-    if method == "adjoint":
-        return paper_derivatives(model, tau, p, side)
-    if method == "autodiff":
-        return _autodiff(model, tau, p, side)
-    first = first_order(model, tau, p, side)
-    if matrix == "none":
-        return first.cost, first.gradient, jnp.full((first.gradient.size, first.gradient.size), jnp.nan)
-    if matrix == "gauss-newton":
-        return first.cost, first.gradient, gauss_newton_hessian(model, first, p)
-    second = forward_hessian if method == "forward" else adjoint_hessian
-    return first.cost, first.gradient, second(model, first, tau, p)
-
-
 @partial(jax.jit, static_argnames=("structure",))
-def constrained_derivatives(
-    arguments: Arguments,
-    tau: jax.Array,
-    p: jax.Array,
-    side: jax.Array,
-    multipliers: jax.Array,
-    penalty: jax.Array,
-    *,
-    structure: Structure,
-) -> tuple[jax.Array, ...]:
-    """Cost, gradient; augmented Lagrangian, its gradient and Hessian; constraints (m,), their derivatives (m, D)."""
-    model = Model(structure, arguments)
-    first = first_order(model, tau, p, side)
-    L, L_d, weights, c, A = augmented(model, first, tau, p, multipliers, penalty)
-    H = adjoint_hessian(model, first, tau, p, weights) + (A.T * penalty) @ A
-    return first.cost, first.gradient, L, L_d, H, c, A
-
-
-def _autodiff(model: Model, tau: jax.Array, p: jax.Array, side: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """J and its derivatives by JAX alone, forward over forward."""
-    N = model.structure.N
-
-    def cost(theta: jax.Array) -> jax.Array:
-        path = propagate(model, theta[:N], theta[N:], side)
-        return path_cost(model, path, theta[N:])
-
-    theta = jnp.concatenate([tau, p])
-    return cost(theta), jax.jacfwd(cost)(theta), jax.jacfwd(jax.jacfwd(cost))(theta)
+def _by_the_paper(
+    arguments: Arguments, tau: jax.Array, p: jax.Array, side: jax.Array, *, structure: Structure
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Cost, gradient and Hessian of one experiment by the paper's adjoint equations."""
+    return paper_derivatives(Model(structure, arguments), tau, p, side)

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.discretization.arguments import Arguments, arguments_of
 from switchfit.discretization.mesh import CHUNK, Mesh, rows
 from switchfit.discretization.model import Model, Piece
-from switchfit.discretization.tableaus import step
+from switchfit.discretization.steps import step
 from switchfit.engine.adaptive import after_reset, initial_state, refined_mesh
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order

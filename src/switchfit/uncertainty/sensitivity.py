@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from switchfit.discretization.arguments import Arguments, arguments_of
 from switchfit.discretization.mesh import CHUNK, Mesh, rows
 from switchfit.discretization.model import Model, Piece
-from switchfit.discretization.tableaus import step
+from switchfit.discretization.steps import step
 from switchfit.engine.adaptive import initial_state
 from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.native.templates import Order

@@ -1,0 +1,93 @@
+"""The programs that JAX compiles: cost and derivatives of one experiment."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+
+from switchfit.discretization.arguments import Arguments
+from switchfit.discretization.model import Model
+from switchfit.discretization.propagation import path_cost, propagate
+from switchfit.engine.jax.backward_sweep import backward_sweep, cost_of
+from switchfit.engine.jax.constraints import constraints
+from switchfit.engine.jax.forward import forward_hessian
+from switchfit.engine.jax.forward_sweep import forward_sweep
+from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
+from switchfit.problem.structure import Structure
+
+Array = jax.Array
+Method = Literal["forward", "discrete-adjoint", "autodiff"]
+Matrix = Literal["exact", "gauss-newton", "none"]
+
+
+@partial(jax.jit, static_argnames=("structure", "method", "matrix"))
+def derivatives(
+    arguments: Arguments,
+    tau: Array,
+    p: Array,
+    side: Array,
+    *,
+    structure: Structure,
+    method: Method,
+    matrix: Matrix = "exact",
+) -> tuple[Array, Array, Array]:
+    """Return cost, gradient (D,) and Hessian (D, D) of one experiment in its transition times (N,) and its p (M,).
+
+    With the matrix "none" the Hessian is NaN.
+    """
+    model = Model(structure, arguments)
+    if method == "autodiff":
+        return _autodiff(model, tau, p, side)
+    first = forward_sweep(model, tau, p, side)
+    back = backward_sweep(model, first, p)
+    cost, gradient = cost_of(model, first, p), back.gradient
+    if matrix == "none":
+        return cost, gradient, jnp.full((gradient.size, gradient.size), jnp.nan)
+    if matrix == "gauss-newton":
+        return cost, gradient, gauss_newton_hessian(model, first, p)
+    if method == "forward":
+        return cost, gradient, forward_hessian(model, first, p)
+    return cost, gradient, adjoint_hessian(model, first, back, p)
+
+
+@partial(jax.jit, static_argnames=("structure",))
+def constrained_derivatives(
+    arguments: Arguments,
+    tau: Array,
+    p: Array,
+    side: Array,
+    multipliers: Array,
+    penalty: Array,
+    *,
+    structure: Structure,
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Differentiate the augmented Lagrangian ``J + multipliers . c + 1/2 penalty . c**2`` of one experiment.
+
+    Returns
+    -------
+    cost, slope, hessian : J, and the derivatives of the augmented Lagrangian (D,) and (D, D)
+    c, jacobian : the constraints (m,) and their derivatives (m, D)
+    """
+    model = Model(structure, arguments)
+    first = forward_sweep(model, tau, p, side)
+    c, A = constraints(model, first, p)
+    # Its first derivative is that of J + weights . c, and so is its second one, but for the product of those of c.
+    weights = multipliers + penalty * c
+    back = backward_sweep(model, first, p, weights)
+    H = adjoint_hessian(model, first, back, p, weights) + (A.T * penalty) @ A
+    return cost_of(model, first, p), back.gradient, H, c, A
+
+
+def _autodiff(model: Model, tau: Array, p: Array, side: Array) -> tuple[Array, Array, Array]:
+    """J and its derivatives by JAX alone, forward over forward."""
+    N = model.structure.N
+
+    def cost(theta: Array) -> Array:
+        path = propagate(model, theta[:N], theta[N:], side)
+        return path_cost(model, path, theta[N:])
+
+    theta = jnp.concatenate([tau, p])
+    return cost(theta), jax.jacfwd(cost)(theta), jax.jacfwd(jax.jacfwd(cost))(theta)
