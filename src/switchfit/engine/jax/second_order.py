@@ -31,9 +31,10 @@ from switchfit.engine.jax.constraints import terms_at_end, terms_at_transitions
 from switchfit.engine.jax.forward_sweep import (
     Forward,
     Tangents,
+    of_rows,
     parameter_directions,
-    row_tangents,
     stages_along,
+    tangents_again,
     time_directions,
     unit,
 )
@@ -144,19 +145,17 @@ def step_length_curvature(model: Model, first: Forward, psi: Costates) -> Array:
 
     Only the first and the last row of a segment have a length that depends on theta.
     """
-    N, tableau, path = model.structure.N, model.tableau, first.path
+    N, tableau = model.structure.N, model.tableau
     P = parameter_directions(model)
     if N == 0:
         return jnp.zeros((P.shape[1], P.shape[1]))
-    layout = path.layout
-    lengths, ends_d = layout.end - layout.start, time_directions(model, layout)
-    of_all = (first.tangents.before, lengths, path.slopes, first.jacobians, *ends_d)
 
     def of_row(row: Array) -> Array:
         """V' of one row: (D,)."""
-        given, after, mu = jax.tree.map(lambda values: by_row(values)[row], (of_all, psi.after, psi.mu))
+        all_rows = of_rows(model, first), psi.after, psi.mu
+        given, after, mu = jax.tree.map(lambda values: by_row(values)[row], all_rows)
         _, _, _, at, start_d, end_d = given
-        X_d, K_d, _ = row_tangents(model, *given)
+        X_d, K_d, _ = tangents_again(model, *given)
         ell_d = jnp.zeros((len(tableau.b), P.shape[1]))
         if at.l is not None:
             times_d = jnp.stack(times_derivative(tableau, start_d, end_d))
