@@ -69,37 +69,8 @@ def backward_sweep(model: Model, first: Forward, p: Array, weights: Array | None
     The costate jumps at samples, ``psi(t-) = psi(t+) + D_x ell_k``, at reset maps, ``psi(tau-) = psi(tau+) D_x R``, and
     by the derivatives of what stands at transitions and at the end.
     """
-    structure, path, resets = model.structure, first.path, first.resets
-    layout = path.layout
-    Q, C, n = path.after.shape
-    of_tau, of_p = jnp.zeros(structure.N), jnp.zeros(structure.M)
-
-    # Nodes at which no map acts: what they add to the costate and to the gradient.
-    jumps = jnp.zeros((Q * C + 1, n))  # at the ends of rows; the first entry is that of samples at t0
-    late = jnp.zeros((Q * C, n))  # at the starts of rows
-    any_late = any(sensor.delay is not None for sensor in structure.measurements)
-    for k, samples in enumerate(model.arguments.samples):
-        if structure.measurements[k].delay is None:
-            g_x, g_p = sample_gradients(model, path, k, samples, p)
-            jumps = jumps.at[row_ending_cell(layout, samples.cell) + 1].add(g_x)
-        else:
-            at = anchors(model, path, k, p)
-            g_start, g_x, g_p = late_gradients(model, at, k, samples, p)
-            late = late.at[at.row].add(g_x)
-            # Row 0 of tau is the start of the first segment, which is fixed.
-            of_tau = of_tau + jnp.zeros(structure.N + 1).at[at.starts_at + 1].add(g_start)[1:]
-        of_p = of_p + g_p.sum(0)
-    at_transitions = jnp.zeros((structure.N + 1, n))
-    terms = terms_at_transitions(model, weights)
-    for i, term in terms:
-        g_t, g_x, g_p = jax.grad(term, argnums=(0, 1, 2))(*path.at_transition(i), p)
-        at_transitions = at_transitions.at[i + 1].add(g_x)
-        of_tau, of_p = of_tau.at[i].add(g_t), of_p + g_p
-    final = jnp.zeros(n)
-    for term in terms_at_end(model, weights):
-        g_x, g_p = jax.grad(term, argnums=(1, 2))(*path.at_end(), p)
-        final, of_p = final + g_x, of_p + g_p
-
+    layout, resets = first.path.layout, first.resets
+    nodes = node_gradients(model, first, p, weights)
     adjoint = row_functions(model.tableau).adjoint
 
     def row(carried: tuple[Array, Array], given: tuple[Any, ...]) -> tuple[Any, tuple[Array, ...]]:
@@ -117,19 +88,80 @@ def backward_sweep(model: Model, first: Forward, p: Array, weights: Array | None
         if resets is not None:
             psi = jnp.where(opens, opened @ resets.x[segment], opened)
             of_p = of_p + jnp.where(opens, opened @ resets.p[segment], 0.0)
-        if terms:
-            psi = psi + jnp.where(opens, at_transitions[segment], 0.0)
+        if nodes.transitions is not None:
+            psi = psi + jnp.where(opens, nodes.transitions[segment], 0.0)
         return (psi, of_p), (opened, *columns)
 
-    of_late = late.reshape(Q, C, n) if any_late else None
-    operands = (layout.end - layout.start, first.jacobians, jumps[1:].reshape(Q, C, n), of_late)
-    (start, of_p), columns = lax.scan(chunk, (final, of_p), (layout.segment, layout.opens, operands), reverse=True)
-    costates = Costates(start + jumps[0], *columns)
+    operands = (layout.end - layout.start, first.jacobians, nodes.ends, nodes.starts)
+    given = (layout.segment, layout.opens, operands)
+    (start, of_p), columns = lax.scan(chunk, (nodes.final, nodes.of_p), given, reverse=True)
+    costates = Costates(start + nodes.first, *columns)
+    of_tau = nodes.of_tau + row_ends_gradient(model, first, costates)
     if resets is not None:
         opened = costates.opened[layout.first_chunk]
         of_tau = of_tau + (opened * resets.t).sum(-1)[1:]
     of_p = of_p + jax.grad(lambda p: costates.start @ model.initial_state(p))(p)
-    return Backward(costates, of_tau + row_ends_gradient(model, first, costates), of_p)
+    return Backward(costates, of_tau, of_p)
+
+
+class NodeGradients(NamedTuple):
+    """Derivatives of what is paid at single moments.
+
+    Attributes
+    ----------
+    first : (n,), in x(t0), of samples there
+    ends, starts : (Q, C, n), in the states at the ends of rows; at the starts, of late samples, None without any
+    transitions : (N + 1, n), in the state before the transition that opens each segment; None if there are no terms
+    final : (n,), in x(tf)
+    of_tau, of_p : (N,), (M,), direct ones in tau and p
+    """
+
+    first: Array
+    ends: Array
+    starts: Array | None
+    transitions: Array | None
+    final: Array
+    of_tau: Array
+    of_p: Array
+
+
+def node_gradients(model: Model, first: Forward, p: Array, weights: Array | None) -> NodeGradients:
+    """Differentiate samples, and what ``J + weights . c`` has at transitions and at the end."""
+    structure, path = model.structure, first.path
+    Q, C, n = path.after.shape
+    of_tau, of_p = jnp.zeros(structure.N), jnp.zeros(structure.M)
+    ends, starts = jnp.zeros((Q * C + 1, n)), jnp.zeros((Q * C, n))  # the first of the ends is t0
+    for k, samples in enumerate(model.arguments.samples):
+        if structure.measurements[k].delay is None:
+            g_x, g_p = sample_gradients(model, path, k, samples, p)
+            ends = ends.at[row_ending_cell(path.layout, samples.cell) + 1].add(g_x)
+        else:
+            at = anchors(model, path, k, p)
+            g_start, g_x, g_p = late_gradients(model, at, k, samples, p)
+            starts = starts.at[at.row].add(g_x)
+            # Entry 0 collects the rows that start at a node of the mesh, which stays where it is.
+            of_tau = of_tau + jnp.zeros(structure.N + 1).at[at.starts_at + 1].add(g_start)[1:]
+        of_p = of_p + g_p.sum(0)
+    transitions = jnp.zeros((structure.N + 1, n))
+    terms = terms_at_transitions(model, weights)
+    for i, term in terms:
+        g_t, g_x, g_p = jax.grad(term, argnums=(0, 1, 2))(*path.at_transition(i), p)
+        transitions = transitions.at[i + 1].add(g_x)
+        of_tau, of_p = of_tau.at[i].add(g_t), of_p + g_p
+    final = jnp.zeros(n)
+    for term in terms_at_end(model, weights):
+        g_x, g_p = jax.grad(term, argnums=(1, 2))(*path.at_end(), p)
+        final, of_p = final + g_x, of_p + g_p
+    late = any(sensor.delay is not None for sensor in structure.measurements)
+    return NodeGradients(
+        ends[0],
+        ends[1:].reshape(Q, C, n),
+        starts.reshape(Q, C, n) if late else None,
+        transitions if terms else None,
+        final,
+        of_tau,
+        of_p,
+    )
 
 
 def pull_of(jacobians: StageJacobians) -> Pull:
