@@ -19,7 +19,7 @@ from switchfit.discretization.arguments import Arguments, arguments_of
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import path_cost, propagate
-from switchfit.engine.jax.backward_sweep import backward_sweep, cost_of
+from switchfit.engine.jax.backward_sweep import backward_sweep
 from switchfit.engine.jax.forward import forward_hessian
 from switchfit.engine.jax.forward_sweep import forward_sweep
 from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
@@ -203,7 +203,7 @@ class Case:
             first = forward_sweep(model, tau, p, side)
             back = backward_sweep(model, first, p)
             gauss_newton = gauss_newton_hessian(model, first, p)
-            return cost_of(model, first, p), back.gradient, adjoint_hessian(model, first, back, p), gauss_newton
+            return back.cost, back.gradient, adjoint_hessian(model, first, back, p), gauss_newton
 
         return compiled(evaluate)
 
@@ -213,7 +213,7 @@ class Case:
             model = Model(self.structure, arguments)
             first = forward_sweep(model, tau, p, side)
             back = backward_sweep(model, first, p)
-            return cost_of(model, first, p), back.gradient, forward_hessian(model, first, p)
+            return back.cost, back.gradient, forward_hessian(model, first, p)
 
         return compiled(evaluate)
 

@@ -14,7 +14,7 @@ from switchfit.discretization.arguments import arguments_of
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import path_cost, propagate
-from switchfit.engine.jax.backward_sweep import backward_sweep, cost_of
+from switchfit.engine.jax.backward_sweep import backward_sweep
 from switchfit.engine.jax.constraints import constraints
 from switchfit.engine.jax.forward import forward_hessian
 from switchfit.engine.jax.forward_sweep import forward_sweep
@@ -118,7 +118,7 @@ def test_costs_at_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
         first = forward_sweep(model, tau, p, side)
         back = backward_sweep(model, first, p)
         matrices = adjoint_hessian(model, first, back, p), forward_hessian(model, first, p)
-        return cost_of(model, first, p), back.gradient, *matrices, constraints(model, first, p)[0]
+        return back.cost, back.gradient, *matrices, constraints(model, first, p)[0]
 
     J, g, H, own = compiled(by_jax)(arguments, TAU, P0)
     assert float(J) == pytest.approx(J_without + float(own), rel=1e-13)

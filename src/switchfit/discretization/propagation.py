@@ -114,7 +114,7 @@ def apply_reset(model: Model, tau: Array, x: Array, p: Array, segment: Array, op
 
 def path_cost(model: Model, path: Path, p: Array) -> Array:
     """Return the cost J of the discretised system: ()."""
-    return running_cost(model, path, p).sum() + node_costs(model, path, p)
+    return running_cost(model, path, p).sum() + sample_costs(model, path, p) + term_costs(model, path, p)
 
 
 def running_cost(model: Model, path: Path, p: Array) -> Array:
@@ -131,9 +131,9 @@ def running_cost(model: Model, path: Path, p: Array) -> Array:
     return jax.vmap(jax.vmap(row))(layout.start, layout.end, path.pieces, path.stages)
 
 
-def node_costs(model: Model, path: Path, p: Array) -> Array:
-    """Return what is paid at single moments: samples, costs at transitions and terminal costs, ()."""
-    total = sample_costs(model, path, p)
+def term_costs(model: Model, path: Path, p: Array) -> Array:
+    """Return the sum of the costs at transitions and at the end: ()."""
+    total = jnp.zeros(())
     for i, cost in costs_at_transitions(model):
         total = total + cost(*path.at_transition(i), p)
     final = end_cost(model)

@@ -12,7 +12,7 @@ from jax import lax
 from switchfit.discretization.arguments import Samples
 from switchfit.discretization.mesh import row_ending_cell
 from switchfit.discretization.model import Model
-from switchfit.discretization.propagation import Path, by_row, node_costs
+from switchfit.discretization.propagation import Path, by_row, term_costs
 from switchfit.discretization.rows import Pull, cost_of_row, length_factor, times_derivative
 from switchfit.discretization.steps import row_functions
 from switchfit.engine.jax.constraints import terms_at_end, terms_at_transitions
@@ -41,8 +41,9 @@ class Costates(NamedTuple):
 
 
 class Backward(NamedTuple):
-    """What the backward sweep finds: costates, and the derivatives in tau (N,) and in p (M,)."""
+    """What the backward sweep finds: the cost J, costates, and the derivatives in tau (N,) and in p (M,)."""
 
+    cost: Array
     costates: Costates
     of_tau: Array
     of_p: Array
@@ -51,16 +52,6 @@ class Backward(NamedTuple):
     def gradient(self) -> Array:
         """Derivative in theta: (D,)."""
         return jnp.concatenate([self.of_tau, self.of_p])
-
-
-def cost_of(model: Model, first: Forward, p: Array) -> Array:
-    """Return the cost J of the discretised system: ()."""
-    path, l = first.path, first.jacobians.l  # noqa: E741
-    nodes = node_costs(model, path, p)
-    if l is None:
-        return nodes
-    rows = cost_of_row(model.tableau, path.layout.end - path.layout.start, list(jnp.moveaxis(l, -1, 0)))
-    return nodes + rows.sum()
 
 
 def backward_sweep(model: Model, first: Forward, p: Array, weights: Array | None = None) -> Backward:
@@ -101,14 +92,23 @@ def backward_sweep(model: Model, first: Forward, p: Array, weights: Array | None
         opened = costates.opened[layout.first_chunk]
         of_tau = of_tau + (opened * resets.t).sum(-1)[1:]
     of_p = of_p + jax.grad(lambda p: costates.start @ model.initial_state(p))(p)
-    return Backward(costates, of_tau, of_p)
+    return Backward(nodes.cost + running_cost(model, first), costates, of_tau, of_p)
+
+
+def running_cost(model: Model, first: Forward) -> Array:
+    """Return the integral of the running costs over all rows: ()."""
+    layout, densities = first.path.layout, first.jacobians.l
+    if densities is None:
+        return jnp.zeros(())
+    return cost_of_row(model.tableau, layout.end - layout.start, list(jnp.moveaxis(densities, -1, 0))).sum()
 
 
 class NodeGradients(NamedTuple):
-    """Derivatives of what is paid at single moments.
+    """What is paid at single moments, without constraints, and its derivatives, with them.
 
     Attributes
     ----------
+    cost : ()
     first : (n,), in x(t0), of samples there
     ends, starts : (Q, C, n), in the states at the ends of rows; at the starts, of late samples, None without any
     transitions : (N + 1, n), in the state before the transition that opens each segment; None if there are no terms
@@ -116,6 +116,7 @@ class NodeGradients(NamedTuple):
     of_tau, of_p : (N,), (M,), direct ones in tau and p
     """
 
+    cost: Array
     first: Array
     ends: Array
     starts: Array | None
@@ -129,19 +130,19 @@ def node_gradients(model: Model, first: Forward, p: Array, weights: Array | None
     """Differentiate samples, and what ``J + weights . c`` has at transitions and at the end."""
     structure, path = model.structure, first.path
     Q, C, n = path.after.shape
-    of_tau, of_p = jnp.zeros(structure.N), jnp.zeros(structure.M)
+    cost, of_tau, of_p = term_costs(model, path, p), jnp.zeros(structure.N), jnp.zeros(structure.M)
     ends, starts = jnp.zeros((Q * C + 1, n)), jnp.zeros((Q * C, n))  # the first of the ends is t0
     for k, samples in enumerate(model.arguments.samples):
         if structure.measurements[k].delay is None:
-            g_x, g_p = sample_gradients(model, path, k, samples, p)
+            values, (g_x, g_p) = sample_gradients(model, path, k, samples, p)
             ends = ends.at[row_ending_cell(path.layout, samples.cell) + 1].add(g_x)
         else:
             at = anchors(model, path, k, p)
-            g_start, g_x, g_p = late_gradients(model, at, k, samples, p)
+            values, (g_start, g_x, g_p) = late_gradients(model, at, k, samples, p)
             starts = starts.at[at.row].add(g_x)
             # Entry 0 collects the rows that start at a node of the mesh, which stays where it is.
             of_tau = of_tau + jnp.zeros(structure.N + 1).at[at.starts_at + 1].add(g_start)[1:]
-        of_p = of_p + g_p.sum(0)
+        cost, of_p = cost + values.sum(), of_p + g_p.sum(0)
     transitions = jnp.zeros((structure.N + 1, n))
     terms = terms_at_transitions(model, weights)
     for i, term in terms:
@@ -154,6 +155,7 @@ def node_gradients(model: Model, first: Forward, p: Array, weights: Array | None
         final, of_p = final + g_x, of_p + g_p
     late = any(sensor.delay is not None for sensor in structure.measurements)
     return NodeGradients(
+        cost,
         ends[0],
         ends[1:].reshape(Q, C, n),
         starts.reshape(Q, C, n) if late else None,
@@ -205,7 +207,7 @@ def row_ends_gradient(model: Model, first: Forward, psi: Costates) -> Array:
     return ends(rows_at_transitions(first), starting, ending).sum(0)
 
 
-def sample_gradients(model: Model, path: Path, k: int, samples: Samples, p: Array) -> tuple[Array, Array]:
-    """Derivatives of the cost of each sample of the k-th Measurements in x (K, n) and p (K, M)."""
-    gradient = jax.grad(partial(model.sample_cost, k), argnums=(1, 2))
+def sample_gradients(model: Model, path: Path, k: int, samples: Samples, p: Array) -> tuple[Array, tuple[Array, Array]]:
+    """Cost (K,) of each sample of the k-th Measurements, and its derivatives in x (K, n) and p (K, M)."""
+    gradient = jax.value_and_grad(partial(model.sample_cost, k), argnums=(1, 2))
     return jax.vmap(gradient, in_axes=(0, 0, None))(samples, path.at_samples(samples.cell), p)

@@ -137,7 +137,7 @@ def sample_second(model: Model, first: Forward, second: Second, k: int, p: Array
     if model.structure.measurements[k].delay is not None:
         at = anchors(model, first.path, k, p)
         i, j = pairs(P.shape[1])
-        g_x = late_gradients(model, at, k, samples, p)[1]
+        _, (_, g_x, _) = late_gradients(model, at, k, samples, p)
         through_state = jnp.einsum("kn,knb->b", g_x, by_row(second.before)[at.row])
         return through_state + late_curvature(model, at, by_row(first.tangents.before)[at.row], k, samples, p)[i, j]
 

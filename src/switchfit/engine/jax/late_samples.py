@@ -12,7 +12,6 @@ one of the size of the integration error.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -70,13 +69,19 @@ def _each(function: Callable[..., Any], *given: Any) -> Any:
     return lax.map(lambda of_sample: function(*of_sample), given, batch_size=SAMPLES_AT_ONCE)
 
 
-def late_gradients(model: Model, at: Anchors, k: int, samples: Samples, p: Array) -> tuple[Array, Array, Array]:
-    """Derivatives of each sample's cost in the start of its row (K,), the state there (K, n) and p (K, M)."""
+def late_gradients(
+    model: Model, at: Anchors, k: int, samples: Samples, p: Array
+) -> tuple[Array, tuple[Array, Array, Array]]:
+    """Cost (K,) of each sample, and its derivatives in (start of its row, state there, p): (K,), (K, n), (K, M)."""
     cost = _costs(model, k)
 
-    def one(sample: Samples, at: Anchors) -> tuple[Array, Array, Array]:
-        of = partial(cost, sample, at.segment, at.piece)
-        return jax.jacfwd(of, argnums=(0, 1, 2))(at.start, at.x, p)
+    def one(sample: Samples, at: Anchors) -> tuple[Array, tuple[Array, Array, Array]]:
+        def of(start: Array, x: Array, p: Array) -> tuple[Array, Array]:
+            value = cost(sample, at.segment, at.piece, start, x, p)
+            return value, value
+
+        gradient, value = jax.jacfwd(of, argnums=(0, 1, 2), has_aux=True)(at.start, at.x, p)
+        return value, gradient
 
     return _each(one, samples, at)
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import path_cost, propagate
-from switchfit.engine.jax.backward_sweep import backward_sweep, cost_of
+from switchfit.engine.jax.backward_sweep import backward_sweep
 from switchfit.engine.jax.constraints import constraints
 from switchfit.engine.jax.forward import forward_hessian
 from switchfit.engine.jax.forward_sweep import forward_sweep
@@ -43,7 +43,7 @@ def derivatives(
         return _autodiff(model, tau, p, side)
     first = forward_sweep(model, tau, p, side)
     back = backward_sweep(model, first, p)
-    cost, gradient = cost_of(model, first, p), back.gradient
+    cost, gradient = back.cost, back.gradient
     if matrix == "none":
         return cost, gradient, jnp.full((gradient.size, gradient.size), jnp.nan)
     if matrix == "gauss-newton":
@@ -78,7 +78,7 @@ def constrained_derivatives(
     weights = multipliers + penalty * c
     back = backward_sweep(model, first, p, weights)
     H = adjoint_hessian(model, first, back, p, weights) + (A.T * penalty) @ A
-    return cost_of(model, first, p), back.gradient, H, c, A
+    return back.cost, back.gradient, H, c, A
 
 
 def _autodiff(model: Model, tau: Array, p: Array, side: Array) -> tuple[Array, Array, Array]:
