@@ -19,8 +19,9 @@ from switchfit.discretization.arguments import Arguments, arguments_of
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import path_cost, propagate
-from switchfit.engine.jax.first_order import first_order
+from switchfit.engine.jax.backward_sweep import backward_sweep
 from switchfit.engine.jax.forward import forward_hessian
+from switchfit.engine.jax.forward_sweep import forward_sweep
 from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
 from switchfit.paper_adjoint import paper_derivatives
 from switchfit.problem.data import Input, Measurements, ReferenceSignal, RunningCost, TerminalCost
@@ -199,9 +200,10 @@ class Case:
     def _discrete(self) -> Callable[..., Any]:
         def evaluate(arguments, tau, p, side):
             model = Model(self.structure, arguments)
-            first = first_order(model, tau, p, side)
+            first = forward_sweep(model, tau, p, side)
+            back = backward_sweep(model, first, p)
             gauss_newton = gauss_newton_hessian(model, first, p)
-            return first.cost, first.gradient, adjoint_hessian(model, first, tau, p), gauss_newton
+            return back.cost, back.gradient, adjoint_hessian(model, first, back, p), gauss_newton
 
         return compiled(evaluate)
 
@@ -209,8 +211,9 @@ class Case:
     def _forward(self) -> Callable[..., Any]:
         def evaluate(arguments, tau, p, side):
             model = Model(self.structure, arguments)
-            first = first_order(model, tau, p, side)
-            return first.cost, first.gradient, forward_hessian(model, first, tau, p)
+            first = forward_sweep(model, tau, p, side)
+            back = backward_sweep(model, first, p)
+            return back.cost, back.gradient, forward_hessian(model, first, p)
 
         return compiled(evaluate)
 

@@ -13,7 +13,7 @@ from systems import KINDS, NODES, P0, Case, Derivatives, case, compiled, padded_
 from switchfit.discretization.arguments import arguments_of
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import propagate
-from switchfit.engine.jax import first_order
+from switchfit.engine.jax import forward_sweep
 
 INSIDE = {"plain": [0.613, 1.287], "resets": [0.413, 0.791, 1.336], "stiff": [0.6187, 1.2812]}
 """Transition times that are not nodes."""
@@ -46,7 +46,7 @@ def test_derivatives_at_the_stages_that_are_found_again(name: str, monkeypatch: 
     """On long meshes they are not kept; the Gauss-Newton matrix takes them too."""
     kept, at = case(name), (case(name).arguments(), INSIDE[name], P0)
     expected = kept.discrete(*at)
-    monkeypatch.setattr(first_order, "KEPT", 0)
+    monkeypatch.setattr(forward_sweep, "KEPT", 0)
     found = Case(kept.problem).discrete(*at)
     assert_same(found, expected, 1e-9 if name == "stiff" else 1e-13)
     largest = np.abs(expected.gauss_newton).max()

@@ -58,9 +58,10 @@ from jax.flatten_util import ravel_pytree
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import row_ending_cell
-from switchfit.discretization.model import Model, Piece
-from switchfit.discretization.propagation import Path, at_cells, by_mode, path_cost, propagate
-from switchfit.discretization.tableaus import STIFF, Field, Tableau, combine
+from switchfit.discretization.model import Field, Model, Piece
+from switchfit.discretization.propagation import Path, at_cells, by_mode, by_row, path_cost, propagate
+from switchfit.discretization.rows import combine
+from switchfit.discretization.tableaus import STIFF, Tableau
 from switchfit.engine.jax.late_samples import anchors, late_state_derivatives
 from switchfit.problem.structure import Structure
 
@@ -492,11 +493,12 @@ def late_jumps(model: Model, path: Path, Dp_x_before: Array, p: Array) -> tuple[
     which = [k for k, sensor in enumerate(model.structure.measurements) if sensor.delay is not None]
     for k in which:
         samples = model.arguments.samples[k]
-        at = anchors(model, path, Dp_x_before, k, p)
+        at = anchors(model, path, k, p)
+        x_d = by_row(Dp_x_before)[at.row]
         (Dell, Dpell), ((D2ell, DpD1ell), (D1Dpell, DpDpell)) = late_state_derivatives(model, at, k, samples, p)
-        jump = Adjoints(Dell, D2ell, D2ell @ at.x_d + DpD1ell)
+        jump = Adjoints(Dell, D2ell, D2ell @ x_d + DpD1ell)
         jumps = jax.tree.map(lambda a, b, row=at.row: a.at[row].add(b), jumps, jump)
-        total = add(total, Quadratures(Dpell.sum(0), (DpDpell + D1Dpell @ at.x_d).sum(0)))
+        total = add(total, Quadratures(Dpell.sum(0), (DpDpell + D1Dpell @ x_d).sum(0)))
     at_rows = jax.tree.map(lambda a: a.reshape((Q, C, *a.shape[1:])), jumps)
     return (at_rows,) if which else (), total
 
@@ -562,7 +564,8 @@ def linear_step(tableau: Tableau, rate: Callable[[Any, Any], Any], h: Array, giv
         slopes: list[Array] = []
         for j in range(len(c)):
             at_stage = jax.tree.map(lambda g, j=j: g[j], given)
-            slopes.append(slope(at_stage, flat + h * combine(a[j], slopes) if slopes else flat))
+            inside = combine(a[j], slopes)
+            slopes.append(slope(at_stage, flat if inside is None else flat + h * inside))
         K = jnp.stack(slopes)
     return jax.vmap(unravel)(flat + h * (a @ K)), unravel(flat + h * (b @ K))
 

@@ -12,12 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from switchfit.discretization.arguments import Arguments, Samples
-from switchfit.discretization.tableaus import Density, Field, tableau_of
+from switchfit.discretization.tableaus import tableau_of
 from switchfit.problem.functions import Function
 from switchfit.problem.losses import influence, robust
 from switchfit.problem.structure import Structure
 
 Array = jax.Array
+
+Field = Callable[[Array, Array, Array], Array]
+"""``f(t, x, p) -> (n,)`` of one mode, p being the flat vector of free parameters."""
+
+Density = Callable[[Array, Array, Array], Array]
+"""``ell(t, x, p) -> ()``: the sum of all running costs."""
 
 
 class Piece(NamedTuple):

@@ -53,6 +53,22 @@ def constrained_transitions(structure: Structure) -> list[tuple[TransitionKind, 
     return [(kind, i) for kind in kinds for i, f in enumerate(getattr(structure, kind.name)) if f is not None]
 
 
+def costs_at_transitions(model: Model) -> list[tuple[int, NodeFunction]]:
+    """Return the costs at transitions, each with its transition (from 0)."""
+    return _at_transitions(model, constraint=False)
+
+
+def constraints_at_transitions(model: Model) -> list[tuple[int, NodeFunction]]:
+    """Return the constraints at transitions in the order of their values, each with its transition (from 0)."""
+    return _at_transitions(model, constraint=True)
+
+
+def _at_transitions(model: Model, constraint: bool) -> list[tuple[int, NodeFunction]]:
+    kinds = [kind for kind in AT_TRANSITIONS if kind.constraint == constraint]
+    found = [(i, transition_function(model, kind, i)) for kind in kinds for i in range(model.structure.N)]
+    return [(i, function) for i, function in found if function is not None]
+
+
 def end_cost(model: Model) -> NodeFunction | None:
     """Return the sum of the terminal costs; None if there are none."""
     return (lambda t, x, p: model.terminal(x, p)) if model.structure.terminal else None

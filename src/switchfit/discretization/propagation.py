@@ -13,7 +13,9 @@ from jax import lax
 from switchfit.discretization.arguments import Samples
 from switchfit.discretization.mesh import Rows, row_ending_cell, rows
 from switchfit.discretization.model import Model, Piece
-from switchfit.discretization.tableaus import combine, stages, step
+from switchfit.discretization.nodes import costs_at_transitions, end_cost
+from switchfit.discretization.rows import cost_of_row, end_of_row
+from switchfit.discretization.steps import row_functions, step
 
 Array = jax.Array
 
@@ -35,6 +37,14 @@ class Path(NamedTuple):
     after: Array
     stages: Array
     slopes: Array
+
+    def at_transition(self, i: int) -> tuple[Array, Array]:
+        """tau_i and x(tau_i-) of transition i (from 0): (), (n,)."""
+        return self.layout.end[self.layout.first_chunk[i + 1] - 1, -1], self.before_transition(i)
+
+    def at_end(self) -> tuple[Array, Array]:
+        """tf and x(tf): (), (n,)."""
+        return self.layout.end[-1, -1], self.after[-1, -1]
 
     def before_transition(self, i: Array | int) -> Array:
         """x(tau_i-), the state before the reset map of transition i (from 0): (n,)."""
@@ -69,13 +79,15 @@ def propagate(model: Model, tau: Array, p: Array, side: Array) -> Path:
     """Integrate from t0 to tf: equation (1), with reset maps at the transitions."""
     layout = rows(model.arguments.nodes, tau, side)
     pieces = Piece(model.arguments.nodes[layout.cell], model.arguments.signals[layout.cell])
+    stages = row_functions(model.tableau).stages
 
     def through(mode: int) -> Callable[..., tuple[Array, tuple[Array, ...]]]:
         def row(x: Array, given: tuple[Array, Array, Piece]) -> tuple[Array, tuple[Array, ...]]:
             start, end, piece = given
-            X, K = stages(model.tableau, model.field(mode, piece), start, end, x, p)
-            after = x + (end - start) * combine(model.tableau.b, K)
-            return after, (x, after, jnp.stack(X), jnp.stack(K))
+            f = model.field(mode, piece)
+            found = stages(model.tableau, lambda t, x: f(t, x, p), start, end, x)
+            after = end_of_row(model.tableau, end - start, x, found.slopes)
+            return after, (x, after, jnp.stack(found.states), jnp.stack(found.slopes))
 
         return lambda x, start, end, piece: lax.scan(row, x, (start, end, piece))
 
@@ -101,22 +113,31 @@ def apply_reset(model: Model, tau: Array, x: Array, p: Array, segment: Array, op
 
 
 def path_cost(model: Model, path: Path, p: Array) -> Array:
-    """The cost J of the discretised system: running costs, samples and terminal costs."""
-    return running_cost(model, path, p).sum() + sample_costs(model, path, p) + model.terminal(path.after[-1, -1], p)
+    """Return the cost J of the discretised system: ()."""
+    return running_cost(model, path, p).sum() + sample_costs(model, path, p) + term_costs(model, path, p)
 
 
 def running_cost(model: Model, path: Path, p: Array) -> Array:
-    """Integral of the running costs over each row, ``h sum_j b_j ell(t_j, X_j)``: (Q, C)."""
+    """Return the integral of the running costs over each row, ``h sum_j b_j ell(t_j, X_j)``: (Q, C)."""
     layout = path.layout
-    h = layout.end - layout.start
     if not model.has_running_cost:
-        return jnp.zeros(h.shape)
+        return jnp.zeros(layout.start.shape)
 
-    def row(start: Array, h: Array, piece: Piece, X: Array) -> Array:
-        times = start + model.tableau.c * h
-        return h * (model.tableau.b @ jax.vmap(model.density(piece), in_axes=(0, 0, None))(times, X, p))
+    def row(start: Array, end: Array, piece: Piece, X: Array) -> Array:
+        times = start + model.tableau.c * (end - start)
+        densities = jax.vmap(model.density(piece), in_axes=(0, 0, None))(times, X, p)
+        return cost_of_row(model.tableau, end - start, list(densities))
 
-    return jax.vmap(jax.vmap(row))(layout.start, h, path.pieces, path.stages)
+    return jax.vmap(jax.vmap(row))(layout.start, layout.end, path.pieces, path.stages)
+
+
+def term_costs(model: Model, path: Path, p: Array) -> Array:
+    """Return the sum of the costs at transitions and at the end: ()."""
+    total = jnp.zeros(())
+    for i, cost in costs_at_transitions(model):
+        total = total + cost(*path.at_transition(i), p)
+    final = end_cost(model)
+    return total if final is None else total + final(*path.at_end(), p)
 
 
 def sample_costs(model: Model, path: Path, p: Array) -> Array:

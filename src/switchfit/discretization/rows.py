@@ -111,12 +111,14 @@ class Adjoint(NamedTuple):
 
     Attributes
     ----------
+    slopes : s arrays w_j (n,), in the slopes of the stages
     states : s arrays mu_j (n,), in the states of the stages
     before : (n,), in the state before the row
     times : s entries (), of ``w_j . f + h b_j ell`` in t_j
     parameters : (M,), the sum of the same in p
     """
 
+    slopes: list[Array]
     states: list[Array]
     before: Array
     times: list[Array]
@@ -131,15 +133,16 @@ def adjoint(tableau: Tableau, h: Array, psi: Array, pull: Pull) -> Adjoint:
     """Pull the costate psi (n,) behind a row back to its start."""
     a, b = tableau.a.tolist(), tableau.b.tolist()
     s = len(b)
+    w: list[Array] = [None] * s
     mu: list[Array] = [None] * s
     times: list[Array] = [None] * s
     parameters: Array = 0.0
     for j in reversed(range(s)):
         later = combine([a[m][j] for m in range(j + 1, s)], mu[j + 1 :])
-        w = h * (_sum(b[j] * psi if b[j] else None, later))
-        times[j], mu[j], in_p = pull(j, w, h * b[j])
+        w[j] = h * (_sum(b[j] * psi if b[j] else None, later))
+        times[j], mu[j], in_p = pull(j, w[j], h * b[j])
         parameters = parameters + in_p
-    return Adjoint(mu, psi + sum(mu[1:], mu[0]), times, parameters)
+    return Adjoint(w, mu, psi + sum(mu[1:], mu[0]), times, parameters)
 
 
 def length_factor(

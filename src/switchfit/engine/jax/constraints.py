@@ -1,8 +1,8 @@
-"""Equality constraints: guards at transitions, ``g_i(tau_i, x(tau_i-), p) = 0``, and conditions on the final state.
+"""Costs and constraints at transitions and at the end, ``c = 0``.
 
-Their values and first derivatives follow from the forward sweep. Their second derivatives are only ever needed in the
-sum ``weights . c`` of a Lagrangian: each is a cost at a transition or at the end, so that one backward sweep over the
-cost with these terms beside it gives them all (`switchfit.engine.jax.second_order.adjoint_hessian`).
+Values and first derivatives of constraints follow from the forward sweep. Their second derivatives are only ever
+needed in the sum ``weights . c`` of a Lagrangian: each is a cost at a transition or at the end, so that one backward
+sweep over the cost with these terms beside it gives them all.
 """
 
 from __future__ import annotations
@@ -11,37 +11,49 @@ import jax
 import jax.numpy as jnp
 
 from switchfit.discretization.model import Model
-from switchfit.engine.jax.first_order import FirstOrder, parameter_directions
+from switchfit.discretization.nodes import (
+    NodeFunction,
+    constraints_at_transitions,
+    costs_at_transitions,
+    end_constraints,
+    end_cost,
+)
+from switchfit.engine.jax.forward_sweep import Forward, parameter_directions
 
 Array = jax.Array
 
 
-def constraints(model: Model, first: FirstOrder, tau: Array, p: Array) -> tuple[Array, Array]:
-    """Values c (m,) and derivatives (m, D): guards in the order of their transitions, then the terminal ones."""
+def terms_at_transitions(model: Model, weights: Array | None) -> list[tuple[int, NodeFunction]]:
+    """Return what ``J + weights . c`` has at transitions: each term with its transition; c only with `weights` (m,)."""
+    if weights is None:
+        return costs_at_transitions(model)
+    constraints = enumerate(constraints_at_transitions(model))
+    weighted = [(i, lambda t, x, p, w=weights[k], c=c: w * c(t, x, p)) for k, (i, c) in constraints]
+    return costs_at_transitions(model) + weighted
+
+
+def terms_at_end(model: Model, weights: Array | None) -> list[NodeFunction]:
+    """Return what ``J + weights . c`` has at the end; c only with `weights` (m,)."""
+    cost, constraints = end_cost(model), end_constraints(model)
+    terms = [] if cost is None else [cost]
+    if weights is not None and constraints is not None:
+        own = weights[len(constraints_at_transitions(model)) :]
+        terms.append(lambda t, x, p: own @ constraints(t, x, p))
+    return terms
+
+
+def constraints(model: Model, first: Forward, p: Array) -> tuple[Array, Array]:
+    """Return the values (m,) and derivatives (m, D) of all constraints: at transitions, then at the end."""
     path, X = first.path, first.tangents
     P = parameter_directions(model)
     values, rows = [jnp.zeros(0)], [jnp.zeros((0, P.shape[1]))]
-    for i in model.structure.guarded:
-        x, x_d = path.before_transition(i), X.before_transition(path.layout, i)
-        value, (g_t, g_x, g_p) = jax.value_and_grad(model.guard(i), argnums=(0, 1, 2))(tau[i], x, p)
+    for i, function in constraints_at_transitions(model):
+        value, (c_t, c_x, c_p) = jax.value_and_grad(function, argnums=(0, 1, 2))(*path.at_transition(i), p)
         values.append(value[None])
-        rows.append((g_x @ x_d + g_p @ P).at[i].add(g_t)[None])
-    if model.structure.terminal_constraints:
-        x, x_d = path.after[-1, -1], X.after[-1, -1]
-        psi_x, psi_p = jax.jacfwd(model.terminal_constraint, argnums=(0, 1))(x, p)
-        values.append(model.terminal_constraint(x, p))
-        rows.append(psi_x @ x_d + psi_p @ P)
+        rows.append((c_x @ X.before_transition(path.layout, i) + c_p @ P).at[i].add(c_t)[None])
+    at_end = end_constraints(model)
+    if at_end is not None:
+        c_x, c_p = jax.jacfwd(at_end, argnums=(1, 2))(*path.at_end(), p)
+        values.append(at_end(*path.at_end(), p))
+        rows.append(c_x @ X.after[-1, -1] + c_p @ P)
     return jnp.concatenate(values), jnp.concatenate(rows)
-
-
-def augmented(
-    model: Model, first: FirstOrder, tau: Array, p: Array, multipliers: Array, penalty: Array
-) -> tuple[Array, Array, Array, Array, Array]:
-    """The augmented Lagrangian ``J + multipliers . c + 1/2 penalty . c**2``: what its Hessian takes beside the cost.
-
-    Returns its value (), its gradient (D,), the weights of the constraints in its Hessian (m,), and c and its
-    derivatives, (m,) and (m, D).
-    """
-    c, A = constraints(model, first, tau, p)
-    weights = multipliers + penalty * c
-    return first.cost + multipliers @ c + 0.5 * penalty @ c**2, first.gradient + weights @ A, weights, c, A

@@ -14,6 +14,7 @@ another is a product of small matrices. There is no adjoint here, so that a mist
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -23,10 +24,11 @@ from jax import lax
 
 from switchfit.discretization.arguments import Samples
 from switchfit.discretization.model import Model, Piece
+from switchfit.discretization.nodes import costs_at_transitions, end_cost
 from switchfit.discretization.propagation import at_cells, by_mode, by_row
-from switchfit.discretization.tableaus import step
-from switchfit.engine.jax.first_order import FirstOrder, parameter_directions, time_directions
-from switchfit.engine.jax.late_samples import anchors, late_costates, late_curvature
+from switchfit.discretization.steps import step
+from switchfit.engine.jax.forward_sweep import Forward, parameter_directions, time_directions, unit
+from switchfit.engine.jax.late_samples import anchors, late_curvature, late_gradients
 
 Array = jax.Array
 
@@ -43,33 +45,39 @@ class Second(NamedTuple):
     after: Array
 
 
-def forward_hessian(model: Model, first: FirstOrder, tau: Array, p: Array) -> Array:
+def forward_hessian(model: Model, first: Forward, p: Array) -> Array:
     """Hessian (D, D) of the discretised cost, D = N + M, without an adjoint.
 
     Parameters
     ----------
     model : Model
-    first : FirstOrder
-        What `switchfit.engine.jax.second_order.first_order` returned at the same (tau, p).
-    tau : (N,)
+    first : Forward
+        What `switchfit.engine.jax.forward_sweep.forward_sweep` returned at the same p.
     p : (M,)
 
     Notes
     -----
     The cost is that of D (D + 1) / 2 second derivatives of each step; `adjoint_hessian` gives the same matrix.
     """
-    H, second = second_tangents(model, first, tau, p)
+    P = parameter_directions(model)
+    H, second = second_tangents(model, first, p)
     for k in range(len(model.arguments.samples)):
         H = H + sample_second(model, first, second, k, p)
-    if model.structure.terminal:
-        x, P = first.path.after[-1, -1], parameter_directions(model)
-        phi_x = jax.grad(model.terminal)(x, p)
-        H = H + phi_x @ second.after[-1, -1]
-        H = H + along_pairs(model.terminal, (x, p), (first.tangents.after[-1, -1], P))
-    return symmetric(H, first.gradient.shape[0])
+    path, X = first.path, first.tangents
+    for i, cost in costs_at_transitions(model):
+        at = *path.at_transition(i), p
+        along = unit(P.shape[1], i), X.before_transition(path.layout, i), P
+        x_tt = second.after[path.layout.first_chunk[i + 1] - 1, -1]
+        H = H + jax.grad(cost, argnums=1)(*at) @ x_tt + along_pairs(cost, at, along)
+    cost_at_end = end_cost(model)
+    if cost_at_end is not None:
+        at_end = partial(cost_at_end, path.at_end()[0])
+        x = path.after[-1, -1]
+        H = H + jax.grad(at_end)(x, p) @ second.after[-1, -1] + along_pairs(at_end, (x, p), (X.after[-1, -1], P))
+    return symmetric(H, P.shape[1])
 
 
-def second_tangents(model: Model, first: FirstOrder, tau: Array, p: Array) -> tuple[Array, Second]:
+def second_tangents(model: Model, first: Forward, p: Array) -> tuple[Array, Second]:
     """``x_tt`` along the path, and the part of the Hessian that the running costs make up, (B,)."""
     P = parameter_directions(model)
 
@@ -99,7 +107,7 @@ def second_tangents(model: Model, first: FirstOrder, tau: Array, p: Array) -> tu
             x_tt = jnp.where(opens, R_x[segment] @ x_tt + S_reset[segment], x_tt)
         return lax.scan(row, (H, x_tt), by_mode(model, segment, of_mode, *operands))
 
-    resets = reset_sources(model, first, tau, p)
+    resets = reset_sources(model, first, p)
     path, layout = first.path, first.path.layout
     start = along_pairs(model.initial_state, (p,), (P,))
     directions = (*time_directions(model, layout), first.tangents.before)
@@ -108,7 +116,7 @@ def second_tangents(model: Model, first: FirstOrder, tau: Array, p: Array) -> tu
     return H, Second(*second)
 
 
-def reset_sources(model: Model, first: FirstOrder, tau: Array, p: Array) -> tuple[Array, Array] | None:
+def reset_sources(model: Model, first: Forward, p: Array) -> tuple[Array, Array] | None:
     """``D_x R`` (N + 1, n, n) and ``D^2 R (Z, Z)`` (N + 1, n, B) where each segment opens; None without reset maps."""
     if first.resets is None:
         return None
@@ -116,21 +124,22 @@ def reset_sources(model: Model, first: FirstOrder, tau: Array, p: Array) -> tupl
     D = P.shape[1]
     S = jnp.zeros((model.structure.N + 1, model.structure.n, D * (D + 1) // 2))
     for i in model.structure.resets:
-        at = (tau[i], first.path.before_transition(i), p)
-        along = ((jnp.arange(D) == i) * 1.0, first.tangents.before_transition(first.path.layout, i), P)
+        at = *first.path.at_transition(i), p
+        along = (unit(D, i), first.tangents.before_transition(first.path.layout, i), P)
         S = S.at[i + 1].set(along_pairs(model.reset(i), at, along))
     return first.resets.x, S
 
 
-def sample_second(model: Model, first: FirstOrder, second: Second, k: int, p: Array) -> Array:
+def sample_second(model: Model, first: Forward, second: Second, k: int, p: Array) -> Array:
     """Second derivative of the costs of the k-th Measurements: (B,)."""
     P = parameter_directions(model)
     samples = model.arguments.samples[k]
     if model.structure.measurements[k].delay is not None:
-        at = anchors(model, first.path, first.tangents.before, k, p)
+        at = anchors(model, first.path, k, p)
         i, j = pairs(P.shape[1])
-        through_state = jnp.einsum("kn,knb->b", late_costates(model, at, k, samples, p), by_row(second.before)[at.row])
-        return through_state + late_curvature(model, at, k, samples, p, P)[i, j]
+        _, (_, g_x, _) = late_gradients(model, at, k, samples, p)
+        through_state = jnp.einsum("kn,knb->b", g_x, by_row(second.before)[at.row])
+        return through_state + late_curvature(model, at, by_row(first.tangents.before)[at.row], k, samples, p)[i, j]
 
     def one(sample: Samples, x: Array, x_d: Array, x_tt: Array) -> Array:
         def cost(x: Array, p: Array) -> Array:

@@ -35,30 +35,23 @@ class Anchors(NamedTuple):
     ----------
     row : (K,) int, flat index
     segment : (K,) int
+    starts_at : (K,) int, index (from 0) of the transition time at which the row starts, else -1
     piece : Piece
     start, x : (K,), (K, n), start of the row and the state there
-    start_d, x_d : (K, D), (K, n, D), their derivatives in theta
     """
 
     row: Array
     segment: Array
+    starts_at: Array
     piece: Piece
     start: Array
     x: Array
-    start_d: Array
-    x_d: Array
 
 
-def anchors(model: Model, path: Path, before_d: Array, k: int, p: Array) -> Anchors:
-    """Rows, states and tangents from which the samples of the k-th Measurements are seen.
-
-    `before_d` (Q, C, n, D) is the derivative of the states at the starts of the rows.
-    """
-    layout = path.layout
+def anchors(model: Model, path: Path, k: int, p: Array) -> Anchors:
+    """Rows and states from which the samples of the k-th Measurements are seen."""
     row, segment, piece, start, x = row_holding(model, path, k, p)
-    index = jnp.arange(before_d.shape[-1])
-    start_d = (by_row(layout.starts_at)[row][:, None] == index) * 1.0
-    return Anchors(row, segment, piece, start, x, start_d, by_row(before_d)[row])
+    return Anchors(row, segment, by_row(path.layout.starts_at)[row], piece, start, x)
 
 
 def _costs(model: Model, k: int) -> Callable[..., Array]:
@@ -71,58 +64,68 @@ def _costs(model: Model, k: int) -> Callable[..., Array]:
     return cost
 
 
-def _each(function: Callable[..., Any], samples: Samples, at: Anchors) -> Any:
-    """``function(sample, anchor)`` of all samples."""
-    return lax.map(lambda given: function(*given), (samples, at), batch_size=SAMPLES_AT_ONCE)
+def _each(function: Callable[..., Any], *given: Any) -> Any:
+    """``function(sample, anchor, ...)`` of all samples."""
+    return lax.map(lambda of_sample: function(*of_sample), given, batch_size=SAMPLES_AT_ONCE)
 
 
-def late_gradient(model: Model, at: Anchors, k: int, samples: Samples, p: Array, P: Array) -> tuple[Array, Array]:
-    """Cost of the samples of the k-th Measurements and its derivative in theta: () and (D,)."""
+def late_gradients(
+    model: Model, at: Anchors, k: int, samples: Samples, p: Array
+) -> tuple[Array, tuple[Array, Array, Array]]:
+    """Cost (K,) of each sample, and its derivatives in (start of its row, state there, p): (K,), (K, n), (K, M)."""
     cost = _costs(model, k)
 
-    def one(sample: Samples, at: Anchors) -> tuple[Array, Array]:
-        def along(e: Array) -> Array:
-            return cost(sample, at.segment, at.piece, at.start + at.start_d @ e, at.x + at.x_d @ e, p + P @ e)
+    def one(sample: Samples, at: Anchors) -> tuple[Array, tuple[Array, Array, Array]]:
+        def of(start: Array, x: Array, p: Array) -> tuple[Array, Array]:
+            value = cost(sample, at.segment, at.piece, start, x, p)
+            return value, value
 
-        zero = jnp.zeros(P.shape[1])
-        return along(zero), jax.jacfwd(along)(zero)
+        gradient, value = jax.jacfwd(of, argnums=(0, 1, 2), has_aux=True)(at.start, at.x, p)
+        return value, gradient
 
-    values, gradients = _each(one, samples, at)
-    return values.sum(), gradients.sum(0)
+    return _each(one, samples, at)
 
 
-def late_curvature(model: Model, at: Anchors, k: int, samples: Samples, p: Array, P: Array) -> Array:
-    """``D^2 L_k (Z_k, Z_k)``, Z_k the derivative of (start, x, p) in theta, summed over the samples: (D, D)."""
+def _along(model: Model, at: Anchors, x_d: Array, p: Array, e: Array) -> tuple[Array, Array, Array]:
+    """``(start, x, p)`` of one sample at ``theta + e``, to first order in e (D,); x_d is that of x, (n, D)."""
+    start_d = (jnp.arange(e.shape[0]) == at.starts_at) * 1.0
+    return at.start + start_d @ e, at.x + x_d @ e, p + e[model.structure.N :]
+
+
+def late_curvature(model: Model, at: Anchors, x_d: Array, k: int, samples: Samples, p: Array) -> Array:
+    """``D^2 L_k (Z_k, Z_k)``, Z_k the derivative of (start, x, p) in theta, summed over the samples: (D, D).
+
+    `x_d` (K, n, D) is the derivative of x.
+    """
     cost = _costs(model, k)
 
-    def one(sample: Samples, at: Anchors) -> Array:
+    def one(sample: Samples, at: Anchors, x_d: Array) -> Array:
         def along(e: Array) -> Array:
-            return cost(sample, at.segment, at.piece, at.start + at.start_d @ e, at.x + at.x_d @ e, p + P @ e)
+            return cost(sample, at.segment, at.piece, *_along(model, at, x_d, p, e))
 
-        return jax.jacfwd(jax.jacfwd(along))(jnp.zeros(P.shape[1]))
+        return jax.jacfwd(jax.jacfwd(along))(jnp.zeros(x_d.shape[-1]))
 
-    return _each(one, samples, at).sum(0)
+    return _each(one, samples, at, x_d).sum(0)
 
 
-def late_gauss_newton(model: Model, at: Anchors, k: int, samples: Samples, p: Array, P: Array) -> Array:
+def late_gauss_newton(model: Model, at: Anchors, x_d: Array, k: int, samples: Samples, p: Array) -> Array:
     """Gauss-Newton matrix of the samples: (D, D)."""
 
-    def one(sample: Samples, at: Anchors) -> Array:
+    def one(sample: Samples, at: Anchors, x_d: Array) -> Array:
         def along(e: Array) -> tuple[Array, Array]:
-            q = p + P @ e
-            given = (at.segment, at.piece, at.start + at.start_d @ e, at.x + at.x_d @ e, q)
-            there, x_s = seen_late(model, k, sample, *given)
+            start, x, q = _along(model, at, x_d, p, e)
+            there, x_s = seen_late(model, k, sample, at.segment, at.piece, start, x, q)
             return model.sample_residual(k, there, x_s, q), model.sample_information(k, there, x_s, q)
 
-        zero = jnp.zeros(P.shape[1])
+        zero = jnp.zeros(x_d.shape[-1])
         r_d, _ = jax.jacfwd(along)(zero)
         H = r_d.T @ (along(zero)[1][:, None] * r_d)
         if model.structure.measurements[k].sigma:
-            s_d = jax.jacfwd(lambda e: model.log_sigma(k, sample, p + P @ e))(zero)
+            s_d = jax.jacfwd(lambda e: model.log_sigma(k, sample, p + e[model.structure.N :]))(zero)
             H = H + 2.0 * s_d.T @ s_d
         return H
 
-    return _each(one, samples, at).sum(0)
+    return _each(one, samples, at, x_d).sum(0)
 
 
 def late_state_derivatives(model: Model, at: Anchors, k: int, samples: Samples, p: Array) -> tuple[Any, Any]:
@@ -141,15 +144,5 @@ def late_state_derivatives(model: Model, at: Anchors, k: int, samples: Samples, 
 
         first = jax.jacfwd(of, argnums=(0, 1))
         return first(at.x, p), jax.jacfwd(first, argnums=(0, 1))(at.x, p)
-
-    return _each(one, samples, at)
-
-
-def late_costates(model: Model, at: Anchors, k: int, samples: Samples, p: Array) -> Array:
-    """Derivative of each sample's cost in the state at the start of its row: (K, n)."""
-    cost = _costs(model, k)
-
-    def one(sample: Samples, at: Anchors) -> Array:
-        return jax.jacfwd(lambda x: cost(sample, at.segment, at.piece, at.start, x, p))(at.x)
 
     return _each(one, samples, at)

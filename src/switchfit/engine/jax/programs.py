@@ -1,4 +1,4 @@
-"""The programs of one experiment: J with its derivatives by one of the methods, and with its constraints."""
+"""The programs that JAX compiles: cost and derivatives of one experiment."""
 
 from __future__ import annotations
 
@@ -11,66 +11,79 @@ import jax.numpy as jnp
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import path_cost, propagate
-from switchfit.engine.jax.constraints import augmented
-from switchfit.engine.jax.first_order import first_order
+from switchfit.engine.jax.backward_sweep import backward_sweep
+from switchfit.engine.jax.constraints import constraints
 from switchfit.engine.jax.forward import forward_hessian
+from switchfit.engine.jax.forward_sweep import forward_sweep
 from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
 from switchfit.engine.protocol import Matrix
 from switchfit.problem.structure import Structure
 
+Array = jax.Array
 Method = Literal["forward", "discrete-adjoint", "autodiff"]
 
 
 @partial(jax.jit, static_argnames=("structure", "method", "matrix"))
 def derivatives(
     arguments: Arguments,
-    tau: jax.Array,
-    p: jax.Array,
-    side: jax.Array,
+    tau: Array,
+    p: Array,
+    side: Array,
     *,
     structure: Structure,
     method: Method,
     matrix: Matrix = "exact",
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Cost, gradient (D,) and Hessian (D, D) of one experiment in its N transition times and its p (M,), traced."""
+) -> tuple[Array, Array, Array]:
+    """Return cost, gradient (D,) and Hessian (D, D) of one experiment in its transition times (N,) and its p (M,).
+
+    With the matrix "none" the Hessian is NaN.
+    """
     model = Model(structure, arguments)
     if method == "autodiff":
         return _autodiff(model, tau, p, side)
-    first = first_order(model, tau, p, side)
+    first = forward_sweep(model, tau, p, side)
+    back = backward_sweep(model, first, p)
+    cost, gradient = back.cost, back.gradient
     if matrix == "none":
-        return first.cost, first.gradient, jnp.full((first.gradient.size, first.gradient.size), jnp.nan)
+        return cost, gradient, jnp.full((gradient.size, gradient.size), jnp.nan)
     if matrix == "gauss-newton":
-        return first.cost, first.gradient, gauss_newton_hessian(model, first, p)
-    second = forward_hessian if method == "forward" else adjoint_hessian
-    return first.cost, first.gradient, second(model, first, tau, p)
+        return cost, gradient, gauss_newton_hessian(model, first, p)
+    if method == "forward":
+        return cost, gradient, forward_hessian(model, first, p)
+    return cost, gradient, adjoint_hessian(model, first, back, p)
 
 
 @partial(jax.jit, static_argnames=("structure",))
 def constrained_derivatives(
     arguments: Arguments,
-    tau: jax.Array,
-    p: jax.Array,
-    side: jax.Array,
-    multipliers: jax.Array,
-    penalty: jax.Array,
+    tau: Array,
+    p: Array,
+    side: Array,
+    multipliers: Array,
+    penalty: Array,
     *,
     structure: Structure,
-) -> tuple[jax.Array, ...]:
-    """Cost; gradient and Hessian of ``J + weights . c``; constraints (m,), their derivatives (m, D).
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Differentiate ``J + weights . c`` of one experiment, the weights being ``multipliers + penalty c``.
 
-    The weights are ``multipliers + penalty c``.
+    Returns
+    -------
+    cost, slope, hessian : J, and the derivatives of the sum (D,) and (D, D)
+    c, jacobian : the constraints (m,) and their derivatives (m, D)
     """
     model = Model(structure, arguments)
-    first = first_order(model, tau, p, side)
-    _, slope, weights, c, A = augmented(model, first, tau, p, multipliers, penalty)
-    return first.cost, slope, adjoint_hessian(model, first, tau, p, weights), c, A
+    first = forward_sweep(model, tau, p, side)
+    c, A = constraints(model, first, p)
+    weights = multipliers + penalty * c
+    back = backward_sweep(model, first, p, weights)
+    return back.cost, back.gradient, adjoint_hessian(model, first, back, p, weights), c, A
 
 
-def _autodiff(model: Model, tau: jax.Array, p: jax.Array, side: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _autodiff(model: Model, tau: Array, p: Array, side: Array) -> tuple[Array, Array, Array]:
     """J and its derivatives by JAX alone, forward over forward."""
     N = model.structure.N
 
-    def cost(theta: jax.Array) -> jax.Array:
+    def cost(theta: Array) -> Array:
         path = propagate(model, theta[:N], theta[N:], side)
         return path_cost(model, path, theta[N:])
 

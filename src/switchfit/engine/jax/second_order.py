@@ -1,4 +1,4 @@
-"""Exact Hessian of the *discretised* cost by a backward sweep, after the forward sweep of `first_order`.
+"""Exact Hessian of the *discretised* cost by a backward sweep, after the forward sweep.
 
 With z = (x_k, theta) the arguments of node map k, Z_k their derivative in theta and psi_{k+1} the derivative of the
 cost to go,
@@ -15,27 +15,30 @@ twice, never a composition.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from switchfit.discretization.arguments import Samples
-from switchfit.discretization.mesh import row_ending_cell
 from switchfit.discretization.model import Model, Piece, weighted
 from switchfit.discretization.propagation import Path, by_mode, by_row
-from switchfit.discretization.tableaus import stage_adjoints
-from switchfit.engine.jax.first_order import (
-    FirstOrder,
+from switchfit.discretization.rows import length_factor, times_derivative
+from switchfit.engine.jax.backward_sweep import Backward, Costates, rows_at_transitions
+from switchfit.engine.jax.constraints import terms_at_end, terms_at_transitions
+from switchfit.engine.jax.forward_sweep import (
+    Forward,
     Tangents,
+    of_rows,
     parameter_directions,
-    sample_gradients,
-    stage_time_directions,
     stages_along,
+    tangents_again,
     time_directions,
+    unit,
 )
-from switchfit.engine.jax.late_samples import anchors, late_costates, late_curvature, late_gauss_newton
+from switchfit.engine.jax.late_samples import anchors, late_curvature, late_gauss_newton
 
 Array = jax.Array
 
@@ -43,144 +46,62 @@ SAMPLES_AT_ONCE = 1024
 """Samples whose second derivatives are evaluated together: bounds the memory of long logs."""
 
 
-class Costates(NamedTuple):
-    """Derivatives of the cost to go.
+def adjoint_hessian(model: Model, first: Forward, back: Backward, p: Array, weights: Array | None = None) -> Array:
+    """Hessian (D, D) of the discretised cost, with ``weights . c`` of the constraints (m,) added where given.
 
-    Attributes
-    ----------
-    start : (n,), at t0
-    opened : (Q, n), at the start of each chunk, after a reset map that acts there
-    after : (Q, C, n), at the end of each row
-    w, mu : (Q, C, s, n), in the slopes K_j and in the stage states X_j of each row
+    `back` is the backward sweep of the same sum.
     """
-
-    start: Array
-    opened: Array
-    after: Array
-    w: Array
-    mu: Array
-
-
-def adjoint_hessian(model: Model, first: FirstOrder, tau: Array, p: Array, weights: Array | None = None) -> Array:
-    """Hessian (D, D) of the discretised cost, with ``weights . c`` of the constraints (m,) added where given."""
-    path, X = first.path, first.tangents
-    guards, final = weighted_constraints(model, weights)
-    psi = costates(model, first, p, tau, guards, final)
+    path, X, psi = first.path, first.tangents, back.costates
     H = stage_curvature(model, first, psi, p) + step_length_curvature(model, first, psi)
+    H = H + curvature_of_terms(model, first, p, weights)
     P = parameter_directions(model)
     for i in model.structure.resets:
-        along = (jnp.arange(P.shape[1]) == i) * 1.0, X.before_transition(path.layout, i), P
+        along = unit(P.shape[1], i), X.before_transition(path.layout, i), P
         value = _weighted(model.reset(i), psi.opened[path.layout.first_chunk[i + 1]])
-        H = H + _second(value, (tau[i], path.before_transition(i), p), along)
-    for i, guard in guards.items():
-        along = (jnp.arange(P.shape[1]) == i) * 1.0, X.before_transition(path.layout, i), P
-        H = H + _second(guard, (tau[i], path.before_transition(i), p), along)
-    if final is not None:
-        H = H + _second(final, (path.after[-1, -1], p), (X.after[-1, -1], P))
+        H = H + _second(value, (*path.at_transition(i), p), along)
     for k, samples in enumerate(model.arguments.samples):
         H = H + sample_curvature(model, path, X, k, samples, p, gauss_newton=False)
-    if model.structure.terminal:
-        H = H + _second(model.terminal, (path.after[-1, -1], p), (X.after[-1, -1], P))
     if model.structure.initial_state is not None:
         H = H + _second(_weighted(model.initial_state, psi.start), (p,), (P,))
     return H
 
 
-def gauss_newton_hessian(model: Model, first: FirstOrder, p: Array) -> Array:
+def gauss_newton_hessian(model: Model, first: Forward, p: Array) -> Array:
     """Hessian without the second derivatives of the trajectory and of the observations: (D, D).
 
     For Measurements and ReferenceSignal this is the Gauss-Newton matrix, a robust loss weighing each residual by rho',
-    which is never negative; a sigma that is a parameter contributes its Fisher information. A RunningCost or
-    TerminalCost contributes its own second derivative in (x, p).
+    which is never negative; a sigma that is a parameter contributes its Fisher information. Any other cost contributes
+    its own second derivative in what it depends on.
     """
-    path, X = first.path, first.tangents
-    P = parameter_directions(model)
-    H = stage_gauss_newton(model, first, p)
+    H = stage_gauss_newton(model, first, p) + curvature_of_terms(model, first, p, None)
     for k, samples in enumerate(model.arguments.samples):
-        H = H + sample_curvature(model, path, X, k, samples, p, gauss_newton=True)
-    if model.structure.terminal:
-        H = H + _second(model.terminal, (path.after[-1, -1], p), (X.after[-1, -1], P))
+        H = H + sample_curvature(model, first.path, first.tangents, k, samples, p, gauss_newton=True)
     return H
 
 
-Scalar = Callable[..., Array]
+def curvature_of_terms(model: Model, first: Forward, p: Array, weights: Array | None) -> Array:
+    """Second derivative of what ``J + weights . c`` has at transitions and at the end: (D, D)."""
+    path, X = first.path, first.tangents
+    P = parameter_directions(model)
+    H = jnp.zeros((P.shape[1], P.shape[1]))
+    for i, term in terms_at_transitions(model, weights):
+        along = unit(P.shape[1], i), X.before_transition(path.layout, i), P
+        H = H + _second(term, (*path.at_transition(i), p), along)
+    t, x = path.at_end()
+    for term in terms_at_end(model, weights):
+        H = H + _second(partial(term, t), (x, p), (X.after[-1, -1], P))
+    return H
 
 
-def weighted_constraints(model: Model, weights: Array | None) -> tuple[dict[int, Scalar], Scalar | None]:
-    """Each guard g_i(t, x, p) by its transition and all terminal constraints (x, p), times their weights."""
-    if weights is None:
-        return {}, None
-    guarded = model.structure.guarded
-    guards = {i: (lambda t, x, p, i=i, w=weights[k]: w * model.guard(i)(t, x, p)) for k, i in enumerate(guarded)}
-    if not model.structure.terminal_constraints:
-        return guards, None
-    rest = weights[len(guarded) :]
-    return guards, lambda x, p: rest @ model.terminal_constraint(x, p)
-
-
-def costates(
-    model: Model,
-    first: FirstOrder,
-    p: Array,
-    tau: Array,
-    guards: dict[int, Scalar],
-    final_constraint: Scalar | None,
-) -> Costates:
-    """The costate psi, backward.
-
-    It jumps at the samples, ``psi(t_k-) = psi(t_k+) + D ell_k``, at reset maps, ``psi(tau-) = psi(tau+) D_x R``, and at
-    guards that have a weight, by its product with D_x g.
-    """
-    path, jacobians, resets = first.path, first.jacobians, first.resets
-    Q, C, n = path.after.shape
-    jumps = jnp.zeros((Q * C + 1, n))  # the first entry is that of samples at t0
-    late = jnp.zeros((Q * C, n))  # at the starts of rows
-    any_late = any(sensor.delay is not None for sensor in model.structure.measurements)
-    for k, samples in enumerate(model.arguments.samples):
-        if model.structure.measurements[k].delay is not None:
-            at = anchors(model, path, first.tangents.before, k, p)
-            late = late.at[at.row].add(late_costates(model, at, k, samples, p))
-            continue
-        where = row_ending_cell(path.layout, samples.cell) + 1
-        jumps = jumps.at[where].add(sample_gradients(model, path, k, samples, p)[1])
-
-    def row(psi: Array, given: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
-        h, f_x, jump, *more = given
-        psi = psi + jump
-        l_x = more[0] if model.has_running_cost else jnp.zeros(f_x.shape[:2])
-        w, mu, before = stage_adjoints(model.tableau, h, f_x, l_x, psi)
-        return before + more[-1] if any_late else before, (psi, w, mu)
-
-    def chunk(psi: Array, given: tuple[Array, Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
-        segment, opens, operands = given
-        opened, columns = lax.scan(row, psi, operands, reverse=True)
-        psi = opened if resets is None else jnp.where(opens, opened @ resets.x[segment], opened)
-        if guards:
-            psi = psi + jnp.where(opens, at_guards[segment], 0.0)
-        return psi, (opened, *columns)
-
-    layout = path.layout
-    at_guards = jnp.zeros((model.structure.N + 1, n))
-    for i, guard in guards.items():
-        at_guards = at_guards.at[i + 1].set(jax.grad(guard, argnums=1)(tau[i], path.before_transition(i), p))
-    final = jax.grad(model.terminal)(path.after[-1, -1], p) if model.structure.terminal else jnp.zeros(n)
-    if final_constraint is not None:
-        final = final + jax.grad(final_constraint)(path.after[-1, -1], p)
-    of_ell = (jacobians.l_x,) if model.has_running_cost else ()
-    of_late = (late.reshape(Q, C, n),) if any_late else ()
-    operands = (layout.end - layout.start, jacobians.f_x, jumps[1:].reshape(Q, C, n), *of_ell, *of_late)
-    psi, columns = lax.scan(chunk, final, (layout.segment, layout.opens, operands), reverse=True)
-    return Costates(psi + jumps[0], *columns)
-
-
-def stage_curvature(model: Model, first: FirstOrder, psi: Costates, p: Array) -> Array:
+def stage_curvature(model: Model, first: Forward, psi: Costates, p: Array) -> Array:
     """``sum Z_j' D^2 (w_j . f + h b_j ell) Z_j`` over the stages of all rows, Z_j that of (t_j, X_j, p): (D, D).
 
     Along theta directly, or along (t, x, p) where these are fewer.
     """
     n, M = model.structure.n, model.structure.M
-    path, X = first.path, first.tangents
+    path = first.path
     P = parameter_directions(model)
+    kept, along_row = stages_along(model, first)
     local = 1 + n + M < P.shape[1]
     basis = jnp.eye(1 + n + M)
 
@@ -204,60 +125,51 @@ def stage_curvature(model: Model, first: FirstOrder, psi: Costates, p: Array) ->
             w: Array,
             s_d: Array,
             e_d: Array,
-            *at_stages: Array,
+            *at_stages: Any,
         ) -> Array:
             h = end - start
-            X_d = stages_along(model, X.ends, h, s_d, e_d, *at_stages)
-            times, times_d = start + model.tableau.c * h, stage_time_directions(model, s_d, e_d)
+            times, times_d = start + model.tableau.c * h, jnp.stack(times_derivative(model.tableau, s_d, e_d))
             over_stages = jax.vmap(at_stage, in_axes=(None, 0, 0, 0, 0, 0, 0))
-            return over_stages(piece, times, states, w, h * jnp.asarray(model.tableau.b), times_d, X_d).sum(0)
+            hb = h * jnp.asarray(model.tableau.b)
+            return over_stages(piece, times, states, w, hb, times_d, along_row(*at_stages)).sum(0)
 
         return lambda *operands: jax.vmap(row)(*operands).sum(0)
 
     layout = path.layout
-    along = (*time_directions(model, layout), *X.at_stages)
-    operands = (layout.start, layout.end, path.pieces, path.stages, psi.w, *along)
+    operands = (layout.start, layout.end, path.pieces, path.stages, psi.w, *time_directions(model, layout), *kept)
     return _sum_over_chunks(model, of_mode, layout.segment, operands)
 
 
-def step_length_curvature(model: Model, first: FirstOrder, psi: Costates) -> Array:
-    """Second derivative of the products of step lengths with slopes: ``h' x (...)' `` and its transpose, (D, D).
+def step_length_curvature(model: Model, first: Forward, psi: Costates) -> Array:
+    """Second derivative of the products of row lengths with slopes: ``h' x V' + V' x h'``, (D, D).
 
-    ``h sum a_jl K_l`` contributes ``h' x mu_j sum a_jl K_l'``, ``h sum b_j K_j`` and ``h sum b_j ell_j`` likewise.
     Only the first and the last row of a segment have a length that depends on theta.
     """
-    N = model.structure.N
+    N, tableau = model.structure.N, model.tableau
     P = parameter_directions(model)
     if N == 0:
         return jnp.zeros((P.shape[1], P.shape[1]))
-    a, b = jnp.asarray(model.tableau.a), jnp.asarray(model.tableau.b)
-    layout, X = first.path.layout, first.tangents
-    starts, ends = time_directions(model, layout)
 
     def of_row(row: Array) -> Array:
-        """Derivative along theta of what the step length of a row multiplies: (D,)."""
+        """V' of one row: (D,)."""
+        all_rows = of_rows(model, first), psi.after, psi.mu
+        given, after, mu = jax.tree.map(lambda values: by_row(values)[row], all_rows)
+        _, _, _, at, start_d, end_d = given
+        X_d, K_d, _ = tangents_again(model, *given)
+        ell_d = jnp.zeros((len(tableau.b), P.shape[1]))
+        if at.l is not None:
+            times_d = jnp.stack(times_derivative(tableau, start_d, end_d))
+            ell_d = at.l_t[:, None] * times_d + jnp.einsum("sn,snd->sd", at.l_x, X_d) + at.l_p @ P
+        return jax.vmap(partial(length_factor, tableau, after, mu), in_axes=-1)(list(K_d), list(ell_d))
 
-        def at(values: Array) -> Array:
-            return by_row(values)[row]
-
-        J, start_d, end_d = jax.tree.map(at, first.jacobians), at(starts), at(ends)
-        X_d = stages_along(model, X.ends, at(layout.end - layout.start), start_d, end_d, *map(at, X.at_stages))
-        times_d = stage_time_directions(model, start_d, end_d)
-        K_d = J.f_x @ X_d + J.f_t[:, :, None] * times_d[:, None] + J.f_p @ P
-        total = jnp.einsum("n,s,snd->d", at(psi.after), b, K_d) + jnp.einsum("jn,js,snd->d", at(psi.mu), a, K_d)
-        if model.has_running_cost:
-            total = total + b @ (J.l_t[:, None] * times_d + jnp.einsum("sn,snd->sd", J.l_x, X_d) + J.l_p @ P)
-        return total
-
-    opening, closing = layout.first_chunk[1:] * layout.start.shape[1], layout.last_row[:-1]
-    by_opening, by_closing = jax.vmap(jax.vmap(of_row))(jnp.stack([opening, closing]))
+    by_opening, by_closing = jax.vmap(jax.vmap(of_row))(rows_at_transitions(first))
     half = jnp.zeros((P.shape[1], P.shape[1])).at[:N].set(by_closing - by_opening)
     return half + half.T
 
 
-def stage_gauss_newton(model: Model, first: FirstOrder, p: Array) -> Array:
+def stage_gauss_newton(model: Model, first: Forward, p: Array) -> Array:
     """Gauss-Newton part of the running costs: (D, D)."""
-    path, X = first.path, first.tangents
+    path = first.path
     P = parameter_directions(model)
     if not model.has_running_cost:
         return jnp.zeros((P.shape[1], P.shape[1]))
@@ -282,16 +194,16 @@ def stage_gauss_newton(model: Model, first: FirstOrder, p: Array) -> Array:
         states: Array,
         s_d: Array,
         e_d: Array,
-        *at_stages: Array,
+        *at_stages: Any,
     ) -> Array:
-        X_d = stages_along(model, X.ends, end - start, s_d, e_d, *at_stages)
-        times, times_d = start + model.tableau.c * (end - start), stage_time_directions(model, s_d, e_d)
-        parts = jax.vmap(at_stage, in_axes=(None, 0, 0, 0, 0))(piece, times, states, times_d, X_d)
-        return (end - start) * jnp.tensordot(jnp.asarray(model.tableau.b), parts, axes=1)
+        h = end - start
+        times, times_d = start + model.tableau.c * h, jnp.stack(times_derivative(model.tableau, s_d, e_d))
+        parts = jax.vmap(at_stage, in_axes=(None, 0, 0, 0, 0))(piece, times, states, times_d, along_row(*at_stages))
+        return h * jnp.tensordot(jnp.asarray(model.tableau.b), parts, axes=1)
 
     layout = path.layout
-    along = (*time_directions(model, layout), *X.at_stages)
-    operands = (layout.start, layout.end, path.pieces, path.stages, *along)
+    kept, along_row = stages_along(model, first)
+    operands = (layout.start, layout.end, path.pieces, path.stages, *time_directions(model, layout), *kept)
     return _sum_over_chunks(model, lambda _: lambda *rows: jax.vmap(row)(*rows).sum(0), layout.segment, operands)
 
 
@@ -314,8 +226,8 @@ def sample_curvature(
     """Second derivative of the costs of the k-th Measurements: (D, D)."""
     P = parameter_directions(model)
     if model.structure.measurements[k].delay is not None:
-        of_late = late_gauss_newton if gauss_newton else late_curvature
-        return of_late(model, anchors(model, path, X.before, k, p), k, samples, p, P)
+        of_late, at = late_gauss_newton if gauss_newton else late_curvature, anchors(model, path, k, p)
+        return of_late(model, at, by_row(X.before)[at.row], k, samples, p)
 
     def one(given: tuple[Samples, Array, Array]) -> Array:
         sample, x, x_d = given

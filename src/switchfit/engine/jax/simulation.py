@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import CHUNK, Mesh, rows
 from switchfit.discretization.model import Model, Piece
-from switchfit.discretization.tableaus import step
+from switchfit.discretization.steps import step
 from switchfit.engine.protocol import Simulation, Tangents, with_samples
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import float64

@@ -1,0 +1,93 @@
+"""One row of an implicit Runge-Kutta method: what `switchfit.discretization.rows` has for an explicit one.
+
+The equations are those of `rows`, and so are the arguments and results of the functions. The stages of an implicit
+method depend on each other: they are found by Newton's method, and their derivatives by the coupled stage equations
+``(I - h a_jl D_1 f_j) K' = ...``, transposed for the adjoint. JAX only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from switchfit.discretization.rows import Adjoint, Pull, Stages, Tangent, times_vector
+from switchfit.discretization.tableaus import Tableau
+
+Array = jax.Array
+
+NEWTON_ITERATIONS = 12
+
+
+def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, end: Array, x: Array) -> Stages:
+    """Compute the stages of a row by Newton's method in the increments ``Z = X - x``.
+
+    `jax.lax.custom_root` supplies the derivatives of the solution by the implicit function theorem, to any order.
+    """
+    s, n = len(tableau.c), x.shape[0]
+    h = end - start
+    times = start + tableau.c * h
+
+    def residual(Z: Array) -> Array:
+        return Z - h * (tableau.a @ jax.vmap(f)(times, x + Z))
+
+    def newton(function: Callable[[Array], Array], guess: Array) -> Array:
+        def correct(_: int, Z: Array) -> Array:
+            jacobian = jax.jacfwd(function)(Z).reshape(s * n, s * n)
+            return Z - jnp.linalg.solve(jacobian, function(Z).reshape(-1)).reshape(s, n)
+
+        return lax.fori_loop(0, NEWTON_ITERATIONS, correct, guess)
+
+    def tangent_solve(linear: Callable[[Array], Array], right: Array) -> Array:
+        jacobian = jax.jacfwd(linear)(jnp.zeros_like(right)).reshape(s * n, s * n)
+        return jnp.linalg.solve(jacobian, right.reshape(-1)).reshape(s, n)
+
+    Z = lax.custom_root(residual, jnp.zeros((s, n)), newton, tangent_solve)
+    X = x + Z
+    # K from Z instead of f(X): the stiff components of f amplify the rounding of X, A^-1 Z does not.
+    K = (np.linalg.inv(tableau.a) @ Z) / jnp.where(h == 0, 1.0, h)
+    K = jnp.where(h == 0, jax.vmap(f)(times, X), K)
+    return Stages(list(times), list(X), list(K))
+
+
+def tangent(
+    tableau: Tableau,
+    h: Array,
+    slopes: Sequence[Array],
+    f_x: Sequence[Array],
+    forcing: Sequence[Array],
+    x_d: Array,
+    h_d: Array | None,
+) -> Tangent:
+    """Differentiate a row along one direction."""
+    a, b = jnp.asarray(tableau.a), jnp.asarray(tableau.b)
+    A, K = jnp.stack(f_x), jnp.stack(slopes)
+    base = x_d if h_d is None else x_d + h_d * (a @ K)  # (n,) or (s, n)
+    right = jnp.stack(forcing) + (A * jnp.expand_dims(base, -2)).sum(-1)
+    K_d = times_vector(_inverse(tableau, h, A), right.reshape(-1)).reshape(K.shape)
+    X_d = base + h * (a @ K_d)
+    after = x_d + h * (b @ K_d)
+    return Tangent(list(X_d), list(K_d), after if h_d is None else after + h_d * (b @ K))
+
+
+def adjoint(tableau: Tableau, h: Array, psi: Array, pull: Pull) -> Adjoint:
+    """Pull the costate psi (n,) behind a row back to its start."""
+    a, b = jnp.asarray(tableau.a), jnp.asarray(tableau.b)
+    s, n = len(b), psi.shape[0]
+    # What pull returns is linear in (w, hb): D_1 f at each stage, row by row, and h b_j D_1 ell.
+    f_x = jnp.stack([jax.vmap(lambda w, j=j: pull(j, w, 0.0)[1])(jnp.eye(n)) for j in range(s)])
+    costs = jnp.stack([pull(j, jnp.zeros(n), h * b[j])[1] for j in range(s)])
+    right = h * (b[:, None] * psi + a.T @ costs)
+    w = (right.reshape(-1) @ _inverse(tableau, h, f_x)).reshape(s, n)
+    times, mu, parameters = zip(*(pull(j, w[j], h * b[j]) for j in range(s)), strict=True)
+    return Adjoint(list(w), list(mu), psi + sum(mu), list(times), sum(parameters))
+
+
+def _inverse(tableau: Tableau, h: Array, f_x: Array) -> Array:
+    """Return the inverse of the coupled stage equations, ``(I - h a_jl D_1 f_j)^-1``: (s n, s n)."""
+    s, n = f_x.shape[:2]
+    blocks = h * jnp.asarray(tableau.a)[:, None, :, None] * f_x[:, :, None, :]
+    return jnp.linalg.inv(jnp.eye(s * n) - blocks.reshape(s * n, s * n))

@@ -1,0 +1,235 @@
+"""The forward sweep: states, derivatives of f and ell at the stages, and the derivative of the state along theta.
+
+theta here is (tau_1 .. tau_N, p_1 .. p_M), D = N + M entries; fixed transition times are among them. f and ell are
+differentiated at all stages of a chunk of rows at once; what remains to be done one row after another is linear.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from switchfit.discretization.mesh import Rows
+from switchfit.discretization.model import Model, Piece
+from switchfit.discretization.propagation import Path, at_cells, by_mode, propagate
+from switchfit.discretization.rows import times_derivative
+from switchfit.discretization.steps import row_functions
+
+Array = jax.Array
+
+
+KEPT = 2**25
+"""Bytes up to which the derivatives at the stages are kept: finding them again takes a fifth of a Hessian's time."""
+
+
+class StageJacobians(NamedTuple):
+    """Derivatives of f and ell at every stage of every row.
+
+    Attributes
+    ----------
+    f_t, f_x, f_p : (Q, C, s, n), (Q, C, s, n, n), (Q, C, s, n, M)
+    l, l_t, l_x, l_p : (Q, C, s), (Q, C, s), (Q, C, s, n), (Q, C, s, M); None if there is no running cost
+    """
+
+    f_t: Array
+    f_x: Array
+    f_p: Array
+    l: Any = None  # noqa: E741  # the paper's ell
+    l_t: Any = None
+    l_x: Any = None
+    l_p: Any = None
+
+
+class ResetJacobians(NamedTuple):
+    """Derivatives of the map at the opening of each segment, identity where there is none: (N + 1, ...) arrays."""
+
+    t: Array  # (N + 1, n)
+    x: Array  # (N + 1, n, n)
+    p: Array  # (N + 1, n, M)
+
+
+class Tangents(NamedTuple):
+    """Derivative of the state in theta.
+
+    Attributes
+    ----------
+    before, after : (Q, C, n, D), at the start and the end of each row
+    stages : (Q, C, s, n, D), at the stages; None where they take more than `KEPT` bytes
+    """
+
+    before: Array
+    after: Array
+    stages: Array | None
+
+    def before_transition(self, layout: Rows, i: int) -> Array:
+        """At tau_i-: (n, D)."""
+        return self.after[layout.first_chunk[i + 1] - 1, -1]
+
+    def at_samples(self, layout: Rows, cell: Array) -> Array:
+        """At the ends of the given cells (K,): (K, n, D)."""
+        return at_cells(layout, self.before[0, 0], self.after, cell)
+
+
+class Forward(NamedTuple):
+    """What the forward sweep finds. What of it nobody reads, XLA leaves out."""
+
+    path: Path
+    jacobians: StageJacobians
+    resets: ResetJacobians | None
+    tangents: Tangents
+
+
+def forward_sweep(model: Model, tau: Array, p: Array, side: Array) -> Forward:
+    """Integrate the state, and differentiate it along theta."""
+    path = propagate(model, tau, p, side)
+    jacobians = stage_jacobians(model, path, p)
+    resets = reset_jacobians(model, path, p)
+    return Forward(path, jacobians, resets, tangents(model, path, jacobians, resets, p))
+
+
+def parameter_directions(model: Model) -> Array:
+    """Derivative of p in theta, ``[0 | I]``: (M, D)."""
+    N, M = model.structure.N, model.structure.M
+    return jnp.concatenate([jnp.zeros((M, N)), jnp.eye(M)], axis=1)
+
+
+def unit(D: int, i: int) -> Array:
+    """Derivative of tau_i in theta, i from 0: (D,)."""
+    return (jnp.arange(D) == i) * 1.0
+
+
+def time_directions(model: Model, layout: Rows) -> tuple[Array, Array]:
+    """Derivatives of the start and the end of each row in theta: two (Q, C, D) arrays of zeros and ones."""
+    index = jnp.arange(model.structure.N + model.structure.M)
+    return (layout.starts_at[..., None] == index) * 1.0, (layout.ends_at[..., None] == index) * 1.0
+
+
+def stage_jacobians(model: Model, path: Path, p: Array) -> StageJacobians:
+    """D_2 f, D_1 f, D_p f at all stages, by forward differentiation, and the gradient of ell."""
+
+    def of_mode(mode: int) -> Callable[..., StageJacobians]:
+        def at_stage(piece: Piece, t: Array, x: Array) -> StageJacobians:
+            f = model.field(mode, piece)
+
+            f_t, f_x, f_p = jax.jacfwd(f, argnums=(0, 1, 2))(t, x, p)
+            if not model.has_running_cost:
+                return StageJacobians(f_t, f_x, f_p)
+            # A scalar: backward is cheaper.
+            l, gradient = jax.value_and_grad(model.density(piece), argnums=(0, 1, 2))(t, x, p)  # noqa: E741
+            return StageJacobians(f_t, f_x, f_p, l, *gradient)
+
+        def row(start: Array, end: Array, piece: Piece, X: Array) -> StageJacobians:
+            times = start + model.tableau.c * (end - start)
+            return jax.vmap(at_stage, in_axes=(None, 0, 0))(piece, times, X)
+
+        return jax.vmap(row)
+
+    def chunk(given: tuple[Array, Array, Array, Piece, Array]) -> StageJacobians:
+        segment, *operands = given
+        return by_mode(model, segment, of_mode, *operands)
+
+    layout = path.layout
+    return lax.map(chunk, (layout.segment, layout.start, layout.end, path.pieces, path.stages))
+
+
+def reset_jacobians(model: Model, path: Path, p: Array) -> ResetJacobians | None:
+    """Jacobians of the reset maps; None where no transition has one."""
+    structure = model.structure
+    if not structure.resets:
+        return None
+    n, N, M = structure.n, structure.N, structure.M
+    t, x, of_p = jnp.zeros((N + 1, n)), jnp.broadcast_to(jnp.eye(n), (N + 1, n, n)), jnp.zeros((N + 1, n, M))
+    for i in structure.resets:
+        R_t, R_x, R_p = jax.jacfwd(model.reset(i), argnums=(0, 1, 2))(*path.at_transition(i), p)
+        t, x, of_p = t.at[i + 1].set(R_t), x.at[i + 1].set(R_x), of_p.at[i + 1].set(R_p)
+    return ResetJacobians(t, x, of_p)
+
+
+def tangents(model: Model, path: Path, jacobians: StageJacobians, resets: ResetJacobians | None, p: Array) -> Tangents:
+    """``x_theta`` along the path: forward, linear, one row after another.
+
+    Every row is treated as if both its ends moved, which only those beside a transition do. Measured, that costs no
+    more than treating those rows by themselves and adding what they give.
+    """
+    layout, P = path.layout, parameter_directions(model)
+    keep = 8 * path.stages.size * P.shape[1] <= KEPT
+
+    def row(X: Array, given: tuple[Any, ...]) -> tuple[Array, tuple[Array, ...]]:
+        stages_d, _, after = row_tangents(model, X, *given)
+        return after, (X, after, stages_d) if keep else (X, after)
+
+    def chunk(X: Array, given: Any) -> tuple[Array, tuple[Array, ...]]:
+        segment, opens, h, slopes, at, start_d, end_d = given
+        if resets is not None:
+            behind = resets.x[segment] @ X + resets.p[segment] @ P + resets.t[segment][:, None] * start_d[0]
+            X = jnp.where(opens, behind, X)
+        # For all rows of a chunk at once, outside of the loop over them: a tenth of an evaluation.
+        direct = jax.vmap(partial(direct_derivatives, model))(at, start_d, end_d)
+        return lax.scan(row, X, (h, slopes, at.f_x, *direct))
+
+    first = jax.jacfwd(model.initial_state)(p) @ P
+    h = layout.end - layout.start
+    given = (layout.segment, layout.opens, h, path.slopes, jacobians, *time_directions(model, layout))
+    _, (before, after, *kept) = lax.scan(chunk, first, given)
+    return Tangents(before, after, kept[0] if keep else None)
+
+
+def direct_derivatives(model: Model, at: StageJacobians, start_d: Array, end_d: Array) -> tuple[Array, Array | None]:
+    """Derivatives of one row that do not come by way of its states: its forcing (s, n, D), and of its length (D,)."""
+    N = model.structure.N
+    forcing = jnp.pad(at.f_p, ((0, 0), (0, 0), (N, 0)))
+    if N == 0:
+        return forcing, None
+    times_d = jnp.stack(times_derivative(model.tableau, start_d, end_d))
+    return forcing + at.f_t[:, :, None] * times_d[:, None], end_d - start_d
+
+
+def row_tangents(
+    model: Model, x_d: Array, h: Array, slopes: Array, f_x: Array, forcing: Array, h_d: Array | None
+) -> tuple[Array, Array, Array]:
+    """Differentiate one row along all of theta.
+
+    Parameters
+    ----------
+    x_d : (n, D), derivative of the state before the row
+    h, slopes, f_x : (), (s, n), (s, n, n)
+    forcing, h_d : (s, n, D), (D,), what `direct_derivatives` returned
+
+    Returns
+    -------
+    X_d, K_d, after : (s, n, D), (s, n, D), (n, D); of states and slopes of the stages, and of the state behind the row
+    """
+    function = partial(row_functions(model.tableau).tangent, model.tableau, h, list(slopes), list(f_x))
+    along = jax.vmap(function, in_axes=(-1, -1, None if h_d is None else -1), out_axes=-1)
+    found = along(list(forcing), x_d, h_d)
+    return jnp.stack(found.states), jnp.stack(found.slopes), found.after
+
+
+def stages_along(model: Model, first: Forward) -> tuple[tuple[Any, ...], Callable[..., Array]]:
+    """What of each row the derivatives at its stages follow from, (Q, C, ...), and how: a function of one row's.
+
+    These are the derivatives themselves, (s, n, D) for each row, where they have been kept.
+    """
+    kept = first.tangents.stages
+    if kept is not None:
+        return (kept,), lambda stages_d: stages_d
+    return of_rows(model, first), lambda *row: tangents_again(model, *row)[0]
+
+
+def of_rows(model: Model, first: Forward) -> tuple[Any, ...]:
+    """What `tangents_again` takes, of all rows: (Q, C, ...)."""
+    layout = first.path.layout
+    lengths = layout.end - layout.start
+    return (first.tangents.before, lengths, first.path.slopes, first.jacobians, *time_directions(model, layout))
+
+
+def tangents_again(
+    model: Model, x_d: Array, h: Array, slopes: Array, at: StageJacobians, start_d: Array, end_d: Array
+) -> tuple[Array, Array, Array]:
+    """What `row_tangents` returned for one row."""
+    return row_tangents(model, x_d, h, slopes, at.f_x, *direct_derivatives(model, at, start_d, end_d))

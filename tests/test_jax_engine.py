@@ -1,0 +1,156 @@
+"""What the JAX engine knows of nodes: constraints and costs, whatever their kind, against JAX's own derivatives."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from systems import compiled
+
+import switchfit as sf
+from switchfit.discretization import nodes
+from switchfit.discretization.arguments import arguments_of
+from switchfit.discretization.mesh import Mesh
+from switchfit.discretization.model import Model
+from switchfit.discretization.propagation import path_cost, propagate
+from switchfit.engine.jax.backward_sweep import backward_sweep
+from switchfit.engine.jax.constraints import constraints
+from switchfit.engine.jax.forward import forward_hessian
+from switchfit.engine.jax.forward_sweep import forward_sweep
+from switchfit.engine.jax.programs import constrained_derivatives
+from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
+
+TAU, P0 = np.array([0.93, 2.07]), np.array([0.7, 0.4])
+
+
+def problem_of(solver: str) -> sf.Problem:
+    """Guards, reset maps, samples, a running cost and terminal constraints that depend on t, x, p."""
+
+    def first(t, x, p):
+        return jnp.stack([x[1] * jnp.cos(t), -p["a"] * x[0] + 0.3 * x[1] ** 2])
+
+    def second(t, x, p):
+        return jnp.stack([p["b"] * x[1] ** 2 - x[0], jnp.sin(x[0]) * p["a"] - 0.2 * x[1]])
+
+    system = sf.HybridSystem(
+        {"first": first, "second": second},
+        lambda p: jnp.stack([1.0 + 0.1 * p["a"] ** 2, p["b"]]),
+        reset_maps={("first", "second"): lambda t, x, p: jnp.stack([x[0] * p["a"], x[1] + 0.1 * x[0] ** 2 * t])},
+        guards={
+            ("first", "second"): lambda t, x, p: x[0] * p["b"] - jnp.sin(t) * x[1],
+            ("second", "first"): lambda t, x, p: p["a"] ** 2 * x[1] ** 2 + t * x[0] - 1.0,
+        },
+    )
+    data = [
+        sf.Measurements([0.5, 1.4, 2.6], [[0.3, 0.2], [0.4, -0.2], [0.1, 0.5]], sigma=0.5),
+        sf.RunningCost(lambda t, x, p: p["b"] * x[0] ** 2 * jnp.cos(t)),
+        sf.TerminalConstraint(lambda x, p: jnp.stack([x[0] * x[1] - p["a"], p["b"] * x[0] ** 2])),
+    ]
+    run = sf.Experiment(data, ("first", "second", "first"), TAU, 0.0, 3.0)
+    return sf.Problem(system, run, {"a": P0[0], "b": P0[1]}, solver=solver)
+
+
+def program_inputs(problem: sf.Problem):
+    """The structure, and the arguments on a mesh of 12 cells."""
+    times = np.unique(np.concatenate([np.linspace(0.0, 3.0, 11), [0.5, 1.4, 2.6]]).round(12))
+    return problem.structures[0], arguments_of(problem, 0, Mesh.from_times(times))
+
+
+def assert_close(found, expected, relative: float) -> None:
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0.0, atol=relative * np.abs(b).max())
+
+
+@pytest.mark.parametrize(("solver", "relative"), [("explicit", 1e-12), ("stiff", 1e-9)])
+def test_augmented_lagrangian_has_exact_derivatives(solver: str, relative: float) -> None:
+    structure, arguments = program_inputs(problem_of(solver))
+    multipliers, penalty = np.array([0.3, -1.1, 0.7, 0.4]), np.array([1.3, 0.6, 0.8, 1.9])
+
+    def constraints_of(model, path, theta):
+        p = theta[2:]
+        at_transitions = [model.guard(i)(theta[i], path.before_transition(i), p) for i in range(2)]
+        return jnp.concatenate([jnp.stack(at_transitions), model.terminal_constraint(path.after[-1, -1], p)])
+
+    def lagrangian(arguments, tau, p, side):
+        def value(theta):
+            model = Model(structure, arguments)
+            path = propagate(model, theta[:2], theta[2:], side)
+            J, c = path_cost(model, path, theta[2:]), constraints_of(model, path, theta)
+            return J + multipliers @ c + 0.5 * penalty @ c**2, (J, c)
+
+        theta = jnp.concatenate([tau, p])
+        _, (J, c) = value(theta)
+        slope, hessian = jax.jacfwd(value, has_aux=True), jax.jacfwd(jax.jacfwd(value, has_aux=True), has_aux=True)
+        return J, slope(theta)[0], hessian(theta)[0], c, jax.jacfwd(lambda theta: value(theta)[1][1])(theta)
+
+    expected = compiled(lagrangian)(arguments, TAU, P0)
+
+    def differentiate(arguments, tau, p, side):
+        return constrained_derivatives(arguments, tau, p, side, multipliers, penalty, structure=structure)
+
+    found = compiled(differentiate)(arguments, TAU, P0)
+    assert np.abs(expected[2]).min() > 1e-3, "an entry is not tested"
+    assert_close(found, expected, relative)
+
+
+def test_costs_at_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A kind of node at transitions that is a cost: here the guards, taken for one."""
+    structure, arguments = program_inputs(problem_of("explicit"))
+    without = compiled(lambda a, tau, p, side: path_cost(m := Model(structure, a), propagate(m, tau, p, side), p))
+    J_without = float(without(arguments, TAU, P0))
+    monkeypatch.setattr(nodes, "AT_TRANSITIONS", (nodes.TransitionKind("guards", constraint=False),))
+
+    def by_jax(arguments, tau, p, side):
+        def cost(theta):
+            model = Model(structure, arguments)
+            path = propagate(model, theta[:2], theta[2:], side)
+            own = sum(model.guard(i)(theta[i], path.before_transition(i), theta[2:]) for i in range(2))
+            return path_cost(model, path, theta[2:]), own
+
+        theta = jnp.concatenate([tau, p])
+        J, own = cost(theta)
+        gradient = jax.jacfwd(lambda theta: cost(theta)[0])
+        return J, gradient(theta), jax.jacfwd(gradient)(theta), own
+
+    def by_sweeps(arguments, tau, p, side):
+        model = Model(structure, arguments)
+        first = forward_sweep(model, tau, p, side)
+        back = backward_sweep(model, first, p)
+        matrices = adjoint_hessian(model, first, back, p), forward_hessian(model, first, p)
+        return back.cost, back.gradient, *matrices, constraints(model, first, p)[0]
+
+    J, g, H, own = compiled(by_jax)(arguments, TAU, P0)
+    assert float(J) == pytest.approx(J_without + float(own), rel=1e-13)
+    found_J, found_g, adjoint, forward, c = compiled(by_sweeps)(arguments, TAU, P0)
+    assert_close((found_J, found_g, adjoint, forward), (J, g, H, H), 1e-12)
+    assert c.shape == (2,)  # those at the end alone
+
+    def gauss_newton(arguments, tau, p, side):
+        model = Model(structure, arguments)
+        return gauss_newton_hessian(model, forward_sweep(model, tau, p, side), p)
+
+    with_costs = compiled(gauss_newton)(arguments, TAU, P0)
+    monkeypatch.setattr(nodes, "AT_TRANSITIONS", ())
+    added = with_costs - compiled(lambda *given: gauss_newton(*given))(arguments, TAU, P0)
+
+    def expected_added(arguments, tau, p, side):
+        """Their second derivatives along (tau_i, x(tau_i-), p), without that of the trajectory."""
+        model = Model(structure, arguments)
+        theta, total = jnp.concatenate([tau, p]), 0.0
+        for i in range(2):
+
+            def x_of(theta, i=i):
+                return propagate(model, theta[:2], theta[2:], side).before_transition(i)
+
+            x, x_d = x_of(theta), jax.jacfwd(x_of)(theta)
+
+            def along(e, i=i, x=x, x_d=x_d):
+                q = theta + e
+                return model.guard(i)(q[i], x + x_d @ e, q[2:])
+
+            total = total + jax.jacfwd(jax.jacfwd(along))(jnp.zeros(theta.size))
+        return total
+
+    expected = compiled(expected_added)(arguments, TAU, P0)
+    np.testing.assert_allclose(added, expected, rtol=0.0, atol=1e-11 * np.abs(expected).max())
