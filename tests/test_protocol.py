@@ -54,6 +54,7 @@ DATA = {
         sf.RunningCost(lambda t, x, p: x[0] ** 2 * x[1] ** 2 + p["k"] * t * x[0]),
         sf.Measurements(TIMES[2:], VALUES[2:], sigma=0.5, delay="d"),
     ],
+    "transitions": [samples(), sf.TransitionCost(lambda t, x, p: p["k"] * x[0] ** 2 * x[1] + (t - 1.2) ** 2 * x[1])],
     "end": [samples(), sf.TerminalCost(lambda x, p: p["k"] * x[0] ** 2 * x[1])],
 }
 MORE = {"s": sf.Parameter(0.7, lower=0.1), "d": sf.Parameter(0.13, lower=0.0, upper=0.25)}
@@ -96,6 +97,59 @@ def test_constraints_are_the_same():
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-10, err_msg=name)
 
 
+def test_the_cost_of_transitions_in_closed_form():
+    """x = x0 exp(-k t): ``mu = (x - a)^2 + c t`` at tau, of which the other transition has nothing."""
+    modes = {
+        "decay": lambda t, x, p: -p["k"] * x,
+        "stand": lambda t, x, p: 0.0 * x,
+        "again": lambda t, x, p: -p["k"] * x,
+    }
+    cost = sf.TransitionCost(lambda t, x, p: (x[0] - 0.4) ** 2 + 0.3 * t, after="stand")
+    run = sf.Experiment(cost, ("decay", "stand", "again"), (0.8, 1.7), 0.0, 3.0)
+    given = sf.Problem(sf.HybridSystem(modes, [1.0]), run, {"k": 0.9})
+    for engine in ("native", "jax"):
+        here = replace(given, engine=engine)
+        found, (tau, _, k) = sf.evaluate(here), here.initial_theta
+        x = np.exp(-k * tau)
+        slope, bend = 2 * (x - 0.4), 2.0
+        assert found.cost == pytest.approx((x - 0.4) ** 2 + 0.3 * tau, rel=1e-8)
+        assert evaluator_of(here).cost(here.initial_theta) == pytest.approx(found.cost, rel=1e-12)
+        np.testing.assert_allclose(found.gradient, [-k * x * slope + 0.3, 0.0, -tau * x * slope], rtol=1e-7)
+        second = bend * x**2 * np.outer([k, tau], [k, tau]) + slope * x * np.array(
+            [[k**2, k * tau - 1], [k * tau - 1, tau**2]]
+        )
+        np.testing.assert_allclose(found.hessian[np.ix_([0, 2], [0, 2])], second, rtol=1e-6)
+        np.testing.assert_allclose(found.hessian[1], 0.0, atol=1e-12)
+    expected = sf.evaluate(given, method="autodiff")
+    np.testing.assert_allclose(sf.evaluate(given, method="forward").hessian, expected.hessian, rtol=1e-9, atol=1e-12)
+
+
+def test_what_the_papers_equations_do_not_know_is_not_compared_with_them():
+    given = problem(DATA["transitions"])
+    with pytest.raises(ValueError, match="the paper's equations know no TransitionCost: take another method"):
+        sf.evaluate(given, method="adjoint")
+    check = sf.check_derivatives(given)
+    assert check.passed
+    assert "gradient not checked" in str(check)
+    assert "not checked" in str(sf.estimate(given).certificate)
+
+
+def test_two_costs_at_one_transition_are_refused():
+    costs = [sf.TransitionCost(lambda t, x, p: x[0]), sf.TransitionCost(lambda t, x, p: t, before="swing")]
+    with pytest.raises(ValueError, match="2 TransitionCosts count at a transition from 'swing' to"):
+        problem([samples(), *costs])
+
+
+def test_a_fit_with_the_cost_of_a_switch():
+    """Minimum of J in closed form: the time that a transition would have alone is drawn to where it is cheap."""
+    modes = {"wait": lambda t, x, p: 0.0 * x, "go": lambda t, x, p: 0.0 * x + 1.0}
+    data = sf.Measurements([3.0], [[1.8]], sigma=0.5)  # x(3) = 3 - tau
+    wish = sf.TransitionCost(lambda t, x, p: 0.5 * ((t - 1.0) / 0.25) ** 2, before="wait", after="go")
+    run = sf.Experiment([data, wish], ("wait", "go"), (1.5,), 0.0, 3.0)
+    found = sf.estimate(sf.Problem(sf.HybridSystem(modes, [0.0]), run))
+    assert found.theta[0] == pytest.approx((1.2 / 0.25 + 1.0 / 0.0625) / (1 / 0.25 + 1 / 0.0625), rel=1e-9)
+
+
 def programs():
     return program._program_of.cache_info().misses
 
@@ -121,7 +175,7 @@ SEQUENCES = {
 }
 
 
-@pytest.mark.parametrize("data", ["samples", "late", "reference, running"])
+@pytest.mark.parametrize("data", ["samples", "late", "reference, running", "transitions"])
 def test_sequences_of_any_length_run_in_a_program_with_room_for_them(data):
     """Sequences with fewer transitions leave segments idle: same cost, derivatives, simulations, guards."""
     system = sf.HybridSystem(MODES, [0.4, 0.1], BOUNCE, guards=GUARDS)

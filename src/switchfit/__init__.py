@@ -12,7 +12,15 @@ from switchfit.fit.termination import Kink, Termination
 from switchfit.fit.trajectory import Comparison, Trajectory, simulate
 from switchfit.optimize import Status
 from switchfit.problem.constraints import ActiveConstraint
-from switchfit.problem.data import Input, Measurements, ReferenceSignal, RunningCost, TerminalConstraint, TerminalCost
+from switchfit.problem.data import (
+    Input,
+    Measurements,
+    ReferenceSignal,
+    RunningCost,
+    TerminalConstraint,
+    TerminalCost,
+    TransitionCost,
+)
 from switchfit.problem.experiment import Experiment, Parameter
 from switchfit.problem.priors import LogNormal, Normal
 from switchfit.problem.problem import Problem
@@ -69,6 +77,7 @@ __all__ = [
     "TerminalCost",
     "Termination",
     "Trajectory",
+    "TransitionCost",
     "bootstrap",
     "check_derivatives",
     "estimate",

@@ -37,7 +37,7 @@ class TransitionKind(NamedTuple):
     constraint: bool
 
 
-AT_TRANSITIONS = (TransitionKind("guards", constraint=True),)
+AT_TRANSITIONS = (TransitionKind("guards", constraint=True), TransitionKind("transition_costs", constraint=False))
 """All kinds of nodes at transitions."""
 
 

@@ -206,6 +206,8 @@ class Evaluator:
             return [engine.derivatives(*at, side, matrix) for engine, at in zip(self.engines, vectors, strict=True)]
         given = list(zip(self.problem.structures, self.arguments, self.meshes, vectors, strict=True))
         if method == "adjoint":
+            if not knows_paper(self.problem):
+                raise ValueError("the paper's equations know no TransitionCost: take another method.")
             with float64(), compilation_cache():
                 found = [evaluate_paper(a, *at, float(side), structure=s) for s, a, _, at in given]
             return [Derivatives(float(J), np.array(g), np.array(H)) for J, g, H in found]
@@ -219,6 +221,11 @@ class Evaluator:
             for place in where[where >= 0].tolist():
                 points[place] = times
         return points
+
+
+def knows_paper(problem: Problem) -> bool:
+    """Return whether the paper's equations know all that the cost consists of."""
+    return not any(any(f is not None for f in s.transition_costs) for s in problem.structures)
 
 
 def evaluator_of(problem: Problem) -> Evaluator:

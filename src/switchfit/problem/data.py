@@ -161,6 +161,47 @@ class TerminalCost:
 
 
 @dataclass(frozen=True, eq=False)
+class TransitionCost:
+    """Cost of a transition: adds ``mu(tau, x(tau-), p)`` to J at each transition between two modes.
+
+    tau is the transition time, and x(tau-) the state just before it, to which a reset map has not been applied yet. It
+    is what a switch costs, how far from a wanted state or moment it may happen, or a prior that depends on the state.
+
+    Parameters
+    ----------
+    mu : callable ``mu(t, x, p) -> scalar``, twice differentiable.
+    before, after : str, optional
+        The modes between which it counts; left out, any. No two may count at the same transition.
+
+    Examples
+    --------
+    Switching from "push" to "brake" costs the square of the speed:
+
+    >>> import switchfit as sf
+    >>> cost = sf.TransitionCost(lambda t, x, p: x[1] ** 2, before="push", after="brake")
+
+    See Also
+    --------
+    RunningCost, TerminalCost
+    """
+
+    mu: Callable[..., Any]
+    before: str | None = None
+    after: str | None = None
+
+    def __post_init__(self) -> None:
+        if not callable(self.mu):
+            raise TypeError(f"TransitionCost needs a function mu(t, x, p); got {type(self.mu).__name__}.")
+        for name in ("before", "after"):
+            if getattr(self, name) is not None:
+                as_name(getattr(self, name), name, "the name of a mode")
+
+    def counts_between(self, before: str, after: str) -> bool:
+        """Whether it counts at a transition from a mode to another."""
+        return self.before in (None, before) and self.after in (None, after)
+
+
+@dataclass(frozen=True, eq=False)
 class TerminalConstraint:
     """What has to hold at the end: ``psi(x(tf), p) = 0``, an equality constraint and no cost.
 

@@ -18,6 +18,7 @@ from switchfit.problem.data import (
     RunningCost,
     TerminalConstraint,
     TerminalCost,
+    TransitionCost,
 )
 from switchfit.problem.parameter import Parameter as Parameter
 from switchfit.problem.parameter import as_parameter
@@ -32,8 +33,8 @@ class Experiment:
     Parameters
     ----------
     data : cost or list of costs
-        `Measurements`, `ReferenceSignal`, `RunningCost`, `TerminalCost`; several add up. A `TerminalConstraint` beside
-        them has to hold.
+        `Measurements`, `ReferenceSignal`, `RunningCost`, `TransitionCost`, `TerminalCost`; several add up. A
+        `TerminalConstraint` beside them has to hold.
     mode_sequence : sequence of str
         Names of the modes in the order in which they are active; a mode may return.
     transition_times : sequence of float or Parameter
@@ -192,12 +193,12 @@ def _checked_map(given: Any) -> Mapping[str, str]:
 
 
 def _checked_data(data: Any) -> tuple[Data, ...]:
-    kinds = (Measurements, ReferenceSignal, RunningCost, TerminalCost, TerminalConstraint)
+    kinds = (Measurements, ReferenceSignal, RunningCost, TransitionCost, TerminalCost, TerminalConstraint)
     items = (data,) if isinstance(data, kinds) else tuple(data) if isinstance(data, (list, tuple)) else (data,)
     for item in items:
         if not isinstance(item, kinds):
             raise TypeError(
-                "data must be sf.Measurements, sf.ReferenceSignal, sf.RunningCost, sf.TerminalCost, "
+                "data must be sf.Measurements, sf.ReferenceSignal, sf.RunningCost, sf.TransitionCost, sf.TerminalCost, "
                 f"sf.TerminalConstraint or a list of them; got {type(item).__name__}."
             )
     if not items:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ from switchfit.problem.data import (
     RunningCost,
     TerminalConstraint,
     TerminalCost,
+    TransitionCost,
 )
 from switchfit.problem.experiment import Experiment, initial_state_of
 from switchfit.problem.functions import Function, Shape, trace_function
@@ -73,6 +74,8 @@ class Structure:
     transitions: int  # most transitions of a sequence that its library has room for
     reset_library: tuple[Function, ...]  # reset maps and guards that sequences of these modes may have
     guard_library: tuple[Function, ...]
+    transition_costs: tuple[Function | None, ...] = ()
+    transition_cost_library: tuple[Function, ...] = ()
 
     @property
     def outputs(self) -> tuple[tuple[Function | None, int], ...]:
@@ -101,6 +104,8 @@ class Structure:
             transitions=0,
             reset_library=(),
             guard_library=(),
+            transition_costs=(),
+            transition_cost_library=(),
         )
 
     @cached_property
@@ -109,7 +114,13 @@ class Structure:
 
         Machine code is written for a library; which mode, reset map and guard comes when, it reads at run time.
         """
-        return replace(self, mode_of_segment=(), reset_maps=self.reset_library, guards=self.guard_library)
+        return replace(
+            self,
+            mode_of_segment=(),
+            reset_maps=self.reset_library,
+            guards=self.guard_library,
+            transition_costs=self.transition_cost_library,
+        )
 
     @property
     def resets(self) -> tuple[int, ...]:
@@ -134,6 +145,7 @@ class Structure:
             ("initial_state", (self.initial_state,)),
             ("reset map", self.reset_maps),
             ("guard", self.guards),
+            ("TransitionCost", self.transition_costs),
             ("RunningCost", self.running),
             ("observe", tuple(observe for observe, _ in self.outputs)),
             ("TerminalCost", self.terminal),
@@ -268,6 +280,8 @@ def structure_of(
             )
     reset_maps, reset_library = at_transitions(system.reset_maps, (n,), "reset map", "R(t, x, p)")
     guards, guard_library = at_transitions(system.guards, (), "guard", "g(t, x, p)")
+    costs = _transition_costs(items(TransitionCost), names)
+    transition_costs, transition_cost_library = at_transitions(costs, (), "TransitionCost", "mu(t, x, p)")
     structure = Structure(
         mode_names=names,
         modes=modes,
@@ -288,6 +302,8 @@ def structure_of(
         transitions=len(reset_maps) if transitions is None else transitions,
         reset_library=reset_library,
         guard_library=guard_library,
+        transition_costs=transition_costs,
+        transition_cost_library=transition_cost_library,
     )
     asked = trace.asked.union(*(sensor.named for sensor in structure.measurements))
     # What is fixed costs nothing.
@@ -297,6 +313,21 @@ def structure_of(
         if name in asked or (q.fixed and name not in trace.hidden)
     )
     return replace(structure, parameters=parameters)
+
+
+def _transition_costs(items: list[TransitionCost], modes: tuple[str, ...]) -> dict[tuple[str, str], Callable[..., Any]]:
+    """The cost of each transition that may happen and has one."""
+    found = {}
+    for before, after in product(modes, modes):
+        here = [item.mu for item in items if item.counts_between(before, after)]
+        if len(here) > 1:
+            raise ValueError(
+                f"{len(here)} TransitionCosts count at a transition from {before!r} to {after!r}, where one may: give "
+                "their sum in one, or say before and after."
+            )
+        if here:
+            found[before, after] = here[0]
+    return found
 
 
 def initial_values(initial: Any) -> FloatArray:

@@ -95,8 +95,8 @@ def write_derivative_check(check: DerivativeCheck) -> str:
         *format_table(rows, ">" * 7),
         "",
         "Paper's equations (6)-(17) against the derivatives of the discretised cost, relative:",
-        f"  gradient {check.gradient_gap:.1e}, with half the steps {check.gradient_gap_halved:.1e}",
-        f"  Hessian  {check.hessian_gap:.1e}, with half the steps {check.hessian_gap_halved:.1e}",
+        f"  gradient {_gap(check.gradient_gap)}, with half the steps {_gap(check.gradient_gap_halved)}",
+        f"  Hessian  {_gap(check.hessian_gap)}, with half the steps {_gap(check.hessian_gap_halved)}",
         f"Observed orders {observed} (1, 2, 3 expected): {verdict}.",
     ]
     return "\n".join(lines)

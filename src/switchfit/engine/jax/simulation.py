@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import CHUNK, Mesh, rows
 from switchfit.discretization.model import Model, Piece
+from switchfit.discretization.nodes import costs_at_transitions
 from switchfit.discretization.steps import step
 from switchfit.engine.protocol import Simulation, Tangents, with_samples
 from switchfit.problem.data import FloatArray
@@ -42,6 +43,7 @@ def simulate_by_jax(
     cell, start, end = (np.reshape(a, -1) for a in (layout.cell, layout.start, layout.end))
     index = np.arange(structure.N + structure.M)
     starts_d, ends_d = (1.0 * (np.reshape(a, -1)[:, None] == index) for a in (layout.starts_at, layout.ends_at))
+    costly = {i for i, _ in costs_at_transitions(Model(structure, arguments))}
     kept, parts, cost = [], [], 0.0
     with float64(), compilation_cache():
         start_of = partial(_start, structure=structure.functions, N=structure.N, tangents=tangents)
@@ -61,6 +63,8 @@ def simulate_by_jax(
             kept.append(np.arange(here.start, here.stop))
             parts.append(columns)
             cost += added
+            if i in costly:
+                cost += float(_at_transition(arguments, tau[i], x, p, structure=structure, i=i))
         cost += float(_terminal(arguments, x, p, structure=structure.functions))
     own = np.concatenate(kept)
     before, after, y_before, y_after, *derivatives = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -228,6 +232,17 @@ def _of_parameters(X: jax.Array, p: jax.Array) -> jax.Array:
     """Derivative of p in (tau, p), ``[0 | I]``: (M, D)."""
     M = p.shape[0]
     return jnp.pad(jnp.eye(M), ((0, 0), (X.shape[1] - M, 0)))
+
+
+@partial(jax.jit, static_argnames=("structure", "i"))
+def _at_transition(
+    arguments: Arguments, t: jax.Array, x: jax.Array, p: jax.Array, *, structure: Structure, i: int
+) -> jax.Array:
+    """The costs at transition i (from 0)."""
+    total = jnp.zeros(())
+    for at, cost in costs_at_transitions(Model(structure, arguments)):
+        total = total + cost(t, x, p) if at == i else total
+    return total
 
 
 @partial(jax.jit, static_argnames=("structure",))

@@ -212,8 +212,9 @@ class Templates:
             function = transition_function(self.model(constants), kind, which)
             if function is None:
                 raise ValueError("there is no function at this transition")
-            if not kind.constraint:
-                return self._cost(function, t, x, p)
+            if not kind.constraint:  # whose own second derivatives belong to the Gauss-Newton matrix too
+                first = [function(t, x, p)]
+                return first if self.order == Order.COST else [*first, *_first_and_second(function, t, x, p)]
             return self._constraint(lambda t, x, p: function(t, x, p)[None], t, x, p, weight)
 
         shapes = (), (self.sizes.n,), (self.sizes.M,), (1,)
