@@ -1,4 +1,4 @@
-"""Seed thirty mistakes into the mathematics, one at a time, and see that the tests notice each of them.
+"""Seed mistakes into the mathematics, one at a time, and see that the tests notice each of them.
 
 Run as ``python tests/mutate.py``, or with the names of some parts: paper, rows, native, sqp. Every mistake is a
 replacement in a temporary copy of the package, whose text must be found exactly once; the tests of its part then run
@@ -20,6 +20,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 
 PAPER, ROWS = "paper_adjoint.py", "discretization/rows.py"
+ALGEBRA = "optimize/algebra.py"
 KERNELS, DRIVER, TEMPLATES = (f"engine/native/{name}.py" for name in ("kernels", "driver", "templates"))
 
 SYSTEMS = ["tests/test_random_systems.py", "-k", "machine_code or in_jax"]
@@ -120,7 +121,21 @@ IN_NATIVE: dict[str, tuple[str, Replacements]] = {
     "W in the Gauss-Newton matrix": (TEMPLATES, [("return factor * weighted(W, A)", "return factor * A")]),
 }
 
-IN_SQP: dict[str, tuple[str, Replacements]] = {}
+IN_SQP: dict[str, tuple[str, Replacements]] = {
+    "absolute values of eigenvalues": (
+        ALGEBRA,
+        [("replaced = xp.maximum(xp.abs(values), EIGENVALUE_REPLACEMENT)", "replaced = xp.maximum(values, 1e-3)")],
+    ),
+    "the decrease that a step must achieve": (
+        ALGEBRA,
+        [("((decrease <= noise) | (cost <= before - fraction * decrease))", "(cost <= before + 1e300 * fraction)")],
+    ),
+    "the size in what is active": (ALGEBRA, [("16 * EPS * (abs_b + abs_A @ size)", "0.0 * (abs_b + abs_A @ size)")]),
+    "bounds that press are reached exactly": (
+        ALGEBRA,
+        [("xp.where(at_low, low, xp.where(at_high, high, step))", "xp.where(at_low, 0.999 * low, step)")],
+    ),
+}
 
 
 def mutated(source: str, replacements: list[tuple[str, str]]) -> str:
