@@ -39,7 +39,7 @@ def start(program: str, *arguments: object, **environment: str) -> subprocess.Po
 SLOW_WRITER = """
 import os, sys, time
 from pathlib import Path
-from switchfit.io import files
+from switchfit.runtime import files
 def sync(handle):
     print("writing", flush=True)
     time.sleep(float(sys.argv[2]))
