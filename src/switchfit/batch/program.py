@@ -1,9 +1,9 @@
 """Fits of one model to many data sets or from many starts, in one compiled program.
 
-On a CPU chunks run side by side, one a core. Where machine code evaluates J, `SLOTS` fits of a chunk are under way at a
-time, so that the optimiser's small matrices are many in one call; a fit that is done makes room for the next one at
-once, and none waits for another. Where JAX does, they go one after the other: each stays in the processor's cache. On a
-GPU all fits of a chunk go in lockstep. In each case a fit is the same function of its data and start.
+On a CPU the program takes the fits of a chunk one after the other: each stays in the processor's cache, a fit that has
+converged costs nothing more, and chunks run side by side, one a core. On a GPU all fits of a chunk go in lockstep.
+Either way each is the same function of its data and start. (Many at a time on a CPU gain little, and XLA's two threads
+can wait for each other for ever where large operations in both programs are split among them.)
 
 What `minimize_traced` does not treat is finished by `minimize`, as in a single fit.
 """
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
-from switchfit.engine.choice import memory_of, runs_natively, traced_derivatives
+from switchfit.engine.choice import runs_natively, traced_derivatives
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.guards import on_guards_if_near
 from switchfit.fit.result import inverse_on
@@ -34,7 +34,7 @@ from switchfit.fit.solution import constraints_of, minimized, minimized_with_con
 from switchfit.fit.termination import Termination, termination_of
 from switchfit.optimize import Status
 from switchfit.optimize.qp import nearest_feasible
-from switchfit.optimize.traced import Constraints, Outcome, State, begin, minimize_traced, outcome_of, take_turn
+from switchfit.optimize.traced import Constraints, Outcome, minimize_traced
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import float64
 from switchfit.problem.priors import PriorTerms
@@ -43,14 +43,8 @@ from switchfit.problem.structure import Structure
 from switchfit.problem.variables import Variables
 from switchfit.runtime.cache import compilation_cache
 
-CHUNK = 128
+CHUNK = 32
 """Fits that one call of the program takes on a CPU."""
-
-SLOTS = 32
-"""Fits that are under way at a time, where machine code evaluates J."""
-
-LARGEST_MEMORY = 2**27
-"""Bytes that the evaluations of all slots may take."""
 
 CHUNK_IN_LOCKSTEP = 1024
 """The same on a GPU, where they go in lockstep."""
@@ -85,7 +79,7 @@ class Layout:
     places: tuple[tuple[int, ...], ...]  # of the N transition times and M parameters, -1 where fixed
     varying: tuple[int, ...]
     lockstep: bool
-    slots: int  # fits under way at a time, where machine code evaluates J; else 0
+    natively: bool  # whether machine code evaluates J
     tolerance: float
     max_iterations: int
 
@@ -188,7 +182,7 @@ def fit_chunk(
         tuple(tuple(int(k) for k in places) for places in problem.places),
         varying.places,
         lockstep,
-        _slots(evaluator) if natively else 0,
+        natively,
         tolerance,
         max_iterations // 2,  # what it does not settle has as many left for the optimiser that finishes it
     )
@@ -260,13 +254,13 @@ def _fits(
 ) -> Outcome:
     """Outcomes of the first `count` fits."""
 
-    def functions(own: tuple[jax.Array, ...], idle: Any = False) -> tuple[Any, Any]:
+    def functions(own: tuple[jax.Array, ...]) -> tuple[Any, Any]:
         """What `minimize_traced` is given for the fit with some numbers of its own: evaluate and piece."""
         here = replaced(arguments, layout.varying, own)
 
         def evaluate(z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             theta = unscaled.theta(z)
-            J, g, H = _total(layout, here, times, theta, idle)
+            J, g, H = _total(layout, here, times, theta)
             prior, prior_g, prior_h = unscaled.priors.evaluate(theta, jnp)
             given = unscaled.variables.derivatives_inward(theta, g + prior_g, H + jnp.diag(prior_h), jnp)
             return J + prior, *given
@@ -294,17 +288,10 @@ def _fits(
         evaluate, piece = functions(own)
         return outward(minimize_traced(evaluate, start, constraints, piece, **settings))
 
-    def turn(own: tuple[jax.Array, ...], state: State, idle: jax.Array) -> State:
-        evaluate, piece = functions(own, idle)
-        return take_turn(state, evaluate, constraints, piece, **settings)
-
     if layout.lockstep:
         return jax.vmap(fit)(values, starts)
     shapes = jax.eval_shape(fit, tuple(value[0] for value in values), starts[0])
     empty = jax.tree.map(lambda s: jnp.zeros((len(starts), *s.shape), s.dtype), shapes)
-    if layout.slots:
-        finish = jax.vmap(lambda state: outward(outcome_of(state, constraints)))
-        return _in_slots(layout.slots, jax.vmap(turn), finish, values, starts, count, empty)
 
     def one(k: jax.Array, outcomes: Outcome) -> Outcome:
         outcome = fit(tuple(value[k] for value in values), starts[k])
@@ -313,50 +300,8 @@ def _fits(
     return lax.fori_loop(0, count, one, empty)
 
 
-def _in_slots(
-    slots: int,
-    turn: Callable[[tuple[jax.Array, ...], State, jax.Array], State],
-    finish: Callable[[State], Outcome],
-    values: tuple[jax.Array, ...],
-    starts: jax.Array,
-    count: jax.Array,
-    outcomes: Outcome,
-) -> Outcome:
-    """Outcomes of the first `count` fits, some of which are under way at a time, each in a slot until it is done."""
-    last = len(starts) - 1
-
-    def fresh(which: jax.Array) -> State:
-        return jax.vmap(begin)(starts[jnp.minimum(which, last)])
-
-    def body(carried: tuple[jax.Array, jax.Array, State, Outcome]) -> tuple[jax.Array, jax.Array, State, Outcome]:
-        which, following, states, outcomes = carried
-        here = jnp.minimum(which, last)
-        states = turn(tuple(value[here] for value in values), states, which >= count)
-        done = states.done & (which < count)
-        place = jnp.where(done, which, last + 1)  # the others are dropped
-        found = finish(states)
-        outcomes = jax.tree.map(lambda all_, new: all_.at[place].set(new, mode="drop"), outcomes, found)
-        which = jnp.where(done, following + jnp.cumsum(done) - 1, which)
-
-        def chosen(new: jax.Array, old: jax.Array) -> jax.Array:
-            return jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-
-        return which, following + done.sum(), jax.tree.map(chosen, fresh(which), states), outcomes
-
-    which = jnp.arange(slots)
-    begun = which, jnp.asarray(slots), fresh(which), outcomes
-    return lax.while_loop(lambda carried: jnp.any(carried[0] < count), body, begun)[3]
-
-
-def _slots(evaluator: Evaluator) -> int:
-    """How many fits may be under way at a time: fewer where each takes much memory."""
-    given = zip(evaluator.problem.structures, evaluator.arguments, strict=True)
-    largest = max(memory_of(structure, arguments) for structure, arguments in given)
-    return int(np.clip(LARGEST_MEMORY // largest, 1, SLOTS))
-
-
 def _total(
-    layout: Layout, arguments: tuple[Arguments, ...], times: tuple[jax.Array, ...], theta: jax.Array, idle: Any
+    layout: Layout, arguments: tuple[Arguments, ...], times: tuple[jax.Array, ...], theta: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Cost, gradient and Hessian of all experiments together.
 
@@ -379,7 +324,7 @@ def _total(
         ) -> tuple[jax.Array, jax.Array, jax.Array]:
             own, tau, p = given
             found: tuple[jax.Array, jax.Array, jax.Array] = traced_derivatives(
-                structure, own, tau, p, idle, natively=layout.slots > 0
+                structure, own, tau, p, natively=layout.natively
             )
             return found
 

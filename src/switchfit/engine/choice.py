@@ -14,8 +14,7 @@ from switchfit.engine.jax.programs import derivatives
 from switchfit.engine.native.engine import NativeEngine
 from switchfit.engine.native.experiment import reason_for_jax
 from switchfit.engine.native.foreign import can_be_foreign, foreign_derivatives
-from switchfit.engine.native.templates import Order, Sizes
-from switchfit.engine.native.workspace import memory
+from switchfit.engine.native.templates import Order
 from switchfit.engine.protocol import Engine, ExperimentEngine
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
@@ -64,20 +63,11 @@ def runs_natively(structures: Sequence[Structure], arguments: Sequence[Arguments
     return all(can_be_foreign(s) and reason_for_jax(s, a, Order.HESSIAN) is None for s, a in given)
 
 
-def traced_derivatives(
-    structure: Structure, arguments: Arguments, tau: Any, p: Any, idle: Any, *, natively: bool
-) -> Any:
+def traced_derivatives(structure: Structure, arguments: Arguments, tau: Any, p: Any, *, natively: bool) -> Any:
     """Return cost, gradient (D,) and Hessian (D, D) of one experiment inside a program of JAX.
 
-    By machine code, which runs on a CPU, where `runs_natively` says so; else by JAX. Where it is `idle` what is
-    returned says nothing, and machine code does nothing.
+    By machine code, which runs on a CPU, where `runs_natively` says so; else by JAX.
     """
     if natively:
-        return foreign_derivatives(structure, arguments, tau, p, idle)
+        return foreign_derivatives(structure, arguments, tau, p)
     return derivatives(arguments, tau, p, jnp.ones(()), structure=structure, method="discrete-adjoint")
-
-
-def memory_of(structure: Structure, arguments: Arguments) -> int:
-    """Return how many bytes an evaluation of one experiment by machine code works in."""
-    sizes, rows = Sizes.of(structure, arguments), len(arguments.nodes) - 1 + structure.N
-    return 8 * sum(length.at(rows) for length in memory(structure.library, sizes, Order.HESSIAN).values())

@@ -39,11 +39,10 @@ def can_be_foreign(structure: Structure) -> bool:
     return not late and structure.transitions == structure.N
 
 
-def foreign_derivatives(structure: Structure, arguments: Arguments, tau: Any, p: Any, idle: Any = False) -> Any:
+def foreign_derivatives(structure: Structure, arguments: Arguments, tau: Any, p: Any) -> Any:
     """Cost, gradient (D,) and Hessian (D, D) of one experiment, inside a JAX program that runs on a CPU.
 
-    With the side +1, for an experiment that `can_be_foreign` and for which there is machine code. Nothing is evaluated,
-    and what is returned says nothing, if it is `idle`.
+    With the side +1, for an experiment that `can_be_foreign` and for which there is machine code.
     """
     sizes, library = Sizes.of(structure, arguments), structure.library
     name, _ = _registered(library, sizes)
@@ -60,7 +59,7 @@ def foreign_derivatives(structure: Structure, arguments: Arguments, tau: Any, p:
         "nodes": nodes,
         "signals": arguments.signals,
         "c": jnp.concatenate([*(jnp.ravel(a) for a in constants_of(arguments)), jnp.zeros(1)]),
-        "p": jnp.append(p, jnp.where(idle, 1.0, 0.0)),
+        "p": jnp.append(p, 0.0),
         "bounds": jnp.concatenate([nodes[:1], tau, nodes[-1:]]),
         "first_cell": jnp.concatenate([jnp.zeros(1, int), begins, jnp.full(1, cells - 1)]),
         "multipliers": np.zeros(count),

@@ -27,8 +27,7 @@ def handler(driver: Driver) -> str:
 
     Its arguments are those of `workspace.GIVEN`, then those of the samples; its results are all sums in one, and the
     memory. In a batch all of them have one dimension more, of length 1 where they are the same for all; the memory of
-    the first serves all, one after the other, and stays in the caches. Those of a batch are left out, and their results
-    not touched, behind whose p stands another number than 0.
+    the first serves all, one after the other, and stays in the caches.
     """
     library, sizes = driver.library, driver.sizes
     measurements = len(library.measurements)
@@ -74,12 +73,8 @@ def handler(driver: Driver) -> str:
         strides[name] = driver.let(f"select i1 {both}, i64 {size}, i64 0")
     driver.line("br label %loop")
     driver.label("loop")
-    driver.line("%which = phi i64 [0, %run], [%following, %next]")
+    driver.line("%which = phi i64 [0, %run], [%following, %loop]")
     found = {name: driver.at(data[name], driver.let(f"mul i64 %which, {strides[name]}")) for name in names}
-    left_out = driver.load("double", driver.at(found["p"], sizes.M))
-    driver.line(f"%asked_for = fcmp oeq double {left_out}, 0.0")
-    driver.line("br i1 %asked_for, label %evaluate, label %next")
-    driver.label("evaluate")
     last = driver.load("i64", driver.at(found["first_cell"], sizes.N + 1))
     rows = driver.let(f"add i64 {last}, {sizes.N + 1}")
     parts = sums(library, sizes)
@@ -101,8 +96,6 @@ def handler(driver: Driver) -> str:
     counts = "".join(f", i64 {lengths[f'{OF_SAMPLES[0]} {k}']}" for k in range(measurements))
     driver.line("store [3 x i64] [i64 0, i64 0, i64 9223372036854775807], ptr %progress")  # all at once
     driver.line(f"call void @evaluate(ptr %table, ptr %progress{counts})")
-    driver.line("br label %next")
-    driver.label("next")
     driver.line("%following = add i64 %which, 1")
     driver.line(f"%more = icmp slt i64 %following, {repeats}")
     driver.line("br i1 %more, label %loop, label %out")
