@@ -18,9 +18,9 @@ import switchfit as sf
 from switchfit.discretization.mesh import padded_length
 from switchfit.engine.adaptive import initial_state
 from switchfit.engine.jax.programs import derivatives
+from switchfit.engine.jax.simulation import _block, _terminal
 from switchfit.engine.native.program import _program_of
 from switchfit.fit.evaluator import evaluator_of
-from switchfit.fit.trajectory import _block, _terminal
 from switchfit.problem import functions
 from switchfit.runtime.xla import SMALL_LOOPS
 

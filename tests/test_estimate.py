@@ -11,9 +11,10 @@ import scipy.optimize
 import scipy.stats
 
 import switchfit as sf
-from switchfit.fit.evaluator import Simulation, evaluator_of
+from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import minimized
 from switchfit.fit.termination import termination_of
+from switchfit.fit.trajectory import SimulatedProblem
 
 # A capacitor that is charged through one resistor and discharged through another one
 
@@ -300,8 +301,8 @@ def test_a_callback_that_returns_nothing_sees_all_iterations():
 
 def test_trajectories_are_simulated_when_they_are_asked_for(monkeypatch):
     simulated = []
-    compare = Simulation.compare
-    monkeypatch.setattr(Simulation, "compare", lambda self: simulated.append(self) or compare(self))
+    compare = SimulatedProblem.compare
+    monkeypatch.setattr(SimulatedProblem, "compare", lambda self: simulated.append(self) or compare(self))
     fit = sf.estimate(capacitor(voltage(TIMES)))
     assert not simulated
     shown = fit.trajectories

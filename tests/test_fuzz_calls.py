@@ -480,6 +480,10 @@ def catalogue():
             inside={"times": lambda bad: [bad, *TIMES[1:]], "values": lambda bad: [bad, *TIMES[1:]]},
         ),
         "RunningCost": Door(lambda **given: problem(experiment(sf.RunningCost(**given))), {"ell": energy}),
+        "TransitionCost": Door(
+            lambda **given: problem(experiment(sf.TransitionCost(**given))),
+            {"mu": lambda t, x, p: x[0], "before": None, "after": None},
+        ),
         "TerminalCost": Door(lambda **given: problem(experiment(sf.TerminalCost(**given))), {"phi": final}),
         "TerminalConstraint": Door(
             lambda **given: problem(experiment([measurements(), sf.TerminalConstraint(**given)])), {"psi": final}

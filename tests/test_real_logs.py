@@ -21,6 +21,7 @@ from switchfit.fit.termination import termination_of
 from switchfit.fit.trajectory import compare
 from switchfit.optimize import Result
 from switchfit.optimize.diagnosis import Finding
+from switchfit.optimize.matrix import Curvature, Spectrum
 from switchfit.problem.functions import float64
 from switchfit.problem.losses import LOSSES, influence, robust
 from switchfit.problem.priors import PriorTerms
@@ -442,8 +443,8 @@ def test_a_line_search_that_failed_tells_of_a_delay_that_is_estimated():
     result = Result(
         theta=np.array([1.0, 1.0, 0.1]), cost=1.0, gradient=np.zeros(3), hessian=np.eye(3), optimality=0.1,
         iterations=1, evaluations=1, status=sf.Status.LINE_SEARCH_FAILED, active=(), multipliers=np.zeros(0), kinks=(),
-        free_basis=np.eye(3), free_eigenvalues=np.ones(3), smallest_eigenvalue=1.0, smallest_unscaled_eigenvalue=1.0,
-        flat_direction=np.zeros(3), tolerance=1e-7, history=(), reason=Finding("jump", 0.1, 1.0, 2.0, ((0, 1.5),)),
+        curvature=Curvature(np.eye(3), Spectrum(np.ones(3), np.ones(3), np.zeros(3)).itself),
+        tolerance=1e-7, history=(), reason=Finding("jump", 0.1, 1.0, 2.0, ((0, 1.5),)),
     )  # fmt: skip
     hint = "A delay is estimated here: J has a kink where a transition meets the moment of which a late sample is"
     jump = "The cost jumps from 1 to 2 where tau_1 passes 1.5. The optimiser needs a cost that is continuous there."

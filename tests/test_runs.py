@@ -501,7 +501,7 @@ def test_a_batch_of_runs_with_times_that_are_known():
     evaluator, theta = evaluator_of(problem), problem.initial_theta + 0.1
     places = tuple(tuple(where.tolist()) for where in problem.places)
     for lockstep in (False, True):
-        layout = Layout(problem.structures, places, (), lockstep, 1e-7, 10)
+        layout = Layout(problem.structures, places, (), lockstep, not lockstep, 1e-7, 10)
         times = tuple(run.initial_times for run in problem.experiments)
         with jax.enable_x64(True):
             found = jax.jit(lambda theta, f=layout, t=times: _total(f, tuple(evaluator.arguments), t, theta))(theta)
