@@ -21,7 +21,7 @@ from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import minimized
 from switchfit.optimize import LinearConstraints, minimize
 from switchfit.optimize.qp import nearest_feasible, solve_qp
-from switchfit.optimize.traced import Constraints, minimize_traced, nonnegative_minimum
+from switchfit.optimize.traced import Breakpoints, Constraints, minimize_traced, nonnegative_minimum
 from switchfit.problem.functions import float64
 
 TIMES = np.linspace(0.25, 6.0, 24)
@@ -103,10 +103,10 @@ def test_the_traced_optimiser_ends_where_the_other_one_does(name):
     with float64():
         outcome = jax.jit(
             lambda start: minimize_traced(
-                lambda theta: tuple(map(jnp.asarray, valley(theta))),
+                lambda theta, side: tuple(map(jnp.asarray, valley(theta))),
                 start,
                 Constraints(*map(jnp.asarray, (A, b, low, high))),
-                lambda theta: jnp.zeros(1, int),
+                Breakpoints((), jnp.zeros((0, 1))),
                 tolerance=1e-9,
                 max_iterations=200,
             )
@@ -114,6 +114,89 @@ def test_the_traced_optimiser_ends_where_the_other_one_does(name):
     assert bool(outcome.settled) is settled
     assert float(outcome.optimality) <= 1e-9
     np.testing.assert_allclose(outcome.theta, expected.theta, rtol=0, atol=1e-9)
+
+
+KNOTS = np.arange(0.0, 10.05, 0.5)
+
+
+def kinked(theta, side, H, centre, weights, xp):
+    """½ (theta − c)ᵀ H (theta − c) and weights |theta_i − b| for each knot b."""
+    e = theta - centre
+    gaps = theta[:, None] - KNOTS
+    slopes = xp.where(gaps == 0.0, side, xp.sign(gaps))
+    return 0.5 * e @ H @ e + xp.sum(weights * xp.abs(gaps)), H @ e + xp.sum(weights * slopes, axis=1), H
+
+
+@jax.jit
+def fitted_with_kinks(start, H, centre, weights):
+    """The traced optimiser on `kinked`, its first two coordinates in order."""
+    return minimize_traced(
+        lambda theta, side: kinked(theta, side, H, centre, weights, jnp),
+        start,
+        Constraints(jnp.array([[-1.0, 1.0, 0.0]]), jnp.zeros(1), jnp.zeros(3), jnp.full(3, 10.0)),
+        Breakpoints((0, 1, 2), jnp.asarray(np.tile(KNOTS, (3, 1)))),
+        tolerance=1e-9,
+        max_iterations=200,
+    )
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4])
+def test_kinks_hold_and_let_go_inside_the_program_too(share):
+    """`share` of the kinks are concave: then minima are many, and each must be one from which no step descends."""
+    settled, held = 0, 0
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        R = rng.standard_normal((3, 3))
+        H, centre = R @ R.T + 0.2 * np.eye(3), np.sort(rng.uniform(1.0, 9.0, 3))
+        weights = 10.0 ** rng.uniform(-2, 0.5, (3, 1)) * rng.random((3, KNOTS.size))
+        weights *= np.where(rng.random(weights.shape) < share, -1.0, 1.0)
+        start = np.sort(np.round(rng.uniform(0.0, 10.0, 3) * 2) / 2 if seed % 2 else rng.uniform(0.0, 10.0, 3))
+        with float64():
+            found = jax.tree.map(np.asarray, fitted_with_kinks(*map(jnp.asarray, (start, H, centre, weights))))
+        if not found.settled:
+            continue
+        settled += 1
+        held += found.held.any()
+        assert np.isin(found.theta[found.held], KNOTS).all()
+        assert np.all((found.left <= 0.0) & (found.gradient >= 0.0) | ~found.held)
+        assert found.optimality <= 1e-9
+
+        class At:
+            def __init__(self, theta, side, *given):
+                self.cost, self.gradient, self.hessian = kinked(theta, side, *given, np)
+
+        given = (H, centre, weights)
+        assert found.cost == pytest.approx(At(found.theta, 1, *given).cost, rel=1e-14)
+        for v in rng.standard_normal((50, 3)):
+            assert At(found.theta + 1e-6 * v, 1, *given).cost >= found.cost - 1e-14 * abs(found.cost)
+        if share == 0.0:
+            order = LinearConstraints(
+                np.array([[-1.0, 1.0, 0.0]]), np.zeros(1), np.zeros(3), np.full(3, 10.0), tuple("abcdefg")
+            )
+            expected = minimize(
+                lambda theta, side, given=given: At(theta, side, *given),
+                start,
+                constraints=order,
+                breakpoints=[KNOTS] * 3,
+                tolerance=1e-9,
+            )
+            np.testing.assert_allclose(found.theta, expected.theta, rtol=0, atol=1e-8)
+            assert [i for i, _, _ in expected.kinks] == np.flatnonzero(found.held).tolist()
+    assert settled >= 45
+    assert held >= 15
+    assert held >= 20
+
+
+def test_the_curvature_of_a_coordinate_that_a_kink_holds_does_not_count():
+    """It is negative here, and the point a minimum all the same."""
+    H, weights = np.diag([-0.3, 1.0, 1.0]), np.zeros((3, KNOTS.size))
+    weights[0, 4] = 1.0
+    given = ([1.4, 3.2, 4.0], H, [1.9, 3.3, 4.1], weights)
+    with float64():
+        found = jax.tree.map(np.asarray, fitted_with_kinks(*map(jnp.asarray, given)))
+    assert found.settled
+    np.testing.assert_array_equal(found.held, [True, False, False])
+    np.testing.assert_allclose(found.theta, [2.0, 3.3, 4.1], rtol=1e-12)
 
 
 # The same as single fits

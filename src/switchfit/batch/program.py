@@ -31,10 +31,10 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.guards import on_guards_if_near
 from switchfit.fit.result import inverse_on
 from switchfit.fit.solution import constraints_of, minimized, minimized_with_constraints
-from switchfit.fit.termination import Termination, termination_of
+from switchfit.fit.termination import Kink, Termination, termination_of
 from switchfit.optimize import Status
 from switchfit.optimize.qp import nearest_feasible
-from switchfit.optimize.traced import Constraints, Outcome, minimize_traced
+from switchfit.optimize.traced import Breakpoints, Constraints, Outcome, minimize_traced
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import float64
 from switchfit.problem.priors import PriorTerms
@@ -254,39 +254,30 @@ def _fits(
 ) -> Outcome:
     """Outcomes of the first `count` fits."""
 
-    def functions(own: tuple[jax.Array, ...]) -> tuple[Any, Any]:
-        """What `minimize_traced` is given for the fit with some numbers of its own: evaluate and piece."""
+    def functions(own: tuple[jax.Array, ...]) -> tuple[Any, Breakpoints]:
+        """What `minimize_traced` is given for the fit with some numbers of its own: evaluate and breakpoints."""
         here = replaced(arguments, layout.varying, own)
 
-        def evaluate(z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        def evaluate(z: jax.Array, side: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             theta = unscaled.theta(z)
-            J, g, H = _total(layout, here, times, theta)
+            J, g, H = _total(layout, here, times, theta, side)
             prior, prior_g, prior_h = unscaled.priors.evaluate(theta, jnp)
             given = unscaled.variables.derivatives_inward(theta, g + prior_g, H + jnp.diag(prior_h), jnp)
             return J + prior, *given
 
-        def piece(theta: jax.Array) -> jax.Array:
-            """The cell in which each free transition time lies; these are not scaled."""
-            cells = [
-                jnp.searchsorted(a.nodes, theta[place], side="right")
-                for a, structure, places in zip(here, layout.structures, layout.places, strict=True)
-                for place in places[: structure.N]
-                if place >= 0
-            ]
-            return jnp.stack([*cells, jnp.zeros((), int)])
-
-        return evaluate, piece
+        return evaluate, _breakpoints(layout, here)
 
     settings: Any = {"tolerance": layout.tolerance, "max_iterations": layout.max_iterations}
 
     def outward(found: Outcome) -> Outcome:
         theta = unscaled.theta(found.theta)
+        left = unscaled.variables.derivatives_outward(theta, found.left, found.hessian, jnp)[0]
         gradient, hessian = unscaled.variables.derivatives_outward(theta, found.gradient, found.hessian, jnp)
-        return found._replace(theta=theta, gradient=gradient, hessian=hessian)
+        return found._replace(theta=theta, gradient=gradient, hessian=hessian, left=left)
 
     def fit(own: tuple[jax.Array, ...], start: jax.Array) -> Outcome:
-        evaluate, piece = functions(own)
-        return outward(minimize_traced(evaluate, start, constraints, piece, **settings))
+        evaluate, breakpoints = functions(own)
+        return outward(minimize_traced(evaluate, start, constraints, breakpoints, **settings))
 
     if layout.lockstep:
         return jax.vmap(fit)(values, starts)
@@ -300,8 +291,27 @@ def _fits(
     return lax.fori_loop(0, count, one, empty)
 
 
+def _breakpoints(layout: Layout, arguments: tuple[Arguments, ...]) -> Breakpoints:
+    """The nodes of each free transition time; these are not scaled."""
+    nodes = {
+        place: own.nodes
+        for own, structure, places in zip(arguments, layout.structures, layout.places, strict=True)
+        for place in places[: structure.N]
+        if place >= 0
+    }
+    if not nodes:
+        return Breakpoints((), jnp.zeros((0, 1)))
+    longest = max(len(a) for a in nodes.values())
+    padded = [jnp.pad(a, (0, longest - len(a)), constant_values=jnp.inf) for a in nodes.values()]
+    return Breakpoints(tuple(nodes), jnp.stack(padded))
+
+
 def _total(
-    layout: Layout, arguments: tuple[Arguments, ...], times: tuple[jax.Array, ...], theta: jax.Array
+    layout: Layout,
+    arguments: tuple[Arguments, ...],
+    times: tuple[jax.Array, ...],
+    theta: jax.Array,
+    side: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Cost, gradient and Hessian of all experiments together.
 
@@ -324,7 +334,7 @@ def _total(
         ) -> tuple[jax.Array, jax.Array, jax.Array]:
             own, tau, p = given
             found: tuple[jax.Array, jax.Array, jax.Array] = traced_derivatives(
-                structure, own, tau, p, natively=layout.natively
+                structure, own, tau, p, side, natively=layout.natively
             )
             return found
 
@@ -394,9 +404,27 @@ def failed_chunk(starts: FloatArray, errors: Mapping[int, BaseException]) -> Chu
 def _not_begun(starts: FloatArray) -> Outcome:
     """Outcomes of fits (R, d) that are all left to `minimize`."""
     R, d = starts.shape
-    nothing, none = np.full(R, np.nan), np.zeros(R, dtype=int)
-    derivatives = np.full((R, d), np.nan), np.full((R, d, d), np.nan)
-    return Outcome(starts, nothing, *derivatives, nothing, none, none, np.zeros(R, dtype=bool))  # type: ignore[arg-type]  # NumPy's
+    nothing, none, no = np.full(R, np.nan), np.zeros(R, dtype=int), np.zeros(R, dtype=bool)
+    slopes, square = np.full((R, d), np.nan), np.full((R, d, d), np.nan)
+    held = np.zeros((R, d), dtype=bool)
+    return Outcome(starts, nothing, slopes, square, nothing, none, none, no, slopes, held)  # type: ignore[arg-type]  # NumPy's
+
+
+def _at_kink(problem: Problem, outcome: Outcome, k: int, tolerance: float) -> Termination:
+    """How fit k ended, one that kinks hold."""
+    names, theta = problem.unknowns.names, outcome.theta[k]
+    kinks = tuple(
+        Kink(names[i], float(theta[i]), float(outcome.left[k, i]), float(outcome.gradient[k, i]))
+        for i in np.flatnonzero(outcome.held[k])
+    )
+    return Termination(
+        Status.CONVERGED_AT_KINK,
+        cost=float(outcome.cost[k]),
+        optimality=float(outcome.optimality[k]),
+        tolerance=tolerance,
+        iterations=int(outcome.iterations[k]),
+        kinks=kinks,
+    )
 
 
 def _finished(
@@ -417,7 +445,12 @@ def _finished(
     settled = np.asarray(outcome.settled)
     base = tuple(evaluator.arguments)
     if settled.any():
-        covariance[settled] = np.linalg.inv(found["hessian"][settled])
+        held = np.asarray(outcome.held)[settled]
+        either = held[:, :, None] | held[:, None, :]
+        covariance[settled] = np.linalg.inv(np.where(either, np.eye(d), found["hessian"][settled])) * ~either
+        free[settled] -= held.sum(axis=1)
+    for k in np.flatnonzero(settled & np.asarray(outcome.held).any(axis=1)):
+        status[k], message[k] = Status.CONVERGED_AT_KINK.name, str(_at_kink(problem, outcome, int(k), tolerance))
     constraints = constraints_of(problem)
     for k in np.flatnonzero(~settled):
         try:

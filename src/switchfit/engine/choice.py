@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import jax.numpy as jnp
-
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.jax.engine import JaxEngine
@@ -63,11 +61,14 @@ def runs_natively(structures: Sequence[Structure], arguments: Sequence[Arguments
     return all(can_be_foreign(s) and reason_for_jax(s, a, Order.HESSIAN) is None for s, a in given)
 
 
-def traced_derivatives(structure: Structure, arguments: Arguments, tau: Any, p: Any, *, natively: bool) -> Any:
+def traced_derivatives(
+    structure: Structure, arguments: Arguments, tau: Any, p: Any, side: Any, *, natively: bool
+) -> Any:
     """Return cost, gradient (D,) and Hessian (D, D) of one experiment inside a program of JAX.
 
-    By machine code, which runs on a CPU, where `runs_natively` says so; else by JAX.
+    By machine code, which runs on a CPU, where `runs_natively` says so; else by JAX. `side` is +1 or -1: the right or
+    left derivatives by a transition time that sits on a node.
     """
     if natively:
-        return foreign_derivatives(structure, arguments, tau, p)
-    return derivatives(arguments, tau, p, jnp.ones(()), structure=structure, method="discrete-adjoint")
+        return foreign_derivatives(structure, arguments, tau, p, side)
+    return derivatives(arguments, tau, p, side, structure=structure, method="discrete-adjoint")

@@ -2,19 +2,21 @@
 
 It takes the steps of `switchfit.optimize.sqp` wherever these are of the ordinary kind: Newton steps on the exact
 Hessian, made positive definite by the absolute values of its eigenvalues, a quadratic programme where constraints are
-in the way, and Armijo backtracking with the same constants. What is rare it leaves alone: a coordinate held at a kink,
-the escape from a saddle, a face on which the Hessian is indefinite; where it makes no headway it stops.
-`Outcome.settled` is True only for a regular minimum, an interior point with a positive definite Hessian and a
-negligible next step; everything else is to be finished by `minimize`, from `Outcome.theta` on.
+in the way, coordinates held at a kink or released to one side, and Armijo backtracking with the same constants. What
+is rare it leaves alone: the escape from a saddle, a face on which the Hessian is indefinite; where it makes no headway
+it stops. `Outcome.settled` is True only for a regular minimum: no constraint is active, the Hessian of the coordinates
+that no kink holds is positive definite, and the next step is negligible. Everything else is to be finished by
+`minimize`, from `Outcome.theta` on.
 
 Every function here is for one fit; `jax.lax.map` or `jax.vmap` make many of it. The loop evaluates J once a turn, at
 the point that is to be judged: fits in lockstep then never wait for another one's line search, and the program, which
-consists of little else than J, is compiled once.
+consists of little else than J, is compiled once. A point on a breakpoint takes two turns, one for each side.
 
 The formulas are those of `switchfit.optimize.algebra`. Three things are written anew, since a traced program has arrays
 of fixed shapes and does not stop early for one fit of many: nonnegative least squares with masks in place of index sets
 (`nonnegative_minimum`), the quadratic programme by its dual, with all rows in place of those that matter, and a Hessian
-that is made positive definite as a whole, not on the face of the active constraints.
+that is made positive definite as a whole, not on the face of the active constraints. A coordinate that is held is
+released at the next point, by its one-sided derivatives there, not by the multipliers of the programme.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from switchfit.optimize import algebra
@@ -31,6 +34,7 @@ from switchfit.optimize.algebra import (
     ARMIJO,
     ARMIJO_ACROSS,
     EIGENVALUE_FLOOR,
+    EPS,
     EQUILIBRATIONS,
     EXTRA_ITERATIONS,
     NOISE,
@@ -41,15 +45,22 @@ Array = jax.Array
 MAX_TRIALS = 30
 """Fractions of a step that are tried."""
 
+MANY_BREAKPOINTS = 3
+"""As of `switchfit.optimize.line_search`."""
+
+SMALLEST_JUMP = 1e-12
+"""Smaller jumps of a derivative, beside the largest one seen, are rounding."""
+
 CRAWLING = (12, 1)
-"""A fit that has refused more fractions of steps than this, plus this many an iteration, has met a kink and is left to
-`minimize`. Fits that settle refuse a dozen at most; at a kink they would go on by hundreds, to no end."""
+"""A fit that has refused more fractions of steps than this, plus this many an iteration, makes no headway and is left
+to `minimize`. Fits that settle refuse a dozen at most; others would go on by hundreds, to no end."""
 
 RIDGE = 1e-14
 """Added to the diagonal of the dual programme, whose rows are of unit length: constraints may depend on one another."""
 
-TracedEvaluate = Callable[[Array], tuple[Array, Array, Array]]
-"""``evaluate(theta)`` returns cost, gradient (d,) and Hessian (d, d)."""
+TracedEvaluate = Callable[[Array, Array], tuple[Array, Array, Array]]
+"""``evaluate(theta, side)`` returns cost, gradient (d,) and Hessian (d, d); `side` is +1.0 or -1.0: the right or left
+derivatives by coordinates on a breakpoint."""
 
 
 class Constraints(NamedTuple):
@@ -75,17 +86,77 @@ class Constraints(NamedTuple):
         return jnp.concatenate([self.A, identity, -identity])
 
 
+class Breakpoints(NamedTuple):
+    """Values of coordinates where the derivatives of J may jump.
+
+    Attributes
+    ----------
+    coordinates : tuple of int
+        Of theta, k of them.
+    points : (k, n)
+        Ascending; infinite, or the last one again, where a coordinate has fewer than others.
+    """
+
+    coordinates: tuple[int, ...]
+    points: Array
+
+    def rank(self, theta: Array) -> tuple[Array, Array]:
+        """Return how many breakpoints lie below each of the coordinates, and how many below or on it: (k,), (k,)."""
+        x = theta[np.array(self.coordinates, dtype=int), None]
+        return jnp.sum(self.points < x, axis=1), jnp.sum(self.points <= x, axis=1)
+
+    def on_one(self, theta: Array) -> Array:
+        """Return which coordinates sit exactly on a breakpoint: (d,) of bool."""
+        below, up_to = self.rank(theta)
+        return jnp.zeros(theta.shape, bool).at[np.array(self.coordinates, dtype=int)].set(up_to > below)
+
+    def crossed(self, theta: Array, to: Array) -> Array:
+        """Return the largest number of breakpoints strictly between two points in one coordinate."""
+        below, up_to = self.rank(theta)
+        below_to, up_to_to = self.rank(to)
+        return jnp.max(jnp.maximum(below_to - up_to, below - up_to_to), initial=0)
+
+    def piece(self, theta: Array, constraints: Constraints) -> tuple[Array, Array]:
+        """Return the bounds (d,), (d,) narrowed to the next breakpoint on either side of theta."""
+        below, above = self._neighbours(theta)
+        where = np.array(self.coordinates, dtype=int)
+        return constraints.lower.at[where].max(below), constraints.upper.at[where].min(above)
+
+    def snap(self, moved: Array, theta: Array, step: Array, size: Array) -> Array:
+        """Return ``moved = theta + step``, exactly on the breakpoints that it reaches up to rounding: (d,)."""
+        where = np.array(self.coordinates, dtype=int)
+        x = moved[where]
+        below, above = self._neighbours(moved)
+        on = self.on_one(moved)[where]
+        mark = jnp.where(on, x, jnp.where(x - below <= above - x, below, above))
+        reach = jnp.maximum(jnp.maximum(jnp.abs(theta), jnp.abs(step)), jnp.abs(moved))
+        near = jnp.abs(mark - x) <= 8 * EPS * jnp.maximum(jnp.where(step != 0.0, reach, 0.0), size)[where]
+        return moved.at[where].set(jnp.where(near, mark, x))
+
+    def _neighbours(self, theta: Array) -> tuple[Array, Array]:
+        """Last breakpoint below and first one above each of the coordinates, infinite where there is none."""
+        x = theta[np.array(self.coordinates, dtype=int), None]
+        below = jnp.max(jnp.where(self.points < x, self.points, -jnp.inf), axis=1, initial=-jnp.inf)
+        above = jnp.min(jnp.where(self.points > x, self.points, jnp.inf), axis=1, initial=jnp.inf)
+        return below, above
+
+
 class Outcome(NamedTuple):
     """Where one fit ended.
 
     Attributes
     ----------
     theta, cost, gradient, hessian : (d,), (), (d,), (d, d)
+        With the right derivatives of coordinates on a breakpoint.
     optimality : ()
         KKT residual.
     iterations, evaluations : () int
     settled : () bool
         Whether this is a regular minimum; if not, `minimize` has to go on from here.
+    left : (d,)
+        The gradient with the left derivatives.
+    held : (d,) bool
+        Coordinates at a kink that holds them.
     """
 
     theta: Array
@@ -96,6 +167,15 @@ class Outcome(NamedTuple):
     iterations: Array
     evaluations: Array
     settled: Array
+    left: Array
+    held: Array
+
+
+class Sides(NamedTuple):
+    """The derivatives on one side of the breakpoints: (d,), (d, d)."""
+
+    gradient: Array
+    hessian: Array
 
 
 class State(NamedTuple):
@@ -103,8 +183,9 @@ class State(NamedTuple):
 
     theta: Array
     cost: Array
-    gradient: Array
-    hessian: Array
+    right: Sides
+    left: Sides
+    kink: Array  # coordinates on a breakpoint with room on both sides: (d,) bool
     optimality: Array
     iterations: Array
     evaluations: Array
@@ -112,19 +193,31 @@ class State(NamedTuple):
     slope: Array
     length: Array  # fraction of the step that is to be judged next
     trials: Array  # of this step, so far
+    refused: Array  # of all steps
+    inside: Array  # whether the step is one inside the present smooth piece
+    undirected: Array  # whether a step has to be found
+    halfway: Array  # whether the point to be judged has been evaluated on its right
+    cost_there: Array  # what was found
+    right_there: Sides
     below: Array  # iterations since the optimality fell below the tolerance
     scale: Array  # largest |theta_i| seen
     cost_scale: Array  # largest |J| seen
+    gradient_scale: Array  # largest one-sided derivative seen
     lowest: Array
     done: Array
     stationary: Array  # the optimality is below the tolerance and the next step negligible
+
+    @property
+    def sides(self) -> Array:
+        """The side to which each coordinate may move, +1 or -1, and 0 where a kink holds it: (d,)."""
+        return _sides(self.left.gradient, self.right.gradient, self.kink)
 
 
 def minimize_traced(
     evaluate: TracedEvaluate,
     start: Array,
     constraints: Constraints,
-    piece: Callable[[Array], Array],
+    breakpoints: Breakpoints,
     *,
     tolerance: float,
     max_iterations: int,
@@ -134,11 +227,10 @@ def minimize_traced(
     Parameters
     ----------
     evaluate : callable
-        ``evaluate(theta)`` returns cost, gradient (d,) and Hessian (d, d).
+        ``evaluate(theta, side)`` returns cost, gradient (d,) and Hessian (d, d).
     start : (d,)
     constraints : Constraints
-    piece : callable
-        ``piece(theta)`` returns integers that change where a coordinate passes a breakpoint of J's derivatives.
+    breakpoints : Breakpoints
     tolerance, max_iterations : as of `minimize`
 
     Returns
@@ -147,7 +239,7 @@ def minimize_traced(
     """
 
     def turn(state: State) -> State:
-        return take_turn(state, evaluate, constraints, piece, tolerance=tolerance, max_iterations=max_iterations)
+        return take_turn(state, evaluate, constraints, breakpoints, tolerance, max_iterations)
 
     return outcome_of(lax.while_loop(lambda state: ~state.done, turn, begin(start)), constraints)
 
@@ -156,87 +248,128 @@ def take_turn(
     state: State,
     evaluate: TracedEvaluate,
     constraints: Constraints,
-    piece: Callable[[Array], Array],
-    *,
+    breakpoints: Breakpoints,
     tolerance: float,
     max_iterations: int,
 ) -> State:
     """Evaluate J once, at the point that is to be judged, and judge it; arguments as of `minimize_traced`."""
+    theta = _moved(constraints, breakpoints, state.theta, state.length * state.step)
+    cost, gradient, hessian = evaluate(theta, jnp.where(state.halfway, -1.0, 1.0))
+    here = Sides(gradient, 0.5 * (hessian + hessian.T))
+    finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(hessian))
+    cost = jnp.where(state.halfway, state.cost_there, cost)
+    right = jax.tree.map(lambda known, new: jnp.where(state.halfway, known, new), state.right_there, here)
+    kink = breakpoints.on_one(theta) & (theta > constraints.lower) & (theta < constraints.upper)
+    at_kink = jnp.any(kink)
+    optimality = _kkt_residual(constraints, theta, state.scale, _steepest(here.gradient, right.gradient, kink))
+    crossed = breakpoints.crossed(state.theta, theta)
+    first = jnp.isinf(state.cost)
+    noise = NOISE * jnp.abs(state.cost)
+    decrease = -state.length * state.slope
+    fraction = jnp.where(state.inside | (crossed == 0), ARMIJO, ARMIJO_ACROSS)
+    lower = algebra.cost_allows(cost, state.cost, state.lowest, decrease, noise, fraction)
+    lower = finite & (first | (lower & jnp.any(theta != state.theta)))
+    better = first | algebra.optimality_allows(optimality, state.optimality, cost, state.lowest, decrease, noise)
+    incomplete = at_kink & ~state.halfway
 
-    def accept(state: State, cost: Array, gradient: Array, hessian: Array, theta: Array, optimality: Array) -> State:
-        first = state.evaluations == 1
+    def accept(state: State) -> State:
         below = jnp.where(first | (optimality > tolerance), 0, state.below + 1)
-        moved = state._replace(
+        slopes = jnp.maximum(jnp.abs(right.gradient), jnp.abs(here.gradient))
+        return state._replace(
             theta=theta,
             cost=cost,
-            gradient=gradient,
-            hessian=hessian,
+            right=right,
+            left=here,
+            kink=kink,
             optimality=optimality,
             iterations=jnp.where(first, 0, state.iterations + 1),
             length=jnp.ones(()),
             trials=jnp.zeros((), int),
+            inside=jnp.zeros((), bool),
+            undirected=jnp.ones((), bool),
+            halfway=jnp.zeros((), bool),
             below=below,
             scale=jnp.maximum(state.scale, jnp.abs(theta)),
             cost_scale=jnp.maximum(state.cost_scale, jnp.abs(cost)),
+            gradient_scale=jnp.maximum(state.gradient_scale, jnp.max(slopes)),
             lowest=jnp.minimum(state.lowest, cost),
         )
-        step, slope = _direction(moved, constraints)
-        negligible = algebra.is_negligible(step, moved.scale, jnp)
-        stationary = (optimality <= tolerance) & (negligible | (below >= EXTRA_ITERATIONS))
-        done = stationary | (moved.iterations >= max_iterations)
-        return moved._replace(step=step, slope=slope, stationary=stationary, done=done)
 
-    def refuse(state: State, *_: Array) -> State:
-        trials = state.trials + 1
+    def go_left(state: State) -> State:
+        return state._replace(halfway=jnp.ones((), bool), cost_there=cost, right_there=right)
+
+    def refuse(state: State) -> State:
+        trials, refused = state.trials + 1, state.refused + 1
         length = state.length * jnp.where(trials <= 5, 0.5, 0.25)
-        unsaid = state.length * -state.slope <= NOISE * jnp.abs(state.cost)
-        hopeless = unsaid | (trials >= MAX_TRIALS)
+        few = breakpoints.crossed(state.theta, state.theta + length * state.step) < MANY_BREAKPOINTS
+        inside = ~state.inside & (crossed > 0) & few
+        hopeless = ((decrease <= noise) & ~inside) | (trials >= MAX_TRIALS)
         # A search that finds nothing below the tolerance has met rounding: that too is the end.
         stationary = hopeless & (state.optimality <= tolerance)
-        refused = state.evaluations - state.iterations - 1
         crawling = refused > CRAWLING[0] + CRAWLING[1] * state.iterations
-        return state._replace(length=length, trials=trials, done=hopeless | crawling, stationary=stationary)
-
-    def judged(state: State) -> State:
-        theta = _moved(constraints, state.theta, state.length * state.step)
-        cost, gradient, hessian = evaluate(theta)
-        hessian = 0.5 * (hessian + hessian.T)
-        optimality = _kkt_residual(constraints, theta, state.scale, gradient)
-        noise = NOISE * jnp.abs(state.cost)
-        decrease = -state.length * state.slope
-        fraction = jnp.where(jnp.any(piece(theta) != piece(state.theta)), ARMIJO_ACROSS, ARMIJO)
-        lower = (
-            algebra.cost_allows(cost, state.cost, state.lowest, decrease, noise, fraction)
-            & algebra.optimality_allows(optimality, state.optimality, cost, state.lowest, decrease, noise)
-            & jnp.any(theta != state.theta)
+        return state._replace(
+            length=jnp.where(inside, 1.0, length),
+            trials=trials,
+            refused=refused,
+            inside=state.inside | inside,
+            undirected=inside,
+            halfway=jnp.zeros((), bool),
+            done=hopeless | crawling | first,
+            stationary=stationary,
         )
-        finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(hessian))
-        first = state.evaluations == 0
-        state = state._replace(evaluations=state.evaluations + 1)
-        after = lax.cond(finite & (first | lower), accept, refuse, state, cost, gradient, hessian, theta, optimality)
-        return after._replace(done=after.done | (first & ~finite))
 
-    return judged(state)
+    def direct(state: State) -> State:
+        step, slope = _direction(state, constraints, breakpoints)
+        negligible = algebra.is_negligible(step, state.scale, jnp)
+        fresh = ~state.inside
+        stationary = fresh & (state.optimality <= tolerance) & (negligible | (state.below >= EXTRA_ITERATIONS))
+        done = stationary | (fresh & (state.iterations >= max_iterations))
+        none = jnp.zeros((), bool)
+        return state._replace(step=step, slope=slope, undirected=none, stationary=stationary, done=done)
+
+    after = lax.cond(
+        lower & (incomplete | better),
+        lambda state: lax.cond(incomplete, go_left, accept, state),
+        refuse,
+        state._replace(evaluations=state.evaluations + 1),
+    )
+    return lax.cond(after.undirected & ~after.done, direct, lambda state: state, after)
 
 
 def outcome_of(state: State, constraints: Constraints) -> Outcome:
     """Return what was found where a fit is done."""
     interior = ~jnp.any(_active(constraints, state.theta, state.scale))
-    scaling = _scaling(state.hessian, algebra.flatness(state.scale, state.cost_scale, jnp))
-    smallest = jnp.linalg.eigvalsh(jnp.nan_to_num(state.hessian / jnp.outer(scaling, scaling)))[0]
+    jump = state.right.gradient - state.left.gradient
+    held = state.kink & (jump > SMALLEST_JUMP * state.gradient_scale)
+    hessian = _without(held, state.right.hessian)
+    scaling = _scaling(hessian, algebra.flatness(state.scale, state.cost_scale, jnp))
+    smallest = jnp.linalg.eigvalsh(jnp.nan_to_num(hessian / jnp.outer(scaling, scaling)))[0]
     settled = state.stationary & interior & (smallest > EIGENVALUE_FLOOR)
-    return Outcome(*state[:7], settled)
+    return Outcome(
+        state.theta,
+        state.cost,
+        state.right.gradient,
+        state.right.hessian,
+        state.optimality,
+        state.iterations,
+        state.evaluations,
+        settled,
+        state.left.gradient,
+        held,
+    )
 
 
 def begin(start: Array) -> State:
-    """The state before the first evaluation, which is accepted whatever it gives, if it is finite."""
+    """Return the state before the first evaluation, which is accepted whatever it gives, if it is finite."""
     d = start.shape[0]
-    infinite, none = jnp.full((), jnp.inf), jnp.zeros((), int)
+    infinite, none, no = jnp.full((), jnp.inf), jnp.zeros((), int), jnp.zeros((), bool)
+    unknown = Sides(jnp.full(d, jnp.nan), jnp.full((d, d), jnp.nan))
     return State(
         theta=start,
         cost=infinite,
-        gradient=jnp.full(d, jnp.nan),
-        hessian=jnp.full((d, d), jnp.nan),
+        right=unknown,
+        left=unknown,
+        kink=jnp.zeros(d, bool),
         optimality=infinite,
         iterations=none,
         evaluations=none,
@@ -244,13 +377,38 @@ def begin(start: Array) -> State:
         slope=jnp.zeros(()),
         length=jnp.ones(()),
         trials=none,
+        refused=none,
+        inside=no,
+        undirected=no,
+        halfway=no,
+        cost_there=infinite,
+        right_there=unknown,
         below=none,
         scale=jnp.abs(start),
         cost_scale=jnp.zeros(()),
+        gradient_scale=jnp.zeros(()),
         lowest=infinite,
-        done=jnp.zeros((), bool),
-        stationary=jnp.zeros((), bool),
+        done=no,
+        stationary=no,
     )
+
+
+def _sides(left: Array, right: Array, kink: Array) -> Array:
+    """As `switchfit.optimize.kinks.steepest_descent` chooses them where no constraint is active: (d,)."""
+    alone = jnp.where((left <= 0.0) & (right >= 0.0), 0, jnp.where(-right >= left, 1, -1))
+    return jnp.where(kink, alone, 1)
+
+
+def _steepest(left: Array, right: Array, kink: Array) -> Array:
+    """The derivative on the side to which each coordinate descends, 0 where a kink holds it: (d,)."""
+    sides = _sides(left, right, kink)
+    return jnp.where(sides == 0, 0.0, jnp.where(sides > 0, right, left))
+
+
+def _without(held: Array, hessian: Array) -> Array:
+    """The Hessian (d, d) with rows and columns of the identity for coordinates that are held."""
+    either = held[:, None] | held
+    return jnp.where(either, jnp.eye(held.shape[0]), hessian)
 
 
 def _active(constraints: Constraints, theta: Array, scale: Array) -> Array:
@@ -324,12 +482,21 @@ def _scaling(hessian: Array, floor: Array) -> Array:
     return lax.fori_loop(0, EQUILIBRATIONS, equilibrate, start)
 
 
-def _direction(state: State, constraints: Constraints) -> tuple[Array, Array]:
+def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints) -> tuple[Array, Array]:
     """Step (d,) of the quadratic programme, and its slope gᵀd."""
-    theta, gradient = state.theta, state.gradient
-    floor = algebra.curvature_floor(state.scale, state.cost_scale, jnp.abs(gradient), jnp)
-    scaling = _scaling(state.hessian, floor)
-    scaled = state.hessian / jnp.outer(scaling, scaling)
+    theta, sides = state.theta, state.sides
+    held = sides == 0
+    pair = sides[:, None] + sides
+    left, right = state.left.hessian, state.right.hessian
+    hessian = _without(held, jnp.where(pair > 0, right, jnp.where(pair < 0, left, 0.5 * (right + left))))
+    gradient = _steepest(state.left.gradient, state.right.gradient, state.kink)
+    narrowed = breakpoints.piece(theta, constraints)
+    lower = jnp.where(state.inside, narrowed[0], constraints.lower)
+    upper = jnp.where(state.inside, narrowed[1], constraints.upper)
+    slopes = jnp.maximum(jnp.abs(state.right.gradient), jnp.abs(state.left.gradient))
+    floor = algebra.curvature_floor(state.scale, state.cost_scale, slopes, jnp)
+    scaling = _scaling(hessian, floor)
+    scaled = hessian / jnp.outer(scaling, scaling)
     identity = jnp.eye(theta.shape[0])
     definite = jnp.all(jnp.isfinite(jnp.linalg.cholesky(scaled - EIGENVALUE_FLOOR * identity)))
 
@@ -339,7 +506,8 @@ def _direction(state: State, constraints: Constraints) -> tuple[Array, Array]:
 
     matrix = lax.cond(definite, lambda: scaled, absolute)
     factor = jnp.linalg.cholesky(matrix)
-    low, high = jnp.minimum(constraints.lower - theta, 0.0), jnp.maximum(constraints.upper - theta, 0.0)
+    low = jnp.where(state.kink & (sides >= 0), 0.0, jnp.minimum(lower - theta, 0.0))
+    high = jnp.where(state.kink & (sides <= 0), 0.0, jnp.maximum(upper - theta, 0.0))
     slack = jnp.maximum(constraints.A @ theta - constraints.b, 0.0)
     offsets = jnp.concatenate([-slack, low, -high])
 
@@ -366,14 +534,15 @@ def _direction(state: State, constraints: Constraints) -> tuple[Array, Array]:
     return step, gradient @ step
 
 
-def _moved(constraints: Constraints, theta: Array, step: Array) -> Array:
-    """theta + step with violations of the size of rounding removed."""
+def _moved(constraints: Constraints, breakpoints: Breakpoints, theta: Array, step: Array) -> Array:
+    """theta + step, on the breakpoints that it reaches, with violations of the size of rounding removed."""
 
     def project(i: int, moved: Array) -> Array:
         normal, bound = constraints.A[i], constraints.b[i]
         violation, projected = algebra.project_on_row(moved, normal, bound, normal, jnp)
         return jnp.where(violation > 0.0, projected, moved)
 
-    moved = jnp.clip(theta + step, constraints.lower, constraints.upper)
+    moved = breakpoints.snap(theta + step, theta, step, jnp.broadcast_to(constraints.size, theta.shape))
+    moved = jnp.clip(moved, constraints.lower, constraints.upper)
     rows = constraints.b.shape[0]
     return jnp.clip(lax.fori_loop(0, rows, project, moved), constraints.lower, constraints.upper) if rows else moved

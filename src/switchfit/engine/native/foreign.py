@@ -39,10 +39,11 @@ def can_be_foreign(structure: Structure) -> bool:
     return not late and structure.transitions == structure.N
 
 
-def foreign_derivatives(structure: Structure, arguments: Arguments, tau: Any, p: Any) -> Any:
+def foreign_derivatives(structure: Structure, arguments: Arguments, tau: Any, p: Any, side: Any) -> Any:
     """Cost, gradient (D,) and Hessian (D, D) of one experiment, inside a JAX program that runs on a CPU.
 
-    With the side +1, for an experiment that `can_be_foreign` and for which there is machine code.
+    For an experiment that `can_be_foreign` and for which there is machine code. `side` is +1 or -1: the right or left
+    derivatives by a transition time that sits on a node.
     """
     sizes, library = Sizes.of(structure, arguments), structure.library
     name, _ = _registered(library, sizes)
@@ -50,7 +51,7 @@ def foreign_derivatives(structure: Structure, arguments: Arguments, tau: Any, p:
     nodes = arguments.nodes
     cells = nodes.shape[0] - 1
     real_cells = jnp.sum(nodes[1:] > nodes[:-1])
-    passed = jnp.sum(nodes[None] <= tau[:, None], axis=1)
+    passed = jnp.sum(jnp.where(side > 0.0, nodes <= tau[:, None], nodes < tau[:, None]), axis=1)
     begins = jnp.clip(passed - 1, 0, real_cells - 1)
     units = np.zeros((D + 1, width))
     units[1:, :D] = np.eye(D)
