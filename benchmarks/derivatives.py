@@ -94,7 +94,7 @@ def compare(
     if compiled is not None:
         calls["casadi C"] = partial(casadi_forms.Timed(compiled), theta)
     timings = take_turns(calls, repetitions)
-    exact = evaluator.divided(4).cost(theta)
+    exact = evaluator.divide(4).cost(theta)
     return {
         "rows": len(rows),
         "cost error": abs(ours.cost - exact) / abs(exact),

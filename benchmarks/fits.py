@@ -163,7 +163,7 @@ def vehicle_task(count: int, quick: bool) -> Task:
         return sf.Problem(system, run, {"mu": sf.Parameter(theta[2], lower=0.05, upper=2.0)})
 
     start = problem.initial_theta
-    judge = Evaluator(again(np.array([*vehicle.TRUTH, vehicle.MU_TRUTH]))).divided(2).cost
+    judge = Evaluator(again(np.array([*vehicle.TRUTH, vehicle.MU_TRUTH]))).divide(2).cost
     by_scipy = Precise(problem)
     sides = {
         "switchfit": lambda theta: sf.estimate(again(theta)).theta,

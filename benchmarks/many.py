@@ -56,7 +56,7 @@ def measure(runs: int) -> dict[str, Any]:
     """Seconds a fit: `runs` refits at once, and some of them by `estimate`, one after the other."""
     from switchfit.batch.simulated import _clean, _meshes, _Work
     from switchfit.fit.evaluator import Evaluator
-    from switchfit.fit.solution import minimized
+    from switchfit.fit.solution import minimize_cost
 
     found: dict[str, Any] = {}
     for name, (seen, start) in CASES.items():
@@ -71,7 +71,8 @@ def measure(runs: int) -> dict[str, Any]:
         work.meshes = _meshes(work.problem_of(0), TRUTH, start)[0]
         few = min(SINGLE, runs)
         singles = [
-            minimized(Evaluator(work.problem_of(k), meshes=work.meshes), start, "exact", 1e-7, 200) for k in range(few)
+            minimize_cost(Evaluator(work.problem_of(k), meshes=work.meshes), start, "exact", 1e-7, 200)
+            for k in range(few)
         ]
         gap = max(float(np.max(np.abs(single.theta - study.theta[k]))) for k, single in enumerate(singles))
         problems = [work.problem_of(k) for k in range(few)]

@@ -13,7 +13,7 @@ from benchmarks.report import Report
 from benchmarks.timing import ms
 from switchfit.engine.native.program import _program_of
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.solution import minimized
+from switchfit.fit.solution import minimize_cost
 
 RUNS = (10, 20, 40, 80, 160)
 SHARED = {"k": 2.0, "c": 0.3, "b": 0.2}
@@ -133,7 +133,7 @@ def _iteration(evaluator: Evaluator, by_blocks: bool) -> tuple[float, int]:
     seconds, iterations = [], 0
     for _ in range(3):
         began = time.perf_counter()
-        result = minimized(evaluator, theta, "exact", 1e-7, 200, by_blocks=by_blocks)
+        result = minimize_cost(evaluator, theta, "exact", 1e-7, 200, by_blocks=by_blocks)
         iterations = result.iterations
         seconds.append((time.perf_counter() - began) / iterations)
     return min(seconds), iterations

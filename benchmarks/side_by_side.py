@@ -143,7 +143,7 @@ def reference_of(case: Case) -> tuple[float, np.ndarray, np.ndarray]:
     from benchmarks.peers.scipy_differences import cost_of
 
     theta = case.model.theta
-    fine = Evaluator(case.problem()).divided(8)(theta)
+    fine = Evaluator(case.problem()).divide(8)(theta)
     J = cost_of(case.model, 1e-13, 1e-15)(theta)
     if not abs(fine.cost - J) <= REFERENCE_AGREEMENT * abs(J):
         raise ArithmeticError(f"{case.model.name}: J is {J!r} by solve_ivp and {fine.cost!r} by switchfit")

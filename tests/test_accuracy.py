@@ -95,7 +95,7 @@ def test_default_tolerances_give_the_derivatives_to_about_1e_7(theta):
     """The paper's problem on its reference of 0.1 s; the last theta is near the solution, where J almost vanishes."""
     problem, theta = simulated(), np.array(theta)
     found = Evaluator(problem, theta)(theta)
-    exact = Evaluator(problem, theta).divided(4)(theta)
+    exact = Evaluator(problem, theta).divide(4)(theta)
     error = np.linalg.norm(found.gradient - exact.gradient) / np.linalg.norm(exact.gradient)
     assert 1e-9 < error < 2e-7
     assert np.linalg.norm(found.hessian - exact.hessian) / np.linalg.norm(exact.hessian) < 1e-7

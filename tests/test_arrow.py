@@ -78,12 +78,12 @@ def test_operations_are_those_of_the_full_matrix(seed):
     np.testing.assert_array_equal(arrow.diagonal(), np.diag(full))
     np.testing.assert_array_equal(abs(arrow).dense(), abs(full))
     np.testing.assert_array_equal(abs(arrow).largest_in_rows(), abs(full).max(1))
-    np.testing.assert_allclose(arrow.scaled(scaling).dense(), full / np.outer(scaling, scaling), rtol=1e-12)
+    np.testing.assert_allclose(arrow.scale(scaling).dense(), full / np.outer(scaling, scaling), rtol=1e-12)
     np.testing.assert_array_equal(arrow.held(free).dense(), np.where(np.outer(free, free), full, np.diag(1.0 - free)))
-    np.testing.assert_array_equal(arrow.masked(labels).dense(), full * (labels[:, None] == labels))
+    np.testing.assert_array_equal(arrow.mask(labels).dense(), full * (labels[:, None] == labels))
     pair = sides[:, None] + sides
     mixed = np.where(pair > 0, full, np.where(pair < 0, other, 0.5 * (full + other)))
-    np.testing.assert_allclose(arrow.mixed(arrow_of(other), sides).dense(), mixed, rtol=1e-14)
+    np.testing.assert_allclose(arrow.mix_sides(arrow_of(other), sides).dense(), mixed, rtol=1e-14)
     floor = rng.uniform(0.0, 1.0, 11)
     np.testing.assert_allclose(diagonal_scaling(arrow, floor), diagonal_scaling(Dense(full), floor), rtol=1e-12)
     assert arrow.finite

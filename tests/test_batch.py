@@ -18,7 +18,7 @@ from switchfit.batch import simulated as module
 from switchfit.batch.chunks import run_chunks
 from switchfit.batch.program import CHUNK, Varying, fit_chunk
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.solution import minimized
+from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import LinearConstraints, minimize
 from switchfit.optimize.qp import nearest_feasible, solve_qp
 from switchfit.optimize.traced import Breakpoints, Constraints, minimize_traced, nonnegative_minimum
@@ -204,7 +204,7 @@ def test_the_curvature_of_a_coordinate_that_a_kink_holds_does_not_count():
 
 def singles(problems, meshes, start):
     """Each problem fitted by itself on the given meshes."""
-    results = [minimized(Evaluator(problem, meshes=meshes), start, "exact", 1e-7, 200) for problem in problems]
+    results = [minimize_cost(Evaluator(problem, meshes=meshes), start, "exact", 1e-7, 200) for problem in problems]
     return results, np.array([result.theta for result in results])
 
 
@@ -464,7 +464,7 @@ def test_a_log_that_needs_a_finer_mesh_is_done_again_by_itself():
 
     problems = [log(1.0), log(12.0), log(1.1)]
     fits = sf.estimate_many(problems)
-    on_its_mesh = minimized(evaluator_of(problems[1]), problems[1].initial_theta, "exact", 1e-7, 200)
+    on_its_mesh = minimize_cost(evaluator_of(problems[1]), problems[1].initial_theta, "exact", 1e-7, 200)
     assert abs(on_its_mesh.theta[0] - fits.theta[1, 0]) > 1e-5
     for k, problem in enumerate(problems):
         single = sf.estimate(problem)
@@ -763,12 +763,12 @@ def test_a_fit_that_is_finished_has_half_the_budget_left(monkeypatch):
 
     budgets = []
 
-    def minimized(evaluator, theta, hessian, tolerance, max_iterations, **settings):
+    def minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, **settings):
         budgets.append(max_iterations)
         return original(evaluator, theta, hessian, tolerance, max_iterations, **settings)
 
-    original = program.minimized
-    monkeypatch.setattr(program, "minimized", minimized)
+    original = program.minimize_cost
+    monkeypatch.setattr(program, "minimize_cost", minimize_cost)
     study = sf.monte_carlo(room(), 4, theta=TRUTH, start=[4.0, 3.0], max_iterations=6)
     assert budgets
     assert min(budgets) >= 3

@@ -12,7 +12,7 @@ import scipy.stats
 
 import switchfit as sf
 from switchfit.fit.evaluator import evaluator_of
-from switchfit.fit.solution import minimized
+from switchfit.fit.solution import minimize_cost
 from switchfit.fit.termination import termination_of
 from switchfit.fit.trajectory import SimulatedProblem
 
@@ -326,7 +326,7 @@ def test_too_few_iterations():
 def test_a_budget_is_that_of_one_mesh():
     """The fit converges on the first mesh with its last iteration, and is resumed on a finer one all the same."""
     problem = refined_fit().problem
-    on_first = minimized(evaluator_of(problem), problem.initial_theta, "exact", 1e-7, 200).iterations
+    on_first = minimize_cost(evaluator_of(problem), problem.initial_theta, "exact", 1e-7, 200).iterations
     found = sf.estimate(problem, max_iterations=on_first)
     assert found.success
     assert found.iterations == refined_fit().iterations > on_first
@@ -342,7 +342,7 @@ def test_a_fit_that_is_out_of_iterations_is_not_resumed_with_none_left():
 
 def test_a_fit_that_is_out_of_iterations_on_a_finer_mesh_says_how_many_there_were():
     problem = capacitor(voltage(TIMES))
-    result = minimized(evaluator_of(problem), problem.initial_theta, "exact", 1e-7, 1)
+    result = minimize_cost(evaluator_of(problem), problem.initial_theta, "exact", 1e-7, 1)
     stopped = termination_of(replace(result, iterations=12, earlier=9), problem)
     assert "Stopped after 12 iterations, 9 of them before the mesh was refined, with" in str(stopped)
 
@@ -591,7 +591,7 @@ def test_the_mesh_is_refined_where_the_solution_needs_it():
     assert cells >= 2 * first.meshes[0].cells
     assert found.integration_error <= 1e-5
     assert f"{found.integration_error:.1e}" in str(found.certificate)
-    rough, fine = first(found.theta).cost, first.divided(32)(found.theta).cost
+    rough, fine = first(found.theta).cost, first.divide(32)(found.theta).cost
     assert abs(rough - fine) > 1e-3 * fine
     assert found.cost == pytest.approx(fine, rel=2e-5)
     data = found.problem.experiments[0].data[0]

@@ -14,7 +14,7 @@ from switchfit.cli import app
 from switchfit.discretization.mesh import common_lengths, padded_length
 from switchfit.engine.native.program import _program_of
 from switchfit.fit.evaluator import evaluator_of
-from switchfit.fit.solution import minimized
+from switchfit.fit.solution import minimize_cost
 from switchfit.io.problem_file import load_problem
 from switchfit.runtime.errors import InputError
 
@@ -437,7 +437,9 @@ def guess_of(run, guess):
 def test_by_blocks_a_fit_is_the_same():
     problem = tanks(6)
     evaluator = evaluator_of(problem)
-    full, blocks = (minimized(evaluator, problem.initial_theta, "exact", 1e-7, 200, by_blocks=b) for b in (False, True))
+    full, blocks = (
+        minimize_cost(evaluator, problem.initial_theta, "exact", 1e-7, 200, by_blocks=b) for b in (False, True)
+    )
     assert blocks.status.is_strict_minimum
     np.testing.assert_allclose(blocks.theta, full.theta, rtol=1e-8, atol=1e-9)
     at, arrow = evaluator(full.theta), evaluator.arrow(full.theta)
@@ -504,7 +506,8 @@ def test_a_batch_of_runs_with_times_that_are_known():
         layout = Layout(problem.structures, places, (), lockstep, not lockstep, 1e-7, 10)
         times = tuple(run.initial_times for run in problem.experiments)
         with jax.enable_x64(True):
-            found = jax.jit(lambda theta, f=layout, t=times: _total(f, tuple(evaluator.arguments), t, theta))(theta)
+            given_here = layout, tuple(evaluator.arguments), times
+            found = jax.jit(lambda theta, here=given_here: _total(*here, theta, jnp.ones(())))(theta)
         expected = evaluator(theta)
         for one, other in zip(found, (expected.cost, expected.gradient, expected.hessian), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-8)

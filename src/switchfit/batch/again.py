@@ -56,7 +56,7 @@ def is_resolved(problem: Problem, meshes: Sequence[Mesh], theta: Any, cost: floa
     """Whether cutting all steps in two changes J at theta by no more than the integration error that is allowed."""
     evaluator = Evaluator(problem, meshes=meshes)
     here = evaluator.cost(theta) if cost is None else cost
-    fine = evaluator.divided().cost(theta)
+    fine = evaluator.divide().cost(theta)
     return cost_error(problem, fine, here, 0.0) <= max(LARGEST_INTEGRATION_ERROR, problem.rtol)
 
 

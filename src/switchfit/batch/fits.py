@@ -17,7 +17,7 @@ from switchfit.batch.chunks import Work, run_chunks
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.hidden import refuse_hidden_switches
 from switchfit.fit.result import interval
-from switchfit.fit.solution import sigma_known
+from switchfit.fit.solution import is_sigma_known
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
@@ -177,7 +177,7 @@ def _fields(
     problem: Problem, requested: int, runs: NDArray[np.intp], arrays: dict[str, NDArray[Any]], seconds: float
 ) -> dict[str, Any]:
     """The fields of `Fits` from what the chunks found, covariances scaled by the residual variance where needed."""
-    known = sigma_known(problem)
+    known = is_sigma_known(problem)
     samples = arrays["samples"]
     freedom = samples - arrays["free"]
     scale = np.ones(len(samples)) if known else np.full(len(samples), np.nan)

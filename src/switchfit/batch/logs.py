@@ -14,10 +14,10 @@ import numpy as np
 from switchfit.batch.again import adopt, is_resolved
 from switchfit.batch.chunks import Arrays, fingerprint
 from switchfit.batch.fits import Fits, check_long_run, repeat, sample_count
-from switchfit.batch.program import Varying, chunk_size, error_message, failed_chunk, fit_chunk
+from switchfit.batch.program import Varying, chunk_size, error_message, fit_chunk, make_failed_chunk
 from switchfit.estimation.estimator import checked_settings, estimate
 from switchfit.fit.evaluator import evaluator_of
-from switchfit.fit.solution import sigma_known
+from switchfit.fit.solution import is_sigma_known
 from switchfit.optimize import Status
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_instance, as_sequence, listed
@@ -62,7 +62,7 @@ def estimate_many(
     first = problems[0]
     for k, problem in enumerate(problems):
         as_instance(problem, f"problems[{k}]", Problem, "an sf.Problem")
-        if problem.theta_names != first.theta_names or sigma_known(problem) is not sigma_known(first):
+        if problem.theta_names != first.theta_names or is_sigma_known(problem) is not is_sigma_known(first):
             raise ValueError(
                 f"problem {k} differs from the first one in more than its numbers: it has the unknowns "
                 f"{listed(problem.theta_names)}, the first one {listed(first.theta_names)}. Fit it by itself."
@@ -136,7 +136,7 @@ class _Work:
     def _failed(self, errors: dict[int, Exception]) -> Arrays:
         """Arrays for problems that could not be begun."""
         starts = np.array([self.problems[k].initial_theta for k in errors])
-        found = failed_chunk(starts, dict(enumerate(errors.values())))
+        found = make_failed_chunk(starts, dict(enumerate(errors.values())))
         samples = np.array([sample_count(self.problems[k]) for k in errors])
         return {**found._asdict(), "start": starts, "samples": samples}
 

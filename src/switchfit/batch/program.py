@@ -28,9 +28,9 @@ from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.choice import runs_natively, traced_derivatives
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.guards import on_guards_if_near
+from switchfit.fit.guards import place_on_near_guards
 from switchfit.fit.result import inverse_on
-from switchfit.fit.solution import constraints_of, minimized, minimized_with_constraints
+from switchfit.fit.solution import constraints_of, minimize_cost, minimize_with_constraints
 from switchfit.fit.termination import Kink, Termination, termination_of
 from switchfit.optimize import Status
 from switchfit.optimize.qp import nearest_feasible
@@ -171,8 +171,8 @@ def fit_chunk(
     """
     if problem.constraint_names:  # which the program does not know
         evaluator = Evaluator(problem, meshes=meshes)
-        outcome = _not_begun(np.asarray(starts, dtype=float))
-        return _finished(problem, evaluator, varying, outcome, tolerance, max_iterations)
+        outcome = _leave_all(np.asarray(starts, dtype=float))
+        return _finish_rest(problem, evaluator, varying, outcome, tolerance, max_iterations)
     unknowns = problem.unknowns
     lockstep = in_lockstep() if lockstep is None else lockstep
     evaluator = Evaluator(problem, meshes=meshes)
@@ -194,22 +194,24 @@ def fit_chunk(
     with float64():
         given = (
             tuple(evaluator.arguments),
-            tuple(_padded(value, size) for value in varying.values),
+            tuple(_pad(value, size) for value in varying.values),
             tuple(experiment.initial_times for experiment in problem.experiments),
             Constraints(*map(jnp.asarray, constraints)),
             Unscaled(variables, unknowns.priors, unknowns.lower, unknowns.upper),
-            _padded(variables.inward(np.asarray(starts)), size),
+            _pad(variables.inward(np.asarray(starts)), size),
             count,
         )
         try:
-            with _compiling(layout, given):
+            with _compile_once(layout, given):
                 outcome = jax.tree.map(lambda a: np.asarray(a)[:count], _fits(*given, layout=layout))
         except Exception:  # of one fit, as where a function of the model calls back into Python: each by itself, then
-            outcome = _not_begun(np.asarray(starts, dtype=float))
-    return _finished(problem, evaluator, varying, outcome, tolerance, max_iterations)
+            outcome = _leave_all(np.asarray(starts, dtype=float))
+    return _finish_rest(problem, evaluator, varying, outcome, tolerance, max_iterations)
 
 
-def replaced(arguments: Sequence[Arguments], places: tuple[int, ...], values: Sequence[Any]) -> tuple[Arguments, ...]:
+def replace_leaves(
+    arguments: Sequence[Arguments], places: tuple[int, ...], values: Sequence[Any]
+) -> tuple[Arguments, ...]:
     """The arguments of all experiments with some of their leaves replaced."""
     leaves, tree = jax.tree.flatten(tuple(arguments))
     for place, value in zip(places, values, strict=True):
@@ -222,7 +224,7 @@ _lock = threading.Lock()
 
 
 @contextmanager
-def _compiling(layout: Layout, given: Any) -> Iterator[None]:
+def _compile_once(layout: Layout, given: Any) -> Iterator[None]:
     """Context of a call of the program: the first one compiles, in the compilation cache, and others wait for it."""
     key = (layout, tuple(np.shape(leaf) for leaf in jax.tree.leaves(given)))
     with _lock:
@@ -234,7 +236,7 @@ def _compiling(layout: Layout, given: Any) -> Iterator[None]:
     yield
 
 
-def _padded(values: Any, size: int) -> FloatArray:
+def _pad(values: Any, size: int) -> FloatArray:
     """`values` (R, ...) with the last one repeated to `size`: the number of fits must not shape the program."""
     array = np.asarray(values)
     return np.concatenate([array, np.repeat(array[-1:], size - len(array), axis=0)]) if len(array) < size else array
@@ -256,7 +258,7 @@ def _fits(
 
     def functions(own: tuple[jax.Array, ...]) -> tuple[Any, Breakpoints]:
         """What `minimize_traced` is given for the fit with some numbers of its own: evaluate and breakpoints."""
-        here = replaced(arguments, layout.varying, own)
+        here = replace_leaves(arguments, layout.varying, own)
 
         def evaluate(z: jax.Array, side: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             theta = unscaled.theta(z)
@@ -269,7 +271,7 @@ def _fits(
 
     settings: Any = {"tolerance": layout.tolerance, "max_iterations": layout.max_iterations}
 
-    def outward(found: Outcome) -> Outcome:
+    def convert(found: Outcome) -> Outcome:
         theta = unscaled.theta(found.theta)
         left = unscaled.variables.derivatives_outward(theta, found.left, found.hessian, jnp)[0]
         gradient, hessian = unscaled.variables.derivatives_outward(theta, found.gradient, found.hessian, jnp)
@@ -277,7 +279,7 @@ def _fits(
 
     def fit(own: tuple[jax.Array, ...], start: jax.Array) -> Outcome:
         evaluate, breakpoints = functions(own)
-        return outward(minimize_traced(evaluate, start, constraints, breakpoints, **settings))
+        return convert(minimize_traced(evaluate, start, constraints, breakpoints, **settings))
 
     if layout.lockstep:
         return jax.vmap(fit)(values, starts)
@@ -320,7 +322,7 @@ def _total(
     d = theta.shape[0]
     J, g, H = jnp.zeros(()), jnp.zeros(d), jnp.zeros((d, d))
     extended = jnp.append(theta, 0.0)
-    for group in _alike(layout, arguments):
+    for group in _group_alike(layout, arguments):
         structure = layout.structures[group[0]]
         N = structure.N
         where = np.array([layout.places[e] for e in group])
@@ -349,7 +351,7 @@ def _total(
     return J, g, H
 
 
-def _alike(layout: Layout, arguments: tuple[Arguments, ...]) -> list[list[int]]:
+def _group_alike(layout: Layout, arguments: tuple[Arguments, ...]) -> list[list[int]]:
     """Groups of experiments that one program can take."""
     groups: dict[Any, list[int]] = {}
     for e, (structure, own) in enumerate(zip(layout.structures, arguments, strict=True)):
@@ -390,7 +392,7 @@ def with_errors(chunk: Chunk, errors: Mapping[int, BaseException]) -> Chunk:
     return Chunk(**found | {name: found[name].astype(str) for name in ("status", "message")})
 
 
-def failed_chunk(starts: FloatArray, errors: Mapping[int, BaseException]) -> Chunk:
+def make_failed_chunk(starts: FloatArray, errors: Mapping[int, BaseException]) -> Chunk:
     """A chunk of fits (R, d) none of which could begin."""
     R, d = starts.shape
     nothing, none, blank = np.full(R, np.nan), np.zeros(R, dtype=int), np.full(R, "", dtype=object)
@@ -401,7 +403,7 @@ def failed_chunk(starts: FloatArray, errors: Mapping[int, BaseException]) -> Chu
     )
 
 
-def _not_begun(starts: FloatArray) -> Outcome:
+def _leave_all(starts: FloatArray) -> Outcome:
     """Outcomes of fits (R, d) that are all left to `minimize`."""
     R, d = starts.shape
     nothing, none, no = np.full(R, np.nan), np.zeros(R, dtype=int), np.zeros(R, dtype=bool)
@@ -427,7 +429,7 @@ def _at_kink(problem: Problem, outcome: Outcome, k: int, tolerance: float) -> Te
     )
 
 
-def _finished(
+def _finish_rest(
     problem: Problem,
     evaluator: Evaluator,
     varying: Varying,
@@ -456,13 +458,17 @@ def _finished(
         try:
             values = tuple(value[k] for value in varying.values)
             with float64():
-                evaluator.replace_arguments(replaced(base, varying.places, [jnp.asarray(value) for value in values]))
+                evaluator.replace_arguments(
+                    replace_leaves(base, varying.places, [jnp.asarray(value) for value in values])
+                )
             left = max_iterations - int(found["iterations"][k])
             start = nearest_feasible(constraints, found["theta"][k])
             if problem.constraint_names:
-                result, _ = minimized_with_constraints(evaluator, on_guards_if_near(evaluator, start), tolerance, left)
+                result, _ = minimize_with_constraints(
+                    evaluator, place_on_near_guards(evaluator, start), tolerance, left
+                )
             else:
-                result = minimized(evaluator, start, "exact", tolerance, left, constraints=constraints)
+                result = minimize_cost(evaluator, start, "exact", tolerance, left, constraints=constraints)
         except Exception as error:  # whatever it is, it must not end the other fits
             status[k], message[k] = Status.ERROR.name, error_message(error)
             free[k] = 0

@@ -46,7 +46,7 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.estimation.estimator import Estimate, checked_settings
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import inverse_on
-from switchfit.fit.solution import plain
+from switchfit.fit.solution import is_plain_least_squares
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_count, as_level, as_seed
@@ -221,7 +221,7 @@ def _check_data(problem: Problem) -> None:
                 raise ValueError(
                     f"a bootstrap resamples Measurements; this problem has a {type(item).__name__} as well."
                 )
-    if not plain(problem):
+    if not is_plain_least_squares(problem):
         raise ValueError(
             "a bootstrap takes least squares alone: no sigma and no delay that is a parameter, no robust loss and no "
             "prior. sf.monte_carlo draws from the noise that was fitted."

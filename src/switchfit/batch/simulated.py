@@ -22,7 +22,7 @@ from switchfit.engine.adaptive import refined_mesh
 from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, checked_settings, estimate
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.guards import on_guards_if_near
+from switchfit.fit.guards import place_on_near_guards
 from switchfit.fit.trajectory import compare
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.problem import Problem
@@ -144,7 +144,7 @@ def monte_carlo(
     began = time.perf_counter()
     given = None if theta is None else problem.checked_theta(theta)
     begin = None if start is None else problem.checked_theta(start, "start")
-    truth = estimate(problem).theta if given is None else on_guards_if_near(evaluator_of(problem), given)
+    truth = estimate(problem).theta if given is None else place_on_near_guards(evaluator_of(problem), given)
     begin = truth if begin is None else begin
     found, error = simulated(
         problem,
@@ -254,7 +254,7 @@ def _meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tuple[lis
     for attempt in range(REFINEMENTS + 1):
         indices = range(len(problem.experiments))
         evaluator = Evaluator(problem, meshes=[refined_mesh(problem, e, *thetas, finer=finer) for e in indices])
-        fine = evaluator.divided().cost(truth)
+        fine = evaluator.divide().cost(truth)
         # Without noise J vanishes at the truth; then the error is measured against J where the fits begin.
         error = cost_error(problem, fine, evaluator(truth).cost, evaluator(start).cost)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)

@@ -16,16 +16,16 @@ from switchfit.engine.adaptive import refined_mesh
 from switchfit.estimation.saved import load_fit, save_fit
 from switchfit.fit.accuracy import worst_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.guards import on_guards_if_near
+from switchfit.fit.guards import place_on_near_guards
 from switchfit.fit.hidden import refuse_jumps
 from switchfit.fit.result import Fit
 from switchfit.fit.solution import (
     constraints_of,
-    least_squares,
-    minimized,
-    minimized_with_constraints,
-    plain,
-    sigma_known,
+    is_least_squares,
+    is_plain_least_squares,
+    is_sigma_known,
+    minimize_cost,
+    minimize_with_constraints,
 )
 from switchfit.fit.termination import termination_of
 from switchfit.fit.trajectory import SimulatedProblem
@@ -107,7 +107,7 @@ class Estimate(Fit):
         """The Gauss-Newton matrix ``sum (D h / sigma)' (D h / sigma)``: (d, d); None where it is not known."""
         if self.saved_gauss_newton is not None or self.sigma_known is None or self.problem is None:
             return self.saved_gauss_newton
-        if plain(self.problem) and self.has_room_for_sensitivities():
+        if is_plain_least_squares(self.problem) and self.has_room_for_sensitivities():
             return gauss_newton_of(sample_derivatives(self.problem, self.sensitivities))
         return self.evaluator_at_solution()(self.theta, matrix="gauss-newton").hessian
 
@@ -294,17 +294,17 @@ def estimate(
     evaluations = 0
     for attempt in range(REFINEMENTS + 1):
         last = history[-1] if history else None
-        told = None if callback is None else lambda record, last=last: callback(record.counted_on(last))
+        told = None if callback is None else lambda record, last=last: callback(record.continue_from(last))
         earlier = max(len(history) - 1, 0)
         if problem.constraint_names:
-            result, held = minimized_with_constraints(evaluator, theta, tolerance, max_iterations, told)
+            result, held = minimize_with_constraints(evaluator, theta, tolerance, max_iterations, told)
         else:
-            result = minimized(evaluator, theta, hessian, tolerance, max_iterations, told, constraints)
-        records = [record.counted_on(last) for record in result.history]
+            result = minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, told, constraints)
+        records = [record.continue_from(last) for record in result.history]
         history += records[1:] if history else records
         evaluations += result.evaluations
         theta = result.theta
-        fine = evaluator.divided()
+        fine = evaluator.divide()
         simulation = SimulatedProblem(fine, theta)
         error, output = worst_error(
             simulation,
@@ -346,7 +346,7 @@ def _beginning(problem: Problem, start: ArrayLike | None) -> tuple[FloatArray, E
     """Where a fit begins (d,), guarded transitions on their guards if that is near, and the meshes for it."""
     theta = problem.checked_theta(start, "start")
     evaluator = evaluator_of(problem) if start is None else Evaluator(problem, theta)
-    placed = on_guards_if_near(evaluator, theta)
+    placed = place_on_near_guards(evaluator, theta)
     if not np.array_equal(placed, theta):
         theta, evaluator = placed, Evaluator(problem, placed)
     return theta, evaluator
@@ -395,10 +395,10 @@ def _estimate(
         hessian=exact,
         history=tuple(history),
         free_basis=result.free_basis,
-        sigma_known=sigma_known(problem),
+        sigma_known=is_sigma_known(problem),
         priors={name: text for name, text in zip(unknowns.names, unknowns.priors.texts(), strict=True) if text},
         log_scaled=unknowns.log_names,
-        least_squares=least_squares(problem),
+        least_squares=is_least_squares(problem),
         hessian_kind=hessian,
         engine=evaluator.engine,
         problem=problem,

@@ -96,7 +96,7 @@ class Evaluator:
         self.replace_arguments([arguments_of(problem, e, m) for e, m in enumerate(with_common_lengths(problem, given))])
         self._priors = problem.unknowns.priors if problem.unknowns.priors.any else None
 
-    def divided(self, parts: int = 2) -> Evaluator:
+    def divide(self, parts: int = 2) -> Evaluator:
         """The same problem with every cell of its meshes cut into equal parts."""
         return Evaluator(self.problem, meshes=[mesh.divided(parts) for mesh in self.meshes])
 

@@ -38,7 +38,7 @@ def refuse_hidden_switches(evaluator: Evaluator, theta: FloatArray, gradient: Fl
     if not suspects:
         return
     base = evaluator(theta, matrix="none").cost
-    hidden = [i for i in suspects if _hidden(evaluator, theta, i, base)]
+    hidden = [i for i in suspects if _is_hidden(evaluator, theta, i, base)]
     if hidden:
         spans = unknowns.parameters.items()
         name = next((name for name, span in spans if span.start <= hidden[0] < span.stop), unknowns.names[hidden[0]])
@@ -105,7 +105,7 @@ def _jump(evaluator: Evaluator, theta: FloatArray, i: int) -> tuple[float, Findi
     return None
 
 
-def _hidden(evaluator: Evaluator, theta: FloatArray, i: int, base: float) -> bool:
+def _is_hidden(evaluator: Evaluator, theta: FloatArray, i: int, base: float) -> bool:
     """Whether the cost differs where unknown i is changed, its derivative being 0 there too."""
     unknowns = evaluator.problem.unknowns
     lower, upper = unknowns.lower[i], unknowns.upper[i]

@@ -41,7 +41,7 @@ def constraints_of(problem: Problem) -> LinearConstraints:
     return LinearConstraints(unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, linear_constraints_of(problem))
 
 
-def minimized(
+def minimize_cost(
     evaluator: Evaluator,
     theta: Any,
     hessian: HessianKind,
@@ -74,23 +74,23 @@ def minimized(
         return CostAndGradient(here.cost, here.gradient) if hessian == "none" else here
 
     def evaluate(z: Any, side: int) -> Any:
-        theta = z if identity else _outward(variables, constraints, z)
+        theta = z if identity else _to_theta(variables, constraints, z)
         here = evaluate_theta(theta, side)
         if not seen:
             seen.append(True)
             refuse_hidden_switches(evaluator, theta, here.gradient)
-        return here if identity else _inward(variables, theta, here)
+        return here if identity else _to_variables(variables, theta, here)
 
     def idle(z: FloatArray, everything: bool) -> NDArray[np.bool_]:
-        return idle_unknowns(evaluator, z if identity else _outward(variables, constraints, z), everything)
+        return idle_unknowns(evaluator, z if identity else _to_theta(variables, constraints, z), everything)
 
     told = callback
     if callback is not None and not identity:
-        told = lambda record: callback(_told(variables, constraints, record))  # noqa: E731
+        told = lambda record: callback(_convert_record(variables, constraints, record))  # noqa: E731
     result = minimize(
         evaluate,
         theta if identity else variables.inward(np.asarray(theta)),
-        constraints=constraints if identity else _constraints_inward(variables, constraints),
+        constraints=constraints if identity else _convert_constraints(variables, constraints),
         breakpoints=evaluator.breakpoints(),
         hessian=hessian,
         blocks=unknowns.is_time.astype(int),
@@ -101,11 +101,11 @@ def minimized(
         idle=idle,
     )
     if result.status is Status.LINE_SEARCH_FAILED:
-        refuse_jumps(evaluator, result.theta if identity else _outward(variables, constraints, result.theta))
-    return result if identity else _result_outward(variables, constraints, result)
+        refuse_jumps(evaluator, result.theta if identity else _to_theta(variables, constraints, result.theta))
+    return result if identity else _convert_result(variables, constraints, result)
 
 
-def minimized_with_constraints(
+def minimize_with_constraints(
     evaluator: Evaluator,
     theta: FloatArray,
     tolerance: float,
@@ -134,40 +134,40 @@ def minimized_with_constraints(
     return found.result, tuple(zip(names, values, multipliers, strict=True))
 
 
-def _outward(variables: Variables, constraints: LinearConstraints, z: FloatArray) -> FloatArray:
+def _to_theta(variables: Variables, constraints: LinearConstraints, z: FloatArray) -> FloatArray:
     """theta at z, inside its bounds whatever the rounding."""
     return np.asarray(np.clip(variables.outward(z), constraints.lower, constraints.upper))
 
 
-def _inward(variables: Variables, theta: FloatArray, here: Any) -> Any:
+def _to_variables(variables: Variables, theta: FloatArray, here: Any) -> Any:
     """An evaluation at theta as one of the optimiser's variables."""
     if here.hessian is None:
         return CostAndGradient(here.cost, variables.slopes(theta)[0] * here.gradient)
     if isinstance(here.hessian, Arrow):
         D, E = variables.slopes(theta)
-        hessian = here.hessian.scaled(1.0 / D).plus_diagonal(E * here.gradient)
+        hessian = here.hessian.scale(1.0 / D).plus_diagonal(E * here.gradient)
         return ArrowEvaluation(here.cost, D * here.gradient, hessian)
     return Evaluation(here.cost, *variables.derivatives_inward(theta, here.gradient, here.hessian))
 
 
-def _constraints_inward(variables: Variables, constraints: LinearConstraints) -> LinearConstraints:
+def _convert_constraints(variables: Variables, constraints: LinearConstraints) -> LinearConstraints:
     """Bounds of the optimiser's variables; the rows join transition times alone, which are not changed."""
     lower, upper = variables.inward(constraints.lower), variables.inward(constraints.upper)
     return replace(constraints, lower=lower, upper=upper)
 
 
-def _told(variables: Variables, constraints: LinearConstraints, record: IterationRecord) -> IterationRecord:
+def _convert_record(variables: Variables, constraints: LinearConstraints, record: IterationRecord) -> IterationRecord:
     """A record of the optimiser's with theta in place of its own variables."""
-    return replace(record, theta=_outward(variables, constraints, record.theta))
+    return replace(record, theta=_to_theta(variables, constraints, record.theta))
 
 
-def _result_outward(variables: Variables, constraints: LinearConstraints, result: Result) -> Result:
+def _convert_result(variables: Variables, constraints: LinearConstraints, result: Result) -> Result:
     """The optimiser's result in theta; its optimality and its eigenvalues stay those of its own variables."""
-    theta = _outward(variables, constraints, result.theta)
+    theta = _to_theta(variables, constraints, result.theta)
     slopes = variables.slopes(theta)[0]
     rows = np.ones(len(constraints.b))  # these join transition times alone, which are not changed
     gradient, hessian = variables.derivatives_outward(theta, result.gradient, result.hessian)
-    history = tuple(_told(variables, constraints, record) for record in result.history)
+    history = tuple(_convert_record(variables, constraints, record) for record in result.history)
     return replace(
         result,
         theta=theta,
@@ -175,11 +175,11 @@ def _result_outward(variables: Variables, constraints: LinearConstraints, result
         hessian=hessian,
         history=history,
         multipliers=result.multipliers / np.concatenate([rows, slopes, slopes]),
-        reason=None if result.reason is None else _reason_outward(variables, result.theta, slopes, result.reason),
+        reason=None if result.reason is None else _convert_reason(variables, result.theta, slopes, result.reason),
     )
 
 
-def _reason_outward(variables: Variables, z: FloatArray, slopes: FloatArray, found: Finding) -> Finding:
+def _convert_reason(variables: Variables, z: FloatArray, slopes: FloatArray, found: Finding) -> Finding:
     """Why the line search failed, in theta in place of the optimiser's variables z (d,); `slopes`: dtheta/dz (d,)."""
     places = []
     for i, value in found.places:
@@ -196,23 +196,23 @@ def smallest_cost(problem: Problem) -> float:
     The negative logarithm of a likelihood may be anything, 0 too; its parts are of the size of half the samples.
     """
     items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
-    return 1e-300 if least_squares(problem) else 0.5 * sum(item.count for item in items)
+    return 1e-300 if is_least_squares(problem) else 0.5 * sum(item.count for item in items)
 
 
-def least_squares(problem: Problem) -> bool:
+def is_least_squares(problem: Problem) -> bool:
     """Whether J is half a sum of squares: no loss is robust, no sigma a parameter."""
     items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
     return not any(item.sigma_names or item.loss != "linear" for item in items)
 
 
-def plain(problem: Problem) -> bool:
+def is_plain_least_squares(problem: Problem) -> bool:
     """Whether J is half a sum of squares of the samples alone, each of the moment at which it was taken."""
     items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
     delayed = any(isinstance(item.delay, str) for item in items)
-    return least_squares(problem) and not problem.unknowns.priors.any and not delayed
+    return is_least_squares(problem) and not problem.unknowns.priors.any and not delayed
 
 
-def sigma_known(problem: Problem) -> bool | None:
+def is_sigma_known(problem: Problem) -> bool | None:
     """Whether sigma is known for all measurements, as a number or as a parameter beside the others.
 
     None where the cost is not made of measurements alone.

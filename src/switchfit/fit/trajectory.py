@@ -172,7 +172,7 @@ def compare(
     return trajectories, tuple(_comparisons(problem, e, theta, *pair) for e, pair in pairs)
 
 
-def shown(simulation: Simulation, before: FloatArray, after: FloatArray) -> FloatArray:
+def select_visible(simulation: Simulation, before: FloatArray, after: FloatArray) -> FloatArray:
     """Of values at the starts and ends of all rows those that a trajectory shows.
 
     The start of every segment, and the ends of all its rows that are not empty.
@@ -191,8 +191,8 @@ def _trajectory(problem: Problem, e: int, simulation: Simulation) -> Trajectory:
     names = system.state_names or tuple(f"x{k + 1}" for k in range(structure.n))
     units = system.state_units or ("",) * structure.n
     return Trajectory(
-        shown(simulation, simulation.start, simulation.end),
-        shown(simulation, simulation.before, simulation.after),
+        select_visible(simulation, simulation.start, simulation.end),
+        select_visible(simulation, simulation.before, simulation.after),
         modes,
         np.cumsum([0, *counts]),
         names,
@@ -206,7 +206,7 @@ def _comparisons(
 ) -> tuple[Comparison, ...]:
     """Measured against fitted for each reference signal and each Measurements."""
     data, times = problem.experiments[e].data, trajectory.times
-    curves = shown(simulation, simulation.y_before, simulation.y_after)
+    curves = select_visible(simulation, simulation.y_before, simulation.y_after)
     comparisons = []
     items = [d for d in data if isinstance(d, ReferenceSignal)] + [d for d in data if isinstance(d, Measurements)]
     first = measured = 0

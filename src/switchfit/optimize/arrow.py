@@ -80,7 +80,7 @@ class ArrowLayout:
         """Own (R, k), zero where padded, and shared (s,) entries of a vector (d,)."""
         return np.append(vector, 0.0)[self.own], vector[self.shared]
 
-    def joined(self, own: FloatArray, shared: FloatArray) -> FloatArray:
+    def join(self, own: FloatArray, shared: FloatArray) -> FloatArray:
         """The vector (d,) with these own (R, k) and shared (s,) entries."""
         vector = np.zeros(self.size + 1)
         vector[self.own] = own
@@ -124,20 +124,20 @@ class Arrow:
     def __matmul__(self, vector: FloatArray) -> FloatArray:
         own, shared = self.layout.split(vector)
         of_own = (self.blocks @ own[..., None])[..., 0] + self.borders @ shared
-        return self.layout.joined(of_own, np.einsum("eks,ek->s", self.borders, own) + self.corner @ shared)
+        return self.layout.join(of_own, np.einsum("eks,ek->s", self.borders, own) + self.corner @ shared)
 
     def __abs__(self) -> Arrow:
         return Arrow(self.layout, np.abs(self.blocks), np.abs(self.borders), np.abs(self.corner))
 
     def diagonal(self) -> FloatArray:
         """(d,)."""
-        return self.layout.joined(np.diagonal(self.blocks, axis1=1, axis2=2), np.diagonal(self.corner))
+        return self.layout.join(np.diagonal(self.blocks, axis1=1, axis2=2), np.diagonal(self.corner))
 
     def largest_in_rows(self) -> FloatArray:
         """Largest entry of each row: (d,)."""
         own = np.maximum(self.blocks.max(2, initial=0.0), self.borders.max(2, initial=0.0))
         shared = np.maximum(self.borders.max((0, 1), initial=0.0), self.corner.max(1, initial=0.0))
-        return self.layout.joined(own, shared)
+        return self.layout.join(own, shared)
 
     def dense(self) -> FloatArray:
         """The matrix in full: (d, d)."""
@@ -155,7 +155,7 @@ class Arrow:
         shared = vector[self.layout.shared]
         return (own[:, :, None], own[:, None, :]), (own[:, :, None], shared), (shared[:, None], shared)
 
-    def scaled(self, scaling: FloatArray) -> Arrow:
+    def scale(self, scaling: FloatArray) -> Arrow:
         """D⁻¹ H D⁻¹ for a diagonal D (d,)."""
         pairs = self._pairs(scaling, 1.0)
         return Arrow(self.layout, *(part / (a * b) for part, (a, b) in zip(self._parts, pairs, strict=True)))
@@ -178,7 +178,7 @@ class Arrow:
         corner[np.arange(s), np.arange(s)] += shared
         return Arrow(self.layout, blocks, borders, corner)
 
-    def masked(self, labels: FloatArray) -> Arrow:
+    def mask(self, labels: FloatArray) -> Arrow:
         """The matrix without the entries that join unknowns of different labels (d,)."""
         pairs = self._pairs(labels, np.nan)
         blocks, borders, corner = (part * (a == b) for part, (a, b) in zip(self._parts, pairs, strict=True))
@@ -186,7 +186,7 @@ class Arrow:
         blocks[:, np.arange(k), np.arange(k)] = np.diagonal(self.blocks, axis1=1, axis2=2)
         return Arrow(self.layout, blocks, borders, corner)
 
-    def mixed(self, minus: Arrow, sides: FloatArray) -> Arrow:
+    def mix_sides(self, minus: Arrow, sides: FloatArray) -> Arrow:
         """This matrix where two unknowns are to the right (sides 1), `minus` to the left (-1), else their mean."""
 
         def mix(right: FloatArray, left: FloatArray, pair: FloatArray) -> FloatArray:
@@ -245,7 +245,7 @@ class Arrow:
         """The smallest eigenvalues without the coordinates held (d,), or, where one is not positive, all of them."""
         kept = self.held(~held)
         scaling = diagonal_scaling(kept, flat)
-        smallest, lowest = _smallest_eigenvalue(kept.scaled(scaling), ~held)
+        smallest, lowest = _smallest_eigenvalue(kept.scale(scaling), ~held)
         unscaled, _ = _smallest_eigenvalue(kept, ~held)
         if lowest is None or held.all():
             return in_full()
@@ -278,7 +278,7 @@ class ArrowFactor:
         if not np.all(variances > 0.0):
             return None
         scaling = np.sqrt(variances)
-        scaled = matrix.scaled(scaling)
+        scaled = matrix.scale(scaling)
         try:
             own = np.asarray(np.linalg.cholesky(scaled.blocks), float)
             border = np.asarray(np.linalg.solve(own, scaled.borders), float)
@@ -307,7 +307,7 @@ class ArrowFactor:
         R, k, _ = self.border.shape
         shared = of_shared.T @ vector[R * k :]
         own = vector[: R * k].reshape(R, k) - self.border @ shared
-        return self.layout.joined((np.swapaxes(of_own, 1, 2) @ own[..., None])[..., 0], shared) / self.scaling
+        return self.layout.join((np.swapaxes(of_own, 1, 2) @ own[..., None])[..., 0], shared) / self.scaling
 
     def solve(self, vector: FloatArray) -> FloatArray:
         """B⁻¹ v."""
@@ -370,7 +370,7 @@ def convexify_arrow(hessian: Arrow, normals: FloatArray, floor: FloatArray) -> A
     """
     layout = hessian.layout
     scaling = diagonal_scaling(hessian, floor)
-    scaled = hessian.scaled(scaling)
+    scaled = hessian.scale(scaling)
     if ArrowFactor.of(scaled.plus_diagonal(-EIGENVALUE_FLOOR)) is not None:
         return hessian
     pressed = np.append(normals / scaling, np.zeros((len(normals), 1)), axis=1)
@@ -393,7 +393,7 @@ def convexify_arrow(hessian: Arrow, normals: FloatArray, floor: FloatArray) -> A
     ridge = EIGENVALUE_FLOOR
     while ArrowFactor.of(convex) is None:  # rounding, where a block is nearly singular
         convex, ridge = convex.plus_diagonal(ridge), 10.0 * ridge
-    return convex.scaled(1.0 / scaling)
+    return convex.scale(1.0 / scaling)
 
 
 def _convex_blocks(scaled: Arrow, pressed: FloatArray) -> tuple[FloatArray, FloatArray]:

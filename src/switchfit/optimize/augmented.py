@@ -137,10 +137,10 @@ def minimize_constrained(
             theta,
             tolerance=tolerance,
             max_iterations=max(max_iterations - (done.iteration if done else 0), 0),
-            callback=None if callback is None else lambda record, done=done: callback(record.counted_on(done)),  # type: ignore[misc]
+            callback=None if callback is None else lambda record, done=done: callback(record.continue_from(done)),  # type: ignore[misc]
             **settings,
         )
-        numbered = [record.counted_on(done) for record in result.history]
+        numbered = [record.continue_from(done) for record in result.history]
         history += numbered[1:] if history else numbered
         evaluations += result.evaluations
         theta = result.theta
@@ -156,10 +156,10 @@ def minimize_constrained(
             break
         penalty = np.where(slow, np.minimum(GROWTH * penalty, highest), penalty)
         before = violation
-    return _finished(evaluate, result, history, evaluations, multipliers, names, unit, tolerance, d)
+    return _finish(evaluate, result, history, evaluations, multipliers, names, unit, tolerance, d)
 
 
-def _finished(
+def _finish(
     evaluate: Evaluate,
     result: Result,
     history: list[IterationRecord],

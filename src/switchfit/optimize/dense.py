@@ -71,15 +71,15 @@ class Dense:
     def __abs__(self) -> Dense:
         return Dense(np.abs(self.array))
 
-    def scaled(self, scaling: FloatArray) -> Dense:
+    def scale(self, scaling: FloatArray) -> Dense:
         """D⁻¹ H D⁻¹ for a diagonal D (d,)."""
         return Dense(self.array / (scaling[:, None] * scaling))
 
-    def masked(self, labels: FloatArray) -> Dense:
+    def mask(self, labels: FloatArray) -> Dense:
         """The matrix without the entries that join unknowns of different labels (d,)."""
         return Dense(self.array * (labels[:, None] == labels))
 
-    def mixed(self, minus: Dense, sides: FloatArray) -> Dense:
+    def mix_sides(self, minus: Dense, sides: FloatArray) -> Dense:
         """This matrix where two unknowns are to the right (sides 1), `minus` to the left (-1), else their mean."""
         pair = sides[:, None] + sides
         right, left = self.array, minus.array
@@ -234,14 +234,14 @@ def convexify_and_factor(
         # A positive definite matrix needs no more than Jacobi's scaling.
         scaling = np.sqrt(square)
         scaled = hessian / (scaling[:, None] * scaling)
-        factor = CholeskyFactor.of_scaled(scaled, scaling) if is_definite(_shifted(scaled)) else None
+        factor = CholeskyFactor.of_scaled(scaled, scaling) if is_definite(_shift(scaled)) else None
         if factor is not None:
             return hessian, factor
     convex = _convex(hessian, normals, floor)
     return convex, CholeskyFactor.of(convex)
 
 
-def _shifted(matrix: FloatArray) -> FloatArray:
+def _shift(matrix: FloatArray) -> FloatArray:
     """The matrix less what counts as no curvature on its diagonal."""
     shifted = matrix.copy()
     shifted.reshape(-1)[:: len(matrix) + 1] -= EIGENVALUE_FLOOR
@@ -253,7 +253,7 @@ def _convex(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None) 
     scaling = diagonal_scaling(Dense(hessian), floor)
     weight = scaling[:, None] * scaling
     scaled = hessian / weight
-    if is_definite(_shifted(scaled)):
+    if is_definite(_shift(scaled)):
         return hessian
     free, blocked = split_space(normals / scaling)
     if blocked.shape[1] == 0 or free.shape[1] == 0:

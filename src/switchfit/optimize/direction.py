@@ -119,4 +119,4 @@ def _model(
     if descent or not problem.uses_hessian:
         return Dense.identity(d, 1.0 / state.metric), None
     labels = np.arange(d, dtype=float) if state.careful else problem.labels
-    return hessian if labels is None else hessian.masked(labels), state.floor
+    return hessian if labels is None else hessian.mask(labels), state.floor

@@ -30,13 +30,13 @@ def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | Non
     problem, theta = oracle.problem, state.point.theta
     breakpoints, constraints = problem.breakpoints, problem.constraints
     alpha = 1.0
-    crossed = breakpoints.crossed(theta, direction.step)
+    crossed = breakpoints.count_crossed(theta, direction.step)
     while crossed > 0:
         accepted = _attempt(oracle, state, direction, alpha, ARMIJO_ACROSS)
         if accepted is not None:
             return accepted
         alpha *= 0.5
-        crossed = breakpoints.crossed(theta, alpha * direction.step)
+        crossed = breakpoints.count_crossed(theta, alpha * direction.step)
         if crossed < MANY_BREAKPOINTS:
             piece = breakpoints.piece(theta, constraints.lower, constraints.upper)
             direction = find_direction(problem, state, piece)

@@ -137,15 +137,15 @@ class SymmetricMatrix(Protocol):
 
     def __abs__(self) -> Self: ...
 
-    def scaled(self, scaling: FloatArray, /) -> Self:
+    def scale(self, scaling: FloatArray, /) -> Self:
         """D⁻¹ H D⁻¹ for a diagonal D (d,)."""
         ...
 
-    def masked(self, labels: FloatArray, /) -> Self:
+    def mask(self, labels: FloatArray, /) -> Self:
         """The matrix without the entries that join unknowns of different labels (d,)."""
         ...
 
-    def mixed(self, minus: Any, sides: FloatArray, /) -> Self:
+    def mix_sides(self, minus: Any, sides: FloatArray, /) -> Self:
         """This matrix where two unknowns are to the right (sides 1), `minus` to the left (-1), else their mean."""
         ...
 
@@ -197,7 +197,7 @@ def diagonal_scaling(matrix: SymmetricMatrix, floor: FloatArray | None = None) -
     diagonal = size.diagonal() if floor is None else np.maximum(size.diagonal(), floor)
     scaling: FloatArray = jacobi_scaling(diagonal, size.largest_in_rows())
     for _ in range(EQUILIBRATIONS):
-        largest = size.scaled(scaling).largest_in_rows()
+        largest = size.scale(scaling).largest_in_rows()
         if (largest <= 1.0 + 1e-9).all():
             break
         scaling = equilibrate(scaling, largest)

@@ -108,7 +108,7 @@ class Point:
             return plus.gradient, plus.hessian
         gradient = np.where(sides > 0, plus.gradient, minus.gradient)
         gradient = np.where(sides == 0, 0.5 * (plus.gradient + minus.gradient), gradient)
-        return gradient, plus.hessian.mixed(minus.hessian, sides.astype(float))
+        return gradient, plus.hessian.mix_sides(minus.hessian, sides.astype(float))
 
 
 class Oracle:
@@ -185,7 +185,7 @@ class Oracle:
 
     def _sides(self, theta: FloatArray) -> tuple[NDArray[np.bool_] | None, NDArray[np.int_]]:
         """`Point.kink` and `Point.side` at theta."""
-        met = self.problem.breakpoints.met(theta)
+        met = self.problem.breakpoints.find_met(theta)
         if not met:
             return None, self._no_side
         kink, side = np.zeros(theta.size, dtype=bool), np.zeros(theta.size, dtype=int)

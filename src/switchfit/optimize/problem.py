@@ -161,7 +161,7 @@ class Breakpoints:
                 found.append((i, read[id(points)]))
         return cls(tuple(found))
 
-    def met(self, theta: FloatArray) -> list[int]:
+    def find_met(self, theta: FloatArray) -> list[int]:
         """Coordinates of theta (d,) that sit exactly on one of their breakpoints."""
         values = theta.tolist()
         return [
@@ -185,7 +185,7 @@ class Breakpoints:
                 found.append(i)
         return found
 
-    def crossed(self, theta: FloatArray, step: FloatArray) -> int:
+    def count_crossed(self, theta: FloatArray, step: FloatArray) -> int:
         """Largest number of breakpoints that a coordinate passes strictly inside a step (d,)."""
         largest = 0
         starts, ends = theta.tolist(), (theta + step).tolist()

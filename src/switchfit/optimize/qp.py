@@ -275,7 +275,7 @@ def _equality_solution(target: FloatArray, rows: FloatArray, offsets: FloatArray
     return Q @ (inside + along) - target, multipliers
 
 
-def _independent(rows: FloatArray, working: NDArray[np.intp]) -> NDArray[np.intp]:
+def _select_independent(rows: FloatArray, working: NDArray[np.intp]) -> NDArray[np.intp]:
     """A maximal linearly independent part of the working set (unit rows)."""
     if working.size <= 1:
         return working
@@ -288,7 +288,7 @@ def _polish(
     target: FloatArray, rows: FloatArray, offsets: FloatArray, working: NDArray[np.intp]
 ) -> tuple[FloatArray, FloatArray] | None:
     """Solution on the working set if it is primal and dual feasible, otherwise None."""
-    working = _independent(rows, working)
+    working = _select_independent(rows, working)
     e, active_multipliers = _equality_solution(target, rows[working], offsets[working])
     size = max(1.0, float(np.max(np.abs(active_multipliers), initial=0.0)))
     infeasible = np.any(rows @ e < offsets - _WHITE_TOLERANCE)

@@ -29,7 +29,7 @@ def close_gaps(oracle: Oracle, state: State) -> State:
     closed = oracle.point(Trial.at(problem.constraints, theta), state.scale)
     if closed is None or closed.cost > point.cost + NOISE * state.cost_scale:
         return state
-    after = state.advanced(Accepted(closed, 1.0), problem.tolerance)
+    after = state.advance(Accepted(closed, 1.0), problem.tolerance)
     if closed.optimality <= max(problem.tolerance, point.optimality):
         return after
     if closed.idle is None:

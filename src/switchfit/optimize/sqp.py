@@ -144,8 +144,8 @@ def _step(oracle: Oracle, state: State) -> State:
         return replace(state, status=Status.MAX_ITERATIONS)
     accepted = search(oracle, state, direction)
     if accepted is None:
-        return _stalled(oracle, state, direction)
-    return state.advanced(accepted, problem.tolerance)
+        return _handle_stall(oracle, state, direction)
+    return state.advance(accepted, problem.tolerance)
 
 
 def _is_settled(problem: Problem, state: State, direction: Direction) -> bool:
@@ -157,7 +157,7 @@ def _is_settled(problem: Problem, state: State, direction: Direction) -> bool:
     return bool(is_negligible(direction.step, state.scale))
 
 
-def _stalled(oracle: Oracle, state: State, direction: Direction) -> State:
+def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
     """The line search found nothing: tell convergence and the limit of precision from failure."""
     if state.point.optimality <= oracle.problem.tolerance:
         return _finish(oracle, state, direction, Status.CONVERGED)
@@ -170,7 +170,7 @@ def _stalled(oracle: Oracle, state: State, direction: Direction) -> State:
     # Near a saddle, where slopes are lost in rounding, its negative curvature still leads away.
     escaped = escape(oracle, state) if oracle.problem.uses_hessian and below_rounding else None
     if escaped is not None:
-        return state.advanced(escaped, oracle.problem.tolerance)
+        return state.advance(escaped, oracle.problem.tolerance)
     if state.restarts < RESTARTS and not state.careful:
         theta = state.point.theta
         point = oracle.point(Trial.at(oracle.problem.constraints, theta), np.abs(theta))
@@ -191,7 +191,7 @@ def _finish(oracle: Oracle, state: State, direction: Direction, status: Status) 
         state = closed
         accepted = escape(oracle, state) if state.iteration < problem.max_iterations else None
         if accepted is not None:
-            return state.advanced(accepted, problem.tolerance)
+            return state.advance(accepted, problem.tolerance)
         curvature = curvature_at(problem, state, state.point.active)
         if curvature.smallest < NEGATIVE_CURVATURE:
             return replace(state, status=Status.SADDLE)

@@ -69,7 +69,7 @@ class State:
             lowest_cost=point.cost,
         )
 
-    def advanced(self, accepted: Accepted, tolerance: float) -> State:
+    def advance(self, accepted: Accepted, tolerance: float) -> State:
         """The state after an accepted step."""
         point, alpha = accepted.point, accepted.step_length
         return State(

@@ -75,7 +75,7 @@ class IterationRecord:
     theta: FloatArray
     evaluations: int
 
-    def counted_on(self, last: IterationRecord | None) -> IterationRecord:
+    def continue_from(self, last: IterationRecord | None) -> IterationRecord:
         """This record of a minimisation that was resumed, counted on from the last record before; None: the first."""
         if last is None:
             return self

@@ -110,7 +110,7 @@ class Breakpoints(NamedTuple):
         below, up_to = self.rank(theta)
         return jnp.zeros(theta.shape, bool).at[np.array(self.coordinates, dtype=int)].set(up_to > below)
 
-    def crossed(self, theta: Array, to: Array) -> Array:
+    def count_crossed(self, theta: Array, to: Array) -> Array:
         """Return the largest number of breakpoints strictly between two points in one coordinate."""
         below, up_to = self.rank(theta)
         below_to, up_to_to = self.rank(to)
@@ -253,7 +253,7 @@ def take_turn(
     max_iterations: int,
 ) -> State:
     """Evaluate J once, at the point that is to be judged, and judge it; arguments as of `minimize_traced`."""
-    theta = _moved(constraints, breakpoints, state.theta, state.length * state.step)
+    theta = _move(constraints, breakpoints, state.theta, state.length * state.step)
     cost, gradient, hessian = evaluate(theta, jnp.where(state.halfway, -1.0, 1.0))
     here = Sides(gradient, 0.5 * (hessian + hessian.T))
     finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(hessian))
@@ -262,7 +262,7 @@ def take_turn(
     kink = breakpoints.on_one(theta) & (theta > constraints.lower) & (theta < constraints.upper)
     at_kink = jnp.any(kink)
     optimality = _kkt_residual(constraints, theta, state.scale, _steepest(here.gradient, right.gradient, kink))
-    crossed = breakpoints.crossed(state.theta, theta)
+    crossed = breakpoints.count_crossed(state.theta, theta)
     first = jnp.isinf(state.cost)
     noise = NOISE * jnp.abs(state.cost)
     decrease = -state.length * state.slope
@@ -301,7 +301,7 @@ def take_turn(
     def refuse(state: State) -> State:
         trials, refused = state.trials + 1, state.refused + 1
         length = state.length * jnp.where(trials <= 5, 0.5, 0.25)
-        few = breakpoints.crossed(state.theta, state.theta + length * state.step) < MANY_BREAKPOINTS
+        few = breakpoints.count_crossed(state.theta, state.theta + length * state.step) < MANY_BREAKPOINTS
         inside = ~state.inside & (crossed > 0) & few
         hopeless = ((decrease <= noise) & ~inside) | (trials >= MAX_TRIALS)
         # A search that finds nothing below the tolerance has met rounding: that too is the end.
@@ -421,13 +421,13 @@ def _kkt_residual(constraints: Constraints, theta: Array, scale: Array, gradient
     """min over lam >= 0, on the active constraints, of ‖g − Nᵀ lam‖."""
     active = _active(constraints, theta, scale)
 
-    def constrained() -> Array:
+    def solve_constrained() -> Array:
         normals, _ = algebra.unit_rows(constraints.normals, jnp)
         size = jnp.maximum(jnp.max(jnp.abs(gradient)), jnp.finfo(float).tiny)
         multipliers = nonnegative_minimum(normals @ normals.T, -normals @ (gradient / size), active)
         return jnp.linalg.norm(gradient - size * multipliers @ normals)
 
-    return lax.cond(jnp.any(active), constrained, lambda: jnp.linalg.norm(gradient))
+    return lax.cond(jnp.any(active), solve_constrained, lambda: jnp.linalg.norm(gradient))
 
 
 def nonnegative_minimum(matrix: Array, vector: Array, allowed: Array) -> Array:
@@ -447,14 +447,14 @@ def nonnegative_minimum(matrix: Array, vector: Array, allowed: Array) -> Array:
     vector = jnp.where(allowed, vector, 0.0)
     floor = -1e-13 * jnp.maximum(1.0, jnp.max(jnp.abs(vector), initial=0.0))
 
-    def solved(positive: Array) -> Array:
+    def solve_on(positive: Array) -> Array:
         both = positive[:, None] & positive[None, :]
         diagonal = jnp.where(positive, RIDGE, 1.0)
         return jnp.linalg.solve(jnp.where(both, matrix, 0.0) + jnp.diag(diagonal), jnp.where(positive, -vector, 0.0))
 
     def body(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         lam, positive, count, _ = state
-        target = solved(positive)
+        target = solve_on(positive)
         leaving = positive & (target <= 0.0)
         ratio = jnp.where(leaving, lam / jnp.where(leaving, lam - target, 1.0), jnp.inf)
         length = jnp.minimum(jnp.min(ratio, initial=jnp.inf), 1.0)
@@ -517,7 +517,7 @@ def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints)
     newton = -solve(gradient)
     newton = newton - solve(gradient + scaling * (matrix @ (scaling * newton)))
 
-    def constrained() -> Array:
+    def solve_constrained() -> Array:
         # In white variables e = Lᵀ D d: minimise ½‖e − e_0‖² subject to G e >= c with unit rows, by its dual.
         normals = constraints.normals
         rows = jax.scipy.linalg.solve_triangular(factor, (normals / scaling).T, lower=True).T
@@ -530,11 +530,11 @@ def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints)
         return algebra.press_on_bounds(newton + back / scaling, low, high, multipliers, jnp)
 
     feasible = jnp.all(constraints.normals @ newton >= offsets)
-    step = lax.cond(feasible, lambda: newton, constrained)
+    step = lax.cond(feasible, lambda: newton, solve_constrained)
     return step, gradient @ step
 
 
-def _moved(constraints: Constraints, breakpoints: Breakpoints, theta: Array, step: Array) -> Array:
+def _move(constraints: Constraints, breakpoints: Breakpoints, theta: Array, step: Array) -> Array:
     """theta + step, on the breakpoints that it reaches, with violations of the size of rounding removed."""
 
     def project(i: int, moved: Array) -> Array:

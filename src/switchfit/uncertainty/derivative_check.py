@@ -128,7 +128,7 @@ def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, seed:
     table = taylor_table(evaluator, problem.checked_theta(theta), seed=seed)
     at = table.theta
     gaps = derivative_gap(evaluator, at)
-    halved = derivative_gap(evaluator.divided(), at)
+    halved = derivative_gap(evaluator.divide(), at)
     return DerivativeCheck(table.steps, table.remainders, table.orders, *gaps, *halved, at, problem.solver == "stiff")
 
 

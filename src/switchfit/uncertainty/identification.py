@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.hidden import refuse_hidden_switches
 from switchfit.fit.result import Fit, scaled_spectrum
-from switchfit.fit.solution import least_squares
+from switchfit.fit.solution import is_least_squares
 from switchfit.fit.trajectory import compare
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
@@ -224,7 +224,7 @@ def _before(problem: Problem) -> Identifiability:
         clean = _noise_free(problem, own)
         evaluator = Evaluator(clean, meshes=own.meshes)
         # Where sigma is a parameter J has no minimum without noise; its expected Hessian is Gauss-Newton's.
-        hessian = evaluator(theta, matrix="exact" if least_squares(problem) else "gauss-newton").hessian
+        hessian = evaluator(theta, matrix="exact" if is_least_squares(problem) else "gauss-newton").hessian
         if all(item.sigma is not None for item in items):
             rise, meaning = 0.5 * float(scipy.special.ndtri(0.975)) ** 2, "noise"
         else:

@@ -34,7 +34,7 @@ from scipy.optimize import brentq, linprog, minimize_scalar
 from switchfit.engine.adaptive import refined_mesh
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
-from switchfit.fit.solution import constraints_of, minimized
+from switchfit.fit.solution import constraints_of, minimize_cost
 from switchfit.optimize import Status, solve_qp
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
@@ -191,7 +191,7 @@ class Trace:
         self.fits += 1
         tolerance = self.fit.tolerance
         try:
-            result = minimized(self.evaluator, start, "exact", tolerance, ITERATIONS, constraints=held)
+            result = minimize_cost(self.evaluator, start, "exact", tolerance, ITERATIONS, constraints=held)
         except ValueError:  # infeasible by rounding
             return None
         if result.status is Status.INTERRUPTED or self.told():
@@ -429,7 +429,7 @@ class Trace:
 
     def integration_error(self, threshold: float) -> float:
         """Largest error of zeta^2 by the integration where it crosses the threshold, by halving all steps."""
-        fine = self.evaluator.divided()
+        fine = self.evaluator.divide()
         base = fine.cost(self.centre.theta) - self.centre.cost
         ends = self.edges(threshold)
         return max(abs(fine.cost(q.theta) - q.cost - base) * 2 / self.scale for q in ends)

@@ -18,7 +18,7 @@ from switchfit.discretization.arguments import arguments_of
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation, Tangents
-from switchfit.fit.trajectory import shown
+from switchfit.fit.trajectory import select_visible
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 
@@ -64,7 +64,7 @@ class Sensitivity:
         """At all nodes in order, as `Trajectory` has them: each transition stands twice, before and after it."""
         s, along = self.simulation, self._tangents
         columns = (s.start, s.end), (s.before, s.after), along[:2], (s.y_before, s.y_after), along[2:]
-        times, states, states_d, outputs, outputs_d = (shown(s, *pair) for pair in columns)
+        times, states, states_d, outputs, outputs_d = (select_visible(s, *pair) for pair in columns)
         return Points(times, states, self._in_theta(states_d), outputs, self._in_theta(outputs_d))
 
     def at(self, times: FloatArray) -> Points:
