@@ -433,7 +433,7 @@ def test_a_problem_whose_functions_have_changed_is_not_pickled_in_silence():
 
 def test_the_page_on_models_runs_and_prints_what_it_says(capsys):
     page = (Path(__file__).parent.parent / "docs" / "models.md").read_text()
-    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    block, *_ = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     exec(compile(block, "models.md", "exec"), {})
     said = re.findall(r"\)  # ([0-9.]+)$", block, re.MULTILINE)
     assert len(said) == 3

@@ -190,7 +190,6 @@ class LogTable(_Table):
 
     file: str = Field(description="CSV file, relative to the problem file")
     time: str = Field(description="name of the column with the time")
-    columns: list[str] = Field(min_length=1, description="names of the columns with the values")
     window: Annotated[list[float], Field(min_length=2, max_length=2)] | None = Field(
         default=None, description="[from, to]: only rows with the time column in between are used"
     )
@@ -201,6 +200,7 @@ class LogTable(_Table):
 class DataTable(LogTable):
     """What the model is compared with."""
 
+    columns: list[str] = Field(min_length=1, description="names of the columns with the values")
     kind: Literal["measurements", "reference"] = Field(
         default="measurements", description="discrete noisy samples, or a continuous reference signal"
     )
@@ -235,6 +235,13 @@ class DataTable(LogTable):
 class InputTable(LogTable):
     """A known input u(t); modes are then called as f(t, x, p, u)."""
 
+    columns: Annotated[
+        Annotated[list[str], Field(min_length=1), pydantic.Tag("list")]
+        | Annotated[dict[str, str], Field(min_length=1), pydantic.Tag("table")],
+        pydantic.Discriminator(lambda given: "table" if isinstance(given, dict) else "list"),
+    ] = Field(
+        description="names of the columns with the values, or { name in the model = column }, with which u is a dict"
+    )
     kind: Literal["hold", "linear", "cubic"] = Field(default="hold", description="what happens between samples")
 
 
@@ -568,7 +575,7 @@ def _data(
         for key, default in (("loss", "linear"), ("delay", 0.0)):
             if getattr(table, key) != default:
                 raise ValueError(f"{key} belongs to kind = 'measurements', not to a reference.")
-        times, values = _log(folder, table)
+        times, values = _log(folder, table, table.columns)
         return ReferenceSignal.from_samples(
             times, values, observe=observe, lowpass_hz=table.lowpass_hz, weights=table.weights, names=names
         )
@@ -576,7 +583,7 @@ def _data(
         if getattr(table, key) is not None:
             raise ValueError(f"{key} belongs to kind = 'reference'; measurements have sigma.")
     sigma_columns = _sigma_columns(table, parameters)
-    times, values = _log(folder, table, sigma_columns)
+    times, values = _log(folder, table, [*table.columns, *sigma_columns])
     q = len(table.columns)
     sigma = values[:, q:] if sigma_columns else table.sigma
     return Measurements(
@@ -606,14 +613,17 @@ def _sigma_columns(table: DataTable, parameters: frozenset[str]) -> list[str]:
 
 
 def _input(folder: Path, table: InputTable) -> Input:
-    times, values = _log(folder, table)
+    if isinstance(table.columns, dict):
+        times, values = _log(folder, table, list(table.columns.values()))
+        return Input(times, dict(zip(table.columns, values.T, strict=True)), kind=table.kind)
+    times, values = _log(folder, table, table.columns)
     return Input(times, values[:, 0] if len(table.columns) == 1 else values, kind=table.kind)
 
 
-def _log(folder: Path, table: LogTable, more: Sequence[str] = ()) -> tuple[FloatArray, FloatArray]:
-    """Times (K,) and values (K, q) of the rows inside the window."""
+def _log(folder: Path, table: LogTable, columns: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+    """Return times (K,) and the values of some columns (K, q) in the rows inside the window."""
     path = folder / table.file
-    rows = read_columns(path, [table.time, *table.columns, *more])
+    rows = read_columns(path, [table.time, *columns])
     missing = np.isnan(rows[:, 0])
     if missing.any():
         raise InputError(f"{path}, column {table.time!r}: the time of sample {missing.argmax() + 1} is missing.")

@@ -20,6 +20,7 @@ from switchfit.problem.validation import (
     as_choice,
     as_finite,
     as_name,
+    as_named_columns,
     as_names,
     as_number,
     as_positive,
@@ -84,8 +85,9 @@ class Input:
     times : (K,) array_like
         Increasing times in the experiment's time unit. They must reach over its ``[t0, tf]``; a held input only has to
         start by t0, its last value is kept.
-    values : (K,) or (K, q) array_like
-        The modes get a scalar u, or a ``(q,)`` array.
+    values : (K,) or (K, q) array_like, or mapping of str to (K,) array_like
+        The modes get a scalar u, or a ``(q,)`` array. With samples by name they get a dict of scalars, ``u["left"]``;
+        so they do with a DataFrame whose columns all have names (strings).
     kind : {"hold", "linear", "cubic"}
         Between samples: the last value is held, straight lines, or a cubic spline.
 
@@ -93,9 +95,27 @@ class Input:
     ------
     ValueError
         For times that do not increase, values that are not finite or differ in length from times, too few
-        samples, or an unknown kind.
+        samples, no name or an empty one, or an unknown kind.
     TypeError
-        If times or values are not numbers, dates among them.
+        If times or values are not numbers, dates among them, or a name is not a string.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import switchfit as sf
+    >>> wheels = sf.Input([0.0, 1.0, 2.0], {"left": [0.0, 4.0, 4.0], "right": [0.0, 4.0, 5.0]}, kind="linear")
+    >>> wheels.names
+    ('left', 'right')
+
+    A mode of an experiment with ``inputs=wheels`` finds each of them by its name:
+
+    >>> def drive(t, x, p, u):
+    ...     return p["r"] * np.array([0.5, 0.5]) @ [u["left"], u["right"]]
+
+    See Also
+    --------
+    Experiment : takes it as `inputs`.
+    ReferenceSignal : a measured signal that the model is compared with.
     """
 
     times: Any
@@ -105,15 +125,37 @@ class Input:
     def __post_init__(self) -> None:
         kind = as_choice(self.kind, "Input kind", ("hold", "linear", "cubic"))
         at_least = {"hold": 1, "linear": 2, "cubic": 4}[kind]
-        times, values = _samples(self.times, self.values, "Input", at_least=at_least)
-        _require_finite(values, "Input values")
+        values: Any
+        named = as_named_columns(self.values, "Input values", "(K,) samples")
+        if named is None:
+            times, values = _samples(self.times, self.values, "Input", at_least=at_least)
+            _require_finite(values, "Input values")
+        else:
+            # Sorted: experiments whose inputs are named in different orders share one program.
+            values = {}
+            for name in sorted(named):
+                what = f"Input {shown(name)}"
+                times, values[name] = _samples(self.times, named[name], what, at_least=at_least, columns=False)
+                _require_finite(values[name], f"{what} values")
         object.__setattr__(self, "kind", kind)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values)
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the entries of u, sorted; empty if u is a scalar or an array."""
+        return tuple(self.values) if isinstance(self.values, Mapping) else ()
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of u: () or (q,). Where its entries have names, q is their number."""
+        return (len(self.values),) if self.names else tuple(self.values.shape[1:])
+
     def signal(self, t0: float, tf: float) -> PiecewisePolynomial:
         """The input as a piecewise polynomial over ``[t0, tf]``."""
-        times, values = self.times, self.values.reshape(len(self.times), -1)
+        times = self.times
+        values = np.stack([self.values[name] for name in self.names], axis=1) if self.names else self.values
+        values = values.reshape(len(times), -1)
         if times[0] > t0 or (self.kind != "hold" and times[-1] < tf):
             raise ValueError(
                 f"Input must be known over (t0, tf) = ({t0}, {tf}); its samples reach from {times[0]} to {times[-1]}."
@@ -429,17 +471,25 @@ Data = RunningCost | TerminalCost | TerminalConstraint | ReferenceSignal | Measu
 
 
 def _samples(
-    times: ArrayLike, values: ArrayLike, what: str, *, at_least: int, breaks: bool = False, missing: bool = False
+    times: ArrayLike,
+    values: ArrayLike,
+    what: str,
+    *,
+    at_least: int,
+    breaks: bool = False,
+    missing: bool = False,
+    columns: bool = True,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return times (K,) and values (K, ...) as float64, checked against each other.
+    """Return times (K,) and values (K,) or (K, q) as float64, checked against each other.
 
-    With `breaks` a time may stand twice; with `missing` masked values become NaN.
+    With `breaks` a time may stand twice; with `missing` masked values become NaN; without `columns` the shape of the
+    values must be (K,).
     """
     times = as_array(times, f"{what} times", form="an array of numbers")
     values = as_array(values, f"{what} values", form="an array of numbers", missing=missing)
-    if times.ndim != 1 or values.ndim not in (1, 2):
+    if times.ndim != 1 or values.ndim not in ((1, 2) if columns else (1,)):
         raise ValueError(
-            f"{what} needs times of shape (K,) and values of shape (K,) or (K, q); "
+            f"{what} needs times of shape (K,) and values of shape (K,){' or (K, q)' if columns else ''}; "
             f"got {times.shape} and {values.shape}."
         )
     if len(times) != len(values):

@@ -23,6 +23,7 @@ import numpy as np
 
 from switchfit.problem.precision import refuse_single_precision_in
 from switchfit.problem.reads import JITTED, contents
+from switchfit.problem.validation import listed
 
 Array = jax.Array
 Shape = tuple[int, ...]
@@ -106,6 +107,7 @@ def trace_function(
     what: str,
     form: str,
     shape: Shape | None,
+    inputs: tuple[str, ...] = (),
 ) -> Function:
     """Trace a function of the user's, or find the trace that is still what it does.
 
@@ -122,6 +124,8 @@ def trace_function(
         Its name and signature for messages, such as "mode 'slip'" and "f(t, x, p)".
     shape : shape, optional
         What it must return; anything if left out.
+    inputs : tuple of str, optional
+        Names of the entries of the last argument, which is then handed over as a dict; the `Function` takes an array.
 
     Raises
     ------
@@ -130,14 +134,14 @@ def trace_function(
     """
     function = _without_jit(function)
     read = contents(function)
-    key = None if read is None else (read, tuple(arguments), tuple(parameters.items()), hidden, shape)
+    key = None if read is None else (read, tuple(arguments), tuple(parameters.items()), hidden, shape, inputs)
     if key is not None:
         with _lock:
             found = _traces.get(key)
             if found is not None:
                 _traces.move_to_end(key)
                 return found
-    given = _Given(arguments, parameters, hidden, what, form, shape)
+    given = _Given(arguments, parameters, hidden, what, form, shape, inputs)
     with float64():
         if key is None:
             with _retracing(next(_turn)):
@@ -171,9 +175,10 @@ class _Given:
         what: str,
         form: str,
         shape: Shape | None,
+        inputs: tuple[str, ...],
     ) -> None:
         self.arguments, self.parameters, self.hidden = arguments, parameters, hidden
-        self.what, self.form, self.shape = what, form, shape
+        self.what, self.form, self.shape, self.inputs = what, form, shape, inputs
 
 
 def _trace(function: Callable[..., Any], given: _Given) -> Function:
@@ -201,7 +206,9 @@ def _traced_with(function: Callable[..., Any], given: _Given, names: tuple[str, 
         if watch:
             shown = {name: value for name, value in named.items() if name not in given.hidden}
             named = Asked(shown, {name: named[name] for name in names if name in given.hidden}, asked)
-        arguments = (*flat[:position], named, *flat[position:])
+        arguments: tuple[Any, ...] = (*flat[:position], named, *flat[position:])
+        if given.inputs:
+            arguments = (*arguments[:-1], {name: arguments[-1][k] for k, name in enumerate(given.inputs)})
         return checked_vector(function, arguments, given.shape, given.what, given.form)
 
     flat = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in given.arguments if shape is not None]
@@ -397,10 +404,7 @@ def called(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, 
     try:
         value = function(*arguments)
     except KeyError as error:
-        parameters = next(given for given in arguments if isinstance(given, dict))
-        raise ValueError(
-            f"{what} asks for the parameter {error}, which the problem lacks; it has {', '.join(parameters) or 'none'}."
-        ) from error
+        raise ValueError(f"{what} {_missing_name(error.args[0] if error.args else '', arguments)}") from error
     except UNTRACEABLE as error:
         raise ValueError(
             f"{what} decides by the value of t, x or p (an `if`, a `while`, float() or numpy function), which JAX "
@@ -409,11 +413,25 @@ def called(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, 
         ) from error
     except Exception as error:
         said = str(error).rstrip(".")
+        if "u)" in form and "string indexing" in said:  # u["left"] of an array
+            said += ". u has no names: give sf.Input a dict of name -> samples"
         raise ValueError(f"{what}: {form} raised {type(error).__name__}: {said}.") from error
     try:
         return jnp.asarray(value)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{what}: {form} must return an array of numbers; got {value!r}.") from error
+
+
+def _missing_name(name: Any, arguments: tuple[Any, ...]) -> str:
+    """Return the end of the sentence about a name that is neither in p nor, where u is a dict too, in u."""
+    parameters, *inputs = [given for given in arguments if isinstance(given, dict)]
+    lacks = f"the parameter {name!r}, which the problem lacks; it has {listed(parameters)}"
+    if not inputs or name in inputs[0]:
+        return f"asks for {lacks}."
+    lacks_input = f"the input {name!r}, which the experiment lacks; it has {listed(inputs[0])}"
+    if name in parameters:
+        return f"asks for {lacks_input}."
+    return f"asks for {name!r}, which is neither a parameter ({listed(parameters)}) nor an input ({listed(inputs[0])})."
 
 
 def _check_signature(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, form: str) -> None:

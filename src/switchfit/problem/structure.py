@@ -210,12 +210,15 @@ class _Tracer:
         shape: Shape | None,
         what: str,
         form: str,
+        inputs: tuple[str, ...] = (),
     ) -> Function:
-        """A function that takes arguments of these shapes, None standing for p, and returns an array of a shape."""
-        key = (id(function), arguments, shape, what, self._key)
+        """Return the trace of a function of arguments of these shapes, None standing for p, and of a result's shape."""
+        key = (id(function), arguments, shape, what, inputs, self._key)
         traced = self._traced.get(key)
         if traced is None:
-            traced = trace_function(function, arguments, self.shapes, self.hidden, what=what, form=form, shape=shape)
+            traced = trace_function(
+                function, arguments, self.shapes, self.hidden, what=what, form=form, shape=shape, inputs=inputs
+            )
             self._traced[key] = traced
         self.asked.update(traced.parameters)
         return traced
@@ -245,7 +248,8 @@ def structure_of(
     unknown = () if callable(initial) else tuple(k for k, x in enumerate(initial) if not getattr(x, "fixed", True))
     items = partial(of_kind, experiment.data)
     at: tuple[Shape | None, ...] = ((), (n,), None)
-    inputs = None if experiment.inputs is None else tuple(experiment.inputs.values.shape[1:])
+    inputs = None if experiment.inputs is None else experiment.inputs.shape
+    input_names = () if experiment.inputs is None else experiment.inputs.names
     in_mode, form = (at, "f(t, x, p)") if inputs is None else ((*at, inputs), "f(t, x, p, u)")
 
     def at_transitions(
@@ -267,7 +271,7 @@ def structure_of(
             )
         return None
 
-    modes = tuple(trace(system.modes[name], in_mode, (n,), f"mode {name!r}", form) for name in names)
+    modes = tuple(trace(system.modes[name], in_mode, (n,), f"mode {name!r}", form, input_names) for name in names)
     references = ((item, item.signal.channels) for item in items(ReferenceSignal))
     measurements = ((item, item.values.shape[1]) for item in items(Measurements))
     constraints = tuple(

@@ -35,8 +35,8 @@ class HybridSystem:
     modes : mapping of str to callable
         Vector field of each mode by name: ``f(t, x, p) -> (n,)`` written with ``jax.numpy``. ``t`` is a
         scalar in the experiment's time unit, ``x`` an ``(n,)`` array and ``p`` a dict of arrays; all are float64.
-        In an experiment with inputs modes are called as ``f(t, x, p, u)``, ``u`` being a dict or an array as the
-        `switchfit.Input` was given.
+        In an experiment with inputs modes are called as ``f(t, x, p, u)``: ``u`` is a dict of scalars, an array or a
+        scalar, as the values of the `switchfit.Input` were given.
     initial_state : (n,) array_like, or callable ``p -> (n,)``
         State at ``t0``; as a function of the parameters it is differentiated with them. An entry may be a
         `switchfit.Parameter`: it is then estimated, for each experiment by itself.

@@ -434,6 +434,27 @@ def as_names(value: Any, what: str, form: str) -> tuple[str, ...]:
     return names
 
 
+def as_named_columns(value: Any, what: str, form: str) -> dict[str, Any] | None:
+    """Return the entries of a mapping, or of a DataFrame whose columns are all named by strings; None for all else.
+
+    Raises
+    ------
+    TypeError
+        If a key of a mapping is not a string.
+    ValueError
+        If a mapping is empty, a key is empty, or two columns of a DataFrame share a name.
+    """
+    if isinstance(value, Mapping):
+        if not value:
+            raise ValueError(f"{what} must have a name for each entry of u, with its {form}; got an empty dict.")
+        return {as_name(name, f"names in {what}", "strings"): entry for name, entry in value.items()}
+    if _is_pandas(value) and hasattr(value, "columns"):
+        names = list(value.columns)
+        if names and all(isinstance(name, str) for name in names):
+            return {name: value.iloc[:, k] for k, name in enumerate(as_names(names, f"columns of {what}", "strings"))}
+    return None
+
+
 def as_sequence(value: Any, what: str, form: str) -> tuple[Any, ...]:
     """Return the entries of a list, a tuple, an array or another sequence.
 
