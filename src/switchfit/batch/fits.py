@@ -58,6 +58,21 @@ class Fits:
         Unknowns that were estimated on a logarithmic scale.
     seconds : float
         Wall time of all.
+
+    See Also
+    --------
+    estimate_many, monte_carlo, multistart, bootstrap
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fits = sf.estimate_many([heater_problem(), heater_problem()])
+    >>> len(fits), fits.success
+    (2, array([ True,  True]))
+    >>> fits.theta.round(3)
+    array([[2.462, 0.393],
+           [2.462, 0.393]])
     """
 
     theta_names: tuple[str, ...]
@@ -103,7 +118,21 @@ class Fits:
             return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
     def confidence_intervals(self, level: float = 0.95) -> FloatArray:
-        """Intervals of each fit: (R, d, 2); see `Estimate.confidence_intervals`."""
+        """Intervals of each fit: (R, d, 2); see `Estimate.confidence_intervals`.
+
+        See Also
+        --------
+        Estimate.confidence_intervals, MonteCarlo.coverage
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fits = sf.estimate_many([heater_problem()])
+        >>> fits.confidence_intervals(0.9).round(2)
+        array([[[2.43, 2.49],
+                [0.38, 0.4 ]]])
+        """
         level = as_level(level)
         freedom, tail = np.maximum(self.samples - self.free, 1), 0.5 + level / 2
         quantile = scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail)

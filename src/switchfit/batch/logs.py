@@ -53,6 +53,18 @@ def estimate_many(
         If the problems differ in more than their numbers, or the folder holds something else.
     TypeError
         If an argument is of the wrong type.
+
+    See Also
+    --------
+    estimate, monte_carlo, multistart
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fits = sf.estimate_many([heater_problem() for _ in range(3)])
+    >>> fits.theta.shape, bool(fits.success.all())
+    ((3, 2), True)
     """
     problems = list(as_sequence(problems, "problems", "a sequence of sf.Problem"))
     tolerance, max_iterations = checked_settings(tolerance, max_iterations)

@@ -79,6 +79,20 @@ class Bootstrap(Fits):
         How the standard error changes with the estimate, for "bca" intervals.
     resampled : (d,) bool
         Of which unknowns something is said: with "runs" only of those that several runs share.
+
+    See Also
+    --------
+    bootstrap, Fits, MonteCarlo
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> found = sf.bootstrap(fit, 20)
+    >>> found.standard_deviation.shape, found.resample
+    ((2,), 'residuals')
     """
 
     estimate: FloatArray
@@ -107,6 +121,20 @@ class Bootstrap(Fits):
             As in ``scipy.stats.bootstrap``: "percentile" takes quantiles of the estimates; "basic" mirrors them at the
             estimate; "bca" shifts them for bias and for acceleration (Efron 1987), whose sum over the leave-one-out
             estimates is taken to first order, from exact derivatives, instead of fitting again without each sample.
+
+        See Also
+        --------
+        bootstrap, Estimate.confidence_intervals, profile
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> low, high = sf.bootstrap(fit, 20).intervals(0.9, method="percentile").T
+        >>> bool((low < high).all())
+        True
         """
         level = as_level(level)
         method = as_choice(method, "method", get_args(Interval))
@@ -129,7 +157,21 @@ class Bootstrap(Fits):
         return found
 
     def plot(self) -> Figure:
-        """Histogram of the estimates of each unknown with its interval, as a matplotlib Figure."""
+        """Histogram of the estimates of each unknown with its interval, as a matplotlib Figure.
+
+        See Also
+        --------
+        bootstrap
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> len(sf.bootstrap(fit, 20).plot().axes)
+        2
+        """
         return figure_of(self)
 
 
@@ -172,6 +214,20 @@ def bootstrap(
     ValueError
         For an estimate that has no problem or did not converge, data that cannot be resampled, fewer than two
         experiments for "runs", or a folder that holds something else.
+
+    See Also
+    --------
+    monte_carlo, profile, Estimate.confidence_intervals
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> found = sf.bootstrap(fit, 20, resample="blocks", block=4, seed=1)
+    >>> len(found), found.intervals(0.9).shape
+    (20, (2, 2))
     """
     if not isinstance(estimate, Estimate):
         raise TypeError(f"bootstrap needs the result of sf.estimate; got {type(estimate).__name__}.")

@@ -48,6 +48,20 @@ class MonteCarlo(Fits):
         At which the data were simulated.
     integration_error : float
         Error of J at the truth by halving all steps, relative to J, or to 1e-3 of J at the start where that is more.
+
+    See Also
+    --------
+    monte_carlo, Fits, bootstrap
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> study = sf.monte_carlo(problem, 20, theta=[2.5, 0.4])
+    >>> study.bias.shape, study.coverage().shape
+    ((2,), (2,))
     """
 
     truth: FloatArray
@@ -69,13 +83,42 @@ class MonteCarlo(Fits):
         return self.errors.std(0, ddof=1)
 
     def coverage(self, level: float = 0.95) -> FloatArray:
-        """Part of the fits that converged whose interval contains the truth: (d,); NaN without a noise model."""
+        """Part of the fits that converged whose interval contains the truth: (d,); NaN without a noise model.
+
+        See Also
+        --------
+        monte_carlo, Fits.confidence_intervals
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> study = sf.monte_carlo(problem, 20, theta=[2.5, 0.4])
+        >>> bool((study.coverage(0.95) > 0.7).all())
+        True
+        """
         low, high = np.moveaxis(self.confidence_intervals(level)[self.success], 2, 0)
         inside = (low <= self.truth) & (self.truth <= high)
         return np.where(np.isnan(low).any(0), np.nan, inside.mean(0))
 
     def plot(self) -> Figure:
-        """Histogram of the estimates of each unknown with the truth, as a matplotlib Figure."""
+        """Histogram of the estimates of each unknown with the truth, as a matplotlib Figure.
+
+        See Also
+        --------
+        monte_carlo
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> len(sf.monte_carlo(problem, 20, theta=[2.5, 0.4]).plot().axes)
+        2
+        """
         return figure_of(self)
 
 
@@ -135,6 +178,20 @@ def monte_carlo(
     -----
     All fits share one mesh, which resolves the trajectories at the start and at the truth. Transition times that have
     guards are moved onto them in the truth.
+
+    See Also
+    --------
+    bootstrap, estimate_many
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> study = sf.monte_carlo(problem, 20, theta=[2.5, 0.4], seed=1)
+    >>> len(study), bool((study.standard_deviation < 0.05).all())
+    (20, True)
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     runs, seed = as_count(runs, "runs", at_least=1), as_seed(seed)

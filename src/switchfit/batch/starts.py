@@ -57,13 +57,42 @@ class Multistart(Fits):
         Which minimum each start ended in, 0 being the lowest; -1 where it did not converge.
     best : Estimate or None
         A full estimate, resumed at the lowest end; None where each of the lowest ones raises an error.
+
+    See Also
+    --------
+    multistart, Fits
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> found = sf.multistart(problem, 8)
+    >>> found.best.success, int(found.clusters.max())
+    (True, 0)
     """
 
     clusters: NDArray[np.int64]
     best: Estimate | None
 
     def plot(self) -> Figure:
-        """Waterfall: the cost at the end of every start, ascending, as a matplotlib Figure."""
+        """Waterfall: the cost at the end of every start, ascending, as a matplotlib Figure.
+
+        See Also
+        --------
+        multistart
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> figure = sf.multistart(problem, 8).plot()
+        >>> len(figure.axes) > 0
+        True
+        """
         return figure_of(self)
 
 
@@ -105,6 +134,20 @@ def multistart(
     Notes
     -----
     All starts share the mesh that is refined at the initial guess; the best end is fitted again on a mesh of its own.
+
+    See Also
+    --------
+    estimate, estimate_many
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> found = sf.multistart(problem, 8, seed=1)
+    >>> found.best.theta.round(2)
+    array([2.46, 0.39])
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     seed = as_seed(seed)

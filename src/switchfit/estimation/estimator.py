@@ -65,14 +65,53 @@ ORDER = 5
 
 @dataclass(frozen=True, eq=False)
 class Estimate(Fit):
-    """Result of `estimate`: everything in `Fit`, and what can be done with it. Print it for the report."""
+    """Result of `estimate`: everything in `Fit`, and what can be done with it. Print it for the report.
+
+    See Also
+    --------
+    estimate : makes it.
+    Fits : many fits at once.
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> fit.success, fit.status.name
+    (True, 'CONVERGED')
+    >>> dict(zip(fit.theta_names, fit.theta.round(3).tolist()))
+    {'tau_1': 2.462, 'k': 0.393}
+    >>> fit.standard_errors.round(3)
+    array([0.018, 0.005])
+    >>> fit.trajectory.mode_spans[0][0]
+    'on'
+    """
 
     saved_certificate: Certificate | None = None
     problem: Problem | None = None
     evaluator: Evaluator | None = None
 
     def simulate_later(self, simulation: SimulatedProblem) -> None:
-        """Take `trajectories` and `comparisons` from a simulation when they are asked for; many fits are not."""
+        """Take `trajectories` and `comparisons` from a simulation when they are asked for; many fits are not.
+
+        See Also
+        --------
+        Estimate.complete
+
+        Examples
+        --------
+        >>> from switchfit.fit.trajectory import SimulatedProblem
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> len(fit.trajectories)
+        1
+        >>> fit.simulate_later(SimulatedProblem(fit.evaluator_at_solution(), fit.theta))
+        >>> fit.trajectory.states.shape[1]
+        1
+        """
         for name in ("trajectories", "comparisons"):
             del self.__dict__[name]
         self.__dict__["_simulation"] = simulation
@@ -112,7 +151,21 @@ class Estimate(Fit):
         return self.evaluator_at_solution()(self.theta, matrix="gauss-newton").hessian
 
     def has_room_for_sensitivities(self) -> bool:
-        """Whether the derivatives of states and outputs at all nodes take less memory than `MOST_SENSITIVITIES`."""
+        """Whether the derivatives of states and outputs at all nodes take less memory than `MOST_SENSITIVITIES`.
+
+        See Also
+        --------
+        Estimate.plot, Estimate.predict
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.has_room_for_sensitivities()
+        True
+        """
         rows = sum(len(mesh.nodes) for mesh in self.evaluator_at_solution().meshes)
         width = max(
             t.states.shape[1] + sum(len(c.names) for c in run)
@@ -134,6 +187,20 @@ class Estimate(Fit):
         ------
         ValueError
             If the estimate was loaded from a file without its problem.
+
+        See Also
+        --------
+        evaluate
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> evaluator = fit.evaluator_at_solution()
+        >>> abs(evaluator(fit.theta).cost - fit.cost) < 1e-12
+        True
         """
         if self.problem is None:
             raise ValueError(
@@ -149,6 +216,19 @@ class Estimate(Fit):
         name : str
         level : float
         callback : callable, optional
+
+        See Also
+        --------
+        profile, Profile
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> [round(float(end), 1) for end in fit.profile("tau_1").interval()]
+        [2.4, 2.5]
         """
         return profile(self, name, level=level, callback=callback)
 
@@ -165,6 +245,20 @@ class Estimate(Fit):
             of a model are compiled for a second.
         level : float, between 0 and 1
             Of the bands.
+
+        See Also
+        --------
+        Estimate.plot_residuals, Estimate.predict
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> figure = fit.plot(bands=False)
+        >>> len(figure.axes)
+        2
         """
         return figure_of(self, bands=bands, level=level)
 
@@ -175,6 +269,20 @@ class Estimate(Fit):
         ----------
         times : (K,) array_like, optional
         experiment : int
+
+        See Also
+        --------
+        predict, Prediction
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.predict([1.0, 4.0]).outputs.round(1)
+        array([[8.3],
+               [8.6]])
         """
         return predict(self, times, experiment=experiment)
 
@@ -184,7 +292,21 @@ class Estimate(Fit):
         return diagnose(self)
 
     def plot_residuals(self) -> Any:
-        """Residuals in time, their autocorrelation and their quantiles, as a matplotlib Figure."""
+        """Residuals in time, their autocorrelation and their quantiles, as a matplotlib Figure.
+
+        See Also
+        --------
+        Estimate.residuals, Estimate.plot
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> len(fit.plot_residuals().axes)
+        3
+        """
         return figure_of(self.residuals)
 
     @cached_property
@@ -193,12 +315,44 @@ class Estimate(Fit):
         return identifiability(self)
 
     def save(self, path: str | Path) -> None:
-        """Write everything but the model to a JSON file, atomically; `load` reads it."""
+        """Write everything but the model to a JSON file, atomically; `load` reads it.
+
+        See Also
+        --------
+        Estimate.load
+
+        Examples
+        --------
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> with TemporaryDirectory() as folder:
+        ...     fit.save(Path(folder) / "fit.json")
+        ...     (Path(folder) / "fit.json").read_text().splitlines()[1]
+        '  "format": "switchfit fit",'
+        """
         file = as_path(path, "path")
         save_fit(self.complete(), self.certificate, file)
 
     def complete(self) -> Estimate:
-        """The same with everything that is saved, which is the Gauss-Newton matrix."""
+        """The same with everything that is saved, which is the Gauss-Newton matrix.
+
+        See Also
+        --------
+        Estimate.save
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.complete().saved_gauss_newton.shape
+        (2, 2)
+        """
         return replace(self, saved_gauss_newton=self.gauss_newton)
 
     @classmethod
@@ -215,6 +369,24 @@ class Estimate(Fit):
         ------
         ValueError
             If the file is not one of switchfit's, or the problem has other unknowns or other time units.
+
+        See Also
+        --------
+        Estimate.save
+
+        Examples
+        --------
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> with TemporaryDirectory() as folder:
+        ...     fit.save(Path(folder) / "fit.json")
+        ...     loaded = sf.Estimate.load(Path(folder) / "fit.json", problem=heater_problem())
+        >>> bool((loaded.theta == fit.theta).all())
+        True
         """
         if problem is not None:
             as_instance(problem, "problem", Problem, "an sf.Problem")
@@ -278,6 +450,23 @@ def estimate(
         For a bad setting, or a guess at which the model cannot be integrated.
     TypeError
         If an argument is of the wrong type.
+
+    See Also
+    --------
+    estimate_many, multistart : many fits.
+    Estimate : what it returns.
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> fit = sf.estimate(problem)
+    >>> fit.success
+    True
+    >>> fit.transition_times[0].round(2), round(float(fit.parameters["k"]), 2)
+    (array([2.46]), 0.39)
     """
     as_instance(problem, "problem", Problem, "an sf.Problem; several are what sf.estimate_many takes")
     hessian = as_choice(hessian, "hessian", HESSIANS)

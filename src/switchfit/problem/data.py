@@ -99,6 +99,11 @@ class Input:
     TypeError
         If times or values are not numbers, dates among them, or a name is not a string.
 
+    See Also
+    --------
+    Experiment : takes it as `inputs`.
+    ReferenceSignal : a measured signal that the model is compared with.
+
     Examples
     --------
     >>> import numpy as np
@@ -111,11 +116,6 @@ class Input:
 
     >>> def drive(t, x, p, u):
     ...     return p["r"] * np.array([0.5, 0.5]) @ [u["left"], u["right"]]
-
-    See Also
-    --------
-    Experiment : takes it as `inputs`.
-    ReferenceSignal : a measured signal that the model is compared with.
     """
 
     times: Any
@@ -152,7 +152,20 @@ class Input:
         return (len(self.values),) if self.names else tuple(self.values.shape[1:])
 
     def signal(self, t0: float, tf: float) -> PiecewisePolynomial:
-        """The input as a piecewise polynomial over ``[t0, tf]``."""
+        """The input as a piecewise polynomial over ``[t0, tf]``.
+
+        See Also
+        --------
+        Input
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> signal = sf.Input([0.0, 1.0], [0.0, 4.0], kind="linear").signal(0.0, 1.0)
+        >>> signal([0.25, 0.5])
+        array([[1.],
+               [2.]])
+        """
         times = self.times
         values = np.stack([self.values[name] for name in self.names], axis=1) if self.names else self.values
         values = values.reshape(len(times), -1)
@@ -177,6 +190,18 @@ class RunningCost:
     Parameters
     ----------
     ell : callable ``ell(t, x, p) -> scalar``, twice differentiable in x and p.
+
+    See Also
+    --------
+    TerminalCost, TransitionCost, ReferenceSignal
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> effort = sf.RunningCost(lambda t, x, p: x[0] ** 2)
+    >>> run = sf.Experiment(effort, ("on", "off"), (2.0,), 0.0, 4.0)
+    >>> len(run.data)
+    1
     """
 
     ell: Callable[..., Any]
@@ -193,6 +218,18 @@ class TerminalCost:
     Parameters
     ----------
     phi : callable ``phi(x, p) -> scalar``, twice differentiable.
+
+    See Also
+    --------
+    RunningCost, TransitionCost, TerminalConstraint
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> far = sf.TerminalCost(lambda x, p: -x[0])
+    >>> run = sf.Experiment(far, ("go",), (), 0.0, 1.0)
+    >>> len(run.data)
+    1
     """
 
     phi: Callable[..., Any]
@@ -215,16 +252,16 @@ class TransitionCost:
     before, after : str, optional
         The modes between which it counts; left out, any. No two may count at the same transition.
 
+    See Also
+    --------
+    RunningCost, TerminalCost
+
     Examples
     --------
     Switching from "push" to "brake" costs the square of the speed:
 
     >>> import switchfit as sf
     >>> cost = sf.TransitionCost(lambda t, x, p: x[1] ** 2, before="push", after="brake")
-
-    See Also
-    --------
-    RunningCost, TerminalCost
     """
 
     mu: Callable[..., Any]
@@ -239,7 +276,19 @@ class TransitionCost:
                 as_name(getattr(self, name), name, "the name of a mode")
 
     def counts_between(self, before: str, after: str) -> bool:
-        """Whether it counts at a transition from a mode to another."""
+        """Whether it counts at a transition from a mode to another.
+
+        See Also
+        --------
+        TransitionCost
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> cost = sf.TransitionCost(lambda t, x, p: x[0], before="push")
+        >>> cost.counts_between("push", "brake"), cost.counts_between("brake", "push")
+        (True, False)
+        """
         return self.before in (None, before) and self.after in (None, after)
 
 
@@ -250,6 +299,21 @@ class TerminalConstraint:
     Parameters
     ----------
     psi : callable ``psi(x, p) -> () or (m,)``, twice differentiable.
+
+    See Also
+    --------
+    TerminalCost, HybridSystem
+
+    Examples
+    --------
+    >>> import switchfit as sf
+
+    The speed has to be zero at the end:
+
+    >>> at_rest = sf.TerminalConstraint(lambda x, p: x[1])
+    >>> run = sf.Experiment([sf.TerminalCost(lambda x, p: -x[0]), at_rest], ("go",), (), 0.0, 1.0)
+    >>> len(run.data)
+    2
     """
 
     psi: Callable[..., Any]
@@ -279,6 +343,20 @@ class ReferenceSignal:
         What the signal was made from.
     lowpass_hz : float, optional
         The cut-off with which it was made.
+
+    See Also
+    --------
+    Measurements : discrete samples.
+    Experiment : takes it as `data`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import switchfit as sf
+    >>> times = np.linspace(0.0, 2.0, 41)
+    >>> reference = sf.ReferenceSignal.from_samples(times, np.sin(times), lowpass_hz=2.0)
+    >>> reference.signal.channels
+    1
     """
 
     signal: PiecewisePolynomial
@@ -333,6 +411,19 @@ class ReferenceSignal:
             beyond what the samples show.
         TypeError
             If times, values, weights or the cut-off are not numbers, dates among them.
+
+        See Also
+        --------
+        Measurements, Input
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import switchfit as sf
+        >>> times = np.linspace(0.0, 2.0, 41)
+        >>> reference = sf.ReferenceSignal.from_samples(times, np.sin(times))
+        >>> reference.signal([1.0]).round(6)
+        array([[0.841471]])
         """
         times, values = _samples(times, values, "ReferenceSignal", at_least=4, breaks=True, missing=True)
         table = values.reshape(len(times), -1)
@@ -386,6 +477,28 @@ class Measurements:
         sigma that is not positive, or a loss that is not known or has no scale to be measured by.
     TypeError
         If times, values, sigma or another number is not a number, dates among them.
+
+    See Also
+    --------
+    ReferenceSignal : a continuous signal.
+    Experiment : takes it as `data`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import switchfit as sf
+
+    Two channels of a state of three, one value missing, with noise of different size:
+
+    >>> gps = sf.Measurements(
+    ...     [0.0, 0.5, 1.0],
+    ...     [[0.0, 1.0], [np.nan, 1.2], [0.4, 1.3]],
+    ...     observe=lambda t, x, p: x[np.array([0, 2])],
+    ...     sigma=[0.1, 0.2],
+    ...     names=("X", "Y"),
+    ... )
+    >>> gps.count
+    5
     """
 
     times: Any
@@ -446,7 +559,20 @@ class Measurements:
         return tuple(entry if isinstance(entry, str) else None for entry in self.sigma)
 
     def noise(self, parameters: Mapping[str, Any]) -> FloatArray | None:
-        """Standard deviation of each sample, a (K, q) array, given the model's parameters; None where it is unknown."""
+        """Standard deviation of each sample, a (K, q) array, given the model's parameters; None where it is unknown.
+
+        See Also
+        --------
+        Measurements
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> log = sf.Measurements([0.0, 1.0], [2.0, 3.0], sigma="noise")
+        >>> log.noise({"noise": 0.5})
+        array([[0.5],
+               [0.5]])
+        """
         if self.sigma is None:
             return None
         sigma = self.sigma

@@ -71,6 +71,18 @@ class Experiment:
     is there under its own name only if a function asks for it. A run is differentiated with respect to the parameters
     that its functions ask for and to no others, so that many runs with parameters of their own cost each what it alone
     would. (Functions that look at ``p`` as a whole, or hand it to ``jax.jit``, ask for all that it holds.)
+
+    See Also
+    --------
+    Problem, HybridSystem, Measurements, Input
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> log = sf.Measurements([1.0, 2.0, 3.0, 4.0], [0.9, 1.8, 1.2, 0.7], sigma=0.1)
+    >>> run = sf.Experiment(log, ("on", "off"), (2.2,), 0.0, 4.0, time_unit="h")
+    >>> run.mode_sequence, run.initial_times
+    (('on', 'off'), array([2.2]))
     """
 
     data: Any

@@ -42,6 +42,20 @@ class Parameter:
         prior is logarithmic and p not confined to positive numbers.
     TypeError
         If a value or a bound is not a number, `unit` not a string, or `fixed` neither True nor False.
+
+    See Also
+    --------
+    Problem : takes it under `parameters`.
+    Normal, LogNormal
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> mu = sf.Parameter(0.8, lower=0.05, upper=2.0, unit="1")
+    >>> rates = sf.Parameter([1e-3, 2.0], scale="log")
+    >>> known = sf.Parameter(9.81, fixed=True)
+    >>> mu.shape, rates.shape
+    ((), (2,))
     """
 
     value: Any
@@ -116,7 +130,19 @@ class Parameter:
         return self.scale == "log" or bool(np.all(self.lower > 0))
 
     def entries(self) -> tuple[Parameter, ...]:
-        """A scalar `Parameter` for each entry, in their order."""
+        """A scalar `Parameter` for each entry, in their order.
+
+        See Also
+        --------
+        Parameter
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> first, second = sf.Parameter([1.0, 2.0], lower=0.0).entries()
+        >>> float(second.value), float(second.lower)
+        (2.0, 0.0)
+        """
         terms = PriorTerms.of(self.prior, self.shape)
         priors: list[Prior | None] = []
         for center, precision, log in zip(*terms, strict=True):

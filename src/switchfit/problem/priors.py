@@ -34,6 +34,17 @@ class Normal:
         If a number is not finite, or sd not positive.
     TypeError
         If one is not a number.
+
+    See Also
+    --------
+    LogNormal, Parameter
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> mu = sf.Parameter(0.8, prior=sf.Normal(mean=0.7, sd=0.1))
+    >>> mu.prior.sd
+    array(0.1)
     """
 
     mean: Any
@@ -64,6 +75,17 @@ class LogNormal:
     Notes
     -----
     This is a normal prior of log p, whose density is taken over log p: the maximum a posteriori is that of log p.
+
+    See Also
+    --------
+    Normal, Parameter
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> mu = sf.Parameter(0.8, lower=0.01, prior=sf.LogNormal(median=0.7, log_sd=0.1))
+    >>> mu.prior.log_sd
+    array(0.1)
     """
 
     median: Any

@@ -135,6 +135,28 @@ class Problem:
         dtype.
     TypeError
         If an argument is of the wrong type.
+
+    See Also
+    --------
+    HybridSystem, Experiment, Parameter : its parts.
+    estimate, simulate, evaluate
+
+    Examples
+    --------
+    >>> import switchfit as sf
+
+    A heater that is switched off at an unknown time; what it loses to the room is unknown too:
+
+    >>> system = sf.HybridSystem(
+    ...     {"on": lambda t, x, p: 10.0 - p["k"] * x, "off": lambda t, x, p: -p["k"] * x}, [0.0]
+    ... )
+    >>> log = sf.Measurements([1.0, 2.0, 3.0, 4.0], [8.2, 13.8, 12.9, 8.7], sigma=0.2)
+    >>> run = sf.Experiment(log, ("on", "off"), (2.0,), 0.0, 4.0)
+    >>> problem = sf.Problem(system, run, {"k": sf.Parameter(0.5, lower=0.0)})
+    >>> problem.theta_names
+    ('tau_1', 'k')
+    >>> problem.initial_theta
+    array([2. , 0.5])
     """
 
     system: HybridSystem
@@ -373,14 +395,42 @@ class Problem:
         return sizes
 
     def elapsed(self, theta: FloatArray) -> FloatArray:
-        """theta with transition times counted from their experiment's t0, (d,): it does not depend on the clock."""
+        """theta with transition times counted from their experiment's t0, (d,): it does not depend on the clock.
+
+        See Also
+        --------
+        Problem.split
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> problem.elapsed(problem.initial_theta)
+        array([2. , 0.5])
+        """
         counted = theta.copy()
         for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
             counted[where[where >= 0]] -= experiment.t0
         return counted
 
     def vectors(self, theta: FloatArray, e: int) -> tuple[FloatArray, FloatArray]:
-        """What the compiled programs of experiment e take: its transition times (N,) and its p (M,)."""
+        """What the compiled programs of experiment e take: its transition times (N,) and its p (M,).
+
+        See Also
+        --------
+        Problem.split
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> problem.vectors(problem.initial_theta, 0)
+        (array([2.]), array([0.5]))
+        """
         places, N = self.places[e], self.structures[e].N
         if self.one_to_one:
             return theta[:N], theta[N:]
@@ -408,13 +458,41 @@ class Problem:
         return tuple(tuple(lengths) for lengths in counts)
 
     def named(self, theta: FloatArray, e: int) -> dict[str, FloatArray]:
-        """The parameters of experiment e under the names that the model has for them."""
+        """The parameters of experiment e under the names that the model has for them.
+
+        See Also
+        --------
+        Problem.split
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> float(problem.named(problem.initial_theta, 0)["k"])
+        0.5
+        """
         own = self.split(theta)[1]
         mapped = self.experiments[e].parameter_map
         return own | {name: own[target] for name, target in mapped.items()}
 
     def late_times(self, theta: FloatArray, e: int) -> FloatArray:
-        """Moments of which the samples of experiment e are whose delay is a parameter: (K,), in no order."""
+        """Moments of which the samples of experiment e are whose delay is a parameter: (K,), in no order.
+
+        See Also
+        --------
+        Measurements
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> problem.late_times(problem.initial_theta, 0)
+        array([], dtype=float64)
+        """
         items = [item for item in self.experiments[e].data if isinstance(item, Measurements)]
         late = [(item.times, item.delay) for item in items if isinstance(item.delay, str)]
         named = self.named(theta, e) if late else {}
@@ -427,6 +505,19 @@ class Problem:
         ------
         ValueError
             Where the shape or the order of transition times is wrong.
+
+        See Also
+        --------
+        simulate, evaluate
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> problem.checked_theta(None)
+        array([2. , 0.5])
         """
         if theta is None:
             return self.initial_theta
@@ -466,7 +557,22 @@ class Problem:
                 )
 
     def split(self, theta: FloatArray) -> tuple[list[FloatArray], dict[str, FloatArray]]:
-        """All transition times, one ``(N,)`` array an experiment, and all parameters by name, fixed ones included."""
+        """All transition times, one ``(N,)`` array an experiment, and all parameters by name, fixed ones included.
+
+        See Also
+        --------
+        Problem.named
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> times, parameters = problem.split(problem.initial_theta)
+        >>> times, float(parameters["k"])
+        ([array([2.])], 0.5)
+        """
         times = []
         for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
             tau = experiment.initial_times

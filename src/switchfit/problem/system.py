@@ -55,6 +55,30 @@ class HybridSystem:
         If a reset map or a guard names an unknown mode, or names, units and initial state differ in length.
     TypeError
         If a mode, a reset map or a guard is not callable, the initial state not made of numbers, or a name no string.
+
+    See Also
+    --------
+    Experiment, Problem, switchfit.models
+
+    Examples
+    --------
+    >>> import jax.numpy as jnp
+    >>> import switchfit as sf
+
+    A ball that falls, and then stays where it is; it comes to rest on the ground:
+
+    >>> system = sf.HybridSystem(
+    ...     modes={
+    ...         "fall": lambda t, x, p: jnp.array([x[1], -p["g"]]),
+    ...         "rest": lambda t, x, p: jnp.zeros(2),
+    ...     },
+    ...     initial_state=[1.0, 0.0],
+    ...     guards={("fall", "rest"): lambda t, x, p: x[0]},
+    ...     state_names=("height", "speed"),
+    ...     state_units=("m", "m/s"),
+    ... )
+    >>> list(system.modes)
+    ['fall', 'rest']
     """
 
     modes: Mapping[str, VectorField]
@@ -85,7 +109,18 @@ class HybridSystem:
             self.check_labels_of(len(self.initial_state))
 
     def check_labels_of(self, n: int) -> None:
-        """ValueError unless names and units, where given, have one entry for each of n states."""
+        """ValueError unless names and units, where given, have one entry for each of n states.
+
+        See Also
+        --------
+        HybridSystem
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> system = sf.HybridSystem({"rest": lambda t, x, p: 0 * x}, lambda p: p["x0"], state_names=("x", "y"))
+        >>> system.check_labels_of(2)
+        """
         for label in ("state_names", "state_units"):
             labels = getattr(self, label)
             if labels is not None and len(labels) != n:
@@ -94,11 +129,38 @@ class HybridSystem:
                 )
 
     def reset_map(self, before: str, after: str) -> ResetMap | None:
-        """The map applied at a transition from mode `before` to mode `after`; None where x is continuous."""
+        """The map applied at a transition from mode `before` to mode `after`; None where x is continuous.
+
+        See Also
+        --------
+        HybridSystem.guard
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> def bounce(t, x, p):
+        ...     return -p["restitution"] * x
+
+        >>> system = sf.HybridSystem({"fly": lambda t, x, p: -9.81 + 0 * x}, [1.0], {("fly", "fly"): bounce})
+        >>> system.reset_map("fly", "fly") is bounce
+        True
+        """
         return self.reset_maps.get((before, after))
 
     def guard(self, before: str, after: str) -> Guard | None:
-        """What is zero at a transition from mode `before` to mode `after`; None where it is free."""
+        """What is zero at a transition from mode `before` to mode `after`; None where it is free.
+
+        See Also
+        --------
+        HybridSystem.reset_map
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> system = sf.HybridSystem({"fall": lambda t, x, p: -x, "rest": lambda t, x, p: 0 * x}, [1.0])
+        >>> system.guard("fall", "rest") is None
+        True
+        """
         return self.guards.get((before, after))
 
 

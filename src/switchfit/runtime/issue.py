@@ -20,6 +20,17 @@ class Issue:
         Names of what it is about: unknowns, channels, outputs.
     figures : mapping of str to float or tuple of float
         The numbers of the sentence by their names; a tuple has one entry for each subject.
+
+    See Also
+    --------
+    Certificate.failures, Termination.reason
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> issue = sf.Issue("error", ("the log is empty",))
+    >>> issue.kind, issue.subjects
+    ('error', ('the log is empty',))
     """
 
     kind: str

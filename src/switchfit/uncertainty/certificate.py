@@ -65,6 +65,23 @@ class Certificate:
         What of all this is not as it has to be; empty where the certificate is good.
     integration_error_of : str
         The output that has the `integration_error`: "J", or the name of a guard or terminal constraint.
+
+    See Also
+    --------
+    estimate, check_derivatives, Estimate.certificate
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> fit.certificate.failures
+    ()
+    >>> fit.certificate.integration_error < 1e-8
+    True
+    >>> fit.certificate.hessian_gap < 1e-5
+    True
     """
 
     optimality: float

@@ -71,6 +71,22 @@ class DerivativeCheck:
     stiff : bool
         With the stiff solver the gaps are told but not judged: the paper's adjoints have boundary layers of their own
         at transitions and samples, which a mesh refined for the state does not resolve.
+
+    See Also
+    --------
+    check_derivatives, Certificate
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> check = sf.check_derivatives(problem)
+    >>> check.passed
+    True
+    >>> [round(order) for order in check.observed_orders]
+    [1, 2, 3]
     """
 
     steps: FloatArray
@@ -121,6 +137,19 @@ def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, seed:
         For a theta of the wrong shape or order, or a seed that is negative.
     TypeError
         If an argument is of the wrong type.
+
+    See Also
+    --------
+    evaluate, Certificate
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> sf.check_derivatives(problem).passed
+    True
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     seed = as_seed(seed)

@@ -77,6 +77,22 @@ class Direction:
         By how much J rises at theta + change and at theta - change; NaN where that is not allowed.
     names : tuple of str
         The unknowns that it mostly consists of, the one with the largest weight first.
+
+    See Also
+    --------
+    Identifiability, identifiability
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> worst = fit.identifiability.directions[0]
+    >>> worst.names
+    ('tau_1', 'k')
+    >>> worst.summary
+    'tau_1 and k trade off'
     """
 
     eigenvalue: float
@@ -122,6 +138,20 @@ class Identifiability:
         Whether J was evaluated along the directions.
     idle : tuple of str
         Unknowns on which the cost does not depend because modes have collapsed, as in `Fit.idle`.
+
+    See Also
+    --------
+    identifiability, Direction, profile
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> found = fit.identifiability
+    >>> found.condition_number < 100, found.undetermined
+    (True, 0)
     """
 
     theta_names: tuple[str, ...]
@@ -172,6 +202,20 @@ def identifiability(subject: Any) -> Identifiability:
         For anything else.
     ValueError
         If a parameter of the problem changes the cost while its derivative is zero: a switch hidden in a function.
+
+    See Also
+    --------
+    profile, Estimate.correlation
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> found = sf.identifiability(problem)
+    >>> found.where, found.undetermined
+    ('first guess', 0)
     """
     if isinstance(subject, Problem):
         return _before(subject)

@@ -52,6 +52,23 @@ class Prediction:
     near_transition : (K,) bool
         Within two standard errors of a transition time: the bands take no account of the other mode there.
     fit : Fit
+
+    See Also
+    --------
+    predict, Estimate.plot
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> prediction = fit.predict([1.0, 4.0])
+    >>> prediction.states.shape, prediction.output_names
+    ((2, 1), ('thermometer',))
+    >>> prediction.state_errors.round(2)
+    array([[0.02],
+           [0.05]])
     """
 
     times: FloatArray
@@ -68,15 +85,63 @@ class Prediction:
     fit: Fit = field(repr=False)
 
     def state_band(self, level: float = 0.95) -> FloatArray:
-        """Confidence band of the states at each time: (K, n, 2)."""
+        """Confidence band of the states at each time: (K, n, 2).
+
+        See Also
+        --------
+        Prediction.output_band, predict
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.predict([1.0, 4.0]).state_band(0.95).round(1)
+        array([[[8.2, 8.3]],
+        <BLANKLINE>
+               [[8.5, 8.7]]])
+        """
         return _band(self.states, self.fit.quantile(level) * self.state_errors)
 
     def output_band(self, level: float = 0.95) -> FloatArray:
-        """Confidence band of the outputs, of their mean without noise, at each time: (K, q, 2)."""
+        """Confidence band of the outputs, of their mean without noise, at each time: (K, q, 2).
+
+        See Also
+        --------
+        Prediction.prediction_band, predict
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.predict([1.0, 4.0]).output_band(0.95).round(1)
+        array([[[8.2, 8.3]],
+        <BLANKLINE>
+               [[8.5, 8.7]]])
+        """
         return _band(self.outputs, self.fit.quantile(level) * self.output_errors)
 
     def prediction_band(self, level: float = 0.95) -> FloatArray:
-        """Where a new sample would fall at each time, noise included: (K, q, 2)."""
+        """Where a new sample would fall at each time, noise included: (K, q, 2).
+
+        See Also
+        --------
+        Prediction.output_band, predict
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.predict([1.0, 4.0]).prediction_band(0.95).round(1)
+        array([[[7.9, 8.7]],
+        <BLANKLINE>
+               [[8.2, 9. ]]])
+        """
         return _band(self.outputs, self.fit.quantile(level) * np.hypot(self.output_errors, self.noise))
 
 
@@ -107,6 +172,23 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
     ValueError
         For times outside the horizon, an experiment that does not exist, or an estimate without a problem or without
         a covariance.
+
+    See Also
+    --------
+    Prediction, simulate, Estimate.plot
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> prediction = sf.predict(fit, [1.0, 4.0])
+    >>> prediction.outputs.round(1)
+    array([[8.3],
+           [8.6]])
+    >>> prediction.near_transition
+    array([False, False])
     """
     fit: Fit = estimate
     if not isinstance(fit, Fit):

@@ -462,6 +462,20 @@ class Profile:
         For a transition time the sample times of its run, where the slope of the profile may jump; empty otherwise.
     trace : Trace
         The points, and how more are made.
+
+    See Also
+    --------
+    profile, Estimate.confidence_intervals
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> found = sf.profile(fit, "tau_1")
+    >>> found.name, len(found.values) > 5
+    ('tau_1', True)
     """
 
     name: str
@@ -528,6 +542,19 @@ class Profile:
         list of (low, high)
             Where a side ends before the threshold is crossed, its end is the limit that the constraints set, infinite
             where the cost does not rise, NaN where it could not be followed.
+
+        See Also
+        --------
+        profile, Profile.interval
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> len(sf.profile(fit, "k").regions(0.95))
+        1
         """
         threshold = self.fit.quantile(self.level if level is None else level)
         try:
@@ -544,6 +571,19 @@ class Profile:
         ----------
         level : float, optional
             As of `regions`.
+
+        See Also
+        --------
+        profile, Profile.regions
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> [round(float(end), 2) for end in sf.profile(fit, "k").interval(0.95)]
+        [0.38, 0.4]
         """
         regions = self.regions(level)
         return next((r for r in regions if not (r[0] > self.value or r[1] < self.value)), regions[0])
@@ -552,7 +592,22 @@ class Profile:
         return text_of(self)
 
     def plot(self) -> Figure:
-        """The likelihood ratio with its thresholds, and the quadratic approximation beside it."""
+        """The likelihood ratio with its thresholds, and the quadratic approximation beside it.
+
+        See Also
+        --------
+        profile
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> figure = sf.profile(fit, "k").plot()
+        >>> len(figure.axes) > 0
+        True
+        """
         return figure_of(self)
 
 
@@ -586,6 +641,19 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     -----
     Costs some twenty warm-started fits and compiles nothing, unless the mesh of the fit turns out too coarse at the
     ends of the profile.
+
+    See Also
+    --------
+    Estimate.confidence_intervals, bootstrap, identifiability
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> [round(float(end), 1) for end in sf.profile(fit, "tau_1").interval(0.95)]
+    [2.4, 2.5]
     """
     fit: Fit = estimate
     if not isinstance(fit, Fit):

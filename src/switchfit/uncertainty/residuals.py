@@ -71,6 +71,20 @@ class ChannelResiduals:
         Effective sample size.
     outliers : int
         Residuals beyond four standard deviations; a thousandth of one is expected in 16 samples.
+
+    See Also
+    --------
+    ResidualDiagnostics, Estimate.residuals
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> channel = fit.residuals.channels[0]
+    >>> channel.name, len(channel.values), channel.white
+    ('thermometer', 24, True)
     """
 
     experiment: int
@@ -120,6 +134,19 @@ class ResidualDiagnostics:
     channels : tuple of ChannelResiduals
     labels : tuple of str
         Of each channel, with the experiment's name where there are several.
+
+    See Also
+    --------
+    ChannelResiduals, Estimate.plot_residuals
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> fit.residuals.passed, fit.residuals.labels
+    (True, ('thermometer',))
     """
 
     channels: tuple[ChannelResiduals, ...]
