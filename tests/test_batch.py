@@ -22,7 +22,7 @@ from switchfit.fit.solution import minimized
 from switchfit.optimize import LinearConstraints, minimize
 from switchfit.optimize.qp import nearest_feasible, solve_qp
 from switchfit.optimize.traced import Constraints, minimize_traced, nonnegative_minimum
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 
 TIMES = np.linspace(0.25, 6.0, 24)
 TRUTH = np.array([2.1, 0.8])
@@ -65,7 +65,7 @@ def test_the_dual_programme_against_scipy(seed):
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
     g = rng.standard_normal(rows.shape[1])
     allowed = rng.random(len(rows)) < 0.8
-    with float64():
+    with use_float64():
         lam = np.asarray(nonnegative_minimum(jnp.asarray(rows @ rows.T), jnp.asarray(-rows @ g), jnp.asarray(allowed)))
     assert np.all(lam >= 0)
     assert np.all(lam[~allowed] == 0)
@@ -100,7 +100,7 @@ def test_the_traced_optimiser_ends_where_the_other_one_does(name):
 
     constraints = LinearConstraints(np.array(A), np.array(b), np.array(low), np.array(high), tuple("abcde"))
     expected = minimize(At, start, constraints=constraints)
-    with float64():
+    with use_float64():
         outcome = jax.jit(
             lambda start: minimize_traced(
                 lambda theta: tuple(map(jnp.asarray, valley(theta))),
@@ -126,8 +126,8 @@ def singles(problems, meshes, start):
 
 
 def work_of(problem, truth, start, noise=None, seed=3):
-    work = module._Work(problem, [], truth, start, noise, seed, 1e-7, 200, module._clean(problem, truth))
-    work.meshes, _ = module._meshes(work.problem_of(0), truth, start)
+    work = module._Work(problem, [], truth, start, noise, seed, 1e-7, 200, module._simulate_clean(problem, truth))
+    work.meshes, _ = module._build_meshes(work.problem_of(0), truth, start)
     return work
 
 
@@ -564,7 +564,7 @@ def failing_room(values, guess=(1.7, 1.0)):
 
 
 def measured_room(seed):
-    clean = module._clean(room(), TRUTH)[0][0]
+    clean = module._simulate_clean(room(), TRUTH)[0][0]
     return clean + 0.01 * np.random.default_rng(seed).standard_normal(clean.shape)
 
 

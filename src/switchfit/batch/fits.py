@@ -22,8 +22,8 @@ from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_path
-from switchfit.runtime.presentation import text_of
-from switchfit.runtime.progress import reporting
+from switchfit.runtime.presentation import format_text
+from switchfit.runtime.progress import show_progress
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +140,7 @@ class Fits:
         return interval(self.theta, half, np.isin(self.theta_names, self.log_scaled))
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)
 
 
 def check_long_run(client: Any, folder: Any, callback: Any) -> None:
@@ -183,12 +183,12 @@ def repeat(
         For a problem with a switch that is hidden in a function, with which no fit could be right.
     """
     _refuse_hidden_switches(problem)
-    progress, end = reporting(callback, title)
+    progress, end = show_progress(callback, title)
     try:
         runs, arrays = run_chunks(work, count, client=client, folder=folder, progress=progress)
     finally:
         end()
-    return _fields(problem, count, runs, arrays, time.perf_counter() - began)
+    return _collect_fields(problem, count, runs, arrays, time.perf_counter() - began)
 
 
 def _refuse_hidden_switches(problem: Problem) -> None:
@@ -202,7 +202,7 @@ def _refuse_hidden_switches(problem: Problem) -> None:
         refuse_hidden_switches(evaluator, theta, gradient)
 
 
-def _fields(
+def _collect_fields(
     problem: Problem, requested: int, runs: NDArray[np.intp], arrays: dict[str, NDArray[Any]], seconds: float
 ) -> dict[str, Any]:
     """The fields of `Fits` from what the chunks found, covariances scaled by the residual variance where needed."""
@@ -227,6 +227,6 @@ def _fields(
     }
 
 
-def sample_count(problem: Problem) -> int:
+def count_samples(problem: Problem) -> int:
     """Measured values that are not missing."""
     return sum(item.count for run in problem.experiments for item in run.data if isinstance(item, Measurements))

@@ -13,21 +13,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.batch.again import redo_unresolved
-from switchfit.batch.chunks import Arrays, fingerprint
-from switchfit.batch.fits import Fits, check_long_run, repeat, sample_count
+from switchfit.batch.chunks import Arrays, compute_fingerprint
+from switchfit.batch.fits import Fits, check_long_run, count_samples, repeat
 from switchfit.batch.program import Varying, chunk_size, fit_chunk, with_errors
-from switchfit.discretization.arguments import arguments_of, by_cell
+from switchfit.discretization.arguments import build_arguments, split_by_cell
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refined_mesh
-from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, checked_settings, estimate
+from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, check_settings, estimate
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.guards import on_guards_if_near
 from switchfit.fit.trajectory import compare
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_array, as_callable, as_count, as_instance, as_seed, shown
-from switchfit.runtime.presentation import figure_of
+from switchfit.problem.validation import as_array, as_callable, as_count, as_instance, as_seed, shorten
+from switchfit.runtime.presentation import draw_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -119,7 +119,7 @@ class MonteCarlo(Fits):
         >>> len(sf.monte_carlo(problem, 20, theta=[2.5, 0.4]).plot().axes)
         2
         """
-        return figure_of(self)
+        return draw_figure(self)
 
 
 def monte_carlo(
@@ -195,15 +195,15 @@ def monte_carlo(
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     runs, seed = as_count(runs, "runs", at_least=1), as_seed(seed)
-    tolerance, max_iterations = checked_settings(tolerance, max_iterations)
+    tolerance, max_iterations = check_settings(tolerance, max_iterations)
     check_long_run(client, folder, callback)
-    noise = _checked_noise(noise)
+    noise = _check_noise(noise)
     began = time.perf_counter()
     given = None if theta is None else problem.checked_theta(theta)
     begin = None if start is None else problem.checked_theta(start, "start")
     truth = estimate(problem).theta if given is None else on_guards_if_near(evaluator_of(problem), given)
     begin = truth if begin is None else begin
-    found, error = simulated(
+    found, error = fit_simulated(
         problem,
         runs,
         truth,
@@ -221,7 +221,7 @@ def monte_carlo(
     return MonteCarlo(**found, truth=truth, integration_error=error)
 
 
-def _checked_noise(noise: Noise) -> Noise:
+def _check_noise(noise: Noise) -> Noise:
     """Return the noise as an array, a function or None."""
     if noise is None:
         return None
@@ -230,7 +230,7 @@ def _checked_noise(noise: Noise) -> Noise:
     return as_array(noise, "noise", form="a number, one for each channel, or a function")
 
 
-def simulated(
+def fit_simulated(
     problem: Problem,
     runs: int,
     truth: FloatArray,
@@ -258,14 +258,14 @@ def simulated(
     began : float
         ``time.perf_counter()`` when the call began.
     """
-    work = _Work(problem, [], truth, begin, noise, seed, tolerance, max_iterations, _clean(problem, truth))
+    work = _Work(problem, [], truth, begin, noise, seed, tolerance, max_iterations, _simulate_clean(problem, truth))
     work.check_noise(runs)
-    work.meshes, error = _meshes(work.problem_of(work.sound), truth, begin)
+    work.meshes, error = _build_meshes(work.problem_of(work.sound), truth, begin)
     found = repeat(problem, work, runs, title, began, client=client, folder=folder, callback=callback)
     return found, error
 
 
-def _clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray | None]]:
+def _simulate_clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray | None]]:
     """What each of the data of each experiment would be without noise: (K, q) arrays; None for costs without data."""
     sampled, which = [], []
     for experiment in problem.experiments:
@@ -288,10 +288,10 @@ def _clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray | None]]
             raise ValueError("monte_carlo needs Measurements or a ReferenceSignal made from samples to simulate.")
         sampled.append(replace(experiment, data=items))
         which.append(kept)
-    simulated = replace(problem, experiments=sampled)
-    meshes = Evaluator(simulated, truth).meshes
+    without_noise = replace(problem, experiments=sampled)
+    meshes = Evaluator(without_noise, truth).meshes
     _, comparisons = compare(
-        simulated, truth, Evaluator(simulated, meshes=[mesh.divided() for mesh in meshes]).simulate(truth)
+        without_noise, truth, Evaluator(without_noise, meshes=[mesh.divided() for mesh in meshes]).simulate(truth)
     )
     clean: list[list[FloatArray | None]] = [[None] * len(experiment.data) for experiment in problem.experiments]
     for e, (kept, found) in enumerate(zip(which, comparisons, strict=True)):
@@ -300,7 +300,7 @@ def _clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray | None]]
     return clean
 
 
-def _meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tuple[list[Mesh], float]:
+def _build_meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tuple[list[Mesh], float]:
     """Meshes that resolve the trajectories at the start and at the truth, and the integration error at the truth.
 
     A mode that is active in another part of the horizon at the start would run over cells that are far too long for it,
@@ -386,7 +386,7 @@ class _Work:
         except ValueError as error:
             raise ValueError(f"noise of shape {np.shape(sigma)} does not fit data of shape {clean.shape}.") from error
         if not (np.isfinite(spread).all() and (spread >= 0).all()):
-            raise ValueError(f"noise must be zero or positive; got {shown(sigma)}.")
+            raise ValueError(f"noise must be zero or positive; got {shorten(sigma)}.")
         return clean + spread * rng.standard_normal(clean.shape)
 
     def problem_of(self, run: int) -> Problem:
@@ -395,7 +395,8 @@ class _Work:
         experiments = []
         for e, experiment in enumerate(self.problem.experiments):
             data = [
-                _with_values(item, noisy[e, k]) if (e, k) in noisy else item for k, item in enumerate(experiment.data)
+                _replace_values(item, noisy[e, k]) if (e, k) in noisy else item
+                for k, item in enumerate(experiment.data)
             ]
             experiments.append(replace(experiment, data=data))
         return replace(self.problem, experiments=experiments)
@@ -421,7 +422,7 @@ class _Work:
         found = with_errors(found, errors) if errors else found
         settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
         found = redo_unresolved(found, lambda k: self.problem_of(runs[k]), self.meshes, **settings)
-        return {**found._asdict(), "start": starts, "samples": np.full(len(runs), sample_count(self.problem))}
+        return {**found._asdict(), "start": starts, "samples": np.full(len(runs), count_samples(self.problem))}
 
     def _without_noise(self) -> dict[tuple[int, int], FloatArray]:
         """What stands for the values of a run that could not be drawn."""
@@ -429,7 +430,7 @@ class _Work:
 
     def _varying(self, values: dict[tuple[int, int], FloatArray]) -> Varying:
         """Noisy values (R, K, q) of all data as leaves of the arguments."""
-        arguments = tuple(arguments_of(self.problem, e, mesh) for e, mesh in enumerate(self.meshes))
+        arguments = tuple(build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes))
         leaves, tree = jax.tree.flatten(arguments)
         places = jax.tree.unflatten(tree, range(len(leaves)))
         changed: dict[int, Any] = {}
@@ -449,11 +450,11 @@ class _Work:
                         R = len(values[e, k])
                         if leaf not in changed:
                             changed[leaf] = np.repeat(np.asarray(leaves[leaf])[None], R, axis=0)
-                        changed[leaf][..., channel : channel + q] = _cells_of(item, values[e, k], self.meshes[e])
+                        changed[leaf][..., channel : channel + q] = _find_cells(item, values[e, k], self.meshes[e])
                     channel += q
         return Varying(tuple(changed), tuple(changed.values()))
 
-    def fingerprint(self) -> str:
+    def compute_fingerprint(self) -> str:
         unknowns = self.problem.unknowns
         data = [np.asarray(values) for items in self.clean for values in items if values is not None]
         drawn = list(self._noisy(self.sound).values())  # stands for the noise, which may be a function
@@ -461,10 +462,12 @@ class _Work:
         model = self.problem.digests
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
         nodes = [mesh.nodes for mesh in self.meshes]
-        return fingerprint("monte carlo", settings, model, self.truth, self.start, *bounds, *nodes, *data, *drawn)
+        return compute_fingerprint(
+            "monte carlo", settings, model, self.truth, self.start, *bounds, *nodes, *data, *drawn
+        )
 
 
-def _with_values(item: Any, values: FloatArray) -> Any:
+def _replace_values(item: Any, values: FloatArray) -> Any:
     """The same kind of data with other values; missing ones stay missing."""
     if isinstance(item, Measurements):
         return replace(item, values=np.where(np.isnan(item.values), np.nan, values))
@@ -479,7 +482,7 @@ def _with_values(item: Any, values: FloatArray) -> Any:
     )
 
 
-def _cells_of(item: ReferenceSignal, values: FloatArray, mesh: Mesh) -> FloatArray:
+def _find_cells(item: ReferenceSignal, values: FloatArray, mesh: Mesh) -> FloatArray:
     """Reference signals made from values (R, K, q), as cubics in the cells of a mesh: (R, G, 4, q).
 
     All R at once: interpolation and filter treat channels one by one, so that runs can be channels too.
@@ -489,5 +492,5 @@ def _cells_of(item: ReferenceSignal, values: FloatArray, mesh: Mesh) -> FloatArr
     table = np.where(np.isnan(measured), np.nan, values)
     channels = np.moveaxis(table, 0, 1).reshape(K, R * q)
     signal = ReferenceSignal.from_samples(times, channels, lowpass_hz=item.lowpass_hz).signal
-    cells = by_cell(signal, mesh)
+    cells = split_by_cell(signal, mesh)
     return np.moveaxis(cells.reshape(*cells.shape[:2], R, q), 2, 0)

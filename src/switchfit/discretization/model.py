@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from switchfit.discretization.arguments import Arguments, Samples
-from switchfit.discretization.tableaus import tableau_of
+from switchfit.discretization.tableaus import get_tableau
 from switchfit.problem.functions import Function
 from switchfit.problem.losses import influence, robust
 from switchfit.problem.structure import Structure
@@ -68,7 +68,7 @@ class Model:
     def __init__(self, structure: Structure, arguments: Arguments) -> None:
         self.structure = structure
         self.arguments = arguments
-        self.tableau = tableau_of(structure.solver)
+        self.tableau = get_tableau(structure.solver)
 
     def parameters(self, p: Array) -> Mapping[str, Array]:
         """The dict the user's functions get."""
@@ -112,7 +112,7 @@ class Model:
                 total = total + function(t, x, self.parameters(p))
             for residual, W in zip(self.reference_residuals(piece), self.arguments.weights, strict=True):
                 r = residual(t, x, p)
-                total = total + 0.5 * r @ weighted(W, r)
+                total = total + 0.5 * r @ apply_weights(W, r)
             return total
 
         return ell
@@ -209,6 +209,6 @@ class Model:
         return self.structure.initial_state(self.parameters(p))
 
 
-def weighted(W: Array, r: Array) -> Array:
+def apply_weights(W: Array, r: Array) -> Array:
     """``W r`` for a W given by its diagonal (q,) or in full (q, q); r is (q,) or (q, D)."""
     return W @ r if W.ndim == 2 else (W * r.T).T

@@ -32,17 +32,22 @@ from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.optimize import IterationRecord, Result, Status
 from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray
-from switchfit.problem.experiment import run_names
+from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_choice, as_count, as_instance, as_path, as_positive
-from switchfit.runtime.presentation import figure_of, text_of
+from switchfit.runtime.presentation import draw_figure, format_text
 from switchfit.runtime.progress import Progress
 from switchfit.uncertainty.certificate import Certificate, certify
 from switchfit.uncertainty.identification import Identifiability, identifiability
 from switchfit.uncertainty.prediction import Prediction, predict
 from switchfit.uncertainty.profiles import Profile, profile
 from switchfit.uncertainty.residuals import ResidualDiagnostics, diagnose
-from switchfit.uncertainty.sensitivity import Sensitivity, gauss_newton_of, sample_derivatives, sensitivity
+from switchfit.uncertainty.sensitivity import (
+    Sensitivity,
+    build_gauss_newton,
+    collect_sample_derivatives,
+    compute_sensitivity,
+)
 
 HESSIANS = get_args(HessianKind)
 
@@ -147,7 +152,7 @@ class Estimate(Fit):
         if self.saved_gauss_newton is not None or self.sigma_known is None or self.problem is None:
             return self.saved_gauss_newton
         if plain(self.problem) and self.has_room_for_sensitivities():
-            return gauss_newton_of(sample_derivatives(self.problem, self.sensitivities))
+            return build_gauss_newton(collect_sample_derivatives(self.problem, self.sensitivities))
         return self.evaluator_at_solution()(self.theta, matrix="gauss-newton").hessian
 
     def has_room_for_sensitivities(self) -> bool:
@@ -178,7 +183,7 @@ class Estimate(Fit):
         """States and outputs with their derivatives in theta, one an experiment, on the meshes of the fit."""
         evaluator = self.evaluator_at_solution()
         meshes = enumerate(evaluator.meshes)
-        return tuple(sensitivity(evaluator.problem, e, self.theta, mesh) for e, mesh in meshes)
+        return tuple(compute_sensitivity(evaluator.problem, e, self.theta, mesh) for e, mesh in meshes)
 
     def evaluator_at_solution(self) -> Evaluator:
         """The problem on the meshes of the fit.
@@ -233,7 +238,7 @@ class Estimate(Fit):
         return profile(self, name, level=level, callback=callback)
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)
 
     def plot(self, *, bands: bool = True, level: float = 0.95) -> Any:
         """Measured against fitted over time with the modes shaded, as a matplotlib Figure.
@@ -260,7 +265,7 @@ class Estimate(Fit):
         >>> len(figure.axes)
         2
         """
-        return figure_of(self, bands=bands, level=level)
+        return draw_figure(self, bands=bands, level=level)
 
     def predict(self, times: ArrayLike | None = None, *, experiment: int = 0) -> Prediction:
         """States and outputs at any times with their standard errors and bands, see `switchfit.predict`.
@@ -307,7 +312,7 @@ class Estimate(Fit):
         >>> len(fit.plot_residuals().axes)
         3
         """
-        return figure_of(self.residuals)
+        return draw_figure(self.residuals)
 
     @cached_property
     def identifiability(self) -> Identifiability:
@@ -470,13 +475,13 @@ def estimate(
     """
     as_instance(problem, "problem", Problem, "an sf.Problem; several are what sf.estimate_many takes")
     hessian = as_choice(hessian, "hessian", HESSIANS)
-    tolerance, max_iterations = checked_settings(tolerance, max_iterations)
+    tolerance, max_iterations = check_settings(tolerance, max_iterations)
     if callback is not None:
         as_callable(callback, "callback", "a function callback(record)", arguments=1)
     if problem.constraint_names and hessian != "exact":
         raise ValueError(f"with guards or terminal constraints hessian must be 'exact'; got {hessian!r}.")
     began = time.perf_counter()
-    theta, evaluator = _beginning(problem, start)
+    theta, evaluator = _prepare_start(problem, start)
     constraints = constraints_of(problem)
     held: tuple[tuple[str, float, float], ...] = ()
     history: list[IterationRecord] = []
@@ -504,7 +509,7 @@ def estimate(
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
         if result.status in STOPPED or attempt == REFINEMENTS or not excess > 1:
             break
-        evaluator = _refined(fine, problem.checked_theta(start), theta, excess)
+        evaluator = _refine(fine, problem.checked_theta(start), theta, excess)
     if excess > 1 and result.status.successful and not problem.constraint_names:
         refuse_jumps(evaluator, theta)  # the error of steps across a jump does not vanish with their length
     found = _estimate(
@@ -526,12 +531,12 @@ def estimate(
     return found
 
 
-def checked_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:
+def check_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:
     """Return the two settings of every fit, checked."""
     return as_positive(tolerance, "tolerance"), as_count(max_iterations, "max_iterations")
 
 
-def _beginning(problem: Problem, start: ArrayLike | None) -> tuple[FloatArray, Evaluator]:
+def _prepare_start(problem: Problem, start: ArrayLike | None) -> tuple[FloatArray, Evaluator]:
     """Where a fit begins (d,), guarded transitions on their guards if that is near, and the meshes for it."""
     theta = problem.checked_theta(start, "start")
     evaluator = evaluator_of(problem) if start is None else Evaluator(problem, theta)
@@ -541,7 +546,7 @@ def _beginning(problem: Problem, start: ArrayLike | None) -> tuple[FloatArray, E
     return theta, evaluator
 
 
-def _refined(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:
+def _refine(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:
     """The problem on finer meshes: cells cut in two, or, where that is not enough, refined at the start and at theta.
 
     A mode that has come to be active in another part of the horizon may find cells there that are far too long for it.
@@ -574,7 +579,7 @@ def _estimate(
         theta=result.theta,
         lower=unknowns.lower,
         upper=unknowns.upper,
-        run_names=tuple(run_names(problem.experiments)),
+        run_names=tuple(name_runs(problem.experiments)),
         transition_times=tuple(times),
         transition_places=unknowns.times,
         parameters={name: np.array(value) for name, value in parameters.items()},

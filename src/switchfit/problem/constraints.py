@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from switchfit.runtime.presentation import text_of
+from switchfit.runtime.presentation import format_text
 
 ConstraintKind = Literal["collapsed", "minimum duration", "lower bound", "upper bound"]
 
@@ -38,7 +38,7 @@ class Constraint:
     run: str = ""
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)
 
 
 @dataclass(frozen=True)
@@ -74,4 +74,4 @@ class ActiveConstraint(Constraint):
     multiplier: float = 0.0
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)

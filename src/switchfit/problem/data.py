@@ -24,7 +24,7 @@ from switchfit.problem.validation import (
     as_names,
     as_number,
     as_positive,
-    shown,
+    shorten,
 )
 
 FloatArray = NDArray[np.float64]
@@ -128,14 +128,14 @@ class Input:
         values: Any
         named = as_named_columns(self.values, "Input values", "(K,) samples")
         if named is None:
-            times, values = _samples(self.times, self.values, "Input", at_least=at_least)
+            times, values = _check_samples(self.times, self.values, "Input", at_least=at_least)
             _require_finite(values, "Input values")
         else:
             # Sorted: experiments whose inputs are named in different orders share one program.
             values = {}
             for name in sorted(named):
-                what = f"Input {shown(name)}"
-                times, values[name] = _samples(self.times, named[name], what, at_least=at_least, columns=False)
+                what = f"Input {shorten(name)}"
+                times, values[name] = _check_samples(self.times, named[name], what, at_least=at_least, columns=False)
                 _require_finite(values[name], f"{what} values")
         object.__setattr__(self, "kind", kind)
         object.__setattr__(self, "times", times)
@@ -174,13 +174,13 @@ class Input:
                 f"Input must be known over (t0, tf) = ({t0}, {tf}); its samples reach from {times[0]} to {times[-1]}."
             )
         if self.kind == "cubic":
-            return _spline(times, values)
+            return _fit_spline(times, values)
         if self.kind == "linear":
             with np.errstate(all="ignore"):
                 slopes = np.diff(values, axis=0) / np.diff(times)[:, None]
-            return _from_powers(times, [values[:-1], slopes])
+            return _build_polynomial(times, [values[:-1], slopes])
         end = max(tf, times[-1] + 1.0)
-        return _from_powers(np.append(times, end), [values])
+        return _build_polynomial(np.append(times, end), [values])
 
 
 @dataclass(frozen=True, eq=False)
@@ -373,8 +373,8 @@ class ReferenceSignal:
                 f"got {type(self.signal).__name__}."
             )
         _check_observe(self.observe)
-        object.__setattr__(self, "weights", _weight_matrix(self.weights, self.signal.channels))
-        object.__setattr__(self, "names", _channel_names(self.names, self.signal.channels))
+        object.__setattr__(self, "weights", _build_weight_matrix(self.weights, self.signal.channels))
+        object.__setattr__(self, "names", _check_channel_names(self.names, self.signal.channels))
 
     @classmethod
     def from_samples(
@@ -425,16 +425,16 @@ class ReferenceSignal:
         >>> reference.signal([1.0]).round(6)
         array([[0.841471]])
         """
-        times, values = _samples(times, values, "ReferenceSignal", at_least=4, breaks=True, missing=True)
+        times, values = _check_samples(times, values, "ReferenceSignal", at_least=4, breaks=True, missing=True)
         table = values.reshape(len(times), -1)
         if np.isinf(table).any():
             raise ValueError("ReferenceSignal values must be finite, or NaN where one is missing; got infinity.")
         cuts = np.flatnonzero(np.diff(times) == 0) + 1
         parts = zip(np.split(times, cuts), np.split(table, cuts), strict=True)
-        signal = _joined([_bridged_spline(part_times, part) for part_times, part in parts])
+        signal = _join_signals([_fit_bridged_spline(part_times, part) for part_times, part in parts])
         if lowpass_hz is not None:
             lowpass_hz = as_positive(lowpass_hz, "lowpass_hz")
-            signal = _lowpass(signal, lowpass_hz)
+            signal = _filter_lowpass(signal, lowpass_hz)
         return cls(signal, observe, weights, names, (times, table), lowpass_hz)  # type: ignore[arg-type]  # made a tuple there
 
 
@@ -511,7 +511,7 @@ class Measurements:
     delay: float | str = 0.0
 
     def __post_init__(self) -> None:
-        times, values = _samples(self.times, self.values, "Measurements", at_least=1, missing=True)
+        times, values = _check_samples(self.times, self.values, "Measurements", at_least=1, missing=True)
         values = values.reshape(len(times), -1)
         if np.isinf(values).any():
             raise ValueError("Measurements values must be finite, or NaN where a sample is missing; got infinity.")
@@ -520,8 +520,8 @@ class Measurements:
         _check_observe(self.observe)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values)
-        object.__setattr__(self, "sigma", _checked_sigma(self.sigma, values.shape))
-        object.__setattr__(self, "names", _channel_names(self.names, values.shape[1]))
+        object.__setattr__(self, "sigma", _check_sigma(self.sigma, values.shape))
+        object.__setattr__(self, "names", _check_channel_names(self.names, values.shape[1]))
         self._check_loss()
         if isinstance(self.delay, str):
             delay: float | str = as_name(self.delay, "delay")
@@ -596,7 +596,7 @@ class Measurements:
 Data = RunningCost | TerminalCost | TerminalConstraint | ReferenceSignal | Measurements
 
 
-def _samples(
+def _check_samples(
     times: ArrayLike,
     values: ArrayLike,
     what: str,
@@ -648,13 +648,13 @@ def _require_finite(values: FloatArray, what: str) -> None:
         raise ValueError(f"{what} must be finite; got {values[tuple(where)]} at index {where}.")
 
 
-def _checked_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | tuple[str | float, ...] | None:
+def _check_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | tuple[str | float, ...] | None:
     if sigma is None:
         return None
     if isinstance(sigma, str):
         return (as_name(sigma, "sigma"),) * shape[1]
     if isinstance(sigma, (list, tuple)) and any(isinstance(entry, str) for entry in sigma):
-        return _sigma_of_channels(sigma, shape[1])
+        return _check_sigma_of_channels(sigma, shape[1])
     sigma = as_array(sigma, "sigma")
     if sigma.shape not in ((), (shape[1],), shape):
         raise ValueError(
@@ -670,39 +670,39 @@ def _checked_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | tuple[str
 def _check_inverse_square(sigma: Any) -> None:
     with np.errstate(over="ignore"):
         if not np.all(np.isfinite(np.asarray(sigma, dtype=np.float64) ** -2.0)):
-            raise ValueError(f"sigma must not be so small that 1 / sigma**2 is infinite; got {shown(sigma)}.")
+            raise ValueError(f"sigma must not be so small that 1 / sigma**2 is infinite; got {shorten(sigma)}.")
 
 
-def _sigma_of_channels(sigma: Sequence[Any], channels: int) -> tuple[str | float, ...]:
+def _check_sigma_of_channels(sigma: Sequence[Any], channels: int) -> tuple[str | float, ...]:
     """Names of parameters and numbers, one a channel."""
     if len(sigma) != channels:
-        raise ValueError(f"sigma must have one entry for each of the {channels} channels; got {shown(sigma)}.")
+        raise ValueError(f"sigma must have one entry for each of the {channels} channels; got {shorten(sigma)}.")
     if any(entry is None for entry in sigma):
         raise ValueError(
             "sigma of one channel cannot be left out (None) where that of another is a parameter: name a parameter for "
-            f"it too; got {shown(sigma)}."
+            f"it too; got {shorten(sigma)}."
         )
     entries = [
         as_name(entry, "sigma of a channel") if isinstance(entry, str) else as_number(entry, "sigma of a channel")
         for entry in sigma
     ]
     if not all(np.isfinite(entry) and entry > 0 for entry in entries if not isinstance(entry, str)):
-        raise ValueError(f"sigma must be positive and finite; got {shown(sigma)}.")
+        raise ValueError(f"sigma must be positive and finite; got {shorten(sigma)}.")
     _check_inverse_square([entry for entry in entries if not isinstance(entry, str)])
     return tuple(entries)
 
 
-def _channel_names(names: Sequence[str] | None, channels: int) -> tuple[str, ...] | None:
+def _check_channel_names(names: Sequence[str] | None, channels: int) -> tuple[str, ...] | None:
     if names is None:
         return None
     given = (names,) if isinstance(names, str) else names
     checked = as_names(given, "names", "a sequence of strings, one for each channel")
     if len(checked) != channels:
-        raise ValueError(f"names must have one entry for each of the {channels} channels; got {shown(checked)}.")
+        raise ValueError(f"names must have one entry for each of the {channels} channels; got {shorten(checked)}.")
     return checked
 
 
-def _weight_matrix(weights: ArrayLike | None, channels: int) -> FloatArray:
+def _build_weight_matrix(weights: ArrayLike | None, channels: int) -> FloatArray:
     """W as a symmetric positive semi-definite ``(q, q)`` matrix."""
     if weights is None:
         return np.eye(channels)
@@ -711,14 +711,14 @@ def _weight_matrix(weights: ArrayLike | None, channels: int) -> FloatArray:
         raise ValueError(f"weights must have shape ({channels},) or ({channels}, {channels}); got {matrix.shape}.")
     matrix = np.diag(matrix) if matrix.ndim == 1 else matrix
     if not np.all(np.isfinite(matrix)) or not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
-        raise ValueError(f"weights must be finite and symmetric; got {shown(matrix.tolist())}.")
+        raise ValueError(f"weights must be finite and symmetric; got {shorten(matrix.tolist())}.")
     smallest = np.linalg.eigvalsh(matrix)[0]
     if smallest < -1e-12 * np.abs(matrix).max():
         raise ValueError(f"weights must be positive semi-definite; its smallest eigenvalue is {smallest:.3g}.")
     return matrix
 
 
-def _from_powers(knots: FloatArray, powers: list[FloatArray]) -> PiecewisePolynomial:
+def _build_polynomial(knots: FloatArray, powers: list[FloatArray]) -> PiecewisePolynomial:
     """Polynomial with the given coefficient arrays ``(K - 1, q)``, lowest power first, the rest zero."""
     coefficients = np.zeros((len(knots) - 1, 4, powers[0].shape[1]))
     for i, power in enumerate(powers):
@@ -726,7 +726,7 @@ def _from_powers(knots: FloatArray, powers: list[FloatArray]) -> PiecewisePolyno
     return PiecewisePolynomial(np.asarray(knots, dtype=np.float64), coefficients)
 
 
-def _spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
+def _fit_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
     """Not-a-knot cubic spline through ``values`` (K, q)."""
     from scipy.interpolate import CubicSpline  # here, since importing it takes longer than most fits
 
@@ -738,13 +738,13 @@ def _spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
     return PiecewisePolynomial(times, np.moveaxis(spline.c[::-1], 0, 1))
 
 
-def _joined(parts: list[PiecewisePolynomial]) -> PiecewisePolynomial:
+def _join_signals(parts: list[PiecewisePolynomial]) -> PiecewisePolynomial:
     """One signal out of several that follow each other."""
     knots = np.concatenate([part.knots[:-1] for part in parts[:-1]] + [parts[-1].knots])
     return PiecewisePolynomial(knots, np.concatenate([part.coefficients for part in parts]))
 
 
-def _bridged_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
+def _fit_bridged_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
     """Spline through the samples that are there, each channel's gaps bridged by its own spline first."""
     filled = values.copy()
     for channel in filled.T:
@@ -752,11 +752,11 @@ def _bridged_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomia
         if known.sum() < 4:
             raise ValueError(f"ReferenceSignal needs four samples or more in each channel and part; got {known.sum()}.")
         if not known.all():
-            channel[~known] = _spline(times[known], channel[known][:, None])(times[~known])[:, 0]
-    return _spline(times, filled)
+            channel[~known] = _fit_spline(times[known], channel[known][:, None])(times[~known])[:, 0]
+    return _fit_spline(times, filled)
 
 
-def _lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePolynomial:
+def _filter_lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePolynomial:
     """Butterworth filter of second order forward and backward, on a grid of ten points a period of the cut-off."""
     import scipy.signal  # here, since importing it takes longer than most fits
 
@@ -778,4 +778,4 @@ def _lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePolynomi
     sos = scipy.signal.butter(2, cutoff_hz, fs=rate, output="sos")
     padding = int(min(len(grid) - 1, np.ceil(3 * rate / cutoff_hz)))
     filtered = scipy.signal.sosfiltfilt(sos, signal(grid), axis=0, padtype="odd", padlen=padding)
-    return _spline(grid, filtered)
+    return _fit_spline(grid, filtered)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.validation import as_array, shown
+from switchfit.problem.validation import as_array, shorten
 
 FloatArray = NDArray[np.float64]
 
@@ -94,7 +94,7 @@ class LogNormal:
     def __post_init__(self) -> None:
         _check(self, "median", "log_sd")
         if not np.all(self.median > 0):
-            raise ValueError(f"LogNormal median must be positive; got {shown(self.median)}.")
+            raise ValueError(f"LogNormal median must be positive; got {shorten(self.median)}.")
 
 
 Prior = Normal | LogNormal
@@ -105,11 +105,11 @@ def _check(prior: Any, center: str, spread: str) -> None:
     for name in (center, spread):
         value = as_array(getattr(prior, name), f"{kind} {name}")
         if not np.all(np.isfinite(value)):
-            raise ValueError(f"{kind} {name} must be finite; got {shown(value)}.")
+            raise ValueError(f"{kind} {name} must be finite; got {shorten(value)}.")
         object.__setattr__(prior, name, value)
     deviation = getattr(prior, spread)
     if not np.all(deviation > 0):
-        raise ValueError(f"{kind} {spread} must be positive; got {shown(deviation)}.")
+        raise ValueError(f"{kind} {spread} must be positive; got {shorten(deviation)}.")
     with np.errstate(over="ignore"):
         if not np.all(np.isfinite(deviation**-2.0)):
             raise ValueError(f"{kind} {spread} must not be so small that 1 / {spread}**2 is infinite; got {deviation}.")

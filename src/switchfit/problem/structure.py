@@ -224,7 +224,7 @@ class _Tracer:
         return traced
 
 
-def structure_of(
+def trace_structure(
     system: HybridSystem, experiment: Experiment, functions: Functions, solver: str, transitions: int | None = None
 ) -> Structure:
     """Trace and check the functions of one experiment, and return its structure.
@@ -246,7 +246,7 @@ def structure_of(
         raise ValueError(f"initial_state(p) must return an array of shape (n,); got shape {x0.shape}.")
     n = len(initial) if x0 is None else x0.shape[0]
     unknown = () if callable(initial) else tuple(k for k, x in enumerate(initial) if not getattr(x, "fixed", True))
-    items = partial(of_kind, experiment.data)
+    items = partial(select_kind, experiment.data)
     at: tuple[Shape | None, ...] = ((), (n,), None)
     inputs = None if experiment.inputs is None else experiment.inputs.shape
     input_names = () if experiment.inputs is None else experiment.inputs.names
@@ -284,7 +284,7 @@ def structure_of(
             )
     reset_maps, reset_library = at_transitions(system.reset_maps, (n,), "reset map", "R(t, x, p)")
     guards, guard_library = at_transitions(system.guards, (), "guard", "g(t, x, p)")
-    costs = _transition_costs(items(TransitionCost), names)
+    costs = _choose_transition_costs(items(TransitionCost), names)
     transition_costs, transition_cost_library = at_transitions(costs, (), "TransitionCost", "mu(t, x, p)")
     structure = Structure(
         mode_names=names,
@@ -319,7 +319,9 @@ def structure_of(
     return replace(structure, parameters=parameters)
 
 
-def _transition_costs(items: list[TransitionCost], modes: tuple[str, ...]) -> dict[tuple[str, str], Callable[..., Any]]:
+def _choose_transition_costs(
+    items: list[TransitionCost], modes: tuple[str, ...]
+) -> dict[tuple[str, str], Callable[..., Any]]:
     """The cost of each transition that may happen and has one."""
     found = {}
     for before, after in product(modes, modes):
@@ -334,11 +336,11 @@ def _transition_costs(items: list[TransitionCost], modes: tuple[str, ...]) -> di
     return found
 
 
-def initial_values(initial: Any) -> FloatArray:
+def read_initial_values(initial: Any) -> FloatArray:
     """An initial state that is no function, as numbers (n,): where it is unknown, its guess."""
     return np.array([x.value if isinstance(x, Parameter) else x for x in initial], dtype=np.float64)
 
 
-def of_kind(data: tuple[Any, ...], kind: type) -> list[Any]:
+def select_kind(data: tuple[Any, ...], kind: type) -> list[Any]:
     """The items of an experiment's data that are of a kind, in order."""
     return [item for item in data if isinstance(item, kind)]

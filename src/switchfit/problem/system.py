@@ -11,7 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.problem.parameter import Parameter
-from switchfit.problem.validation import as_array, as_callable, as_name, as_names, as_sequence, as_text, listed, shown
+from switchfit.problem.validation import (
+    as_array,
+    as_callable,
+    as_name,
+    as_names,
+    as_sequence,
+    as_text,
+    join_names,
+    shorten,
+)
 
 VectorField = Callable[..., Any]
 """``f(t, x, p) -> (n,)``, or ``f(t, x, p, u) -> (n,)`` in an experiment with inputs."""
@@ -90,13 +99,13 @@ class HybridSystem:
 
     def __post_init__(self) -> None:
         if not isinstance(self.modes, Mapping) or len(self.modes) == 0:
-            raise ValueError(f"modes must be a non-empty dict of name -> vector field; got {shown(self.modes)}.")
+            raise ValueError(f"modes must be a non-empty dict of name -> vector field; got {shorten(self.modes)}.")
         for name, mode in self.modes.items():
             as_name(name, "mode names", "strings")
-            as_callable(mode, f"mode {shown(name)}", "a function f(t, x, p)")
+            as_callable(mode, f"mode {shorten(name)}", "a function f(t, x, p)")
         _set(self, "modes", MappingProxyType(dict(self.modes)))
         for name in ("reset_maps", "guards"):
-            _set(self, name, MappingProxyType(_checked_pairs(getattr(self, name), name, self.modes)))
+            _set(self, name, MappingProxyType(_check_pairs(getattr(self, name), name, self.modes)))
         if not callable(self.initial_state):
             _set(self, "initial_state", as_state(self.initial_state, "initial_state"))
         form = "a sequence of strings, one for each state"
@@ -125,7 +134,7 @@ class HybridSystem:
             labels = getattr(self, label)
             if labels is not None and len(labels) != n:
                 raise ValueError(
-                    f"{label} must have one entry for each of the {n} states; got {len(labels)}: {shown(labels)}."
+                    f"{label} must have one entry for each of the {n} states; got {len(labels)}: {shorten(labels)}."
                 )
 
     def reset_map(self, before: str, after: str) -> ResetMap | None:
@@ -182,7 +191,7 @@ def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ..
     if state.ndim != 1 or state.size == 0:
         raise ValueError(f"{name} must have shape (n,), one entry for each state; got shape {state.shape}.")
     if not np.all(np.isfinite(state)):
-        raise ValueError(f"{name} must be finite; got {shown(state)}.")
+        raise ValueError(f"{name} must be finite; got {shorten(state)}.")
     state.flags.writeable = False
     return state
 
@@ -194,7 +203,7 @@ def _as_entry(entry: Any, name: str) -> Parameter:
     else:
         array = as_array(entry, f"each entry of {name}", form="a number or an sf.Parameter")
         if not np.all(np.isfinite(array)) or array.size == 0:
-            raise ValueError(f"{name} must have a number or an sf.Parameter for each state; got {shown(entry)}.")
+            raise ValueError(f"{name} must have a number or an sf.Parameter for each state; got {shorten(entry)}.")
         parameter = Parameter(array, fixed=True)
     if parameter.shape != ():
         raise ValueError(
@@ -204,21 +213,21 @@ def _as_entry(entry: Any, name: str) -> Parameter:
     return parameter
 
 
-def _checked_pairs(
+def _check_pairs(
     given: Mapping[tuple[str, str], Callable[..., Any]] | None, name: str, modes: Mapping[str, VectorField]
 ) -> dict[tuple[str, str], Callable[..., Any]]:
     """Functions of transitions, by the modes before and after."""
     if not isinstance(given, Mapping | None):
-        raise TypeError(f"{name} must be a dict of (mode before, mode after) -> function; got {shown(given)}.")
+        raise TypeError(f"{name} must be a dict of (mode before, mode after) -> function; got {shorten(given)}.")
     checked = {} if given is None else dict(given)
     for key, function in checked.items():
         if not (isinstance(key, tuple) and len(key) == 2):
-            raise ValueError(f"{name} must have keys (mode before, mode after); got {shown(key)}.")
+            raise ValueError(f"{name} must have keys (mode before, mode after); got {shorten(key)}.")
         for mode in key:
             if mode not in modes:
-                raise ValueError(f"{name} names the unknown mode {shown(mode)}; the modes are {listed(modes)}.")
+                raise ValueError(f"{name} names the unknown mode {shorten(mode)}; the modes are {join_names(modes)}.")
         what, form = ("reset map", "R(t, x, p)") if name == "reset_maps" else ("guard", "g(t, x, p)")
-        as_callable(function, f"{what} {shown(key)}", f"a function {form}")
+        as_callable(function, f"{what} {shorten(key)}", f"a function {form}")
     return checked
 
 

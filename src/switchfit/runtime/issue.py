@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from switchfit.runtime.presentation import text_of
+from switchfit.runtime.presentation import format_text
 
 
 @dataclass(frozen=True)
@@ -38,4 +38,4 @@ class Issue:
     figures: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)

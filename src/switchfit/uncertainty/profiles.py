@@ -38,9 +38,9 @@ from switchfit.fit.solution import constraints_of, minimized
 from switchfit.optimize import Status, solve_qp
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_callable, as_level, as_name, listed, shown
-from switchfit.runtime.presentation import figure_of, text_of
-from switchfit.runtime.progress import Progress, reporting
+from switchfit.problem.validation import as_callable, as_level, as_name, join_names, shorten
+from switchfit.runtime.presentation import draw_figure, format_text
+from switchfit.runtime.progress import Progress, show_progress
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -589,7 +589,7 @@ class Profile:
         return next((r for r in regions if not (r[0] > self.value or r[1] < self.value)), regions[0])
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)
 
     def plot(self) -> Figure:
         """The likelihood ratio with its thresholds, and the quadratic approximation beside it.
@@ -608,7 +608,7 @@ class Profile:
         >>> len(figure.axes) > 0
         True
         """
-        return figure_of(self)
+        return draw_figure(self)
 
 
 def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress | None = None) -> Profile:
@@ -659,7 +659,7 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     if not isinstance(fit, Fit):
         raise TypeError(f"profile needs the result of sf.estimate; got {type(fit).__name__}. Fit the problem first.")
     if as_name(name, "name") not in fit.theta_names:
-        raise ValueError(f"there is no unknown {shown(name)}; there are {listed(fit.theta_names)}.")
+        raise ValueError(f"there is no unknown {shorten(name)}; there are {join_names(fit.theta_names)}.")
     level = as_level(level)
     if callback is not None:
         as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
@@ -668,18 +668,18 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     threshold = fit.quantile(level)
     index = fit.theta_names.index(name)
     times = _sample_times(evaluator, index)
-    report, end = reporting(callback, f"Profile of {name}")
+    report, end = show_progress(callback, f"Profile of {name}")
     trace = Trace(fit, evaluator, index)
     try:
         for _ in range(2):
-            trace.told = partial(_told, report, trace)
+            trace.told = partial(_wrap_callback, report, trace)
             for side in (-1, 1):
                 trace.march(side, threshold)
             trace.add_kinks(times, threshold)
             if trace.integration_error(threshold) <= LARGE_ERROR * threshold**2:
                 break
             trace.coarse = True
-            finer = _finer(evaluator.problem, trace, threshold) if trace.evaluator is evaluator else None
+            finer = _refine_mesh(evaluator.problem, trace, threshold) if trace.evaluator is evaluator else None
             if finer is None:
                 break
             trace = Trace(fit, finer, index)
@@ -692,7 +692,7 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     return Profile(name, fit.theta_units[index], trace.centre.value, error, level, fit, times, trace)
 
 
-def _finer(problem: Problem, trace: Trace, threshold: float) -> Evaluator | None:
+def _refine_mesh(problem: Problem, trace: Trace, threshold: float) -> Evaluator | None:
     """The problem on meshes that resolve both ends of a profile as well; None where these cannot be integrated."""
     thetas = [trace.centre.theta, *(q.theta for q in trace.edges(threshold))]
     try:
@@ -702,7 +702,7 @@ def _finer(problem: Problem, trace: Trace, threshold: float) -> Evaluator | None
     return Evaluator(problem, meshes=meshes)
 
 
-def _told(report: Progress, trace: Trace) -> bool:
+def _wrap_callback(report: Progress, trace: Trace) -> bool:
     """Tell how many fits are done, of as many as a profile usually takes; whether to stop."""
     return bool(report(trace.fits, max(2 * (STEPS + LOOK_AHEAD + 2), trace.fits)))
 

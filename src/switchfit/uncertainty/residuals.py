@@ -29,7 +29,7 @@ from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import text_of
+from switchfit.runtime.presentation import format_text
 
 UNLIKELY = 1e-3
 """Probability below which a test counts as failed: with ten channels one false alarm in fifty fits."""
@@ -181,7 +181,7 @@ class ResidualDiagnostics:
         return found
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)
 
 
 def diagnose(fit: Fit) -> ResidualDiagnostics:
@@ -199,12 +199,12 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
                 continue
             for k, name in enumerate(comparison.names):
                 if np.isfinite(comparison.measured[:, k]).sum() > 0:
-                    channels.append(of_channel(comparison, k, e, fit.trajectories[e].time_unit))
+                    channels.append(diagnose_channel(comparison, k, e, fit.trajectories[e].time_unit))
                     names.append(name if single else f"{fit.run_names[e]} {name}")
     return ResidualDiagnostics(tuple(channels), tuple(names))
 
 
-def of_channel(comparison: Comparison, k: int, experiment: int = 0, time_unit: str = "s") -> ChannelResiduals:
+def diagnose_channel(comparison: Comparison, k: int, experiment: int = 0, time_unit: str = "s") -> ChannelResiduals:
     """Test one channel of a comparison.
 
     Parameters
@@ -224,7 +224,7 @@ def of_channel(comparison: Comparison, k: int, experiment: int = 0, time_unit: s
         z = np.nan_to_num(raw[there] / size)
     n = len(z)
     lags = min(10, n // 5)
-    r = autocorrelation(z, lags)
+    r = compute_autocorrelation(z, lags)
     spread = z - z.mean()
     variance = float(np.mean(spread**2))
     skewness, kurtosis = 0.0, 3.0
@@ -258,7 +258,7 @@ def of_channel(comparison: Comparison, k: int, experiment: int = 0, time_unit: s
     )
 
 
-def autocorrelation(z: FloatArray, lags: int) -> FloatArray:
+def compute_autocorrelation(z: FloatArray, lags: int) -> FloatArray:
     """Correlation of z (n,) with itself at lags 1 .. lags, about zero, where residuals should be: (lags,)."""
     square = float(z @ z)
     if square == 0:
