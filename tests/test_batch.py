@@ -182,7 +182,7 @@ def test_several_experiments_each_with_its_own_noise():
 
 def test_lockstep_is_the_same_as_one_after_the_other():
     work = work_of(room(), TRUTH, np.array([1.7, 1.0]))
-    values = np.stack([work._noisy(k)[0, 0] for k in range(12)])
+    values = np.stack([work._draw_run(k)[0, 0] for k in range(12)])
     varying, starts = work._varying({(0, 0): values}), np.repeat(work.start[None], 12, axis=0)
     settings = {"tolerance": 1e-7, "max_iterations": 200}
     one, other = (fit_chunk(work.problem, work.meshes, varying, starts, **settings, lockstep=m) for m in (False, True))

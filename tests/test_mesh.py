@@ -141,7 +141,7 @@ def test_mesh_of_times_in_any_order(times):
     assert len(mesh.nodes) == pad_length(mesh.cells) + 1
     assert np.all(mesh.nodes[mesh.cells :] == mesh.times[-1])
     np.testing.assert_array_equal(mesh.cell_ending_at(mesh.times), np.arange(-1, mesh.cells))
-    third = mesh.divided(3)
+    third = mesh.divide(3)
     assert third.cells == 3 * mesh.cells
     np.testing.assert_array_equal(third.times[::3], mesh.times)
     np.testing.assert_allclose(np.diff(third.times), np.repeat(np.diff(mesh.times) / 3, 3), rtol=1e-10)
@@ -368,7 +368,7 @@ def test_a_mesh_for_several_thetas_is_as_dense_as_the_densest():
 @pytest.mark.parametrize("parts", [2, 3, 5])
 def test_equal_parts_of_a_cell_as_short_as_rounding_are_one(parts):
     for nodes in (np.array([1.0, np.nextafter(1.0, 2.0), 2.0]), np.array([0.0, 0.3, 1.0])):
-        mesh = Mesh.from_times(nodes).divided(parts)
+        mesh = Mesh.from_times(nodes).divide(parts)
         ends = [a + (b - a) * k / parts for a, b in pairwise(nodes.tolist()) for k in range(parts)]
         np.testing.assert_array_equal(mesh.times, sorted({*ends, nodes[-1]}))
         assert mesh.cells == len(mesh.times) - 1

@@ -426,5 +426,5 @@ def test_a_profile_of_the_sparse_vehicle_is_the_lowest_cost_there_is():
     for point in inside[::4]:
         for tau_1 in (4.6, 5.5, 6.4):
             for mu in (0.4, 0.7, 1.1):
-                other = found.trace._fitted(point.value, np.array([tau_1, point.value, mu]))
+                other = found.trace._fit(point.value, np.array([tau_1, point.value, mu]))
                 assert other is None or other.cost >= point.cost - 1e-6

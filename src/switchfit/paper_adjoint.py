@@ -259,7 +259,7 @@ def evaluate_transition(model: Model, path: Path, i: int, tau_i: Array, p: Array
     f_before, f_after, ell = model.field(modes[i], piece), model.field(modes[i + 1], piece), model.density(piece)
     R = model.reset(i) if i in model.structure.resets else lambda t, x, p: x
 
-    def carried(t: Array, x: Array, p: Array) -> Array:
+    def carry_over(t: Array, x: Array, p: Array) -> Array:
         """F_{i-1} = D_t R + D_x R f_{i-1}, which is f_{i-1} without a reset map."""
         direction = (jnp.ones(()), f_before(t, x, p), jnp.zeros_like(p))
         return jax.jvp(R, (t, x, p), direction)[1]
@@ -269,8 +269,8 @@ def evaluate_transition(model: Model, path: Path, i: int, tau_i: Array, p: Array
 
     x_minus, x_plus = path.before_transition(i), path.before[opening, 0]
     minus, plus = (tau_i, x_minus, p), (tau_i, x_plus, p)
-    f_im1, f_i = carried(*minus), f_after(*plus)
-    D2f_im1, D1f_im1, Dpf_im1 = jax.jacfwd(carried, argnums=(0, 1, 2))(*minus)
+    f_im1, f_i = carry_over(*minus), f_after(*plus)
+    D2f_im1, D1f_im1, Dpf_im1 = jax.jacfwd(carry_over, argnums=(0, 1, 2))(*minus)
     D2f_i, D1f_i, Dpf_i = jax.jacfwd(f_after, argnums=(0, 1, 2))(*plus)
     D2Lambda, D1Lambda, DpLambda = jax.grad(Lambda, argnums=(0, 1, 2))(*minus)
     X = f_im1 - f_i  # (8)

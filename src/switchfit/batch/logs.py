@@ -113,15 +113,15 @@ class _Work:
                 Exception
             ) as error:  # where its guess cannot be integrated, say: listed, as it must not end the others
                 errors[k] = error
-        parts = [self._group([self.problems[k] for k in members]) for members in groups.values()]
+        parts = [self._fit_group([self.problems[k] for k in members]) for members in groups.values()]
         order = [k for members in groups.values() for k in members]
         if errors:
             order += errors
-            parts.append(self._failed(errors))
+            parts.append(self._list_failed(errors))
         place = np.argsort(order)
         return {name: np.concatenate([part[name] for part in parts])[place] for name in parts[0]}
 
-    def _group(self, problems: list[Problem]) -> Arrays:
+    def _fit_group(self, problems: list[Problem]) -> Arrays:
         leaves = [jax.tree.leaves(tuple(evaluator_of(problem).arguments)) for problem in problems]
         stacked = tuple(np.stack([np.asarray(leaf) for leaf in column]) for column in zip(*leaves, strict=True))
         varying = Varying(tuple(range(len(stacked))), stacked)
@@ -139,20 +139,20 @@ class _Work:
         for k, problem in enumerate(problems):
             if arrays["status"][k] != Status.ERROR.name:
                 try:
-                    self._check(problem, k, arrays)
+                    self._redo_unresolved(problem, k, arrays)
                 except Exception as error:
                     arrays["status"][k], arrays["message"][k] = Status.ERROR.name, error_message(error)
         arrays["message"], arrays["status"] = arrays["message"].astype(str), arrays["status"].astype(str)
         return {**arrays, "start": starts, "samples": np.array([count_samples(problem) for problem in problems])}
 
-    def _failed(self, errors: dict[int, Exception]) -> Arrays:
+    def _list_failed(self, errors: dict[int, Exception]) -> Arrays:
         """Arrays for problems that could not be begun."""
         starts = np.array([self.problems[k].initial_theta for k in errors])
         found = failed_chunk(starts, dict(enumerate(errors.values())))
         samples = np.array([count_samples(self.problems[k]) for k in errors])
         return {**found._asdict(), "start": starts, "samples": samples}
 
-    def _check(self, problem: Problem, k: int, arrays: Arrays) -> None:
+    def _redo_unresolved(self, problem: Problem, k: int, arrays: Arrays) -> None:
         """Do a fit again by `estimate` if its integration error is too large."""
         theta, cost = arrays["theta"][k], float(arrays["cost"][k])
         if not is_resolved(problem, evaluator_of(problem).meshes, theta, cost):

@@ -384,14 +384,14 @@ class _Runs:
         found = fit_chunk(
             self.problem,
             self.meshes,
-            self._varying(weights),
+            self._stack_values(weights),
             starts,
             tolerance=self.tolerance,
             max_iterations=self.max_iterations,
         )
         return {**found._asdict(), "start": starts, "samples": np.full(len(runs), count_samples(self.problem))}
 
-    def _varying(self, weights: FloatArray) -> Varying:
+    def _stack_values(self, weights: FloatArray) -> Varying:
         """The weights of all samples (R, K, q), times those of their experiments."""
         arguments = tuple(Evaluator(self.problem, meshes=self.meshes).arguments)
         leaves, tree = jax.tree.flatten(arguments)

@@ -199,8 +199,8 @@ def monte_carlo(
     check_long_run(client, folder, callback)
     noise = _check_noise(noise)
     began = time.perf_counter()
-    given = None if theta is None else problem.checked_theta(theta)
-    begin = None if start is None else problem.checked_theta(start, "start")
+    given = None if theta is None else problem.check_theta(theta)
+    begin = None if start is None else problem.check_theta(start, "start")
     truth = estimate(problem).theta if given is None else on_guards_if_near(evaluator_of(problem), given)
     begin = truth if begin is None else begin
     found, error = fit_simulated(
@@ -291,7 +291,7 @@ def _simulate_clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray
     without_noise = replace(problem, experiments=sampled)
     meshes = Evaluator(without_noise, truth).meshes
     _, comparisons = compare(
-        without_noise, truth, Evaluator(without_noise, meshes=[mesh.divided() for mesh in meshes]).simulate(truth)
+        without_noise, truth, Evaluator(without_noise, meshes=[mesh.divide() for mesh in meshes]).simulate(truth)
     )
     clean: list[list[FloatArray | None]] = [[None] * len(experiment.data) for experiment in problem.experiments]
     for e, (kept, found) in enumerate(zip(which, comparisons, strict=True)):
@@ -345,7 +345,7 @@ class _Work:
         errors = []
         for run in range(min(count, SOUND_AMONG)):
             try:
-                self._noisy(run)
+                self._draw_run(run)
             except Exception as error:  # of this run alone, perhaps
                 errors.append(error)
             else:
@@ -353,7 +353,7 @@ class _Work:
                 return
         raise errors[0]
 
-    def _noisy(self, run: int) -> dict[tuple[int, int], FloatArray]:
+    def _draw_run(self, run: int) -> dict[tuple[int, int], FloatArray]:
         """Values of the k-th data of experiment e, in one run."""
         rng = np.random.default_rng([self.seed, run])
         drawn = {}
@@ -361,7 +361,7 @@ class _Work:
             for k, clean in enumerate(items):
                 if clean is None:
                     continue
-                values = self._drawn(rng, clean, self.problem.experiments[e].data[k], e)
+                values = self._draw_values(rng, clean, self.problem.experiments[e].data[k], e)
                 if values.shape != clean.shape or not np.isfinite(values).all():
                     raise ValueError(
                         f"noise must give finite values of shape {clean.shape}; got shape {values.shape}"
@@ -370,12 +370,12 @@ class _Work:
                 drawn[e, k] = values
         return drawn
 
-    def _drawn(self, rng: np.random.Generator, clean: FloatArray, item: Any, e: int) -> FloatArray:
+    def _draw_values(self, rng: np.random.Generator, clean: FloatArray, item: Any, e: int) -> FloatArray:
         if callable(self.noise):
             return as_array(self.noise(rng, clean.copy(), item), "what noise(rng, clean, item) returns")
         sigma = self.noise
         if sigma is None:
-            sigma = item.noise(self.problem.named(self.truth, e)) if isinstance(item, Measurements) else None
+            sigma = item.noise(self.problem.name_parameters(self.truth, e)) if isinstance(item, Measurements) else None
             if sigma is None:
                 raise ValueError(
                     "noise must be given, since the data have no sigma from which to draw: a standard deviation, one "
@@ -391,7 +391,7 @@ class _Work:
 
     def problem_of(self, run: int) -> Problem:
         """The problem with the data of one run."""
-        noisy = self._noisy(run)
+        noisy = self._draw_run(run)
         experiments = []
         for e, experiment in enumerate(self.problem.experiments):
             data = [
@@ -405,11 +405,11 @@ class _Work:
         noisy, errors = [], {}
         for place, run in enumerate(runs):
             try:
-                noisy.append(self._noisy(run))
+                noisy.append(self._draw_run(run))
             except Exception as error:  # listed: it must not end the other runs
                 noisy.append(self._without_noise())
                 errors[place] = error
-        varying = self._varying({key: np.stack([values[key] for values in noisy]) for key in noisy[0]})
+        varying = self._stack_values({key: np.stack([values[key] for values in noisy]) for key in noisy[0]})
         starts = np.repeat(self.start[None], len(runs), axis=0)
         found = fit_chunk(
             self.problem,
@@ -428,7 +428,7 @@ class _Work:
         """What stands for the values of a run that could not be drawn."""
         return {(e, k): v for e, items in enumerate(self.clean) for k, v in enumerate(items) if v is not None}
 
-    def _varying(self, values: dict[tuple[int, int], FloatArray]) -> Varying:
+    def _stack_values(self, values: dict[tuple[int, int], FloatArray]) -> Varying:
         """Noisy values (R, K, q) of all data as leaves of the arguments."""
         arguments = tuple(build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes))
         leaves, tree = jax.tree.flatten(arguments)
@@ -457,7 +457,7 @@ class _Work:
     def compute_fingerprint(self) -> str:
         unknowns = self.problem.unknowns
         data = [np.asarray(values) for items in self.clean for values in items if values is not None]
-        drawn = list(self._noisy(self.sound).values())  # stands for the noise, which may be a function
+        drawn = list(self._draw_run(self.sound).values())  # stands for the noise, which may be a function
         settings = self.seed, self.tolerance, self.max_iterations, unknowns.names, self.problem.solver
         model = self.problem.digests
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors

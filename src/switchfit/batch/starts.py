@@ -225,7 +225,7 @@ def _check_starts(problem: Problem, starts: Any) -> FloatArray:
         raise ValueError(f"starts must be a number, or an array of shape (S, {d}); got shape {points.shape}.")
     constraints = constraints_of(problem)
     for k, point in enumerate(points):
-        slack = constraints.slack(problem.checked_theta(point, f"starts[{k}]"))
+        slack = constraints.slack(problem.check_theta(point, f"starts[{k}]"))
         if np.any(slack < -1e-12 * (1 + np.max(np.abs(point)))):
             raise ValueError(f"start {k} violates: {constraints.names[int(np.argmin(slack))]}.")
     return points

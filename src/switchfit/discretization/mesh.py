@@ -47,10 +47,10 @@ class Mesh:
     @classmethod
     def from_times(cls, times: FloatArray) -> Mesh:
         """The mesh whose nodes are `times`, in any order and with repetitions."""
-        return cls.padded(np.unique(times))
+        return cls.pad(np.unique(times))
 
     @classmethod
-    def padded(cls, nodes: FloatArray) -> Mesh:
+    def pad(cls, nodes: FloatArray) -> Mesh:
         """The mesh with these nodes, which increase strictly, and padding of a usual length."""
         cells = len(nodes) - 1
         padding = np.full(pad_length(cells) - cells, nodes[-1])
@@ -61,17 +61,17 @@ class Mesh:
         """The nodes without the padding."""
         return self.nodes[: self.cells + 1]
 
-    def padded_to(self, cells: int) -> Mesh:
+    def pad_to(self, cells: int) -> Mesh:
         """The mesh with its padding made so long that it has the given number of cells."""
         return Mesh(np.append(self.times, np.full(cells - self.cells, self.times[-1])), self.cells)
 
-    def divided(self, parts: int = 2) -> Mesh:
+    def divide(self, parts: int = 2) -> Mesh:
         """The mesh with every cell cut into equal parts."""
         nodes = self.times
         inside = nodes[:-1, None] + np.diff(nodes)[:, None] * np.arange(parts) / parts
         divided = np.append(inside, nodes[-1])
         # Equal parts of a cell as short as rounding may coincide.
-        return Mesh.padded(divided) if (divided[1:] > divided[:-1]).all() else Mesh.from_times(divided)
+        return Mesh.pad(divided) if (divided[1:] > divided[:-1]).all() else Mesh.from_times(divided)
 
     def cell_ending_at(self, times: FloatArray) -> NDArray[np.intp]:
         """Index of the cell that ends at each of `times`, which must be nodes; -1 for t0."""
@@ -86,7 +86,7 @@ def pad_to_common_lengths(problem: Problem, meshes: Sequence[Mesh]) -> list[Mesh
     for group in problem.alike:
         lengths = choose_common_lengths([meshes[e].cells for e in group])
         for e, length in zip(group, lengths, strict=True):
-            padded[e] = meshes[e] if len(group) == 1 else meshes[e].padded_to(length)
+            padded[e] = meshes[e] if len(group) == 1 else meshes[e].pad_to(length)
     return padded
 
 

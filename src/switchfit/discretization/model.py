@@ -126,19 +126,19 @@ class Model:
         ]
 
     def _reference_residual(self, k: int, channels: slice, piece: Piece, t: Array, x: Array, p: Array) -> Array:
-        return self.observed(self.structure.references[k][0], t, x, p) - piece(t)[channels]
+        return self.observe(self.structure.references[k][0], t, x, p) - piece(t)[channels]
 
-    def observed(self, observe: Function | None, t: Array, x: Array, p: Array) -> Array:
+    def observe(self, observe: Function | None, t: Array, x: Array, p: Array) -> Array:
         """What a sensor sees: (q,)."""
         return x if observe is None else observe(t, x, self.parameters(p))
 
     def sample_residual(self, k: int, sample: Samples, x: Array, p: Array) -> Array:
         """``h - y`` of one sample of the k-th Measurements, 0 where it is missing: (q,)."""
         sensor = self.structure.measurements[k]
-        h = self.observed(sensor.observe, sample.time, x, p)
+        h = self.observe(sensor.observe, sample.time, x, p)
         return jnp.where(sample.weight > 0, h - sample.value, 0.0)
 
-    def seen_at(self, k: int, sample: Samples, p: Array) -> Samples:
+    def correct_delay(self, k: int, sample: Samples, p: Array) -> Samples:
         """A late sample with the time of the state that it is of, ``t - delay``, in place of its own."""
         delay = self.structure.measurements[k].delay
         return sample if delay is None else sample._replace(time=sample.time - self.parameters(p)[delay])

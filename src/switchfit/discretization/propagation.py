@@ -169,7 +169,7 @@ def find_late_rows(model: Model, path: Path, k: int, p: Array) -> tuple[Array, A
     """
     layout = path.layout
     samples = model.arguments.samples[k]
-    times = lax.stop_gradient(jax.vmap(lambda s: model.seen_at(k, s, p).time)(samples))
+    times = lax.stop_gradient(jax.vmap(lambda s: model.correct_delay(k, s, p).time)(samples))
     ends = lax.stop_gradient(flatten_rows(layout.end))
     row = jnp.minimum(jnp.searchsorted(ends, times), ends.shape[0] - 1)
     piece = Piece(flatten_rows(path.pieces.origin)[row], flatten_rows(path.pieces.coefficients)[row])
@@ -181,7 +181,7 @@ def step_to_late_sample(
     model: Model, k: int, sample: Samples, segment: Array, piece: Piece, start: Array, x: Array, p: Array
 ) -> tuple[Samples, Array]:
     """One late sample with the time of the state that it is of, and that state, one step from `start`: (n,)."""
-    there = model.seen_at(k, sample, p)
+    there = model.correct_delay(k, sample, p)
 
     def through(mode: int) -> Callable[..., Array]:
         def state(time: Array, start: Array, x: Array) -> Array:

@@ -509,7 +509,7 @@ def estimate(
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
         if result.status in STOPPED or attempt == REFINEMENTS or not excess > 1:
             break
-        evaluator = _refine(fine, problem.checked_theta(start), theta, excess)
+        evaluator = _refine(fine, problem.check_theta(start), theta, excess)
     if excess > 1 and result.status.successful and not problem.constraint_names:
         refuse_jumps(evaluator, theta)  # the error of steps across a jump does not vanish with their length
     found = _estimate(
@@ -518,7 +518,7 @@ def estimate(
         replace(result, iterations=earlier + result.iterations, earlier=earlier),
         history,
         hessian,
-        initial_theta=problem.checked_theta(start),
+        initial_theta=problem.check_theta(start),
         evaluations=evaluations,
         trajectories=(),
         comparisons=(),
@@ -538,7 +538,7 @@ def check_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:
 
 def _prepare_start(problem: Problem, start: ArrayLike | None) -> tuple[FloatArray, Evaluator]:
     """Where a fit begins (d,), guarded transitions on their guards if that is near, and the meshes for it."""
-    theta = problem.checked_theta(start, "start")
+    theta = problem.check_theta(start, "start")
     evaluator = evaluator_of(problem) if start is None else Evaluator(problem, theta)
     placed = on_guards_if_near(evaluator, theta)
     if not np.array_equal(placed, theta):

@@ -100,7 +100,7 @@ class Evaluator:
 
     def divided(self, parts: int = 2) -> Evaluator:
         """The same problem with every cell of its meshes cut into equal parts."""
-        return Evaluator(self.problem, meshes=[mesh.divided(parts) for mesh in self.meshes])
+        return Evaluator(self.problem, meshes=[mesh.divide(parts) for mesh in self.meshes])
 
     def __call__(
         self, theta: FloatArray, side: int = 1, method: Method = "auto", matrix: Matrix = "exact"
@@ -272,4 +272,4 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     method = as_choice(method, "method", METHODS)
-    return evaluator_of(problem)(problem.checked_theta(theta), method=method)
+    return evaluator_of(problem)(problem.check_theta(theta), method=method)

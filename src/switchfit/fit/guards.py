@@ -74,7 +74,7 @@ def evaluate_on_guards(problem: Problem, theta: ArrayLike | None = None) -> Guar
     as_instance(problem, "problem", Problem, "an sf.Problem")
     guarded_places(problem)  # an error where there are no guards
     evaluator = evaluator_of(problem)
-    at = on_guards(evaluator, problem.checked_theta(theta))
+    at = on_guards(evaluator, problem.check_theta(theta))
     evaluator = Evaluator(problem, at)  # a mesh for where the transitions really are
     at = on_guards(evaluator, at)
     guarded = guarded_places(problem)

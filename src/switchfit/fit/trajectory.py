@@ -119,7 +119,7 @@ def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: in
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     experiment = as_index(experiment, "experiment", len(problem.experiments))
-    checked = problem.checked_theta(theta)
+    checked = problem.check_theta(theta)
     mesh = refined_mesh(problem, experiment, checked)
     engine = engine_of(problem, experiment, build_arguments(problem, experiment, mesh), mesh)
     simulation = engine.simulate(*problem.vectors(checked, experiment), tangents=False)
@@ -220,7 +220,7 @@ def _comparisons(
         if isinstance(item, ReferenceSignal):
             here = Comparison("reference", label, times, item.signal(times), curve, None, times, curve)
         else:
-            named = problem.named(theta, e)
+            named = problem.name_parameters(theta, e)
             fitted = simulation.seen[measured][: len(item.times)]
             measured += 1
             delay = float(named[item.delay]) if isinstance(item.delay, str) else item.delay

@@ -360,42 +360,42 @@ class WatchedParameters(dict[str, Array]):
         self.asked = asked
 
     def __getitem__(self, name: str) -> Array:
-        value = super().__getitem__(name) if name in self.keys_alone() else self.others[name]
+        value = super().__getitem__(name) if name in self.list_keys() else self.others[name]
         self.asked.add(name)
         return value
 
     def __contains__(self, name: object) -> bool:
-        there = name in self.keys_alone()
+        there = name in self.list_keys()
         if there:
             self.asked.add(str(name))
         return there
 
     def get(self, name: str, default: Any = None) -> Any:
-        return self[name] if name in self.keys_alone() or name in self.others else default
+        return self[name] if name in self.list_keys() or name in self.others else default
 
-    def keys_alone(self) -> Any:
+    def list_keys(self) -> Any:
         """The names, without asking for them."""
         return super().keys()
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.whole())
+        return iter(self.read_all())
 
     def __len__(self) -> int:
-        return len(self.whole())
+        return len(self.read_all())
 
     def keys(self) -> Any:
-        return self.whole().keys()
+        return self.read_all().keys()
 
     def values(self) -> Any:
-        return self.whole().values()
+        return self.read_all().values()
 
     def items(self) -> Any:
-        return self.whole().items()
+        return self.read_all().items()
 
-    def whole(self) -> dict[str, Array]:
+    def read_all(self) -> dict[str, Array]:
         """All that is shown, which counts as asked for."""
-        self.asked.update(self.keys_alone())
-        return {name: super(WatchedParameters, self).__getitem__(name) for name in self.keys_alone()}
+        self.asked.update(self.list_keys())
+        return {name: super(WatchedParameters, self).__getitem__(name) for name in self.list_keys()}
 
 
 def call_while_tracing(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, form: str) -> Array:

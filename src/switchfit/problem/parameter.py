@@ -74,9 +74,9 @@ class Parameter:
         if not np.all(np.isfinite(value)):
             raise ValueError(f"Parameter value must be finite; got {shorten(value)}.")
         if not np.all(lower <= upper):
-            raise ValueError(f"Parameter bounds must satisfy lower <= upper; got {self._shown_bounds}.")
+            raise ValueError(f"Parameter bounds must satisfy lower <= upper; got {self._bounds_text}.")
         if not (np.all(lower <= value) and np.all(value <= upper)):
-            raise ValueError(f"Parameter value {shorten(self.value)} lies outside its bounds {self._shown_bounds}.")
+            raise ValueError(f"Parameter value {shorten(self.value)} lies outside its bounds {self._bounds_text}.")
         scale = as_choice(self.scale, "Parameter scale", ("linear", "log"))
         if scale == "log":
             lower = np.where(np.isneginf(lower), 0.0, lower)
@@ -103,7 +103,7 @@ class Parameter:
             ) from None
 
     @property
-    def _shown_bounds(self) -> str:
+    def _bounds_text(self) -> str:
         return f"[{shorten(self.lower)}, {shorten(self.upper)}]"
 
     def _check_prior(self) -> None:

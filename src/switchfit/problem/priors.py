@@ -144,7 +144,7 @@ class PriorTerms(NamedTuple):
         )
 
     @classmethod
-    def joined(cls, parts: list[PriorTerms]) -> PriorTerms:
+    def join(cls, parts: list[PriorTerms]) -> PriorTerms:
         """The terms of several unknowns, one after the other."""
         return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 

@@ -394,7 +394,7 @@ class Problem:
             sizes[where[where >= 0]] = _clock(experiment)
         return sizes
 
-    def elapsed(self, theta: FloatArray) -> FloatArray:
+    def measure_from_start(self, theta: FloatArray) -> FloatArray:
         """theta with transition times counted from their experiment's t0, (d,): it does not depend on the clock.
 
         See Also
@@ -407,7 +407,7 @@ class Problem:
         >>> from switchfit.models import heater_problem
         >>> problem = heater_problem()
 
-        >>> problem.elapsed(problem.initial_theta)
+        >>> problem.measure_from_start(problem.initial_theta)
         array([2. , 0.5])
         """
         counted = theta.copy()
@@ -457,7 +457,7 @@ class Problem:
                     counts[e][k] = length
         return tuple(tuple(lengths) for lengths in counts)
 
-    def named(self, theta: FloatArray, e: int) -> dict[str, FloatArray]:
+    def name_parameters(self, theta: FloatArray, e: int) -> dict[str, FloatArray]:
         """The parameters of experiment e under the names that the model has for them.
 
         See Also
@@ -470,7 +470,7 @@ class Problem:
         >>> from switchfit.models import heater_problem
         >>> problem = heater_problem()
 
-        >>> float(problem.named(problem.initial_theta, 0)["k"])
+        >>> float(problem.name_parameters(problem.initial_theta, 0)["k"])
         0.5
         """
         own = self.split(theta)[1]
@@ -495,10 +495,10 @@ class Problem:
         """
         items = [item for item in self.experiments[e].data if isinstance(item, Measurements)]
         late = [(item.times, item.delay) for item in items if isinstance(item.delay, str)]
-        named = self.named(theta, e) if late else {}
+        named = self.name_parameters(theta, e) if late else {}
         return np.concatenate([np.zeros(0), *(times - named[delay] for times, delay in late)])
 
-    def checked_theta(self, theta: ArrayLike | None, what: str = "theta") -> FloatArray:
+    def check_theta(self, theta: ArrayLike | None, what: str = "theta") -> FloatArray:
         """Return `theta`, or the initial guess for None, as a ``(d,)`` array; messages call it `what`.
 
         Raises
@@ -516,7 +516,7 @@ class Problem:
         >>> from switchfit.models import heater_problem
         >>> problem = heater_problem()
 
-        >>> problem.checked_theta(None)
+        >>> problem.check_theta(None)
         array([2. , 0.5])
         """
         if theta is None:
@@ -561,7 +561,7 @@ class Problem:
 
         See Also
         --------
-        Problem.named
+        Problem.name_parameters
 
         Examples
         --------
@@ -639,7 +639,7 @@ def _list_unknowns(
         twice = sorted({name for name in names if names.count(name) > 1})
         raise ValueError(f"Two unknowns share a name: {join_names(twice)}; rename the parameter or the experiment.")
     flat = {key: np.concatenate([getattr(q, key).ravel() for q in pieces]) for key in ("value", "lower", "upper")}
-    priors = PriorTerms.joined([PriorTerms.of(q.prior, q.shape) for q in pieces])
+    priors = PriorTerms.join([PriorTerms.of(q.prior, q.shape) for q in pieces])
     log = np.concatenate([np.full(q.value.size, q.scale == "log") for q in pieces])
     A, b, rows = _build_ordering(experiments, where, len(names), dwell)
     vectors = flat["value"], flat["lower"], flat["upper"]

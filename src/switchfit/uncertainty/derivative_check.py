@@ -154,7 +154,7 @@ def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, seed:
     as_instance(problem, "problem", Problem, "an sf.Problem")
     seed = as_seed(seed)
     evaluator = evaluator_of(problem)
-    table = build_taylor_table(evaluator, problem.checked_theta(theta), seed=seed)
+    table = build_taylor_table(evaluator, problem.check_theta(theta), seed=seed)
     at = table.theta
     gaps = measure_derivative_gap(evaluator, at)
     halved = measure_derivative_gap(evaluator.divided(), at)

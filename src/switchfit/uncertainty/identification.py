@@ -324,10 +324,10 @@ def _measure_variation(problem: Problem) -> float:
 def _limit_change(problem: Problem) -> Callable[[FloatArray], bool]:
     u = problem.unknowns
 
-    def allowed(theta: FloatArray) -> bool:
+    def is_allowed(theta: FloatArray) -> bool:
         return bool(np.all(theta >= u.lower) and np.all(theta <= u.upper) and np.all(u.A @ theta >= u.b))
 
-    return allowed
+    return is_allowed
 
 
 def analyse(

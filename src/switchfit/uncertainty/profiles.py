@@ -111,7 +111,7 @@ class Trace:
         self.interrupted = False
         self.jumps: list[float] = []
         self.coarse = False
-        self.told: Callable[[], bool] = lambda: False
+        self.should_stop: Callable[[], bool] = lambda: False
 
     # --- what the points say
 
@@ -183,7 +183,7 @@ class Trace:
         found[coupled] = linprog(objective, -c.A[:, coupled], -c.b, bounds=bounds).x
         return found
 
-    def _fitted(self, value: float, start: FloatArray) -> Point | None:
+    def _fit(self, value: float, start: FloatArray) -> Point | None:
         """The point at `value`, fitted from `start`; None where that fails."""
         lower, upper = self.constraints.lower.copy(), self.constraints.upper.copy()
         lower[self.index] = upper[self.index] = value
@@ -194,7 +194,7 @@ class Trace:
             result = minimized(self.evaluator, start, "exact", tolerance, ITERATIONS, constraints=held)
         except ValueError:  # infeasible by rounding
             return None
-        if result.status is Status.INTERRUPTED or self.told():
+        if result.status is Status.INTERRUPTED or self.should_stop():
             raise KeyboardInterrupt
         if not np.isfinite(result.cost):
             return None
@@ -215,7 +215,7 @@ class Trace:
         for start in starts:
             start[k] = value
             feasible = self._feasible(start, near.theta)
-            found = None if feasible is None else self._fitted(value, feasible)
+            found = None if feasible is None else self._fit(value, feasible)
             if found is not None and (
                 best is None or (not found.converged, found.cost) < (not best.converged, best.cost)
             ):
@@ -344,7 +344,7 @@ class Trace:
             start = outer.theta.copy()
             start[self.index] = inner.value
             feasible = self._feasible(start, outer.theta)
-            found = None if feasible is None else self._fitted(inner.value, feasible)
+            found = None if feasible is None else self._fit(inner.value, feasible)
             if found is None or not found.converged or found.cost >= inner.cost - 1e-9 * abs(inner.cost):
                 return
             self._insert(found)
@@ -381,7 +381,7 @@ class Trace:
 
     # --- where it crosses
 
-    def crossing(self, a: Point, b: Point, threshold: float) -> float:
+    def find_crossing(self, a: Point, b: Point, threshold: float) -> float:
         """Where |zeta| is the threshold between two neighbouring points on different sides of it."""
         found = {a.value: a, b.value: b}
         inner = min((a, b), key=lambda q: abs(q.value - self.centre.value))
@@ -407,7 +407,7 @@ class Trace:
         found: list[tuple[float, float]] = []
         for a, b, a_in, b_in in zip(points[:-1], points[1:], inside[:-1], inside[1:], strict=True):
             if a_in != b_in:
-                edge = self.crossing(a, b, threshold)
+                edge = self.find_crossing(a, b, threshold)
                 if b_in:
                     low = edge
                 elif low is not None:
@@ -672,7 +672,7 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     trace = Trace(fit, evaluator, index)
     try:
         for _ in range(2):
-            trace.told = partial(_wrap_callback, report, trace)
+            trace.should_stop = partial(_wrap_callback, report, trace)
             for side in (-1, 1):
                 trace.march(side, threshold)
             trace.add_kinks(times, threshold)
@@ -687,7 +687,7 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
         trace.interrupted = True
     finally:
         end()
-        trace.told = lambda: False
+        trace.should_stop = lambda: False
     error = float(fit.standard_errors[index])
     return Profile(name, fit.theta_units[index], trace.centre.value, error, level, fit, times, trace)
 

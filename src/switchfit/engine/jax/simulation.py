@@ -214,7 +214,7 @@ def _block(
     costs, before, after, *derivatives = found
 
     def seen(t: jax.Array, x: jax.Array, p: jax.Array) -> jax.Array:
-        return jnp.concatenate([jnp.zeros(0), *(model.observed(h, t, x, p) for h, _ in structure.outputs)])
+        return jnp.concatenate([jnp.zeros(0), *(model.observe(h, t, x, p) for h, _ in structure.outputs)])
 
     def along(t: jax.Array, x: jax.Array, X: jax.Array) -> jax.Array:
         linear = jax.linearize(partial(seen, t), x, p)[1]
@@ -291,6 +291,6 @@ def _late_block(
             for m in range(len(structure.modes))
         ]
         there = lax.switch(mode, steps, x)
-        return jnp.concatenate([jnp.zeros(0), *(model.observed(h, time, there, p) for h, _ in structure.outputs)])
+        return jnp.concatenate([jnp.zeros(0), *(model.observe(h, time, there, p) for h, _ in structure.outputs)])
 
     return jax.vmap(one)(times, mode, start, x, Piece(origin, coefficients))

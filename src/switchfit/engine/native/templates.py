@@ -183,7 +183,7 @@ class Templates:
         def time(t: Any, p: Any, *constants: Any) -> Any:
             model = self.model(constants)
             nothing = jnp.zeros(0)
-            seen = lambda p: model.seen_at(k, Samples(jnp.zeros((), int), t, nothing, nothing), p).time  # noqa: E731
+            seen = lambda p: model.correct_delay(k, Samples(jnp.zeros((), int), t, nothing, nothing), p).time  # noqa: E731
             return [seen(p), jax.grad(seen)(p)]
 
         return traced(time, (), (self.sizes.M,), *self.sizes.constants, name="delay of Measurements")
@@ -265,7 +265,7 @@ class Templates:
             model = self.model(constants)
 
             def seen(x: Any, p: Any) -> Any:
-                each = [model.observed(observe, t, x, p) for observe, _ in self.library.outputs]
+                each = [model.observe(observe, t, x, p) for observe, _ in self.library.outputs]
                 return jnp.concatenate([jnp.zeros(0), *each])
 
             return [seen(x, p), *(jax.jacfwd(seen, argnums=(0, 1))(x, p) if self.order > Order.GRADIENT else ())]
