@@ -8,10 +8,10 @@ import jax
 import numpy as np
 
 import switchfit as sf
-from switchfit.discretization.mesh import Mesh, rows
+from switchfit.discretization.mesh import Mesh, build_rows
 from switchfit.fit.evaluator import Evaluator
 from switchfit.models import skid_steer
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 
 SEQUENCE = ("stick", "slip", "stick")
 START, TRUTH, HORIZON = (5.0, 9.0), (6.0, 10.0), (0.0, 15.0)
@@ -74,8 +74,8 @@ def table_of_rows(evaluator: Evaluator, theta: np.ndarray) -> list[Row]:
     A row of length zero beside a transition stays: its derivative does not vanish.
     """
     arguments = evaluator.arguments[0]
-    with float64():
-        layout = rows(arguments.nodes, np.asarray(theta[:2]), np.float64(1.0))
+    with use_float64():
+        layout = build_rows(arguments.nodes, np.asarray(theta[:2]), np.float64(1.0))
         layout = jax.tree.map(np.asarray, layout)
     signals = np.asarray(arguments.signals)
     nodes = np.asarray(arguments.nodes)

@@ -46,13 +46,14 @@ IN_PAPER: dict[str, Replacements] = {
     "dropped D1Dp f Dp_x, (14)": [(" + contract(psi, d.D1Dpf @ d.Dp_x)", "")],
     "tau_j for tau_i, (13), the misprint": [
         (
-            "tau_tau(i, here, adjoints, minus, plus)",
-            "tau_tau(i, here, adjoints, minus, plus, "
-            "[transition_at(model, path, i, tau[j], p).D1f_im1 for j in range(i)])",
+            "compute_tau_tau(i, here, adjoints, minus, plus)",
+            "compute_tau_tau(i, here, adjoints, minus, plus, "
+            "[evaluate_transition(model, path, i, tau[j], p).D1f_im1 for j in range(i)])",
         ),
         (
-            "def tau_tau(i: int, here: Transition, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities)",
-            "def tau_tau(i, here, adjoints, minus, plus, misprinted)",
+            "def compute_tau_tau(i: int, here: Transition, adjoints: Adjoints, minus: Sensitivities, "
+            "plus: Sensitivities)",
+            "def compute_tau_tau(i, here, adjoints, minus, plus, misprinted)",
         ),
         ("X_ij = D1f_im1 @ minus.Phi_X[:, j]", "X_ij = misprinted[j] @ minus.Phi_X[:, j]"),
     ],
@@ -118,7 +119,7 @@ IN_NATIVE: dict[str, tuple[str, Replacements]] = {
         DRIVER,
         [('{"late": self.at(found["late"], row, n)})', '{"late": found["late"]})')],
     ),
-    "W in the Gauss-Newton matrix": (TEMPLATES, [("return factor * weighted(W, A)", "return factor * A")]),
+    "W in the Gauss-Newton matrix": (TEMPLATES, [("return factor * apply_weights(W, A)", "return factor * A")]),
 }
 
 IN_SQP: dict[str, tuple[str, Replacements]] = {

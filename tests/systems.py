@@ -15,18 +15,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from switchfit.discretization.arguments import Arguments, arguments_of
+from switchfit.discretization.arguments import Arguments, build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model
-from switchfit.discretization.propagation import path_cost, propagate
+from switchfit.discretization.propagation import compute_path_cost, propagate
 from switchfit.engine.jax.backward_sweep import backward_sweep
 from switchfit.engine.jax.forward import forward_hessian
 from switchfit.engine.jax.forward_sweep import forward_sweep
 from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
-from switchfit.paper_adjoint import paper_derivatives
+from switchfit.paper_adjoint import compute_paper_derivatives
 from switchfit.problem.data import Input, Measurements, ReferenceSignal, RunningCost, TerminalCost
 from switchfit.problem.experiment import Experiment, Parameter
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
 
@@ -142,7 +142,7 @@ def padded_mesh(times: np.ndarray, cells: int = CELLS) -> Mesh:
 def weighted(arguments: Arguments, kind: str, equal: float = 0.0) -> Arguments:
     """Arguments of `problem_of` that leave one kind of cost, or all; `equal` = 1 makes mode B equal to mode A."""
     on = {name: float(kind in (name, "all")) for name in KINDS}
-    with float64():
+    with use_float64():
         return arguments._replace(
             fixed=(arguments.fixed[0], *(jnp.asarray(q) for q in (equal, on["running"], on["terminal"]))),
             weights=tuple(W * on["reference"] for W in arguments.weights),
@@ -170,7 +170,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     program = jax.jit(function, compiler_options={"xla_backend_optimization_level": 0})
 
     def call(arguments: Arguments, tau: Any, p: Any, side: int = 1) -> Any:
-        with float64():
+        with use_float64():
             return jax.block_until_ready(program(arguments, jnp.asarray(tau), jnp.asarray(p), jnp.asarray(side)))
 
     return call
@@ -190,11 +190,11 @@ class Case:
         times = np.unique(LAYERED) if self.structure.solver == "stiff" else NODES
         for _ in range(halvings):
             times = np.sort(np.concatenate([times, 0.5 * (times[1:] + times[:-1])]))
-        return weighted(arguments_of(self.problem, 0, padded_mesh(times)), kind, equal)
+        return weighted(build_arguments(self.problem, 0, padded_mesh(times)), kind, equal)
 
     @cached_property
     def _paper(self) -> Callable[..., Any]:
-        return compiled(lambda arguments, *at: paper_derivatives(Model(self.structure, arguments), *at))
+        return compiled(lambda arguments, *at: compute_paper_derivatives(Model(self.structure, arguments), *at))
 
     @cached_property
     def _discrete(self) -> Callable[..., Any]:
@@ -240,7 +240,7 @@ class Case:
 
     def _simulate(self, arguments, theta, side):
         model, tau, p = Model(self.structure, arguments), theta[: self.N], theta[self.N :]
-        return path_cost(model, propagate(model, tau, p, side), p)
+        return compute_path_cost(model, propagate(model, tau, p, side), p)
 
     def cost(self, *given: Any) -> float:
         """The simulated cost."""

@@ -8,7 +8,7 @@ import pytest
 
 import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
-from switchfit.paper.vehicle import TRUTH, simulated
+from switchfit.paper.vehicle import TRUTH, build_simulated_problem
 
 
 def pendulum(torque):
@@ -93,7 +93,7 @@ AWAY = np.array([0.03, 0.02, 0.001])
 @pytest.mark.parametrize("theta", [(5.0, 9.0, 0.8), (5.43, 9.27, 0.77), tuple(TRUTH + AWAY)])
 def test_default_tolerances_give_the_derivatives_to_about_1e_7(theta):
     """The paper's problem on its reference of 0.1 s; the last theta is near the solution, where J almost vanishes."""
-    problem, theta = simulated(), np.array(theta)
+    problem, theta = build_simulated_problem(), np.array(theta)
     found = Evaluator(problem, theta)(theta)
     exact = Evaluator(problem, theta).divide(4)(theta)
     error = np.linalg.norm(found.gradient - exact.gradient) / np.linalg.norm(exact.gradient)
@@ -102,7 +102,7 @@ def test_default_tolerances_give_the_derivatives_to_about_1e_7(theta):
 
 
 def test_default_tolerances_give_the_solution_to_1e_8():
-    fit = sf.estimate(simulated())
+    fit = sf.estimate(build_simulated_problem())
     exact = sf.estimate(sf.Problem(fit.problem.system, fit.problem.experiments, fit.problem.parameters, rtol=1e-12))
     assert fit.success
     assert exact.success

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from systems import KINDS, NODES, P0, Case, Parameter, case, closed_form, closed_form_case, compiled, padded_mesh
 
-from switchfit.discretization.arguments import arguments_of
+from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import propagate
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 
 # A sample inside a stiff mode starts a layer of the adjoints, which this mesh does not resolve.
 SMOOTH_KINDS = ("running", "reference", "terminal")
@@ -132,14 +132,14 @@ def test_coinciding_transitions() -> None:
 
 
 def closed_form_arguments(this: Case):
-    return arguments_of(this.problem, 0, padded_mesh(np.linspace(0.0, 2.0, 41), 40))
+    return build_arguments(this.problem, 0, padded_mesh(np.linspace(0.0, 2.0, 41), 40))
 
 
 @pytest.mark.parametrize("method", ["paper", "discrete"])
 def test_closed_form_with_reset_map(method: str) -> None:
     this = closed_form_case(transitions=1, q=Parameter(0.7))
     found = getattr(this, method)(closed_form_arguments(this), [0.9], [0.7])
-    with float64():
+    with use_float64():
         at = jnp.array([0.9, 0.7])
         gradient, hessian = (d(lambda z: closed_form(z[0], z[1]))(at) for d in (jax.grad, jax.hessian))
     np.testing.assert_allclose(found.gradient, gradient, rtol=1e-8)
@@ -149,7 +149,7 @@ def test_closed_form_with_reset_map(method: str) -> None:
 def test_without_parameters() -> None:
     this = closed_form_case(transitions=1, q=Parameter(0.7, fixed=True))
     found = this.paper(closed_form_arguments(this), [0.9], np.zeros(0))
-    with float64():
+    with use_float64():
         expected = jax.hessian(closed_form)(0.9, 0.7)
     assert found.hessian.shape == (1, 1)
     np.testing.assert_allclose(found.hessian[0, 0], expected, rtol=1e-6)

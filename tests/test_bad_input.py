@@ -10,7 +10,7 @@ import pytest
 import switchfit as sf
 from switchfit.discretization.model import Model
 from switchfit.models import skid_steer
-from switchfit.problem.functions import checked_vector, float64
+from switchfit.problem.functions import call_for_vector, use_float64
 
 
 def grow(t, x, p):
@@ -433,9 +433,9 @@ def test_observations_and_costs(data, said):
 
 def test_integers_and_booleans_are_taken_for_numbers():
     """A constant velocity written as ``jnp.array([1])`` is no mistake of the user's."""
-    with float64():
+    with use_float64():
         for value in (jnp.array([1]), jnp.array([True]), [1], 1):
-            array = checked_vector(lambda value=value: value, (), (1,), "mode", "f()")
+            array = call_for_vector(lambda value=value: value, (), (1,), "mode", "f()")
             assert array.dtype == jnp.float64
             np.testing.assert_array_equal(array, [1.0])
 

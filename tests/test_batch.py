@@ -22,7 +22,7 @@ from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import LinearConstraints, minimize
 from switchfit.optimize.qp import nearest_feasible, solve_qp
 from switchfit.optimize.traced import Breakpoints, Constraints, minimize_traced, nonnegative_minimum
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 
 TIMES = np.linspace(0.25, 6.0, 24)
 TRUTH = np.array([2.1, 0.8])
@@ -65,7 +65,7 @@ def test_the_dual_programme_against_scipy(seed):
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
     g = rng.standard_normal(rows.shape[1])
     allowed = rng.random(len(rows)) < 0.8
-    with float64():
+    with use_float64():
         lam = np.asarray(nonnegative_minimum(jnp.asarray(rows @ rows.T), jnp.asarray(-rows @ g), jnp.asarray(allowed)))
     assert np.all(lam >= 0)
     assert np.all(lam[~allowed] == 0)
@@ -100,7 +100,7 @@ def test_the_traced_optimiser_ends_where_the_other_one_does(name):
 
     constraints = LinearConstraints(np.array(A), np.array(b), np.array(low), np.array(high), tuple("abcde"))
     expected = minimize(At, start, constraints=constraints)
-    with float64():
+    with use_float64():
         outcome = jax.jit(
             lambda start: minimize_traced(
                 lambda theta, side: tuple(map(jnp.asarray, valley(theta))),
@@ -151,7 +151,7 @@ def test_kinks_hold_and_let_go_inside_the_program_too(share):
         weights = 10.0 ** rng.uniform(-2, 0.5, (3, 1)) * rng.random((3, KNOTS.size))
         weights *= np.where(rng.random(weights.shape) < share, -1.0, 1.0)
         start = np.sort(np.round(rng.uniform(0.0, 10.0, 3) * 2) / 2 if seed % 2 else rng.uniform(0.0, 10.0, 3))
-        with float64():
+        with use_float64():
             found = jax.tree.map(np.asarray, fitted_with_kinks(*map(jnp.asarray, (start, H, centre, weights))))
         if not found.settled:
             continue
@@ -192,7 +192,7 @@ def test_the_curvature_of_a_coordinate_that_a_kink_holds_does_not_count():
     H, weights = np.diag([-0.3, 1.0, 1.0]), np.zeros((3, KNOTS.size))
     weights[0, 4] = 1.0
     given = ([1.4, 3.2, 4.0], H, [1.9, 3.3, 4.1], weights)
-    with float64():
+    with use_float64():
         found = jax.tree.map(np.asarray, fitted_with_kinks(*map(jnp.asarray, given)))
     assert found.settled
     np.testing.assert_array_equal(found.held, [True, False, False])
@@ -209,8 +209,8 @@ def singles(problems, meshes, start):
 
 
 def work_of(problem, truth, start, noise=None, seed=3):
-    work = module._Work(problem, [], truth, start, noise, seed, 1e-7, 200, module._clean(problem, truth))
-    work.meshes, _ = module._meshes(work.problem_of(0), truth, start)
+    work = module._Work(problem, [], truth, start, noise, seed, 1e-7, 200, module._simulate_clean(problem, truth))
+    work.meshes, _ = module._build_meshes(work.problem_of(0), truth, start)
     return work
 
 
@@ -265,7 +265,7 @@ def test_several_experiments_each_with_its_own_noise():
 
 def test_lockstep_is_the_same_as_one_after_the_other():
     work = work_of(room(), TRUTH, np.array([1.7, 1.0]))
-    values = np.stack([work._noisy(k)[0, 0] for k in range(12)])
+    values = np.stack([work._draw_run(k)[0, 0] for k in range(12)])
     varying, starts = work._varying({(0, 0): values}), np.repeat(work.start[None], 12, axis=0)
     settings = {"tolerance": 1e-7, "max_iterations": 200}
     one, other = (fit_chunk(work.problem, work.meshes, varying, starts, **settings, lockstep=m) for m in (False, True))
@@ -647,7 +647,7 @@ def failing_room(values, guess=(1.7, 1.0)):
 
 
 def measured_room(seed):
-    clean = module._clean(room(), TRUTH)[0][0]
+    clean = module._simulate_clean(room(), TRUTH)[0][0]
     return clean + 0.01 * np.random.default_rng(seed).standard_normal(clean.shape)
 
 

@@ -16,7 +16,7 @@ import switchfit as sf
 from benchmarks import casadi_forms, derivatives, models, problems, side_by_side, vehicle
 from benchmarks.fit import CostBySciPy
 from benchmarks.peers import casadi_collocation, casadi_shooting, scipy_differences, scipy_fits
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 
 ROWS = 22
 
@@ -60,7 +60,7 @@ def test_entrywise_models_are_those_of_switchfit():
         assert len(problem.theta_names) == len(model.theta), name
         np.testing.assert_array_equal(problem.initial_theta, model.theta)
         x, p = random.standard_normal(len(model.x0)), [float(value) for value in model.p]
-        with float64():
+        with use_float64():
             for mode in model.modes:
                 theirs = model.field(mode, x.tolist(), p, math)
                 np.testing.assert_allclose(case.system.modes[mode](0.0, x, case.pack(np.array(p))), theirs, rtol=1e-12)

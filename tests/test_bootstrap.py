@@ -10,7 +10,7 @@ import pytest
 import scipy.stats
 
 import switchfit as sf
-from switchfit.batch.resampling import _acceleration, _Draw, _Runs
+from switchfit.batch.resampling import _compute_acceleration, _Draw, _Runs
 
 TIMES = np.linspace(0.1, 4.0, 40)
 
@@ -230,4 +230,4 @@ def test_what_cannot_be_resampled():
 
 def test_the_acceleration_of_a_symmetric_sample_is_zero():
     values = np.concatenate([1.0 + np.arange(20), 1.0 - np.arange(20)])
-    assert _acceleration(mean_of(values), by_run=False)[0] == pytest.approx(0.0, abs=1e-12)
+    assert _compute_acceleration(mean_of(values), by_run=False)[0] == pytest.approx(0.0, abs=1e-12)

@@ -379,7 +379,7 @@ def test_progress_only_on_a_terminal(monkeypatch):
     record = sf.optimize.IterationRecord(3, 1.5, 2e-4, 0.5, np.zeros(1), 4)
     for stream, shown in ((Terminal(), True), (io.StringIO(), False)):
         monkeypatch.setattr(sys, "stderr", stream)
-        with cli._progress() as show:
+        with cli._show_progress() as show:
             show(record)
         assert ("iteration   3   cost 1.5   optimality 2.00e-04   step 0.5" in stream.getvalue()) == shown
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.discretization.mesh import padded_length
+from switchfit.discretization.mesh import pad_length
 from switchfit.engine.adaptive import initial_state
 from switchfit.engine.jax.programs import derivatives
 from switchfit.engine.jax.simulation import _block, _terminal
@@ -98,7 +98,7 @@ def test_nothing_is_traced_for_other_data_of_the_same_shape(compiled):
 
 def test_nothing_is_traced_for_another_number_of_samples_of_the_same_padded_length(compiled):
     other = oscillator(samples=11)
-    assert padded_length(11) == padded_length(9)
+    assert pad_length(11) == pad_length(9)
     assert cells_of(other) == cells_of(compiled)
     assert traces_of(lambda: sf.evaluate(other)) == 0
     assert sf.evaluate(other).cost == pytest.approx(11 / 9 * sf.evaluate(compiled).cost, rel=0.5)
@@ -135,9 +135,9 @@ def test_another_number_of_transitions_compiles_one_program_another_number_of_sa
         return sf.Problem(ROOM, sf.Experiment(data, modes, knots, 0.0, 3.0), {"k": sf.Parameter(1.0, 0.5, 2.0)})
 
     sf.estimate(room())
-    size = padded_length(evaluator_of(room()).meshes[0].cells)
+    size = pad_length(evaluator_of(room()).meshes[0].cells)
     if "samples" in change:
-        assert padded_length(evaluator_of(room(**change)).meshes[0].cells) > size
+        assert pad_length(evaluator_of(room(**change)).meshes[0].cells) > size
     fits = []
     counts = compiled_by(lambda: fits.append(sf.estimate(room(**change))))
     assert fits[0].integration_error < 1e-8, "the mesh has not been refined after the fit"

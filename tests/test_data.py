@@ -12,7 +12,7 @@ import switchfit as sf
 from switchfit.discretization.model import Piece
 from switchfit.engine.adaptive import refined_mesh
 from switchfit.fit.evaluator import Evaluator
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 
 # Inputs
 
@@ -112,7 +112,7 @@ OTHER = Polynomial([0.3, 0.5, -1.0, 0.25])
 def test_the_derivatives_of_a_signal_in_a_cell_are_those_of_its_cubic():
     """The rule for them is switchfit's own: value and three derivatives against NumPy's polynomials, along a curve."""
     coefficients, at = np.array([[0.3, -1.0], [2.0, 0.7], [-0.4, 0.2], [1.1, -0.6]]), 0.37
-    with float64():
+    with use_float64():
         function = Piece(jnp.asarray(0.2), jnp.asarray(coefficients))
         for order in range(5):
             exact = [Polynomial(c).deriv(order)(at - 0.2) for c in coefficients.T]

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from systems import KINDS, NODES, P0, Case, Derivatives, case, compiled, padded_mesh, problem_of, weighted
 
-from switchfit.discretization.arguments import arguments_of
+from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import propagate
 from switchfit.engine.jax import forward_sweep
@@ -161,7 +161,7 @@ def weighted_data(this: Case):
 def test_samples_alone() -> None:
     """Without a running cost nothing is integrated; it is not the same program as a running cost of weight 0."""
     this, alone = case("plain"), Case(problem_of("plain", parts=("samples",)))
-    arguments = weighted(arguments_of(alone.problem, 0, padded_mesh(NODES)), "all")
+    arguments = weighted(build_arguments(alone.problem, 0, padded_mesh(NODES)), "all")
     assert not alone.structure.running
     found = alone.discrete(arguments, INSIDE["plain"], P0)
     expected = this.discrete(this.arguments("samples"), INSIDE["plain"], P0)
@@ -193,6 +193,6 @@ def test_splitting_a_mode_changes_nothing(split: float) -> None:
 @pytest.mark.parametrize("name", ["plain", "resets"])
 def test_shift_of_time_changes_nothing(name: str) -> None:
     this, shift = case(name), 4.0
-    moved = arguments_of(problem_of(name, shift), 0, padded_mesh(NODES + shift))
+    moved = build_arguments(problem_of(name, shift), 0, padded_mesh(NODES + shift))
     found = this.discrete(weighted(moved, "all"), np.array(INSIDE[name]) + shift, P0)
     assert_same(found, this.discrete(this.arguments(), INSIDE[name], P0), 1e-11)

@@ -351,10 +351,10 @@ def test_times_out_of_order_by_rounding_are_put_in_order():
     """By a part of 1e-15 of the horizon, the time itself being 0: an end that one fit found is a start for the next."""
     problem = capacitor(voltage(TIMES))
     for tau, put in ((-3.8e-14, 0.0), (2.0 + 4e-16, 2.0), (1.6e-30, 1.6e-30)):
-        assert problem.checked_theta([tau, 2.0, 1.0])[0] == put
+        assert problem.check_theta([tau, 2.0, 1.0])[0] == put
         sf.estimate(problem, start=[tau, 2.0, 1.0])
     with pytest.raises(ValueError, match="must not decrease inside"):
-        problem.checked_theta([-1e-9, 2.0, 1.0])
+        problem.check_theta([-1e-9, 2.0, 1.0])
     two = sf.Problem(
         CAPACITOR,
         sf.Experiment(
@@ -366,7 +366,7 @@ def test_times_out_of_order_by_rounding_are_put_in_order():
         ),
         {"k": GUESS[1:]},
     )
-    theta = two.checked_theta([1.0 + 4e-16, 1.0 - 4e-16, 2.0, 1.0])
+    theta = two.check_theta([1.0 + 4e-16, 1.0 - 4e-16, 2.0, 1.0])
     np.testing.assert_array_equal(theta, [1.0, 1.0, 2.0, 1.0])
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from switchfit.batch.chunks import run_chunks
-from switchfit.runtime.cache import read_code, usable_folder, write_code
+from switchfit.runtime.cache import get_usable_folder, read_code, write_code
 from switchfit.runtime.files import PREFIX, SUFFIX, write_atomically
 
 SOURCE = Path(__file__).parent.parent / "src"
@@ -389,7 +389,7 @@ def test_the_cache_folder_is_made_for_the_user_alone(tmp_path, monkeypatch):
     monkeypatch.setenv("SWITCHFIT_CACHE", str(tmp_path / "a" / "cache"))
     before = os.umask(0)
     try:
-        assert usable_folder() == tmp_path / "a" / "cache"
+        assert get_usable_folder() == tmp_path / "a" / "cache"
     finally:
         os.umask(before)
     assert stat.S_IMODE((tmp_path / "a" / "cache").stat().st_mode) == 0o700
@@ -402,10 +402,10 @@ def test_a_cache_folder_that_others_can_write_to_is_not_used(mode, tmp_path, mon
     tmp_path.chmod(mode)
     message = rf"The cache folder {tmp_path} is not used, .*: others may write to it \(drwx"
     with pytest.warns(UserWarning, match=message):
-        assert usable_folder() is None
-    assert usable_folder() is None  # without another warning, which would be an error here
+        assert get_usable_folder() is None
+    assert get_usable_folder() is None  # without another warning, which would be an error here
     tmp_path.chmod(0o755)
-    assert usable_folder() == tmp_path
+    assert get_usable_folder() == tmp_path
 
 
 @ONLY_WHERE_THERE_ARE_USERS
@@ -414,7 +414,7 @@ def test_a_cache_folder_of_another_user_is_not_used(tmp_path, monkeypatch):
     owner = tmp_path.stat().st_uid
     monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
     with pytest.warns(UserWarning, match=f"it belongs to the user with the number {owner}, not to you"):
-        assert usable_folder() is None
+        assert get_usable_folder() is None
 
 
 @ONLY_WHERE_THERE_ARE_USERS

@@ -14,7 +14,7 @@ from functions import FALLS_BACK, FUNCTIONS, LEFT_AT_SOME_POINTS, ZERO_TIMES_INF
 from switchfit.engine.native import llvm
 from switchfit.engine.native.scalars import CHECKED, Graph
 from switchfit.engine.native.trace import Unsupported, traced
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 
 OFTEN = (
     *("arithmetic: mod", "arithmetic: power of a negative", "elementary: guarded log", "rounding: round away"),
@@ -91,12 +91,12 @@ def assert_same_function(name):
     weights = np.random.default_rng(0).uniform(0.5, 1.5, 40)
     both = derivatives_of(FUNCTIONS[name])
     if name in FALLS_BACK:
-        with float64(), pytest.raises(Unsupported) as caught:
+        with use_float64(), pytest.raises(Unsupported) as caught:
             traced(both, (3,), (40,))
         assert str(caught.value).startswith(f"the function {FALLS_BACK[name]}")
         assert "internal" not in str(caught.value)
         return
-    with float64(), warnings.catch_warnings():
+    with use_float64(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of JAX, about narrow types and the like
         evaluate = machine_code_of(traced(both, (3,), (40,)), 40)
         by_jax = jax.jit(both)

@@ -398,15 +398,15 @@ def test_a_function_that_reads_plain_things_is_not_called_again(monkeypatch):
 @pytest.mark.parametrize("way", WAYS)
 def test_what_is_read_is_told_by_content_or_not_at_all(way):
     f, change = way()
-    before = reads.contents(f)
+    before = reads.read_contents(f)
     change()
-    after = reads.contents(f)
+    after = reads.read_contents(f)
     assert after is None or before != after
 
 
 def test_values_of_different_types_are_different():
     values = [0.0, -0.0, 1, True, 1.0, "1", np.float64(1.0), np.ones(1), [1.0], (1.0,), {"a": 1.0}, np.ones(1, int)]
-    read = [reads.contents(lambda value=value: value) for value in values]
+    read = [reads.read_contents(lambda value=value: value) for value in values]
     assert None not in read
     assert len(set(read)) == len(values)
 
@@ -433,7 +433,7 @@ def test_a_problem_whose_functions_have_changed_is_not_pickled_in_silence():
 
 def test_the_page_on_models_runs_and_prints_what_it_says(capsys):
     page = (Path(__file__).parent.parent / "docs" / "models.md").read_text()
-    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    block, *_ = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     exec(compile(block, "models.md", "exec"), {})
     said = re.findall(r"\)  # ([0-9.]+)$", block, re.MULTILINE)
     assert len(said) == 3

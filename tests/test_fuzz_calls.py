@@ -734,7 +734,7 @@ def cheap_doors(doors, monkeypatch):
     for module in LONG_RUNS:
         monkeypatch.setattr(f"switchfit.batch.{module}.fit_chunk", take_long)
     monkeypatch.setattr(Evaluator, "constrained", take_long)
-    monkeypatch.setattr("switchfit.uncertainty.derivative_check.derivative_gap", take_long)
+    monkeypatch.setattr("switchfit.uncertainty.derivative_check.measure_derivative_gap", take_long)
     return {name: door for name, door in doors.items() if not name.startswith(STUDIES)}
 
 

@@ -9,9 +9,9 @@ import pytest
 
 import switchfit as sf
 from switchfit.discretization.model import Model
-from switchfit.discretization.propagation import path_cost, propagate
+from switchfit.discretization.propagation import compute_path_cost, propagate
 from switchfit.fit.evaluator import Evaluator
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 
 G = 9.8
 HEIGHT, END, TARGET = 50.0, 15.0, 20.0
@@ -51,7 +51,7 @@ def ball_in_closed_form(e):
 
 def test_bouncing_ball_has_the_derivatives_of_its_closed_form():
     found = sf.evaluate_on_guards(ball())
-    with float64():
+    with use_float64():
         at, cost = jnp.float64(0.8), ball_in_closed_form
         J, g, H = cost(at), jax.grad(cost)(at), jax.hessian(cost)(at)
         rest = np.sqrt(2 * HEIGHT / G)
@@ -103,7 +103,7 @@ def test_events_of_amici_to_twelve_digits():
         event = (jnp.exp(gamma * delta) - eta * delta) / (1 - eta)
         return zeta * jnp.exp(alpha * event - beta * (10 - event))
 
-    with float64():
+    with use_float64():
         hessian = np.asarray(jax.hessian(closed)(jnp.array(list(AMICI.values()))))
     np.testing.assert_allclose(found.times, [1.0, 5.0], rtol=1e-12)
     assert found.cost == pytest.approx(0.0078125, rel=1e-11)
@@ -272,10 +272,10 @@ def by_jax(evaluator, theta, multipliers, penalty):
                 c += list(model.terminal_constraint(path.after[-1, -1], p))
             here = slice(last, last := last + len(c))
             c = jnp.stack(c)
-            total = total + path_cost(model, path, p) + multipliers[here] @ c + 0.5 * penalty[here] @ c**2
+            total = total + compute_path_cost(model, path, p) + multipliers[here] @ c + 0.5 * penalty[here] @ c**2
         return total
 
-    with float64():
+    with use_float64():
         theta = jnp.asarray(theta)
         return value(theta), jax.jacfwd(value)(theta), jax.jacfwd(jax.jacfwd(value))(theta)
 

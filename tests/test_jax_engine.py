@@ -10,10 +10,10 @@ from systems import compiled
 
 import switchfit as sf
 from switchfit.discretization import nodes
-from switchfit.discretization.arguments import arguments_of
+from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model
-from switchfit.discretization.propagation import path_cost, propagate
+from switchfit.discretization.propagation import compute_path_cost, propagate
 from switchfit.engine.jax.backward_sweep import backward_sweep
 from switchfit.engine.jax.constraints import constraints
 from switchfit.engine.jax.forward import forward_hessian
@@ -54,7 +54,7 @@ def problem_of(solver: str) -> sf.Problem:
 def program_inputs(problem: sf.Problem):
     """The structure, and the arguments on a mesh of 12 cells."""
     times = np.unique(np.concatenate([np.linspace(0.0, 3.0, 11), [0.5, 1.4, 2.6]]).round(12))
-    return problem.structures[0], arguments_of(problem, 0, Mesh.from_times(times))
+    return problem.structures[0], build_arguments(problem, 0, Mesh.from_times(times))
 
 
 def assert_close(found, expected, relative: float) -> None:
@@ -76,7 +76,7 @@ def test_augmented_lagrangian_has_exact_derivatives(solver: str, relative: float
         def value(theta):
             model = Model(structure, arguments)
             path = propagate(model, theta[:2], theta[2:], side)
-            J, c = path_cost(model, path, theta[2:]), constraints_of(model, path, theta)
+            J, c = compute_path_cost(model, path, theta[2:]), constraints_of(model, path, theta)
             return J + multipliers @ c + 0.5 * penalty @ c**2, (J, c)
 
         theta = jnp.concatenate([tau, p])
@@ -101,7 +101,9 @@ def test_augmented_lagrangian_has_exact_derivatives(solver: str, relative: float
 def test_costs_at_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
     """A kind of node at transitions that is a cost: here the guards, taken for one."""
     structure, arguments = program_inputs(problem_of("explicit"))
-    without = compiled(lambda a, tau, p, side: path_cost(m := Model(structure, a), propagate(m, tau, p, side), p))
+    without = compiled(
+        lambda a, tau, p, side: compute_path_cost(m := Model(structure, a), propagate(m, tau, p, side), p)
+    )
     J_without = float(without(arguments, TAU, P0))
     monkeypatch.setattr(nodes, "AT_TRANSITIONS", (nodes.TransitionKind("guards", constraint=False),))
 
@@ -110,7 +112,7 @@ def test_costs_at_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
             model = Model(structure, arguments)
             path = propagate(model, theta[:2], theta[2:], side)
             own = sum(model.guard(i)(theta[i], path.before_transition(i), theta[2:]) for i in range(2))
-            return path_cost(model, path, theta[2:]), own
+            return compute_path_cost(model, path, theta[2:]), own
 
         theta = jnp.concatenate([tau, p])
         J, own = cost(theta)

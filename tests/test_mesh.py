@@ -11,14 +11,14 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import switchfit as sf
-from switchfit.discretization.arguments import arguments_of
-from switchfit.discretization.mesh import CHUNK, Mesh, chunk_count, padded_length, row_ending_cell, rows
+from switchfit.discretization.arguments import build_arguments
+from switchfit.discretization.mesh import CHUNK, Mesh, build_rows, count_chunks, find_row_ending_cell, pad_length
 from switchfit.discretization.model import Model
-from switchfit.discretization.propagation import path_cost, propagate
+from switchfit.discretization.propagation import compute_path_cost, propagate
 from switchfit.engine.adaptive import _solve, _solve_natively, fixed_nodes, refined_mesh
 from switchfit.engine.native.experiment import native_experiment
 from switchfit.fit.evaluator import Evaluator
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 
 # Rows
 
@@ -43,11 +43,13 @@ def walk(nodes, tau, side):
 
 @cache
 def program(cells, transitions):
-    return jax.jit(lambda nodes, tau, side: (r := rows(nodes, tau, side), row_ending_cell(r, jnp.arange(-1, cells))))
+    return jax.jit(
+        lambda nodes, tau, side: (r := build_rows(nodes, tau, side), find_row_ending_cell(r, jnp.arange(-1, cells)))
+    )
 
 
 def layout_of(nodes, tau, side):
-    with float64():
+    with use_float64():
         found = program(len(nodes) - 1, len(tau))(jnp.asarray(nodes), jnp.asarray(tau, float), side)
     return jax.tree.map(np.asarray, found)
 
@@ -94,7 +96,7 @@ def test_rows_against_a_walk_along_the_time_axis(cut):
     layout, ending = layout_of(nodes, tau, side)
     expected = walk(nodes, tau, side)
     N, cells = len(tau), len(nodes) - 1
-    assert len(layout.segment) == chunk_count(cells, N)
+    assert len(layout.segment) == count_chunks(cells, N)
     assert np.all(layout.first_chunk[1:] * CHUNK > layout.last_row[:-1])
 
     real = np.concatenate(
@@ -136,10 +138,10 @@ def test_rows_against_a_walk_along_the_time_axis(cut):
 def test_mesh_of_times_in_any_order(times):
     mesh = Mesh.from_times(np.array(times) / 7.0)
     assert mesh.times.tolist() == sorted({t / 7.0 for t in times})
-    assert len(mesh.nodes) == padded_length(mesh.cells) + 1
+    assert len(mesh.nodes) == pad_length(mesh.cells) + 1
     assert np.all(mesh.nodes[mesh.cells :] == mesh.times[-1])
     np.testing.assert_array_equal(mesh.cell_ending_at(mesh.times), np.arange(-1, mesh.cells))
-    third = mesh.divided(3)
+    third = mesh.divide(3)
     assert third.cells == 3 * mesh.cells
     np.testing.assert_array_equal(third.times[::3], mesh.times)
     np.testing.assert_allclose(np.diff(third.times), np.repeat(np.diff(mesh.times) / 3, 3), rtol=1e-10)
@@ -147,14 +149,14 @@ def test_mesh_of_times_in_any_order(times):
 
 @given(st.integers(1, 10**6))
 def test_padded_lengths_are_few_and_not_much_longer(length):
-    padded = padded_length(length)
+    padded = pad_length(length)
     assert length <= padded <= max(1.125 * length, length + 7)
-    assert padded_length(padded) == padded
-    assert padded_length(length + 1) >= padded
+    assert pad_length(padded) == padded
+    assert pad_length(length + 1) >= padded
 
 
 def test_few_padded_lengths():
-    assert len({padded_length(length) for length in range(1, 4097)}) < 70
+    assert len({pad_length(length) for length in range(1, 4097)}) < 70
 
 
 # The cost as a transition time passes a node
@@ -299,10 +301,10 @@ def cost_of(made, **settings):
     @jax.jit
     def cost(arguments, tau):
         model = Model(problem.structures[0], arguments)
-        return path_cost(model, propagate(model, tau, jnp.zeros(0), jnp.ones(())), jnp.zeros(0))
+        return compute_path_cost(model, propagate(model, tau, jnp.zeros(0), jnp.ones(())), jnp.zeros(0))
 
-    with float64():
-        return float(cost(arguments_of(problem, 0, mesh), run.initial_times))
+    with use_float64():
+        return float(cost(build_arguments(problem, 0, mesh), run.initial_times))
 
 
 @pytest.mark.parametrize(
@@ -337,11 +339,11 @@ def test_the_compiled_solver_takes_the_steps_of_scipy():
     run = sf.Experiment(data, ("a", "b", "a"), (1.7, 2.9), 0.0, 6.0, inputs=inputs)
     problem = sf.Problem(system, run)
     coarse = Mesh.from_times(fixed_nodes(run))
-    arguments = arguments_of(problem, 0, coarse)
+    arguments = build_arguments(problem, 0, coarse)
     native = native_experiment(problem.structures[0], arguments, coarse.times, 0)
     given = (problem, problem.structures[0], arguments.without_mesh(), arguments.signals, coarse)
     for mode, start, end, x in ((0, 0.0, 1.7, [0.0, 0.0]), (1, 1.7, 2.5, [0.4, 1.0]), (0, 2.9, 6.0, [0.1, -0.2])):
-        with float64():
+        with use_float64():
             steps, after = _solve_natively(problem, native, mode, start, end, np.array(x), np.zeros(0))
             expected, state = _solve(*given, mode, start, end, np.array(x), np.zeros(0))
         assert len(steps) == len(expected) > 10
@@ -366,7 +368,7 @@ def test_a_mesh_for_several_thetas_is_as_dense_as_the_densest():
 @pytest.mark.parametrize("parts", [2, 3, 5])
 def test_equal_parts_of_a_cell_as_short_as_rounding_are_one(parts):
     for nodes in (np.array([1.0, np.nextafter(1.0, 2.0), 2.0]), np.array([0.0, 0.3, 1.0])):
-        mesh = Mesh.from_times(nodes).divided(parts)
+        mesh = Mesh.from_times(nodes).divide(parts)
         ends = [a + (b - a) * k / parts for a, b in pairwise(nodes.tolist()) for k in range(parts)]
         np.testing.assert_array_equal(mesh.times, sorted({*ends, nodes[-1]}))
         assert mesh.cells == len(mesh.times) - 1

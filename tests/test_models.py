@@ -7,7 +7,7 @@ import pytest
 
 from switchfit.models import BUILT_IN, magic_formula, skid_steer, sliding_block
 from switchfit.models.magic_formula import MAGIC_FORMULA, lateral_force, longitudinal_force
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 
 
 def value(function, *arguments):
@@ -144,7 +144,7 @@ def test_magic_formula_against_published_values():
 
 def on_tyres(x, treads, **constants):
     """Accelerations (ddX, ddY, ddtheta) at the state `x` with treads moving at the given speeds (m/s)."""
-    with float64():
+    with use_float64():
         drive = magic_formula(wheel_radius=0.2, **constants).modes["drive"]
         rate = drive(0.0, jnp.asarray(x), dict(MAGIC_FORMULA), jnp.asarray(treads) / 0.2)
     np.testing.assert_array_equal(np.asarray(rate)[[0, 2, 4]], np.asarray(x)[[1, 3, 5]])

@@ -27,7 +27,7 @@ from switchfit.engine.native.program import forget_programs
 from switchfit.engine.native.scalars import Graph, Node
 from switchfit.engine.native.trace import Unsupported, traced
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 
 # Functions as scalars
 
@@ -134,7 +134,7 @@ def test_functions_as_scalars(name):
     """By folding constants, and by machine code."""
     random = np.random.default_rng(0)
     x, A = random.uniform(0.3, 1.5, 4), random.uniform(0.3, 1.5, (3, 4))
-    with float64():
+    with use_float64():
         flat = lambda x, A: [jnp.asarray(value, jnp.float64) for value in FUNCTIONS[name](x, A)]  # noqa: E731
         template = traced(flat, x.shape, A.shape)
         expected = [np.asarray(value) for value in flat(jnp.asarray(x), jnp.asarray(A))]
@@ -171,7 +171,7 @@ def test_functions_as_scalars(name):
     ids=["eigh", "copysign", "large solve", "fft", "while", "long"],
 )
 def test_what_has_no_scalar_form_says_so(function):
-    with float64(), pytest.raises(Unsupported):
+    with use_float64(), pytest.raises(Unsupported):
         traced(lambda x: [jnp.asarray(function(x), jnp.float64)], (4,))
 
 
@@ -429,7 +429,7 @@ def test_inside_a_program_of_jax():
     this = case("resets")
     arguments, tau = this.arguments(), np.array(INSIDE["resets"])
     expected = this.discrete(arguments, tau, P0)
-    with float64():
+    with use_float64():
         one = jax.jit(lambda a, tau, p: foreign_derivatives(this.structure, a, tau, p))
         assert_close(tuple(map(np.asarray, one(arguments, tau, P0))), expected)
         many = jax.jit(lambda a, taus, p: jax.lax.map(lambda t: foreign_derivatives(this.structure, a, t, p), taus))
@@ -541,7 +541,7 @@ def test_functions_of_jax_are_named_where_they_are_called():
 
     for function in (first, second):
         with (
-            float64(),
+            use_float64(),
             pytest.raises(Unsupported, match=rf"calls jnp.copysign \(test_native.py:{line_of(function, 'copysign')}"),
         ):
             traced(lambda x, f=function: [f(x)], (4,))

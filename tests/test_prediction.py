@@ -12,7 +12,7 @@ from systems import problem_of
 import switchfit as sf
 from switchfit.discretization.mesh import Mesh
 from switchfit.fit.evaluator import evaluator_of
-from switchfit.uncertainty.sensitivity import gauss_newton_of, sample_derivatives, sensitivity
+from switchfit.uncertainty.sensitivity import build_gauss_newton, collect_sample_derivatives, compute_sensitivity
 
 SIGMA = 0.1
 TIMES = np.linspace(0.25, 6.0, 24)
@@ -71,7 +71,7 @@ def noisy(seed=0, sigma=SIGMA, **settings):
 def test_sensitivities_in_closed_form(jump):
     problem = room(system=JUMPING if jump else ROOM)
     theta = np.array([2.13, 1.1, 0.37])
-    found = sensitivity(problem, 0, theta, evaluator_of(problem).meshes[0]).nodes
+    found = compute_sensitivity(problem, 0, theta, evaluator_of(problem).meshes[0]).nodes
     away = np.abs(found.times - theta[0]) > 1e-5
     assert away.sum() > 20
     np.testing.assert_allclose(found.states[:, 0][away], temperature(found.times, *theta, jump=jump)[away], rtol=1e-8)
@@ -83,7 +83,7 @@ def test_sensitivities_in_closed_form(jump):
 def test_at_a_transition_the_derivative_jumps_by_that_of_the_vector_field():
     problem = room()
     tau, power, k = theta = np.array([2.13, 1.1, 0.37])
-    found = sensitivity(problem, 0, theta, evaluator_of(problem).meshes[0]).nodes
+    found = compute_sensitivity(problem, 0, theta, evaluator_of(problem).meshes[0]).nodes
     before, after = np.flatnonzero(found.times == tau)
     x = found.states[before, 0]
     assert found.states_d[before, 0, 0] == pytest.approx(0.0, abs=1e-14)
@@ -96,12 +96,12 @@ def test_gradient_and_gauss_newton_matrix_follow_from_those_at_the_samples(name)
     problem = problem_of(name, parts=("samples",))
     evaluator = evaluator_of(problem)
     theta = problem.initial_theta + 0.013 * (np.arange(len(problem.initial_theta)) < 2)
-    samples = sample_derivatives(problem, [sensitivity(problem, 0, theta, evaluator.meshes[0])])
+    samples = collect_sample_derivatives(problem, [compute_sensitivity(problem, 0, theta, evaluator.meshes[0])])
     expected = evaluator(theta, matrix="gauss-newton")
     gradient = samples.derivative.T @ (samples.weight * samples.residual)
     scale = np.abs(expected.hessian).max()
     np.testing.assert_allclose(gradient, expected.gradient, atol=1e-11 * scale)
-    np.testing.assert_allclose(gauss_newton_of(samples), expected.hessian, atol=1e-11 * scale)
+    np.testing.assert_allclose(build_gauss_newton(samples), expected.hessian, atol=1e-11 * scale)
     assert len(samples.time) == problem.experiments[0].data[0].count
 
 
@@ -111,12 +111,12 @@ def test_several_experiments_have_their_own_transition_times():
     runs = [sf.Experiment(data, ("on", "off"), (tau,), 0.0, 6.0) for tau in (2.0, fixed, 2.2)]
     problem = sf.Problem(ROOM, runs, {"power": 1.0, "k": 0.4})
     meshes = evaluator_of(problem).meshes
-    found = [sensitivity(problem, e, problem.initial_theta, mesh) for e, mesh in enumerate(meshes)]
+    found = [compute_sensitivity(problem, e, problem.initial_theta, mesh) for e, mesh in enumerate(meshes)]
     last = [s.nodes.states_d[-1, 0] for s in found]
     assert [np.flatnonzero(row[:2]).tolist() for row in last] == [[0], [], [1]]
-    samples = sample_derivatives(problem, found)
+    samples = collect_sample_derivatives(problem, found)
     np.testing.assert_allclose(
-        gauss_newton_of(samples),
+        build_gauss_newton(samples),
         evaluator_of(problem)(problem.initial_theta, matrix="gauss-newton").hessian,
         rtol=1e-9,
     )
@@ -212,7 +212,7 @@ def test_bands_in_the_figure():
 def test_the_mesh_of_a_prediction_has_the_times_as_nodes():
     problem = room()
     mesh = Mesh.from_times(np.append(evaluator_of(problem).meshes[0].times, 1.2345))
-    found = sensitivity(problem, 0, problem.initial_theta, mesh).at(np.array([0.0, 1.2345, 6.0, 1.2345]))
+    found = compute_sensitivity(problem, 0, problem.initial_theta, mesh).at(np.array([0.0, 1.2345, 6.0, 1.2345]))
     np.testing.assert_allclose(found.states[:, 0], temperature(found.times, 2.1, 1.0, 0.4), rtol=1e-9)
 
 
@@ -222,7 +222,7 @@ def test_a_sensor_that_depends_on_parameters():
 
     data = sf.Measurements(TIMES, TIMES, observe=seen, sigma=SIGMA)
     problem = sf.Problem(ROOM, sf.Experiment(data, ("on", "off"), (2.1,), 0.0, 6.0), {"power": 1.0, "k": 0.4})
-    found = sensitivity(problem, 0, problem.initial_theta, evaluator_of(problem).meshes[0]).nodes
+    found = compute_sensitivity(problem, 0, problem.initial_theta, evaluator_of(problem).meshes[0]).nodes
     x, X, k = found.states, found.states_d, 0.4
     expected = 2 * k * x[:, :, None] * X + (x**2)[:, :, None] * np.array([0.0, 0.0, 1.0])
     np.testing.assert_allclose(found.outputs_d, expected, atol=1e-12)

@@ -71,7 +71,7 @@ def both(given):
 def test_derivatives_are_the_same(name, matrix):
     given = problem(DATA[name], parameters=MORE)
     native, by_jax = both(given)
-    for theta in (given.initial_theta, given.checked_theta([1.2, 1.2, 1.3, 0.7, 0.8, 0.2])):
+    for theta in (given.initial_theta, given.check_theta([1.2, 1.2, 1.3, 0.7, 0.8, 0.2])):
         found, expected = native(theta, matrix=matrix), by_jax(theta, matrix=matrix)
         np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-12)
         np.testing.assert_allclose(found.gradient, expected.gradient, rtol=1e-10, atol=1e-11)

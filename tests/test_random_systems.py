@@ -575,7 +575,7 @@ def differences(system: System, methods: tuple[str, ...]) -> list[str]:
     """Everything in which switchfit differs from the reference, as sentences."""
     problem = system.problem
     special, other = system.special_theta()
-    thetas = {"guess": problem.initial_theta, special: problem.checked_theta(other)}
+    thetas = {"guess": problem.initial_theta, special: problem.check_theta(other)}
     meshes = [refined_mesh(problem, e, *thetas.values()) for e in range(len(problem.experiments))]
     evaluator = Evaluator(problem, meshes=meshes)
     wrong: list[str] = []

@@ -5,7 +5,6 @@ orders and by four methods that agree.
 """
 
 import re
-import textwrap
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from switchfit.fit.trajectory import compare
 from switchfit.optimize import Result
 from switchfit.optimize.diagnosis import Finding
 from switchfit.optimize.matrix import Curvature, Spectrum
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 from switchfit.problem.losses import LOSSES, influence, robust
 from switchfit.problem.priors import PriorTerms
 from switchfit.problem.variables import Variables
@@ -177,7 +176,7 @@ def test_losses_are_those_of_scipy(loss):
     ours = 0.5 * robust(loss, scale, r**2).sum()
     theirs = least_squares(lambda z: r + 0.0 * z, [1.0], loss=loss, f_scale=scale, max_nfev=1)
     assert ours == pytest.approx(theirs.cost, rel=1e-13)
-    with float64():
+    with use_float64():
         u = jnp.asarray(r**2)
         slope = jax.vmap(jax.grad(lambda u: robust(loss, scale, u, jnp)))(u)
     np.testing.assert_allclose(influence(loss, scale, r**2), slope, rtol=1e-12)
@@ -237,7 +236,7 @@ def test_a_tight_prior_wins_and_a_wide_one_does_not():
 @pytest.mark.parametrize("log", [False, True])
 def test_prior_terms_are_derivatives_of_their_cost(log):
     terms = PriorTerms(np.array([0.3, 0.0]), np.array([4.0, 0.0]), np.array([log, False]))
-    with float64():
+    with use_float64():
         at = jnp.array([1.7, -2.0])
         J, g, h = terms.evaluate(at, jnp)
 
@@ -353,7 +352,7 @@ def test_nothing_compiles_anew_as_delay_and_noise_move(case):
 def test_variables_there_and_back():
     """Against JAX: gradient and Hessian in z of a cost that is given in theta."""
     variables = Variables(np.array([1.0, 2.0**-20, 1.0]), np.array([False, False, True]))
-    with float64():
+    with use_float64():
         theta = jnp.array([0.3, 3e-6, 40.0])
 
         def cost(theta):
@@ -421,13 +420,13 @@ def test_a_logarithmic_scale_stays_positive_and_bounds_hold():
 
 
 def test_the_examples_of_the_page_run():
-    """Every indented block of docs/real-logs.md, one after the other."""
+    """Every block of docs/real-logs.md, one after the other."""
     page = (Path(__file__).parent.parent / "docs" / "real-logs.md").read_text()
-    blocks = re.findall(r"(?:^    .*\n|^\n(?=    ))+", page, re.M)
+    blocks = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
     assert len(blocks) >= 5
     names = {}
     for block in blocks:
-        exec(compile(textwrap.dedent(block), "real-logs.md", "exec"), names)
+        exec(compile(block, "real-logs.md", "exec"), names)
     assert names["robust"].success
     assert names["late"].success
 

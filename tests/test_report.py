@@ -20,10 +20,10 @@ from switchfit.fit.termination import Kink, Termination
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord, Status
 from switchfit.problem.constraints import ActiveConstraint
-from switchfit.report.numbers import rounded
+from switchfit.report.numbers import format_rounded
 from switchfit.report.plot import (
     MODE_COLOURS,
-    mode_colours,
+    choose_mode_colours,
     plot_comparison,
     plot_convergence,
     plot_fit,
@@ -179,13 +179,13 @@ def test_unknowns_have_errors_units_guesses_and_modes():
     ],
 )
 def test_values_are_rounded_to_their_errors(value, error, expected):
-    assert rounded(value, error) == expected
+    assert format_rounded(value, error) == expected
 
 
 @pytest.mark.parametrize("value", [3.0, -0.02, 4.4e-9, 1.7e12, 0.0])
 @pytest.mark.parametrize("error", [1e-13, 3e-6, 0.0996, 7.0, 1e5])
 def test_rounding_loses_less_than_a_tenth_of_the_error(value, error):
-    text, spread, _ = rounded(value, error)
+    text, spread, _ = format_rounded(value, error)
     assert abs(float(text) - value) <= 0.1 * error
     assert float(spread.removeprefix("± ")) == pytest.approx(error, rel=0.06)
 
@@ -644,7 +644,9 @@ def test_mode_colours_are_light_and_differ_in_grey():
     grey = np.array([np.dot([0.2126, 0.7152, 0.0722], to_rgb(colour)) for colour in MODE_COLOURS])
     assert grey.min() > 0.75
     assert np.abs(np.diff(grey)).min() > 0.02
-    colours = mode_colours([trajectory_of(("a", "b"), (0.0, 1.0, 2.0)), trajectory_of(("c", "b"), (0.0, 1.0, 2.0))])
+    colours = choose_mode_colours(
+        [trajectory_of(("a", "b"), (0.0, 1.0, 2.0)), trajectory_of(("c", "b"), (0.0, 1.0, 2.0))]
+    )
     assert list(colours) == ["a", "b", "c"]
     assert len(set(colours.values())) == 3
 

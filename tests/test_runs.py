@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import switchfit as sf
 from switchfit.batch.program import Layout, _total
 from switchfit.cli import app
-from switchfit.discretization.mesh import common_lengths, padded_length
+from switchfit.discretization.mesh import choose_common_lengths, pad_length
 from switchfit.engine.native.program import _program_of
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import minimize_cost
@@ -545,11 +545,11 @@ def evaluated(problem):
 
 def test_common_lengths():
     """Few distinct lengths, and none more than twice what is needed."""
-    assert common_lengths([29, 59, 41]) == [64, 64, 64]
-    assert common_lengths([100]) == [padded_length(100)]
+    assert choose_common_lengths([29, 59, 41]) == [64, 64, 64]
+    assert choose_common_lengths([100]) == [pad_length(100)]
     lengths = list(range(1, 3000, 17))
-    common = common_lengths(lengths)
-    assert all(length <= there <= 2 * padded_length(length) for length, there in zip(lengths, common, strict=True))
+    common = choose_common_lengths(lengths)
+    assert all(length <= there <= 2 * pad_length(length) for length, there in zip(lengths, common, strict=True))
     assert len(set(common)) <= 11
 
 

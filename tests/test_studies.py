@@ -10,7 +10,7 @@ from switchfit.batch import simulated as module
 
 def drawn(problem, truth, seed, run=0):
     """The problem with the data of one run of a Monte Carlo study."""
-    clean = module._clean(problem, truth)
+    clean = module._simulate_clean(problem, truth)
     return module._Work(problem, [], truth, truth, None, seed, 1e-7, 200, clean).problem_of(run)
 
 

@@ -18,7 +18,7 @@ from switchfit.optimize import Status
 from switchfit.report.text import report
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.identification import analyse
-from switchfit.uncertainty.residuals import diagnose, of_channel
+from switchfit.uncertainty.residuals import diagnose, diagnose_channel
 
 TIMES = np.linspace(0.25, 6.0, 24)
 
@@ -239,7 +239,7 @@ def diagnostics_of(residual, sigma=0.1):
 def test_residuals_against_scipy_and_the_textbook():
     rng = np.random.default_rng(0)
     residual = 0.1 * rng.standard_normal(200)
-    found = of_channel(diagnostics_of(residual), 0)
+    found = diagnose_channel(diagnostics_of(residual), 0)
     z = residual / 0.1
     assert found.normality == pytest.approx(scipy.stats.jarque_bera(z).pvalue, rel=1e-9)
     assert found.skewness == pytest.approx(scipy.stats.skew(z), rel=1e-9)
@@ -256,7 +256,7 @@ def test_residuals_against_scipy_and_the_textbook():
 def test_the_tests_fail_as_often_as_they_say():
     """Of white normal noise the probabilities are uniform: 10 % of them below 0.1."""
     rng = np.random.default_rng(1)
-    found = [of_channel(diagnostics_of(0.1 * rng.standard_normal(300)), 0) for _ in range(400)]
+    found = [diagnose_channel(diagnostics_of(0.1 * rng.standard_normal(300)), 0) for _ in range(400)]
     assert np.mean([c.whiteness < 0.1 for c in found]) == pytest.approx(0.1, abs=0.045)
     assert np.mean([c.normality < 0.1 for c in found]) == pytest.approx(0.1, abs=0.045)
 
@@ -267,7 +267,7 @@ def test_correlated_residuals_are_worth_fewer():
     residual = np.zeros(2000)
     for k in range(1, 2000):
         residual[k] = 0.6 * residual[k - 1] + 0.08 * noise[k]
-    found = of_channel(diagnostics_of(residual), 0)
+    found = diagnose_channel(diagnostics_of(residual), 0)
     assert not found.white
     assert found.correlation == pytest.approx(0.6, abs=0.05)
     assert found.effective == pytest.approx(2000 * 0.4 / 1.6, rel=0.15)
@@ -306,9 +306,9 @@ def test_residuals_as_text_and_as_a_figure():
 
 
 def test_a_channel_met_exactly_and_a_short_one():
-    exact = of_channel(diagnostics_of(np.zeros(30), sigma=None), 0)
+    exact = diagnose_channel(diagnostics_of(np.zeros(30), sigma=None), 0)
     assert (exact.white, exact.normal, exact.outliers) == (True, True, 0)
-    short = of_channel(diagnostics_of(np.ones(4)), 0)
+    short = diagnose_channel(diagnostics_of(np.ones(4)), 0)
     assert np.isnan(short.whiteness)
     assert short.lags == 0
     assert short.correlation == 0.0
@@ -426,5 +426,5 @@ def test_a_profile_of_the_sparse_vehicle_is_the_lowest_cost_there_is():
     for point in inside[::4]:
         for tau_1 in (4.6, 5.5, 6.4):
             for mu in (0.4, 0.7, 1.1):
-                other = found.trace._fitted(point.value, np.array([tau_1, point.value, mu]))
+                other = found.trace._fit(point.value, np.array([tau_1, point.value, mu]))
                 assert other is None or other.cost >= point.cost - 1e-6

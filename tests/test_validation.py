@@ -25,9 +25,9 @@ from switchfit.problem.validation import (
     as_number,
     as_path,
     as_sequence,
-    listed,
+    join_names,
     refuse_single_precision,
-    shown,
+    shorten,
 )
 
 
@@ -372,7 +372,7 @@ class Table:
 
 
 def test_what_messages_show_is_on_one_line():
-    assert shown(Table()) == "a b 1 2"
+    assert shorten(Table()) == "a b 1 2"
 
 
 class Loud:
@@ -392,15 +392,15 @@ class Broken:
 )
 def test_what_messages_show_is_short(value):
     began = time.perf_counter()
-    assert 0 < len(shown(value)) <= LONGEST
+    assert 0 < len(shorten(value)) <= LONGEST
     assert time.perf_counter() - began < 0.5
 
 
 def test_lists_of_names_are_short():
-    assert listed(["a", "b"]) == "a, b"
-    assert listed([]) == "none"
-    assert listed(str(k) for k in range(1000)).endswith("9, ... (1000 in all)")
-    assert len(listed(["x" * 1000])) == 40
+    assert join_names(["a", "b"]) == "a, b"
+    assert join_names([]) == "none"
+    assert join_names(str(k) for k in range(1000)).endswith("9, ... (1000 in all)")
+    assert len(join_names(["x" * 1000])) == 40
 
 
 # What has been accepted without a word

@@ -11,7 +11,7 @@ import switchfit as sf
 from switchfit.engine.native.scalars import Graph
 from switchfit.engine.native.trace import traced
 from switchfit.fit.evaluator import evaluator_of
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 
 TIMES = np.linspace(0.1, 1.0, 5)
 GOOD, BAD = 0.5, -0.5
@@ -130,7 +130,7 @@ def test_a_batch_hands_such_fits_to_the_single_optimiser():
 
 
 def presumed(function, *shapes):
-    with float64():
+    with use_float64():
         return {node.op for node in traced(function, *shapes).presumed}
 
 

@@ -45,7 +45,7 @@ def main() -> None:
     app()
 
 
-def _version(asked: bool) -> None:
+def _print_version(asked: bool) -> None:
     if asked:
         from importlib.metadata import version
 
@@ -54,9 +54,9 @@ def _version(asked: bool) -> None:
 
 
 @app.callback()
-def _options(
+def _collect_options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
     ] = False,
 ) -> None:
     pass
@@ -91,7 +91,7 @@ def fit(
     is wrong with what was given.
     """
     given = {"hessian": hessian, "tolerance": tolerance, "max_iterations": max_iterations}
-    with _reported(debug):
+    with _report_errors(debug):
         loaded = _load(problem)
         options = loaded.options | {key: value for key, value in given.items() if value is not None}
         figures = out is not None and not no_figures
@@ -103,7 +103,7 @@ def fit(
         typer.echo(report)
         if out is not None:
             _write(out / "report.txt", report + "\n")
-            with _writing(out / "estimate.json") as path:
+            with _explain_write_errors(out / "estimate.json") as path:
                 _save(estimate, path, complete=certificate)
             if figures:
                 figure = io.BytesIO()
@@ -128,10 +128,10 @@ def check(
     Exit code 0: the derivatives are right; 1: they are not; 2: something is wrong with what was given.
     """
     if no_run:
-        with _reported(debug):
+        with _report_errors(debug):
             _check_files(problem)
         return
-    with _reported(debug):
+    with _report_errors(debug):
         loaded = _load(problem)
         import switchfit as sf
         from switchfit.io.summary import describe
@@ -154,7 +154,7 @@ def simulate(
 
     The column of times is called t, or "t (min)" where the experiments' time_unit is "min" and not "s".
     """
-    with _reported(debug):
+    with _report_errors(debug):
         loaded = _load(problem)
         import switchfit as sf
 
@@ -199,7 +199,7 @@ def paper(
     An interrupted run goes on where it stopped when the same command is given again.
     """
     os.environ.setdefault("MPLBACKEND", "Agg")
-    with _reported(debug):
+    with _report_errors(debug):
         from switchfit.paper import run
         from switchfit.paper.runner import TABLE
         from switchfit.runtime.errors import InputError
@@ -227,15 +227,15 @@ def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
 
 
 @contextlib.contextmanager
-def _reported(debug: bool) -> Iterator[None]:
+def _report_errors(debug: bool) -> Iterator[None]:
     """Turn exceptions into a sentence on stderr and an exit code, those of model files whatever they are."""
     try:
         with _handle_interrupt(_interrupt):
             yield
     except BaseException as error:
-        from switchfit.io.python_file import user_place
+        from switchfit.io.python_file import find_user_place
 
-        users = user_place(error) is not None
+        users = find_user_place(error) is not None
         if isinstance(error, typer.Exit) and not users:
             raise
         if debug:
@@ -249,11 +249,11 @@ def _reported(debug: bool) -> Iterator[None]:
 
 def _explain(error: BaseException, *, users: bool, debug: bool) -> NoReturn:
     """Say what is wrong; `users`: it was raised in a file of the user's."""
-    from switchfit.io.python_file import located
+    from switchfit.io.python_file import describe_error
     from switchfit.runtime.errors import InputError
 
     if users and not isinstance(error, InputError):
-        _fail(f"{located(error)}. (--debug shows the full traceback.)", BAD_INPUT)
+        _fail(f"{describe_error(error)}. (--debug shows the full traceback.)", BAD_INPUT)
     if isinstance(error, (ValueError, OSError)):
         _fail(str(error), BAD_INPUT)
     if isinstance(error, MemoryError):
@@ -309,7 +309,7 @@ def _estimate(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: 
     if prepare_figures:  # matplotlib, which must not look for a display, loads while XLA compiles
         os.environ.setdefault("MPLBACKEND", "Agg")
         threading.Thread(target=_import_figures, daemon=True).start()
-    with _stop_on_interrupt() as stopped, _progress() as show:
+    with _stop_on_interrupt() as stopped, _show_progress() as show:
 
         def callback(record: Any) -> bool:
             show(record)
@@ -348,7 +348,7 @@ def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
 
 
 @contextlib.contextmanager
-def _progress() -> Iterator[Callable[[Any], None]]:
+def _show_progress() -> Iterator[Callable[[Any], None]]:
     """A live line on stderr where that is a terminal, nothing otherwise."""
     if not sys.stderr.isatty():
         yield lambda record: None
@@ -360,10 +360,10 @@ def _progress() -> Iterator[Callable[[Any], None]]:
 
     waiting = Spinner("dots", "compiling (only the first time)")
     with Live(waiting, console=Console(stderr=True), transient=True, refresh_per_second=12) as live:
-        yield lambda record: live.update(Text(_line(record)))
+        yield lambda record: live.update(Text(_format_record(record)))
 
 
-def _line(record: Any) -> str:
+def _format_record(record: Any) -> str:
     return (
         f"iteration {record.iteration:3d}   cost {record.cost:.8g}   optimality {record.optimality:.2e}   "
         f"step {record.step:.2g}"
@@ -383,7 +383,7 @@ def _make_folder(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def _writing(path: Path) -> Iterator[Path]:
+def _explain_write_errors(path: Path) -> Iterator[Path]:
     """Context that says in an InputError which file cannot be written, and why."""
     from switchfit.runtime.errors import InputError
 
@@ -397,5 +397,5 @@ def _write(path: Path, content: str | bytes) -> None:
     """Write a file whole or not at all."""
     from switchfit.runtime.files import write_atomically
 
-    with _writing(path):
+    with _explain_write_errors(path):
         write_atomically(content, path)

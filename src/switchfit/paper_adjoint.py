@@ -57,9 +57,16 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from switchfit.discretization.arguments import Arguments
-from switchfit.discretization.mesh import row_ending_cell
+from switchfit.discretization.mesh import find_row_ending_cell
 from switchfit.discretization.model import Field, Model, Piece
-from switchfit.discretization.propagation import Path, at_cells, by_mode, by_row, path_cost, propagate
+from switchfit.discretization.propagation import (
+    Path,
+    compute_path_cost,
+    flatten_rows,
+    pick_at_cells,
+    propagate,
+    switch_mode,
+)
 from switchfit.discretization.rows import combine
 from switchfit.discretization.tableaus import STIFF, Tableau
 from switchfit.engine.jax.late_samples import anchors, late_state_derivatives
@@ -156,7 +163,7 @@ class Transition(NamedTuple):
     DpDpR: Array
 
 
-def paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -> tuple[Array, Array, Array]:
+def compute_paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -> tuple[Array, Array, Array]:
     """Cost, gradient and Hessian by the paper's adjoint equations.
 
     Parameters
@@ -183,25 +190,29 @@ def paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -> tuple[
     With the stiff solver each row takes a dense solve of 3 (n + n^2 + n M) unknowns: a reference for small n.
     """
     path = propagate(model, tau, p, side)
-    transitions = [transition_at(model, path, i, tau[i], p) for i in range(model.structure.N)]
-    before, after = sensitivities(model, path, transitions, p)
-    start, opened, total = backward_sweep(model, path, transitions, Sensitivities(before.Dp_x, after.Dp_x), p)
-    total = add(total, at_initial_state(model, start, p))
+    transitions = [evaluate_transition(model, path, i, tau[i], p) for i in range(model.structure.N)]
+    before, after = integrate_sensitivities(model, path, transitions, p)
+    start, opened, total = sweep_backward(model, path, transitions, Sensitivities(before.Dp_x, after.Dp_x), p)
+    total = add(total, add_initial_state(model, start, p))
 
     D_tau_J, rows_tau = [], []
     for i, here in enumerate(transitions):
         opening = path.layout.first_chunk[i + 1]
         adjoints: Adjoints = jax.tree.map(lambda a, opening=opening: a[opening], opened)
         minus, plus = pick(after, opening - 1, -1), pick(before, opening, 0)
-        total = add(total, at_reset(here, adjoints, minus.Dp_x))
+        total = add(total, add_reset(here, adjoints, minus.Dp_x))
         D_tau_J.append(here.Lambda + adjoints.psi @ here.X)  # (6), Lambda = 0 without a reset map
-        rows_tau.append(jnp.concatenate([tau_tau(i, here, adjoints, minus, plus), tau_p(here, adjoints, minus, plus)]))
+        rows_tau.append(
+            jnp.concatenate(
+                [compute_tau_tau(i, here, adjoints, minus, plus), compute_tau_p(here, adjoints, minus, plus)]
+            )
+        )
 
     gradient = jnp.concatenate([jnp.array(D_tau_J), total.Dp_J])
-    return path_cost(model, path, p), gradient, assembled(rows_tau, total.DpDp_J)
+    return compute_path_cost(model, path, p), gradient, assemble(rows_tau, total.DpDp_J)
 
 
-def assembled(rows_tau: list[Array], DpDp_J: Array) -> Array:
+def assemble(rows_tau: list[Array], DpDp_J: Array) -> Array:
     """The Hessian, equation (3), from rows (N + M,) of the tau block, zero for j > i, and the p block."""
     N, D = len(rows_tau), len(rows_tau) + DpDp_J.shape[0]
     H = jnp.zeros((D, D)).at[N:, N:].set(DpDp_J)
@@ -214,7 +225,7 @@ def assembled(rows_tau: list[Array], DpDp_J: Array) -> Array:
 # Equations (11), (13), (16), (17), at a transition time
 
 
-def tau_tau(i: int, here: Transition, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities) -> Array:
+def compute_tau_tau(i: int, here: Transition, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities) -> Array:
     """D_{tau_j} D_{tau_i} J for all j <= i, equations (11) and (13): (N,), zero for j > i."""
     psi, Omega, _ = adjoints
     X, xdot = here.X, here.xdot
@@ -232,7 +243,7 @@ def tau_tau(i: int, here: Transition, adjoints: Adjoints, minus: Sensitivities, 
     return row
 
 
-def tau_p(here: Transition, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities) -> Array:
+def compute_tau_p(here: Transition, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities) -> Array:
     """D_{tau_i} D_p J, equation (16): (M,)."""
     psi, _, Omega_p = adjoints
     X_taup = here.D1f_im1 @ minus.Dp_x - here.D1f_i @ plus.Dp_x + here.Dpf_im1 - here.Dpf_i  # (17)
@@ -240,7 +251,7 @@ def tau_p(here: Transition, adjoints: Adjoints, minus: Sensitivities, plus: Sens
     return jump + psi @ X_taup + here.X @ Omega_p  # (16)
 
 
-def transition_at(model: Model, path: Path, i: int, tau_i: Array, p: Array) -> Transition:
+def evaluate_transition(model: Model, path: Path, i: int, tau_i: Array, p: Array) -> Transition:
     """The vector fields, ell and the reset map on both sides of transition i (from 0), equation (8)."""
     opening = path.layout.first_chunk[i + 1]
     piece: Piece = pick(path.pieces, opening, 0)
@@ -248,7 +259,7 @@ def transition_at(model: Model, path: Path, i: int, tau_i: Array, p: Array) -> T
     f_before, f_after, ell = model.field(modes[i], piece), model.field(modes[i + 1], piece), model.density(piece)
     R = model.reset(i) if i in model.structure.resets else lambda t, x, p: x
 
-    def carried(t: Array, x: Array, p: Array) -> Array:
+    def carry_over(t: Array, x: Array, p: Array) -> Array:
         """F_{i-1} = D_t R + D_x R f_{i-1}, which is f_{i-1} without a reset map."""
         direction = (jnp.ones(()), f_before(t, x, p), jnp.zeros_like(p))
         return jax.jvp(R, (t, x, p), direction)[1]
@@ -258,12 +269,12 @@ def transition_at(model: Model, path: Path, i: int, tau_i: Array, p: Array) -> T
 
     x_minus, x_plus = path.before_transition(i), path.before[opening, 0]
     minus, plus = (tau_i, x_minus, p), (tau_i, x_plus, p)
-    f_im1, f_i = carried(*minus), f_after(*plus)
-    D2f_im1, D1f_im1, Dpf_im1 = jax.jacfwd(carried, argnums=(0, 1, 2))(*minus)
+    f_im1, f_i = carry_over(*minus), f_after(*plus)
+    D2f_im1, D1f_im1, Dpf_im1 = jax.jacfwd(carry_over, argnums=(0, 1, 2))(*minus)
     D2f_i, D1f_i, Dpf_i = jax.jacfwd(f_after, argnums=(0, 1, 2))(*plus)
     D2Lambda, D1Lambda, DpLambda = jax.grad(Lambda, argnums=(0, 1, 2))(*minus)
     X = f_im1 - f_i  # (8)
-    D1R, DpR, *second = first_and_second(R, *minus)
+    D1R, DpR, *second = differentiate_twice(R, *minus)
     return Transition(
         X,
         f_before(*minus),
@@ -289,7 +300,7 @@ def transition_at(model: Model, path: Path, i: int, tau_i: Array, p: Array) -> T
 # The forward sweep: equation (10) and the columns of Phi
 
 
-def sensitivities(
+def integrate_sensitivities(
     model: Model, path: Path, transitions: list[Transition], p: Array
 ) -> tuple[Sensitivities, Sensitivities]:
     """Phi(t, tau_j) X^j and D_p x at the start and at the end of each row: (Q, C, n, N) and (Q, C, n, M) arrays."""
@@ -318,7 +329,7 @@ def sensitivities(
 
     def row(now: Sensitivities, given: Any) -> tuple[Sensitivities, tuple[Sensitivities, Sensitivities]]:
         h, *jacobians = given
-        after = linear_step(tableau, rate, h, tuple(jacobians), now)[1]
+        after = step_linear(tableau, rate, h, tuple(jacobians), now)[1]
         return after, (now, after)
 
     def chunk(now: Sensitivities, given: Any) -> tuple[Sensitivities, tuple[Sensitivities, Sensitivities]]:
@@ -326,7 +337,7 @@ def sensitivities(
         # The columns X^i begin at tau_i. Misprint in the display before (10): segment k integrates from tau_k, not t0.
         jumped = Sensitivities(D1R[segment] @ now.Phi_X + X_columns[segment], D1R[segment] @ now.Dp_x + DpR[segment])
         now = where(opens, jumped, now)
-        return lax.scan(row, now, (end - start, *by_mode(model, segment, of_mode, start, end, piece, states)))
+        return lax.scan(row, now, (end - start, *switch_mode(model, segment, of_mode, start, end, piece, states)))
 
     layout = path.layout
     first = Sensitivities(jnp.zeros((n, N)), jax.jacfwd(model.initial_state)(p))
@@ -337,7 +348,7 @@ def sensitivities(
 # The backward sweep: equations (7), (12), (15) and the integrals (9), (14)
 
 
-def adjoint_rate(d: Along, adjoints: Adjoints) -> Adjoints:
+def evaluate_adjoint_rate(d: Along, adjoints: Adjoints) -> Adjoints:
     """Right-hand sides of the adjoint equations at one time; affine in the adjoints."""
     psi, Omega, Omega_p = adjoints
     psi_dot = -d.D1ell - psi @ d.D1f  # (7)
@@ -348,7 +359,7 @@ def adjoint_rate(d: Along, adjoints: Adjoints) -> Adjoints:
     return Adjoints(psi_dot, Omega_dot, Omega_p_dot)
 
 
-def integrands(d: Along, adjoints: Adjoints) -> Quadratures:
+def evaluate_integrands(d: Along, adjoints: Adjoints) -> Quadratures:
     """Integrands of D_p J and D_p D_p J; the terms in ell are ours. (15) is followed by a stray integral sign."""
     psi, _, Omega_p = adjoints
     first = psi @ d.Dpf + d.Dpell  # (9)
@@ -358,7 +369,7 @@ def integrands(d: Along, adjoints: Adjoints) -> Quadratures:
     return Quadratures(first, second)
 
 
-def backward_sweep(
+def sweep_backward(
     model: Model, path: Path, transitions: list[Transition], Dp_x: Sensitivities, p: Array
 ) -> tuple[Adjoints, Adjoints, Quadratures]:
     """Adjoints at t0, the adjoints where each chunk opens (Q, ...; tau_i+ where it opens a segment), and (9), (14).
@@ -366,25 +377,25 @@ def backward_sweep(
     `Dp_x` holds D_p x at the start and at the end of each row, two (Q, C, n, M) arrays.
     """
     Dp_x_before, Dp_x_after = Dp_x
-    final, total = point_cost(model.terminal, path.after[-1, -1], Dp_x_after[-1, -1], p)
-    at_t0, jumps, sampled = sample_jumps(model, path, Dp_x_before, Dp_x_after, p)
-    late, sampled_late = late_jumps(model, path, Dp_x_before, p)
+    final, total = add_point_cost(model.terminal, path.after[-1, -1], Dp_x_after[-1, -1], p)
+    at_t0, jumps, sampled = add_sample_jumps(model, path, Dp_x_before, Dp_x_after, p)
+    late, sampled_late = add_late_jumps(model, path, Dp_x_before, p)
     total = add(total, add(sampled, sampled_late))
 
     def row(now: tuple[Adjoints, Quadratures], given: Any) -> tuple[tuple[Adjoints, Quadratures], None]:
         adjoints, total = now
         start, end, d, jump, *late = given
-        states, adjoints = linear_step(model.tableau, adjoint_rate, start - end, d, add(adjoints, jump))
-        rates = jax.vmap(integrands)(d, states)
+        states, adjoints = step_linear(model.tableau, evaluate_adjoint_rate, start - end, d, add(adjoints, jump))
+        rates = jax.vmap(evaluate_integrands)(d, states)
         b = jnp.asarray(model.tableau.b)
         total = jax.tree.map(lambda a, r: a + (end - start) * jnp.tensordot(b, r, 1), total, rates)
         return (add(adjoints, late[0]) if late else adjoints, total), None
 
     def chunk(now: tuple[Adjoints, Quadratures], given: Any) -> tuple[tuple[Adjoints, Quadratures], Adjoints]:
         segment, opens, jump, late, start, end, *trajectory = given
-        d = along_rows(model, segment, p, start, end, *trajectory)
+        d = differentiate_along_rows(model, segment, p, start, end, *trajectory)
         (opened, total), _ = lax.scan(row, now, (start, end, d, jump, *late), reverse=True)
-        return (before_reset(transitions, segment, opens, opened, pick(Dp_minus, segment)), total), opened
+        return (pass_reset(transitions, segment, opens, opened, pick(Dp_minus, segment)), total), opened
 
     layout = path.layout
     minus = [Dp_x_after[layout.first_chunk[i + 1] - 1, -1] for i in range(len(transitions))]
@@ -395,7 +406,7 @@ def backward_sweep(
     return add(start, at_t0), opened, total
 
 
-def along_rows(
+def differentiate_along_rows(
     model: Model, segment: Array, p: Array, start: Array, end: Array, pieces: Piece, *values: Array
 ) -> Along:
     """`Along` at the stages of the backward sweep through a chunk of rows of one segment, (C, s, ...).
@@ -410,9 +421,9 @@ def along_rows(
             f = model.field(mode, piece)
 
             def stage(s: Array) -> tuple[Array, ...]:
-                x, linear = jax.linearize(lambda *ends: interpolated(f, s, start, end, *ends), x_k, x_k1, p)
+                x, linear = jax.linearize(lambda *ends: interpolate(f, s, start, end, *ends), x_k, x_k1, p)
                 columns = jax.vmap(linear, in_axes=-1, out_axes=-1)(*Dp_x, directions)
-                return x, columns, *first_and_second(f, start + s * (end - start), x, p)
+                return x, columns, *differentiate_twice(f, start + s * (end - start), x, p)
 
             return jax.vmap(stage)(fractions)
 
@@ -420,13 +431,13 @@ def along_rows(
 
     def of_ell(start: Array, end: Array, piece: Piece, x: Array) -> tuple[Array, ...]:
         times = start + fractions * (end - start)
-        return jax.vmap(lambda t, x: first_and_second(model.density(piece), t, x, p))(times, x)
+        return jax.vmap(lambda t, x: differentiate_twice(model.density(piece), t, x, p))(times, x)
 
-    x, Dp_x, *of_f = by_mode(model, segment, of_mode, start, end, pieces, *values)
+    x, Dp_x, *of_f = switch_mode(model, segment, of_mode, start, end, pieces, *values)
     return Along(Dp_x, *of_f, *jax.vmap(of_ell)(start, end, pieces, x))
 
 
-def interpolated(f: Field, s: Array, start: Array, end: Array, x_k: Array, x_k1: Array, p: Array) -> Array:
+def interpolate(f: Field, s: Array, start: Array, end: Array, x_k: Array, x_k1: Array, p: Array) -> Array:
     """x at ``start + s (end - start)``, s in [0, 1], by quintic Hermite interpolation of one row: (n,).
 
     From x, x_dot = f and x_ddot = D_2 f + D_1 f f at both ends; the error is of order 6 in the row's length.
@@ -448,7 +459,9 @@ def interpolated(f: Field, s: Array, start: Array, end: Array, x_k: Array, x_k1:
 # Jumps: samples, the terminal cost, reset maps, the initial state
 
 
-def point_cost(cost: Callable[[Array, Array], Array], x: Array, Dp_x: Array, p: Array) -> tuple[Adjoints, Quadratures]:
+def add_point_cost(
+    cost: Callable[[Array, Array], Array], x: Array, Dp_x: Array, p: Array
+) -> tuple[Adjoints, Quadratures]:
     """What a cost of x at one time, a sample or the terminal cost, adds to the adjoints there and to (9), (14)."""
     (Dell, Dpell) = jax.grad(cost, argnums=(0, 1))(x, p)
     (D2ell, DpD1ell), (D1Dpell, DpDpell) = jax.hessian(cost, argnums=(0, 1))(x, p)
@@ -456,7 +469,7 @@ def point_cost(cost: Callable[[Array, Array], Array], x: Array, Dp_x: Array, p: 
     return jump, Quadratures(Dpell, DpDpell + D1Dpell @ Dp_x)
 
 
-def sample_jumps(
+def add_sample_jumps(
     model: Model, path: Path, Dp_x_before: Array, Dp_x_after: Array, p: Array
 ) -> tuple[Adjoints, Adjoints, Quadratures]:
     """Jumps of the adjoints at t0, those at the end of each row (Q, C, ...), and what samples add to (9), (14)."""
@@ -469,18 +482,18 @@ def sample_jumps(
             continue
 
         def one(sample: Any, x: Array, Dp_x: Array, k: int = k) -> tuple[Adjoints, Quadratures]:
-            return point_cost(lambda x, p: model.sample_cost(k, sample, x, p), x, Dp_x, p)
+            return add_point_cost(lambda x, p: model.sample_cost(k, sample, x, p), x, Dp_x, p)
 
-        Dp_x = at_cells(path.layout, Dp_x_before[0, 0], Dp_x_after, samples.cell)
+        Dp_x = pick_at_cells(path.layout, Dp_x_before[0, 0], Dp_x_after, samples.cell)
         jump, added = jax.vmap(one)(samples, path.at_samples(samples.cell), Dp_x)
-        ends = row_ending_cell(path.layout, samples.cell) + 1  # 0 is t0
+        ends = find_row_ending_cell(path.layout, samples.cell) + 1  # 0 is t0
         jumps = jax.tree.map(lambda a, b, ends=ends: a.at[ends].add(b), jumps, jump)
         total = add(total, jax.tree.map(lambda a: a.sum(0), added))
     at_rows = jax.tree.map(lambda a: a[1:].reshape((Q, C, *a.shape[1:])), jumps)
     return pick(jumps, 0), at_rows, total
 
 
-def late_jumps(model: Model, path: Path, Dp_x_before: Array, p: Array) -> tuple[tuple[Adjoints, ...], Quadratures]:
+def add_late_jumps(model: Model, path: Path, Dp_x_before: Array, p: Array) -> tuple[tuple[Adjoints, ...], Quadratures]:
     """Jumps of the adjoints at the start of each row by samples that are seen late, and what these add to (9), (14).
 
     A late sample is a cost of the state at the start of the row that holds ``t - delay``. The jumps are one tuple of
@@ -494,7 +507,7 @@ def late_jumps(model: Model, path: Path, Dp_x_before: Array, p: Array) -> tuple[
     for k in which:
         samples = model.arguments.samples[k]
         at = anchors(model, path, k, p)
-        x_d = by_row(Dp_x_before)[at.row]
+        x_d = flatten_rows(Dp_x_before)[at.row]
         (Dell, Dpell), ((D2ell, DpD1ell), (D1Dpell, DpDpell)) = late_state_derivatives(model, at, k, samples, p)
         jump = Adjoints(Dell, D2ell, D2ell @ x_d + DpD1ell)
         jumps = jax.tree.map(lambda a, b, row=at.row: a.at[row].add(b), jumps, jump)
@@ -503,7 +516,7 @@ def late_jumps(model: Model, path: Path, Dp_x_before: Array, p: Array) -> tuple[
     return (at_rows,) if which else (), total
 
 
-def before_reset(
+def pass_reset(
     transitions: list[Transition], segment: Array, opens: Array, adjoints: Adjoints, Dp_x: Array
 ) -> Adjoints:
     """The adjoints at tau_i- from those at tau_i+, where a chunk opens a segment; `Dp_x` is that at tau_i-."""
@@ -522,7 +535,7 @@ def before_reset(
     return adjoints
 
 
-def at_reset(here: Transition, adjoints: Adjoints, Dp_x: Array) -> Quadratures:
+def add_reset(here: Transition, adjoints: Adjoints, Dp_x: Array) -> Quadratures:
     """What the reset map's own dependence on p adds to (9) and (14); `Dp_x` is that at tau_i-, (n, M)."""
     psi, _, Omega_p = adjoints
     return Quadratures(
@@ -531,7 +544,7 @@ def at_reset(here: Transition, adjoints: Adjoints, Dp_x: Array) -> Quadratures:
     )
 
 
-def at_initial_state(model: Model, adjoints: Adjoints, p: Array) -> Quadratures:
+def add_initial_state(model: Model, adjoints: Adjoints, p: Array) -> Quadratures:
     """What an initial state x0(p) adds to (9) and (14)."""
     Dp_x0 = jax.jacfwd(model.initial_state)(p)
     DpDp_x0 = jax.jacfwd(jax.jacfwd(model.initial_state))(p)
@@ -542,7 +555,7 @@ def at_initial_state(model: Model, adjoints: Adjoints, p: Array) -> Quadratures:
 # Tools
 
 
-def linear_step(tableau: Tableau, rate: Callable[[Any, Any], Any], h: Array, given: Any, y: Any) -> tuple[Any, Any]:
+def step_linear(tableau: Tableau, rate: Callable[[Any, Any], Any], h: Array, given: Any, y: Any) -> tuple[Any, Any]:
     """One Runge-Kutta step of ``dy/dt = rate(given, y)``, affine in y: its stage states (s, ...) and y at its end.
 
     `given` holds what varies in time, at the s stages; h < 0 steps backward.
@@ -570,7 +583,7 @@ def linear_step(tableau: Tableau, rate: Callable[[Any, Any], Any], h: Array, giv
     return jax.vmap(unravel)(flat + h * (a @ K)), unravel(flat + h * (b @ K))
 
 
-def first_and_second(
+def differentiate_twice(
     function: Callable[[Array, Array, Array], Array], t: Array, x: Array, p: Array
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     """``D1, Dp, D1D1, DpD1, D1Dp, DpDp`` of a function of (t, x, p); the outermost derivative is the last axis."""
@@ -608,5 +621,5 @@ def pick(values: Any, *index: Any) -> Any:
 def evaluate_paper(
     arguments: Arguments, tau: Array, p: Array, side: Array, *, structure: Structure
 ) -> tuple[Array, Array, Array]:
-    """J, its gradient (D,) and its Hessian (D, D) of one experiment, as of `paper_derivatives`."""
-    return paper_derivatives(Model(structure, arguments), tau, p, side)
+    """J, its gradient (D,) and its Hessian (D, D) of one experiment, as of `compute_paper_derivatives`."""
+    return compute_paper_derivatives(Model(structure, arguments), tau, p, side)

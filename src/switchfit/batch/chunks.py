@@ -22,7 +22,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.runtime.errors import first_line
+from switchfit.runtime.errors import get_first_line
 from switchfit.runtime.files import PREFIX, SUFFIX, set_aside, write_atomically
 
 Arrays = dict[str, NDArray[Any]]
@@ -45,7 +45,7 @@ class Work(Protocol):
         """Arrays with one entry for each of the runs."""
         ...
 
-    def fingerprint(self) -> str:
+    def compute_fingerprint(self) -> str:
         """Changes with everything that a result depends on."""
         ...
 
@@ -80,7 +80,7 @@ def run_chunks(
         If the folder holds the chunks of something else.
     """
     chunks = [range(first, min(first + work.size, count)) for first in range(0, count, work.size)]
-    store = None if folder is None else _Store(Path(folder), work.fingerprint(), work.size)
+    store = None if folder is None else _Store(Path(folder), work.compute_fingerprint(), work.size)
     results: dict[int, Arrays] = {}
     if store is not None:
         results = {chunk.start: found for chunk in chunks if (found := store.load(chunk)) is not None}
@@ -88,8 +88,8 @@ def run_chunks(
     missing = [chunk for chunk in chunks if chunk.start not in results]
     stopped = progress is not None and done > 0 and bool(progress(done, count))
     if missing and not stopped:
-        computed = _threaded(work, missing) if client is None else _distributed(work, missing, client)
-        with _closing(computed):
+        computed = _run_in_threads(work, missing) if client is None else _run_on_cluster(work, missing, client)
+        with _close_generator(computed):
             try:
                 for chunk, arrays in computed:
                     results[chunk.start] = arrays
@@ -109,21 +109,21 @@ def run_chunks(
 
 
 @contextmanager
-def _closing(generator: Iterator[Any]) -> Iterator[None]:
+def _close_generator(generator: Iterator[Any]) -> Iterator[None]:
     try:
         yield
     finally:
         generator.close()  # type: ignore[attr-defined]  # a generator
 
 
-def cores() -> int:
+def count_cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _threaded(work: Work, chunks: list[range]) -> Iterator[tuple[range, Arrays]]:
+def _run_in_threads(work: Work, chunks: list[range]) -> Iterator[tuple[range, Arrays]]:
     """Chunks as they are done by threads; JAX's programs run outside Python's lock."""
-    pool = ThreadPoolExecutor(cores())
+    pool = ThreadPoolExecutor(count_cores())
     try:
         futures: dict[Future[Arrays], range] = {pool.submit(work, chunk): chunk for chunk in chunks}
         pending = set(futures)
@@ -136,7 +136,7 @@ def _threaded(work: Work, chunks: list[range]) -> Iterator[tuple[range, Arrays]]
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _distributed(work: Work, chunks: list[range], client: Any) -> Iterator[tuple[range, Arrays]]:
+def _run_on_cluster(work: Work, chunks: list[range], client: Any) -> Iterator[tuple[range, Arrays]]:
     """Chunks as they are done by the workers of a Dask cluster.
 
     The work travels as bytes that are themselves the result of a task, so that they outlive the workers that hold
@@ -146,9 +146,10 @@ def _distributed(work: Work, chunks: list[range], client: Any) -> Iterator[tuple
     from distributed import as_completed
 
     blob = cloudpickle.dumps(work)
-    shared = client.submit(_received, blob, pure=False)
+    shared = client.submit(_receive, blob, pure=False)
     futures = {
-        client.submit(_remote, shared, chunk.start, chunk.stop, pure=False, retries=RETRIES): chunk for chunk in chunks
+        client.submit(_run_remotely, shared, chunk.start, chunk.stop, pure=False, retries=RETRIES): chunk
+        for chunk in chunks
     }
     try:
         for future in as_completed(list(futures)):
@@ -157,20 +158,20 @@ def _distributed(work: Work, chunks: list[range], client: Any) -> Iterator[tuple
         client.cancel([*futures, shared])
 
 
-def _received(blob: bytes) -> bytes:
+def _receive(blob: bytes) -> bytes:
     return blob
 
 
 @functools.lru_cache(maxsize=4)
-def _unpickled(blob: bytes) -> Work:
+def _unpickle(blob: bytes) -> Work:
     import cloudpickle
 
     work: Work = cloudpickle.loads(blob)
     return work
 
 
-def _remote(blob: bytes, start: int, stop: int) -> Arrays:
-    return _unpickled(blob)(range(start, stop))
+def _run_remotely(blob: bytes, start: int, stop: int) -> Arrays:
+    return _unpickle(blob)(range(start, stop))
 
 
 class _Store:
@@ -273,7 +274,7 @@ def _read_chunk(path: Path) -> tuple[Arrays | None, str]:
             arrays = {name: file[name] for name in file.files}
         seal = str(arrays.pop("seal", ""))
     except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds on what they cannot read
-        return None, f"it cannot be read ({first_line(error)})"
+        return None, f"it cannot be read ({get_first_line(error)})"
     if seal != _seal(arrays) or not {"fingerprint", "runs"} <= arrays.keys():
         return None, "its content is not what was written"
     return arrays, ""
@@ -281,10 +282,10 @@ def _read_chunk(path: Path) -> tuple[Arrays | None, str]:
 
 def _seal(arrays: Arrays) -> str:
     """A digest of names, types, shapes and numbers."""
-    return fingerprint(*(part for name in sorted(arrays) for part in (name, np.asarray(arrays[name]))))
+    return compute_fingerprint(*(part for name in sorted(arrays) for part in (name, np.asarray(arrays[name]))))
 
 
-def fingerprint(*parts: Any) -> str:
+def compute_fingerprint(*parts: Any) -> str:
     """A digest of numbers, strings and arrays."""
     digest = hashlib.sha256()
     for part in parts:

@@ -22,8 +22,8 @@ from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_path
-from switchfit.runtime.presentation import text_of
-from switchfit.runtime.progress import reporting
+from switchfit.runtime.presentation import format_text
+from switchfit.runtime.progress import show_progress
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +58,21 @@ class Fits:
         Unknowns that were estimated on a logarithmic scale.
     seconds : float
         Wall time of all.
+
+    See Also
+    --------
+    estimate_many, monte_carlo, multistart, bootstrap
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fits = sf.estimate_many([heater_problem(), heater_problem()])
+    >>> len(fits), fits.success
+    (2, array([ True,  True]))
+    >>> fits.theta.round(3)
+    array([[2.462, 0.393],
+           [2.462, 0.393]])
     """
 
     theta_names: tuple[str, ...]
@@ -103,7 +118,21 @@ class Fits:
             return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
     def confidence_intervals(self, level: float = 0.95) -> FloatArray:
-        """Intervals of each fit: (R, d, 2); see `Estimate.confidence_intervals`."""
+        """Intervals of each fit: (R, d, 2); see `Estimate.confidence_intervals`.
+
+        See Also
+        --------
+        Estimate.confidence_intervals, MonteCarlo.coverage
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fits = sf.estimate_many([heater_problem()])
+        >>> fits.confidence_intervals(0.9).round(2)
+        array([[[2.43, 2.49],
+                [0.38, 0.4 ]]])
+        """
         level = as_level(level)
         freedom, tail = np.maximum(self.samples - self.free, 1), 0.5 + level / 2
         quantile = scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail)
@@ -111,7 +140,7 @@ class Fits:
         return interval(self.theta, half, np.isin(self.theta_names, self.log_scaled))
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)
 
 
 def check_long_run(client: Any, folder: Any, callback: Any) -> None:
@@ -154,12 +183,12 @@ def repeat(
         For a problem with a switch that is hidden in a function, with which no fit could be right.
     """
     _refuse_hidden_switches(problem)
-    progress, end = reporting(callback, title)
+    progress, end = show_progress(callback, title)
     try:
         runs, arrays = run_chunks(work, count, client=client, folder=folder, progress=progress)
     finally:
         end()
-    return _fields(problem, count, runs, arrays, time.perf_counter() - began)
+    return _collect_fields(problem, count, runs, arrays, time.perf_counter() - began)
 
 
 def _refuse_hidden_switches(problem: Problem) -> None:
@@ -173,7 +202,7 @@ def _refuse_hidden_switches(problem: Problem) -> None:
         refuse_hidden_switches(evaluator, theta, gradient)
 
 
-def _fields(
+def _collect_fields(
     problem: Problem, requested: int, runs: NDArray[np.intp], arrays: dict[str, NDArray[Any]], seconds: float
 ) -> dict[str, Any]:
     """The fields of `Fits` from what the chunks found, covariances scaled by the residual variance where needed."""
@@ -198,6 +227,6 @@ def _fields(
     }
 
 
-def sample_count(problem: Problem) -> int:
+def count_samples(problem: Problem) -> int:
     """Measured values that are not missing."""
     return sum(item.count for run in problem.experiments for item in run.data if isinstance(item, Measurements))

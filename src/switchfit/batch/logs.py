@@ -12,15 +12,15 @@ import jax
 import numpy as np
 
 from switchfit.batch.again import adopt, is_resolved
-from switchfit.batch.chunks import Arrays, fingerprint
-from switchfit.batch.fits import Fits, check_long_run, repeat, sample_count
+from switchfit.batch.chunks import Arrays, compute_fingerprint
+from switchfit.batch.fits import Fits, check_long_run, count_samples, repeat
 from switchfit.batch.program import Varying, chunk_size, error_message, fit_chunk, make_failed_chunk
-from switchfit.estimation.estimator import checked_settings, estimate
+from switchfit.estimation.estimator import check_settings, estimate
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import is_sigma_known
 from switchfit.optimize import Status
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_instance, as_sequence, listed
+from switchfit.problem.validation import as_instance, as_sequence, join_names
 
 
 def estimate_many(
@@ -53,9 +53,21 @@ def estimate_many(
         If the problems differ in more than their numbers, or the folder holds something else.
     TypeError
         If an argument is of the wrong type.
+
+    See Also
+    --------
+    estimate, monte_carlo, multistart
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fits = sf.estimate_many([heater_problem() for _ in range(3)])
+    >>> fits.theta.shape, bool(fits.success.all())
+    ((3, 2), True)
     """
     problems = list(as_sequence(problems, "problems", "a sequence of sf.Problem"))
-    tolerance, max_iterations = checked_settings(tolerance, max_iterations)
+    tolerance, max_iterations = check_settings(tolerance, max_iterations)
     check_long_run(client, folder, callback)
     if not problems:
         raise ValueError("estimate_many needs one problem or more; got none.")
@@ -65,7 +77,7 @@ def estimate_many(
         if problem.theta_names != first.theta_names or is_sigma_known(problem) is not is_sigma_known(first):
             raise ValueError(
                 f"problem {k} differs from the first one in more than its numbers: it has the unknowns "
-                f"{listed(problem.theta_names)}, the first one {listed(first.theta_names)}. Fit it by itself."
+                f"{join_names(problem.theta_names)}, the first one {join_names(first.theta_names)}. Fit it by itself."
             )
         units = [[run.time_unit for run in of.experiments] for of in (problem, first)]
         if units[0] != units[1]:
@@ -96,20 +108,20 @@ class _Work:
         errors: dict[int, Exception] = {}
         for k in runs:
             try:
-                groups.setdefault(_kind(self.problems[k]), []).append(k)
+                groups.setdefault(_get_kind(self.problems[k]), []).append(k)
             except (
                 Exception
             ) as error:  # where its guess cannot be integrated, say: listed, as it must not end the others
                 errors[k] = error
-        parts = [self._group([self.problems[k] for k in members]) for members in groups.values()]
+        parts = [self._fit_group([self.problems[k] for k in members]) for members in groups.values()]
         order = [k for members in groups.values() for k in members]
         if errors:
             order += errors
-            parts.append(self._failed(errors))
+            parts.append(self._list_failed(errors))
         place = np.argsort(order)
         return {name: np.concatenate([part[name] for part in parts])[place] for name in parts[0]}
 
-    def _group(self, problems: list[Problem]) -> Arrays:
+    def _fit_group(self, problems: list[Problem]) -> Arrays:
         leaves = [jax.tree.leaves(tuple(evaluator_of(problem).arguments)) for problem in problems]
         stacked = tuple(np.stack([np.asarray(leaf) for leaf in column]) for column in zip(*leaves, strict=True))
         varying = Varying(tuple(range(len(stacked))), stacked)
@@ -127,20 +139,20 @@ class _Work:
         for k, problem in enumerate(problems):
             if arrays["status"][k] != Status.ERROR.name:
                 try:
-                    self._check(problem, k, arrays)
+                    self._redo_unresolved(problem, k, arrays)
                 except Exception as error:
                     arrays["status"][k], arrays["message"][k] = Status.ERROR.name, error_message(error)
         arrays["message"], arrays["status"] = arrays["message"].astype(str), arrays["status"].astype(str)
-        return {**arrays, "start": starts, "samples": np.array([sample_count(problem) for problem in problems])}
+        return {**arrays, "start": starts, "samples": np.array([count_samples(problem) for problem in problems])}
 
-    def _failed(self, errors: dict[int, Exception]) -> Arrays:
+    def _list_failed(self, errors: dict[int, Exception]) -> Arrays:
         """Arrays for problems that could not be begun."""
         starts = np.array([self.problems[k].initial_theta for k in errors])
         found = make_failed_chunk(starts, dict(enumerate(errors.values())))
-        samples = np.array([sample_count(self.problems[k]) for k in errors])
+        samples = np.array([count_samples(self.problems[k]) for k in errors])
         return {**found._asdict(), "start": starts, "samples": samples}
 
-    def _check(self, problem: Problem, k: int, arrays: Arrays) -> None:
+    def _redo_unresolved(self, problem: Problem, k: int, arrays: Arrays) -> None:
         """Do a fit again by `estimate` if its integration error is too large."""
         theta, cost = arrays["theta"][k], float(arrays["cost"][k])
         if not is_resolved(problem, evaluator_of(problem).meshes, theta, cost):
@@ -148,7 +160,7 @@ class _Work:
                 arrays, k, estimate(problem, tolerance=self.tolerance, max_iterations=self.max_iterations, start=theta)
             )
 
-    def fingerprint(self) -> str:
+    def compute_fingerprint(self) -> str:
         parts: list[Any] = ["logs", len(self.problems), self.tolerance, self.max_iterations]
         for problem in self.problems:
             parts += [problem.theta_names, problem.initial_theta, *problem.unknowns.priors, problem.digests]
@@ -158,10 +170,10 @@ class _Work:
                 parts.append(error_message(error))
             else:
                 parts += map(np.asarray, jax.tree.leaves(tuple(evaluator.arguments)))
-        return fingerprint(*parts)
+        return compute_fingerprint(*parts)
 
 
-def _kind(problem: Problem) -> Any:
+def _get_kind(problem: Problem) -> Any:
     """Equal for problems that one program can fit with one set of constraints."""
     evaluator = evaluator_of(problem)
     shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(tuple(evaluator.arguments)))

@@ -36,12 +36,12 @@ from switchfit.optimize import Status
 from switchfit.optimize.qp import nearest_feasible
 from switchfit.optimize.traced import Breakpoints, Constraints, Outcome, minimize_traced
 from switchfit.problem.data import FloatArray
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
 from switchfit.problem.variables import Variables
-from switchfit.runtime.cache import compilation_cache
+from switchfit.runtime.cache import use_compilation_cache
 
 CHUNK = 32
 """Fits that one call of the program takes on a CPU."""
@@ -191,7 +191,7 @@ def fit_chunk(
     variables = unknowns.variables
     bounds = variables.inward(unknowns.lower), variables.inward(unknowns.upper)
     constraints = (unknowns.A, unknowns.b, *bounds, variables.sizes_inward(problem.sizes))
-    with float64():
+    with use_float64():
         given = (
             tuple(evaluator.arguments),
             tuple(_pad(value, size) for value in varying.values),
@@ -229,7 +229,7 @@ def _compile_once(layout: Layout, given: Any) -> Iterator[None]:
     key = (layout, tuple(np.shape(leaf) for leaf in jax.tree.leaves(given)))
     with _lock:
         if key not in _known:
-            with compilation_cache():
+            with use_compilation_cache():
                 yield
             _known.add(key)
             return
@@ -457,7 +457,7 @@ def _finish_rest(
     for k in np.flatnonzero(~settled):
         try:
             values = tuple(value[k] for value in varying.values)
-            with float64():
+            with use_float64():
                 evaluator.replace_arguments(
                     replace_leaves(base, varying.places, [jnp.asarray(value) for value in values])
                 )

@@ -37,22 +37,22 @@ import jax
 import numpy as np
 import scipy.special
 
-from switchfit.batch.chunks import Arrays, fingerprint
-from switchfit.batch.fits import Fits, check_long_run, repeat, sample_count
+from switchfit.batch.chunks import Arrays, compute_fingerprint
+from switchfit.batch.fits import Fits, check_long_run, count_samples, repeat
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
-from switchfit.batch.simulated import simulated
-from switchfit.discretization.arguments import arguments_of
+from switchfit.batch.simulated import fit_simulated
+from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
-from switchfit.estimation.estimator import Estimate, checked_settings
+from switchfit.estimation.estimator import Estimate, check_settings
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import inverse_on
 from switchfit.fit.solution import is_plain_least_squares
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_count, as_level, as_seed
-from switchfit.runtime.presentation import figure_of
-from switchfit.uncertainty.residuals import autocorrelation
-from switchfit.uncertainty.sensitivity import sample_derivatives
+from switchfit.runtime.presentation import draw_figure
+from switchfit.uncertainty.residuals import compute_autocorrelation
+from switchfit.uncertainty.sensitivity import collect_sample_derivatives
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -79,6 +79,20 @@ class Bootstrap(Fits):
         How the standard error changes with the estimate, for "bca" intervals.
     resampled : (d,) bool
         Of which unknowns something is said: with "runs" only of those that several runs share.
+
+    See Also
+    --------
+    bootstrap, Fits, MonteCarlo
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> found = sf.bootstrap(fit, 20)
+    >>> found.standard_deviation.shape, found.resample
+    ((2,), 'residuals')
     """
 
     estimate: FloatArray
@@ -107,6 +121,20 @@ class Bootstrap(Fits):
             As in ``scipy.stats.bootstrap``: "percentile" takes quantiles of the estimates; "basic" mirrors them at the
             estimate; "bca" shifts them for bias and for acceleration (Efron 1987), whose sum over the leave-one-out
             estimates is taken to first order, from exact derivatives, instead of fitting again without each sample.
+
+        See Also
+        --------
+        bootstrap, Estimate.confidence_intervals, profile
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> low, high = sf.bootstrap(fit, 20).intervals(0.9, method="percentile").T
+        >>> bool((low < high).all())
+        True
         """
         level = as_level(level)
         method = as_choice(method, "method", get_args(Interval))
@@ -129,8 +157,22 @@ class Bootstrap(Fits):
         return found
 
     def plot(self) -> Figure:
-        """Histogram of the estimates of each unknown with its interval, as a matplotlib Figure."""
-        return figure_of(self)
+        """Histogram of the estimates of each unknown with its interval, as a matplotlib Figure.
+
+        See Also
+        --------
+        bootstrap
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> len(sf.bootstrap(fit, 20).plot().axes)
+        2
+        """
+        return draw_figure(self)
 
 
 def bootstrap(
@@ -172,6 +214,20 @@ def bootstrap(
     ValueError
         For an estimate that has no problem or did not converge, data that cannot be resampled, fewer than two
         experiments for "runs", or a folder that holds something else.
+
+    See Also
+    --------
+    monte_carlo, profile, Estimate.confidence_intervals
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> found = sf.bootstrap(fit, 20, resample="blocks", block=4, seed=1)
+    >>> len(found), found.intervals(0.9).shape
+    (20, (2, 2))
     """
     if not isinstance(estimate, Estimate):
         raise TypeError(f"bootstrap needs the result of sf.estimate; got {type(estimate).__name__}.")
@@ -179,7 +235,7 @@ def bootstrap(
     if block is not None and resample != "blocks":
         raise ValueError(f"block is the length of blocks: give it with resample='blocks', not with {resample!r}.")
     runs, seed = as_count(runs, "runs", at_least=1), as_seed(seed)
-    tolerance, max_iterations = checked_settings(tolerance, max_iterations)
+    tolerance, max_iterations = check_settings(tolerance, max_iterations)
     check_long_run(client, folder, callback)
     if not estimate.success:
         raise ValueError(f"a bootstrap begins at a minimum, and this fit has not found one: {estimate.message}")
@@ -200,10 +256,10 @@ def bootstrap(
     else:
         draw = _Draw(estimate, problem, resample, block)
         size = draw.block
-        found, _ = simulated(
+        found, _ = fit_simulated(
             problem, runs, estimate.theta, estimate.theta, draw, title="Bootstrap", began=began, **settings, **long_run
         )
-    acceleration = _acceleration(estimate, by_run=resample == "runs")
+    acceleration = _compute_acceleration(estimate, by_run=resample == "runs")
     return Bootstrap(
         **found,
         estimate=estimate.theta.copy(),
@@ -228,12 +284,12 @@ def _check_data(problem: Problem) -> None:
         )
 
 
-def _acceleration(estimate: Estimate, *, by_run: bool) -> FloatArray:
+def _compute_acceleration(estimate: Estimate, *, by_run: bool) -> FloatArray:
     """``sum l^3 / (6 (sum l^2)^(3/2))`` over the influence l of each sample, or run, on each unknown ([5]_): (d,).
 
     A sample's influence is to first order ``-H^-1 g``, g being the gradient of its part of the cost.
     """
-    found = sample_derivatives(estimate.evaluator_at_solution().problem, estimate.sensitivities)
+    found = collect_sample_derivatives(estimate.evaluator_at_solution().problem, estimate.sensitivities)
     gradients = (found.weight * found.residual)[:, None] * found.derivative
     if by_run:
         runs = len(estimate.trajectories)
@@ -255,7 +311,7 @@ class _Draw:
         self.pools: list[FloatArray] = []
         for experiment, comparisons in zip(problem.experiments, estimate.comparisons, strict=True):
             for item, comparison in zip(experiment.data, comparisons, strict=True):
-                residuals = inflation * comparison.residuals / _sigma(item)
+                residuals = inflation * comparison.residuals / _get_sigma(item)
                 centred = residuals if resample == "wild" else residuals - np.nanmean(residuals, axis=0)
                 self.items.append(item)
                 self.pools.append(centred)
@@ -273,7 +329,7 @@ class _Draw:
             for channel in pool.T:
                 known = channel[np.isfinite(channel)]
                 if len(known) > 2:
-                    r = min(float(autocorrelation(known, 1)[0]), 0.99)
+                    r = min(float(compute_autocorrelation(known, 1)[0]), 0.99)
                     lengths.append((np.sqrt(6) * r / (1 - r**2)) ** (2 / 3) * len(known) ** (1 / 3) if r > 0 else 1.0)
         return max(1, min(round(max(lengths)), max(len(pool) for pool in self.pools) // 2))
 
@@ -293,10 +349,10 @@ class _Draw:
                 known = pool[np.isfinite(pool[:, k]), k]
                 if missing.any():
                     drawn[missing, k] = rng.choice(known, size=int(missing.sum())) if len(known) else 0.0
-        return clean + drawn * _sigma(item)
+        return clean + drawn * _get_sigma(item)
 
 
-def _sigma(item: Measurements) -> FloatArray:
+def _get_sigma(item: Measurements) -> FloatArray:
     """Standard deviation of each sample, 1 where it is unknown: (K, q)."""
     return np.broadcast_to(1.0 if item.sigma is None else item.sigma, item.values.shape)
 
@@ -328,14 +384,14 @@ class _Runs:
         found = fit_chunk(
             self.problem,
             self.meshes,
-            self._varying(weights),
+            self._stack_values(weights),
             starts,
             tolerance=self.tolerance,
             max_iterations=self.max_iterations,
         )
-        return {**found._asdict(), "start": starts, "samples": np.full(len(runs), sample_count(self.problem))}
+        return {**found._asdict(), "start": starts, "samples": np.full(len(runs), count_samples(self.problem))}
 
-    def _varying(self, weights: FloatArray) -> Varying:
+    def _stack_values(self, weights: FloatArray) -> Varying:
         """The weights of all samples (R, K, q), times those of their experiments."""
         arguments = tuple(Evaluator(self.problem, meshes=self.meshes).arguments)
         leaves, tree = jax.tree.flatten(arguments)
@@ -346,10 +402,10 @@ class _Runs:
                 changed[samples.weight] = weights[:, e, None, None] * np.asarray(leaves[samples.weight])[None]
         return Varying(tuple(changed), tuple(changed.values()))
 
-    def fingerprint(self) -> str:
+    def compute_fingerprint(self) -> str:
         unknowns = self.problem.unknowns
         settings = self.seed, self.tolerance, self.max_iterations, unknowns.names, self.problem.solver
-        leaves = jax.tree.leaves([arguments_of(self.problem, e, mesh) for e, mesh in enumerate(self.meshes)])
+        leaves = jax.tree.leaves([build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes)])
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
         model = self.problem.digests
-        return fingerprint("bootstrap of runs", settings, model, self.start, *bounds, *map(np.asarray, leaves))
+        return compute_fingerprint("bootstrap of runs", settings, model, self.start, *bounds, *map(np.asarray, leaves))

@@ -13,21 +13,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.batch.again import redo_unresolved
-from switchfit.batch.chunks import Arrays, fingerprint
-from switchfit.batch.fits import Fits, check_long_run, repeat, sample_count
+from switchfit.batch.chunks import Arrays, compute_fingerprint
+from switchfit.batch.fits import Fits, check_long_run, count_samples, repeat
 from switchfit.batch.program import Varying, chunk_size, fit_chunk, with_errors
-from switchfit.discretization.arguments import arguments_of, by_cell
+from switchfit.discretization.arguments import build_arguments, split_by_cell
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refined_mesh
-from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, checked_settings, estimate
+from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, check_settings, estimate
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.guards import place_on_near_guards
 from switchfit.fit.trajectory import compare
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_array, as_callable, as_count, as_instance, as_seed, shown
-from switchfit.runtime.presentation import figure_of
+from switchfit.problem.validation import as_array, as_callable, as_count, as_instance, as_seed, shorten
+from switchfit.runtime.presentation import draw_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,6 +48,20 @@ class MonteCarlo(Fits):
         At which the data were simulated.
     integration_error : float
         Error of J at the truth by halving all steps, relative to J, or to 1e-3 of J at the start where that is more.
+
+    See Also
+    --------
+    monte_carlo, Fits, bootstrap
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> study = sf.monte_carlo(problem, 20, theta=[2.5, 0.4])
+    >>> study.bias.shape, study.coverage().shape
+    ((2,), (2,))
     """
 
     truth: FloatArray
@@ -69,14 +83,43 @@ class MonteCarlo(Fits):
         return self.errors.std(0, ddof=1)
 
     def coverage(self, level: float = 0.95) -> FloatArray:
-        """Part of the fits that converged whose interval contains the truth: (d,); NaN without a noise model."""
+        """Part of the fits that converged whose interval contains the truth: (d,); NaN without a noise model.
+
+        See Also
+        --------
+        monte_carlo, Fits.confidence_intervals
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> study = sf.monte_carlo(problem, 20, theta=[2.5, 0.4])
+        >>> bool((study.coverage(0.95) > 0.7).all())
+        True
+        """
         low, high = np.moveaxis(self.confidence_intervals(level)[self.success], 2, 0)
         inside = (low <= self.truth) & (self.truth <= high)
         return np.where(np.isnan(low).any(0), np.nan, inside.mean(0))
 
     def plot(self) -> Figure:
-        """Histogram of the estimates of each unknown with the truth, as a matplotlib Figure."""
-        return figure_of(self)
+        """Histogram of the estimates of each unknown with the truth, as a matplotlib Figure.
+
+        See Also
+        --------
+        monte_carlo
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> len(sf.monte_carlo(problem, 20, theta=[2.5, 0.4]).plot().axes)
+        2
+        """
+        return draw_figure(self)
 
 
 def monte_carlo(
@@ -135,18 +178,32 @@ def monte_carlo(
     -----
     All fits share one mesh, which resolves the trajectories at the start and at the truth. Transition times that have
     guards are moved onto them in the truth.
+
+    See Also
+    --------
+    bootstrap, estimate_many
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> study = sf.monte_carlo(problem, 20, theta=[2.5, 0.4], seed=1)
+    >>> len(study), bool((study.standard_deviation < 0.05).all())
+    (20, True)
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     runs, seed = as_count(runs, "runs", at_least=1), as_seed(seed)
-    tolerance, max_iterations = checked_settings(tolerance, max_iterations)
+    tolerance, max_iterations = check_settings(tolerance, max_iterations)
     check_long_run(client, folder, callback)
-    noise = _checked_noise(noise)
+    noise = _check_noise(noise)
     began = time.perf_counter()
-    given = None if theta is None else problem.checked_theta(theta)
-    begin = None if start is None else problem.checked_theta(start, "start")
+    given = None if theta is None else problem.check_theta(theta)
+    begin = None if start is None else problem.check_theta(start, "start")
     truth = estimate(problem).theta if given is None else place_on_near_guards(evaluator_of(problem), given)
     begin = truth if begin is None else begin
-    found, error = simulated(
+    found, error = fit_simulated(
         problem,
         runs,
         truth,
@@ -164,7 +221,7 @@ def monte_carlo(
     return MonteCarlo(**found, truth=truth, integration_error=error)
 
 
-def _checked_noise(noise: Noise) -> Noise:
+def _check_noise(noise: Noise) -> Noise:
     """Return the noise as an array, a function or None."""
     if noise is None:
         return None
@@ -173,7 +230,7 @@ def _checked_noise(noise: Noise) -> Noise:
     return as_array(noise, "noise", form="a number, one for each channel, or a function")
 
 
-def simulated(
+def fit_simulated(
     problem: Problem,
     runs: int,
     truth: FloatArray,
@@ -201,14 +258,14 @@ def simulated(
     began : float
         ``time.perf_counter()`` when the call began.
     """
-    work = _Work(problem, [], truth, begin, noise, seed, tolerance, max_iterations, _clean(problem, truth))
+    work = _Work(problem, [], truth, begin, noise, seed, tolerance, max_iterations, _simulate_clean(problem, truth))
     work.check_noise(runs)
-    work.meshes, error = _meshes(work.problem_of(work.sound), truth, begin)
+    work.meshes, error = _build_meshes(work.problem_of(work.sound), truth, begin)
     found = repeat(problem, work, runs, title, began, client=client, folder=folder, callback=callback)
     return found, error
 
 
-def _clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray | None]]:
+def _simulate_clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray | None]]:
     """What each of the data of each experiment would be without noise: (K, q) arrays; None for costs without data."""
     sampled, which = [], []
     for experiment in problem.experiments:
@@ -231,10 +288,10 @@ def _clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray | None]]
             raise ValueError("monte_carlo needs Measurements or a ReferenceSignal made from samples to simulate.")
         sampled.append(replace(experiment, data=items))
         which.append(kept)
-    simulated = replace(problem, experiments=sampled)
-    meshes = Evaluator(simulated, truth).meshes
+    without_noise = replace(problem, experiments=sampled)
+    meshes = Evaluator(without_noise, truth).meshes
     _, comparisons = compare(
-        simulated, truth, Evaluator(simulated, meshes=[mesh.divided() for mesh in meshes]).simulate(truth)
+        without_noise, truth, Evaluator(without_noise, meshes=[mesh.divide() for mesh in meshes]).simulate(truth)
     )
     clean: list[list[FloatArray | None]] = [[None] * len(experiment.data) for experiment in problem.experiments]
     for e, (kept, found) in enumerate(zip(which, comparisons, strict=True)):
@@ -243,7 +300,7 @@ def _clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray | None]]
     return clean
 
 
-def _meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tuple[list[Mesh], float]:
+def _build_meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tuple[list[Mesh], float]:
     """Meshes that resolve the trajectories at the start and at the truth, and the integration error at the truth.
 
     A mode that is active in another part of the horizon at the start would run over cells that are far too long for it,
@@ -288,7 +345,7 @@ class _Work:
         errors = []
         for run in range(min(count, SOUND_AMONG)):
             try:
-                self._noisy(run)
+                self._draw_run(run)
             except Exception as error:  # of this run alone, perhaps
                 errors.append(error)
             else:
@@ -296,7 +353,7 @@ class _Work:
                 return
         raise errors[0]
 
-    def _noisy(self, run: int) -> dict[tuple[int, int], FloatArray]:
+    def _draw_run(self, run: int) -> dict[tuple[int, int], FloatArray]:
         """Values of the k-th data of experiment e, in one run."""
         rng = np.random.default_rng([self.seed, run])
         drawn = {}
@@ -304,7 +361,7 @@ class _Work:
             for k, clean in enumerate(items):
                 if clean is None:
                     continue
-                values = self._drawn(rng, clean, self.problem.experiments[e].data[k], e)
+                values = self._draw_values(rng, clean, self.problem.experiments[e].data[k], e)
                 if values.shape != clean.shape or not np.isfinite(values).all():
                     raise ValueError(
                         f"noise must give finite values of shape {clean.shape}; got shape {values.shape}"
@@ -313,12 +370,12 @@ class _Work:
                 drawn[e, k] = values
         return drawn
 
-    def _drawn(self, rng: np.random.Generator, clean: FloatArray, item: Any, e: int) -> FloatArray:
+    def _draw_values(self, rng: np.random.Generator, clean: FloatArray, item: Any, e: int) -> FloatArray:
         if callable(self.noise):
             return as_array(self.noise(rng, clean.copy(), item), "what noise(rng, clean, item) returns")
         sigma = self.noise
         if sigma is None:
-            sigma = item.noise(self.problem.named(self.truth, e)) if isinstance(item, Measurements) else None
+            sigma = item.noise(self.problem.name_parameters(self.truth, e)) if isinstance(item, Measurements) else None
             if sigma is None:
                 raise ValueError(
                     "noise must be given, since the data have no sigma from which to draw: a standard deviation, one "
@@ -329,16 +386,17 @@ class _Work:
         except ValueError as error:
             raise ValueError(f"noise of shape {np.shape(sigma)} does not fit data of shape {clean.shape}.") from error
         if not (np.isfinite(spread).all() and (spread >= 0).all()):
-            raise ValueError(f"noise must be zero or positive; got {shown(sigma)}.")
+            raise ValueError(f"noise must be zero or positive; got {shorten(sigma)}.")
         return clean + spread * rng.standard_normal(clean.shape)
 
     def problem_of(self, run: int) -> Problem:
         """The problem with the data of one run."""
-        noisy = self._noisy(run)
+        noisy = self._draw_run(run)
         experiments = []
         for e, experiment in enumerate(self.problem.experiments):
             data = [
-                _with_values(item, noisy[e, k]) if (e, k) in noisy else item for k, item in enumerate(experiment.data)
+                _replace_values(item, noisy[e, k]) if (e, k) in noisy else item
+                for k, item in enumerate(experiment.data)
             ]
             experiments.append(replace(experiment, data=data))
         return replace(self.problem, experiments=experiments)
@@ -347,11 +405,11 @@ class _Work:
         noisy, errors = [], {}
         for place, run in enumerate(runs):
             try:
-                noisy.append(self._noisy(run))
+                noisy.append(self._draw_run(run))
             except Exception as error:  # listed: it must not end the other runs
                 noisy.append(self._without_noise())
                 errors[place] = error
-        varying = self._varying({key: np.stack([values[key] for values in noisy]) for key in noisy[0]})
+        varying = self._stack_values({key: np.stack([values[key] for values in noisy]) for key in noisy[0]})
         starts = np.repeat(self.start[None], len(runs), axis=0)
         found = fit_chunk(
             self.problem,
@@ -364,15 +422,15 @@ class _Work:
         found = with_errors(found, errors) if errors else found
         settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
         found = redo_unresolved(found, lambda k: self.problem_of(runs[k]), self.meshes, **settings)
-        return {**found._asdict(), "start": starts, "samples": np.full(len(runs), sample_count(self.problem))}
+        return {**found._asdict(), "start": starts, "samples": np.full(len(runs), count_samples(self.problem))}
 
     def _without_noise(self) -> dict[tuple[int, int], FloatArray]:
         """What stands for the values of a run that could not be drawn."""
         return {(e, k): v for e, items in enumerate(self.clean) for k, v in enumerate(items) if v is not None}
 
-    def _varying(self, values: dict[tuple[int, int], FloatArray]) -> Varying:
+    def _stack_values(self, values: dict[tuple[int, int], FloatArray]) -> Varying:
         """Noisy values (R, K, q) of all data as leaves of the arguments."""
-        arguments = tuple(arguments_of(self.problem, e, mesh) for e, mesh in enumerate(self.meshes))
+        arguments = tuple(build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes))
         leaves, tree = jax.tree.flatten(arguments)
         places = jax.tree.unflatten(tree, range(len(leaves)))
         changed: dict[int, Any] = {}
@@ -392,22 +450,24 @@ class _Work:
                         R = len(values[e, k])
                         if leaf not in changed:
                             changed[leaf] = np.repeat(np.asarray(leaves[leaf])[None], R, axis=0)
-                        changed[leaf][..., channel : channel + q] = _cells_of(item, values[e, k], self.meshes[e])
+                        changed[leaf][..., channel : channel + q] = _find_cells(item, values[e, k], self.meshes[e])
                     channel += q
         return Varying(tuple(changed), tuple(changed.values()))
 
-    def fingerprint(self) -> str:
+    def compute_fingerprint(self) -> str:
         unknowns = self.problem.unknowns
         data = [np.asarray(values) for items in self.clean for values in items if values is not None]
-        drawn = list(self._noisy(self.sound).values())  # stands for the noise, which may be a function
+        drawn = list(self._draw_run(self.sound).values())  # stands for the noise, which may be a function
         settings = self.seed, self.tolerance, self.max_iterations, unknowns.names, self.problem.solver
         model = self.problem.digests
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
         nodes = [mesh.nodes for mesh in self.meshes]
-        return fingerprint("monte carlo", settings, model, self.truth, self.start, *bounds, *nodes, *data, *drawn)
+        return compute_fingerprint(
+            "monte carlo", settings, model, self.truth, self.start, *bounds, *nodes, *data, *drawn
+        )
 
 
-def _with_values(item: Any, values: FloatArray) -> Any:
+def _replace_values(item: Any, values: FloatArray) -> Any:
     """The same kind of data with other values; missing ones stay missing."""
     if isinstance(item, Measurements):
         return replace(item, values=np.where(np.isnan(item.values), np.nan, values))
@@ -422,7 +482,7 @@ def _with_values(item: Any, values: FloatArray) -> Any:
     )
 
 
-def _cells_of(item: ReferenceSignal, values: FloatArray, mesh: Mesh) -> FloatArray:
+def _find_cells(item: ReferenceSignal, values: FloatArray, mesh: Mesh) -> FloatArray:
     """Reference signals made from values (R, K, q), as cubics in the cells of a mesh: (R, G, 4, q).
 
     All R at once: interpolation and filter treat channels one by one, so that runs can be channels too.
@@ -432,5 +492,5 @@ def _cells_of(item: ReferenceSignal, values: FloatArray, mesh: Mesh) -> FloatArr
     table = np.where(np.isnan(measured), np.nan, values)
     channels = np.moveaxis(table, 0, 1).reshape(K, R * q)
     signal = ReferenceSignal.from_samples(times, channels, lowpass_hz=item.lowpass_hz).signal
-    cells = by_cell(signal, mesh)
+    cells = split_by_cell(signal, mesh)
     return np.moveaxis(cells.reshape(*cells.shape[:2], R, q), 2, 0)

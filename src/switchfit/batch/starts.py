@@ -14,20 +14,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.batch.again import redo_unresolved
-from switchfit.batch.chunks import Arrays, fingerprint
-from switchfit.batch.fits import Fits, check_long_run, repeat, sample_count
+from switchfit.batch.chunks import Arrays, compute_fingerprint
+from switchfit.batch.fits import Fits, check_long_run, count_samples, repeat
 from switchfit.batch.program import Varying, chunk_size, error_message, fit_chunk
-from switchfit.discretization.arguments import arguments_of
+from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
-from switchfit.estimation.estimator import Estimate, checked_settings, estimate
+from switchfit.estimation.estimator import Estimate, check_settings, estimate
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import constraints_of
 from switchfit.optimize import Status
 from switchfit.optimize.qp import solve_qp
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_array, as_count, as_instance, as_seed, listed
-from switchfit.runtime.presentation import figure_of
+from switchfit.problem.validation import as_array, as_count, as_instance, as_seed, join_names
+from switchfit.runtime.presentation import draw_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -57,14 +57,43 @@ class Multistart(Fits):
         Which minimum each start ended in, 0 being the lowest; -1 where it did not converge.
     best : Estimate or None
         A full estimate, resumed at the lowest end; None where each of the lowest ones raises an error.
+
+    See Also
+    --------
+    multistart, Fits
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> found = sf.multistart(problem, 8)
+    >>> found.best.success, int(found.clusters.max())
+    (True, 0)
     """
 
     clusters: NDArray[np.int64]
     best: Estimate | None
 
     def plot(self) -> Figure:
-        """Waterfall: the cost at the end of every start, ascending, as a matplotlib Figure."""
-        return figure_of(self)
+        """Waterfall: the cost at the end of every start, ascending, as a matplotlib Figure.
+
+        See Also
+        --------
+        multistart
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> figure = sf.multistart(problem, 8).plot()
+        >>> len(figure.axes) > 0
+        True
+        """
+        return draw_figure(self)
 
 
 def multistart(
@@ -105,26 +134,40 @@ def multistart(
     Notes
     -----
     All starts share the mesh that is refined at the initial guess; the best end is fitted again on a mesh of its own.
+
+    See Also
+    --------
+    estimate, estimate_many
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> found = sf.multistart(problem, 8, seed=1)
+    >>> found.best.theta.round(2)
+    array([2.46, 0.39])
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     seed = as_seed(seed)
-    tolerance, max_iterations = checked_settings(tolerance, max_iterations)
+    tolerance, max_iterations = check_settings(tolerance, max_iterations)
     check_long_run(client, folder, callback)
     began = time.perf_counter()
     several = hasattr(type(starts), "__len__")
-    points = _given(problem, starts) if several else _drawn(problem, starts, seed)
+    points = _check_starts(problem, starts) if several else _draw_starts(problem, starts, seed)
     work = _Work(problem, list(evaluator_of(problem).meshes), points, tolerance, max_iterations)
     found = repeat(problem, work, len(points), "Multistart", began, client=client, folder=folder, callback=callback)
-    best, errors = _best(problem, Fits(**found), tolerance, max_iterations)
+    best, errors = _find_best(problem, Fits(**found), tolerance, max_iterations)
     if errors:
         status, message = found["status"].astype(object), found["message"].astype(object)
         for k, error in errors.items():
             status[k], message[k] = Status.ERROR.name, error_message(error)
         found |= {"status": status.astype(str), "message": message.astype(str)}
-    return Multistart(**found, clusters=_clusters(problem, Fits(**found)), best=best)
+    return Multistart(**found, clusters=_find_clusters(problem, Fits(**found)), best=best)
 
 
-def _best(
+def _find_best(
     problem: Problem, fits: Fits, tolerance: float, max_iterations: int
 ) -> tuple[Estimate | None, dict[int, Exception]]:
     """A full estimate, resumed at the lowest end that allows one, and the errors of the ends that do not."""
@@ -164,17 +207,17 @@ class _Work:
         )
         settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
         found = redo_unresolved(found, lambda k: self.problem, self.meshes, **settings)
-        return {**found._asdict(), "start": starts, "samples": np.full(len(runs), sample_count(self.problem))}
+        return {**found._asdict(), "start": starts, "samples": np.full(len(runs), count_samples(self.problem))}
 
-    def fingerprint(self) -> str:
+    def compute_fingerprint(self) -> str:
         unknowns = self.problem.unknowns
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
-        leaves = jax.tree.leaves([arguments_of(self.problem, e, mesh) for e, mesh in enumerate(self.meshes)])
+        leaves = jax.tree.leaves([build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes)])
         settings = self.tolerance, self.max_iterations, unknowns.names, self.problem.digests
-        return fingerprint("multistart", settings, self.starts, *bounds, *map(np.asarray, leaves))
+        return compute_fingerprint("multistart", settings, self.starts, *bounds, *map(np.asarray, leaves))
 
 
-def _given(problem: Problem, starts: Any) -> FloatArray:
+def _check_starts(problem: Problem, starts: Any) -> FloatArray:
     """Starts of the user's, checked."""
     points = as_array(starts, "starts")
     d = len(problem.theta_names)
@@ -182,13 +225,13 @@ def _given(problem: Problem, starts: Any) -> FloatArray:
         raise ValueError(f"starts must be a number, or an array of shape (S, {d}); got shape {points.shape}.")
     constraints = constraints_of(problem)
     for k, point in enumerate(points):
-        slack = constraints.slack(problem.checked_theta(point, f"starts[{k}]"))
+        slack = constraints.slack(problem.check_theta(point, f"starts[{k}]"))
         if np.any(slack < -1e-12 * (1 + np.max(np.abs(point)))):
             raise ValueError(f"start {k} violates: {constraints.names[int(np.argmin(slack))]}.")
     return points
 
 
-def _drawn(problem: Problem, starts: Any, seed: int) -> FloatArray:
+def _draw_starts(problem: Problem, starts: Any, seed: int) -> FloatArray:
     """Starts from a Sobol sequence: (S, d)."""
     from scipy.stats import qmc  # here, since importing it takes longer than most fits
 
@@ -200,7 +243,7 @@ def _drawn(problem: Problem, starts: Any, seed: int) -> FloatArray:
     unbounded = ~is_time & ~(np.isfinite(unknowns.lower) & np.isfinite(unknowns.upper))
     unbounded |= unknowns.log & (unknowns.lower <= 0)
     if unbounded.any():
-        names = listed(np.array(unknowns.names)[unbounded])
+        names = join_names(np.array(unknowns.names)[unbounded])
         raise ValueError(
             f"multistart draws starts between bounds, but there are none for {names}: give sf.Parameter(..., "
             "lower=..., upper=...), or the starts themselves."
@@ -212,23 +255,23 @@ def _drawn(problem: Problem, starts: Any, seed: int) -> FloatArray:
     log = unknowns.log
     points[:, log] = low[log] * (high[log] / low[log]) ** cube[:, log]
     for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
-        for begin, end, group in _stretches(experiment, where):
+        for begin, end, group in _list_stretches(experiment, where):
             # Sorted uniform numbers are uniform over all ordered times; the room that minimum durations take is added.
             room = end - begin - (len(group) + 1) * problem.min_duration
             ordered = np.sort(cube[:, group], axis=1)
             points[:, group] = begin + max(room, 0.0) * ordered + problem.min_duration * np.arange(1, len(group) + 1)
     points[0] = unknowns.initial
-    return np.array([_nearest_feasible(problem, point) for point in points])
+    return np.array([_find_nearest_feasible(problem, point) for point in points])
 
 
-def _stretches(experiment: Any, where: NDArray[np.intp]) -> list[tuple[float, float, NDArray[np.intp]]]:
+def _list_stretches(experiment: Any, where: NDArray[np.intp]) -> list[tuple[float, float, NDArray[np.intp]]]:
     """Groups of free transition times with the fixed times (or ends of the horizon) that enclose them."""
     knots = np.concatenate([[experiment.t0], experiment.initial_times, [experiment.tf]])
     fixed = [0, *(np.flatnonzero(where < 0) + 1).tolist(), len(knots) - 1]
     return [(float(knots[a]), float(knots[b]), where[a : b - 1]) for a, b in pairwise(fixed) if b - a > 1]
 
 
-def _nearest_feasible(problem: Problem, point: FloatArray) -> FloatArray:
+def _find_nearest_feasible(problem: Problem, point: FloatArray) -> FloatArray:
     """The feasible point nearest to `point`, each unknown measured by its own range."""
     constraints = constraints_of(problem)
     inside = problem.initial_theta
@@ -241,7 +284,7 @@ def _nearest_feasible(problem: Problem, point: FloatArray) -> FloatArray:
     return np.clip(inside + step, constraints.lower, constraints.upper)
 
 
-def _clusters(problem: Problem, fits: Fits) -> NDArray[np.int64]:
+def _find_clusters(problem: Problem, fits: Fits) -> NDArray[np.int64]:
     """Number of the minimum in which each fit ended, ascending in cost; -1 where it did not converge."""
     labels = np.full(len(fits), -1)
     unknowns = problem.unknowns
@@ -254,10 +297,14 @@ def _clusters(problem: Problem, fits: Fits) -> NDArray[np.int64]:
     for k in np.argsort(fits.cost, kind="stable"):
         if not fits.success[k]:
             continue
-        cost, p, schedule = float(fits.cost[k]), fits.theta[k][places], _schedule(problem, fits.theta[k])
+        cost, p, schedule = float(fits.cost[k]), fits.theta[k][places], _build_schedule(problem, fits.theta[k])
         for label, (other_cost, other_p, other_schedule) in enumerate(found):
             level = abs(cost - other_cost) <= SAME_COST * max(abs(cost), 1e-300)
-            if level and np.all(np.abs(p - other_p) <= SAME_PLACE * spread) and _alike(schedule, other_schedule):
+            if (
+                level
+                and np.all(np.abs(p - other_p) <= SAME_PLACE * spread)
+                and _is_same_schedule(schedule, other_schedule)
+            ):
                 labels[k] = label
                 break
         else:
@@ -266,7 +313,7 @@ def _clusters(problem: Problem, fits: Fits) -> NDArray[np.int64]:
     return labels
 
 
-def _schedule(problem: Problem, theta: FloatArray) -> list[Any]:
+def _build_schedule(problem: Problem, theta: FloatArray) -> list[Any]:
     """For each experiment its modes without the collapsed ones, and when they switch as parts of the horizon."""
     schedules = []
     for experiment, times in zip(problem.experiments, problem.split(theta)[0], strict=True):
@@ -282,7 +329,7 @@ def _schedule(problem: Problem, theta: FloatArray) -> list[Any]:
     return schedules
 
 
-def _alike(one: list[Any], other: list[Any]) -> bool:
+def _is_same_schedule(one: list[Any], other: list[Any]) -> bool:
     return all(
         modes == others and np.all(np.abs(times - other_times) <= SAME_PLACE)
         for (modes, times), (others, other_times) in zip(one, other, strict=True)

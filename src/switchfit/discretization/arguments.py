@@ -9,9 +9,9 @@ import numpy as np
 
 from switchfit.discretization.mesh import Mesh
 from switchfit.problem.data import FloatArray, Measurements, PiecewisePolynomial, ReferenceSignal
-from switchfit.problem.experiment import Experiment, initial_state_of, signals_of
+from switchfit.problem.experiment import Experiment, initial_state_of, list_signals
 from switchfit.problem.problem import Problem
-from switchfit.problem.structure import initial_values, of_kind
+from switchfit.problem.structure import read_initial_values, select_kind
 
 Array = jax.Array
 
@@ -52,7 +52,7 @@ class Arguments(NamedTuple):
         return self._replace(nodes=np.zeros(2), signals=np.zeros((1, *self.signals.shape[1:])), samples=())  # type: ignore[arg-type]
 
 
-def arguments_of(problem: Problem, e: int, mesh: Mesh) -> Arguments:
+def build_arguments(problem: Problem, e: int, mesh: Mesh) -> Arguments:
     """The arrays (NumPy's) of experiment e on a mesh that holds all its sample times and knots as nodes."""
     structure, experiment = problem.structures[e], problem.experiments[e]
     initial = initial_state_of(problem.system, experiment)
@@ -60,21 +60,21 @@ def arguments_of(problem: Problem, e: int, mesh: Mesh) -> Arguments:
     fixed = tuple(
         problem.parameters[mapped.get(name, name)].value for name, _, free in structure.parameters if not free
     )
-    measurements = of_kind(experiment.data, Measurements)
+    measurements = select_kind(experiment.data, Measurements)
     lengths = problem.sample_lengths[e]
-    samples = tuple(_padded_samples(*given, mesh) for given in zip(measurements, lengths, strict=True))
-    weights = tuple(_compact(item.weights) for item in of_kind(experiment.data, ReferenceSignal))
-    x0 = np.zeros(structure.n) if callable(initial) else initial_values(initial)
-    return Arguments(mesh.nodes, _signals_by_cell(experiment, mesh), fixed, x0, samples, weights)  # type: ignore[arg-type]
+    samples = tuple(_pad_samples(*given, mesh) for given in zip(measurements, lengths, strict=True))
+    weights = tuple(_drop_off_diagonal_zeros(item.weights) for item in select_kind(experiment.data, ReferenceSignal))
+    x0 = np.zeros(structure.n) if callable(initial) else read_initial_values(initial)
+    return Arguments(mesh.nodes, _split_signals_by_cell(experiment, mesh), fixed, x0, samples, weights)  # type: ignore[arg-type]
 
 
-def _compact(W: FloatArray) -> FloatArray:
+def _drop_off_diagonal_zeros(W: FloatArray) -> FloatArray:
     """The diagonal of a diagonal matrix: it costs q products instead of q squared at every stage of every step."""
     diagonal = np.diag(W)
     return diagonal if np.array_equal(W, np.diag(diagonal)) else W
 
 
-def _padded_samples(item: Measurements, length: int, mesh: Mesh) -> Samples:
+def _pad_samples(item: Measurements, length: int, mesh: Mesh) -> Samples:
     """Samples of one Measurements, padded with missing ones to a length."""
     extra = length - len(item.times)
     rows = ((0, extra), (0, 0))
@@ -86,14 +86,14 @@ def _padded_samples(item: Measurements, length: int, mesh: Mesh) -> Samples:
     )
 
 
-def _signals_by_cell(experiment: Experiment, mesh: Mesh) -> FloatArray:
+def _split_signals_by_cell(experiment: Experiment, mesh: Mesh) -> FloatArray:
     """Every signal as a cubic in each cell, in powers of the time since the cell's first node: (G, 4, S)."""
-    signals = [by_cell(signal, mesh) for signal in signals_of(experiment)]
+    signals = [split_by_cell(signal, mesh) for signal in list_signals(experiment)]
     none = np.zeros((len(mesh.nodes) - 1, 4, 0))
     return signals[0] if len(signals) == 1 else np.concatenate([none, *signals], axis=2)
 
 
-def by_cell(signal: PiecewisePolynomial, mesh: Mesh) -> FloatArray:
+def split_by_cell(signal: PiecewisePolynomial, mesh: Mesh) -> FloatArray:
     """One signal as a cubic in each cell of a mesh that has its knots as nodes: (G, 4, q)."""
     starts = mesh.nodes[:-1]
     middles = 0.5 * (mesh.nodes[:-1] + mesh.nodes[1:])

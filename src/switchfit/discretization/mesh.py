@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.problem.data import FloatArray
-from switchfit.problem.lengths import common_lengths, padded_length
+from switchfit.problem.lengths import choose_common_lengths, pad_length
 from switchfit.problem.problem import Problem
 
 CHUNK = 16
@@ -35,7 +35,7 @@ class Mesh:
     Attributes
     ----------
     nodes : (G + 1,) array
-        Increasing, from t0 to tf; padded at the end with tf to a length out of `padded_length`, so that
+        Increasing, from t0 to tf; padded at the end with tf to a length out of `pad_length`, so that
         experiments of similar size share one compiled program.
     cells : int
         Cells before the padding.
@@ -47,13 +47,13 @@ class Mesh:
     @classmethod
     def from_times(cls, times: FloatArray) -> Mesh:
         """The mesh whose nodes are `times`, in any order and with repetitions."""
-        return cls.padded(np.unique(times))
+        return cls.pad(np.unique(times))
 
     @classmethod
-    def padded(cls, nodes: FloatArray) -> Mesh:
+    def pad(cls, nodes: FloatArray) -> Mesh:
         """The mesh with these nodes, which increase strictly, and padding of a usual length."""
         cells = len(nodes) - 1
-        padding = np.full(padded_length(cells) - cells, nodes[-1])
+        padding = np.full(pad_length(cells) - cells, nodes[-1])
         return cls(np.concatenate([nodes, padding]), cells)
 
     @property
@@ -61,32 +61,32 @@ class Mesh:
         """The nodes without the padding."""
         return self.nodes[: self.cells + 1]
 
-    def padded_to(self, cells: int) -> Mesh:
+    def pad_to(self, cells: int) -> Mesh:
         """The mesh with its padding made so long that it has the given number of cells."""
         return Mesh(np.append(self.times, np.full(cells - self.cells, self.times[-1])), self.cells)
 
-    def divided(self, parts: int = 2) -> Mesh:
+    def divide(self, parts: int = 2) -> Mesh:
         """The mesh with every cell cut into equal parts."""
         nodes = self.times
         inside = nodes[:-1, None] + np.diff(nodes)[:, None] * np.arange(parts) / parts
         divided = np.append(inside, nodes[-1])
         # Equal parts of a cell as short as rounding may coincide.
-        return Mesh.padded(divided) if (divided[1:] > divided[:-1]).all() else Mesh.from_times(divided)
+        return Mesh.pad(divided) if (divided[1:] > divided[:-1]).all() else Mesh.from_times(divided)
 
     def cell_ending_at(self, times: FloatArray) -> NDArray[np.intp]:
         """Index of the cell that ends at each of `times`, which must be nodes; -1 for t0."""
         return np.searchsorted(self.times, times) - 1
 
 
-def with_common_lengths(problem: Problem, meshes: Sequence[Mesh]) -> list[Mesh]:
+def pad_to_common_lengths(problem: Problem, meshes: Sequence[Mesh]) -> list[Mesh]:
     """The meshes of all experiments, those of experiments that are alike padded to common lengths."""
     padded = list(meshes)
     if len(padded) == 1:
         return padded
     for group in problem.alike:
-        lengths = common_lengths([meshes[e].cells for e in group])
+        lengths = choose_common_lengths([meshes[e].cells for e in group])
         for e, length in zip(group, lengths, strict=True):
-            padded[e] = meshes[e] if len(group) == 1 else meshes[e].padded_to(length)
+            padded[e] = meshes[e] if len(group) == 1 else meshes[e].pad_to(length)
     return padded
 
 
@@ -117,12 +117,12 @@ class Rows(NamedTuple):
     first_cell: jax.Array
 
 
-def chunk_count(cells: int, transitions: int) -> int:
+def count_chunks(cells: int, transitions: int) -> int:
     """Chunks that hold all rows wherever the transition times lie: the padding wastes at most C - 1 rows a segment."""
     return (cells + transitions + (transitions + 1) * (CHUNK - 1)) // CHUNK
 
 
-def rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
+def build_rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
     """Cut the cells between `nodes` (G + 1,) at `tau` (N,).
 
     Where tau_i equals a node, `side` = +1 lets segment i begin in the cell after it, so that derivatives are those
@@ -139,7 +139,7 @@ def rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
     chunks = -(-count // CHUNK)
     first_chunk = xp.concatenate([xp.zeros(1, chunks.dtype), xp.cumsum(chunks)[:-1]])
 
-    q = xp.arange(chunk_count(cells, N))
+    q = xp.arange(count_chunks(cells, N))
     segment = (q[:, None] >= first_chunk[None, 1:]).sum(1)
     offset = (q - first_chunk[segment])[:, None] * CHUNK + xp.arange(CHUNK)
     rows_here = count[segment][:, None]
@@ -159,7 +159,7 @@ def rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
     return Rows(segment, opens, cell, start, end, starts_at, ends_at, first_chunk, last_row, first_cell)
 
 
-def row_ending_cell(layout: Rows, cell: jax.Array) -> jax.Array:
+def find_row_ending_cell(layout: Rows, cell: jax.Array) -> jax.Array:
     """Flat index of the last row inside each of the given cells (K,); -1 for cell -1."""
     segment = (cell[:, None] >= layout.first_cell[None, 1:]).sum(1)
     row = layout.first_chunk[segment] * CHUNK + cell - layout.first_cell[segment]

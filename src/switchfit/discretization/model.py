@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from switchfit.discretization.arguments import Arguments, Samples
-from switchfit.discretization.tableaus import tableau_of
+from switchfit.discretization.tableaus import get_tableau
 from switchfit.problem.functions import Function
 from switchfit.problem.losses import influence, robust
 from switchfit.problem.structure import Structure
@@ -68,7 +68,7 @@ class Model:
     def __init__(self, structure: Structure, arguments: Arguments) -> None:
         self.structure = structure
         self.arguments = arguments
-        self.tableau = tableau_of(structure.solver)
+        self.tableau = get_tableau(structure.solver)
 
     def parameters(self, p: Array) -> Mapping[str, Array]:
         """The dict the user's functions get."""
@@ -112,7 +112,7 @@ class Model:
                 total = total + function(t, x, self.parameters(p))
             for residual, W in zip(self.reference_residuals(piece), self.arguments.weights, strict=True):
                 r = residual(t, x, p)
-                total = total + 0.5 * r @ weighted(W, r)
+                total = total + 0.5 * r @ apply_weights(W, r)
             return total
 
         return ell
@@ -126,19 +126,19 @@ class Model:
         ]
 
     def _reference_residual(self, k: int, channels: slice, piece: Piece, t: Array, x: Array, p: Array) -> Array:
-        return self.observed(self.structure.references[k][0], t, x, p) - piece(t)[channels]
+        return self.observe(self.structure.references[k][0], t, x, p) - piece(t)[channels]
 
-    def observed(self, observe: Function | None, t: Array, x: Array, p: Array) -> Array:
+    def observe(self, observe: Function | None, t: Array, x: Array, p: Array) -> Array:
         """What a sensor sees: (q,)."""
         return x if observe is None else observe(t, x, self.parameters(p))
 
     def sample_residual(self, k: int, sample: Samples, x: Array, p: Array) -> Array:
         """``h - y`` of one sample of the k-th Measurements, 0 where it is missing: (q,)."""
         sensor = self.structure.measurements[k]
-        h = self.observed(sensor.observe, sample.time, x, p)
+        h = self.observe(sensor.observe, sample.time, x, p)
         return jnp.where(sample.weight > 0, h - sample.value, 0.0)
 
-    def seen_at(self, k: int, sample: Samples, p: Array) -> Samples:
+    def correct_delay(self, k: int, sample: Samples, p: Array) -> Samples:
         """A late sample with the time of the state that it is of, ``t - delay``, in place of its own."""
         delay = self.structure.measurements[k].delay
         return sample if delay is None else sample._replace(time=sample.time - self.parameters(p)[delay])
@@ -209,6 +209,6 @@ class Model:
         return self.structure.initial_state(self.parameters(p))
 
 
-def weighted(W: Array, r: Array) -> Array:
+def apply_weights(W: Array, r: Array) -> Array:
     """``W r`` for a W given by its diagonal (q,) or in full (q, q); r is (q,) or (q, D)."""
     return W @ r if W.ndim == 2 else (W * r.T).T

@@ -41,40 +41,40 @@ AT_TRANSITIONS = (TransitionKind("guards", constraint=True), TransitionKind("tra
 """All kinds of nodes at transitions."""
 
 
-def transition_function(model: Model, kind: TransitionKind, i: int) -> NodeFunction | None:
+def get_transition_function(model: Model, kind: TransitionKind, i: int) -> NodeFunction | None:
     """Return the function of transition i (from 0) of a kind, which returns a number; None if it has none."""
     function = getattr(model.structure, kind.name)[i]
     return None if function is None else lambda t, x, p: function(t, x, model.parameters(p))
 
 
-def constrained_transitions(structure: Structure) -> list[tuple[TransitionKind, int]]:
+def list_constrained_transitions(structure: Structure) -> list[tuple[TransitionKind, int]]:
     """Return the constraints at transitions in the order of their values: kind and transition."""
     kinds = [kind for kind in AT_TRANSITIONS if kind.constraint]
     return [(kind, i) for kind in kinds for i, f in enumerate(getattr(structure, kind.name)) if f is not None]
 
 
-def costs_at_transitions(model: Model) -> list[tuple[int, NodeFunction]]:
+def list_costs_at_transitions(model: Model) -> list[tuple[int, NodeFunction]]:
     """Return the costs at transitions, each with its transition (from 0)."""
     return _at_transitions(model, constraint=False)
 
 
-def constraints_at_transitions(model: Model) -> list[tuple[int, NodeFunction]]:
+def list_constraints_at_transitions(model: Model) -> list[tuple[int, NodeFunction]]:
     """Return the constraints at transitions in the order of their values, each with its transition (from 0)."""
     return _at_transitions(model, constraint=True)
 
 
 def _at_transitions(model: Model, constraint: bool) -> list[tuple[int, NodeFunction]]:
     kinds = [kind for kind in AT_TRANSITIONS if kind.constraint == constraint]
-    found = [(i, transition_function(model, kind, i)) for kind in kinds for i in range(model.structure.N)]
+    found = [(i, get_transition_function(model, kind, i)) for kind in kinds for i in range(model.structure.N)]
     return [(i, function) for i, function in found if function is not None]
 
 
-def end_cost(model: Model) -> NodeFunction | None:
+def get_end_cost(model: Model) -> NodeFunction | None:
     """Return the sum of the terminal costs; None if there are none."""
     return (lambda t, x, p: model.terminal(x, p)) if model.structure.terminal else None
 
 
-def end_constraints(model: Model) -> NodeFunction | None:
+def get_end_constraints(model: Model) -> NodeFunction | None:
     """Return all terminal constraints in one, which returns (m,); None if there are none."""
     if not model.structure.terminal_constraints:
         return None

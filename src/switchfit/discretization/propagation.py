@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from switchfit.discretization.arguments import Samples
-from switchfit.discretization.mesh import Rows, row_ending_cell, rows
+from switchfit.discretization.mesh import Rows, build_rows, find_row_ending_cell
 from switchfit.discretization.model import Model, Piece
-from switchfit.discretization.nodes import costs_at_transitions, end_cost
+from switchfit.discretization.nodes import get_end_cost, list_costs_at_transitions
 from switchfit.discretization.rows import cost_of_row, end_of_row
 from switchfit.discretization.steps import row_functions, step
 
@@ -52,21 +52,21 @@ class Path(NamedTuple):
 
     def at_samples(self, cell: Array) -> Array:
         """State at the ends of the given cells (K,), the one before a jump: (K, n)."""
-        return at_cells(self.layout, self.before[0, 0], self.after, cell)
+        return pick_at_cells(self.layout, self.before[0, 0], self.after, cell)
 
 
-def by_row(values: Array) -> Array:
+def flatten_rows(values: Array) -> Array:
     """Values (Q, C, ...) as (Q C, ...): one entry a row."""
     return values.reshape((values.shape[0] * values.shape[1], *values.shape[2:]))
 
 
-def at_cells(layout: Rows, first: Array, after: Array, cell: Array) -> Array:
+def pick_at_cells(layout: Rows, first: Array, after: Array, cell: Array) -> Array:
     """Pick from values (Q, C, ...) at the ends of rows those at the ends of cells (K,); `first` for cell -1."""
-    flat = jnp.concatenate([first[None], by_row(after)])
-    return flat[row_ending_cell(layout, cell) + 1]
+    flat = jnp.concatenate([first[None], flatten_rows(after)])
+    return flat[find_row_ending_cell(layout, cell) + 1]
 
 
-def by_mode(model: Model, segment: Array, branch: Callable[[int], Callable[..., Any]], *operands: Any) -> Any:
+def switch_mode(model: Model, segment: Array, branch: Callable[[int], Callable[..., Any]], *operands: Any) -> Any:
     """Call ``branch(mode)(*operands)`` for the mode that is active in a segment, compiling only what is needed."""
     sequence = jnp.asarray(model.structure.mode_of_segment)
     count = len(model.structure.modes)
@@ -77,7 +77,7 @@ def by_mode(model: Model, segment: Array, branch: Callable[[int], Callable[..., 
 
 def propagate(model: Model, tau: Array, p: Array, side: Array) -> Path:
     """Integrate from t0 to tf: equation (1), with reset maps at the transitions."""
-    layout = rows(model.arguments.nodes, tau, side)
+    layout = build_rows(model.arguments.nodes, tau, side)
     pieces = Piece(model.arguments.nodes[layout.cell], model.arguments.signals[layout.cell])
     stages = row_functions(model.tableau).stages
 
@@ -94,7 +94,7 @@ def propagate(model: Model, tau: Array, p: Array, side: Array) -> Path:
     def chunk(x: Array, given: tuple[Array, Array, Array, Array, Piece]) -> tuple[Array, tuple[Array, ...]]:
         segment, opens, start, end, piece = given
         x = apply_reset(model, tau, x, p, segment, opens)
-        return by_mode(model, segment, through, x, start, end, piece)
+        return switch_mode(model, segment, through, x, start, end, piece)
 
     given = (layout.segment, layout.opens, layout.start, layout.end, pieces)
     _, columns = lax.scan(chunk, model.initial_state(p), given)
@@ -112,12 +112,16 @@ def apply_reset(model: Model, tau: Array, x: Array, p: Array, segment: Array, op
     return lax.switch(jnp.where(opens, which[segment], 0), branches, times[segment], x)
 
 
-def path_cost(model: Model, path: Path, p: Array) -> Array:
+def compute_path_cost(model: Model, path: Path, p: Array) -> Array:
     """Return the cost J of the discretised system: ()."""
-    return running_cost(model, path, p).sum() + sample_costs(model, path, p) + term_costs(model, path, p)
+    return (
+        integrate_running_cost(model, path, p).sum()
+        + add_sample_costs(model, path, p)
+        + add_point_costs(model, path, p)
+    )
 
 
-def running_cost(model: Model, path: Path, p: Array) -> Array:
+def integrate_running_cost(model: Model, path: Path, p: Array) -> Array:
     """Return the integral of the running costs over each row, ``h sum_j b_j ell(t_j, X_j)``: (Q, C)."""
     layout = path.layout
     if not model.has_running_cost:
@@ -131,30 +135,30 @@ def running_cost(model: Model, path: Path, p: Array) -> Array:
     return jax.vmap(jax.vmap(row))(layout.start, layout.end, path.pieces, path.stages)
 
 
-def term_costs(model: Model, path: Path, p: Array) -> Array:
+def add_point_costs(model: Model, path: Path, p: Array) -> Array:
     """Return the sum of the costs at transitions and at the end: ()."""
     total = jnp.zeros(())
-    for i, cost in costs_at_transitions(model):
+    for i, cost in list_costs_at_transitions(model):
         total = total + cost(*path.at_transition(i), p)
-    final = end_cost(model)
+    final = get_end_cost(model)
     return total if final is None else total + final(*path.at_end(), p)
 
 
-def sample_costs(model: Model, path: Path, p: Array) -> Array:
+def add_sample_costs(model: Model, path: Path, p: Array) -> Array:
     """Sum of the costs of all discrete samples."""
     total = jnp.zeros(())
     for k, samples in enumerate(model.arguments.samples):
         if model.structure.measurements[k].delay is None:
             x = path.at_samples(samples.cell)
         else:
-            _, segment, piece, start, before = row_holding(model, path, k, p)
-            late = jax.vmap(partial(seen_late, model, k), in_axes=(0, 0, 0, 0, 0, None))
+            _, segment, piece, start, before = find_late_rows(model, path, k, p)
+            late = jax.vmap(partial(step_to_late_sample, model, k), in_axes=(0, 0, 0, 0, 0, None))
             samples, x = late(samples, segment, piece, start, before, p)
         total = total + jax.vmap(lambda s, x, k=k: model.sample_cost(k, s, x, p))(samples, x).sum()
     return total
 
 
-def row_holding(model: Model, path: Path, k: int, p: Array) -> tuple[Array, Array, Piece, Array, Array]:
+def find_late_rows(model: Model, path: Path, k: int, p: Array) -> tuple[Array, Array, Piece, Array, Array]:
     """The rows with ``start < t - delay <= end`` for the samples of the k-th Measurements, which is late.
 
     Returns
@@ -165,19 +169,19 @@ def row_holding(model: Model, path: Path, k: int, p: Array) -> tuple[Array, Arra
     """
     layout = path.layout
     samples = model.arguments.samples[k]
-    times = lax.stop_gradient(jax.vmap(lambda s: model.seen_at(k, s, p).time)(samples))
-    ends = lax.stop_gradient(by_row(layout.end))
+    times = lax.stop_gradient(jax.vmap(lambda s: model.correct_delay(k, s, p).time)(samples))
+    ends = lax.stop_gradient(flatten_rows(layout.end))
     row = jnp.minimum(jnp.searchsorted(ends, times), ends.shape[0] - 1)
-    piece = Piece(by_row(path.pieces.origin)[row], by_row(path.pieces.coefficients)[row])
+    piece = Piece(flatten_rows(path.pieces.origin)[row], flatten_rows(path.pieces.coefficients)[row])
     segment = layout.segment[row // layout.start.shape[1]]
-    return row, segment, piece, by_row(layout.start)[row], by_row(path.before)[row]
+    return row, segment, piece, flatten_rows(layout.start)[row], flatten_rows(path.before)[row]
 
 
-def seen_late(
+def step_to_late_sample(
     model: Model, k: int, sample: Samples, segment: Array, piece: Piece, start: Array, x: Array, p: Array
 ) -> tuple[Samples, Array]:
     """One late sample with the time of the state that it is of, and that state, one step from `start`: (n,)."""
-    there = model.seen_at(k, sample, p)
+    there = model.correct_delay(k, sample, p)
 
     def through(mode: int) -> Callable[..., Array]:
         def state(time: Array, start: Array, x: Array) -> Array:
@@ -185,4 +189,4 @@ def seen_late(
 
         return state
 
-    return there, by_mode(model, segment, through, there.time, start, x)
+    return there, switch_mode(model, segment, through, there.time, start, x)

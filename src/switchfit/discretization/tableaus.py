@@ -49,6 +49,6 @@ def radau_iia() -> Tableau:
 EXPLICIT, STIFF = butcher(), radau_iia()
 
 
-def tableau_of(solver: str) -> Tableau:
+def get_tableau(solver: str) -> Tableau:
     """Return the method behind `Problem.solver`."""
     return EXPLICIT if solver == "explicit" else STIFF

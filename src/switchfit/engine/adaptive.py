@@ -20,19 +20,19 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.integrate
 
-from switchfit.discretization.arguments import Arguments, arguments_of
+from switchfit.discretization.arguments import Arguments, build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model, Piece
 from switchfit.engine.native.adaptive import Adaptive
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order
 from switchfit.problem.data import FloatArray, Measurements
-from switchfit.problem.experiment import Experiment, signals_of
-from switchfit.problem.functions import float64
+from switchfit.problem.experiment import Experiment, list_signals
+from switchfit.problem.functions import use_float64
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
-from switchfit.runtime.cache import compilation_cache
+from switchfit.runtime.cache import use_compilation_cache
 
 T = TypeVar("T")
 
@@ -48,7 +48,7 @@ def fixed_nodes(experiment: Experiment) -> FloatArray:
     t0, tf = experiment.t0, experiment.tf
     times = [np.array([t0, tf])]
     times += [item.seen_times for item in experiment.data if isinstance(item, Measurements)]
-    times += [signal.knots for signal in signals_of(experiment)]
+    times += [signal.knots for signal in list_signals(experiment)]
     nodes = np.unique(np.concatenate(times))
     return nodes[(nodes >= t0) & (nodes <= tf)]
 
@@ -109,7 +109,7 @@ def _graded(ends: FloatArray, steps: _Steps, pieces: int) -> FloatArray:
 def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -> FloatArray:
     """All times at which the adaptive solver stopped, from t0 to tf, strictly increasing."""
     experiment, structure = problem.experiments[e], problem.structures[e]
-    whole = arguments_of(problem, e, coarse)
+    whole = build_arguments(problem, e, coarse)
     arguments, signals = whole.without_mesh(), np.asarray(whole.signals)
     tau, p = problem.vectors(theta, e)
     unit = unit_suffix(experiment.time_unit)
@@ -147,7 +147,7 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
 
 def _by_jax(function: Callable[..., T], *given: Any, **settings: Any) -> T:
     """Call a function that runs JAX's programs; what surrounds it takes longer than most solves in machine code."""
-    with float64(), compilation_cache():
+    with use_float64(), use_compilation_cache():
         return function(*given, **settings)
 
 

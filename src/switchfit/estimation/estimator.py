@@ -32,17 +32,22 @@ from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.optimize import IterationRecord, Result, Status
 from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray
-from switchfit.problem.experiment import run_names
+from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_choice, as_count, as_instance, as_path, as_positive
-from switchfit.runtime.presentation import figure_of, text_of
+from switchfit.runtime.presentation import draw_figure, format_text
 from switchfit.runtime.progress import Progress
 from switchfit.uncertainty.certificate import Certificate, certify
 from switchfit.uncertainty.identification import Identifiability, identifiability
 from switchfit.uncertainty.prediction import Prediction, predict
 from switchfit.uncertainty.profiles import Profile, profile
 from switchfit.uncertainty.residuals import ResidualDiagnostics, diagnose
-from switchfit.uncertainty.sensitivity import Sensitivity, gauss_newton_of, sample_derivatives, sensitivity
+from switchfit.uncertainty.sensitivity import (
+    Sensitivity,
+    build_gauss_newton,
+    collect_sample_derivatives,
+    compute_sensitivity,
+)
 
 HESSIANS = get_args(HessianKind)
 
@@ -65,14 +70,53 @@ ORDER = 5
 
 @dataclass(frozen=True, eq=False)
 class Estimate(Fit):
-    """Result of `estimate`: everything in `Fit`, and what can be done with it. Print it for the report."""
+    """Result of `estimate`: everything in `Fit`, and what can be done with it. Print it for the report.
+
+    See Also
+    --------
+    estimate : makes it.
+    Fits : many fits at once.
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> fit.success, fit.status.name
+    (True, 'CONVERGED')
+    >>> dict(zip(fit.theta_names, fit.theta.round(3).tolist()))
+    {'tau_1': 2.462, 'k': 0.393}
+    >>> fit.standard_errors.round(3)
+    array([0.018, 0.005])
+    >>> fit.trajectory.mode_spans[0][0]
+    'on'
+    """
 
     saved_certificate: Certificate | None = None
     problem: Problem | None = None
     evaluator: Evaluator | None = None
 
     def simulate_later(self, simulation: SimulatedProblem) -> None:
-        """Take `trajectories` and `comparisons` from a simulation when they are asked for; many fits are not."""
+        """Take `trajectories` and `comparisons` from a simulation when they are asked for; many fits are not.
+
+        See Also
+        --------
+        Estimate.complete
+
+        Examples
+        --------
+        >>> from switchfit.fit.trajectory import SimulatedProblem
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> len(fit.trajectories)
+        1
+        >>> fit.simulate_later(SimulatedProblem(fit.evaluator_at_solution(), fit.theta))
+        >>> fit.trajectory.states.shape[1]
+        1
+        """
         for name in ("trajectories", "comparisons"):
             del self.__dict__[name]
         self.__dict__["_simulation"] = simulation
@@ -108,11 +152,25 @@ class Estimate(Fit):
         if self.saved_gauss_newton is not None or self.sigma_known is None or self.problem is None:
             return self.saved_gauss_newton
         if is_plain_least_squares(self.problem) and self.has_room_for_sensitivities():
-            return gauss_newton_of(sample_derivatives(self.problem, self.sensitivities))
+            return build_gauss_newton(collect_sample_derivatives(self.problem, self.sensitivities))
         return self.evaluator_at_solution()(self.theta, matrix="gauss-newton").hessian
 
     def has_room_for_sensitivities(self) -> bool:
-        """Whether the derivatives of states and outputs at all nodes take less memory than `MOST_SENSITIVITIES`."""
+        """Whether the derivatives of states and outputs at all nodes take less memory than `MOST_SENSITIVITIES`.
+
+        See Also
+        --------
+        Estimate.plot, Estimate.predict
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.has_room_for_sensitivities()
+        True
+        """
         rows = sum(len(mesh.nodes) for mesh in self.evaluator_at_solution().meshes)
         width = max(
             t.states.shape[1] + sum(len(c.names) for c in run)
@@ -125,7 +183,7 @@ class Estimate(Fit):
         """States and outputs with their derivatives in theta, one an experiment, on the meshes of the fit."""
         evaluator = self.evaluator_at_solution()
         meshes = enumerate(evaluator.meshes)
-        return tuple(sensitivity(evaluator.problem, e, self.theta, mesh) for e, mesh in meshes)
+        return tuple(compute_sensitivity(evaluator.problem, e, self.theta, mesh) for e, mesh in meshes)
 
     def evaluator_at_solution(self) -> Evaluator:
         """The problem on the meshes of the fit.
@@ -134,6 +192,20 @@ class Estimate(Fit):
         ------
         ValueError
             If the estimate was loaded from a file without its problem.
+
+        See Also
+        --------
+        evaluate
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> evaluator = fit.evaluator_at_solution()
+        >>> abs(evaluator(fit.theta).cost - fit.cost) < 1e-12
+        True
         """
         if self.problem is None:
             raise ValueError(
@@ -149,11 +221,24 @@ class Estimate(Fit):
         name : str
         level : float
         callback : callable, optional
+
+        See Also
+        --------
+        profile, Profile
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> [round(float(end), 1) for end in fit.profile("tau_1").interval()]
+        [2.4, 2.5]
         """
         return profile(self, name, level=level, callback=callback)
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)
 
     def plot(self, *, bands: bool = True, level: float = 0.95) -> Any:
         """Measured against fitted over time with the modes shaded, as a matplotlib Figure.
@@ -165,8 +250,22 @@ class Estimate(Fit):
             of a model are compiled for a second.
         level : float, between 0 and 1
             Of the bands.
+
+        See Also
+        --------
+        Estimate.plot_residuals, Estimate.predict
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> figure = fit.plot(bands=False)
+        >>> len(figure.axes)
+        2
         """
-        return figure_of(self, bands=bands, level=level)
+        return draw_figure(self, bands=bands, level=level)
 
     def predict(self, times: ArrayLike | None = None, *, experiment: int = 0) -> Prediction:
         """States and outputs at any times with their standard errors and bands, see `switchfit.predict`.
@@ -175,6 +274,20 @@ class Estimate(Fit):
         ----------
         times : (K,) array_like, optional
         experiment : int
+
+        See Also
+        --------
+        predict, Prediction
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.predict([1.0, 4.0]).outputs.round(1)
+        array([[8.3],
+               [8.6]])
         """
         return predict(self, times, experiment=experiment)
 
@@ -184,8 +297,22 @@ class Estimate(Fit):
         return diagnose(self)
 
     def plot_residuals(self) -> Any:
-        """Residuals in time, their autocorrelation and their quantiles, as a matplotlib Figure."""
-        return figure_of(self.residuals)
+        """Residuals in time, their autocorrelation and their quantiles, as a matplotlib Figure.
+
+        See Also
+        --------
+        Estimate.residuals, Estimate.plot
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> len(fit.plot_residuals().axes)
+        3
+        """
+        return draw_figure(self.residuals)
 
     @cached_property
     def identifiability(self) -> Identifiability:
@@ -193,12 +320,44 @@ class Estimate(Fit):
         return identifiability(self)
 
     def save(self, path: str | Path) -> None:
-        """Write everything but the model to a JSON file, atomically; `load` reads it."""
+        """Write everything but the model to a JSON file, atomically; `load` reads it.
+
+        See Also
+        --------
+        Estimate.load
+
+        Examples
+        --------
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> with TemporaryDirectory() as folder:
+        ...     fit.save(Path(folder) / "fit.json")
+        ...     (Path(folder) / "fit.json").read_text().splitlines()[1]
+        '  "format": "switchfit fit",'
+        """
         file = as_path(path, "path")
         save_fit(self.complete(), self.certificate, file)
 
     def complete(self) -> Estimate:
-        """The same with everything that is saved, which is the Gauss-Newton matrix."""
+        """The same with everything that is saved, which is the Gauss-Newton matrix.
+
+        See Also
+        --------
+        Estimate.save
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.complete().saved_gauss_newton.shape
+        (2, 2)
+        """
         return replace(self, saved_gauss_newton=self.gauss_newton)
 
     @classmethod
@@ -215,6 +374,24 @@ class Estimate(Fit):
         ------
         ValueError
             If the file is not one of switchfit's, or the problem has other unknowns or other time units.
+
+        See Also
+        --------
+        Estimate.save
+
+        Examples
+        --------
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> with TemporaryDirectory() as folder:
+        ...     fit.save(Path(folder) / "fit.json")
+        ...     loaded = sf.Estimate.load(Path(folder) / "fit.json", problem=heater_problem())
+        >>> bool((loaded.theta == fit.theta).all())
+        True
         """
         if problem is not None:
             as_instance(problem, "problem", Problem, "an sf.Problem")
@@ -278,16 +455,33 @@ def estimate(
         For a bad setting, or a guess at which the model cannot be integrated.
     TypeError
         If an argument is of the wrong type.
+
+    See Also
+    --------
+    estimate_many, multistart : many fits.
+    Estimate : what it returns.
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> fit = sf.estimate(problem)
+    >>> fit.success
+    True
+    >>> fit.transition_times[0].round(2), round(float(fit.parameters["k"]), 2)
+    (array([2.46]), 0.39)
     """
     as_instance(problem, "problem", Problem, "an sf.Problem; several are what sf.estimate_many takes")
     hessian = as_choice(hessian, "hessian", HESSIANS)
-    tolerance, max_iterations = checked_settings(tolerance, max_iterations)
+    tolerance, max_iterations = check_settings(tolerance, max_iterations)
     if callback is not None:
         as_callable(callback, "callback", "a function callback(record)", arguments=1)
     if problem.constraint_names and hessian != "exact":
         raise ValueError(f"with guards or terminal constraints hessian must be 'exact'; got {hessian!r}.")
     began = time.perf_counter()
-    theta, evaluator = _beginning(problem, start)
+    theta, evaluator = _prepare_start(problem, start)
     constraints = constraints_of(problem)
     held: tuple[tuple[str, float, float], ...] = ()
     history: list[IterationRecord] = []
@@ -315,7 +509,7 @@ def estimate(
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
         if result.status in STOPPED or attempt == REFINEMENTS or not excess > 1:
             break
-        evaluator = _refined(fine, problem.checked_theta(start), theta, excess)
+        evaluator = _refine(fine, problem.check_theta(start), theta, excess)
     if excess > 1 and result.status.successful and not problem.constraint_names:
         refuse_jumps(evaluator, theta)  # the error of steps across a jump does not vanish with their length
     found = _estimate(
@@ -324,7 +518,7 @@ def estimate(
         replace(result, iterations=earlier + result.iterations, earlier=earlier),
         history,
         hessian,
-        initial_theta=problem.checked_theta(start),
+        initial_theta=problem.check_theta(start),
         evaluations=evaluations,
         trajectories=(),
         comparisons=(),
@@ -337,14 +531,14 @@ def estimate(
     return found
 
 
-def checked_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:
+def check_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:
     """Return the two settings of every fit, checked."""
     return as_positive(tolerance, "tolerance"), as_count(max_iterations, "max_iterations")
 
 
-def _beginning(problem: Problem, start: ArrayLike | None) -> tuple[FloatArray, Evaluator]:
+def _prepare_start(problem: Problem, start: ArrayLike | None) -> tuple[FloatArray, Evaluator]:
     """Where a fit begins (d,), guarded transitions on their guards if that is near, and the meshes for it."""
-    theta = problem.checked_theta(start, "start")
+    theta = problem.check_theta(start, "start")
     evaluator = evaluator_of(problem) if start is None else Evaluator(problem, theta)
     placed = place_on_near_guards(evaluator, theta)
     if not np.array_equal(placed, theta):
@@ -352,7 +546,7 @@ def _beginning(problem: Problem, start: ArrayLike | None) -> tuple[FloatArray, E
     return theta, evaluator
 
 
-def _refined(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:
+def _refine(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:
     """The problem on finer meshes: cells cut in two, or, where that is not enough, refined at the start and at theta.
 
     A mode that has come to be active in another part of the horizon may find cells there that are far too long for it.
@@ -385,7 +579,7 @@ def _estimate(
         theta=result.theta,
         lower=unknowns.lower,
         upper=unknowns.upper,
-        run_names=tuple(run_names(problem.experiments)),
+        run_names=tuple(name_runs(problem.experiments)),
         transition_times=tuple(times),
         transition_places=unknowns.times,
         parameters={name: np.array(value) for name, value in parameters.items()},

@@ -33,10 +33,10 @@ from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.problem.constraints import Constraint
 from switchfit.problem.data import FloatArray
-from switchfit.runtime.errors import first_line
+from switchfit.runtime.errors import get_first_line
 from switchfit.runtime.files import write_atomically
 from switchfit.uncertainty.certificate import Certificate
-from switchfit.uncertainty.identification import after
+from switchfit.uncertainty.identification import analyse_solution
 
 FORMAT = "switchfit fit"
 VERSION = 4
@@ -116,7 +116,7 @@ def load_fit(path: Path) -> tuple[Fit, Certificate]:
         certificate = _from_json(Certificate, content.get("certificate"), "certificate")
         _check_fit(fit)
         if version < VERSION:
-            directions = after(fit, None).directions
+            directions = analyse_solution(fit, None).directions
             certificate = replace(certificate, worst_unknowns=directions[0].names if directions else ())
         return fit, certificate
     except (ValueError, OverflowError, RecursionError, MemoryError) as error:
@@ -177,44 +177,44 @@ def _from_json(kind: type, content: Any, where: str) -> Any:
     import pydantic
 
     try:
-        return _adapter(kind).validate_python(content)
+        return _make_adapter(kind).validate_python(content)
     except pydantic.ValidationError as error:
-        raise ValueError(_sentence(error.errors(include_url=False)[0], content, where)) from error
+        raise ValueError(_describe_error(error.errors(include_url=False)[0], content, where)) from error
 
 
 @cache
-def _adapter(kind: type) -> Any:
+def _make_adapter(kind: type) -> Any:
     """pydantic's validator of a dataclass."""
     import pydantic
 
-    return pydantic.TypeAdapter(_read_type(kind))
+    return pydantic.TypeAdapter(_convert_hint(kind))
 
 
-def _read_type(hint: Any) -> Any:
+def _convert_hint(hint: Any) -> Any:
     """The type hint of a field as pydantic is to read it from JSON: arrays, names of statuses, lists for tuples."""
     from pydantic import AfterValidator, BeforeValidator, ConfigDict, PlainValidator, Strict, create_model
 
     origin, inner = get_origin(hint), get_args(hint)
     if isinstance(hint, type) and is_dataclass(hint):
         hints = get_type_hints(hint)
-        entries: dict[str, Any] = {f.name: (_read_type(hints[f.name]), ...) for f in fields(hint)}
+        entries: dict[str, Any] = {f.name: (_convert_hint(hints[f.name]), ...) for f in fields(hint)}
         model = create_model(hint.__name__, __config__=ConfigDict(extra="forbid", strict=True), **entries)
         return Annotated[model, _as_dataclass(hint)]
     if origin is np.ndarray:
-        return Annotated[Any, PlainValidator(partial(_array, np.dtype(get_args(inner[1])[0])))]
+        return Annotated[Any, PlainValidator(partial(_read_array, np.dtype(get_args(inner[1])[0])))]
     if isinstance(hint, type) and issubclass(hint, Enum):
-        return Annotated[Any, PlainValidator(partial(_member, hint))]
+        return Annotated[Any, PlainValidator(partial(_read_member, hint))]
     if hint is str:
-        return Annotated[str, AfterValidator(_text)]
+        return Annotated[str, AfterValidator(_check_text)]
     if hint is float:
-        return Annotated[Any, PlainValidator(_number)]
+        return Annotated[Any, PlainValidator(_read_number)]
     if origin is tuple:
-        entries_ = tuple(entry if entry is Ellipsis else _read_type(entry) for entry in inner)
+        entries_ = tuple(entry if entry is Ellipsis else _convert_hint(entry) for entry in inner)
         return Annotated[tuple[entries_], Strict(), BeforeValidator(_list_as_tuple)]  # type: ignore[valid-type]
     if origin in (UnionType, Union):
-        return Union[tuple(_read_type(entry) for entry in inner)]  # noqa: UP007  # of a list that is known at run time
+        return Union[tuple(_convert_hint(entry) for entry in inner)]  # noqa: UP007  # of a list that is known at run time
     if isinstance(origin, type) and issubclass(origin, Mapping):
-        return dict[_read_type(str), _read_type(inner[1])]  # type: ignore[misc]
+        return dict[_convert_hint(str), _convert_hint(inner[1])]  # type: ignore[misc]
     return hint
 
 
@@ -230,86 +230,86 @@ def _list_as_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _member(kind: type[Enum], value: Any) -> Enum:
+def _read_member(kind: type[Enum], value: Any) -> Enum:
     if not isinstance(value, str) or value not in kind.__members__:
-        raise ValueError(f"must be one of {', '.join(kind.__members__)}; got {_shown(value)}")
+        raise ValueError(f"must be one of {', '.join(kind.__members__)}; got {_shorten(value)}")
     return kind[value]
 
 
-def _array(declared: np.dtype[Any], value: Any) -> NDArray[Any]:
+def _read_array(declared: np.dtype[Any], value: Any) -> NDArray[Any]:
     """An array of the declared type from a list of numbers, or from its dtype, shape and values."""
     if isinstance(value, dict):
-        array = _described_array(value)
+        array = _read_described_array(value)
     elif declared.kind == "f":
-        array = _assembled(_numbers(value), np.dtype(np.float64))
+        array = _build_array(_read_numbers(value), np.dtype(np.float64))
     else:
-        raise ValueError(f"must be an array of {declared.type.__name__}; got {_shown(value)}")
+        raise ValueError(f"must be an array of {declared.type.__name__}; got {_shorten(value)}")
     same_size = declared.kind == "U" or array.dtype.itemsize == declared.itemsize
     if array.dtype.kind != declared.kind or not same_size:
         raise ValueError(f"must be an array of {declared.type.__name__}; got one of {array.dtype}")
     return array
 
 
-def _described_array(value: dict[str, Any]) -> NDArray[Any]:
+def _read_described_array(value: dict[str, Any]) -> NDArray[Any]:
     """An array from its dtype, shape and values."""
     if set(value) != {"dtype", "shape", "values"}:
-        raise ValueError(f"must be an array; got {_shown(value)}")
-    name = _checked(value["dtype"], str)
+        raise ValueError(f"must be an array; got {_shorten(value)}")
+    name = _require_type(value["dtype"], str)
     if not DTYPES.fullmatch(name):  # NumPy knows others, some of which it only warns of
         raise ValueError(f"has the dtype {name!r}, which is none of numbers or text")
     try:
         dtype = np.dtype(name)
     except TypeError as error:
         raise ValueError(f"has the unknown dtype {name!r}") from error
-    values = _checked(value["values"], list)
+    values = _require_type(value["values"], list)
     if dtype.kind == "f":
-        values = _numbers(values)
+        values = _read_numbers(values)
     else:
         kind = {"U": str, "b": bool}.get(dtype.kind, int)
-        values = [_checked(entry, kind) for entry in values]
-    flat = _assembled(values, dtype)
-    shape = tuple(_checked(entry, int) for entry in _checked(value["shape"], list))
+        values = [_require_type(entry, kind) for entry in values]
+    flat = _build_array(values, dtype)
+    shape = tuple(_require_type(entry, int) for entry in _require_type(value["shape"], list))
     if flat.size != np.prod(shape) or min(shape, default=0) < 0:
         raise ValueError(f"has the shape {shape} but {flat.size} values")
     return flat.reshape(shape)
 
 
-def _assembled(values: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
+def _build_array(values: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
     try:
         return np.array(values, dtype=dtype)
     except (TypeError, ValueError, OverflowError, MemoryError) as error:
         raise ValueError(f"is no array of {dtype}: {error}") from error
 
 
-def _numbers(value: Any) -> Any:
+def _read_numbers(value: Any) -> Any:
     """Nested lists of floats."""
     if isinstance(value, list):
-        return [_numbers(entry) for entry in value]
-    return _number(value)
+        return [_read_numbers(entry) for entry in value]
+    return _read_number(value)
 
 
-def _number(value: Any) -> float:
+def _read_number(value: Any) -> float:
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if not number and (not isinstance(value, str) or value not in NUMBERS):
-        raise ValueError(f'must be a number, or one of "NaN", "Infinity", "-Infinity"; got {_shown(value)}')
+        raise ValueError(f'must be a number, or one of "NaN", "Infinity", "-Infinity"; got {_shorten(value)}')
     return float(value)
 
 
-def _checked(value: Any, kind: type) -> Any:
+def _require_type(value: Any, kind: type) -> Any:
     """`value`, which has to be exactly of a JSON type."""
     if type(value) is not kind:
         words = {list: "a list", str: "a string", int: "an integer", bool: "true or false"}
-        raise ValueError(f"must be {words[kind]}; got {_shown(value)}")
-    return _text(value) if isinstance(value, str) else value
+        raise ValueError(f"must be {words[kind]}; got {_shorten(value)}")
+    return _check_text(value) if isinstance(value, str) else value
 
 
-def _text(value: str) -> str:
+def _check_text(value: str) -> str:
     """`value`; ValueError for half of a surrogate pair, which can be written as JSON, but is no text."""
     value.encode()
     return value
 
 
-def _shown(value: Any) -> str:
+def _shorten(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) <= 40 else f"{text[:40]}..."
 
@@ -325,24 +325,24 @@ WORDS = {
 """What pydantic's errors ask for, in the words of JSON."""
 
 
-def _sentence(error: Mapping[str, Any], content: Any, top: str) -> str:
+def _describe_error(error: Mapping[str, Any], content: Any, top: str) -> str:
     """One of pydantic's errors: where, what is wrong, what was given."""
     kind, given = error["type"], error["input"]
-    where = _place(error["loc"], content, top)
+    where = _describe_place(error["loc"], content, top)
     if kind == "missing":
         return f"{where} is missing"
     if kind == "extra_forbidden":
-        return f"{_place(error['loc'][:-1], content, top)} has the unknown entry {error['loc'][-1]!r}"
+        return f"{_describe_place(error['loc'][:-1], content, top)} has the unknown entry {error['loc'][-1]!r}"
     if kind == "value_error":
         return f"{where} {error['ctx']['error']}"
     if kind == "too_long" and isinstance(given, tuple):
         return f"{where} must have {error['ctx']['max_length']} entries; got {len(given)}"
     if kind in WORDS:
-        return f"{where} must be {WORDS[kind]}; got {_shown(given)}"
-    return f"{where} must be {error['msg'].removeprefix('Input should be ')}; got {_shown(given)}"
+        return f"{where} must be {WORDS[kind]}; got {_shorten(given)}"
+    return f"{where} must be {error['msg'].removeprefix('Input should be ')}; got {_shorten(given)}"
 
 
-def _place(loc: Iterable[Any], content: Any, top: str) -> str:
+def _describe_place(loc: Iterable[Any], content: Any, top: str) -> str:
     """The path of an entry, as in ``fit.history[1].cost``; what pydantic adds to a path is left out."""
     where, value = top, content
     for step in loc:
@@ -362,7 +362,7 @@ def _upgrade(content: dict[str, Any]) -> None:
         _upgrade_fit(content["fit"])
         _upgrade_certificate(content["certificate"], content["fit"])
     except (LookupError, TypeError, AttributeError) as error:
-        raise ValueError(f"it is not what version {content['version']} holds ({first_line(error)})") from error
+        raise ValueError(f"it is not what version {content['version']} holds ({get_first_line(error)})") from error
 
 
 def _upgrade_fit(fit: dict[str, Any]) -> None:
@@ -378,10 +378,10 @@ def _upgrade_fit(fit: dict[str, Any]) -> None:
         {"unknown": name, "value": theta[names.index(name)] if name in names else "NaN", "left": left, "right": right}
         for name, left, right in fit["kinks"]
     ]
-    known = _possible_constraints(fit)
+    known = _list_possible_constraints(fit)
     for k, text in enumerate(fit["active"]):
         if text not in known:
-            raise ValueError(f"fit.active[{k}] is no constraint of this fit; got {_shown(text)}")
+            raise ValueError(f"fit.active[{k}] is no constraint of this fit; got {_shorten(text)}")
     fit["active"] = [known[text] for text in fit["active"]]
     fit["reason"] = {"kind": "message", "subjects": [fit.pop("message")], "figures": {}}
     fit |= {"earlier_iterations": 0, "smallest_eigenvalue": "NaN", "flat_direction": [], "violated": []}
@@ -416,7 +416,7 @@ def _find_transitions(fit: dict[str, Any]) -> tuple[list[str], list[Any]]:
     return runs, all_places
 
 
-def _possible_constraints(fit: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def _list_possible_constraints(fit: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Every linear constraint that may be active, by the sentence that stands for it in version 3."""
     found = {}
     for name, low, high in zip(fit["theta_names"], fit["lower"], fit["upper"], strict=False):
@@ -496,7 +496,7 @@ def _check_trajectory(trajectory: Trajectory, transition_times: FloatArray, e: i
 
 def _check_comparison(comparison: Comparison, where: str) -> None:
     if comparison.kind not in ("measurements", "reference"):
-        raise ValueError(f'{where}.kind must be "measurements" or "reference"; got {_shown(comparison.kind)}')
+        raise ValueError(f'{where}.kind must be "measurements" or "reference"; got {_shorten(comparison.kind)}')
     _check_times(f"{where}.times", comparison.times)
     _check_times(f"{where}.curve_times", comparison.curve_times)
     q, K, L = len(comparison.names), len(comparison.times), len(comparison.curve_times)

@@ -28,10 +28,10 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import smallest_cost
 from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.problem.data import FloatArray
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
-from switchfit.runtime.cache import compilation_cache
+from switchfit.runtime.cache import use_compilation_cache
 
 PERFECT_FIT = 1e-3
 """Where J has fallen to less than this part of its first value, the integration error is measured against that part:
@@ -101,7 +101,7 @@ def constraint_values(
             tau, p = problem.vectors(theta, e)
             ends = np.stack([simulation.after[rows][-1] for rows in simulation.segments])
             states = np.concatenate([simulation.before, simulation.after])
-            with float64(), compilation_cache():
+            with use_float64(), use_compilation_cache():
                 found = _constraint_values(arguments.without_mesh(), tau, ends, p, structure=structure)
             values.append(np.asarray(found[0]))
             scales.append(np.abs(found[1]) @ np.ptp(states, axis=0))

@@ -10,8 +10,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.discretization.arguments import Arguments, arguments_of
-from switchfit.discretization.mesh import Mesh, with_common_lengths
+from switchfit.discretization.arguments import Arguments, build_arguments
+from switchfit.discretization.mesh import Mesh, pad_to_common_lengths
 from switchfit.engine.adaptive import refined_mesh
 from switchfit.engine.choice import engine_of, summarize
 from switchfit.engine.jax.engine import JaxEngine
@@ -19,11 +19,11 @@ from switchfit.engine.protocol import Derivatives, Engine, Matrix, Simulation
 from switchfit.optimize.arrow import Arrow, ArrowLayout
 from switchfit.paper_adjoint import evaluate_paper
 from switchfit.problem.data import FloatArray
-from switchfit.problem.experiment import run_names
-from switchfit.problem.functions import float64
+from switchfit.problem.experiment import name_runs
+from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_instance
-from switchfit.runtime.cache import compilation_cache
+from switchfit.runtime.cache import use_compilation_cache
 
 Method = Literal["auto", "forward", "discrete-adjoint", "adjoint", "autodiff"]
 METHODS = ("auto", "forward", "discrete-adjoint", "adjoint", "autodiff")
@@ -93,12 +93,14 @@ class Evaluator:
         indices = range(len(problem.experiments))
         at = problem.initial_theta if theta is None else theta
         given = list(meshes) if meshes is not None else [refined_mesh(problem, e, at) for e in indices]
-        self.replace_arguments([arguments_of(problem, e, m) for e, m in enumerate(with_common_lengths(problem, given))])
+        self.replace_arguments(
+            [build_arguments(problem, e, m) for e, m in enumerate(pad_to_common_lengths(problem, given))]
+        )
         self._priors = problem.unknowns.priors if problem.unknowns.priors.any else None
 
     def divide(self, parts: int = 2) -> Evaluator:
         """The same problem with every cell of its meshes cut into equal parts."""
-        return Evaluator(self.problem, meshes=[mesh.divided(parts) for mesh in self.meshes])
+        return Evaluator(self.problem, meshes=[mesh.divide(parts) for mesh in self.meshes])
 
     def __call__(
         self, theta: FloatArray, side: int = 1, method: Method = "auto", matrix: Matrix = "exact"
@@ -191,7 +193,7 @@ class Evaluator:
     @property
     def engine(self) -> Engine:
         """What evaluates cost, gradient and exact Hessian by the method "auto": machine code, or JAX and why."""
-        return summarize(self.engines, run_names(self.problem.experiments))
+        return summarize(self.engines, name_runs(self.problem.experiments))
 
     def simulate(self, theta: FloatArray, *, tangents: bool = False) -> list[Simulation]:
         """All experiments row by row, with their derivatives in their own unknowns if asked for."""
@@ -208,7 +210,7 @@ class Evaluator:
         if method == "adjoint":
             if not knows_paper(self.problem):
                 raise ValueError("the paper's equations know no TransitionCost: take another method.")
-            with float64(), compilation_cache():
+            with use_float64(), use_compilation_cache():
                 found = [evaluate_paper(a, *at, float(side), structure=s) for s, a, _, at in given]
             return [Derivatives(float(J), np.array(g), np.array(H)) for J, g, H in found]
         return [JaxEngine(s, a, mesh).derivatives(*at, side, matrix, method) for s, a, mesh, at in given]
@@ -270,4 +272,4 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     method = as_choice(method, "method", METHODS)
-    return evaluator_of(problem)(problem.checked_theta(theta), method=method)
+    return evaluator_of(problem)(problem.check_theta(theta), method=method)

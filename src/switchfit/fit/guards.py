@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_instance, listed, shown
+from switchfit.problem.validation import as_instance, join_names, shorten
 
 ITERATIONS = 60
 #: Newton steps below this part of a transition time are rounding.
@@ -74,7 +74,7 @@ def evaluate_on_guards(problem: Problem, theta: ArrayLike | None = None) -> Guar
     as_instance(problem, "problem", Problem, "an sf.Problem")
     guarded_places(problem)  # an error where there are no guards
     evaluator = evaluator_of(problem)
-    at = on_guards(evaluator, problem.checked_theta(theta))
+    at = on_guards(evaluator, problem.check_theta(theta))
     evaluator = Evaluator(problem, at)  # a mesh for where the transitions really are
     at = on_guards(evaluator, at)
     guarded = guarded_places(problem)
@@ -123,7 +123,7 @@ def on_guards(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     else:
         if np.all(np.abs(step[guarded]) <= 1e-10 * np.maximum(np.abs(theta[guarded]), 1.0)):
             return theta
-    near, names = shown(theta[guarded].round(6)), listed(problem.theta_names[k] for k in guarded)
+    near, names = shorten(theta[guarded].round(6)), join_names(problem.theta_names[k] for k in guarded)
     raise ValueError(
         f"No transition times near {near} put {names} on their guards: the state does not "
         "reach a guard there, or grazes it. Give transition_times nearer to where the guards vanish (sf.simulate shows "

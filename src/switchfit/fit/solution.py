@@ -128,7 +128,7 @@ def minimize_with_constraints(
         constraints=constraints_of(problem),
         breakpoints=evaluator.breakpoints(),
         size=problem.sizes,
-        scale=problem.elapsed(theta),
+        scale=problem.measure_from_start(theta),
     )
     values, multipliers = found.constraints.tolist(), found.multipliers.tolist()
     return found.result, tuple(zip(names, values, multipliers, strict=True))

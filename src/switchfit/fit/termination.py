@@ -13,7 +13,7 @@ from switchfit.problem.constraints import ActiveConstraint, Constraint
 from switchfit.problem.data import Measurements
 from switchfit.problem.problem import Problem
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import text_of
+from switchfit.runtime.presentation import format_text
 
 NAMED = 4
 """Unknowns of a flat direction that are named."""
@@ -41,7 +41,7 @@ class Kink:
     right: float
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Termination:
         return cls(Status.ERROR, reason=Issue("error", (text,)))
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)
 
 
 def termination_of(result: Result, problem: Problem) -> Termination:

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.discretization.arguments import arguments_of
+from switchfit.discretization.arguments import build_arguments
 from switchfit.engine.adaptive import refined_mesh
 from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation
@@ -119,9 +119,9 @@ def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: in
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     experiment = as_index(experiment, "experiment", len(problem.experiments))
-    checked = problem.checked_theta(theta)
+    checked = problem.check_theta(theta)
     mesh = refined_mesh(problem, experiment, checked)
-    engine = engine_of(problem, experiment, arguments_of(problem, experiment, mesh), mesh)
+    engine = engine_of(problem, experiment, build_arguments(problem, experiment, mesh), mesh)
     simulation = engine.simulate(*problem.vectors(checked, experiment), tangents=False)
     return _trajectory(problem, experiment, simulation)
 
@@ -220,7 +220,7 @@ def _comparisons(
         if isinstance(item, ReferenceSignal):
             here = Comparison("reference", label, times, item.signal(times), curve, None, times, curve)
         else:
-            named = problem.named(theta, e)
+            named = problem.name_parameters(theta, e)
             fitted = simulation.seen[measured][: len(item.times)]
             measured += 1
             delay = float(named[item.delay]) if isinstance(item.delay, str) else item.delay

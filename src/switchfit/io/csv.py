@@ -37,25 +37,25 @@ def read_columns(path: str | Path, columns: Sequence[str]) -> FloatArray:
         fields than the header, or a cell is not a number.
     """
     path = Path(path)
-    rows = _rows(path)
+    rows = _read_rows(path)
     header = next(rows, None)
     if header is None:
         raise InputError(f"{path} is empty; it needs a line with the names of the columns and one line a sample.")
     names = header[1]
-    where = [_position(path, names, column) for column in columns]
+    where = [_find_column(path, names, column) for column in columns]
     table = []
     for line, cells in rows:
         if len(cells) != len(names):
             raise InputError(
                 f"{path}, line {line}: {len(cells)} fields where the header has {len(names)}; is a field missing?"
             )
-        table.append([_number(path, line, names[k], cells[k]) for k in where])
+        table.append([_read_number(path, line, names[k], cells[k]) for k in where])
     if not table:
         raise InputError(f"{path} has a header but no rows; there is nothing to read.")
     return np.array(table, dtype=np.float64)
 
 
-def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+def _read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Line number and stripped cells of each line that is neither empty nor a comment."""
     if is_device(path):
         raise InputError(f"{path} is a device; name a CSV file.")
@@ -86,7 +86,7 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
         raise InputError(f"{path}, line {line}: {error}; is a quotation mark missing?") from error
 
 
-def _position(path: Path, names: list[str], column: str) -> int:
+def _find_column(path: Path, names: list[str], column: str) -> int:
     found = names.count(column)
     if found == 0:
         raise InputError(f"{path} has no column {column!r}; its columns are {', '.join(names)}.")
@@ -95,7 +95,7 @@ def _position(path: Path, names: list[str], column: str) -> int:
     return names.index(column)
 
 
-def _number(path: Path, line: int, column: str, cell: str) -> float:
+def _read_number(path: Path, line: int, column: str, cell: str) -> float:
     if cell == "" or cell.upper() == "NA":
         return np.nan
     try:

@@ -21,7 +21,7 @@ import pydantic
 from pydantic import Field
 
 from switchfit.io.csv import read_columns
-from switchfit.io.python_file import call, find_object, load_object, located, user_place
+from switchfit.io.python_file import call, describe_error, find_object, find_user_place, load_object
 from switchfit.models import BUILT_IN
 from switchfit.problem.data import FloatArray, Input, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment, Parameter
@@ -70,9 +70,9 @@ def load_problem(path: str | Path) -> ProblemFile:
         and what to do.
     """
     path = Path(path)
-    contents = _validated(path, _parsed(path))
+    contents = _validate(path, _parse(path))
     options = contents.options.model_dump(include={"hessian", "tolerance", "max_iterations"}, exclude_none=True)
-    build = _from_tables if contents.problem is None else _from_python
+    build = _build_from_tables if contents.problem is None else _load_from_python
     return ProblemFile(path, build(path, contents), options)
 
 
@@ -94,7 +94,7 @@ def read_experiments(path: str | Path) -> tuple[Experiment, ...]:
         As of `load_problem`.
     """
     path = Path(path)
-    contents = _validated(path, _parsed(path))
+    contents = _validate(path, _parse(path))
     if contents.problem is not None:
         find_object(contents.problem, path.parent, f"{path}: problem")
         return ()
@@ -102,8 +102,8 @@ def read_experiments(path: str | Path) -> tuple[Experiment, ...]:
         _check_model_name(f"{path}: model", contents.model)
         find_object(contents.model.name, path.parent, f"{path}: model")
     for name, table in contents.parameters.items():
-        _explained(f"{path}: parameters.{name}", _parameter, table)
-    return _experiments(path, contents, None)
+        _build_at(f"{path}: parameters.{name}", _build_parameter, table)
+    return _build_experiments(path, contents, None)
 
 
 # --- the format -------------------------------------------------------------------------------------------------------
@@ -190,7 +190,6 @@ class LogTable(_Table):
 
     file: str = Field(description="CSV file, relative to the problem file")
     time: str = Field(description="name of the column with the time")
-    columns: list[str] = Field(min_length=1, description="names of the columns with the values")
     window: Annotated[list[float], Field(min_length=2, max_length=2)] | None = Field(
         default=None, description="[from, to]: only rows with the time column in between are used"
     )
@@ -201,6 +200,7 @@ class LogTable(_Table):
 class DataTable(LogTable):
     """What the model is compared with."""
 
+    columns: list[str] = Field(min_length=1, description="names of the columns with the values")
     kind: Literal["measurements", "reference"] = Field(
         default="measurements", description="discrete noisy samples, or a continuous reference signal"
     )
@@ -235,6 +235,13 @@ class DataTable(LogTable):
 class InputTable(LogTable):
     """A known input u(t); modes are then called as f(t, x, p, u)."""
 
+    columns: Annotated[
+        Annotated[list[str], Field(min_length=1), pydantic.Tag("list")]
+        | Annotated[dict[str, str], Field(min_length=1), pydantic.Tag("table")],
+        pydantic.Discriminator(lambda given: "table" if isinstance(given, dict) else "list"),
+    ] = Field(
+        description="names of the columns with the values, or { name in the model = column }, with which u is a dict"
+    )
     kind: Literal["hold", "linear", "cubic"] = Field(default="hold", description="what happens between samples")
 
 
@@ -308,7 +315,7 @@ class Contents(_Table):
 # --- from text to checked tables --------------------------------------------------------------------------------------
 
 
-def _parsed(path: Path) -> dict[str, Any]:
+def _parse(path: Path) -> dict[str, Any]:
     if is_device(path):
         raise InputError(f"{path} is a device; name a problem file.")
     try:
@@ -324,11 +331,11 @@ def _parsed(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} is not valid TOML: {error}.") from error
 
 
-def _validated(path: Path, given: dict[str, Any]) -> Contents:
+def _validate(path: Path, given: dict[str, Any]) -> Contents:
     try:
         contents = Contents.model_validate(given)
     except pydantic.ValidationError as error:
-        raise InputError(f"{path}: {_sentence(error)}") from error
+        raise InputError(f"{path}: {_describe_error(error)}") from error
     if contents.problem is not None:
         others = [key for key in ("model", "parameters", "experiments") if key in given]
         if others:
@@ -340,26 +347,26 @@ def _validated(path: Path, given: dict[str, Any]) -> Contents:
     return contents
 
 
-def _sentence(error: pydantic.ValidationError) -> str:
+def _describe_error(error: pydantic.ValidationError) -> str:
     """The first thing that is wrong, in words."""
     errors = sorted(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
     first = errors[0]
-    table, steps = _followed(first["loc"])
-    key = _key(steps)
+    table, steps = _follow_location(first["loc"])
+    key = _join_steps(steps)
     if first["type"] == "extra_forbidden":
         known = list(table.model_fields) if table else []
         close = difflib.get_close_matches(str(steps[-1]), known, n=1)
         remedy = f"did you mean {close[0]!r}?" if close else f"known here are {', '.join(known)}."
         sentence = f"unknown key {key}; {remedy}"
     elif first["type"] == "missing":
-        sentence = f"the key {key} is missing: {_description(table, steps)}."
+        sentence = f"the key {key} is missing: {_get_description(table, steps)}."
     else:
-        sentence = f"{key} {_complaint(first)}; got {_short(first['input'])} ({_description(table, steps)})."
-    different = {_key(_followed(e["loc"])[1]) for e in errors} - {key}
+        sentence = f"{key} {_rephrase(first)}; got {_shorten(first['input'])} ({_get_description(table, steps)})."
+    different = {_join_steps(_follow_location(e["loc"])[1]) for e in errors} - {key}
     return sentence + (f" Also wrong: {', '.join(sorted(different))}." if different else "")
 
 
-def _followed(location: Sequence[str | int]) -> tuple[type[_Table] | None, list[str | int]]:
+def _follow_location(location: Sequence[str | int]) -> tuple[type[_Table] | None, list[str | int]]:
     """The table that holds the key at a location, and the location without pydantic's names for unions."""
     table: type[_Table] | None = Contents
     holder = table
@@ -369,7 +376,7 @@ def _followed(location: Sequence[str | int]) -> tuple[type[_Table] | None, list[
             holder = table
             steps.append(step)
             annotation = table.model_fields[step].annotation if step in table.model_fields else None
-            table = _table_in(annotation)
+            table = _find_table(annotation)
             if table is ParameterTable:  # a dict of tables: the next step is a name the user chose
                 table = _ParameterNames
         elif table is _ParameterNames:
@@ -384,13 +391,13 @@ class _ParameterNames(_Table):
     """Stands for [parameters], whose keys are free."""
 
 
-def _table_in(annotation: Any) -> type[_Table] | None:
+def _find_table(annotation: Any) -> type[_Table] | None:
     if inspect.isclass(annotation) and issubclass(annotation, _Table):
         return annotation
-    return next((found for part in get_args(annotation) if (found := _table_in(part)) is not None), None)
+    return next((found for part in get_args(annotation) if (found := _find_table(part)) is not None), None)
 
 
-def _key(steps: Sequence[str | int]) -> str:
+def _join_steps(steps: Sequence[str | int]) -> str:
     """``'experiments[1].data[2].file'``, counted from 1."""
     text = ""
     for step in steps:
@@ -398,13 +405,13 @@ def _key(steps: Sequence[str | int]) -> str:
     return repr(text)
 
 
-def _description(table: type[_Table] | None, steps: Sequence[str | int]) -> str:
+def _get_description(table: type[_Table] | None, steps: Sequence[str | int]) -> str:
     names = [step for step in steps if isinstance(step, str)]
     known = table.model_fields.get(names[-1]) if table and names else None
     return (known.description if known else None) or "a parameter is a number, a list of numbers or a table"
 
 
-def _complaint(error: Any) -> str:
+def _rephrase(error: Any) -> str:
     """pydantic's message as the end of a sentence: 'Input should be a valid number' -> 'must be a number'."""
     if error["type"] in ("too_short", "too_long"):
         bound, size = next((k, v) for k, v in error["ctx"].items() if k in ("min_length", "max_length"))
@@ -415,7 +422,7 @@ def _complaint(error: Any) -> str:
     return re.sub(r" of \w+Table$", "", message)
 
 
-def _short(given: Any) -> str:
+def _shorten(given: Any) -> str:
     text = repr(given)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
@@ -423,7 +430,7 @@ def _short(given: Any) -> str:
 # --- from tables to a problem -----------------------------------------------------------------------------------------
 
 
-def _from_python(path: Path, contents: Contents) -> Problem:
+def _load_from_python(path: Path, contents: Contents) -> Problem:
     given = contents.options.model_dump(include={"min_duration", "solver", "rtol", "atol"}, exclude_none=True)
     if given:
         raise InputError(f"{path}: with 'problem', {', '.join(given)} is set where the sf.Problem is built, not here.")
@@ -439,41 +446,42 @@ def _from_python(path: Path, contents: Contents) -> Problem:
     return found
 
 
-def _from_tables(path: Path, contents: Contents) -> Problem:
-    system = _system(path, contents.model or ModelTable(name=""))
-    experiments = _experiments(path, contents, system)
+def _build_from_tables(path: Path, contents: Contents) -> Problem:
+    system = _build_system(path, contents.model or ModelTable(name=""))
+    experiments = _build_experiments(path, contents, system)
     parameters = {
-        name: _explained(f"{path}: parameters.{name}", _parameter, table) for name, table in contents.parameters.items()
+        name: _build_at(f"{path}: parameters.{name}", _build_parameter, table)
+        for name, table in contents.parameters.items()
     }
     options = contents.options.model_dump(include={"min_duration", "solver", "rtol", "atol"}, exclude_none=True)
-    return _explained(f"{path}", Problem, system, experiments, parameters, **options)
+    return _build_at(f"{path}", Problem, system, experiments, parameters, **options)
 
 
-def _experiments(path: Path, contents: Contents, system: HybridSystem | None) -> tuple[Experiment, ...]:
+def _build_experiments(path: Path, contents: Contents, system: HybridSystem | None) -> tuple[Experiment, ...]:
     """The experiments; without a system their observations are left out."""
     experiments = []
     for k, table in enumerate(contents.experiments, start=1):
         where = f"{path}: experiments[{k}]"
         known = frozenset(contents.parameters) | frozenset(table.parameter_map)
-        experiments.append(_explained(where, _experiment, path.parent, table, system, where, known))
+        experiments.append(_build_at(where, _build_experiment, path.parent, table, system, where, known))
     return tuple(experiments)
 
 
-def _explained(where: str, build: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+def _build_at(where: str, build: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
     """Build something; what it says is wrong is said with the place in the problem file."""
     try:
         return build(*arguments, **named)
     except (InputError, KeyboardInterrupt):
         raise
     except BaseException as error:
-        if user_place(error) is not None:
-            raise InputError(f"{where}: {located(error)}.") from error
+        if find_user_place(error) is not None:
+            raise InputError(f"{where}: {describe_error(error)}.") from error
         if isinstance(error, (ValueError, TypeError)):
             raise InputError(f"{where}: {error}") from error
         raise
 
 
-def _system(path: Path, table: ModelTable) -> HybridSystem:
+def _build_system(path: Path, table: ModelTable) -> HybridSystem:
     what = f"{path}: model"
     if table.name in BUILT_IN:
         found = BUILT_IN[table.name]
@@ -481,7 +489,7 @@ def _system(path: Path, table: ModelTable) -> HybridSystem:
         _check_model_name(what, table)
         found = load_object(table.name, path.parent, what)
     if callable(found):
-        found = call(found, f"{what} {table.name!r}", **_accepted(found, table, what))
+        found = call(found, f"{what} {table.name!r}", **_check_arguments(found, table, what))
     elif table.arguments:
         raise InputError(f"{what} {table.name!r} is not a function; leave out its arguments.")
     if not isinstance(found, HybridSystem):
@@ -500,7 +508,7 @@ def _check_model_name(what: str, table: ModelTable) -> None:
         )
 
 
-def _accepted(factory: Callable[..., Any], table: ModelTable, what: str) -> dict[str, Any]:
+def _check_arguments(factory: Callable[..., Any], table: ModelTable, what: str) -> dict[str, Any]:
     """The arguments, if the factory takes them."""
     try:
         inspect.signature(factory).bind(**table.arguments)
@@ -510,13 +518,13 @@ def _accepted(factory: Callable[..., Any], table: ModelTable, what: str) -> dict
     return table.arguments
 
 
-def _parameter(table: ParameterTable | TransitionTable | StateTable, **more: Any) -> Parameter:
+def _build_parameter(table: ParameterTable | TransitionTable | StateTable, **more: Any) -> Parameter:
     """The unknown that a table describes."""
     given = table.model_dump(exclude={"prior"})
-    return Parameter(**given, prior=None if table.prior is None else _prior(table.prior), **more)
+    return Parameter(**given, prior=None if table.prior is None else _build_prior(table.prior), **more)
 
 
-def _prior(table: PriorTable) -> Prior:
+def _build_prior(table: PriorTable) -> Prior:
     given = table.model_dump(exclude_none=True)
     if set(given) == {"mean", "sd"}:
         return Normal(**given)
@@ -525,42 +533,42 @@ def _prior(table: PriorTable) -> Prior:
     raise ValueError(f"prior needs mean and sd (normal), or median and log_sd (log-normal); got {given}.")
 
 
-def _experiment(
+def _build_experiment(
     folder: Path, table: ExperimentTable, system: HybridSystem | None, where: str, parameters: frozenset[str]
 ) -> Experiment:
     places = [f"{where}.data[{k}]" for k in range(1, len(table.data) + 1)]
     data = [
-        _explained(place, _data, folder, item, system, place, parameters)
+        _build_at(place, _build_data, folder, item, system, place, parameters)
         for place, item in zip(places, table.data, strict=True)
     ]
     spans = [item.seen_times if isinstance(item, Measurements) else item.signal.knots for item in data]
     return Experiment(
         data=data,
         mode_sequence=tuple(table.mode_sequence),
-        transition_times=tuple(_parameter(tau) for tau in table.transition_times),
+        transition_times=tuple(_build_parameter(tau) for tau in table.transition_times),
         t0=min(span[0] for span in spans) if table.t0 is None else table.t0,
         tf=max(span[-1] for span in spans) if table.tf is None else table.tf,
-        inputs=None if table.inputs is None else _explained(f"{where}.inputs", _input, folder, table.inputs),
-        initial_state=_initial_state(table),
+        inputs=None if table.inputs is None else _build_at(f"{where}.inputs", _build_input, folder, table.inputs),
+        initial_state=_build_initial_state(table),
         parameter_map=table.parameter_map,
         name=table.name,
         time_unit=table.time_unit,
     )
 
 
-def _initial_state(table: ExperimentTable) -> list[Parameter] | list[float] | None:
+def _build_initial_state(table: ExperimentTable) -> list[Parameter] | list[float] | None:
     """State at t0 for an Experiment: plain numbers where all of it is known."""
     if table.initial_state is None:
         return None
     if all(entry.fixed for entry in table.initial_state):
         return [entry.value for entry in table.initial_state]
-    return [_parameter(entry) for entry in table.initial_state]
+    return [_build_parameter(entry) for entry in table.initial_state]
 
 
-def _data(
+def _build_data(
     folder: Path, table: DataTable, system: HybridSystem | None, where: str, parameters: frozenset[str]
 ) -> Measurements | ReferenceSignal:
-    observe = _observe(folder, table, system, where)
+    observe = _build_observe(folder, table, system, where)
     names = tuple(table.observe) if isinstance(table.observe, list) else tuple(table.columns)
     if table.kind == "reference":
         if table.sigma is not None:
@@ -568,15 +576,15 @@ def _data(
         for key, default in (("loss", "linear"), ("delay", 0.0)):
             if getattr(table, key) != default:
                 raise ValueError(f"{key} belongs to kind = 'measurements', not to a reference.")
-        times, values = _log(folder, table)
+        times, values = _read_log(folder, table, table.columns)
         return ReferenceSignal.from_samples(
             times, values, observe=observe, lowpass_hz=table.lowpass_hz, weights=table.weights, names=names
         )
     for key in ("lowpass_hz", "weights"):
         if getattr(table, key) is not None:
             raise ValueError(f"{key} belongs to kind = 'reference'; measurements have sigma.")
-    sigma_columns = _sigma_columns(table, parameters)
-    times, values = _log(folder, table, sigma_columns)
+    sigma_columns = _find_sigma_columns(table, parameters)
+    times, values = _read_log(folder, table, [*table.columns, *sigma_columns])
     q = len(table.columns)
     sigma = values[:, q:] if sigma_columns else table.sigma
     return Measurements(
@@ -591,7 +599,7 @@ def _data(
     )
 
 
-def _sigma_columns(table: DataTable, parameters: frozenset[str]) -> list[str]:
+def _find_sigma_columns(table: DataTable, parameters: frozenset[str]) -> list[str]:
     """The columns that hold sigma; none where it is numbers, or names of parameters."""
     given = table.sigma if isinstance(table.sigma, list) else []
     named = [entry for entry in given if isinstance(entry, str)]
@@ -605,15 +613,18 @@ def _sigma_columns(table: DataTable, parameters: frozenset[str]) -> list[str]:
     return named
 
 
-def _input(folder: Path, table: InputTable) -> Input:
-    times, values = _log(folder, table)
+def _build_input(folder: Path, table: InputTable) -> Input:
+    if isinstance(table.columns, dict):
+        times, values = _read_log(folder, table, list(table.columns.values()))
+        return Input(times, dict(zip(table.columns, values.T, strict=True)), kind=table.kind)
+    times, values = _read_log(folder, table, table.columns)
     return Input(times, values[:, 0] if len(table.columns) == 1 else values, kind=table.kind)
 
 
-def _log(folder: Path, table: LogTable, more: Sequence[str] = ()) -> tuple[FloatArray, FloatArray]:
-    """Times (K,) and values (K, q) of the rows inside the window."""
+def _read_log(folder: Path, table: LogTable, columns: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+    """Return times (K,) and the values of some columns (K, q) in the rows inside the window."""
     path = folder / table.file
-    rows = read_columns(path, [table.time, *table.columns, *more])
+    rows = read_columns(path, [table.time, *columns])
     missing = np.isnan(rows[:, 0])
     if missing.any():
         raise InputError(f"{path}, column {table.time!r}: the time of sample {missing.argmax() + 1} is missing.")
@@ -629,7 +640,9 @@ def _log(folder: Path, table: LogTable, more: Sequence[str] = ()) -> tuple[Float
     return (rows[:, 0] - table.time_offset) * table.time_scale, rows[:, 1:]
 
 
-def _observe(folder: Path, table: DataTable, system: HybridSystem | None, where: str) -> Callable[..., Any] | None:
+def _build_observe(
+    folder: Path, table: DataTable, system: HybridSystem | None, where: str
+) -> Callable[..., Any] | None:
     """The observation h(t, x, p), or None for the whole state, and where there is no system to observe."""
     if table.observe is None:
         return None

@@ -8,7 +8,7 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-from switchfit.runtime.errors import InputError, first_line
+from switchfit.runtime.errors import InputError, get_first_line
 from switchfit.runtime.files import is_regular
 
 
@@ -61,29 +61,29 @@ def find_object(reference: str, folder: Path, what: str) -> tuple[Path, str]:
 def call(function: Any, what: str, **arguments: Any) -> Any:
     """Call a user's factory; InputError says where it failed."""
     try:
-        with _double_precision():
+        with _use_double_precision():
             return function(**arguments)
     except (InputError, KeyboardInterrupt):
         raise
     except BaseException as error:  # whatever a user's file raises, SystemExit among it
-        raise InputError(f"{what} failed: {located(error)}.") from error
+        raise InputError(f"{what} failed: {describe_error(error)}.") from error
 
 
-def located(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """An exception with the place in a user's file it came from, as far as it has one."""
     explained = error.__cause__ is not None and isinstance(error, ValueError)
-    place, what = user_place(error), (str(error) if explained else first_line(error)).rstrip(".")
+    place, what = find_user_place(error), (str(error) if explained else get_first_line(error)).rstrip(".")
     return f"{place}: {what}" if place else what
 
 
-def user_place(error: BaseException | None) -> str | None:
+def find_user_place(error: BaseException | None) -> str | None:
     """``"file.py, line 3, in slip"`` for the innermost frame that is in a file loaded by `load_object`.
 
     The exception that caused this one goes first: it was raised further inside.
     """
     if error is None:
         return None
-    cause = user_place(error.__cause__)
+    cause = find_user_place(error.__cause__)
     if cause is not None:
         return cause
     if isinstance(error, SyntaxError) and error.filename in _files:
@@ -96,7 +96,7 @@ def user_place(error: BaseException | None) -> str | None:
     return f"{_files[frame.filename]}, line {frame.lineno}{inside}"
 
 
-def _double_precision() -> Any:
+def _use_double_precision() -> Any:
     """Context in which what a file makes with jax.numpy is as precise as what it computes with later."""
     import jax  # here, since a file that is only read needs none of it
 
@@ -124,12 +124,12 @@ def _run(path: Path) -> Any:
     sys.modules[module.__name__] = module
     sys.path.insert(0, str(path.parent))
     try:
-        with _double_precision():
+        with _use_double_precision():
             specification.loader.exec_module(module)
     except KeyboardInterrupt:
         raise
     except BaseException as error:
-        raise InputError(f"Running {path} failed: {located(error)}.") from error
+        raise InputError(f"Running {path} failed: {describe_error(error)}.") from error
     finally:
         sys.path.remove(str(path.parent))
     _modules[key] = (stamp, module)

@@ -42,11 +42,11 @@ def describe_experiments(experiments: Sequence[Experiment]) -> str:
     lines = []
     for k, experiment in enumerate(experiments, start=1):
         lines.append(f"Experiment {k}{f' ({experiment.name})' if experiment.name else ''}")
-        lines += [f"  {line}" for line in _experiment_lines(experiment)]
+        lines += [f"  {line}" for line in _describe_experiment(experiment)]
     return "\n".join(lines)
 
 
-def _experiment_lines(experiment: Experiment) -> list[str]:
+def _describe_experiment(experiment: Experiment) -> list[str]:
     unit = unit_suffix(experiment.time_unit)
     times = ", ".join(f"{t:.6g}" for t in experiment.initial_times)
     sequence, horizon = " -> ".join(experiment.mode_sequence), f"[{experiment.t0:.6g}, {experiment.tf:.6g}]{unit}"
@@ -56,20 +56,20 @@ def _experiment_lines(experiment: Experiment) -> list[str]:
             step = np.median(np.diff(item.times)) if len(item.times) > 1 else np.nan
             missing = item.values.size - item.count
             lines.append(
-                f"{len(item.times)} samples of {_names(item.names, item.values.shape[1])}, "
+                f"{len(item.times)} samples of {_join_channel_names(item.names, item.values.shape[1])}, "
                 f"{item.times[0]:.6g} to {item.times[-1]:.6g}{unit}, typically {step:.4g}{unit} apart, "
-                f"{missing} values missing{_sensor(item, unit)}"
+                f"{missing} values missing{_describe_sensor(item, unit)}"
             )
         elif isinstance(item, ReferenceSignal):
             knots = item.signal.knots
-            names = _names(item.names, item.signal.channels)
+            names = _join_channel_names(item.names, item.signal.channels)
             lines.append(f"reference signal of {names}, {knots[0]:.6g} to {knots[-1]:.6g}{unit}, {len(knots)} knots")
         else:
             lines.append(type(item).__name__)
     return lines
 
 
-def _sensor(item: Measurements, unit: str) -> str:
+def _describe_sensor(item: Measurements, unit: str) -> str:
     """What is to be said of delay, noise and loss, where there is anything."""
     named = sorted({name for name in item.sigma_names if name})
     said = [
@@ -81,5 +81,5 @@ def _sensor(item: Measurements, unit: str) -> str:
     return "".join(f", {text}" for text in said if text)
 
 
-def _names(names: tuple[str, ...] | None, channels: int) -> str:
+def _join_channel_names(names: tuple[str, ...] | None, channels: int) -> str:
     return ", ".join(names) if names else f"{channels} channels"

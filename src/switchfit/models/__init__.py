@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
+from switchfit.models.heater import heater_problem
 from switchfit.models.magic_formula import magic_formula
 from switchfit.models.skid_steer import skid_steer
 from switchfit.models.sliding_block import sliding_block
@@ -13,4 +14,4 @@ BUILT_IN: Mapping[str, Callable[..., HybridSystem]] = MappingProxyType(
     {"skid_steer": skid_steer, "sliding_block": sliding_block, "magic_formula": magic_formula}
 )
 
-__all__ = ["BUILT_IN", "magic_formula", "skid_steer", "sliding_block"]
+__all__ = ["BUILT_IN", "heater_problem", "magic_formula", "skid_steer", "sliding_block"]

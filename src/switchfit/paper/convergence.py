@@ -10,7 +10,7 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate, HessianKind, estimate
 from switchfit.fit.evaluator import evaluate
 from switchfit.paper.part import BLUE, COLUMN, DARK, LIGHT, RED, Found, Row, Say, conditions, new_figure, tidy
-from switchfit.paper.vehicle import TRUTH, simulated, summary
+from switchfit.paper.vehicle import TRUTH, build_simulated_problem, summary
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,7 +28,7 @@ LOOKS: dict[str, dict[str, Any]] = {
 KEPT = 300
 
 
-def thinned(fit: Estimate) -> list[list[Any]]:
+def thin(fit: Estimate) -> list[list[Any]]:
     """Iterations and norms of the gradient; of a long history those evenly spaced in the logarithm."""
     norms = [record.optimality for record in fit.history]
     last = len(norms) - 1
@@ -38,7 +38,7 @@ def thinned(fit: Estimate) -> list[list[Any]]:
 
 def compute(quick: bool, folder: Path, say: Say) -> Found:
     """Every algorithm to 1e-7."""
-    problem = simulated()
+    problem = build_simulated_problem()
     found: Found = {
         "truth": list(TRUTH),
         "eigenvalues_at_start": np.linalg.eigvalsh(evaluate(problem).hessian).tolist(),
@@ -47,7 +47,7 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
     for kind in KINDS:
         say(kind)
         fit = estimate(problem, hessian=kind, max_iterations=20000)
-        found["fits"][kind] = {**summary(fit), "history": thinned(fit)}
+        found["fits"][kind] = {**summary(fit), "history": thin(fit)}
     first = estimate(problem, hessian="descent-first")
     positive = [np.linalg.eigvalsh(evaluate(problem, record.theta).hessian)[0] > 0 for record in first.history]
     found["descents"] = positive.index(True)

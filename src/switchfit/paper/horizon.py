@@ -16,7 +16,7 @@ from switchfit.batch.simulated import monte_carlo
 from switchfit.batch.starts import multistart
 from switchfit.fit.evaluator import evaluate
 from switchfit.paper.part import BLUE, COLUMN, DARK, RED, SYMBOLS, Found, Row, Say, new_figure, tidy
-from switchfit.paper.vehicle import HORIZON, NAMES, TRUTH, complete, driven, position, states_at, stick_slip
+from switchfit.paper.vehicle import HORIZON, NAMES, TRUTH, complete, position, simulate_drive, states_at, stick_slip
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
 
 def _horizon(tf: float, runs: int, starts: int, folder: Path) -> Found:
     """Accuracy and conditioning with noisy positions; convergence of the noise-free fit of Fig. 4 from many starts."""
-    path = driven(tf=max(tf, HORIZON))
+    path = simulate_drive(tf=max(tf, HORIZON))
     times = np.arange(round(RATE * tf) + 1) / RATE
     names = NAMES if tf > TRUTH[1] else (NAMES[0], NAMES[2])
     truth = tuple(TRUTH[NAMES.index(name)] for name in names)

@@ -18,12 +18,12 @@ from jax.scipy.linalg import expm
 from switchfit.estimation.estimator import HessianKind, estimate
 from switchfit.fit.evaluator import evaluate
 from switchfit.fit.trajectory import simulate
-from switchfit.paper.convergence import convergence_figure, thinned
+from switchfit.paper.convergence import convergence_figure, thin
 from switchfit.paper.part import Found, Row, Say, conditions
 from switchfit.paper.vehicle import summary
 from switchfit.problem.data import FloatArray, ReferenceSignal
 from switchfit.problem.experiment import Experiment, Parameter
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
 
@@ -59,7 +59,7 @@ def _reference() -> ReferenceSignal:
     times, states, at = [], [], np.array(INITIAL)
     for begin, end, damping in ((0.0, tau, 0.0), (tau, HORIZON, c)):
         step = np.linspace(0.0, end - begin, 501)
-        with float64():
+        with use_float64():
             A = _matrix(k, damping)
             path = np.asarray(jax.vmap(lambda h, A=A: expm(A * h))(jnp.asarray(step))) @ at
         times.append(begin + step)
@@ -78,7 +78,7 @@ def _matrix(k: Any, c: Any) -> Any:
 
 def exact(theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
     """J, its gradient and its Hessian from matrix exponentials, at tau before or at that of the truth."""
-    with float64():
+    with use_float64():
         cost, gradient, hessian = _exact(jnp.asarray(theta))
         return float(cost), np.asarray(gradient), np.asarray(hessian)
 
@@ -124,7 +124,7 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
     for kind in KINDS:
         say(kind)
         fit = estimate(here, hessian=kind, max_iterations=20000)
-        found["fits"][kind] = {**summary(fit), "history": thinned(fit)}
+        found["fits"][kind] = {**summary(fit), "history": thin(fit)}
     exact_fit = found["fits"]["exact"]["theta"]
     found["error"] = float(np.max(np.abs(np.array(list(exact_fit.values())) - TRUTH)))
     path = simulate(problem(TRUTH))

@@ -17,9 +17,9 @@ from switchfit.paper.vehicle import (
     NAMES,
     TRUTH,
     complete,
-    driven,
     gps_reference,
     position,
+    simulate_drive,
     states_at,
     stick_slip,
 )
@@ -43,14 +43,14 @@ FILTERED, DIRECT = "interpolated and filtered", "samples fitted directly"
 
 def problems() -> dict[str, Problem]:
     """The two ways to fit the same samples."""
-    clean = states_at(driven(step=1.0), TIMES)[:, [0, 2]]
+    clean = states_at(simulate_drive(step=1.0), TIMES)[:, [0, 2]]
     return {
         FILTERED: stick_slip(gps_reference(TIMES, clean)),
         DIRECT: stick_slip(Measurements(TIMES, clean, position, sigma=1.0, names=("X", "Y"))),
     }
 
 
-def with_sigma(problem: Problem, sigma: float) -> Problem:
+def set_sigma(problem: Problem, sigma: float) -> Problem:
     """The problem with another known noise; a reference signal has none."""
     (run,) = problem.experiments
     (data,) = run.data
@@ -69,7 +69,7 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
             say(f"{way}: sigma {sigma:g} m")
             study = complete(
                 monte_carlo(
-                    with_sigma(problem, sigma),
+                    set_sigma(problem, sigma),
                     1 if sigma == 0 else runs,
                     theta=TRUTH,
                     start=problem.initial_theta,

@@ -16,7 +16,7 @@ from typing import Any, cast
 
 from switchfit.paper import convergence, horizon, lti, magic, noise, trials
 from switchfit.paper.part import Found, Part, Row, Say
-from switchfit.runtime.errors import first_line
+from switchfit.runtime.errors import get_first_line
 from switchfit.runtime.files import set_aside, write_atomically
 
 #: Name -> part, in the order of the paper.
@@ -134,7 +134,7 @@ def _read_kept(path: Path) -> dict[str, Any] | None:
             return entry
         reason = "its content is not what was written"
     except (ValueError, LookupError, TypeError, RecursionError) as error:
-        reason = f"it cannot be read ({first_line(error)})"
+        reason = f"it cannot be read ({get_first_line(error)})"
     set_aside(path, reason, "This part is computed again.")
     return None
 
@@ -150,7 +150,7 @@ def _earlier(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         return {}
     except (ValueError, RecursionError) as error:
-        set_aside(path, f"it is no valid JSON ({first_line(error)})", "The other parts have to be computed again.")
+        set_aside(path, f"it is no valid JSON ({get_first_line(error)})", "The other parts have to be computed again.")
         return {}
     fields = {"quick": bool, "seconds": float, "found": dict}
     for name, entry in earlier.items() if isinstance(earlier, dict) else [("", None)]:

@@ -57,7 +57,7 @@ def stick_slip(
     return Problem(system, run, {"mu": Parameter(start[-1], lower=0.05, upper=2.0, unit="1")})
 
 
-def driven(
+def simulate_drive(
     theta: tuple[float, float, float] = TRUTH,
     *,
     tf: float = HORIZON,
@@ -71,9 +71,9 @@ def driven(
     return simulate(stick_slip(nothing, theta, tf=tf, stick_force=stick_force, restick=restick))
 
 
-def simulated(start: tuple[float, float, float] = START, tf: float = HORIZON) -> Problem:
+def build_simulated_problem(start: tuple[float, float, float] = START, tf: float = HORIZON) -> Problem:
     """The simulated problem of Section V-A 2: the whole state of (18) at TRUTH is the reference signal."""
-    path = driven(tf=tf)
+    path = simulate_drive(tf=tf)
     return stick_slip(ReferenceSignal.from_samples(path.times, path.states), start, tf=tf)
 
 
@@ -84,7 +84,7 @@ def wheel_speeds(differential: float = DIFFERENTIAL, stick_force: float = 15.0) 
     to 10 s (with reset at re-stick, so that it drives straight on). From 5 to 10 s wheels 1 and 4 are `differential`
     faster and 2 and 3 as much slower, which they become and cease to be within RISE.
     """
-    path = driven((*COMMANDED, TRUTH[2]), stick_force=stick_force, restick="reset")
+    path = simulate_drive((*COMMANDED, TRUTH[2]), stick_force=stick_force, restick="reset")
     theta = path.states[:, 4]
     forward = np.cos(theta) * path.states[:, 1] + np.sin(theta) * path.states[:, 3]
     knots = [0.0, COMMANDED[0], COMMANDED[0] + RISE, COMMANDED[1], COMMANDED[1] + RISE, HORIZON]

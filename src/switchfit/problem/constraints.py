@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from switchfit.runtime.presentation import text_of
+from switchfit.runtime.presentation import format_text
 
 ConstraintKind = Literal["collapsed", "minimum duration", "lower bound", "upper bound"]
 
@@ -38,7 +38,7 @@ class Constraint:
     run: str = ""
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,27 @@ class ActiveConstraint(Constraint):
     multiplier : float
         Its Lagrange multiplier, 0 or more: by how much J falls per unit by which the constraint is relaxed. NaN
         in a fit that was loaded from a file of an earlier version, which does not hold it.
+
+    See Also
+    --------
+    Estimate.active : those of a fit.
+    Termination, Issue
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+    >>> bounded = {**problem.parameters, "k": sf.Parameter(0.3, upper=0.35, unit="1/h")}
+    >>> fit = sf.estimate(sf.Problem(problem.system, problem.experiments[0], bounded))
+    >>> active = fit.active[0]
+    >>> active.kind, active.unknown, active.value, active.multiplier > 0
+    ('upper bound', 'k', 0.35, True)
+    >>> print(active)
+    k at its upper bound 0.35
     """
 
     multiplier: float = 0.0
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)

@@ -20,10 +20,11 @@ from switchfit.problem.validation import (
     as_choice,
     as_finite,
     as_name,
+    as_named_columns,
     as_names,
     as_number,
     as_positive,
-    shown,
+    shorten,
 )
 
 FloatArray = NDArray[np.float64]
@@ -84,8 +85,9 @@ class Input:
     times : (K,) array_like
         Increasing times in the experiment's time unit. They must reach over its ``[t0, tf]``; a held input only has to
         start by t0, its last value is kept.
-    values : (K,) or (K, q) array_like
-        The modes get a scalar u, or a ``(q,)`` array.
+    values : (K,) or (K, q) array_like, or mapping of str to (K,) array_like
+        The modes get a scalar u, or a ``(q,)`` array. With samples by name they get a dict of scalars, ``u["left"]``;
+        so they do with a DataFrame whose columns all have names (strings).
     kind : {"hold", "linear", "cubic"}
         Between samples: the last value is held, straight lines, or a cubic spline.
 
@@ -93,9 +95,27 @@ class Input:
     ------
     ValueError
         For times that do not increase, values that are not finite or differ in length from times, too few
-        samples, or an unknown kind.
+        samples, no name or an empty one, or an unknown kind.
     TypeError
-        If times or values are not numbers, dates among them.
+        If times or values are not numbers, dates among them, or a name is not a string.
+
+    See Also
+    --------
+    Experiment : takes it as `inputs`.
+    ReferenceSignal : a measured signal that the model is compared with.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import switchfit as sf
+    >>> wheels = sf.Input([0.0, 1.0, 2.0], {"left": [0.0, 4.0, 4.0], "right": [0.0, 4.0, 5.0]}, kind="linear")
+    >>> wheels.names
+    ('left', 'right')
+
+    A mode of an experiment with ``inputs=wheels`` finds each of them by its name:
+
+    >>> def drive(t, x, p, u):
+    ...     return p["r"] * np.array([0.5, 0.5]) @ [u["left"], u["right"]]
     """
 
     times: Any
@@ -105,27 +125,62 @@ class Input:
     def __post_init__(self) -> None:
         kind = as_choice(self.kind, "Input kind", ("hold", "linear", "cubic"))
         at_least = {"hold": 1, "linear": 2, "cubic": 4}[kind]
-        times, values = _samples(self.times, self.values, "Input", at_least=at_least)
-        _require_finite(values, "Input values")
+        values: Any
+        named = as_named_columns(self.values, "Input values", "(K,) samples")
+        if named is None:
+            times, values = _check_samples(self.times, self.values, "Input", at_least=at_least)
+            _require_finite(values, "Input values")
+        else:
+            # Sorted: experiments whose inputs are named in different orders share one program.
+            values = {}
+            for name in sorted(named):
+                what = f"Input {shorten(name)}"
+                times, values[name] = _check_samples(self.times, named[name], what, at_least=at_least, columns=False)
+                _require_finite(values[name], f"{what} values")
         object.__setattr__(self, "kind", kind)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values)
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the entries of u, sorted; empty if u is a scalar or an array."""
+        return tuple(self.values) if isinstance(self.values, Mapping) else ()
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of u: () or (q,). Where its entries have names, q is their number."""
+        return (len(self.values),) if self.names else tuple(self.values.shape[1:])
+
     def signal(self, t0: float, tf: float) -> PiecewisePolynomial:
-        """The input as a piecewise polynomial over ``[t0, tf]``."""
-        times, values = self.times, self.values.reshape(len(self.times), -1)
+        """The input as a piecewise polynomial over ``[t0, tf]``.
+
+        See Also
+        --------
+        Input
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> signal = sf.Input([0.0, 1.0], [0.0, 4.0], kind="linear").signal(0.0, 1.0)
+        >>> signal([0.25, 0.5])
+        array([[1.],
+               [2.]])
+        """
+        times = self.times
+        values = np.stack([self.values[name] for name in self.names], axis=1) if self.names else self.values
+        values = values.reshape(len(times), -1)
         if times[0] > t0 or (self.kind != "hold" and times[-1] < tf):
             raise ValueError(
                 f"Input must be known over (t0, tf) = ({t0}, {tf}); its samples reach from {times[0]} to {times[-1]}."
             )
         if self.kind == "cubic":
-            return _spline(times, values)
+            return _fit_spline(times, values)
         if self.kind == "linear":
             with np.errstate(all="ignore"):
                 slopes = np.diff(values, axis=0) / np.diff(times)[:, None]
-            return _from_powers(times, [values[:-1], slopes])
+            return _build_polynomial(times, [values[:-1], slopes])
         end = max(tf, times[-1] + 1.0)
-        return _from_powers(np.append(times, end), [values])
+        return _build_polynomial(np.append(times, end), [values])
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +190,18 @@ class RunningCost:
     Parameters
     ----------
     ell : callable ``ell(t, x, p) -> scalar``, twice differentiable in x and p.
+
+    See Also
+    --------
+    TerminalCost, TransitionCost, ReferenceSignal
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> effort = sf.RunningCost(lambda t, x, p: x[0] ** 2)
+    >>> run = sf.Experiment(effort, ("on", "off"), (2.0,), 0.0, 4.0)
+    >>> len(run.data)
+    1
     """
 
     ell: Callable[..., Any]
@@ -151,6 +218,18 @@ class TerminalCost:
     Parameters
     ----------
     phi : callable ``phi(x, p) -> scalar``, twice differentiable.
+
+    See Also
+    --------
+    RunningCost, TransitionCost, TerminalConstraint
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> far = sf.TerminalCost(lambda x, p: -x[0])
+    >>> run = sf.Experiment(far, ("go",), (), 0.0, 1.0)
+    >>> len(run.data)
+    1
     """
 
     phi: Callable[..., Any]
@@ -173,16 +252,16 @@ class TransitionCost:
     before, after : str, optional
         The modes between which it counts; left out, any. No two may count at the same transition.
 
+    See Also
+    --------
+    RunningCost, TerminalCost
+
     Examples
     --------
     Switching from "push" to "brake" costs the square of the speed:
 
     >>> import switchfit as sf
     >>> cost = sf.TransitionCost(lambda t, x, p: x[1] ** 2, before="push", after="brake")
-
-    See Also
-    --------
-    RunningCost, TerminalCost
     """
 
     mu: Callable[..., Any]
@@ -197,7 +276,19 @@ class TransitionCost:
                 as_name(getattr(self, name), name, "the name of a mode")
 
     def counts_between(self, before: str, after: str) -> bool:
-        """Whether it counts at a transition from a mode to another."""
+        """Whether it counts at a transition from a mode to another.
+
+        See Also
+        --------
+        TransitionCost
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> cost = sf.TransitionCost(lambda t, x, p: x[0], before="push")
+        >>> cost.counts_between("push", "brake"), cost.counts_between("brake", "push")
+        (True, False)
+        """
         return self.before in (None, before) and self.after in (None, after)
 
 
@@ -208,6 +299,21 @@ class TerminalConstraint:
     Parameters
     ----------
     psi : callable ``psi(x, p) -> () or (m,)``, twice differentiable.
+
+    See Also
+    --------
+    TerminalCost, HybridSystem
+
+    Examples
+    --------
+    >>> import switchfit as sf
+
+    The speed has to be zero at the end:
+
+    >>> at_rest = sf.TerminalConstraint(lambda x, p: x[1])
+    >>> run = sf.Experiment([sf.TerminalCost(lambda x, p: -x[0]), at_rest], ("go",), (), 0.0, 1.0)
+    >>> len(run.data)
+    2
     """
 
     psi: Callable[..., Any]
@@ -237,6 +343,20 @@ class ReferenceSignal:
         What the signal was made from.
     lowpass_hz : float, optional
         The cut-off with which it was made.
+
+    See Also
+    --------
+    Measurements : discrete samples.
+    Experiment : takes it as `data`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import switchfit as sf
+    >>> times = np.linspace(0.0, 2.0, 41)
+    >>> reference = sf.ReferenceSignal.from_samples(times, np.sin(times), lowpass_hz=2.0)
+    >>> reference.signal.channels
+    1
     """
 
     signal: PiecewisePolynomial
@@ -253,8 +373,8 @@ class ReferenceSignal:
                 f"got {type(self.signal).__name__}."
             )
         _check_observe(self.observe)
-        object.__setattr__(self, "weights", _weight_matrix(self.weights, self.signal.channels))
-        object.__setattr__(self, "names", _channel_names(self.names, self.signal.channels))
+        object.__setattr__(self, "weights", _build_weight_matrix(self.weights, self.signal.channels))
+        object.__setattr__(self, "names", _check_channel_names(self.names, self.signal.channels))
 
     @classmethod
     def from_samples(
@@ -291,17 +411,30 @@ class ReferenceSignal:
             beyond what the samples show.
         TypeError
             If times, values, weights or the cut-off are not numbers, dates among them.
+
+        See Also
+        --------
+        Measurements, Input
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import switchfit as sf
+        >>> times = np.linspace(0.0, 2.0, 41)
+        >>> reference = sf.ReferenceSignal.from_samples(times, np.sin(times))
+        >>> reference.signal([1.0]).round(6)
+        array([[0.841471]])
         """
-        times, values = _samples(times, values, "ReferenceSignal", at_least=4, breaks=True, missing=True)
+        times, values = _check_samples(times, values, "ReferenceSignal", at_least=4, breaks=True, missing=True)
         table = values.reshape(len(times), -1)
         if np.isinf(table).any():
             raise ValueError("ReferenceSignal values must be finite, or NaN where one is missing; got infinity.")
         cuts = np.flatnonzero(np.diff(times) == 0) + 1
         parts = zip(np.split(times, cuts), np.split(table, cuts), strict=True)
-        signal = _joined([_bridged_spline(part_times, part) for part_times, part in parts])
+        signal = _join_signals([_fit_bridged_spline(part_times, part) for part_times, part in parts])
         if lowpass_hz is not None:
             lowpass_hz = as_positive(lowpass_hz, "lowpass_hz")
-            signal = _lowpass(signal, lowpass_hz)
+            signal = _filter_lowpass(signal, lowpass_hz)
         return cls(signal, observe, weights, names, (times, table), lowpass_hz)  # type: ignore[arg-type]  # made a tuple there
 
 
@@ -344,6 +477,28 @@ class Measurements:
         sigma that is not positive, or a loss that is not known or has no scale to be measured by.
     TypeError
         If times, values, sigma or another number is not a number, dates among them.
+
+    See Also
+    --------
+    ReferenceSignal : a continuous signal.
+    Experiment : takes it as `data`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import switchfit as sf
+
+    Two channels of a state of three, one value missing, with noise of different size:
+
+    >>> gps = sf.Measurements(
+    ...     [0.0, 0.5, 1.0],
+    ...     [[0.0, 1.0], [np.nan, 1.2], [0.4, 1.3]],
+    ...     observe=lambda t, x, p: x[np.array([0, 2])],
+    ...     sigma=[0.1, 0.2],
+    ...     names=("X", "Y"),
+    ... )
+    >>> gps.count
+    5
     """
 
     times: Any
@@ -356,7 +511,7 @@ class Measurements:
     delay: float | str = 0.0
 
     def __post_init__(self) -> None:
-        times, values = _samples(self.times, self.values, "Measurements", at_least=1, missing=True)
+        times, values = _check_samples(self.times, self.values, "Measurements", at_least=1, missing=True)
         values = values.reshape(len(times), -1)
         if np.isinf(values).any():
             raise ValueError("Measurements values must be finite, or NaN where a sample is missing; got infinity.")
@@ -365,8 +520,8 @@ class Measurements:
         _check_observe(self.observe)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values)
-        object.__setattr__(self, "sigma", _checked_sigma(self.sigma, values.shape))
-        object.__setattr__(self, "names", _channel_names(self.names, values.shape[1]))
+        object.__setattr__(self, "sigma", _check_sigma(self.sigma, values.shape))
+        object.__setattr__(self, "names", _check_channel_names(self.names, values.shape[1]))
         self._check_loss()
         if isinstance(self.delay, str):
             delay: float | str = as_name(self.delay, "delay")
@@ -404,7 +559,20 @@ class Measurements:
         return tuple(entry if isinstance(entry, str) else None for entry in self.sigma)
 
     def noise(self, parameters: Mapping[str, Any]) -> FloatArray | None:
-        """Standard deviation of each sample, a (K, q) array, given the model's parameters; None where it is unknown."""
+        """Standard deviation of each sample, a (K, q) array, given the model's parameters; None where it is unknown.
+
+        See Also
+        --------
+        Measurements
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> log = sf.Measurements([0.0, 1.0], [2.0, 3.0], sigma="noise")
+        >>> log.noise({"noise": 0.5})
+        array([[0.5],
+               [0.5]])
+        """
         if self.sigma is None:
             return None
         sigma = self.sigma
@@ -428,18 +596,26 @@ class Measurements:
 Data = RunningCost | TerminalCost | TerminalConstraint | ReferenceSignal | Measurements
 
 
-def _samples(
-    times: ArrayLike, values: ArrayLike, what: str, *, at_least: int, breaks: bool = False, missing: bool = False
+def _check_samples(
+    times: ArrayLike,
+    values: ArrayLike,
+    what: str,
+    *,
+    at_least: int,
+    breaks: bool = False,
+    missing: bool = False,
+    columns: bool = True,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return times (K,) and values (K, ...) as float64, checked against each other.
+    """Return times (K,) and values (K,) or (K, q) as float64, checked against each other.
 
-    With `breaks` a time may stand twice; with `missing` masked values become NaN.
+    With `breaks` a time may stand twice; with `missing` masked values become NaN; without `columns` the shape of the
+    values must be (K,).
     """
     times = as_array(times, f"{what} times", form="an array of numbers")
     values = as_array(values, f"{what} values", form="an array of numbers", missing=missing)
-    if times.ndim != 1 or values.ndim not in (1, 2):
+    if times.ndim != 1 or values.ndim not in ((1, 2) if columns else (1,)):
         raise ValueError(
-            f"{what} needs times of shape (K,) and values of shape (K,) or (K, q); "
+            f"{what} needs times of shape (K,) and values of shape (K,){' or (K, q)' if columns else ''}; "
             f"got {times.shape} and {values.shape}."
         )
     if len(times) != len(values):
@@ -472,13 +648,13 @@ def _require_finite(values: FloatArray, what: str) -> None:
         raise ValueError(f"{what} must be finite; got {values[tuple(where)]} at index {where}.")
 
 
-def _checked_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | tuple[str | float, ...] | None:
+def _check_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | tuple[str | float, ...] | None:
     if sigma is None:
         return None
     if isinstance(sigma, str):
         return (as_name(sigma, "sigma"),) * shape[1]
     if isinstance(sigma, (list, tuple)) and any(isinstance(entry, str) for entry in sigma):
-        return _sigma_of_channels(sigma, shape[1])
+        return _check_sigma_of_channels(sigma, shape[1])
     sigma = as_array(sigma, "sigma")
     if sigma.shape not in ((), (shape[1],), shape):
         raise ValueError(
@@ -494,39 +670,39 @@ def _checked_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | tuple[str
 def _check_inverse_square(sigma: Any) -> None:
     with np.errstate(over="ignore"):
         if not np.all(np.isfinite(np.asarray(sigma, dtype=np.float64) ** -2.0)):
-            raise ValueError(f"sigma must not be so small that 1 / sigma**2 is infinite; got {shown(sigma)}.")
+            raise ValueError(f"sigma must not be so small that 1 / sigma**2 is infinite; got {shorten(sigma)}.")
 
 
-def _sigma_of_channels(sigma: Sequence[Any], channels: int) -> tuple[str | float, ...]:
+def _check_sigma_of_channels(sigma: Sequence[Any], channels: int) -> tuple[str | float, ...]:
     """Names of parameters and numbers, one a channel."""
     if len(sigma) != channels:
-        raise ValueError(f"sigma must have one entry for each of the {channels} channels; got {shown(sigma)}.")
+        raise ValueError(f"sigma must have one entry for each of the {channels} channels; got {shorten(sigma)}.")
     if any(entry is None for entry in sigma):
         raise ValueError(
             "sigma of one channel cannot be left out (None) where that of another is a parameter: name a parameter for "
-            f"it too; got {shown(sigma)}."
+            f"it too; got {shorten(sigma)}."
         )
     entries = [
         as_name(entry, "sigma of a channel") if isinstance(entry, str) else as_number(entry, "sigma of a channel")
         for entry in sigma
     ]
     if not all(np.isfinite(entry) and entry > 0 for entry in entries if not isinstance(entry, str)):
-        raise ValueError(f"sigma must be positive and finite; got {shown(sigma)}.")
+        raise ValueError(f"sigma must be positive and finite; got {shorten(sigma)}.")
     _check_inverse_square([entry for entry in entries if not isinstance(entry, str)])
     return tuple(entries)
 
 
-def _channel_names(names: Sequence[str] | None, channels: int) -> tuple[str, ...] | None:
+def _check_channel_names(names: Sequence[str] | None, channels: int) -> tuple[str, ...] | None:
     if names is None:
         return None
     given = (names,) if isinstance(names, str) else names
     checked = as_names(given, "names", "a sequence of strings, one for each channel")
     if len(checked) != channels:
-        raise ValueError(f"names must have one entry for each of the {channels} channels; got {shown(checked)}.")
+        raise ValueError(f"names must have one entry for each of the {channels} channels; got {shorten(checked)}.")
     return checked
 
 
-def _weight_matrix(weights: ArrayLike | None, channels: int) -> FloatArray:
+def _build_weight_matrix(weights: ArrayLike | None, channels: int) -> FloatArray:
     """W as a symmetric positive semi-definite ``(q, q)`` matrix."""
     if weights is None:
         return np.eye(channels)
@@ -535,14 +711,14 @@ def _weight_matrix(weights: ArrayLike | None, channels: int) -> FloatArray:
         raise ValueError(f"weights must have shape ({channels},) or ({channels}, {channels}); got {matrix.shape}.")
     matrix = np.diag(matrix) if matrix.ndim == 1 else matrix
     if not np.all(np.isfinite(matrix)) or not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
-        raise ValueError(f"weights must be finite and symmetric; got {shown(matrix.tolist())}.")
+        raise ValueError(f"weights must be finite and symmetric; got {shorten(matrix.tolist())}.")
     smallest = np.linalg.eigvalsh(matrix)[0]
     if smallest < -1e-12 * np.abs(matrix).max():
         raise ValueError(f"weights must be positive semi-definite; its smallest eigenvalue is {smallest:.3g}.")
     return matrix
 
 
-def _from_powers(knots: FloatArray, powers: list[FloatArray]) -> PiecewisePolynomial:
+def _build_polynomial(knots: FloatArray, powers: list[FloatArray]) -> PiecewisePolynomial:
     """Polynomial with the given coefficient arrays ``(K - 1, q)``, lowest power first, the rest zero."""
     coefficients = np.zeros((len(knots) - 1, 4, powers[0].shape[1]))
     for i, power in enumerate(powers):
@@ -550,7 +726,7 @@ def _from_powers(knots: FloatArray, powers: list[FloatArray]) -> PiecewisePolyno
     return PiecewisePolynomial(np.asarray(knots, dtype=np.float64), coefficients)
 
 
-def _spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
+def _fit_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
     """Not-a-knot cubic spline through ``values`` (K, q)."""
     from scipy.interpolate import CubicSpline  # here, since importing it takes longer than most fits
 
@@ -562,13 +738,13 @@ def _spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
     return PiecewisePolynomial(times, np.moveaxis(spline.c[::-1], 0, 1))
 
 
-def _joined(parts: list[PiecewisePolynomial]) -> PiecewisePolynomial:
+def _join_signals(parts: list[PiecewisePolynomial]) -> PiecewisePolynomial:
     """One signal out of several that follow each other."""
     knots = np.concatenate([part.knots[:-1] for part in parts[:-1]] + [parts[-1].knots])
     return PiecewisePolynomial(knots, np.concatenate([part.coefficients for part in parts]))
 
 
-def _bridged_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
+def _fit_bridged_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
     """Spline through the samples that are there, each channel's gaps bridged by its own spline first."""
     filled = values.copy()
     for channel in filled.T:
@@ -576,11 +752,11 @@ def _bridged_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomia
         if known.sum() < 4:
             raise ValueError(f"ReferenceSignal needs four samples or more in each channel and part; got {known.sum()}.")
         if not known.all():
-            channel[~known] = _spline(times[known], channel[known][:, None])(times[~known])[:, 0]
-    return _spline(times, filled)
+            channel[~known] = _fit_spline(times[known], channel[known][:, None])(times[~known])[:, 0]
+    return _fit_spline(times, filled)
 
 
-def _lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePolynomial:
+def _filter_lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePolynomial:
     """Butterworth filter of second order forward and backward, on a grid of ten points a period of the cut-off."""
     import scipy.signal  # here, since importing it takes longer than most fits
 
@@ -602,4 +778,4 @@ def _lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePolynomi
     sos = scipy.signal.butter(2, cutoff_hz, fs=rate, output="sos")
     padding = int(min(len(grid) - 1, np.ceil(3 * rate / cutoff_hz)))
     filtered = scipy.signal.sosfiltfilt(sos, signal(grid), axis=0, padtype="odd", padlen=padding)
-    return _spline(grid, filtered)
+    return _fit_spline(grid, filtered)

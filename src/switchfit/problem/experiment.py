@@ -23,7 +23,7 @@ from switchfit.problem.data import (
 from switchfit.problem.parameter import Parameter as Parameter
 from switchfit.problem.parameter import as_parameter
 from switchfit.problem.system import HybridSystem, as_state
-from switchfit.problem.validation import as_instance, as_name, as_number, as_sequence, shown
+from switchfit.problem.validation import as_instance, as_name, as_number, as_sequence, shorten
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +71,18 @@ class Experiment:
     is there under its own name only if a function asks for it. A run is differentiated with respect to the parameters
     that its functions ask for and to no others, so that many runs with parameters of their own cost each what it alone
     would. (Functions that look at ``p`` as a whole, or hand it to ``jax.jit``, ask for all that it holds.)
+
+    See Also
+    --------
+    Problem, HybridSystem, Measurements, Input
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> log = sf.Measurements([1.0, 2.0, 3.0, 4.0], [0.9, 1.8, 1.2, 0.7], sigma=0.1)
+    >>> run = sf.Experiment(log, ("on", "off"), (2.2,), 0.0, 4.0, time_unit="h")
+    >>> run.mode_sequence, run.initial_times
+    (('on', 'off'), array([2.2]))
     """
 
     data: Any
@@ -109,8 +121,8 @@ class Experiment:
             object.__setattr__(self, "initial_state", as_state(self.initial_state, "initial_state"))
         for field, value in (("t0", t0), ("tf", tf), ("mode_sequence", sequence), ("transition_times", times)):
             object.__setattr__(self, field, value)
-        object.__setattr__(self, "data", _checked_data(self.data))
-        object.__setattr__(self, "parameter_map", _checked_map(self.parameter_map))
+        object.__setattr__(self, "data", _check_data(self.data))
+        object.__setattr__(self, "parameter_map", _check_map(self.parameter_map))
         self._check_time_unit()
         self._check_times()
         self._check_data_inside()
@@ -138,13 +150,13 @@ class Experiment:
         if any(tau.shape != () for tau in self.transition_times):
             shapes = [tau.shape for tau in self.transition_times]
             raise ValueError(
-                f"transition_times must be single numbers or Parameters of one; got the shapes {shown(shapes)}."
+                f"transition_times must be single numbers or Parameters of one; got the shapes {shorten(shapes)}."
             )
         knots = np.concatenate([[self.t0], self.initial_times, [self.tf]])
         if np.any(np.diff(knots) <= 0):
             raise ValueError(
                 f"transition_times must increase strictly inside (t0, tf) = ({self.t0}, {self.tf}); "
-                f"got {shown(self.initial_times)}."
+                f"got {shorten(self.initial_times)}."
             )
 
     def _check_data_inside(self) -> None:
@@ -167,7 +179,7 @@ def initial_state_of(system: HybridSystem, experiment: Experiment) -> Any:
     return system.initial_state if experiment.initial_state is None else experiment.initial_state
 
 
-def signals_of(experiment: Experiment) -> tuple[PiecewisePolynomial, ...]:
+def list_signals(experiment: Experiment) -> tuple[PiecewisePolynomial, ...]:
     """Reference signals in the order of the data, then the input: all that varies in time beside the modes."""
     signals = [item.signal for item in experiment.data if isinstance(item, ReferenceSignal)]
     if experiment.inputs is not None:
@@ -175,24 +187,24 @@ def signals_of(experiment: Experiment) -> tuple[PiecewisePolynomial, ...]:
     return tuple(signals)
 
 
-def run_names(experiments: Sequence[Experiment]) -> tuple[str, ...]:
+def name_runs(experiments: Sequence[Experiment]) -> tuple[str, ...]:
     """What each experiment is called: its name, or run1, run2, ..."""
     return tuple(experiment.name or f"run{e + 1}" for e, experiment in enumerate(experiments))
 
 
-def _checked_map(given: Any) -> Mapping[str, str]:
+def _check_map(given: Any) -> Mapping[str, str]:
     """A map of the model's names to the problem's; empty for None."""
     names = {} if given is None else given
     strings = isinstance(names, Mapping) and all(isinstance(name, str) for pair in names.items() for name in pair)
     if not strings:
         raise TypeError(
             "parameter_map must be a dict of the model's name -> the problem's name, such as "
-            f"{{'beta': 'beta_run3'}}; got {shown(given)}."
+            f"{{'beta': 'beta_run3'}}; got {shorten(given)}."
         )
     return {as_name(here, "parameter_map"): as_name(target, "parameter_map") for here, target in names.items()}
 
 
-def _checked_data(data: Any) -> tuple[Data, ...]:
+def _check_data(data: Any) -> tuple[Data, ...]:
     kinds = (Measurements, ReferenceSignal, RunningCost, TransitionCost, TerminalCost, TerminalConstraint)
     items = (data,) if isinstance(data, kinds) else tuple(data) if isinstance(data, (list, tuple)) else (data,)
     for item in items:

@@ -22,13 +22,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from switchfit.problem.precision import refuse_single_precision_in
-from switchfit.problem.reads import JITTED, contents
+from switchfit.problem.reads import JITTED, read_contents
+from switchfit.problem.validation import join_names
 
 Array = jax.Array
 Shape = tuple[int, ...]
 
 
-def float64() -> Any:
+def use_float64() -> Any:
     """Context in which JAX computes in float64; the user's setting is back in force afterwards."""
     return jax.enable_x64(True)
 
@@ -62,7 +63,7 @@ class Function:
 
     def __call__(self, *arguments: Any) -> Array:
         """Value for arguments in the order of the user's function, p being a mapping of names to arrays."""
-        flat = [_strong(a) for a in arguments if not isinstance(a, Mapping)]
+        flat = [_as_float64(a) for a in arguments if not isinstance(a, Mapping)]
         named = next(argument for argument in arguments if isinstance(argument, Mapping))
         given = [*flat, *(named[name] for name in self.parameters)]
         return jax.core.eval_jaxpr(self._closed.jaxpr, self._closed.consts, *given)[0]
@@ -74,7 +75,7 @@ class Function:
         return self is other or (isinstance(other, Function) and self._key == other._key)
 
 
-def _strong(value: Any) -> Any:
+def _as_float64(value: Any) -> Any:
     """A float64 array as the jaxpr expects it: Python's numbers have a weak type."""
     if (
         isinstance(value, (np.ndarray, jax.Array))
@@ -106,6 +107,7 @@ def trace_function(
     what: str,
     form: str,
     shape: Shape | None,
+    inputs: tuple[str, ...] = (),
 ) -> Function:
     """Trace a function of the user's, or find the trace that is still what it does.
 
@@ -122,6 +124,8 @@ def trace_function(
         Its name and signature for messages, such as "mode 'slip'" and "f(t, x, p)".
     shape : shape, optional
         What it must return; anything if left out.
+    inputs : tuple of str, optional
+        Names of the entries of the last argument, which is then handed over as a dict; the `Function` takes an array.
 
     Raises
     ------
@@ -129,16 +133,16 @@ def trace_function(
         If it raises, returns another shape or dtype, or computes in less than double precision.
     """
     function = _without_jit(function)
-    read = contents(function)
-    key = None if read is None else (read, tuple(arguments), tuple(parameters.items()), hidden, shape)
+    read = read_contents(function)
+    key = None if read is None else (read, tuple(arguments), tuple(parameters.items()), hidden, shape, inputs)
     if key is not None:
         with _lock:
             found = _traces.get(key)
             if found is not None:
                 _traces.move_to_end(key)
                 return found
-    given = _Given(arguments, parameters, hidden, what, form, shape)
-    with float64():
+    given = _Call(arguments, parameters, hidden, what, form, shape, inputs)
+    with use_float64():
         if key is None:
             with _retracing(next(_turn)):
                 traced = _trace(function, given)
@@ -160,7 +164,7 @@ def _without_jit(function: Any) -> Any:
     return function
 
 
-class _Given:
+class _Call:
     """How a function is called, and what it must return."""
 
     def __init__(
@@ -171,28 +175,29 @@ class _Given:
         what: str,
         form: str,
         shape: Shape | None,
+        inputs: tuple[str, ...],
     ) -> None:
         self.arguments, self.parameters, self.hidden = arguments, parameters, hidden
-        self.what, self.form, self.shape = what, form, shape
+        self.what, self.form, self.shape, self.inputs = what, form, shape, inputs
 
 
-def _trace(function: Callable[..., Any], given: _Given) -> Function:
+def _trace(function: Callable[..., Any], given: _Call) -> Function:
     """Trace with a dict that notes what is asked of it; with an ordinary one where the function allows no other."""
     shown = tuple(name for name in given.parameters if name not in given.hidden)
     try:
-        return _traced_with(function, given, tuple(given.parameters), watch=True)
+        return _trace_with(function, given, tuple(given.parameters), watch=True)
     except Exception:
         pass
     try:
-        return _traced_with(function, given, shown, watch=False)
+        return _trace_with(function, given, shown, watch=False)
     except ValueError:
         if not given.hidden:
             raise
     # One of the hidden may be asked for; if not, this says what is wrong.
-    return _traced_with(function, given, tuple(given.parameters), watch=False)
+    return _trace_with(function, given, tuple(given.parameters), watch=False)
 
 
-def _traced_with(function: Callable[..., Any], given: _Given, names: tuple[str, ...], watch: bool) -> Function:
+def _trace_with(function: Callable[..., Any], given: _Call, names: tuple[str, ...], watch: bool) -> Function:
     asked: set[str] = set()
     position = list(given.arguments).index(None)
 
@@ -200,34 +205,36 @@ def _traced_with(function: Callable[..., Any], given: _Given, names: tuple[str, 
         named = dict(zip(names, values, strict=True))
         if watch:
             shown = {name: value for name, value in named.items() if name not in given.hidden}
-            named = Asked(shown, {name: named[name] for name in names if name in given.hidden}, asked)
-        arguments = (*flat[:position], named, *flat[position:])
-        return checked_vector(function, arguments, given.shape, given.what, given.form)
+            named = WatchedParameters(shown, {name: named[name] for name in names if name in given.hidden}, asked)
+        arguments: tuple[Any, ...] = (*flat[:position], named, *flat[position:])
+        if given.inputs:
+            arguments = (*arguments[:-1], {name: arguments[-1][k] for k, name in enumerate(given.inputs)})
+        return call_for_vector(function, arguments, given.shape, given.what, given.form)
 
     flat = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in given.arguments if shape is not None]
     values = [jax.ShapeDtypeStruct(given.parameters[name], jnp.float64) for name in names]
     closed = jax.make_jaxpr(call)(flat, values)
     used = names if not watch else tuple(name for name in names if name in asked)
-    return _function_of(closed, len(flat), names, used, function, given)
+    return _build_function(closed, len(flat), names, used, function, given)
 
 
-def _function_of(
-    closed: Any, count: int, names: tuple[str, ...], used: tuple[str, ...], function: Any, given: _Given
+def _build_function(
+    closed: Any, count: int, names: tuple[str, ...], used: tuple[str, ...], function: Any, given: _Call
 ) -> Function:
     """The jaxpr with the parameters that are used, its constants copied: what they came from may change."""
     refuse_single_precision_in(closed, function, given.what)
     invars = closed.jaxpr.invars
     kept = [*invars[:count], *(v for name, v in zip(names, invars[count:], strict=True) if name in used)]
-    _freeze(closed.jaxpr)
+    _copy_literals(closed.jaxpr)
     consts = [np.array(const) if isinstance(const, np.ndarray) else const for const in closed.consts]
     debug = closed.jaxpr.debug_info.with_unknown_names()
     jaxpr = closed.jaxpr.replace(invars=kept, debug_info=debug)
     closed = type(closed)(jaxpr, consts)
-    text, opaque = _content(closed)
+    text, opaque = _describe_content(closed)
     return Function(closed, used, hashlib.sha256("\n".join([repr(used), *text]).encode()).hexdigest(), opaque)
 
 
-def _freeze(jaxpr: Any) -> None:
+def _copy_literals(jaxpr: Any) -> None:
     """Copy the numbers that stand in a jaxpr: JAX keeps the user's arrays without axes there, which may change."""
     for equation in jaxpr.eqns:
         for atom in equation.invars:
@@ -235,7 +242,7 @@ def _freeze(jaxpr: Any) -> None:
         for value in equation.params.values():
             for entry in value if isinstance(value, (tuple, list)) else (value,):
                 if hasattr(entry, "eqns"):
-                    _freeze(getattr(entry, "jaxpr", entry))
+                    _copy_literals(getattr(entry, "jaxpr", entry))
     for atom in jaxpr.outvars:
         _copy_literal(atom)
 
@@ -251,19 +258,19 @@ RULES = ("jvp_jaxpr_fun", "jvp_jaxpr_thunk", "fwd_jaxpr_thunk", "bwd", "out_tree
 """Parameters of operations that are left out: names, and rules of derivatives, which are seen by differentiating."""
 
 
-def _content(closed: Any) -> tuple[list[str], tuple[Any, ...]]:
+def _describe_content(closed: Any) -> tuple[list[str], tuple[Any, ...]]:
     """A jaxpr as text, with the values of its constants; and the objects in it that have no text."""
     text, opaque = _Text.of(closed)
     if text.has_rules:
         try:
-            more = _Text.of(_twice_differentiated(closed))[0].lines
+            more = _Text.of(_differentiate_twice(closed))[0].lines
         except TypeError:  # reverse rules alone, which have no text
             return text.lines, (*opaque, object())
         return text.lines + more, opaque
     return text.lines, opaque
 
 
-def _twice_differentiated(closed: Any) -> Any:
+def _differentiate_twice(closed: Any) -> Any:
     """First and second derivatives along all arguments: custom rules have been applied in it."""
 
     def value(*arguments: Any) -> Any:
@@ -337,7 +344,7 @@ class _Text:
 # Calling a function of the user's while tracing
 
 
-class Asked(dict[str, Array]):
+class WatchedParameters(dict[str, Array]):
     """The dict the user's functions get while it is found out which parameters they ask for.
 
     Parameters
@@ -353,54 +360,51 @@ class Asked(dict[str, Array]):
         self.asked = asked
 
     def __getitem__(self, name: str) -> Array:
-        value = super().__getitem__(name) if name in self.keys_alone() else self.others[name]
+        value = super().__getitem__(name) if name in self.list_keys() else self.others[name]
         self.asked.add(name)
         return value
 
     def __contains__(self, name: object) -> bool:
-        there = name in self.keys_alone()
+        there = name in self.list_keys()
         if there:
             self.asked.add(str(name))
         return there
 
     def get(self, name: str, default: Any = None) -> Any:
-        return self[name] if name in self.keys_alone() or name in self.others else default
+        return self[name] if name in self.list_keys() or name in self.others else default
 
-    def keys_alone(self) -> Any:
+    def list_keys(self) -> Any:
         """The names, without asking for them."""
         return super().keys()
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.whole())
+        return iter(self.read_all())
 
     def __len__(self) -> int:
-        return len(self.whole())
+        return len(self.read_all())
 
     def keys(self) -> Any:
-        return self.whole().keys()
+        return self.read_all().keys()
 
     def values(self) -> Any:
-        return self.whole().values()
+        return self.read_all().values()
 
     def items(self) -> Any:
-        return self.whole().items()
+        return self.read_all().items()
 
-    def whole(self) -> dict[str, Array]:
+    def read_all(self) -> dict[str, Array]:
         """All that is shown, which counts as asked for."""
-        self.asked.update(self.keys_alone())
-        return {name: super(Asked, self).__getitem__(name) for name in self.keys_alone()}
+        self.asked.update(self.list_keys())
+        return {name: super(WatchedParameters, self).__getitem__(name) for name in self.list_keys()}
 
 
-def called(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, form: str) -> Array:
+def call_while_tracing(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, form: str) -> Array:
     """Call a function of the user's while tracing; whatever it raises becomes one sentence that names it."""
     _check_signature(function, arguments, what, form)
     try:
         value = function(*arguments)
     except KeyError as error:
-        parameters = next(given for given in arguments if isinstance(given, dict))
-        raise ValueError(
-            f"{what} asks for the parameter {error}, which the problem lacks; it has {', '.join(parameters) or 'none'}."
-        ) from error
+        raise ValueError(f"{what} {_describe_missing_name(error.args[0] if error.args else '', arguments)}") from error
     except UNTRACEABLE as error:
         raise ValueError(
             f"{what} decides by the value of t, x or p (an `if`, a `while`, float() or numpy function), which JAX "
@@ -409,11 +413,26 @@ def called(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, 
         ) from error
     except Exception as error:
         said = str(error).rstrip(".")
+        if "u)" in form and "string indexing" in said:  # u["left"] of an array
+            said += ". u has no names: give sf.Input a dict of name -> samples"
         raise ValueError(f"{what}: {form} raised {type(error).__name__}: {said}.") from error
     try:
         return jnp.asarray(value)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{what}: {form} must return an array of numbers; got {value!r}.") from error
+
+
+def _describe_missing_name(name: Any, arguments: tuple[Any, ...]) -> str:
+    """Return the end of the sentence about a name that is neither in p nor, where u is a dict too, in u."""
+    parameters, *inputs = [given for given in arguments if isinstance(given, dict)]
+    lacks = f"the parameter {name!r}, which the problem lacks; it has {join_names(parameters)}"
+    if not inputs or name in inputs[0]:
+        return f"asks for {lacks}."
+    lacks_input = f"the input {name!r}, which the experiment lacks; it has {join_names(inputs[0])}"
+    if name in parameters:
+        return f"asks for {lacks_input}."
+    known = f"a parameter ({join_names(parameters)}) nor an input ({join_names(inputs[0])})"
+    return f"asks for {name!r}, which is neither {known}."
 
 
 def _check_signature(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, form: str) -> None:
@@ -429,14 +448,14 @@ def _check_signature(function: Callable[..., Any], arguments: tuple[Any, ...], w
         raise ValueError(f"{what} is called as {form}, but takes the arguments {signature}.{inputs}") from error
 
 
-def checked_vector(
+def call_for_vector(
     function: Callable[..., Any], arguments: tuple[Any, ...], shape: Shape | None, what: str, form: str
 ) -> Array:
     """What a function of the user's returns, checked (while tracing) to be a float64 array of the given shape.
 
     Without a shape, an array of any.
     """
-    array = called(function, arguments, what, form)
+    array = call_while_tracing(function, arguments, what, form)
     if shape is not None and array.shape != shape:
         if not array.size == int(np.prod(shape)) == 1:
             raise ValueError(f"{what}: {form} must return an array of shape {shape}; got shape {array.shape}.")

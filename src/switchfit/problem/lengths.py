@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 
-def padded_length(length: int) -> int:
+def pad_length(length: int) -> int:
     """`length` rounded up to four significant bits: at most an eighth too long, few distinct values."""
     unit = 1 << max(int(length).bit_length() - 4, 3)
     return -(-length // unit) * unit
@@ -16,9 +16,9 @@ LONGEST_PADDING = 2.0
 its own. Compiling a program costs as much as some thousand evaluations, a row of padding as much as any other row."""
 
 
-def common_lengths(lengths: Sequence[int]) -> list[int]:
-    """Lengths out of `padded_length`, as few distinct ones as `LONGEST_PADDING` allows."""
-    padded = [padded_length(length) for length in lengths]
+def choose_common_lengths(lengths: Sequence[int]) -> list[int]:
+    """Lengths out of `pad_length`, as few distinct ones as `LONGEST_PADDING` allows."""
+    padded = [pad_length(length) for length in lengths]
     common: dict[int, int] = {}
     for length in sorted(set(padded), reverse=True):
         shared = min(common.values(), default=0)

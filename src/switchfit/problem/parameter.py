@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.problem.priors import LogNormal, Normal, Prior, PriorTerms
-from switchfit.problem.validation import as_array, as_choice, as_flag, as_text, shown
+from switchfit.problem.validation import as_array, as_choice, as_flag, as_text, shorten
 
 FloatArray = NDArray[np.float64]
 
@@ -42,6 +42,20 @@ class Parameter:
         prior is logarithmic and p not confined to positive numbers.
     TypeError
         If a value or a bound is not a number, `unit` not a string, or `fixed` neither True nor False.
+
+    See Also
+    --------
+    Problem : takes it under `parameters`.
+    Normal, LogNormal
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> mu = sf.Parameter(0.8, lower=0.05, upper=2.0, unit="1")
+    >>> rates = sf.Parameter([1e-3, 2.0], scale="log")
+    >>> known = sf.Parameter(9.81, fixed=True)
+    >>> mu.shape, rates.shape
+    ((), (2,))
     """
 
     value: Any
@@ -58,18 +72,18 @@ class Parameter:
         if value.size == 0:
             raise ValueError("Parameter value must have one entry or more; got none.")
         if not np.all(np.isfinite(value)):
-            raise ValueError(f"Parameter value must be finite; got {shown(value)}.")
+            raise ValueError(f"Parameter value must be finite; got {shorten(value)}.")
         if not np.all(lower <= upper):
-            raise ValueError(f"Parameter bounds must satisfy lower <= upper; got {self._shown_bounds}.")
+            raise ValueError(f"Parameter bounds must satisfy lower <= upper; got {self._bounds_text}.")
         if not (np.all(lower <= value) and np.all(value <= upper)):
-            raise ValueError(f"Parameter value {shown(self.value)} lies outside its bounds {self._shown_bounds}.")
+            raise ValueError(f"Parameter value {shorten(self.value)} lies outside its bounds {self._bounds_text}.")
         scale = as_choice(self.scale, "Parameter scale", ("linear", "log"))
         if scale == "log":
             lower = np.where(np.isneginf(lower), 0.0, lower)
             if not (np.all(value > 0) and np.all(lower >= 0)):
                 raise ValueError(
                     "Parameter with scale='log' must be positive, and its lower bound 0 or more; got the value "
-                    f"{shown(self.value)} and the lower bound {shown(self.lower)}."
+                    f"{shorten(self.value)} and the lower bound {shorten(self.lower)}."
                 )
         unit, fixed = as_text(self.unit, "Parameter unit"), as_flag(self.fixed, "Parameter fixed")
         checked = {"value": value, "lower": lower, "upper": upper, "unit": unit, "fixed": fixed, "scale": scale}
@@ -84,19 +98,19 @@ class Parameter:
             return np.broadcast_to(bound, shape).copy()
         except ValueError:
             raise ValueError(
-                f"Parameter needs numbers that fit its value, of shape {shape}; got {name} {shown(bound)} of shape "
+                f"Parameter needs numbers that fit its value, of shape {shape}; got {name} {shorten(bound)} of shape "
                 f"{bound.shape}."
             ) from None
 
     @property
-    def _shown_bounds(self) -> str:
-        return f"[{shown(self.lower)}, {shown(self.upper)}]"
+    def _bounds_text(self) -> str:
+        return f"[{shorten(self.lower)}, {shorten(self.upper)}]"
 
     def _check_prior(self) -> None:
         if self.prior is None:
             return
         if not isinstance(self.prior, (Normal, LogNormal)):
-            raise TypeError(f"Parameter prior must be an sf.Normal or an sf.LogNormal; got {shown(self.prior)}.")
+            raise TypeError(f"Parameter prior must be an sf.Normal or an sf.LogNormal; got {shorten(self.prior)}.")
         try:
             PriorTerms.of(self.prior, self.shape)
         except ValueError as error:
@@ -107,7 +121,7 @@ class Parameter:
         if isinstance(self.prior, LogNormal) and not (self.positive or self.fixed):
             raise ValueError(
                 "Parameter with a LogNormal prior must stay positive: give it a lower bound above 0, or scale='log'; "
-                f"got the lower bound {shown(self.lower)}."
+                f"got the lower bound {shorten(self.lower)}."
             )
 
     @property
@@ -116,7 +130,19 @@ class Parameter:
         return self.scale == "log" or bool(np.all(self.lower > 0))
 
     def entries(self) -> tuple[Parameter, ...]:
-        """A scalar `Parameter` for each entry, in their order."""
+        """A scalar `Parameter` for each entry, in their order.
+
+        See Also
+        --------
+        Parameter
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> first, second = sf.Parameter([1.0, 2.0], lower=0.0).entries()
+        >>> float(second.value), float(second.lower)
+        (2.0, 0.0)
+        """
         terms = PriorTerms.of(self.prior, self.shape)
         priors: list[Prior | None] = []
         for center, precision, log in zip(*terms, strict=True):

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jax._src import source_info_util
 
-from switchfit.problem.reads import named_values
+from switchfit.problem.reads import find_named_values
 from switchfit.problem.validation import is_low_precision, refuse_single_precision
 
 MOVES = frozenset(
@@ -33,7 +33,7 @@ def refuse_single_precision_in(closed: Any, function: Any, what: str) -> None:
     function : callable, to find the names of its constants
     what : str, such as "mode 'slip'"
     """
-    for name, value in named_values(function).items():
+    for name, value in find_named_values(function).items():
         if isinstance(value, (np.ndarray, np.generic, jax.Array)):
             refuse_single_precision(value, f"the constant {name} of {what}")
     if _has_short(closed.jaxpr, closed.consts):
@@ -47,12 +47,12 @@ def _has_short(jaxpr: Any, consts: Sequence[Any]) -> bool:
         for atom in (*equation.invars, *equation.outvars):
             if is_low_precision(getattr(atom.aval, "dtype", np.float64)):
                 return True
-        if any(_has_short(*inner) for inner in _inner(equation)):
+        if any(_has_short(*inner) for inner in _find_inner_jaxprs(equation)):
             return True
     return False
 
 
-def _inner(equation: Any) -> list[tuple[Any, Sequence[Any]]]:
+def _find_inner_jaxprs(equation: Any) -> list[tuple[Any, Sequence[Any]]]:
     """The jaxprs that an operation calls, each with its constants."""
     found = []
     for value in equation.params.values():
@@ -83,7 +83,7 @@ class _Walk:
             for atom, number in zip(equation.invars, given, strict=True):
                 if hasattr(atom, "val"):
                     self.check(number)
-            inner = _inner(equation)
+            inner = _find_inner_jaxprs(equation)
             if inner:
                 results = self.calls(equation, inner, given)
             elif all(g is not None for g in given) and not equation.effects:
@@ -100,7 +100,7 @@ class _Walk:
                     and equation.primitive.name not in MOVES
                 ):
                     if result is not None:
-                        self.check(result, _where(equation))
+                        self.check(result, _find_line(equation))
                     elif not inner:
                         self.refuse_cast(variable, equation)
         return [value(a) for a in jaxpr.outvars]
@@ -118,12 +118,12 @@ class _Walk:
 
     def refuse_cast(self, variable: Any, equation: Any) -> None:
         raise ValueError(
-            f"{self.what} computes in {variable.aval.dtype}{_where(equation)} with numbers that depend on t, x or p, "
-            "and so loses half of their digits: its arguments are float64, do not cast them."
+            f"{self.what} computes in {variable.aval.dtype}{_find_line(equation)} with numbers that depend on t, x or "
+            "p, and so loses half of their digits: its arguments are float64, do not cast them."
         )
 
 
-def _where(equation: Any) -> str:
+def _find_line(equation: Any) -> str:
     """Where in the user's code an operation stands, as " (file.py:12)"; empty where that is not known."""
     frame = source_info_util.user_frame(equation.source_info.traceback)
     return "" if frame is None else f" ({frame.file_name.rpartition('/')[2]}:{frame.start_line})"

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.validation import as_array, shown
+from switchfit.problem.validation import as_array, shorten
 
 FloatArray = NDArray[np.float64]
 
@@ -34,6 +34,17 @@ class Normal:
         If a number is not finite, or sd not positive.
     TypeError
         If one is not a number.
+
+    See Also
+    --------
+    LogNormal, Parameter
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> mu = sf.Parameter(0.8, prior=sf.Normal(mean=0.7, sd=0.1))
+    >>> mu.prior.sd
+    array(0.1)
     """
 
     mean: Any
@@ -64,6 +75,17 @@ class LogNormal:
     Notes
     -----
     This is a normal prior of log p, whose density is taken over log p: the maximum a posteriori is that of log p.
+
+    See Also
+    --------
+    Normal, Parameter
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> mu = sf.Parameter(0.8, lower=0.01, prior=sf.LogNormal(median=0.7, log_sd=0.1))
+    >>> mu.prior.log_sd
+    array(0.1)
     """
 
     median: Any
@@ -72,7 +94,7 @@ class LogNormal:
     def __post_init__(self) -> None:
         _check(self, "median", "log_sd")
         if not np.all(self.median > 0):
-            raise ValueError(f"LogNormal median must be positive; got {shown(self.median)}.")
+            raise ValueError(f"LogNormal median must be positive; got {shorten(self.median)}.")
 
 
 Prior = Normal | LogNormal
@@ -83,11 +105,11 @@ def _check(prior: Any, center: str, spread: str) -> None:
     for name in (center, spread):
         value = as_array(getattr(prior, name), f"{kind} {name}")
         if not np.all(np.isfinite(value)):
-            raise ValueError(f"{kind} {name} must be finite; got {shown(value)}.")
+            raise ValueError(f"{kind} {name} must be finite; got {shorten(value)}.")
         object.__setattr__(prior, name, value)
     deviation = getattr(prior, spread)
     if not np.all(deviation > 0):
-        raise ValueError(f"{kind} {spread} must be positive; got {shown(deviation)}.")
+        raise ValueError(f"{kind} {spread} must be positive; got {shorten(deviation)}.")
     with np.errstate(over="ignore"):
         if not np.all(np.isfinite(deviation**-2.0)):
             raise ValueError(f"{kind} {spread} must not be so small that 1 / {spread}**2 is infinite; got {deviation}.")
@@ -122,7 +144,7 @@ class PriorTerms(NamedTuple):
         )
 
     @classmethod
-    def joined(cls, parts: list[PriorTerms]) -> PriorTerms:
+    def join(cls, parts: list[PriorTerms]) -> PriorTerms:
         """The terms of several unknowns, one after the other."""
         return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 

@@ -17,11 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.problem.constraints import Constraint
 from switchfit.problem.data import FloatArray, Measurements
-from switchfit.problem.experiment import Experiment, initial_state_of, run_names
-from switchfit.problem.lengths import common_lengths
+from switchfit.problem.experiment import Experiment, initial_state_of, name_runs
+from switchfit.problem.lengths import choose_common_lengths
 from switchfit.problem.parameter import Parameter, as_parameter, unit_suffix
 from switchfit.problem.priors import PriorTerms
-from switchfit.problem.structure import Functions, Structure, structure_of
+from switchfit.problem.structure import Functions, Structure, trace_structure
 from switchfit.problem.system import HybridSystem
 from switchfit.problem.validation import (
     as_array,
@@ -31,8 +31,8 @@ from switchfit.problem.validation import (
     as_name,
     as_number,
     as_positive,
-    listed,
-    shown,
+    join_names,
+    shorten,
 )
 from switchfit.problem.variables import Variables
 
@@ -135,6 +135,28 @@ class Problem:
         dtype.
     TypeError
         If an argument is of the wrong type.
+
+    See Also
+    --------
+    HybridSystem, Experiment, Parameter : its parts.
+    estimate, simulate, evaluate
+
+    Examples
+    --------
+    >>> import switchfit as sf
+
+    A heater that is switched off at an unknown time; what it loses to the room is unknown too:
+
+    >>> system = sf.HybridSystem(
+    ...     {"on": lambda t, x, p: 10.0 - p["k"] * x, "off": lambda t, x, p: -p["k"] * x}, [0.0]
+    ... )
+    >>> log = sf.Measurements([1.0, 2.0, 3.0, 4.0], [8.2, 13.8, 12.9, 8.7], sigma=0.2)
+    >>> run = sf.Experiment(log, ("on", "off"), (2.0,), 0.0, 4.0)
+    >>> problem = sf.Problem(system, run, {"k": sf.Parameter(0.5, lower=0.0)})
+    >>> problem.theta_names
+    ('tau_1', 'k')
+    >>> problem.initial_theta
+    array([2. , 0.5])
     """
 
     system: HybridSystem
@@ -154,13 +176,13 @@ class Problem:
         given = self.experiments
         experiments = tuple(given) if isinstance(given, (list, tuple)) else (given,)
         if not experiments or not all(isinstance(e, Experiment) for e in experiments):
-            raise TypeError(f"experiments must be an sf.Experiment or a non-empty list of them; got {shown(given)}.")
+            raise TypeError(f"experiments must be an sf.Experiment or a non-empty list of them; got {shorten(given)}.")
         for experiment in experiments:
             for mode in experiment.mode_sequence:
                 if mode not in self.system.modes:
                     raise ValueError(
-                        f"mode_sequence names the unknown mode {shown(mode)}; the modes are "
-                        f"{listed(self.system.modes)}."
+                        f"mode_sequence names the unknown mode {shorten(mode)}; the modes are "
+                        f"{join_names(self.system.modes)}."
                     )
         object.__setattr__(self, "solver", as_choice(self.solver, "solver", ("explicit", "stiff")))
         object.__setattr__(self, "engine", as_choice(self.engine, "engine", ("auto", "native", "jax")))
@@ -174,20 +196,20 @@ class Problem:
             object.__setattr__(self, name, as_positive(getattr(self, name), name))
         if not SMALLEST_RTOL <= self.rtol < 1:
             raise ValueError(f"rtol must lie between {SMALLEST_RTOL} (rounding) and 1; got {self.rtol}.")
-        parameters = _checked_parameters(self.parameters)
+        parameters = _check_parameters(self.parameters)
         object.__setattr__(self, "experiments", experiments)
         object.__setattr__(self, "parameters", parameters)
         dwell = as_number(self.min_duration, "min_duration")
         object.__setattr__(self, "min_duration", dwell)
         self._check_maps()
         self._check_states()
-        object.__setattr__(self, "unknowns", _unknowns(self.system, experiments, parameters, dwell))
+        object.__setattr__(self, "unknowns", _list_unknowns(self.system, experiments, parameters, dwell))
         self._check_noise()
         self._check_delays()
         targets = frozenset(name for e in experiments for name in e.parameter_map.values())
         functions = Functions(parameters, targets)
         settings = functions, self.solver, self.max_transitions
-        structures = tuple(structure_of(self.system, e, *settings) for e in experiments)
+        structures = tuple(trace_structure(self.system, e, *settings) for e in experiments)
         for structure in structures:
             self.system.check_labels_of(structure.n)
         object.__setattr__(self, "structures", structures)
@@ -217,12 +239,12 @@ class Problem:
                 )
 
     def _check_maps(self) -> None:
-        for name, experiment in zip(run_names(self.experiments), self.experiments, strict=True):
+        for name, experiment in zip(name_runs(self.experiments), self.experiments, strict=True):
             for here, target in experiment.parameter_map.items():
                 if target not in self.parameters:
                     raise ValueError(
-                        f"parameter_map of experiment {listed([name])} gives the model's {shown(here)} as the "
-                        f"unknown parameter {shown(target)}; the problem has {listed(self.parameters)}."
+                        f"parameter_map of experiment {join_names([name])} gives the model's {shorten(here)} as the "
+                        f"unknown parameter {shorten(target)}; the problem has {join_names(self.parameters)}."
                     )
 
     def _check_noise(self) -> None:
@@ -233,8 +255,8 @@ class Problem:
                 parameter = self.parameters.get(experiment.parameter_map.get(name, name))
                 if parameter is None:
                     raise ValueError(
-                        f"sigma names the parameter {shown(name)}, which the problem lacks; it has "
-                        f"{listed(self.parameters)}."
+                        f"sigma names the parameter {shorten(name)}, which the problem lacks; it has "
+                        f"{join_names(self.parameters)}."
                     )
                 if parameter.shape != () or not (parameter.positive or (parameter.fixed and parameter.value > 0)):
                     raise ValueError(
@@ -263,8 +285,8 @@ class Problem:
                 parameter = self.parameters.get(experiment.parameter_map.get(item.delay, item.delay))
                 if parameter is None or parameter.shape != ():
                     raise ValueError(
-                        f"delay names {shown(item.delay)}, which must be a parameter of one number; the problem has "
-                        f"{listed(self.parameters)}."
+                        f"delay names {shorten(item.delay)}, which must be a parameter of one number; the problem has "
+                        f"{join_names(self.parameters)}."
                     )
                 self._check_delay_unit(experiment, item.delay)
                 unit = unit_suffix(experiment.time_unit)
@@ -287,8 +309,8 @@ class Problem:
                 f"the delay {name!r} has the unit {unit!r}, but time_unit of its experiment is "
                 f"{experiment.time_unit!r}, and times are not converted. Give both in the same unit."
             )
-        runs = zip(run_names(self.experiments), self.experiments, strict=True)
-        units = {run: e.time_unit for run, e in runs if name in _delay_targets(e)}
+        runs = zip(name_runs(self.experiments), self.experiments, strict=True)
+        units = {run: e.time_unit for run, e in runs if name in _find_delay_targets(e)}
         _require_one_time_unit(units, f"the delay {name!r}", "give each run a delay of its own (parameter_map)")
 
     def _check_states(self) -> None:
@@ -335,7 +357,7 @@ class Problem:
     def _prefixes(self) -> list[str]:
         if len(self.experiments) == 1:
             return [""]
-        return [f"{name}." for name in run_names(self.experiments)]
+        return [f"{name}." for name in name_runs(self.experiments)]
 
     @cached_property
     def places(self) -> tuple[NDArray[np.intp], ...]:
@@ -372,15 +394,43 @@ class Problem:
             sizes[where[where >= 0]] = _clock(experiment)
         return sizes
 
-    def elapsed(self, theta: FloatArray) -> FloatArray:
-        """theta with transition times counted from their experiment's t0, (d,): it does not depend on the clock."""
+    def measure_from_start(self, theta: FloatArray) -> FloatArray:
+        """theta with transition times counted from their experiment's t0, (d,): it does not depend on the clock.
+
+        See Also
+        --------
+        Problem.split
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> problem.measure_from_start(problem.initial_theta)
+        array([2. , 0.5])
+        """
         counted = theta.copy()
         for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
             counted[where[where >= 0]] -= experiment.t0
         return counted
 
     def vectors(self, theta: FloatArray, e: int) -> tuple[FloatArray, FloatArray]:
-        """What the compiled programs of experiment e take: its transition times (N,) and its p (M,)."""
+        """What the compiled programs of experiment e take: its transition times (N,) and its p (M,).
+
+        See Also
+        --------
+        Problem.split
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> problem.vectors(problem.initial_theta, 0)
+        (array([2.]), array([0.5]))
+        """
         places, N = self.places[e], self.structures[e].N
         if self.one_to_one:
             return theta[:N], theta[N:]
@@ -403,41 +453,82 @@ class Problem:
         counts = [[len(item.times) for item in e.data if isinstance(item, Measurements)] for e in self.experiments]
         for group in self.alike:
             for k in range(len(counts[group[0]])):
-                for e, length in zip(group, common_lengths([counts[e][k] for e in group]), strict=True):
+                for e, length in zip(group, choose_common_lengths([counts[e][k] for e in group]), strict=True):
                     counts[e][k] = length
         return tuple(tuple(lengths) for lengths in counts)
 
-    def named(self, theta: FloatArray, e: int) -> dict[str, FloatArray]:
-        """The parameters of experiment e under the names that the model has for them."""
+    def name_parameters(self, theta: FloatArray, e: int) -> dict[str, FloatArray]:
+        """The parameters of experiment e under the names that the model has for them.
+
+        See Also
+        --------
+        Problem.split
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> float(problem.name_parameters(problem.initial_theta, 0)["k"])
+        0.5
+        """
         own = self.split(theta)[1]
         mapped = self.experiments[e].parameter_map
         return own | {name: own[target] for name, target in mapped.items()}
 
     def late_times(self, theta: FloatArray, e: int) -> FloatArray:
-        """Moments of which the samples of experiment e are whose delay is a parameter: (K,), in no order."""
+        """Moments of which the samples of experiment e are whose delay is a parameter: (K,), in no order.
+
+        See Also
+        --------
+        Measurements
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> problem.late_times(problem.initial_theta, 0)
+        array([], dtype=float64)
+        """
         items = [item for item in self.experiments[e].data if isinstance(item, Measurements)]
         late = [(item.times, item.delay) for item in items if isinstance(item.delay, str)]
-        named = self.named(theta, e) if late else {}
+        named = self.name_parameters(theta, e) if late else {}
         return np.concatenate([np.zeros(0), *(times - named[delay] for times, delay in late)])
 
-    def checked_theta(self, theta: ArrayLike | None, what: str = "theta") -> FloatArray:
+    def check_theta(self, theta: ArrayLike | None, what: str = "theta") -> FloatArray:
         """Return `theta`, or the initial guess for None, as a ``(d,)`` array; messages call it `what`.
 
         Raises
         ------
         ValueError
             Where the shape or the order of transition times is wrong.
+
+        See Also
+        --------
+        simulate, evaluate
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> problem.check_theta(None)
+        array([2. , 0.5])
         """
         if theta is None:
             return self.initial_theta
         checked = as_array(theta, what)
         if checked.shape != self.unknowns.initial.shape:
             raise ValueError(
-                f"{what} must have shape ({len(self.theta_names)},): {listed(self.theta_names)}; "
+                f"{what} must have shape ({len(self.theta_names)},): {join_names(self.theta_names)}; "
                 f"got shape {checked.shape}."
             )
         if not np.all(np.isfinite(checked)):
-            raise ValueError(f"{what} must be finite; got {shown(checked)}.")
+            raise ValueError(f"{what} must be finite; got {shorten(checked)}.")
         checked = checked.copy()
         for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
             times = experiment.initial_times
@@ -446,7 +537,7 @@ class Problem:
             if np.any(np.diff(knots) < -ROUNDING * _clock(experiment)):
                 raise ValueError(
                     f"The transition times in {what} must not decrease inside (t0, tf) = ({experiment.t0}, "
-                    f"{experiment.tf}); got {shown(times)}."
+                    f"{experiment.tf}); got {shorten(times)}."
                 )
             if np.any(np.diff(knots) < 0):  # by rounding: put in order, round the times that are fixed
                 low = np.maximum.accumulate(np.append(experiment.t0, np.where(where < 0, times, -np.inf)))[1:]
@@ -466,7 +557,22 @@ class Problem:
                 )
 
     def split(self, theta: FloatArray) -> tuple[list[FloatArray], dict[str, FloatArray]]:
-        """All transition times, one ``(N,)`` array an experiment, and all parameters by name, fixed ones included."""
+        """All transition times, one ``(N,)`` array an experiment, and all parameters by name, fixed ones included.
+
+        See Also
+        --------
+        Problem.name_parameters
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> times, parameters = problem.split(problem.initial_theta)
+        >>> times, float(parameters["k"])
+        ([array([2.])], 0.5)
+        """
         times = []
         for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
             tau = experiment.initial_times
@@ -484,22 +590,22 @@ def _clock(experiment: Experiment) -> float:
     return max(experiment.tf - experiment.t0, abs(experiment.t0), abs(experiment.tf))
 
 
-def _checked_parameters(parameters: Any) -> dict[str, Parameter]:
+def _check_parameters(parameters: Any) -> dict[str, Parameter]:
     if not isinstance(parameters, Mapping | None):
-        raise TypeError(f"parameters must be a dict of name -> value or sf.Parameter; got {shown(parameters)}.")
+        raise TypeError(f"parameters must be a dict of name -> value or sf.Parameter; got {shorten(parameters)}.")
     given = {} if parameters is None else parameters
     names = [as_name(name, "parameter names", "strings") for name in given]
-    return {name: as_parameter(given[name], f"parameter {shown(name)}") for name in names}
+    return {name: as_parameter(given[name], f"parameter {shorten(name)}") for name in names}
 
 
-def _unknowns(
+def _list_unknowns(
     system: HybridSystem, experiments: tuple[Experiment, ...], parameters: dict[str, Parameter], dwell: float
 ) -> Unknowns:
     names: list[str] = []
     units: list[str] = []
     pieces: list[Parameter] = []
     where: list[NDArray[np.intp]] = []
-    prefixes = [""] if len(experiments) == 1 else [f"{name}." for name in run_names(experiments)]
+    prefixes = [""] if len(experiments) == 1 else [f"{name}." for name in name_runs(experiments)]
     for prefix, experiment in zip(prefixes, experiments, strict=True):
         positions = np.full(len(experiment.transition_times), -1, dtype=np.intp)
         for i, tau in enumerate(experiment.transition_times):
@@ -531,16 +637,16 @@ def _unknowns(
         raise ValueError("Nothing to estimate: every parameter and transition time is fixed.")
     if len(set(names)) != len(names):
         twice = sorted({name for name in names if names.count(name) > 1})
-        raise ValueError(f"Two unknowns share a name: {listed(twice)}; rename the parameter or the experiment.")
+        raise ValueError(f"Two unknowns share a name: {join_names(twice)}; rename the parameter or the experiment.")
     flat = {key: np.concatenate([getattr(q, key).ravel() for q in pieces]) for key in ("value", "lower", "upper")}
-    priors = PriorTerms.joined([PriorTerms.of(q.prior, q.shape) for q in pieces])
+    priors = PriorTerms.join([PriorTerms.of(q.prior, q.shape) for q in pieces])
     log = np.concatenate([np.full(q.value.size, q.scale == "log") for q in pieces])
-    A, b, rows = _ordering(experiments, where, len(names), dwell)
+    A, b, rows = _build_ordering(experiments, where, len(names), dwell)
     vectors = flat["value"], flat["lower"], flat["upper"]
     return Unknowns(tuple(names), tuple(units), *vectors, tuple(where), spans, tuple(states), A, b, rows, priors, log)
 
 
-def _delay_targets(experiment: Experiment) -> set[str]:
+def _find_delay_targets(experiment: Experiment) -> set[str]:
     """Names of the problem's parameters that are delays in an experiment."""
     delays = [item.delay for item in experiment.data if isinstance(item, Measurements)]
     return {experiment.parameter_map.get(delay, delay) for delay in delays if isinstance(delay, str)}
@@ -549,9 +655,9 @@ def _delay_targets(experiment: Experiment) -> set[str]:
 def _require_one_time_unit(units: Mapping[str, str], what: str, otherwise: str) -> None:
     """Raise ValueError if `what`, one time for several experiments, would have several units; `units` by run's name."""
     if len(set(units.values())) > 1:
-        shown = ", ".join(f"{name} in {unit}" for name, unit in units.items())
+        listed = ", ".join(f"{name} in {unit}" for name, unit in units.items())
         raise ValueError(
-            f"{what} is one number for experiments whose times are in different units ({shown}), and times are not "
+            f"{what} is one number for experiments whose times are in different units ({listed}), and times are not "
             f"converted. Give all times in one unit, as time_unit of each experiment, or {otherwise}."
         )
 
@@ -560,14 +666,14 @@ def _index(k: tuple[int, ...]) -> str:
     return f"[{','.join(map(str, k))}]" if k else ""
 
 
-def _ordering(
+def _build_ordering(
     experiments: tuple[Experiment, ...], where: list[NDArray[np.intp]], d: int, dwell: float
 ) -> tuple[FloatArray, FloatArray, tuple[Constraint, ...]]:
     """Rows ``tau_{i+1} - tau_i >= min_duration`` for every mode of every experiment with a free end."""
     if not (np.isfinite(dwell) and dwell >= 0):
         raise ValueError(f"min_duration must be zero or positive; got {dwell}.")
     rows, bounds, constraints = [], [], []
-    labels = run_names(experiments)
+    labels = name_runs(experiments)
     if dwell > 0:
         units = {name: experiment.time_unit for name, experiment in zip(labels, experiments, strict=True)}
         _require_one_time_unit(units, "min_duration", "leave it out and bound the transition times of each")

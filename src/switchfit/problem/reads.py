@@ -1,9 +1,9 @@
 """What a Python function reads: its code, closure, defaults and globals, by content.
 
-Two functions with equal `contents` do the same when they are traced, so that a trace can be used again without calling
-the function. Only plain things are compared by content: numbers, strings, arrays, tuples, lists, dicts, functions made
-of them, and functions of the libraries in `TRUSTED`, which do not change. For anything else (objects with state,
-modules of the user, files, the time) `contents` gives up, and the caller has to trace.
+Two functions for which `read_contents` returns the same do the same when they are traced, so that a trace can be used
+again without calling the function. Only plain things are compared by content: numbers, strings, arrays, tuples, lists,
+dicts, functions made of them, and functions of the libraries in `TRUSTED`, which do not change. For anything else
+(objects with state, modules of the user, files, the time) `read_contents` gives up, and the caller has to trace.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class NotPlain(Exception):  # noqa: N818  # control flow: the caller traces
     """A function reads something that cannot be compared by content."""
 
 
-def contents(function: Any) -> Hashable | None:
+def read_contents(function: Any) -> Hashable | None:
     """All that a function reads, by content; None where that cannot be told, so that it has to be traced."""
     try:
         return _read(function, DEPTH)
@@ -56,21 +56,21 @@ def contents(function: Any) -> Hashable | None:
         return None
 
 
-def named_values(function: Any) -> dict[str, Any]:
+def find_named_values(function: Any) -> dict[str, Any]:
     """What a function reads by name: defaults, globals, its closure, attributes of its object, entries of its dicts.
 
     Of dicts and objects what the code names: keys that it holds as constants, attributes that it loads.
     """
     if isinstance(function, functools.partial):
         given = {f"argument {k + 1}": value for k, value in enumerate(function.args)} | function.keywords
-        return named_values(function.func) | given
+        return find_named_values(function.func) | given
     owner = getattr(function, "__self__", None)
     if owner is None and not isinstance(function, (types.FunctionType, JITTED, type)):
         owner, function = function, vars(type(function)).get("__call__")
     plain = getattr(function, "__func__", getattr(function, "__wrapped__", function))
     if not isinstance(plain, types.FunctionType):
         return {}
-    code, reads = plain.__code__, _reads_of(plain.__code__)
+    code, reads = plain.__code__, _find_reads(plain.__code__)
     arguments = code.co_varnames[: code.co_argcount]
     defaults = plain.__defaults__ or ()
     found = dict(zip(arguments[len(arguments) - len(defaults) :], defaults, strict=True)) | (plain.__kwdefaults__ or {})
@@ -130,7 +130,7 @@ def _read_function(function: types.FunctionType, depth: int) -> Hashable:
     if vars(function):
         raise NotPlain
     code = function.__code__
-    reads = _reads_of(code)
+    reads = _find_reads(code)
     if not reads.plain:
         raise NotPlain
     try:
@@ -214,5 +214,5 @@ class _Reads:
 
 
 @functools.lru_cache(maxsize=1024)
-def _reads_of(code: types.CodeType) -> _Reads:
+def _find_reads(code: types.CodeType) -> _Reads:
     return _Reads(code)

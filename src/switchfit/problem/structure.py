@@ -210,18 +210,21 @@ class _Tracer:
         shape: Shape | None,
         what: str,
         form: str,
+        inputs: tuple[str, ...] = (),
     ) -> Function:
-        """A function that takes arguments of these shapes, None standing for p, and returns an array of a shape."""
-        key = (id(function), arguments, shape, what, self._key)
+        """Return the trace of a function of arguments of these shapes, None standing for p, and of a result's shape."""
+        key = (id(function), arguments, shape, what, inputs, self._key)
         traced = self._traced.get(key)
         if traced is None:
-            traced = trace_function(function, arguments, self.shapes, self.hidden, what=what, form=form, shape=shape)
+            traced = trace_function(
+                function, arguments, self.shapes, self.hidden, what=what, form=form, shape=shape, inputs=inputs
+            )
             self._traced[key] = traced
         self.asked.update(traced.parameters)
         return traced
 
 
-def structure_of(
+def trace_structure(
     system: HybridSystem, experiment: Experiment, functions: Functions, solver: str, transitions: int | None = None
 ) -> Structure:
     """Trace and check the functions of one experiment, and return its structure.
@@ -243,9 +246,10 @@ def structure_of(
         raise ValueError(f"initial_state(p) must return an array of shape (n,); got shape {x0.shape}.")
     n = len(initial) if x0 is None else x0.shape[0]
     unknown = () if callable(initial) else tuple(k for k, x in enumerate(initial) if not getattr(x, "fixed", True))
-    items = partial(of_kind, experiment.data)
+    items = partial(select_kind, experiment.data)
     at: tuple[Shape | None, ...] = ((), (n,), None)
-    inputs = None if experiment.inputs is None else tuple(experiment.inputs.values.shape[1:])
+    inputs = None if experiment.inputs is None else experiment.inputs.shape
+    input_names = () if experiment.inputs is None else experiment.inputs.names
     in_mode, form = (at, "f(t, x, p)") if inputs is None else ((*at, inputs), "f(t, x, p, u)")
 
     def at_transitions(
@@ -267,7 +271,7 @@ def structure_of(
             )
         return None
 
-    modes = tuple(trace(system.modes[name], in_mode, (n,), f"mode {name!r}", form) for name in names)
+    modes = tuple(trace(system.modes[name], in_mode, (n,), f"mode {name!r}", form, input_names) for name in names)
     references = ((item, item.signal.channels) for item in items(ReferenceSignal))
     measurements = ((item, item.values.shape[1]) for item in items(Measurements))
     constraints = tuple(
@@ -280,7 +284,7 @@ def structure_of(
             )
     reset_maps, reset_library = at_transitions(system.reset_maps, (n,), "reset map", "R(t, x, p)")
     guards, guard_library = at_transitions(system.guards, (), "guard", "g(t, x, p)")
-    costs = _transition_costs(items(TransitionCost), names)
+    costs = _choose_transition_costs(items(TransitionCost), names)
     transition_costs, transition_cost_library = at_transitions(costs, (), "TransitionCost", "mu(t, x, p)")
     structure = Structure(
         mode_names=names,
@@ -315,7 +319,9 @@ def structure_of(
     return replace(structure, parameters=parameters)
 
 
-def _transition_costs(items: list[TransitionCost], modes: tuple[str, ...]) -> dict[tuple[str, str], Callable[..., Any]]:
+def _choose_transition_costs(
+    items: list[TransitionCost], modes: tuple[str, ...]
+) -> dict[tuple[str, str], Callable[..., Any]]:
     """The cost of each transition that may happen and has one."""
     found = {}
     for before, after in product(modes, modes):
@@ -330,11 +336,11 @@ def _transition_costs(items: list[TransitionCost], modes: tuple[str, ...]) -> di
     return found
 
 
-def initial_values(initial: Any) -> FloatArray:
+def read_initial_values(initial: Any) -> FloatArray:
     """An initial state that is no function, as numbers (n,): where it is unknown, its guess."""
     return np.array([x.value if isinstance(x, Parameter) else x for x in initial], dtype=np.float64)
 
 
-def of_kind(data: tuple[Any, ...], kind: type) -> list[Any]:
+def select_kind(data: tuple[Any, ...], kind: type) -> list[Any]:
     """The items of an experiment's data that are of a kind, in order."""
     return [item for item in data if isinstance(item, kind)]

@@ -11,7 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.problem.parameter import Parameter
-from switchfit.problem.validation import as_array, as_callable, as_name, as_names, as_sequence, as_text, listed, shown
+from switchfit.problem.validation import (
+    as_array,
+    as_callable,
+    as_name,
+    as_names,
+    as_sequence,
+    as_text,
+    join_names,
+    shorten,
+)
 
 VectorField = Callable[..., Any]
 """``f(t, x, p) -> (n,)``, or ``f(t, x, p, u) -> (n,)`` in an experiment with inputs."""
@@ -35,8 +44,8 @@ class HybridSystem:
     modes : mapping of str to callable
         Vector field of each mode by name: ``f(t, x, p) -> (n,)`` written with ``jax.numpy``. ``t`` is a
         scalar in the experiment's time unit, ``x`` an ``(n,)`` array and ``p`` a dict of arrays; all are float64.
-        In an experiment with inputs modes are called as ``f(t, x, p, u)``, ``u`` being a dict or an array as the
-        `switchfit.Input` was given.
+        In an experiment with inputs modes are called as ``f(t, x, p, u)``: ``u`` is a dict of scalars, an array or a
+        scalar, as the values of the `switchfit.Input` were given.
     initial_state : (n,) array_like, or callable ``p -> (n,)``
         State at ``t0``; as a function of the parameters it is differentiated with them. An entry may be a
         `switchfit.Parameter`: it is then estimated, for each experiment by itself.
@@ -55,6 +64,30 @@ class HybridSystem:
         If a reset map or a guard names an unknown mode, or names, units and initial state differ in length.
     TypeError
         If a mode, a reset map or a guard is not callable, the initial state not made of numbers, or a name no string.
+
+    See Also
+    --------
+    Experiment, Problem, switchfit.models
+
+    Examples
+    --------
+    >>> import jax.numpy as jnp
+    >>> import switchfit as sf
+
+    A ball that falls, and then stays where it is; it comes to rest on the ground:
+
+    >>> system = sf.HybridSystem(
+    ...     modes={
+    ...         "fall": lambda t, x, p: jnp.array([x[1], -p["g"]]),
+    ...         "rest": lambda t, x, p: jnp.zeros(2),
+    ...     },
+    ...     initial_state=[1.0, 0.0],
+    ...     guards={("fall", "rest"): lambda t, x, p: x[0]},
+    ...     state_names=("height", "speed"),
+    ...     state_units=("m", "m/s"),
+    ... )
+    >>> list(system.modes)
+    ['fall', 'rest']
     """
 
     modes: Mapping[str, VectorField]
@@ -66,13 +99,13 @@ class HybridSystem:
 
     def __post_init__(self) -> None:
         if not isinstance(self.modes, Mapping) or len(self.modes) == 0:
-            raise ValueError(f"modes must be a non-empty dict of name -> vector field; got {shown(self.modes)}.")
+            raise ValueError(f"modes must be a non-empty dict of name -> vector field; got {shorten(self.modes)}.")
         for name, mode in self.modes.items():
             as_name(name, "mode names", "strings")
-            as_callable(mode, f"mode {shown(name)}", "a function f(t, x, p)")
+            as_callable(mode, f"mode {shorten(name)}", "a function f(t, x, p)")
         _set(self, "modes", MappingProxyType(dict(self.modes)))
         for name in ("reset_maps", "guards"):
-            _set(self, name, MappingProxyType(_checked_pairs(getattr(self, name), name, self.modes)))
+            _set(self, name, MappingProxyType(_check_pairs(getattr(self, name), name, self.modes)))
         if not callable(self.initial_state):
             _set(self, "initial_state", as_state(self.initial_state, "initial_state"))
         form = "a sequence of strings, one for each state"
@@ -85,20 +118,58 @@ class HybridSystem:
             self.check_labels_of(len(self.initial_state))
 
     def check_labels_of(self, n: int) -> None:
-        """ValueError unless names and units, where given, have one entry for each of n states."""
+        """ValueError unless names and units, where given, have one entry for each of n states.
+
+        See Also
+        --------
+        HybridSystem
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> system = sf.HybridSystem({"rest": lambda t, x, p: 0 * x}, lambda p: p["x0"], state_names=("x", "y"))
+        >>> system.check_labels_of(2)
+        """
         for label in ("state_names", "state_units"):
             labels = getattr(self, label)
             if labels is not None and len(labels) != n:
                 raise ValueError(
-                    f"{label} must have one entry for each of the {n} states; got {len(labels)}: {shown(labels)}."
+                    f"{label} must have one entry for each of the {n} states; got {len(labels)}: {shorten(labels)}."
                 )
 
     def reset_map(self, before: str, after: str) -> ResetMap | None:
-        """The map applied at a transition from mode `before` to mode `after`; None where x is continuous."""
+        """The map applied at a transition from mode `before` to mode `after`; None where x is continuous.
+
+        See Also
+        --------
+        HybridSystem.guard
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> def bounce(t, x, p):
+        ...     return -p["restitution"] * x
+
+        >>> system = sf.HybridSystem({"fly": lambda t, x, p: -9.81 + 0 * x}, [1.0], {("fly", "fly"): bounce})
+        >>> system.reset_map("fly", "fly") is bounce
+        True
+        """
         return self.reset_maps.get((before, after))
 
     def guard(self, before: str, after: str) -> Guard | None:
-        """What is zero at a transition from mode `before` to mode `after`; None where it is free."""
+        """What is zero at a transition from mode `before` to mode `after`; None where it is free.
+
+        See Also
+        --------
+        HybridSystem.reset_map
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> system = sf.HybridSystem({"fall": lambda t, x, p: -x, "rest": lambda t, x, p: 0 * x}, [1.0])
+        >>> system.guard("fall", "rest") is None
+        True
+        """
         return self.guards.get((before, after))
 
 
@@ -120,7 +191,7 @@ def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ..
     if state.ndim != 1 or state.size == 0:
         raise ValueError(f"{name} must have shape (n,), one entry for each state; got shape {state.shape}.")
     if not np.all(np.isfinite(state)):
-        raise ValueError(f"{name} must be finite; got {shown(state)}.")
+        raise ValueError(f"{name} must be finite; got {shorten(state)}.")
     state.flags.writeable = False
     return state
 
@@ -132,7 +203,7 @@ def _as_entry(entry: Any, name: str) -> Parameter:
     else:
         array = as_array(entry, f"each entry of {name}", form="a number or an sf.Parameter")
         if not np.all(np.isfinite(array)) or array.size == 0:
-            raise ValueError(f"{name} must have a number or an sf.Parameter for each state; got {shown(entry)}.")
+            raise ValueError(f"{name} must have a number or an sf.Parameter for each state; got {shorten(entry)}.")
         parameter = Parameter(array, fixed=True)
     if parameter.shape != ():
         raise ValueError(
@@ -142,21 +213,21 @@ def _as_entry(entry: Any, name: str) -> Parameter:
     return parameter
 
 
-def _checked_pairs(
+def _check_pairs(
     given: Mapping[tuple[str, str], Callable[..., Any]] | None, name: str, modes: Mapping[str, VectorField]
 ) -> dict[tuple[str, str], Callable[..., Any]]:
     """Functions of transitions, by the modes before and after."""
     if not isinstance(given, Mapping | None):
-        raise TypeError(f"{name} must be a dict of (mode before, mode after) -> function; got {shown(given)}.")
+        raise TypeError(f"{name} must be a dict of (mode before, mode after) -> function; got {shorten(given)}.")
     checked = {} if given is None else dict(given)
     for key, function in checked.items():
         if not (isinstance(key, tuple) and len(key) == 2):
-            raise ValueError(f"{name} must have keys (mode before, mode after); got {shown(key)}.")
+            raise ValueError(f"{name} must have keys (mode before, mode after); got {shorten(key)}.")
         for mode in key:
             if mode not in modes:
-                raise ValueError(f"{name} names the unknown mode {shown(mode)}; the modes are {listed(modes)}.")
+                raise ValueError(f"{name} names the unknown mode {shorten(mode)}; the modes are {join_names(modes)}.")
         what, form = ("reset map", "R(t, x, p)") if name == "reset_maps" else ("guard", "g(t, x, p)")
-        as_callable(function, f"{what} {shown(key)}", f"a function {form}")
+        as_callable(function, f"{what} {shorten(key)}", f"a function {form}")
     return checked
 
 

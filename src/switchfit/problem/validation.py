@@ -2,7 +2,7 @@
 
 Every public constructor, function and method passes its arguments through here, so that a mistake ends in one sentence
 where it was made, and not in an error of NumPy or JAX somewhere inside. A message says which argument of what, what
-was given (shortened, `shown`) and what is wanted.
+was given (shortened, `shorten`) and what is wanted.
 
 - `TypeError` for a wrong type, `ValueError` for a wrong value. Text where a number is wanted is a wrong value, as it is
   for ``float("x")``.
@@ -93,7 +93,7 @@ class _Short(reprlib.Repr):
 _SHORT = _Short()
 
 
-def shown(value: Any) -> str:
+def shorten(value: Any) -> str:
     """Return `value` as a message shows it: at most `LONGEST` characters, whatever it is."""
     try:
         text = " ".join(_SHORT.repr(value).split())
@@ -102,7 +102,7 @@ def shown(value: Any) -> str:
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
 
 
-def listed(names: Iterable[Any]) -> str:
+def join_names(names: Iterable[Any]) -> str:
     """Return names with commas between them, the first ten if there are more; 'none' for no names."""
     every = list(names)
     texts = [f"{name!s:.40}" for name in every[:MOST_LISTED]]
@@ -131,8 +131,8 @@ class _Door(NamedTuple):
 
     def refuse(self, entry: Any, error: type[Exception] = TypeError, why: str = "") -> NoReturn:
         """Raise `error` about one entry of what was given."""
-        inside = "" if entry is self.given else f", in which {shown(entry)} is not a number"
-        raise error(f"{self.what} must be {self.form}; got {shown(self.given)}{inside}{why}.")
+        inside = "" if entry is self.given else f", in which {shorten(entry)} is not a number"
+        raise error(f"{self.what} must be {self.form}; got {shorten(self.given)}{inside}{why}.")
 
 
 def as_array(value: Any, what: str, *, form: str = ARRAY, missing: bool = False) -> FloatArray:
@@ -159,17 +159,17 @@ def as_array(value: Any, what: str, *, form: str = ARRAY, missing: bool = False)
     if type(value) is np.ndarray and value.dtype == np.float64:
         return np.array(value, dtype=np.float64)
     door = _Door(what, form, value, missing)
-    exact = _exact(value, door, 0)
+    exact = _read_exactly(value, door, 0)
     try:
         with np.errstate(all="ignore"):
             return np.array(exact, dtype=np.float64)
     except OverflowError:
         raise ValueError(
-            f"{what} must be {form} up to 1.8e308, the largest double; got {shown(value)}, which is larger."
+            f"{what} must be {form} up to 1.8e308, the largest double; got {shorten(value)}, which is larger."
         ) from None
     except ValueError:
         raise ValueError(
-            f"{what} must be {form}; got {shown(value)}, whose rows differ in length or in shape."
+            f"{what} must be {form}; got {shorten(value)}, whose rows differ in length or in shape."
         ) from None
 
 
@@ -179,7 +179,7 @@ def as_number(value: Any, what: str) -> float:
         return value
     number = as_array(value, what, form="a number")
     if number.size != 1:
-        raise ValueError(f"{what} must be a single number; got {shown(value)}.")
+        raise ValueError(f"{what} must be a single number; got {shorten(value)}.")
     return float(number.item())
 
 
@@ -214,12 +214,12 @@ def as_count(value: Any, what: str, *, at_least: int = 0, at_most: int = LARGEST
     except Exception:  # TypeError; JAX's tracers raise their own
         count = None
     if count is None or getattr(value, "dtype", None) == np.bool_:
-        raise TypeError(f"{what} must be a whole number (an int); got {shown(value)}.")
+        raise TypeError(f"{what} must be a whole number (an int); got {shorten(value)}.")
     if count < at_least:
         wanted = "must not be negative" if at_least == 0 else f"must be {at_least} or more"
-        raise ValueError(f"{what} {wanted}; got {shown(count)}.")
+        raise ValueError(f"{what} {wanted}; got {shorten(count)}.")
     if count > at_most:
-        raise ValueError(f"{what} must be at most {at_most}; got {shown(count)}.")
+        raise ValueError(f"{what} must be at most {at_most}; got {shorten(count)}.")
     return count
 
 
@@ -233,27 +233,27 @@ def as_index(value: Any, what: str, size: int) -> int:
     try:
         return as_count(value, what, at_most=size - 1)
     except ValueError:
-        raise ValueError(f"{what} must lie in 0..{size - 1}; got {shown(value)}.") from None
+        raise ValueError(f"{what} must lie in 0..{size - 1}; got {shorten(value)}.") from None
 
 
-def _exact(value: Any, door: _Door, depth: int) -> Any:
+def _read_exactly(value: Any, door: _Door, depth: int) -> Any:
     """Return what `numpy.array` turns into float64 without changing a number: a number, an array, or nested lists."""
     if type(value) in _EXACT:
         return value
     if depth > MOST_DIMENSIONS:
         door.refuse(door.given, ValueError, f", which is nested more than {MOST_DIMENSIONS} deep")
     if _is_pandas(value) and hasattr(value, "columns"):  # a DataFrame: its columns may differ in type
-        columns = [_exact(value.iloc[:, k], door, depth + 1) for k in range(len(value.columns))]
+        columns = [_read_exactly(value.iloc[:, k], door, depth + 1) for k in range(len(value.columns))]
         return np.stack(columns, axis=1) if columns else np.zeros((len(value), 0))
     if hasattr(value, "__array__") and not isinstance(value, type):
-        return _exact_array(value, door, depth)
+        return _read_array_exactly(value, door, depth)
     if isinstance(value, Sequence) and not isinstance(value, (*_TEXT, memoryview)):
         kinds = set(map(type, value))
         if kinds <= _EXACT:
             return list(value)
         if len(kinds) == 1 and issubclass(next(iter(kinds)), np.number):
-            return _exact_array(np.array(value), door, depth)
-        return [_exact(entry, door, depth + 1) for entry in value]
+            return _read_array_exactly(np.array(value), door, depth)
+        return [_read_exactly(entry, door, depth + 1) for entry in value]
     if isinstance(value, (numbers.Real, Decimal)) and not isinstance(value, bool):
         try:
             return float(value)
@@ -268,16 +268,16 @@ def _exact(value: Any, door: _Door, depth: int) -> Any:
     door.refuse(value, why=": give a list or an array" if isinstance(value, (Iterator, AbstractSet)) else "")
 
 
-def _exact_array(value: Any, door: _Door, depth: int) -> Any:
+def _read_array_exactly(value: Any, door: _Door, depth: int) -> Any:
     """Return an array, or whatever else has a dtype, as an array of integers or doubles."""
     try:
-        array = _of_pandas(value) if _is_pandas(value) else np.asarray(np.ma.getdata(np.asanyarray(value)))
+        array = _read_pandas(value) if _is_pandas(value) else np.asarray(np.ma.getdata(np.asanyarray(value)))
     except Exception as error:
         door.refuse(value, why=f", which NumPy cannot read ({type(error).__name__})")
     if array.dtype.kind in "Mm":
         _refuse_dates(value, door)
     if array.dtype.kind == "O":
-        array = _exact(array.tolist(), door, depth + 1)
+        array = _read_exactly(array.tolist(), door, depth + 1)
     elif is_low_precision(array.dtype):
         refuse_single_precision(value if isinstance(value, jax.Array) else array, door.what)
         array = array.astype(np.float64)
@@ -298,7 +298,7 @@ def _is_pandas(value: Any) -> bool:
     return type(value).__module__.partition(".")[0] == "pandas"
 
 
-def _of_pandas(value: Any) -> NDArray[Any]:
+def _read_pandas(value: Any) -> NDArray[Any]:
     """Return a Series or an Index as an array, NA as NaN.
 
     The types of pandas that know NA turn into arrays of objects, which hide that they were of single precision.
@@ -361,7 +361,7 @@ def refuse_single_precision(value: Any, what: str) -> None:
     places = np.flatnonzero(doubtful)
     for first in range(0, len(places), BLOCK):
         here = places[first : first + BLOCK]
-        meant = _shortest_decimals(given[here])
+        meant = _find_shortest_decimals(given[here])
         if np.any(changed := meant != wide[here]):
             k = int(np.argmax(changed))
             advice = (
@@ -377,7 +377,7 @@ def refuse_single_precision(value: Any, what: str) -> None:
             )
 
 
-def _shortest_decimals(values: NDArray[Any]) -> FloatArray:
+def _find_shortest_decimals(values: NDArray[Any]) -> FloatArray:
     """Return the doubles that the shortest decimal texts of finite low-precision numbers (K,) stand for."""
     if values.dtype in (np.float16, np.float32):
         return values.astype(str).astype(np.float64)
@@ -394,7 +394,7 @@ def _shortest_decimals(values: NDArray[Any]) -> FloatArray:
 def as_flag(value: Any, what: str) -> bool:
     """Return a truth value of Python or NumPy as a bool; numbers are not taken for one."""
     if not isinstance(value, (bool, np.bool_)):
-        raise TypeError(f"{what} must be True or False; got {shown(value)}.")
+        raise TypeError(f"{what} must be True or False; got {shorten(value)}.")
     return bool(value)
 
 
@@ -406,22 +406,22 @@ def as_choice(value: Any, what: str, choices: Sequence[str]) -> Any:
     few = f"{', '.join(quoted[:-1])} or {quoted[-1]}"
     wanted = few if len(choices) <= 3 else f"one of {', '.join(choices)}"
     error = ValueError if isinstance(value, str) else TypeError
-    raise error(f"{what} must be {wanted}; got {shown(value)}.")
+    raise error(f"{what} must be {wanted}; got {shorten(value)}.")
 
 
 def as_name(value: Any, what: str, form: str = "a string") -> str:
     """Return a string that is not empty."""
     if not isinstance(value, str):
-        raise TypeError(f"{what} must be {form}; got {shown(value)}.")
+        raise TypeError(f"{what} must be {form}; got {shorten(value)}.")
     if not value.strip():
-        raise ValueError(f"{what} must not be empty; got {shown(value)}.")
+        raise ValueError(f"{what} must not be empty; got {shorten(value)}.")
     return str(value)
 
 
 def as_text(value: Any, what: str) -> str:
     """Return a string, which may be empty."""
     if not isinstance(value, str):
-        raise TypeError(f"{what} must be a string; got {shown(value)}.")
+        raise TypeError(f"{what} must be a string; got {shorten(value)}.")
     return str(value)
 
 
@@ -430,8 +430,29 @@ def as_names(value: Any, what: str, form: str) -> tuple[str, ...]:
     names = tuple(as_name(name, what, form) for name in as_sequence(value, what, form))
     if len(set(names)) < len(names):
         twice = next(name for k, name in enumerate(names) if name in names[:k])
-        raise ValueError(f"{what} must differ from each other; got {shown(twice)} twice.")
+        raise ValueError(f"{what} must differ from each other; got {shorten(twice)} twice.")
     return names
+
+
+def as_named_columns(value: Any, what: str, form: str) -> dict[str, Any] | None:
+    """Return the entries of a mapping, or of a DataFrame whose columns are all named by strings; None for all else.
+
+    Raises
+    ------
+    TypeError
+        If a key of a mapping is not a string.
+    ValueError
+        If a mapping is empty, a key is empty, or two columns of a DataFrame share a name.
+    """
+    if isinstance(value, Mapping):
+        if not value:
+            raise ValueError(f"{what} must have a name for each entry of u, with its {form}; got an empty dict.")
+        return {as_name(name, f"names in {what}", "strings"): entry for name, entry in value.items()}
+    if _is_pandas(value) and hasattr(value, "columns"):
+        names = list(value.columns)
+        if names and all(isinstance(name, str) for name in names):
+            return {name: value.iloc[:, k] for k, name in enumerate(as_names(names, f"columns of {what}", "strings"))}
+    return None
 
 
 def as_sequence(value: Any, what: str, form: str) -> tuple[Any, ...]:
@@ -443,13 +464,15 @@ def as_sequence(value: Any, what: str, form: str) -> tuple[Any, ...]:
         For text, and for what has no order or can be read only once: sets, dicts, generators.
     """
     if isinstance(value, _TEXT):
-        raise TypeError(f"{what} must be {form}; got the string {shown(value)}.")
+        raise TypeError(f"{what} must be {form}; got the string {shorten(value)}.")
     if isinstance(value, (AbstractSet, Mapping, Iterator)):
-        raise TypeError(f"{what} must be {form}; got {shown(value)} ({type(value).__name__}): give a list or a tuple.")
+        raise TypeError(
+            f"{what} must be {form}; got {shorten(value)} ({type(value).__name__}): give a list or a tuple."
+        )
     try:
         return tuple(value)
     except Exception:  # TypeError; arrays without dimensions and others raise their own
-        raise TypeError(f"{what} must be {form}; got {shown(value)}.") from None
+        raise TypeError(f"{what} must be {form}; got {shorten(value)}.") from None
 
 
 def as_instance(value: Any, what: str, kind: type[T], form: str) -> T:
@@ -493,7 +516,7 @@ def as_path(value: Any, what: str) -> Path:
     """Return a path that is not empty."""
     text = os.fspath(value) if isinstance(value, (str, os.PathLike)) else None
     if not isinstance(text, str):
-        raise TypeError(f"{what} must be a path (a string or a pathlib.Path); got {shown(value)}.")
+        raise TypeError(f"{what} must be a path (a string or a pathlib.Path); got {shorten(value)}.")
     if not text.strip() or "\0" in text:
-        raise ValueError(f"{what} must be a path; got {shown(value)}.")
+        raise ValueError(f"{what} must be a path; got {shorten(value)}.")
     return Path(text)

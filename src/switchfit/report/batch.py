@@ -15,7 +15,7 @@ from switchfit.batch.starts import Multistart
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report.tables import format_table
-from switchfit.runtime.presentation import figure_of, text_of
+from switchfit.runtime.presentation import draw_figure, format_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,7 +33,7 @@ BOOTSTRAP_TITLES = {
 }
 
 
-def summary_of(fits: Fits) -> list[str]:
+def summarise(fits: Fits) -> list[str]:
     """How many fits were done, how they ended, and the first that did not converge.
 
     Parameters
@@ -56,7 +56,7 @@ def summary_of(fits: Fits) -> list[str]:
     return lines
 
 
-@text_of.register(Fits)
+@format_text.register(Fits)
 def write_fits(fits: Fits) -> str:
     """How the fits ended.
 
@@ -64,10 +64,10 @@ def write_fits(fits: Fits) -> str:
     ----------
     fits : Fits
     """
-    return "\n".join(summary_of(fits))
+    return "\n".join(summarise(fits))
 
 
-@text_of.register(MonteCarlo)
+@format_text.register(MonteCarlo)
 def write_monte_carlo(study: MonteCarlo) -> str:
     """How the fits ended, and a line for each unknown.
 
@@ -75,10 +75,10 @@ def write_monte_carlo(study: MonteCarlo) -> str:
     ----------
     study : MonteCarlo
     """
-    return "\n".join([*summary_of(study), "", *table_of_monte_carlo(study)])
+    return "\n".join([*summarise(study), "", *tabulate_monte_carlo(study)])
 
 
-@text_of.register(Bootstrap)
+@format_text.register(Bootstrap)
 def write_bootstrap(study: Bootstrap) -> str:
     """How the fits ended, what was resampled, and a line for each unknown.
 
@@ -87,10 +87,10 @@ def write_bootstrap(study: Bootstrap) -> str:
     study : Bootstrap
     """
     what = f"{study.resample} of {study.block} samples" if study.resample == "blocks" else study.resample
-    return "\n".join([*summary_of(study), f"resampled: {what}", "", *table_of_bootstrap(study)])
+    return "\n".join([*summarise(study), f"resampled: {what}", "", *tabulate_bootstrap(study)])
 
 
-@text_of.register(Multistart)
+@format_text.register(Multistart)
 def write_multistart(study: Multistart) -> str:
     """How the fits ended, and a line for each of the ten lowest minima.
 
@@ -105,10 +105,10 @@ def write_multistart(study: Multistart) -> str:
         columns = zip(study.theta_names, study.theta[here[0]], study.theta_units, strict=True)
         place = ", ".join(f"{name} = {value:.6g}{unit_suffix(unit)}" for name, value, unit in columns)
         rows.append((f"J = {study.cost[here].min():.9g}", f"{len(here)} starts", place))
-    return "\n".join([*summary_of(study), "", f"{minima} minima:", *format_table(rows, "<><")])
+    return "\n".join([*summarise(study), "", f"{minima} minima:", *format_table(rows, "<><")])
 
 
-def table_of_monte_carlo(study: MonteCarlo) -> list[str]:
+def tabulate_monte_carlo(study: MonteCarlo) -> list[str]:
     """One line an unknown: truth, mean error with its own error, spread, standard error, coverage."""
     count = int(study.success.sum())
     if count < 2:
@@ -134,7 +134,7 @@ def table_of_monte_carlo(study: MonteCarlo) -> list[str]:
     return format_table([header, *rows], "<" + ">" * 6, indent="")
 
 
-def table_of_bootstrap(study: Bootstrap) -> list[str]:
+def tabulate_bootstrap(study: Bootstrap) -> list[str]:
     """One line an unknown: estimate, bias, bootstrap standard error, 95 % interval (BCa)."""
     if int(study.success.sum()) < 2:
         return ["Fewer than two fits converged: no statistics."]
@@ -150,7 +150,7 @@ def table_of_bootstrap(study: Bootstrap) -> list[str]:
     return format_table(rows, "<" + ">" * 4, indent="")
 
 
-@figure_of.register(Bootstrap)
+@draw_figure.register(Bootstrap)
 def plot_bootstrap(study: Bootstrap) -> Figure:
     """A histogram an unknown: estimates of the resampled data, the estimate, and its 95 % interval."""
     from matplotlib.figure import Figure
@@ -162,12 +162,12 @@ def plot_bootstrap(study: Bootstrap) -> Figure:
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     theta, intervals = study.theta[study.success], study.intervals()
     for ax, k in zip(axes, shown, strict=False):
-        limits = _limits(theta[:, k], study.estimate[k])
+        limits = _choose_limits(theta[:, k], study.estimate[k])
         ax.hist(theta[:, k], bins=40, range=limits, color=ESTIMATE, alpha=0.7, label=f"{len(theta)} estimates")
         ax.axvline(study.estimate[k], color=TRUTH, linewidth=1.4, label="estimate")
         for side, edge in enumerate(intervals[k]):
             ax.axvline(edge, color=NORMAL, linestyle=":", linewidth=1.2, label="" if side else "95 % interval (BCa)")
-        _histogram_axis(study, int(k), limits, ax)
+        _draw_histogram_axis(study, int(k), limits, ax)
     for ax in axes[len(shown) :]:
         ax.set_visible(False)
     axes[0].set_ylabel("fits")
@@ -178,14 +178,14 @@ def plot_bootstrap(study: Bootstrap) -> Figure:
     return figure
 
 
-def _limits(values: FloatArray, centre: float) -> tuple[float, float]:
+def _choose_limits(values: FloatArray, centre: float) -> tuple[float, float]:
     """What a histogram of estimates shows: all but the farthest hundredth, with a margin."""
     middle = np.percentile(values, [0.5, 99.5])
     reach = max(float(np.ptp(middle)), 1e-12 * abs(centre), np.finfo(float).tiny)
     return float(middle[0] - 0.25 * reach), float(middle[1] + 0.25 * reach)
 
 
-def _histogram_axis(study: Fits, k: int, limits: tuple[float, float], ax: Axes) -> None:
+def _draw_histogram_axis(study: Fits, k: int, limits: tuple[float, float], ax: Axes) -> None:
     """Name and unit of unknown k along the axis, and few ticks."""
     unit = study.theta_units[k]
     ax.set_xlabel(study.theta_names[k] + (f" ({unit})" if unit and unit != "1" else ""))
@@ -195,7 +195,7 @@ def _histogram_axis(study: Fits, k: int, limits: tuple[float, float], ax: Axes) 
     ax.locator_params(axis="x", nbins=4)
 
 
-@figure_of.register(MonteCarlo)
+@draw_figure.register(MonteCarlo)
 def plot_monte_carlo(study: MonteCarlo) -> Figure:
     """A histogram an unknown: estimates, truth, and the normal density of the reported standard error."""
     from matplotlib.figure import Figure
@@ -213,7 +213,7 @@ def plot_monte_carlo(study: MonteCarlo) -> Figure:
             ax.set_visible(False)
             continue
         values = theta[:, k]
-        limits = _limits(values, study.truth[k])
+        limits = _choose_limits(values, study.truth[k])
         ax.hist(
             values, bins=40, range=limits, density=True, color=ESTIMATE, alpha=0.7, label=f"{len(values)} estimates"
         )
@@ -222,7 +222,7 @@ def plot_monte_carlo(study: MonteCarlo) -> Figure:
             normal = np.exp(-0.5 * ((x - study.truth[k]) / errors[k]) ** 2) / (np.sqrt(2 * np.pi) * errors[k])
             ax.plot(x, normal, color=NORMAL, linewidth=1.2, label="normal, reported error")
         ax.axvline(study.truth[k], color=TRUTH, linestyle="--", linewidth=1.4, label="truth")
-        _histogram_axis(study, k, limits, ax)
+        _draw_histogram_axis(study, k, limits, ax)
     axes[0].set_ylabel("density")
     handles, labels = axes[0].get_legend_handles_labels()
     failed = int((~study.success).sum())
@@ -231,7 +231,7 @@ def plot_monte_carlo(study: MonteCarlo) -> Figure:
     return figure
 
 
-@figure_of.register(Multistart)
+@draw_figure.register(Multistart)
 def plot_waterfall(study: Multistart) -> Figure:
     """Final cost of every start, ascending, above the best; starts that ended together share a colour."""
     from matplotlib.figure import Figure

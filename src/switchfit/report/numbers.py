@@ -7,7 +7,7 @@ import numpy as np
 from switchfit.fit.trajectory import Trajectory
 
 
-def rounded(value: float, error: float) -> tuple[str, str, str]:
+def format_rounded(value: float, error: float) -> tuple[str, str, str]:
     """Value, "± error" and "(relative error)" as text, the value to the two significant digits of its error.
 
     Parameters
@@ -17,31 +17,31 @@ def rounded(value: float, error: float) -> tuple[str, str, str]:
     """
     if not np.isfinite(error) or error <= 0.0 or not np.isfinite(value):
         return f"{value:.8g}", "held" if error == 0.0 else "", ""
-    last = 1 - _exponent(error)  # decimal place of the second digit of the error
+    last = 1 - _find_exponent(error)  # decimal place of the second digit of the error
     if value != 0.0:
-        last = max(last, 1 - _exponent(value))
+        last = max(last, 1 - _find_exponent(value))
     relative = f"({100 * error / abs(value):.2g} %)" if abs(value) > error / 10 else ""
     if 1e-4 <= max(abs(value), error) < 1e7:
         return f"{value:.{max(last, 0)}f}", f"± {error:.{max(last, 0)}f}", relative
-    digits = max(last + _exponent(value), 1) if value != 0.0 else 1
+    digits = max(last + _find_exponent(value), 1) if value != 0.0 else 1
     return f"{value:.{digits}e}", f"± {error:.1e}", relative
 
 
-def _exponent(number: float) -> int:
+def _find_exponent(number: float) -> int:
     return int(np.floor(np.log10(abs(number))))
 
 
-def shown_unit(unit: str) -> str:
+def format_unit(unit: str) -> str:
     """Return a unit as it is shown: nothing for "1", a pure number."""
     return "" if unit == "1" else unit
 
 
-def unit_of(channel: str, trajectory: Trajectory) -> str:
+def get_unit(channel: str, trajectory: Trajectory) -> str:
     """The unit of a channel that is called like a state; "" for any other, and for a pure number."""
     units = dict(zip(trajectory.state_names, trajectory.state_units, strict=True))
-    return shown_unit(units.get(channel, ""))
+    return format_unit(units.get(channel, ""))
 
 
-def time_label(unit: str) -> str:
+def label_time(unit: str) -> str:
     """The label of an axis of times in a unit, such as "time (min)"."""
-    return f"time ({unit})" if shown_unit(unit) else "time"
+    return f"time ({unit})" if format_unit(unit) else "time"

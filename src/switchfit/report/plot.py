@@ -21,8 +21,8 @@ from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_flag
-from switchfit.report.numbers import time_label, unit_of
-from switchfit.runtime.presentation import figure_of
+from switchfit.report.numbers import get_unit, label_time
+from switchfit.runtime.presentation import draw_figure
 from switchfit.uncertainty.prediction import predict
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class Bands:
         )
 
 
-@figure_of.register(Estimate)
+@draw_figure.register(Estimate)
 def plot_estimate(estimate: Estimate, *, bands: bool = True, level: float = 0.95) -> Figure:
     """As `plot_fit`, with bands of what is fitted where there is a model and a covariance.
 
@@ -119,19 +119,19 @@ def plot_fit(fit: Fit, bands: Sequence[Bands] = ()) -> Figure:
     columns = min(shown, COLUMNS) if shown > 3 else max(shown, 1)
     blocks = -(-shown // columns)
     panels = [
-        max(len(_panels(fit, e)) for e in range(b * columns, min((b + 1) * columns, shown))) for b in range(blocks)
+        max(len(_list_panels(fit, e)) for e in range(b * columns, min((b + 1) * columns, shown))) for b in range(blocks)
     ]
     width = {1: 8.0, 2: 5.5, 3: 4.5}.get(columns, 4.0) * columns
     heights = [0.6 + 2.5 * count for count in panels]
     figure = Figure(figsize=(width, 0.7 + sum(heights)), layout="constrained")
     grid = figure.add_gridspec(blocks, columns, height_ratios=heights)
-    colours = mode_colours(fit.trajectories)
+    colours = choose_mode_colours(fit.trajectories)
     for e in range(shown):
         block = figure.add_subfigure(grid[divmod(e, columns)])
         _draw_experiment(fit, e, block, panels[e // columns], colours)
         if bands:
             _draw_bands(fit, e, block.axes, bands[e])
-    _head(fit, figure, shown, colours)
+    _draw_head(fit, figure, shown, colours)
     return figure
 
 
@@ -151,16 +151,16 @@ def plot_comparison(comparison: Comparison, trajectory: Trajectory, channel: int
     -------
     matplotlib.axes.Axes
     """
-    measured = _drawable(comparison.measured[:, channel])
+    measured = _replace_infinities(comparison.measured[:, channel])
     if comparison.kind == "measurements":
-        ax.plot(comparison.times, measured, label="measured", zorder=3, **_dots(len(measured)))
+        ax.plot(comparison.times, measured, label="measured", zorder=3, **_draw_dots(len(measured)))
         _mark_outliers(comparison, measured, channel, ax)
     else:
         ax.plot(comparison.times, measured, "--", color=REFERENCE, linewidth=1.5, label="reference signal", zorder=3)
-    times, curve = _broken(comparison.curve_times, comparison.curve[:, channel], trajectory)
+    times, curve = _break_at_gaps(comparison.curve_times, comparison.curve[:, channel], trajectory)
     ax.plot(times, curve, "-", color=FIT, linewidth=1.5, label="fitted", zorder=4)
-    ax.set_ylabel(_labelled(comparison.names[channel], trajectory))
-    return _time_axis(ax, trajectory)
+    ax.set_ylabel(_add_unit(comparison.names[channel], trajectory))
+    return _label_time_axis(ax, trajectory)
 
 
 def plot_residuals(comparison: Comparison, trajectory: Trajectory, channel: int, ax: Axes) -> Axes:
@@ -178,22 +178,22 @@ def plot_residuals(comparison: Comparison, trajectory: Trajectory, channel: int,
     -------
     matplotlib.axes.Axes
     """
-    residual = _drawable(comparison.residuals[:, channel])
+    residual = _replace_infinities(comparison.residuals[:, channel])
     ax.axhline(0.0, color=FIT, linewidth=1.0, zorder=2)
     if comparison.kind == "measurements":
-        ax.plot(comparison.times, residual, zorder=3, **_dots(len(residual)))
+        ax.plot(comparison.times, residual, zorder=3, **_draw_dots(len(residual)))
         _mark_outliers(comparison, residual, channel, ax)
     else:
-        times, line = _broken(comparison.times, residual, trajectory)
+        times, line = _break_at_gaps(comparison.times, residual, trajectory)
         ax.plot(times, line, "-", color=REFERENCE, linewidth=1.0, zorder=3)
     if comparison.sigma is not None:
-        sigma = _drawable(comparison.sigma[:, channel])
+        sigma = _replace_infinities(comparison.sigma[:, channel])
         ax.plot(comparison.times, sigma, ":", color=TRANSITION, linewidth=1.0, zorder=2, label="± sigma")
         ax.plot(comparison.times, -sigma, ":", color=TRANSITION, linewidth=1.0, zorder=2)
-    unit = unit_of(comparison.names[channel], trajectory)
+    unit = get_unit(comparison.names[channel], trajectory)
     ax.set_ylabel(f"residual\n({unit})" if unit else "residual")
     ax.margins(y=0.12)
-    return _time_axis(ax, trajectory)
+    return _label_time_axis(ax, trajectory)
 
 
 def plot_state(trajectory: Trajectory, state: int, ax: Axes) -> Axes:
@@ -210,10 +210,10 @@ def plot_state(trajectory: Trajectory, state: int, ax: Axes) -> Axes:
     -------
     matplotlib.axes.Axes
     """
-    times, curve = _broken(trajectory.times, trajectory.states[:, state], trajectory)
+    times, curve = _break_at_gaps(trajectory.times, trajectory.states[:, state], trajectory)
     ax.plot(times, curve, "-", color=FIT, linewidth=1.5, label="fitted", zorder=4)
-    ax.set_ylabel(_labelled(trajectory.state_names[state], trajectory))
-    return _time_axis(ax, trajectory)
+    ax.set_ylabel(_add_unit(trajectory.state_names[state], trajectory))
+    return _label_time_axis(ax, trajectory)
 
 
 def plot_modes(
@@ -226,7 +226,7 @@ def plot_modes(
     trajectory : Trajectory
     ax : matplotlib.axes.Axes
     colours : mapping of mode to colour, optional
-        As from `mode_colours`, so that several axes agree; left out, the modes of this trajectory in their order.
+        As from `choose_mode_colours`, so that several axes agree; left out, in the order of this trajectory's modes.
     labels : bool, optional
         False leaves the names out. A name that is wider than its mode's time is turned by 90 degrees.
 
@@ -234,7 +234,7 @@ def plot_modes(
     -------
     matplotlib.axes.Axes
     """
-    colours = mode_colours([trajectory]) if colours is None else colours
+    colours = choose_mode_colours([trajectory]) if colours is None else colours
     spans = trajectory.mode_spans
     inches = ax.bbox.width / ax.figure.dpi
     for mode, begin, end in spans:
@@ -254,7 +254,7 @@ def plot_modes(
                 fontsize=9,
                 rotation=90 if turned else 0,
             )
-    return _time_axis(ax, trajectory)
+    return _label_time_axis(ax, trajectory)
 
 
 def plot_transitions(times: Sequence[float], errors: Sequence[float], ax: Axes) -> Axes:
@@ -315,7 +315,7 @@ def plot_convergence(history: Sequence[IterationRecord], ax: Axes, *, tolerance:
     return ax
 
 
-def mode_colours(trajectories: Sequence[Trajectory]) -> dict[str, str]:
+def choose_mode_colours(trajectories: Sequence[Trajectory]) -> dict[str, str]:
     """A colour for each mode that occurs, in the order of first occurrence.
 
     Parameters
@@ -329,7 +329,7 @@ def mode_colours(trajectories: Sequence[Trajectory]) -> dict[str, str]:
 # --- the figure of a fit ----------------------------------------------------------------------------------------------
 
 
-def _panels(fit: Fit, e: int) -> list[tuple[Comparison | None, int]]:
+def _list_panels(fit: Fit, e: int) -> list[tuple[Comparison | None, int]]:
     """What the panels of an experiment show: (comparison, channel), or (None, state) where there is no data."""
     channels: list[tuple[Comparison | None, int]] = [(c, k) for c in fit.comparisons[e] for k in range(len(c.names))]
     return channels or [(None, k) for k in range(len(fit.trajectories[e].state_names))]
@@ -337,7 +337,7 @@ def _panels(fit: Fit, e: int) -> list[tuple[Comparison | None, int]]:
 
 def _draw_experiment(fit: Fit, e: int, block: Any, rows: int, colours: Mapping[str, str]) -> None:
     """Draw one experiment into its subfigure, leaving rows free at the bottom that only others need."""
-    trajectory, panels = fit.trajectories[e], _panels(fit, e)
+    trajectory, panels = fit.trajectories[e], _list_panels(fit, e)
     with_data = panels[0][0] is not None
     ratios = [3.0, 1.2] * rows if with_data else [1.0] * rows
     grid = block.add_gridspec(len(ratios), 1, height_ratios=ratios)
@@ -368,7 +368,7 @@ def _draw_experiment(fit: Fit, e: int, block: Any, rows: int, colours: Mapping[s
 
 def _draw_bands(fit: Fit, e: int, axes: Sequence[Axes], bands: Bands) -> None:
     """Bands in the panels of one experiment; its channels come with their residuals, states alone."""
-    panels = _panels(fit, e)
+    panels = _list_panels(fit, e)
     if panels[0][0] is None:
         for ax, band in zip(axes, np.moveaxis(bands.states, 1, 0), strict=True):
             plot_band(bands, band, ax, alpha=0.3, label=f"{100 * bands.level:g} % confidence")
@@ -411,7 +411,7 @@ def plot_band(bands: Bands, band: FloatArray, ax: Axes, *, alpha: float, label: 
     return ax
 
 
-def _head(fit: Fit, figure: Figure, shown: int, colours: Mapping[str, str]) -> None:
+def _draw_head(fit: Fit, figure: Figure, shown: int, colours: Mapping[str, str]) -> None:
     """Legend, a warning where the fit did not succeed, and a note where not everything is shown."""
     from matplotlib.patches import Patch
 
@@ -419,7 +419,7 @@ def _head(fit: Fit, figure: Figure, shown: int, colours: Mapping[str, str]) -> N
     for ax in figure.axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
-    handles |= _transition_handles(fit)
+    handles |= _make_transition_handles(fit)
     named = {text.get_text() for ax in figure.axes for text in ax.texts}
     drawn = {mode for trajectory in fit.trajectories[:shown] for mode, a, b in trajectory.mode_spans if b > a}
     for mode in (mode for mode in colours if mode in drawn - named):  # too short for a name
@@ -434,7 +434,7 @@ def _head(fit: Fit, figure: Figure, shown: int, colours: Mapping[str, str]) -> N
         figure.suptitle("; ".join(notes), x=0.01, ha="left", fontweight="bold", fontsize="medium", color=colour)
 
 
-def _transition_handles(fit: Fit) -> dict[str, Any]:
+def _make_transition_handles(fit: Fit) -> dict[str, Any]:
     """Entries of the legend for the transitions and their standard errors."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -451,7 +451,7 @@ def _transition_handles(fit: Fit) -> dict[str, Any]:
 # --- parts ------------------------------------------------------------------------------------------------------------
 
 
-def _dots(count: int) -> dict[str, Any]:
+def _draw_dots(count: int) -> dict[str, Any]:
     """Dots that become smaller the more there are; thousands are one picture in a vector file."""
     size = 4.5 if count <= 100 else 3.0 if count <= 400 else 1.5
     return {
@@ -476,27 +476,27 @@ def _mark_outliers(comparison: Comparison, values: FloatArray, channel: int, ax:
     )
 
 
-def _drawable(values: FloatArray) -> FloatArray:
+def _replace_infinities(values: FloatArray) -> FloatArray:
     """Values with NaN where they are too large for an axis, as a sigma of 1e308 is that takes a sample out."""
     return np.where(np.abs(values) < LARGEST_DRAWN, values, np.nan)
 
 
-def _broken(times: FloatArray, values: FloatArray, trajectory: Trajectory) -> tuple[FloatArray, FloatArray]:
+def _break_at_gaps(times: FloatArray, values: FloatArray, trajectory: Trajectory) -> tuple[FloatArray, FloatArray]:
     """A curve over the trajectory's nodes with a gap at each transition, where a reset map may make it jump."""
-    values = _drawable(values)
+    values = _replace_infinities(values)
     if len(times) != len(trajectory.times):
         return times, values
     inner = trajectory.segments[1:-1]
     return np.insert(times, inner, times[inner]), np.insert(values, inner, np.nan)
 
 
-def _labelled(name: str, trajectory: Trajectory) -> str:
-    unit = unit_of(name, trajectory)
+def _add_unit(name: str, trajectory: Trajectory) -> str:
+    unit = get_unit(name, trajectory)
     return f"{name} ({unit})" if unit else name
 
 
-def _time_axis(ax: Axes, trajectory: Trajectory) -> Axes:
+def _label_time_axis(ax: Axes, trajectory: Trajectory) -> Axes:
     """The experiment's horizon, labelled."""
     ax.set_xlim(float(trajectory.times[0]), float(trajectory.times[-1]))
-    ax.set_xlabel(time_label(trajectory.time_unit))
+    ax.set_xlabel(label_time(trajectory.time_unit))
     return ax

@@ -10,7 +10,7 @@ from switchfit.fit.termination import Kink, Termination
 from switchfit.optimize import Status
 from switchfit.problem.constraints import Constraint
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import text_of
+from switchfit.runtime.presentation import format_text
 from switchfit.uncertainty.identification import Combination
 
 LISTED = 6
@@ -25,26 +25,26 @@ def join_words(words: list[str] | tuple[str, ...]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
-def _mode(position: float, mode: str, run: str) -> str:
+def _describe_mode(position: float, mode: str, run: str) -> str:
     return f"mode {position + 1:.0f} ({mode!r})" + (f" of {run}" if run else "")
 
 
-@text_of.register(Constraint)
+@format_text.register(Constraint)
 def write_constraint(constraint: Constraint) -> str:
     """What it says of a fit that this constraint is active."""
     if constraint.position is None:
         return f"{constraint.unknown} at its {constraint.kind} {constraint.value:g}"
     state = "has collapsed to nothing" if constraint.kind == "collapsed" else "is at its minimum duration"
-    return f"{_mode(constraint.position, constraint.mode, constraint.run)} {state}"
+    return f"{_describe_mode(constraint.position, constraint.mode, constraint.run)} {state}"
 
 
-@text_of.register(Kink)
+@format_text.register(Kink)
 def write_kink(kink: Kink) -> str:
     """Which unknown is at a kink, and the derivatives on both sides."""
     return f"{kink.unknown} at a kink ({kink.left:.1e}, {kink.right:.1e})"
 
 
-@text_of.register(Combination)
+@format_text.register(Combination)
 def write_combination(combination: Combination) -> str:
     """Which unknowns trade off."""
     names = combination.unknowns
@@ -56,7 +56,7 @@ def write_combination(combination: Combination) -> str:
 # --- how a fit ended --------------------------------------------------------------------------------------------------
 
 
-@text_of.register(Termination)
+@format_text.register(Termination)
 def write_termination(ended: Termination) -> str:
     """How a fit ended, the numbers that say so, what to do, and the active constraints."""
     if ended.reason is not None and ended.reason.kind == "message":
@@ -65,7 +65,7 @@ def write_termination(ended: Termination) -> str:
     return _ENDINGS[ended.status](ended) + active
 
 
-def _stopped(ended: Termination) -> str:
+def _describe_stop(ended: Termination) -> str:
     earlier = ended.earlier_iterations
     before = f", {earlier} of them before the mesh was refined," if earlier else ""
     return (
@@ -74,7 +74,7 @@ def _stopped(ended: Termination) -> str:
     )
 
 
-def _at_kink(ended: Termination) -> str:
+def _describe_kink(ended: Termination) -> str:
     kinks = ", ".join(
         f"{kink.unknown} = {kink.value:.10g}, where the derivative jumps from {kink.left:.1e} to {kink.right:.1e}"
         for kink in ended.kinks
@@ -85,7 +85,7 @@ def _at_kink(ended: Termination) -> str:
     )
 
 
-def _search_failed(ended: Termination) -> str:
+def _describe_failed_search(ended: Termination) -> str:
     reason = f" {ended.reason}" if ended.reason is not None else ""
     return (
         "The line search found no decrease of the cost along a descent direction (optimality "
@@ -93,7 +93,7 @@ def _search_failed(ended: Termination) -> str:
     )
 
 
-def _flat(ended: Termination) -> str:
+def _describe_flat_direction(ended: Termination) -> str:
     direction = " ".join(f"{part:+.2g} {name}" for name, part in ended.flat_direction) or "no direction"
     return (
         f"Converged, but the cost is flat to second order along {direction} (scaled eigenvalue "
@@ -101,7 +101,7 @@ def _flat(ended: Termination) -> str:
     )
 
 
-def _infeasible(ended: Termination) -> str:
+def _describe_infeasible(ended: Termination) -> str:
     violated = "; ".join(f"{name} = {value:.2e}" for name, value in ended.violated)
     return f"The constraints are not met: {violated}. Start nearer to a point that meets them, or check that one can."
 
@@ -115,9 +115,9 @@ _ENDINGS: dict[Status, Callable[[Termination], str]] = {
         f"{ended.tolerance:.1e}, but the decrease still predicted is below the rounding error of the cost "
         f"{ended.cost:.6e}. Ask for a larger tolerance."
     ),
-    Status.CONVERGED_AT_KINK: _at_kink,
-    Status.MAX_ITERATIONS: _stopped,
-    Status.LINE_SEARCH_FAILED: _search_failed,
+    Status.CONVERGED_AT_KINK: _describe_kink,
+    Status.MAX_ITERATIONS: _describe_stop,
+    Status.LINE_SEARCH_FAILED: _describe_failed_search,
     Status.INTERRUPTED: lambda ended: (
         f"Interrupted after {ended.iterations} iterations with optimality {ended.optimality:.1e}: the best point so "
         "far."
@@ -129,13 +129,13 @@ _ENDINGS: dict[Status, Callable[[Termination], str]] = {
         "A stationary point but no minimum: the scaled Hessian on the free directions has the eigenvalue "
         f"{ended.smallest_eigenvalue:.1e}, and no step along it decreased the cost. Start elsewhere."
     ),
-    Status.SINGULAR: _flat,
+    Status.SINGULAR: _describe_flat_direction,
     Status.COLLAPSED: lambda ended: (
         f"Converged (optimality {ended.optimality:.1e}), with a mode that has no duration: the cost depends neither on "
         f"where it would stand nor on what acts in it alone ({', '.join(ended.idle)}). Leave it out of mode_sequence, "
         "start from another guess, or give min_duration."
     ),
-    Status.INFEASIBLE: _infeasible,
+    Status.INFEASIBLE: _describe_infeasible,
     Status.ERROR: lambda ended: (
         f"The fit ended with an error, and was left where it was. {ended.reason or ''}".rstrip()
     ),
@@ -145,53 +145,53 @@ _ENDINGS: dict[Status, Callable[[Termination], str]] = {
 # --- issues -----------------------------------------------------------------------------------------------------------
 
 
-def _one(issue: Issue, name: str) -> float:
+def _get(issue: Issue, name: str) -> float:
     """A figure that is one number; NaN if the issue lacks it."""
     value = issue.figures.get(name, np.nan)
     return np.nan if isinstance(value, tuple) else value
 
 
-def _each(issue: Issue, name: str) -> list[tuple[str, float]]:
+def _pair_figures(issue: Issue, name: str) -> list[tuple[str, float]]:
     """A figure that has a number for each subject: (subject, number)."""
     value = issue.figures.get(name, ())
     return list(zip(issue.subjects, value if isinstance(value, tuple) else (value,), strict=False))
 
 
-def _subjects(issue: Issue) -> str:
+def _join(issue: Issue) -> str:
     return ", ".join(issue.subjects)
 
 
-@text_of.register(Issue)
+@format_text.register(Issue)
 def write_issue(issue: Issue) -> str:
     """An issue as a sentence or two."""
     if issue.kind in _ISSUES:
         return _ISSUES[issue.kind](issue)
-    return f"{issue.kind}: {_subjects(issue)}" if issue.subjects else issue.kind
+    return f"{issue.kind}: {_join(issue)}" if issue.subjects else issue.kind
 
 
-def _held_mode(issue: Issue) -> str:
+def _name_held_mode(issue: Issue) -> str:
     mode, run = (*issue.subjects, "", "")[:2]
-    return _capitalised(_mode(_one(issue, "position"), mode, run))
+    return _capitalise(_describe_mode(_get(issue, "position"), mode, run))
 
 
-def _held_by_bound(issue: Issue) -> str:
+def _describe_held_by_bound(issue: Issue) -> str:
     return (
-        f"{_subjects(issue)} is at its {issue.kind} {_one(issue, 'value'):g}: it has no standard error, and those of "
+        f"{_join(issue)} is at its {issue.kind} {_get(issue, 'value'):g}: it has no standard error, and those of "
         "the others take it as known. Move the bound if it is not a physical one."
     )
 
 
-def _hardly_determined(issue: Issue) -> str:
+def _describe_hardly_determined(issue: Issue) -> str:
     *others, last = issue.subjects or ("the unknowns",)
     what = f"{', '.join(others)} and {last} apart from one another" if others else last
     return (
-        f"The data hardly determine {what} (smallest eigenvalue {_one(issue, 'eigenvalue'):.1e} of the Hessian scaled "
+        f"The data hardly determine {what} (smallest eigenvalue {_get(issue, 'eigenvalue'):.1e} of the Hessian scaled "
         "to unit curvature). Fix one of the unknowns, or add data that tell them apart."
     )
 
 
-def _wrong_sigma(issue: Issue) -> str:
-    ratio = _one(issue, "chi-square")
+def _describe_wrong_sigma(issue: Issue) -> str:
+    ratio = _get(issue, "chi-square")
     if issue.kind == "sigma too small":
         cause, effect = "the model misses something (look at the residuals)", "small"
         factor = np.sqrt(ratio)
@@ -204,82 +204,82 @@ def _wrong_sigma(issue: Issue) -> str:
     )
 
 
-def _shortened(entries: list[str]) -> str:
+def _shorten_list(entries: list[str]) -> str:
     more = f" and {len(entries) - LISTED} more" if len(entries) > LISTED else ""
     return ", ".join(entries[:LISTED]) + more
 
 
-def _correlated(issue: Issue) -> str:
-    where = _shortened([f"{label} ({value:.2f})" for label, value in _each(issue, "correlation")])
+def _describe_correlation(issue: Issue) -> str:
+    where = _shorten_list([f"{label} ({value:.2f})" for label, value in _pair_figures(issue, "correlation")])
     return (
         f"Neighbouring residuals are correlated in {where}: the model misses something there, or the samples were "
-        f"smoothed before. The {_one(issue, 'values'):.0f} values are worth about {_one(issue, 'effective'):.0f} "
+        f"smoothed before. The {_get(issue, 'values'):.0f} values are worth about {_get(issue, 'effective'):.0f} "
         "independent ones: the standard errors, which take them as independent, are too small by a factor of up to "
-        f"{_one(issue, 'narrowing'):.2g}."
+        f"{_get(issue, 'narrowing'):.2g}."
     )
 
 
-def _not_normal(issue: Issue) -> str:
-    each = zip(_each(issue, "kurtosis"), _each(issue, "outliers"), strict=False)
+def _describe_non_normality(issue: Issue) -> str:
+    each = zip(_pair_figures(issue, "kurtosis"), _pair_figures(issue, "outliers"), strict=False)
     where = [f"{label} (kurtosis {kurtosis:.1f}, {count:.0f} beyond 4 sigma)" for (label, kurtosis), (_, count) in each]
     return (
-        f"The residuals are not normal in {_shortened(where)}. Look for outliers; intervals from a bootstrap do not "
+        f"The residuals are not normal in {_shorten_list(where)}. Look for outliers; intervals from a bootstrap do not "
         "take them as normal."
     )
 
 
-def _second_order(issue: Issue) -> str:
+def _describe_second_order(issue: Issue) -> str:
     return (
-        f"To first order the fitted values hardly depend on {_subjects(issue)}: its standard errors from the exact "
-        f"Hessian and from the Gauss-Newton matrix are {_both_errors(issue)}. What is known of it is known to second "
+        f"To first order the fitted values hardly depend on {_join(issue)}: its standard errors from the exact "
+        f"Hessian and from the Gauss-Newton matrix are {_format_errors(issue)}. What is known of it is known to second "
         "order: trust its profile likelihood more than either."
     )
 
 
-def _covariances_differ(issue: Issue) -> str:
+def _describe_covariances(issue: Issue) -> str:
     return (
         "Standard errors from the exact Hessian and from the Gauss-Newton matrix differ by up to a factor "
-        f"{_one(issue, 'factor'):.3g} (of {_subjects(issue)}: {_both_errors(issue)}): within its noise the model is "
+        f"{_get(issue, 'factor'):.3g} (of {_join(issue)}: {_format_errors(issue)}): within its noise the model is "
         "not linear in its unknowns. Trust profile likelihoods more than either."
     )
 
 
-def _both_errors(issue: Issue) -> str:
-    return f"{_one(issue, 'exact'):.2g} and {_one(issue, 'Gauss-Newton'):.2g}"
+def _format_errors(issue: Issue) -> str:
+    return f"{_get(issue, 'exact'):.2g} and {_get(issue, 'Gauss-Newton'):.2g}"
 
 
-def _wrong_slope(issue: Issue) -> str:
-    each = zip(_each(issue, "derivatives"), _each(issue, "differences"), strict=False)
+def _describe_wrong_slope(issue: Issue) -> str:
+    each = zip(_pair_figures(issue, "derivatives"), _pair_figures(issue, "differences"), strict=False)
     entries = [f"{name} (derivative {stated:.3g}, differences {found:.3g})" for (name, stated), (_, found) in each]
     wrong = f"; it is wrong in {', '.join(entries)}" if entries else ""
     return (
-        f"The gradient does not belong to the cost: along that direction it says {_one(issue, 'before'):.3g}, "
-        f"differences of the cost say {_one(issue, 'after'):.3g}{wrong}. Check the derivatives."
+        f"The gradient does not belong to the cost: along that direction it says {_get(issue, 'before'):.3g}, "
+        f"differences of the cost say {_get(issue, 'after'):.3g}{wrong}. Check the derivatives."
     )
 
 
-def _jump(issue: Issue) -> str:
-    places = _each(issue, "at")
+def _describe_jump(issue: Issue) -> str:
+    places = _pair_figures(issue, "at")
     if len(places) == 1:
         where = f"{places[0][0]} passes {places[0][1]:.8g}"
     else:
         where = "the step passes " + ", ".join(f"{name} = {value:.8g}" for name, value in places)
     return (
-        f"The cost jumps from {_one(issue, 'before'):.8g} to {_one(issue, 'after'):.8g} where {where}. The optimiser "
+        f"The cost jumps from {_get(issue, 'before'):.8g} to {_get(issue, 'after'):.8g} where {where}. The optimiser "
         "needs a cost that is continuous there."
     )
 
 
-def _near_kink(issue: Issue) -> str:
-    where = ", ".join(f"{name} = {value:.8g}" for name, value in _each(issue, "at"))
+def _describe_near_kink(issue: Issue) -> str:
+    where = ", ".join(f"{name} = {value:.8g}" for name, value in _pair_figures(issue, "at"))
     return (
         f"The derivatives are right, but there is a kink close by, near {where}: along that direction the slope jumps "
-        f"from {_one(issue, 'before'):.3g} to {_one(issue, 'after'):.3g}. Start elsewhere, or fix what is at the kink "
+        f"from {_get(issue, 'before'):.3g} to {_get(issue, 'after'):.3g}. Start elsewhere, or fix what is at the kink "
         "there."
     )
 
 
-def _with_delay(sentence: Callable[[Issue], str]) -> Callable[[Issue], str]:
+def _add_delay_hint(sentence: Callable[[Issue], str]) -> Callable[[Issue], str]:
     """The reason why a line search failed, and what an estimated delay may have to do with it."""
 
     def write(issue: Issue) -> str:
@@ -287,7 +287,7 @@ def _with_delay(sentence: Callable[[Issue], str]) -> Callable[[Issue], str]:
             " A delay is estimated here: J has a kink where a transition meets the moment of which a late sample is, "
             "and the fit may have ended at one. Fix the delay at its estimate to see."
         )
-        return sentence(issue) + (hint if _one(issue, "delayed") == 1.0 else "")
+        return sentence(issue) + (hint if _get(issue, "delayed") == 1.0 else "")
 
     return write
 
@@ -295,96 +295,97 @@ def _with_delay(sentence: Callable[[Issue], str]) -> Callable[[Issue], str]:
 _ISSUES: dict[str, Callable[[Issue], str]] = {
     # Before the numbers are believed
     "mode collapsed": lambda issue: (
-        f"{_held_mode(issue)} has collapsed to nothing: the data want no such mode there. Leave it out of "
+        f"{_name_held_mode(issue)} has collapsed to nothing: the data want no such mode there. Leave it out of "
         "mode_sequence, start from another guess, or give min_duration."
     ),
     "minimum duration": lambda issue: (
-        f"{_held_mode(issue)} is at its minimum duration: the data would have it shorter. Lower min_duration, or leave "
-        "the mode out."
+        f"{_name_held_mode(issue)} is at its minimum duration: the data would have it shorter. Lower min_duration, or "
+        "leave the mode out."
     ),
-    "lower bound": _held_by_bound,
-    "upper bound": _held_by_bound,
+    "lower bound": _describe_held_by_bound,
+    "upper bound": _describe_held_by_bound,
     "idle times": lambda issue: (
         "Where the collapsed mode would stand does not matter, since the same mode is active before and after it: "
-        f"{_subjects(issue)} may lie anywhere in between, and the numbers above say no more than that."
+        f"{_join(issue)} may lie anywhere in between, and the numbers above say no more than that."
     ),
     "idle parameters": lambda issue: (
-        f"{_subjects(issue)}: acts only in modes that have collapsed. The data say nothing about it, and its value "
+        f"{_join(issue)}: acts only in modes that have collapsed. The data say nothing about it, and its value "
         "above is where the fit left it, not an estimate."
     ),
     "at a kink": lambda issue: (
-        f"{_subjects(issue)} is at a kink of the cost, where its derivative jumps from {_one(issue, 'left'):.1e} to "
-        f"{_one(issue, 'right'):.1e}; a transition time that meets a sample is one. It has no standard error, and "
+        f"{_join(issue)} is at a kink of the cost, where its derivative jumps from {_get(issue, 'left'):.1e} to "
+        f"{_get(issue, 'right'):.1e}; a transition time that meets a sample is one. It has no standard error, and "
         "those of the others take it as known."
     ),
-    "hardly determined": _hardly_determined,
+    "hardly determined": _describe_hardly_determined,
     "no errors: not finite": lambda issue: "No standard errors: the cost or its derivatives are not finite.",
     "no errors: no noise model": lambda issue: (
         "No standard errors: the cost has no noise model. They need a cost that is made of Measurements alone, with "
         "sigma or without."
     ),
     "no errors: too few samples": lambda issue: (
-        f"No standard errors: sigma is unknown and {_one(issue, 'samples'):.0f} values are too few to estimate it "
-        f"beside {_one(issue, 'unknowns'):.0f} unknowns."
+        f"No standard errors: sigma is unknown and {_get(issue, 'samples'):.0f} values are too few to estimate it "
+        f"beside {_get(issue, 'unknowns'):.0f} unknowns."
     ),
     "no errors: not positive definite": lambda issue: (
         "No standard errors: the Hessian is not positive definite (smallest eigenvalue "
-        f"{_one(issue, 'eigenvalue'):.1e}, scaled to unit curvature)."
+        f"{_get(issue, 'eigenvalue'):.1e}, scaled to unit curvature)."
     ),
-    "sigma too small": _wrong_sigma,
-    "sigma too large": _wrong_sigma,
-    "correlated residuals": _correlated,
-    "residuals not normal": _not_normal,
-    "known to second order": _second_order,
-    "covariances differ": _covariances_differ,
+    "sigma too small": _describe_wrong_sigma,
+    "sigma too large": _describe_wrong_sigma,
+    "correlated residuals": _describe_correlation,
+    "residuals not normal": _describe_non_normality,
+    "known to second order": _describe_second_order,
+    "covariances differ": _describe_covariances,
     "large integration error": lambda issue: (
-        f"The integration error of {_subjects(issue)} is {_one(issue, 'error'):.1e}, relative: the numbers have fewer "
+        f"The integration error of {_join(issue)} is {_get(issue, 'error'):.1e}, relative: the numbers have fewer "
         "digits than it seems. Give the Problem a smaller rtol, or solver='stiff' if a mode is stiff."
     ),
     # Failures of a certificate
     "optimality": lambda issue: (
-        f"the KKT residual {_one(issue, 'optimality'):.1e} is above the tolerance {_one(issue, 'tolerance'):.1e}"
+        f"the KKT residual {_get(issue, 'optimality'):.1e} is above the tolerance {_get(issue, 'tolerance'):.1e}"
     ),
     "negative curvature": lambda issue: (
-        f"the Hessian has a negative eigenvalue on the free directions ({_one(issue, 'eigenvalue'):.1e}, scaled)"
+        f"the Hessian has a negative eigenvalue on the free directions ({_get(issue, 'eigenvalue'):.1e}, scaled)"
     ),
     "integration error": lambda issue: (
-        f"the integration error of {_subjects(issue)} is {_one(issue, 'error'):.1e}, relative"
+        f"the integration error of {_join(issue)} is {_get(issue, 'error'):.1e}, relative"
     ),
     "derivative gap": lambda issue: (
-        f"the paper's equations differ from the derivatives of J by {_one(issue, 'gap'):.1e}, relative"
+        f"the paper's equations differ from the derivatives of J by {_get(issue, 'gap'):.1e}, relative"
     ),
     "Taylor orders": lambda issue: (
-        f"the Taylor orders are {_orders(issue)} instead of (any), 2, 3 or more: gradient or Hessian do not belong to J"
+        f"the Taylor orders are {_format_orders(issue)} instead of (any), 2, 3 or more: gradient or Hessian do not "
+        "belong to J"
     ),
     # Why a line search failed, or a fit ended with an error
-    "wrong slope": _with_delay(_wrong_slope),
-    "jump": _with_delay(_jump),
-    "kink": _with_delay(_near_kink),
-    "rounding": _with_delay(
+    "wrong slope": _add_delay_hint(_describe_wrong_slope),
+    "jump": _add_delay_hint(_describe_jump),
+    "kink": _add_delay_hint(_describe_near_kink),
+    "rounding": _add_delay_hint(
         lambda issue: (
             "The derivatives are right, but what the cost can still fall along that direction is less than its "
-            f"rounding error, {_one(issue, 'noise'):.1e}. Scale the unknowns to be of size one, or ask for a larger "
+            f"rounding error, {_get(issue, 'noise'):.1e}. Scale the unknowns to be of size one, or ask for a larger "
             "tolerance."
         )
     ),
-    "valley": _with_delay(
+    "valley": _add_delay_hint(
         lambda issue: (
             "The derivatives are right, but the cost has a narrow valley there (condition number of the scaled Hessian "
-            f"{_one(issue, 'condition'):.1e}). Start elsewhere, fix one of the unknowns that trade off, or take "
+            f"{_get(issue, 'condition'):.1e}). Start elsewhere, fix one of the unknowns that trade off, or take "
             "hessian='gauss-newton'."
         )
     ),
-    "error": _subjects,
+    "error": _join,
     # What a file of an earlier version holds as a sentence
-    "message": _subjects,
+    "message": _join,
 }
 
 
-def _orders(issue: Issue) -> str:
+def _format_orders(issue: Issue) -> str:
     orders = issue.figures.get("orders", ())
     return ", ".join(f"{order:.2f}" for order in (orders if isinstance(orders, tuple) else (orders,)))
 
 
-def _capitalised(text: str) -> str:
+def _capitalise(text: str) -> str:
     return text[:1].upper() + text[1:]

@@ -12,12 +12,12 @@ from switchfit.fit.result import Fit, disagreement
 from switchfit.fit.trajectory import Comparison
 from switchfit.optimize import Status
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report.numbers import rounded, shown_unit, unit_of
+from switchfit.report.numbers import format_rounded, format_unit, get_unit
 from switchfit.report.tables import format_table
 from switchfit.report.uncertainty import write_direction
-from switchfit.runtime.presentation import text_of
+from switchfit.runtime.presentation import format_text
 from switchfit.uncertainty.certificate import Certificate, certify
-from switchfit.uncertainty.identification import WEAK, Identifiability, after
+from switchfit.uncertainty.identification import WEAK, Identifiability, analyse_solution
 from switchfit.uncertainty.issues import DIFFERENT, find_issues
 
 WIDTH = 100
@@ -53,25 +53,27 @@ def report(fit: Fit, certificate: Certificate | None = None, found: Identifiabil
         Several lines without a newline at the end.
     """
     sections = [
-        _failure(fit, certify(fit, None) if certificate is None else certificate),
-        _section("Fit", [*_experiments(fit), *_course(fit)]),
-        _section("Quality of the fit", [*_quality(fit), *_channels(fit)]),
-        _section("Unknowns", _unknowns(fit)),
-        _section("Held fixed", _fixed(fit)),
-        _section(f"Correlations above {SMALL_CORRELATION:g}", _correlations(fit)),
-        _section("Determined worst by the data", _weak(fit, after(fit, None) if found is None else found)),
-        _section("Warnings", [line for issue in find_issues(fit) for line in _wrapped(str(issue), "  - ", "    ")]),
+        _format_failure(fit, certify(fit, None) if certificate is None else certificate),
+        _format_section("Fit", [*_format_experiments(fit), *_format_course(fit)]),
+        _format_section("Quality of the fit", [*_format_quality(fit), *_format_channels(fit)]),
+        _format_section("Unknowns", _format_unknowns(fit)),
+        _format_section("Held fixed", _format_fixed(fit)),
+        _format_section(f"Correlations above {SMALL_CORRELATION:g}", _format_correlations(fit)),
+        _format_section(
+            "Determined worst by the data", _describe_weak(fit, analyse_solution(fit, None) if found is None else found)
+        ),
+        _format_section("Warnings", [line for issue in find_issues(fit) for line in _wrap(str(issue), "  - ", "    ")]),
     ]
     return "\n\n".join("\n".join(section) for section in sections if section)
 
 
-@text_of.register(Fit)
+@format_text.register(Fit)
 def write_fit(fit: Fit) -> str:
     """The report of a fit, with what can be checked without its model."""
     return report(fit)
 
 
-@text_of.register(Estimate)
+@format_text.register(Estimate)
 def write_estimate(estimate: Estimate) -> str:
     """The report of an estimate, with its certificate if that is known already, and J evaluated where it is weak."""
     return report(estimate, estimate.known_certificate, estimate.identifiability)
@@ -80,13 +82,13 @@ def write_estimate(estimate: Estimate) -> str:
 # --- sections ---------------------------------------------------------------------------------------------------------
 
 
-def _failure(fit: Fit, certificate: Certificate) -> list[str]:
+def _format_failure(fit: Fit, certificate: Certificate) -> list[str]:
     """Lines in capitals, unless a minimum was found, it is the only one nearby, and nothing that was checked failed."""
     if not fit.status.is_strict_minimum:
         return [f"*** {_FAILURES.get(fit.status, 'NOT CONVERGED: the numbers below are not a minimum')}. ***"]
     if certificate.passed:
         return []
-    return _wrapped(f"*** CERTIFICATE FAILED: {'; '.join(map(str, certificate.failures))}. ***", "", "    ")
+    return _wrap(f"*** CERTIFICATE FAILED: {'; '.join(map(str, certificate.failures))}. ***", "", "    ")
 
 
 _FAILURES = {
@@ -101,23 +103,23 @@ _FAILURES = {
 }
 
 
-def _experiments(fit: Fit) -> Iterator[str]:
+def _format_experiments(fit: Fit) -> Iterator[str]:
     """For each experiment its modes, its horizon and its data."""
     single = len(fit.trajectories) == 1
     names = ["experiment"] if single else fit.run_names
     for name, trajectory, run in list(zip(names, fit.trajectories, fit.comparisons, strict=True))[:LISTED_EXPERIMENTS]:
         sequence = " -> ".join(mode for mode, _, _ in trajectory.mode_spans)
         horizon = f"{trajectory.times[0]:.6g} to {trajectory.times[-1]:.6g}{unit_suffix(trajectory.time_unit)}"
-        yield from _row(name, f"{sequence}, {horizon}")
+        yield from _format_row(name, f"{sequence}, {horizon}")
         for comparison in run:
-            yield from _row("", _data(comparison))
+            yield from _format_row("", _format_data(comparison))
         if not run:
-            yield from _row("", "no data: a cost of the trajectory")
+            yield from _format_row("", "no data: a cost of the trajectory")
     if len(names) > LISTED_EXPERIMENTS:
-        yield from _row("", f"and {len(names) - LISTED_EXPERIMENTS} more experiments")
+        yield from _format_row("", f"and {len(names) - LISTED_EXPERIMENTS} more experiments")
 
 
-def _data(comparison: Comparison) -> str:
+def _format_data(comparison: Comparison) -> str:
     """One of the data in words."""
     names = ", ".join(comparison.names)
     if comparison.kind != "measurements":
@@ -129,46 +131,48 @@ def _data(comparison: Comparison) -> str:
     return f"{names}: {_count(len(comparison.times), 'sample')}{note}"
 
 
-def _course(fit: Fit) -> Iterator[str]:
+def _format_course(fit: Fit) -> Iterator[str]:
     """Method, effort, and how it ended."""
-    yield from _row("method", METHODS.get(fit.hessian_kind, fit.hessian_kind))
+    yield from _format_row("method", METHODS.get(fit.hessian_kind, fit.hessian_kind))
     effort = f"{_count(fit.iterations, 'iteration')}, {_count(fit.evaluations, 'evaluation')}, {fit.seconds:.3g} s"
-    yield from _row("effort", effort)
+    yield from _format_row("effort", effort)
     if fit.engine is not None:
-        yield from _row("", str(fit.engine))
-    yield from _row("status", fit.message)
+        yield from _format_row("", str(fit.engine))
+    yield from _format_row("status", fit.message)
 
 
-def _quality(fit: Fit) -> Iterator[str]:
+def _format_quality(fit: Fit) -> Iterator[str]:
     """Cost, optimality, residual variance, integration error."""
     start = f"   (first guess: {fit.history[0].cost:.8g})" if fit.history else ""
-    yield from _row("cost J", f"{fit.cost:.8g}{start}")
-    yield from _row("KKT residual", f"{fit.optimality:.1e}   (tolerance: {fit.tolerance:.1e})")
+    yield from _format_row("cost J", f"{fit.cost:.8g}{start}")
+    yield from _format_row("KKT residual", f"{fit.optimality:.1e}   (tolerance: {fit.tolerance:.1e})")
     for name, value, multiplier in fit.constraints:
-        yield from _row(name, f"{value:.1e}   (multiplier {multiplier:.6g})")
+        yield from _format_row(name, f"{value:.1e}   (multiplier {multiplier:.6g})")
     variance, unknowns = fit.residual_variance, _count(fit.free_basis.shape[1], "free unknown")
     if np.isfinite(variance):
         priors = f" + {_count(len(fit.priors), 'prior')}" if fit.priors else ""
         origin = f"2 J / ({fit.samples} values{priors} - {unknowns})"
         if fit.sigma_known:
-            yield from _row("reduced chi-square", f"{variance:.4g}   ({origin}; near 1 where sigma is right)")
+            yield from _format_row("reduced chi-square", f"{variance:.4g}   ({origin}; near 1 where sigma is right)")
         else:
             noise = f"so sigma is about {np.sqrt(variance):.4g}"
-            yield from _row("residual variance", f"{variance:.4g}   ({origin}, {noise})")
+            yield from _format_row("residual variance", f"{variance:.4g}   ({origin}, {noise})")
     of = fit.integration_error_of
-    yield from _row("integration error", f"{fit.integration_error:.1e}   (of {of}, relative, by halving all steps)")
+    yield from _format_row(
+        "integration error", f"{fit.integration_error:.1e}   (of {of}, relative, by halving all steps)"
+    )
 
 
-def _channels(fit: Fit) -> list[str]:
+def _format_channels(fit: Fit) -> list[str]:
     """A table of the channels: root mean square of the residuals, in units and in sigmas."""
     single = len(fit.trajectories) == 1
     rows = []
     for name, trajectory, run in zip(fit.run_names, fit.trajectories, fit.comparisons, strict=True):
         for comparison in run:
             for k, channel in enumerate(comparison.names):
-                count, rmse, scaled = _residuals(comparison, k)
+                count, rmse, scaled = _format_residuals(comparison, k)
                 label = channel if single else f"{name} {channel}"
-                rows.append([label, count, rmse, unit_of(channel, trajectory), scaled])
+                rows.append([label, count, rmse, get_unit(channel, trajectory), scaled])
     if not rows:
         return []
     most = 4 * LISTED_EXPERIMENTS
@@ -177,7 +181,7 @@ def _channels(fit: Fit) -> list[str]:
     return ["", *table] + ([f"  and {len(rows) - most} more channels"] if len(rows) > most else [])
 
 
-def _residuals(comparison: Comparison, k: int) -> tuple[str, str, str]:
+def _format_residuals(comparison: Comparison, k: int) -> tuple[str, str, str]:
     """Number of values, rmse and rmse / sigma of one channel; blank where there are none."""
     residual = comparison.measured[:, k] - comparison.fitted[:, k]
     there = np.isfinite(residual)
@@ -189,25 +193,27 @@ def _residuals(comparison: Comparison, k: int) -> tuple[str, str, str]:
     return count, f"{rmse:.4g}", "" if isinstance(scaled, str) else f"{np.sqrt(np.mean(scaled**2)):.3g}"
 
 
-def _unknowns(fit: Fit) -> list[str]:
+def _format_unknowns(fit: Fit) -> list[str]:
     """The table of the unknowns."""
     errors = fit.standard_errors
     known = bool(np.isfinite(errors).any())
     joins = {t.index: f"{t.before} -> {t.after}" for t in fit.transitions}
     rows = [["", "value", "std. error", "", "", "first guess", ""]]
     for i, name in enumerate(fit.theta_names):
-        value, error, relative = rounded(fit.theta[i], np.nan if name in fit.idle else errors[i])
+        value, error, relative = format_rounded(fit.theta[i], np.nan if name in fit.idle else errors[i])
         prior = f"prior: {fit.priors[name]}" if name in fit.priors else ""
-        notes = [joins.get(i, ""), prior, _on_log_scale(fit, i), _mark(fit, name)]
+        notes = [joins.get(i, ""), prior, _format_log_scale(fit, i), _mark_unknown(fit, name)]
         note = ", ".join(note for note in notes if note)
-        rows.append([name, value, error, relative, shown_unit(fit.theta_units[i]), f"{fit.initial_theta[i]:.6g}", note])
+        rows.append(
+            [name, value, error, relative, format_unit(fit.theta_units[i]), f"{fit.initial_theta[i]:.6g}", note]
+        )
     if not known:
         rows = [row[:2] + row[4:] for row in rows]
         return format_table(rows, "<><><")
-    return [*format_table(rows, "<><><><"), "", f"  Standard errors from the exact Hessian{_beside(fit)}."]
+    return [*format_table(rows, "<><><><"), "", f"  Standard errors from the exact Hessian{_compare_covariances(fit)}."]
 
 
-def _beside(fit: Fit) -> str:
+def _compare_covariances(fit: Fit) -> str:
     """How the other covariance compares."""
     found = disagreement(fit)
     if found is None:
@@ -215,7 +221,7 @@ def _beside(fit: Fit) -> str:
     return f"; Gauss-Newton's are within {100 * (found.factor - 1):.2g} % of them" if found.factor < DIFFERENT else ""
 
 
-def _on_log_scale(fit: Fit, i: int) -> str:
+def _format_log_scale(fit: Fit, i: int) -> str:
     """The interval of an unknown on a logarithmic scale, which its standard error does not say."""
     if fit.theta_names[i] not in fit.log_scaled:
         return ""
@@ -223,7 +229,7 @@ def _on_log_scale(fit: Fit, i: int) -> str:
     return f"95 % in [{low:.4g}, {high:.4g}]" if low < high else ""
 
 
-def _mark(fit: Fit, name: str) -> str:
+def _mark_unknown(fit: Fit, name: str) -> str:
     """What holds an unknown, in capitals."""
     if name in fit.idle:
         return "MODE COLLAPSED"
@@ -233,17 +239,17 @@ def _mark(fit: Fit, name: str) -> str:
     return "AT A KINK" if name in [kink.unknown for kink in fit.kinks] else ""
 
 
-def _fixed(fit: Fit) -> list[str]:
+def _format_fixed(fit: Fit) -> list[str]:
     """Transition times and parameters that were not estimated."""
     fixed = [t for t in fit.transitions if t.index is None]
-    rows = [[t.name, f"{t.time:.8g}", shown_unit(t.unit), f"{t.before} -> {t.after}"] for t in fixed]
+    rows = [[t.name, f"{t.time:.8g}", format_unit(t.unit), f"{t.before} -> {t.after}"] for t in fixed]
     for name in fit.fixed:
         text = np.array2string(fit.parameters[name], precision=8, threshold=6, edgeitems=2, separator=", ")
-        rows.append([name, " ".join(text.split()), shown_unit(fit.parameter_units[name]), ""])
+        rows.append([name, " ".join(text.split()), format_unit(fit.parameter_units[name]), ""])
     return format_table(rows, "<<<<")
 
 
-def _correlations(fit: Fit) -> list[str]:
+def _format_correlations(fit: Fit) -> list[str]:
     """The largest correlations."""
     if not np.isfinite(fit.standard_errors).any():
         return []
@@ -256,27 +262,27 @@ def _correlations(fit: Fit) -> list[str]:
     return format_table(rows, "<>") + ([f"  and {more} more"] if more > 0 else [])
 
 
-def _weak(fit: Fit, found: Identifiability) -> list[str]:
+def _describe_weak(fit: Fit, found: Identifiability) -> list[str]:
     """The combinations of unknowns that the data hardly see, if there are any."""
     weak = [d for d in found.directions if d.eigenvalue < WEAK] if fit.success else []
-    return [line for direction in weak for line in _wrapped(write_direction(found, direction), "  - ", "    ")]
+    return [line for direction in weak for line in _wrap(write_direction(found, direction), "  - ", "    ")]
 
 
 # --- layout -----------------------------------------------------------------------------------------------------------
 
 
-def _section(title: str, lines: Sequence[str]) -> list[str]:
+def _format_section(title: str, lines: Sequence[str]) -> list[str]:
     return [title, *lines] if lines else []
 
 
-def _row(label: str, text: str) -> list[str]:
+def _format_row(label: str, text: str) -> list[str]:
     """A label at the left and text, wrapped, beside it."""
     if len(label) > LABEL:
-        return [f"  {label}", *_wrapped(text, " " * (LABEL + 4), " " * (LABEL + 4))]
-    return _wrapped(text, f"  {label:<{LABEL}}  ", " " * (LABEL + 4))
+        return [f"  {label}", *_wrap(text, " " * (LABEL + 4), " " * (LABEL + 4))]
+    return _wrap(text, f"  {label:<{LABEL}}  ", " " * (LABEL + 4))
 
 
-def _wrapped(text: str, first: str, others: str) -> list[str]:
+def _wrap(text: str, first: str, others: str) -> list[str]:
     return textwrap.wrap(
         text, WIDTH, initial_indent=first, subsequent_indent=others, break_long_words=False, break_on_hyphens=False
     )

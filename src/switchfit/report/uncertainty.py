@@ -9,10 +9,10 @@ import numpy as np
 import scipy.special
 
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report.numbers import rounded, time_label
+from switchfit.report.numbers import format_rounded, label_time
 from switchfit.report.sentences import join_words
 from switchfit.report.tables import format_table
-from switchfit.runtime.presentation import figure_of, text_of
+from switchfit.runtime.presentation import draw_figure, format_text
 from switchfit.uncertainty.certificate import Certificate
 from switchfit.uncertainty.derivative_check import DerivativeCheck
 from switchfit.uncertainty.identification import Direction, Identifiability
@@ -34,7 +34,7 @@ LARGEST_FIGURE = 10
 # --- certificate ------------------------------------------------------------------------------------------------------
 
 
-@text_of.register(Certificate)
+@format_text.register(Certificate)
 def write_certificate(certificate: Certificate) -> str:
     """Every check with its number, and the verdict.
 
@@ -52,20 +52,20 @@ def write_certificate(certificate: Certificate) -> str:
         ("  condition number of that", f"{certificate.condition_number:.3g}"),
         ("  worst-determined direction", certificate.worst_direction),
         ("largest integration error, relative", error),
-        ("paper's gradient against discretised, relative", _gap(certificate.gradient_gap)),
-        ("paper's Hessian against discretised, relative", _gap(certificate.hessian_gap)),
-        ("Taylor orders of J, with gradient, with Hessian", _orders(certificate.taylor_orders)),
+        ("paper's gradient against discretised, relative", _format_gap(certificate.gradient_gap)),
+        ("paper's Hessian against discretised, relative", _format_gap(certificate.hessian_gap)),
+        ("Taylor orders of J, with gradient, with Hessian", _format_orders(certificate.taylor_orders)),
         ("active constraints", held or "none"),
         ("verdict", f"FAILED: {failures}" if failures else "passed"),
     ]
     return "\n".join(format_table(rows, "<<", indent=""))
 
 
-def _gap(gap: float) -> str:
+def _format_gap(gap: float) -> str:
     return "not checked" if np.isnan(gap) else f"{gap:.1e}"
 
 
-def _orders(orders: tuple[float, ...]) -> str:
+def _format_orders(orders: tuple[float, ...]) -> str:
     if np.isnan(orders).all():
         return "not checked"
     return ", ".join("rounding" if np.isnan(order) else f"{order:.2f}" for order in orders)
@@ -74,7 +74,7 @@ def _orders(orders: tuple[float, ...]) -> str:
 # --- derivatives ------------------------------------------------------------------------------------------------------
 
 
-@text_of.register(DerivativeCheck)
+@format_text.register(DerivativeCheck)
 def write_derivative_check(check: DerivativeCheck) -> str:
     """The Taylor table, the gaps between the methods, and the verdict.
 
@@ -84,7 +84,7 @@ def write_derivative_check(check: DerivativeCheck) -> str:
     """
     rows = [["h", "J", "order", "+ gradient", "order", "+ Hessian", "order"]]
     for k, (h, remainders) in enumerate(zip(check.steps, check.remainders, strict=True)):
-        orders = [""] * 3 if k == 0 else [_order(order) for order in check.orders[k - 1]]
+        orders = [""] * 3 if k == 0 else [_format_order(order) for order in check.orders[k - 1]]
         cells = [text for r, order in zip(remainders, orders, strict=True) for text in (f"{r:.2e}", order)]
         rows.append([f"{h:.1e}", *cells])
     verdict = "passed" if check.passed else "FAILED: the derivatives do not belong to the cost"
@@ -95,14 +95,14 @@ def write_derivative_check(check: DerivativeCheck) -> str:
         *format_table(rows, ">" * 7),
         "",
         "Paper's equations (6)-(17) against the derivatives of the discretised cost, relative:",
-        f"  gradient {_gap(check.gradient_gap)}, with half the steps {_gap(check.gradient_gap_halved)}",
-        f"  Hessian  {_gap(check.hessian_gap)}, with half the steps {_gap(check.hessian_gap_halved)}",
+        f"  gradient {_format_gap(check.gradient_gap)}, with half the steps {_format_gap(check.gradient_gap_halved)}",
+        f"  Hessian  {_format_gap(check.hessian_gap)}, with half the steps {_format_gap(check.hessian_gap_halved)}",
         f"Observed orders {observed} (1, 2, 3 expected): {verdict}.",
     ]
     return "\n".join(lines)
 
 
-def _order(order: float) -> str:
+def _format_order(order: float) -> str:
     return "-" if np.isnan(order) else f"{order:.2f}"
 
 
@@ -116,7 +116,7 @@ _RISES = {
 }
 
 
-@text_of.register(Identifiability)
+@format_text.register(Identifiability)
 def write_identifiability(found: Identifiability) -> str:
     """How many unknowns the data determine, and the combinations that they determine badly.
 
@@ -164,20 +164,24 @@ def write_direction(found: Identifiability, direction: Direction) -> str:
     # A change that is described as its opposite where only that side is allowed.
     side = -1.0 if np.isnan(direction.rises[0]) and np.isfinite(direction.rises[1]) else 1.0
     places = [found.theta_names.index(name) for name in direction.names]
-    moves = join_words([_move(found, i, side * float(direction.change[i])) for i in places])
+    moves = join_words([_format_move(found, i, side * float(direction.change[i])) for i in places])
     rise = _RISES[found.meaning].format(f"{found.rise:.2g}") if found.rise > 0 else ""
-    seen = _rises(direction, rise, found.cost) if found.tried else f", or the opposite, should raise J little; {rise}."
+    seen = (
+        _format_rises(direction, rise, found.cost)
+        if found.tried
+        else f", or the opposite, should raise J little; {rise}."
+    )
     return f"{direction.summary} (scaled eigenvalue {direction.eigenvalue:.2g}): {moves}{seen}"
 
 
-def _move(found: Identifiability, i: int, change: float) -> str:
+def _format_move(found: Identifiability, i: int, change: float) -> str:
     """A change in words: later or earlier for a transition time, higher or lower for anything else."""
     up, down = ("later", "earlier") if found.is_time[i] else ("higher", "lower")
     size = f"{abs(change):.2g}{unit_suffix(found.theta_units[i])}"
     return f"{found.theta_names[i]} {size} {up if change > 0 else down}"
 
 
-def _rises(direction: Direction, rise: str, cost: float) -> str:
+def _format_rises(direction: Direction, rise: str, cost: float) -> str:
     """What was found on both sides of a change, the end of a sentence."""
     finite = [r for r in direction.rises if np.isfinite(r)]
     if not finite:
@@ -192,7 +196,7 @@ def _rises(direction: Direction, rise: str, cost: float) -> str:
 # --- residuals --------------------------------------------------------------------------------------------------------
 
 
-@text_of.register(ResidualDiagnostics)
+@format_text.register(ResidualDiagnostics)
 def write_diagnostics(diagnostics: ResidualDiagnostics) -> str:
     """A line for each channel, and what fails.
 
@@ -212,8 +216,8 @@ def write_diagnostics(diagnostics: ResidualDiagnostics) -> str:
                 f"{channel.mean:+.2f}",
                 f"{channel.correlation:+.2f}",
                 f"{channel.effective:.0f}",
-                _probability(channel.whiteness),
-                _probability(channel.normality),
+                _format_probability(channel.whiteness),
+                _format_probability(channel.normality),
                 f"{channel.outliers}",
             ]
         )
@@ -221,14 +225,14 @@ def write_diagnostics(diagnostics: ResidualDiagnostics) -> str:
     return "\n".join([*lines, *(f"  - {issue}" for issue in diagnostics.issues)])
 
 
-def _probability(value: float) -> str:
+def _format_probability(value: float) -> str:
     return "-" if np.isnan(value) else f"{value:.3f}" if value >= 5e-4 else f"{value:.0e}"
 
 
 # --- profiles ---------------------------------------------------------------------------------------------------------
 
 
-@text_of.register(Profile)
+@format_text.register(Profile)
 def write_profile(profile: Profile) -> str:
     """The estimate, both intervals, how each side ended, and what to be wary of.
 
@@ -237,7 +241,7 @@ def write_profile(profile: Profile) -> str:
     profile : Profile
     """
     unit = unit_suffix(profile.unit)
-    value, error, _ = rounded(profile.value, profile.standard_error)
+    value, error, _ = format_rounded(profile.value, profile.standard_error)
     percent = f"{100 * profile.level:.3g} %"
     low, high = profile.interval()
     digits = max(profile.standard_error, 0.0) if np.isfinite(profile.standard_error) else 0.0
@@ -249,28 +253,29 @@ def write_profile(profile: Profile) -> str:
     )
     quadratic = profile.fit.confidence_intervals(profile.level)[profile.fit.theta_names.index(profile.name)]
     shown = (
-        f"[{_number(quadratic[0], digits)}, {_number(quadratic[1], digits)}]{unit}"
+        f"[{_format_number(quadratic[0], digits)}, {_format_number(quadratic[1], digits)}]{unit}"
         if np.isfinite(quadratic).all()
         else "none"
     )
+    ends = [_format_number(end, digits) for end in (low, high)]
     lines = [
         f"Profile of {profile.name}",
         f"  estimate              {value} {error}{unit}".rstrip(),
-        f"  {percent:<4} interval         [{_number(low, digits)}, {_number(high, digits)}]{unit}   ({by})",
+        f"  {percent:<4} interval         [{ends[0]}, {ends[1]}]{unit}   ({by})",
         f"  quadratic             {shown}",
         f"  points, fits          {len(profile.values)}, {profile.trace.fits}",
     ]
-    return "\n".join([*lines, *(f"  - {note}" for note in profile_notes(profile))])
+    return "\n".join([*lines, *(f"  - {note}" for note in list_profile_notes(profile))])
 
 
-def _number(value: float, error: float) -> str:
+def _format_number(value: float, error: float) -> str:
     """A number to the second digit of an error."""
     if not np.isfinite(value):
         return {np.inf: "inf", -np.inf: "-inf"}.get(value, "?")
-    return rounded(value, error)[0] if error > 0 else f"{value:.6g}"
+    return format_rounded(value, error)[0] if error > 0 else f"{value:.6g}"
 
 
-def profile_notes(profile: Profile) -> list[str]:
+def list_profile_notes(profile: Profile) -> list[str]:
     """What is not as in the textbook, a sentence each.
 
     Parameters
@@ -313,7 +318,7 @@ def profile_notes(profile: Profile) -> list[str]:
     return notes
 
 
-@figure_of.register(Profile)
+@draw_figure.register(Profile)
 def plot_profile(profile: Profile) -> Figure:
     """A figure of one profile.
 
@@ -391,7 +396,7 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     return ax
 
 
-@figure_of.register(ResidualDiagnostics)
+@draw_figure.register(ResidualDiagnostics)
 def plot_diagnostics(diagnostics: ResidualDiagnostics) -> Figure:
     """A row a channel: residuals in time, their autocorrelation, and their quantiles against those of a normal one.
 
@@ -418,7 +423,7 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics) -> Figure:
     for k, ax in enumerate(axes[:, 0]):  # below all rows, or wherever the next row has times in another unit
         unit = shown[k][1].time_unit
         if k + 1 == len(shown) or shown[k + 1][1].time_unit != unit:
-            ax.set_xlabel(time_label(unit))
+            ax.set_xlabel(label_time(unit))
     for ax, label in zip(axes[-1, 1:], ("lag (samples)", "normal quantile"), strict=True):
         ax.set_xlabel(label)
     return figure

@@ -34,7 +34,7 @@ SETTINGS: dict[str, Any] = {
 }
 
 
-def folder() -> Path | None:
+def find_folder() -> Path | None:
     """Where compiled programs are kept; None if the cache is off."""
     chosen = os.environ.get("SWITCHFIT_CACHE", "")
     if chosen.lower() == "off":
@@ -43,9 +43,9 @@ def folder() -> Path | None:
 
 
 @contextmanager
-def compilation_cache() -> Iterator[None]:
-    """Context in which JAX reads and writes compiled programs in `folder`; everything is as before afterwards."""
-    path = usable_folder()
+def use_compilation_cache() -> Iterator[None]:
+    """Context in which JAX reads and writes compiled programs in `find_folder`; everything is as before afterwards."""
+    path = get_usable_folder()
     before = {name: getattr(jax.config, name) for name in SETTINGS}
     if path is None or before["jax_compilation_cache_dir"]:
         yield
@@ -63,9 +63,9 @@ def compilation_cache() -> Iterator[None]:
         jax_cache.reset_cache()
 
 
-def usable_folder() -> Path | None:
-    """Return `folder`, made if it is not there; None if nothing can be written to it, or others can write to it."""
-    path = folder()
+def get_usable_folder() -> Path | None:
+    """Return the cache folder, made if it is missing; None if it cannot be written to, or others can write to it."""
+    path = find_folder()
     if path is None:
         return None
     try:
@@ -74,13 +74,13 @@ def usable_folder() -> Path | None:
         found = path.stat()
     except OSError:
         return None
-    if reason := others_may_write(found):
+    if reason := can_others_write(found):
         _warn_once(path, reason)
         return None
     return path if os.access(path, os.W_OK) else None
 
 
-def others_may_write(found: os.stat_result) -> str:
+def can_others_write(found: os.stat_result) -> str:
     """Return why somebody else may have written a file or a folder; "" if nobody may, or the system does not tell."""
     if not hasattr(os, "geteuid"):
         return ""
@@ -106,7 +106,7 @@ def read_code(path: Path) -> bytes | None:
     Parameters
     ----------
     path : Path
-        In the folder of `usable_folder`.
+        In the folder of `get_usable_folder`.
     """
     try:
         with path.open("rb") as file:
@@ -115,7 +115,7 @@ def read_code(path: Path) -> bytes | None:
     except OSError:
         return None
     check, code = content[:32], content[32:]
-    return code if hashlib.sha256(code).digest() == check and not others_may_write(found) else None
+    return code if hashlib.sha256(code).digest() == check and not can_others_write(found) else None
 
 
 def write_code(path: Path, code: bytes) -> None:
@@ -124,7 +124,7 @@ def write_code(path: Path, code: bytes) -> None:
     Parameters
     ----------
     path : Path
-        In the folder of `usable_folder`.
+        In the folder of `get_usable_folder`.
     code : bytes
     """
     with suppress(OSError):  # a cache that cannot be written is no reason to stop

@@ -7,7 +7,7 @@ class InputError(ValueError):
     """Something given is wrong; the message names the file and the key or line, what was given, and what to do."""
 
 
-def first_line(error: BaseException) -> str:
+def get_first_line(error: BaseException) -> str:
     """An exception in one line: its type and the first line of its message."""
     message = str(error).strip().splitlines()
     return f"{type(error).__name__}: {message[0]}" if message else type(error).__name__

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from switchfit.runtime.presentation import text_of
+from switchfit.runtime.presentation import format_text
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,17 @@ class Issue:
         Names of what it is about: unknowns, channels, outputs.
     figures : mapping of str to float or tuple of float
         The numbers of the sentence by their names; a tuple has one entry for each subject.
+
+    See Also
+    --------
+    Certificate.failures, Termination.reason
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> issue = sf.Issue("error", ("the log is empty",))
+    >>> issue.kind, issue.subjects
+    ('error', ('the log is empty',))
     """
 
     kind: str
@@ -27,4 +38,4 @@ class Issue:
     figures: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)

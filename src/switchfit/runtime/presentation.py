@@ -1,7 +1,8 @@
 """How results are written and drawn, without their knowing who does it.
 
-Results are data. Their ``__str__`` and ``plot`` call `text_of` and `figure_of`, and the modules of `switchfit.report`
-register a function for each kind of result. So the report depends on the results, and no result on the report.
+Results are data. Their ``__str__`` and ``plot`` call `format_text` and `draw_figure`, and the modules of
+`switchfit.report` register a function for each kind of result. So the report depends on the results, and no result on
+the report.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import Any
 
 
 @singledispatch
-def text_of(result: Any) -> str:
+def format_text(result: Any) -> str:
     """Return a result as plain text, one line or several without a newline at the end.
 
     Parameters
@@ -23,7 +24,7 @@ def text_of(result: Any) -> str:
 
 
 @singledispatch
-def figure_of(result: Any, **settings: Any) -> Any:
+def draw_figure(result: Any, **settings: Any) -> Any:
     """Return the figure of a result, a matplotlib Figure.
 
     Parameters

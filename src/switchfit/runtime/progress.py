@@ -9,7 +9,7 @@ Progress = Callable[[int, int], object]
 """``progress(done, total)``; a true value stops."""
 
 
-def reporting(callback: Progress | None, title: str) -> tuple[Progress, Callable[[], None]]:
+def show_progress(callback: Progress | None, title: str) -> tuple[Progress, Callable[[], None]]:
     """What a long run calls with (done, total), true to stop: the user's callback, and a bar on a terminal.
 
     Parameters

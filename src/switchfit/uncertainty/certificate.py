@@ -13,15 +13,15 @@ from switchfit.fit.termination import Kink
 from switchfit.optimize import Status
 from switchfit.problem.constraints import ActiveConstraint
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import text_of
+from switchfit.runtime.presentation import format_text
 from switchfit.uncertainty.derivative_check import (
     LARGEST_GAP,
-    derivative_gap,
-    observed_orders,
-    orders_right,
-    taylor_table,
+    are_orders_right,
+    build_taylor_table,
+    estimate_orders,
+    measure_derivative_gap,
 )
-from switchfit.uncertainty.identification import Combination, after
+from switchfit.uncertainty.identification import Combination, analyse_solution
 
 LARGE_INTEGRATION_ERROR = 1e-6
 """Relative error of J or of a constraint by halving the steps above which a fit has fewer digits than it seems."""
@@ -65,6 +65,23 @@ class Certificate:
         What of all this is not as it has to be; empty where the certificate is good.
     integration_error_of : str
         The output that has the `integration_error`: "J", or the name of a guard or terminal constraint.
+
+    See Also
+    --------
+    estimate, check_derivatives, Estimate.certificate
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> fit.certificate.failures
+    ()
+    >>> fit.certificate.integration_error < 1e-8
+    True
+    >>> fit.certificate.hessian_gap < 1e-5
+    True
     """
 
     optimality: float
@@ -92,7 +109,7 @@ class Certificate:
         return str(Combination(self.worst_unknowns))
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)
 
 
 def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
@@ -109,13 +126,13 @@ def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
     -------
     Certificate
     """
-    found = after(fit, None)
+    found = analyse_solution(fit, None)
     scaled = found.eigenvalues
     gaps = (np.nan, np.nan)
     orders: tuple[float, ...] = (np.nan,) * 3
     if evaluator is not None:
-        gaps = derivative_gap(evaluator, fit.theta)
-        orders = observed_orders(taylor_table(evaluator, fit.theta).orders)
+        gaps = measure_derivative_gap(evaluator, fit.theta)
+        orders = estimate_orders(build_taylor_table(evaluator, fit.theta).orders)
     stiff = evaluator is not None and evaluator.problem.solver == "stiff"
     smallest = float(scaled[0]) if len(scaled) else np.nan
     return Certificate(
@@ -131,11 +148,11 @@ def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
         taylor_orders=orders,
         active=fit.active,
         kinks=fit.kinks,
-        failures=tuple(_failures(fit, smallest, gaps, orders, stiff=stiff)),
+        failures=tuple(_find_failures(fit, smallest, gaps, orders, stiff=stiff)),
     )
 
 
-def _failures(
+def _find_failures(
     fit: Fit, smallest: float, gaps: tuple[float, float], orders: tuple[float, ...], *, stiff: bool
 ) -> Iterator[Issue]:
     """The checks that failed."""
@@ -148,5 +165,5 @@ def _failures(
     if max(gaps) > LARGEST_GAP and not stiff:
         yield Issue("derivative gap", figures={"gap": max(gaps)})
     # The first order says nothing at a minimum, where the gradient vanishes.
-    if not orders_right((np.nan, *orders[1:])):
+    if not are_orders_right((np.nan, *orders[1:])):
         yield Issue("Taylor orders", figures={"orders": orders})

@@ -12,7 +12,7 @@ from switchfit.fit.evaluator import Evaluation, Evaluator, evaluator_of, knows_p
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_instance, as_seed
-from switchfit.runtime.presentation import text_of
+from switchfit.runtime.presentation import format_text
 
 LARGEST_GAP = 1e-4
 """Relative gap between the paper's equations and the discretised cost's derivatives that is still the integrator's."""
@@ -27,26 +27,26 @@ class TaylorTable(NamedTuple):
     theta: FloatArray
 
 
-def taylor_table(evaluator: Evaluator, theta: FloatArray, *, seed: int = 0) -> TaylorTable:
+def build_taylor_table(evaluator: Evaluator, theta: FloatArray, *, seed: int = 0) -> TaylorTable:
     """Remainders of J with its gradient and its Hessian along a random direction, at theta but off the nodes."""
-    at = _off_nodes(evaluator, theta)
+    at = _move_off_nodes(evaluator, theta)
     base = evaluator(at)
-    direction = np.random.default_rng(seed).choice([-1.0, 1.0], size=len(at)) * _scales(base, at)
-    largest = _room(evaluator, at, direction)
+    direction = np.random.default_rng(seed).choice([-1.0, 1.0], size=len(at)) * _choose_scales(base, at)
+    largest = _find_room(evaluator, at, direction)
     steps: FloatArray = largest * 0.5 ** np.arange(8.0)
-    remainders = np.array([_remainders(evaluator, base, at, h, direction) for h in steps])
+    remainders = np.array([_compute_remainders(evaluator, base, at, h, direction) for h in steps])
     rounding = remainders < 1e3 * np.finfo(float).eps * max(abs(base.cost), float(remainders.max()))
     with np.errstate(divide="ignore", invalid="ignore"):
         orders = np.where(rounding[1:], np.nan, np.log2(remainders[:-1] / remainders[1:]))
     return TaylorTable(steps, remainders, orders, at)
 
 
-def observed_orders(orders: FloatArray) -> tuple[float, ...]:
+def estimate_orders(orders: FloatArray) -> tuple[float, ...]:
     """Median order of each remainder over the steps at which it is not yet rounding; NaN if it always is."""
-    return tuple(_median(orders[:, k]) for k in range(3))
+    return tuple(_take_median(orders[:, k]) for k in range(3))
 
 
-def orders_right(observed: tuple[float, ...]) -> bool:
+def are_orders_right(observed: tuple[float, ...]) -> bool:
     """Whether they are 1, 2, 3 or more within 0.25, or beyond what can be seen."""
     return all(order > k - 0.25 or np.isnan(order) for k, order in enumerate(observed, start=1))
 
@@ -71,6 +71,22 @@ class DerivativeCheck:
     stiff : bool
         With the stiff solver the gaps are told but not judged: the paper's adjoints have boundary layers of their own
         at transitions and samples, which a mesh refined for the state does not resolve.
+
+    See Also
+    --------
+    check_derivatives, Certificate
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> check = sf.check_derivatives(problem)
+    >>> check.passed
+    True
+    >>> [round(order) for order in check.observed_orders]
+    [1, 2, 3]
     """
 
     steps: FloatArray
@@ -86,16 +102,16 @@ class DerivativeCheck:
     @property
     def observed_orders(self) -> tuple[float, ...]:
         """Median order of each remainder over the steps at which it is not yet rounding; NaN if it always is."""
-        return observed_orders(self.orders)
+        return estimate_orders(self.orders)
 
     @property
     def passed(self) -> bool:
         """Whether the orders are 1, 2, 3 within 0.25, or beyond what can be seen, and the methods agree to 1e-4."""
         agree = self.stiff or not max(self.gradient_gap, self.hessian_gap) >= LARGEST_GAP  # NaN where not checked
-        return orders_right(self.observed_orders) and agree
+        return are_orders_right(self.observed_orders) and agree
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)
 
 
 def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, seed: int = 0) -> DerivativeCheck:
@@ -121,18 +137,31 @@ def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, seed:
         For a theta of the wrong shape or order, or a seed that is negative.
     TypeError
         If an argument is of the wrong type.
+
+    See Also
+    --------
+    evaluate, Certificate
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> sf.check_derivatives(problem).passed
+    True
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     seed = as_seed(seed)
     evaluator = evaluator_of(problem)
-    table = taylor_table(evaluator, problem.checked_theta(theta), seed=seed)
+    table = build_taylor_table(evaluator, problem.check_theta(theta), seed=seed)
     at = table.theta
-    gaps = derivative_gap(evaluator, at)
-    halved = derivative_gap(evaluator.divide(), at)
+    gaps = measure_derivative_gap(evaluator, at)
+    halved = measure_derivative_gap(evaluator.divide(), at)
     return DerivativeCheck(table.steps, table.remainders, table.orders, *gaps, *halved, at, problem.solver == "stiff")
 
 
-def derivative_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[float, float]:
+def measure_derivative_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[float, float]:
     """Relative gap of gradient and Hessian between the paper's equations and the discretised cost.
 
     NaN where the cost has what the paper's equations do not know. Unknowns are scaled to unit curvature each. Near a
@@ -146,26 +175,26 @@ def derivative_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[float, floa
     small = 1e-3 * float(np.linalg.norm(theta / scale))
     scales = np.outer(scale, scale)
     return (
-        _gap(paper.gradient * scale, discrete.gradient * scale, small),
-        _gap(paper.hessian * scales, discrete.hessian * scales, 0.0),
+        _measure_gap(paper.gradient * scale, discrete.gradient * scale, small),
+        _measure_gap(paper.hessian * scales, discrete.hessian * scales, 0.0),
     )
 
 
-def _gap(a: FloatArray, b: FloatArray, floor: float) -> float:
+def _measure_gap(a: FloatArray, b: FloatArray, floor: float) -> float:
     return float(np.linalg.norm(a - b)) / max(float(np.linalg.norm(b)), floor, 1e-300)
 
 
-def _scales(base: Evaluation, theta: FloatArray) -> FloatArray:
+def _choose_scales(base: Evaluation, theta: FloatArray) -> FloatArray:
     """Changes of the unknowns that each change J by about as much as the others."""
     curvature = np.abs(np.diag(base.hessian))
     typical = np.where(theta != 0, np.abs(theta), 1.0)
     return np.where(curvature > 0, 1.0 / np.sqrt(np.where(curvature > 0, curvature, 1.0)), typical)
 
 
-def _off_nodes(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
+def _move_off_nodes(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     """theta with each transition time in the middle of the cell it is in, where J is smooth for longest."""
     moved = theta.copy()
-    late = _late_times(evaluator, theta)
+    late = _list_late_times(evaluator, theta)
     for i, nodes in enumerate(evaluator.breakpoints()):
         if len(nodes):
             nodes = np.union1d(nodes, late[i]) if i in late else nodes
@@ -174,7 +203,7 @@ def _off_nodes(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     return moved
 
 
-def _room(evaluator: Evaluator, theta: FloatArray, direction: FloatArray) -> float:
+def _find_room(evaluator: Evaluator, theta: FloatArray, direction: FloatArray) -> float:
     """Largest step that leaves every transition time in its cell, and every unknown near its size.
 
     No transition may pass what a late sample sees, either, which moves with the delay.
@@ -183,14 +212,14 @@ def _room(evaluator: Evaluator, theta: FloatArray, direction: FloatArray) -> flo
     for i, nodes in enumerate(evaluator.breakpoints()):
         if len(nodes):
             room = min(room, 0.9 * np.min(np.abs(nodes - theta[i])) / abs(direction[i]))
-    late, moved = _late_times(evaluator, theta), _late_times(evaluator, theta + direction)
+    late, moved = _list_late_times(evaluator, theta), _list_late_times(evaluator, theta + direction)
     for i, moments in late.items():
         closing = np.maximum(np.abs(moved[i] - moments - direction[i]), 1e-300)
         room = min(room, 0.9 * np.min(np.abs(moments - theta[i]) / closing))
     return float(room)
 
 
-def _late_times(evaluator: Evaluator, theta: FloatArray) -> dict[int, FloatArray]:
+def _list_late_times(evaluator: Evaluator, theta: FloatArray) -> dict[int, FloatArray]:
     """For each transition time in theta the moments that late samples of its run see, if there are any."""
     problem = evaluator.problem
     found: dict[int, FloatArray] = {}
@@ -200,7 +229,7 @@ def _late_times(evaluator: Evaluator, theta: FloatArray) -> dict[int, FloatArray
     return found
 
 
-def _remainders(
+def _compute_remainders(
     evaluator: Evaluator, base: Evaluation, theta: FloatArray, h: float, direction: FloatArray
 ) -> tuple[float, float, float]:
     zeroth = evaluator(theta + h * direction).cost - base.cost
@@ -209,6 +238,6 @@ def _remainders(
     return abs(zeroth), abs(float(first)), abs(float(second))
 
 
-def _median(orders: FloatArray) -> float:
+def _take_median(orders: FloatArray) -> float:
     finite = orders[np.isfinite(orders)]
     return float(np.median(finite)) if len(finite) else np.nan

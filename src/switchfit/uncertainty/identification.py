@@ -29,7 +29,7 @@ from switchfit.fit.solution import is_least_squares
 from switchfit.fit.trajectory import compare
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
-from switchfit.runtime.presentation import text_of
+from switchfit.runtime.presentation import format_text
 
 WEAK = 0.05
 """Scaled eigenvalues below this are told: standard errors along them are 4.5 times those of each unknown alone."""
@@ -58,7 +58,7 @@ class Combination:
     unknowns: tuple[str, ...]
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +77,22 @@ class Direction:
         By how much J rises at theta + change and at theta - change; NaN where that is not allowed.
     names : tuple of str
         The unknowns that it mostly consists of, the one with the largest weight first.
+
+    See Also
+    --------
+    Identifiability, identifiability
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> worst = fit.identifiability.directions[0]
+    >>> worst.names
+    ('tau_1', 'k')
+    >>> worst.summary
+    'tau_1 and k trade off'
     """
 
     eigenvalue: float
@@ -122,6 +138,20 @@ class Identifiability:
         Whether J was evaluated along the directions.
     idle : tuple of str
         Unknowns on which the cost does not depend because modes have collapsed, as in `Fit.idle`.
+
+    See Also
+    --------
+    identifiability, Direction, profile
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> found = fit.identifiability
+    >>> found.condition_number < 100, found.undetermined
+    (True, 0)
     """
 
     theta_names: tuple[str, ...]
@@ -152,7 +182,7 @@ class Identifiability:
         return len(self.without) + int(np.sum(self.eigenvalues < UNDETERMINED))
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)
 
 
 def identifiability(subject: Any) -> Identifiability:
@@ -172,16 +202,30 @@ def identifiability(subject: Any) -> Identifiability:
         For anything else.
     ValueError
         If a parameter of the problem changes the cost while its derivative is zero: a switch hidden in a function.
+
+    See Also
+    --------
+    profile, Estimate.correlation
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> found = sf.identifiability(problem)
+    >>> found.where, found.undetermined
+    ('first guess', 0)
     """
     if isinstance(subject, Problem):
-        return _before(subject)
+        return _analyse_first_guess(subject)
     if isinstance(subject, Fit):
         fit: Any = subject
-        return after(fit, None if fit.problem is None else fit.evaluator_at_solution())
+        return analyse_solution(fit, None if fit.problem is None else fit.evaluator_at_solution())
     raise TypeError(f"identifiability needs an sf.Estimate or an sf.Problem; got {type(subject).__name__}.")
 
 
-def after(fit: Fit, evaluator: Evaluator | None) -> Identifiability:
+def analyse_solution(fit: Fit, evaluator: Evaluator | None) -> Identifiability:
     """At the solution of a fit; without an evaluator nothing is tried.
 
     Parameters
@@ -207,13 +251,13 @@ def after(fit: Fit, evaluator: Evaluator | None) -> Identifiability:
         rise,
         meaning,
         "solution",
-        allowed=None if evaluator is None else _allowed(evaluator.problem),
+        allowed=None if evaluator is None else _limit_change(evaluator.problem),
         base=fit.cost,
     )
     return replace(found, idle=fit.idle)
 
 
-def _before(problem: Problem) -> Identifiability:
+def _analyse_first_guess(problem: Problem) -> Identifiability:
     """At the first guess, with the data that it would itself produce, where they are Measurements."""
     theta, unknowns = problem.initial_theta, problem.unknowns
     own = evaluator_of(problem)
@@ -221,14 +265,14 @@ def _before(problem: Problem) -> Identifiability:
     items = [item for run in problem.experiments for item in run.data]
     meaning: Meaning
     if all(isinstance(item, Measurements) for item in items):
-        clean = _noise_free(problem, own)
+        clean = _drop_noise(problem, own)
         evaluator = Evaluator(clean, meshes=own.meshes)
         # Where sigma is a parameter J has no minimum without noise; its expected Hessian is Gauss-Newton's.
         hessian = evaluator(theta, matrix="exact" if is_least_squares(problem) else "gauss-newton").hessian
         if all(item.sigma is not None for item in items):
             rise, meaning = 0.5 * float(scipy.special.ndtri(0.975)) ** 2, "noise"
         else:
-            rise, meaning = 1e-4 * _variation(clean), "1 % of variation"
+            rise, meaning = 1e-4 * _measure_variation(clean), "1 % of variation"
         base = np.nan
     else:
         evaluator = own
@@ -246,12 +290,12 @@ def _before(problem: Problem) -> Identifiability:
         rise,
         meaning,
         "first guess",
-        allowed=_allowed(problem),
+        allowed=_limit_change(problem),
         base=base,
     )
 
 
-def _noise_free(problem: Problem, evaluator: Evaluator) -> Problem:
+def _drop_noise(problem: Problem, evaluator: Evaluator) -> Problem:
     """The problem with the values that its first guess produces; missing ones stay missing."""
     theta = problem.initial_theta
     comparisons = compare(problem, theta, evaluator.simulate(theta))[1]
@@ -265,7 +309,7 @@ def _noise_free(problem: Problem, evaluator: Evaluator) -> Problem:
     return replace(problem, experiments=experiments)
 
 
-def _variation(problem: Problem) -> float:
+def _measure_variation(problem: Problem) -> float:
     """Half the weighted sum of squares of what is measured about its mean, channel by channel."""
     total = 0.0
     for experiment in problem.experiments:
@@ -277,13 +321,13 @@ def _variation(problem: Problem) -> float:
     return total
 
 
-def _allowed(problem: Problem) -> Callable[[FloatArray], bool]:
+def _limit_change(problem: Problem) -> Callable[[FloatArray], bool]:
     u = problem.unknowns
 
-    def allowed(theta: FloatArray) -> bool:
+    def is_allowed(theta: FloatArray) -> bool:
         return bool(np.all(theta >= u.lower) and np.all(theta <= u.upper) and np.all(u.A @ theta >= u.b))
 
-    return allowed
+    return is_allowed
 
 
 def analyse(
@@ -340,14 +384,14 @@ def analyse(
     for k in weak:
         v = vectors[:, k]
         v = v * np.sign(v[np.argmax(np.abs(v))])
-        change, rises = _tried(spectrum.size * v, float(values[k]), theta, cost, rise, allowed)
+        change, rises = _try_direction(spectrum.size * v, float(values[k]), theta, cost, rise, allowed)
         strong = [i for i in np.argsort(-np.abs(v), kind="stable") if abs(v[i]) > NAMED * np.abs(v).max()]
         directions.append(Direction(float(values[k]), v, change, rises, tuple(names[i] for i in strong)))
     found = values, vectors, without, held, tuple(directions)
     return Identifiability(names, units, is_time, *found, rise, meaning, where, base, cost is not None)
 
 
-def _tried(
+def _try_direction(
     direction: FloatArray,
     eigenvalue: float,
     theta: FloatArray,

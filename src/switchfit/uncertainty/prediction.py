@@ -27,7 +27,7 @@ from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_index
-from switchfit.uncertainty.sensitivity import Points, Sensitivity, sensitivity
+from switchfit.uncertainty.sensitivity import Points, Sensitivity, compute_sensitivity
 
 NEAR = 2.0
 """Standard errors of a transition time within which a band is not to be trusted."""
@@ -52,6 +52,23 @@ class Prediction:
     near_transition : (K,) bool
         Within two standard errors of a transition time: the bands take no account of the other mode there.
     fit : Fit
+
+    See Also
+    --------
+    predict, Estimate.plot
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> prediction = fit.predict([1.0, 4.0])
+    >>> prediction.states.shape, prediction.output_names
+    ((2, 1), ('thermometer',))
+    >>> prediction.state_errors.round(2)
+    array([[0.02],
+           [0.05]])
     """
 
     times: FloatArray
@@ -68,19 +85,67 @@ class Prediction:
     fit: Fit = field(repr=False)
 
     def state_band(self, level: float = 0.95) -> FloatArray:
-        """Confidence band of the states at each time: (K, n, 2)."""
-        return _band(self.states, self.fit.quantile(level) * self.state_errors)
+        """Confidence band of the states at each time: (K, n, 2).
+
+        See Also
+        --------
+        Prediction.output_band, predict
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.predict([1.0, 4.0]).state_band(0.95).round(1)
+        array([[[8.2, 8.3]],
+        <BLANKLINE>
+               [[8.5, 8.7]]])
+        """
+        return _build_band(self.states, self.fit.quantile(level) * self.state_errors)
 
     def output_band(self, level: float = 0.95) -> FloatArray:
-        """Confidence band of the outputs, of their mean without noise, at each time: (K, q, 2)."""
-        return _band(self.outputs, self.fit.quantile(level) * self.output_errors)
+        """Confidence band of the outputs, of their mean without noise, at each time: (K, q, 2).
+
+        See Also
+        --------
+        Prediction.prediction_band, predict
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.predict([1.0, 4.0]).output_band(0.95).round(1)
+        array([[[8.2, 8.3]],
+        <BLANKLINE>
+               [[8.5, 8.7]]])
+        """
+        return _build_band(self.outputs, self.fit.quantile(level) * self.output_errors)
 
     def prediction_band(self, level: float = 0.95) -> FloatArray:
-        """Where a new sample would fall at each time, noise included: (K, q, 2)."""
-        return _band(self.outputs, self.fit.quantile(level) * np.hypot(self.output_errors, self.noise))
+        """Where a new sample would fall at each time, noise included: (K, q, 2).
+
+        See Also
+        --------
+        Prediction.output_band, predict
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.predict([1.0, 4.0]).prediction_band(0.95).round(1)
+        array([[[7.9, 8.7]],
+        <BLANKLINE>
+               [[8.2, 9. ]]])
+        """
+        return _build_band(self.outputs, self.fit.quantile(level) * np.hypot(self.output_errors, self.noise))
 
 
-def _band(values: FloatArray, half: FloatArray) -> FloatArray:
+def _build_band(values: FloatArray, half: FloatArray) -> FloatArray:
     return np.stack([values - half, values + half], axis=-1)
 
 
@@ -107,6 +172,23 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
     ValueError
         For times outside the horizon, an experiment that does not exist, or an estimate without a problem or without
         a covariance.
+
+    See Also
+    --------
+    Prediction, simulate, Estimate.plot
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> prediction = sf.predict(fit, [1.0, 4.0])
+    >>> prediction.outputs.round(1)
+    array([[8.3],
+           [8.6]])
+    >>> prediction.near_transition
+    array([False, False])
     """
     fit: Fit = estimate
     if not isinstance(fit, Fit):
@@ -117,14 +199,14 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
     if times is None:
         points = estimate.sensitivities[experiment].nodes
     else:
-        asked = _checked_times(times, problem, experiment)
+        asked = _check_times(times, problem, experiment)
         mesh = Mesh.from_times(np.concatenate([evaluator.meshes[experiment].times, asked]))
-        found: Sensitivity = sensitivity(problem, experiment, fit.theta, mesh)
+        found: Sensitivity = compute_sensitivity(problem, experiment, fit.theta, mesh)
         points = found.at(asked)
-    return _prediction(fit, problem, experiment, points)
+    return _build_prediction(fit, problem, experiment, points)
 
 
-def _prediction(fit: Fit, problem: Problem, e: int, points: Points) -> Prediction:
+def _build_prediction(fit: Fit, problem: Problem, e: int, points: Points) -> Prediction:
     covariance = fit.covariance
     if not np.isfinite(covariance).all():
         raise ValueError(
@@ -136,29 +218,29 @@ def _prediction(fit: Fit, problem: Problem, e: int, points: Points) -> Predictio
     return Prediction(
         points.times,
         points.states,
-        _errors(points.states_d, covariance),
+        _compute_errors(points.states_d, covariance),
         points.outputs,
-        _errors(points.outputs_d, covariance),
-        _noise(fit, problem, e, points.times),
+        _compute_errors(points.outputs_d, covariance),
+        _get_noise(fit, problem, e, points.times),
         trajectory.state_names,
         trajectory.state_units,
         tuple(names),
         trajectory.time_unit,
-        _near(fit, problem, e, points.times),
+        _is_near_transition(fit, problem, e, points.times),
         fit,
     )
 
 
-def _errors(derivative: FloatArray, covariance: FloatArray) -> FloatArray:
+def _compute_errors(derivative: FloatArray, covariance: FloatArray) -> FloatArray:
     """``sqrt(X C X')`` of derivatives (K, q, d): (K, q)."""
     variance = np.einsum("kqd,de,kqe->kq", derivative, covariance, derivative)
     return np.sqrt(np.maximum(variance, 0.0))
 
 
-def _noise(fit: Fit, problem: Problem, e: int, times: FloatArray) -> FloatArray:
+def _get_noise(fit: Fit, problem: Problem, e: int, times: FloatArray) -> FloatArray:
     """Standard deviation of one sample of each output at each time: (K, q)."""
     columns = [np.full((len(times), q), np.nan) for _, q in problem.structures[e].references]
-    for item, comparison in zip(_compared(problem, e), fit.comparisons[e], strict=True):
+    for item, comparison in zip(_list_compared(problem, e), fit.comparisons[e], strict=True):
         if isinstance(item, Measurements):
             # Weights are 1 where sigma is unknown; a known one beside an unknown one is scaled like it.
             unknown = 1.0 if fit.sigma_known else np.sqrt(fit.residual_variance)
@@ -167,19 +249,19 @@ def _noise(fit: Fit, problem: Problem, e: int, times: FloatArray) -> FloatArray:
     return np.concatenate([np.zeros((len(times), 0)), *columns], axis=1)
 
 
-def _compared(problem: Problem, e: int) -> list[Any]:
+def _list_compared(problem: Problem, e: int) -> list[Any]:
     """The data of experiment e that have a comparison, in its order."""
     return [item for item in problem.experiments[e].data if isinstance(item, (Measurements, ReferenceSignal))]
 
 
-def _near(fit: Fit, problem: Problem, e: int, times: FloatArray) -> NDArray[np.bool_]:
+def _is_near_transition(fit: Fit, problem: Problem, e: int, times: FloatArray) -> NDArray[np.bool_]:
     where = problem.unknowns.times[e]
     free = where[where >= 0]
     reach = NEAR * fit.standard_errors[free]
     return np.asarray((np.abs(times[:, None] - fit.theta[free][None]) <= reach[None]).any(1))
 
 
-def _checked_times(times: ArrayLike, problem: Problem, e: int) -> FloatArray:
+def _check_times(times: ArrayLike, problem: Problem, e: int) -> FloatArray:
     asked = np.atleast_1d(as_array(times, "times"))
     t0, tf = problem.experiments[e].t0, problem.experiments[e].tf
     if asked.ndim != 1 or asked.size == 0 or not np.isfinite(asked).all():

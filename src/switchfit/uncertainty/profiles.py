@@ -38,9 +38,9 @@ from switchfit.fit.solution import constraints_of, minimize_cost
 from switchfit.optimize import Status, solve_qp
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_callable, as_level, as_name, listed, shown
-from switchfit.runtime.presentation import figure_of, text_of
-from switchfit.runtime.progress import Progress, reporting
+from switchfit.problem.validation import as_callable, as_level, as_name, join_names, shorten
+from switchfit.runtime.presentation import draw_figure, format_text
+from switchfit.runtime.progress import Progress, show_progress
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -111,7 +111,7 @@ class Trace:
         self.interrupted = False
         self.jumps: list[float] = []
         self.coarse = False
-        self.told: Callable[[], bool] = lambda: False
+        self.should_stop: Callable[[], bool] = lambda: False
 
     # --- what the points say
 
@@ -183,7 +183,7 @@ class Trace:
         found[coupled] = linprog(objective, -c.A[:, coupled], -c.b, bounds=bounds).x
         return found
 
-    def _fitted(self, value: float, start: FloatArray) -> Point | None:
+    def _fit(self, value: float, start: FloatArray) -> Point | None:
         """The point at `value`, fitted from `start`; None where that fails."""
         lower, upper = self.constraints.lower.copy(), self.constraints.upper.copy()
         lower[self.index] = upper[self.index] = value
@@ -194,7 +194,7 @@ class Trace:
             result = minimize_cost(self.evaluator, start, "exact", tolerance, ITERATIONS, constraints=held)
         except ValueError:  # infeasible by rounding
             return None
-        if result.status is Status.INTERRUPTED or self.told():
+        if result.status is Status.INTERRUPTED or self.should_stop():
             raise KeyboardInterrupt
         if not np.isfinite(result.cost):
             return None
@@ -215,7 +215,7 @@ class Trace:
         for start in starts:
             start[k] = value
             feasible = self._feasible(start, near.theta)
-            found = None if feasible is None else self._fitted(value, feasible)
+            found = None if feasible is None else self._fit(value, feasible)
             if found is not None and (
                 best is None or (not found.converged, found.cost) < (not best.converged, best.cost)
             ):
@@ -344,7 +344,7 @@ class Trace:
             start = outer.theta.copy()
             start[self.index] = inner.value
             feasible = self._feasible(start, outer.theta)
-            found = None if feasible is None else self._fitted(inner.value, feasible)
+            found = None if feasible is None else self._fit(inner.value, feasible)
             if found is None or not found.converged or found.cost >= inner.cost - 1e-9 * abs(inner.cost):
                 return
             self._insert(found)
@@ -381,7 +381,7 @@ class Trace:
 
     # --- where it crosses
 
-    def crossing(self, a: Point, b: Point, threshold: float) -> float:
+    def find_crossing(self, a: Point, b: Point, threshold: float) -> float:
         """Where |zeta| is the threshold between two neighbouring points on different sides of it."""
         found = {a.value: a, b.value: b}
         inner = min((a, b), key=lambda q: abs(q.value - self.centre.value))
@@ -407,7 +407,7 @@ class Trace:
         found: list[tuple[float, float]] = []
         for a, b, a_in, b_in in zip(points[:-1], points[1:], inside[:-1], inside[1:], strict=True):
             if a_in != b_in:
-                edge = self.crossing(a, b, threshold)
+                edge = self.find_crossing(a, b, threshold)
                 if b_in:
                     low = edge
                 elif low is not None:
@@ -462,6 +462,20 @@ class Profile:
         For a transition time the sample times of its run, where the slope of the profile may jump; empty otherwise.
     trace : Trace
         The points, and how more are made.
+
+    See Also
+    --------
+    profile, Estimate.confidence_intervals
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> found = sf.profile(fit, "tau_1")
+    >>> found.name, len(found.values) > 5
+    ('tau_1', True)
     """
 
     name: str
@@ -528,6 +542,19 @@ class Profile:
         list of (low, high)
             Where a side ends before the threshold is crossed, its end is the limit that the constraints set, infinite
             where the cost does not rise, NaN where it could not be followed.
+
+        See Also
+        --------
+        profile, Profile.interval
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> len(sf.profile(fit, "k").regions(0.95))
+        1
         """
         threshold = self.fit.quantile(self.level if level is None else level)
         try:
@@ -544,16 +571,44 @@ class Profile:
         ----------
         level : float, optional
             As of `regions`.
+
+        See Also
+        --------
+        profile, Profile.regions
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> [round(float(end), 2) for end in sf.profile(fit, "k").interval(0.95)]
+        [0.38, 0.4]
         """
         regions = self.regions(level)
         return next((r for r in regions if not (r[0] > self.value or r[1] < self.value)), regions[0])
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)
 
     def plot(self) -> Figure:
-        """The likelihood ratio with its thresholds, and the quadratic approximation beside it."""
-        return figure_of(self)
+        """The likelihood ratio with its thresholds, and the quadratic approximation beside it.
+
+        See Also
+        --------
+        profile
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> figure = sf.profile(fit, "k").plot()
+        >>> len(figure.axes) > 0
+        True
+        """
+        return draw_figure(self)
 
 
 def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress | None = None) -> Profile:
@@ -586,12 +641,25 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     -----
     Costs some twenty warm-started fits and compiles nothing, unless the mesh of the fit turns out too coarse at the
     ends of the profile.
+
+    See Also
+    --------
+    Estimate.confidence_intervals, bootstrap, identifiability
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> [round(float(end), 1) for end in sf.profile(fit, "tau_1").interval(0.95)]
+    [2.4, 2.5]
     """
     fit: Fit = estimate
     if not isinstance(fit, Fit):
         raise TypeError(f"profile needs the result of sf.estimate; got {type(fit).__name__}. Fit the problem first.")
     if as_name(name, "name") not in fit.theta_names:
-        raise ValueError(f"there is no unknown {shown(name)}; there are {listed(fit.theta_names)}.")
+        raise ValueError(f"there is no unknown {shorten(name)}; there are {join_names(fit.theta_names)}.")
     level = as_level(level)
     if callback is not None:
         as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
@@ -600,18 +668,18 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     threshold = fit.quantile(level)
     index = fit.theta_names.index(name)
     times = _sample_times(evaluator, index)
-    report, end = reporting(callback, f"Profile of {name}")
+    report, end = show_progress(callback, f"Profile of {name}")
     trace = Trace(fit, evaluator, index)
     try:
         for _ in range(2):
-            trace.told = partial(_told, report, trace)
+            trace.should_stop = partial(_wrap_callback, report, trace)
             for side in (-1, 1):
                 trace.march(side, threshold)
             trace.add_kinks(times, threshold)
             if trace.integration_error(threshold) <= LARGE_ERROR * threshold**2:
                 break
             trace.coarse = True
-            finer = _finer(evaluator.problem, trace, threshold) if trace.evaluator is evaluator else None
+            finer = _refine_mesh(evaluator.problem, trace, threshold) if trace.evaluator is evaluator else None
             if finer is None:
                 break
             trace = Trace(fit, finer, index)
@@ -619,12 +687,12 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
         trace.interrupted = True
     finally:
         end()
-        trace.told = lambda: False
+        trace.should_stop = lambda: False
     error = float(fit.standard_errors[index])
     return Profile(name, fit.theta_units[index], trace.centre.value, error, level, fit, times, trace)
 
 
-def _finer(problem: Problem, trace: Trace, threshold: float) -> Evaluator | None:
+def _refine_mesh(problem: Problem, trace: Trace, threshold: float) -> Evaluator | None:
     """The problem on meshes that resolve both ends of a profile as well; None where these cannot be integrated."""
     thetas = [trace.centre.theta, *(q.theta for q in trace.edges(threshold))]
     try:
@@ -634,7 +702,7 @@ def _finer(problem: Problem, trace: Trace, threshold: float) -> Evaluator | None
     return Evaluator(problem, meshes=meshes)
 
 
-def _told(report: Progress, trace: Trace) -> bool:
+def _wrap_callback(report: Progress, trace: Trace) -> bool:
     """Tell how many fits are done, of as many as a profile usually takes; whether to stop."""
     return bool(report(trace.fits, max(2 * (STEPS + LOOK_AHEAD + 2), trace.fits)))
 

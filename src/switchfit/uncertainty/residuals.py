@@ -29,7 +29,7 @@ from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import text_of
+from switchfit.runtime.presentation import format_text
 
 UNLIKELY = 1e-3
 """Probability below which a test counts as failed: with ten channels one false alarm in fifty fits."""
@@ -71,6 +71,20 @@ class ChannelResiduals:
         Effective sample size.
     outliers : int
         Residuals beyond four standard deviations; a thousandth of one is expected in 16 samples.
+
+    See Also
+    --------
+    ResidualDiagnostics, Estimate.residuals
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> channel = fit.residuals.channels[0]
+    >>> channel.name, len(channel.values), channel.white
+    ('thermometer', 24, True)
     """
 
     experiment: int
@@ -120,6 +134,19 @@ class ResidualDiagnostics:
     channels : tuple of ChannelResiduals
     labels : tuple of str
         Of each channel, with the experiment's name where there are several.
+
+    See Also
+    --------
+    ChannelResiduals, Estimate.plot_residuals
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> fit.residuals.passed, fit.residuals.labels
+    (True, ('thermometer',))
     """
 
     channels: tuple[ChannelResiduals, ...]
@@ -154,7 +181,7 @@ class ResidualDiagnostics:
         return found
 
     def __str__(self) -> str:
-        return text_of(self)
+        return format_text(self)
 
 
 def diagnose(fit: Fit) -> ResidualDiagnostics:
@@ -172,12 +199,12 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
                 continue
             for k, name in enumerate(comparison.names):
                 if np.isfinite(comparison.measured[:, k]).sum() > 0:
-                    channels.append(of_channel(comparison, k, e, fit.trajectories[e].time_unit))
+                    channels.append(diagnose_channel(comparison, k, e, fit.trajectories[e].time_unit))
                     names.append(name if single else f"{fit.run_names[e]} {name}")
     return ResidualDiagnostics(tuple(channels), tuple(names))
 
 
-def of_channel(comparison: Comparison, k: int, experiment: int = 0, time_unit: str = "s") -> ChannelResiduals:
+def diagnose_channel(comparison: Comparison, k: int, experiment: int = 0, time_unit: str = "s") -> ChannelResiduals:
     """Test one channel of a comparison.
 
     Parameters
@@ -197,7 +224,7 @@ def of_channel(comparison: Comparison, k: int, experiment: int = 0, time_unit: s
         z = np.nan_to_num(raw[there] / size)
     n = len(z)
     lags = min(10, n // 5)
-    r = autocorrelation(z, lags)
+    r = compute_autocorrelation(z, lags)
     spread = z - z.mean()
     variance = float(np.mean(spread**2))
     skewness, kurtosis = 0.0, 3.0
@@ -231,7 +258,7 @@ def of_channel(comparison: Comparison, k: int, experiment: int = 0, time_unit: s
     )
 
 
-def autocorrelation(z: FloatArray, lags: int) -> FloatArray:
+def compute_autocorrelation(z: FloatArray, lags: int) -> FloatArray:
     """Correlation of z (n,) with itself at lags 1 .. lags, about zero, where residuals should be: (lags,)."""
     square = float(z @ z)
     if square == 0:

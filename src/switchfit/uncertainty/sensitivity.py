@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.discretization.arguments import arguments_of
+from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation, Tangents
@@ -95,7 +95,7 @@ class Sensitivity:
         return full
 
 
-def sensitivity(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> Sensitivity:
+def compute_sensitivity(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> Sensitivity:
     """Return states and outputs of experiment e at theta, and their derivatives in theta, on the nodes of a mesh.
 
     Parameters
@@ -107,11 +107,11 @@ def sensitivity(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> Sens
     mesh : Mesh
         With all sample times and knots as nodes.
     """
-    engine = engine_of(problem, e, arguments_of(problem, e, mesh), mesh)
-    return sensitivity_of(problem, e, engine.simulate(*problem.vectors(theta, e), tangents=True))
+    engine = engine_of(problem, e, build_arguments(problem, e, mesh), mesh)
+    return get_sensitivity_program(problem, e, engine.simulate(*problem.vectors(theta, e), tangents=True))
 
 
-def sensitivity_of(problem: Problem, e: int, simulation: Simulation) -> Sensitivity:
+def get_sensitivity_program(problem: Problem, e: int, simulation: Simulation) -> Sensitivity:
     """Return the sensitivity of experiment e from a simulation with its derivatives."""
     return Sensitivity(simulation, problem.places[e], len(problem.theta_names))
 
@@ -139,7 +139,7 @@ class SampleDerivatives(NamedTuple):
     derivative: FloatArray
 
 
-def sample_derivatives(problem: Problem, sensitivities: Sequence[Sensitivity]) -> SampleDerivatives:
+def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensitivity]) -> SampleDerivatives:
     """Residuals of all samples and the derivatives of what is fitted to them.
 
     Parameters
@@ -176,6 +176,6 @@ def sample_derivatives(problem: Problem, sensitivities: Sequence[Sensitivity]) -
     return SampleDerivatives(*(np.concatenate(column) for column in zip(*columns, strict=True)))
 
 
-def gauss_newton_of(samples: SampleDerivatives) -> FloatArray:
+def build_gauss_newton(samples: SampleDerivatives) -> FloatArray:
     """The Gauss-Newton matrix ``sum_k w_k (D h_k)' D h_k`` of all samples: (d, d)."""
     return samples.derivative.T @ (samples.weight[:, None] * samples.derivative)

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from switchfit.discretization.arguments import Samples
-from switchfit.discretization.mesh import row_ending_cell
+from switchfit.discretization.mesh import find_row_ending_cell
 from switchfit.discretization.model import Model
-from switchfit.discretization.propagation import Path, by_row, term_costs
+from switchfit.discretization.propagation import Path, add_point_costs, flatten_rows
 from switchfit.discretization.rows import Pull, cost_of_row, length_factor, times_derivative
 from switchfit.discretization.steps import row_functions
 from switchfit.engine.jax.constraints import terms_at_end, terms_at_transitions
@@ -130,12 +130,12 @@ def node_gradients(model: Model, first: Forward, p: Array, weights: Array | None
     """Differentiate samples, and what ``J + weights . c`` has at transitions and at the end."""
     structure, path = model.structure, first.path
     Q, C, n = path.after.shape
-    cost, of_tau, of_p = term_costs(model, path, p), jnp.zeros(structure.N), jnp.zeros(structure.M)
+    cost, of_tau, of_p = add_point_costs(model, path, p), jnp.zeros(structure.N), jnp.zeros(structure.M)
     ends, starts = jnp.zeros((Q * C + 1, n)), jnp.zeros((Q * C, n))  # the first of the ends is t0
     for k, samples in enumerate(model.arguments.samples):
         if structure.measurements[k].delay is None:
             values, (g_x, g_p) = sample_gradients(model, path, k, samples, p)
-            ends = ends.at[row_ending_cell(path.layout, samples.cell) + 1].add(g_x)
+            ends = ends.at[find_row_ending_cell(path.layout, samples.cell) + 1].add(g_x)
         else:
             at = anchors(model, path, k, p)
             values, (g_start, g_x, g_p) = late_gradients(model, at, k, samples, p)
@@ -193,7 +193,7 @@ def row_ends_gradient(model: Model, first: Forward, psi: Costates) -> Array:
 
     def beside(k: Array, start_d: Array, end_d: Array) -> Array:
         h, at, slopes, after, w, mu = jax.tree.map(
-            lambda a: by_row(a)[k],
+            lambda a: flatten_rows(a)[k],
             (layout.end - layout.start, first.jacobians, first.path.slopes, psi.after, psi.w, psi.mu),
         )
         densities = list(jnp.zeros(len(tableau.b)) if at.l is None else at.l)

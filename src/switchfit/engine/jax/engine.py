@@ -13,9 +13,9 @@ from switchfit.engine.jax.programs import Method, constrained_derivatives, deriv
 from switchfit.engine.jax.simulation import simulate_by_jax
 from switchfit.engine.protocol import Constrained, Derivatives, Engine, Matrix, Simulation
 from switchfit.problem.data import FloatArray
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
-from switchfit.runtime.cache import compilation_cache
+from switchfit.runtime.cache import use_compilation_cache
 
 
 class JaxEngine:
@@ -50,7 +50,7 @@ class JaxEngine:
     ) -> Derivatives:
         """J and its derivatives, by one of the methods."""
         compiled = (method, matrix) in self._compiled
-        with float64(), nullcontext() if compiled else compilation_cache():
+        with use_float64(), nullcontext() if compiled else use_compilation_cache():
             given = self._given(), tau, p, float(side)
             found = derivatives(*given, structure=self._structure, method=method, matrix=matrix)
         self._compiled.add((method, matrix))
@@ -61,7 +61,7 @@ class JaxEngine:
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
     ) -> Constrained:
         """J and its constraints."""
-        with float64(), compilation_cache():
+        with use_float64(), use_compilation_cache():
             given = self._given(), tau, p, float(side), multipliers, penalty
             J, slope, H, c, A = constrained_derivatives(*given, structure=self._structure)
         return Constrained(float(J), np.array(slope), np.array(H), np.array(c), np.array(A))
@@ -78,6 +78,6 @@ class JaxEngine:
 
     def _given(self) -> Arguments:
         if self._on_device is None:
-            with float64():
+            with use_float64():
                 self._on_device = jax.device_put(self._arguments)
         return self._on_device

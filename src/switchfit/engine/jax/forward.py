@@ -24,8 +24,8 @@ from jax import lax
 
 from switchfit.discretization.arguments import Samples
 from switchfit.discretization.model import Model, Piece
-from switchfit.discretization.nodes import costs_at_transitions, end_cost
-from switchfit.discretization.propagation import at_cells, by_mode, by_row
+from switchfit.discretization.nodes import get_end_cost, list_costs_at_transitions
+from switchfit.discretization.propagation import flatten_rows, pick_at_cells, switch_mode
 from switchfit.discretization.steps import step
 from switchfit.engine.jax.forward_sweep import Forward, parameter_directions, time_directions, unit
 from switchfit.engine.jax.late_samples import anchors, late_curvature, late_gradients
@@ -64,12 +64,12 @@ def forward_hessian(model: Model, first: Forward, p: Array) -> Array:
     for k in range(len(model.arguments.samples)):
         H = H + sample_second(model, first, second, k, p)
     path, X = first.path, first.tangents
-    for i, cost in costs_at_transitions(model):
+    for i, cost in list_costs_at_transitions(model):
         at = *path.at_transition(i), p
         along = unit(P.shape[1], i), X.before_transition(path.layout, i), P
         x_tt = second.after[path.layout.first_chunk[i + 1] - 1, -1]
         H = H + jax.grad(cost, argnums=1)(*at) @ x_tt + along_pairs(cost, at, along)
-    cost_at_end = end_cost(model)
+    cost_at_end = get_end_cost(model)
     if cost_at_end is not None:
         at_end = partial(cost_at_end, path.at_end()[0])
         x = path.after[-1, -1]
@@ -105,7 +105,7 @@ def second_tangents(model: Model, first: Forward, p: Array) -> tuple[Array, Seco
         if resets is not None:
             R_x, S_reset = resets
             x_tt = jnp.where(opens, R_x[segment] @ x_tt + S_reset[segment], x_tt)
-        return lax.scan(row, (H, x_tt), by_mode(model, segment, of_mode, *operands))
+        return lax.scan(row, (H, x_tt), switch_mode(model, segment, of_mode, *operands))
 
     resets = reset_sources(model, first, p)
     path, layout = first.path, first.path.layout
@@ -138,8 +138,10 @@ def sample_second(model: Model, first: Forward, second: Second, k: int, p: Array
         at = anchors(model, first.path, k, p)
         i, j = pairs(P.shape[1])
         _, (_, g_x, _) = late_gradients(model, at, k, samples, p)
-        through_state = jnp.einsum("kn,knb->b", g_x, by_row(second.before)[at.row])
-        return through_state + late_curvature(model, at, by_row(first.tangents.before)[at.row], k, samples, p)[i, j]
+        through_state = jnp.einsum("kn,knb->b", g_x, flatten_rows(second.before)[at.row])
+        return (
+            through_state + late_curvature(model, at, flatten_rows(first.tangents.before)[at.row], k, samples, p)[i, j]
+        )
 
     def one(sample: Samples, x: Array, x_d: Array, x_tt: Array) -> Array:
         def cost(x: Array, p: Array) -> Array:
@@ -148,8 +150,8 @@ def sample_second(model: Model, first: Forward, second: Second, k: int, p: Array
         return jax.grad(cost)(x, p) @ x_tt + along_pairs(cost, (x, p), (x_d, P))
 
     path, X = first.path, first.tangents
-    x_d = at_cells(path.layout, X.before[0, 0], X.after, samples.cell)
-    x_tt = at_cells(path.layout, second.before[0, 0], second.after, samples.cell)
+    x_d = pick_at_cells(path.layout, X.before[0, 0], X.after, samples.cell)
+    x_tt = pick_at_cells(path.layout, second.before[0, 0], second.after, samples.cell)
     return jax.vmap(one)(samples, path.at_samples(samples.cell), x_d, x_tt).sum(0)
 
 

@@ -16,7 +16,7 @@ from jax import lax
 
 from switchfit.discretization.mesh import Rows
 from switchfit.discretization.model import Model, Piece
-from switchfit.discretization.propagation import Path, at_cells, by_mode, propagate
+from switchfit.discretization.propagation import Path, pick_at_cells, propagate, switch_mode
 from switchfit.discretization.rows import times_derivative
 from switchfit.discretization.steps import row_functions
 
@@ -72,7 +72,7 @@ class Tangents(NamedTuple):
 
     def at_samples(self, layout: Rows, cell: Array) -> Array:
         """At the ends of the given cells (K,): (K, n, D)."""
-        return at_cells(layout, self.before[0, 0], self.after, cell)
+        return pick_at_cells(layout, self.before[0, 0], self.after, cell)
 
 
 class Forward(NamedTuple):
@@ -131,7 +131,7 @@ def stage_jacobians(model: Model, path: Path, p: Array) -> StageJacobians:
 
     def chunk(given: tuple[Array, Array, Array, Piece, Array]) -> StageJacobians:
         segment, *operands = given
-        return by_mode(model, segment, of_mode, *operands)
+        return switch_mode(model, segment, of_mode, *operands)
 
     layout = path.layout
     return lax.map(chunk, (layout.segment, layout.start, layout.end, path.pieces, path.stages))

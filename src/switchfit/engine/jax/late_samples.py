@@ -20,7 +20,7 @@ from jax import lax
 
 from switchfit.discretization.arguments import Samples
 from switchfit.discretization.model import Model, Piece
-from switchfit.discretization.propagation import Path, by_row, row_holding, seen_late
+from switchfit.discretization.propagation import Path, find_late_rows, flatten_rows, step_to_late_sample
 
 Array = jax.Array
 
@@ -50,15 +50,15 @@ class Anchors(NamedTuple):
 
 def anchors(model: Model, path: Path, k: int, p: Array) -> Anchors:
     """Rows and states from which the samples of the k-th Measurements are seen."""
-    row, segment, piece, start, x = row_holding(model, path, k, p)
-    return Anchors(row, segment, by_row(path.layout.starts_at)[row], piece, start, x)
+    row, segment, piece, start, x = find_late_rows(model, path, k, p)
+    return Anchors(row, segment, flatten_rows(path.layout.starts_at)[row], piece, start, x)
 
 
 def _costs(model: Model, k: int) -> Callable[..., Array]:
     """Cost of one late sample as a function of (start, x, p)."""
 
     def cost(sample: Samples, segment: Array, piece: Piece, start: Array, x: Array, p: Array) -> Array:
-        there, x_s = seen_late(model, k, sample, segment, piece, start, x, p)
+        there, x_s = step_to_late_sample(model, k, sample, segment, piece, start, x, p)
         return model.sample_cost(k, there, x_s, p)
 
     return cost
@@ -114,7 +114,7 @@ def late_gauss_newton(model: Model, at: Anchors, x_d: Array, k: int, samples: Sa
     def one(sample: Samples, at: Anchors, x_d: Array) -> Array:
         def along(e: Array) -> tuple[Array, Array]:
             start, x, q = _along(model, at, x_d, p, e)
-            there, x_s = seen_late(model, k, sample, at.segment, at.piece, start, x, q)
+            there, x_s = step_to_late_sample(model, k, sample, at.segment, at.piece, start, x, q)
             return model.sample_residual(k, there, x_s, q), model.sample_information(k, there, x_s, q)
 
         zero = jnp.zeros(x_d.shape[-1])

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.model import Model
-from switchfit.discretization.propagation import path_cost, propagate
+from switchfit.discretization.propagation import compute_path_cost, propagate
 from switchfit.engine.jax.backward_sweep import backward_sweep
 from switchfit.engine.jax.constraints import constraints
 from switchfit.engine.jax.forward import forward_hessian
@@ -85,7 +85,7 @@ def _autodiff(model: Model, tau: Array, p: Array, side: Array) -> tuple[Array, A
 
     def cost(theta: Array) -> Array:
         path = propagate(model, theta[:N], theta[N:], side)
-        return path_cost(model, path, theta[N:])
+        return compute_path_cost(model, path, theta[N:])
 
     theta = jnp.concatenate([tau, p])
     return cost(theta), jax.jacfwd(cost)(theta), jax.jacfwd(jax.jacfwd(cost))(theta)

@@ -23,8 +23,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from switchfit.discretization.arguments import Samples
-from switchfit.discretization.model import Model, Piece, weighted
-from switchfit.discretization.propagation import Path, by_mode, by_row
+from switchfit.discretization.model import Model, Piece, apply_weights
+from switchfit.discretization.propagation import Path, flatten_rows, switch_mode
 from switchfit.discretization.rows import length_factor, times_derivative
 from switchfit.engine.jax.backward_sweep import Backward, Costates, rows_at_transitions
 from switchfit.engine.jax.constraints import terms_at_end, terms_at_transitions
@@ -153,7 +153,7 @@ def step_length_curvature(model: Model, first: Forward, psi: Costates) -> Array:
     def of_row(row: Array) -> Array:
         """V' of one row: (D,)."""
         all_rows = of_rows(model, first), psi.after, psi.mu
-        given, after, mu = jax.tree.map(lambda values: by_row(values)[row], all_rows)
+        given, after, mu = jax.tree.map(lambda values: flatten_rows(values)[row], all_rows)
         _, _, _, at, start_d, end_d = given
         X_d, K_d, _ = tangents_again(model, *given)
         ell_d = jnp.zeros((len(tableau.b), P.shape[1]))
@@ -178,7 +178,7 @@ def stage_gauss_newton(model: Model, first: Forward, p: Array) -> Array:
         H = jnp.zeros((P.shape[1], P.shape[1]))
         for residual, W in zip(model.reference_residuals(piece), model.arguments.weights, strict=True):
             r_d = _columns(residual, (t, x, p), (t_d, x_d, P))
-            H = H + r_d.T @ weighted(W, r_d)
+            H = H + r_d.T @ apply_weights(W, r_d)
         for ell in model.structure.running:
 
             def value(x: Array, p: Array, ell: Callable[..., Any] = ell) -> Array:
@@ -215,7 +215,7 @@ def _sum_over_chunks(
 
     def chunk(H: Array, given: Any) -> tuple[Array, None]:
         segment, rows = given
-        return H + by_mode(model, segment, of_mode, *rows), None
+        return H + switch_mode(model, segment, of_mode, *rows), None
 
     return lax.scan(chunk, jnp.zeros((D, D)), (segment, operands))[0]
 
@@ -227,7 +227,7 @@ def sample_curvature(
     P = parameter_directions(model)
     if model.structure.measurements[k].delay is not None:
         of_late, at = late_gauss_newton if gauss_newton else late_curvature, anchors(model, path, k, p)
-        return of_late(model, at, by_row(X.before)[at.row], k, samples, p)
+        return of_late(model, at, flatten_rows(X.before)[at.row], k, samples, p)
 
     def one(given: tuple[Samples, Array, Array]) -> Array:
         sample, x, x_d = given

@@ -19,16 +19,16 @@ from jax import lax
 from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
-from switchfit.discretization.mesh import CHUNK, Mesh, rows
+from switchfit.discretization.mesh import CHUNK, Mesh, build_rows
 from switchfit.discretization.model import Model, Piece
-from switchfit.discretization.nodes import costs_at_transitions
+from switchfit.discretization.nodes import list_costs_at_transitions
 from switchfit.discretization.steps import step
 from switchfit.engine.protocol import Simulation, Tangents, with_samples
 from switchfit.problem.data import FloatArray
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 from switchfit.problem.losses import robust
 from switchfit.problem.structure import Structure
-from switchfit.runtime.cache import compilation_cache
+from switchfit.runtime.cache import use_compilation_cache
 
 BLOCK = 64
 """Rows that one call of the program takes: with shapes that do not depend on the mesh it is compiled once a model."""
@@ -39,13 +39,13 @@ def simulate_by_jax(
 ) -> Simulation:
     """Return all rows of one experiment, and their derivatives if asked for."""
     arguments = whole.without_mesh()
-    layout = rows(mesh.nodes, tau, 1.0, np)
+    layout = build_rows(mesh.nodes, tau, 1.0, np)
     cell, start, end = (np.reshape(a, -1) for a in (layout.cell, layout.start, layout.end))
     index = np.arange(structure.N + structure.M)
     starts_d, ends_d = (1.0 * (np.reshape(a, -1)[:, None] == index) for a in (layout.starts_at, layout.ends_at))
-    costly = {i for i, _ in costs_at_transitions(Model(structure, arguments))}
+    costly = {i for i, _ in list_costs_at_transitions(Model(structure, arguments))}
     kept, parts, cost = [], [], 0.0
-    with float64(), compilation_cache():
+    with use_float64(), use_compilation_cache():
         start_of = partial(_start, structure=structure.functions, N=structure.N, tangents=tangents)
         x, X = map(np.asarray, start_of(arguments, p))
         for i, mode in enumerate(structure.mode_of_segment):
@@ -214,7 +214,7 @@ def _block(
     costs, before, after, *derivatives = found
 
     def seen(t: jax.Array, x: jax.Array, p: jax.Array) -> jax.Array:
-        return jnp.concatenate([jnp.zeros(0), *(model.observed(h, t, x, p) for h, _ in structure.outputs)])
+        return jnp.concatenate([jnp.zeros(0), *(model.observe(h, t, x, p) for h, _ in structure.outputs)])
 
     def along(t: jax.Array, x: jax.Array, X: jax.Array) -> jax.Array:
         linear = jax.linearize(partial(seen, t), x, p)[1]
@@ -240,7 +240,7 @@ def _at_transition(
 ) -> jax.Array:
     """The costs at transition i (from 0)."""
     total = jnp.zeros(())
-    for at, cost in costs_at_transitions(Model(structure, arguments)):
+    for at, cost in list_costs_at_transitions(Model(structure, arguments)):
         total = total + cost(t, x, p) if at == i else total
     return total
 
@@ -262,7 +262,7 @@ def _late_outputs(
     of_rows = times, mode, simulation.start[row], simulation.before[row], whole.nodes[at], whole.signals[at]
     padded = [np.concatenate([a, np.repeat(a[-1:], -len(times) % BLOCK, axis=0)]) for a in of_rows]
     parts = []
-    with float64(), compilation_cache():
+    with use_float64(), use_compilation_cache():
         for first in range(0, len(padded[0]), BLOCK):
             block = [a[first : first + BLOCK] for a in padded]
             parts.append(np.asarray(_late_block(whole.without_mesh(), *block, p, structure=structure.functions)))
@@ -291,6 +291,6 @@ def _late_block(
             for m in range(len(structure.modes))
         ]
         there = lax.switch(mode, steps, x)
-        return jnp.concatenate([jnp.zeros(0), *(model.observed(h, time, there, p) for h, _ in structure.outputs)])
+        return jnp.concatenate([jnp.zeros(0), *(model.observe(h, time, there, p) for h, _ in structure.outputs)])
 
     return jax.vmap(one)(times, mode, start, x, Piece(origin, coefficients))

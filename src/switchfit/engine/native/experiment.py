@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments, Samples
-from switchfit.discretization.nodes import AT_TRANSITIONS, constrained_transitions
+from switchfit.discretization.nodes import AT_TRANSITIONS, list_constrained_transitions
 from switchfit.engine.native.adaptive import SLOPE
 from switchfit.engine.native.kernels import RESET, START
 from switchfit.engine.native.llvm import BUDGET, Program
@@ -135,7 +135,7 @@ class NativeExperiment:
         self._own_p, self._tau = self._p[: sizes.M], self._bounds[1 : structure.N + 1]
         self._begins = self._first_cell[1 : structure.N + 1]
         rows = constraint_rows(library, sizes)
-        own_rows = [rows[kind.name] + i for kind, i in constrained_transitions(structure)]
+        own_rows = [rows[kind.name] + i for kind, i in list_constrained_transitions(structure)]
         self._constraint_rows = np.array([*own_rows, *range(rows["end"], rows["count"])], dtype=np.intp)
         self._weights = np.zeros((2, max(rows["count"], 1)))  # multipliers and penalties
         lengths = sums(library, sizes)
@@ -393,7 +393,7 @@ class NativeExperiment:
                 self._table[k] = found[name].ctypes.data
 
     def _place(self, tau: FloatArray, side: float) -> None:
-        """The cells in which segments begin, as in `switchfit.discretization.mesh.rows`."""
+        """The cells in which segments begin, as in `switchfit.discretization.mesh.build_rows`."""
         if len(tau):
             passed = self.times.searchsorted(tau, "right" if side > 0 else "left")
             self._begins[:] = np.minimum(np.maximum(passed - 1, 0), self._cells - 1)

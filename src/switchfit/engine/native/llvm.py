@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.engine.native.scalars import LOGIC, Node, needed
-from switchfit.runtime.cache import read_code, usable_folder, write_code
+from switchfit.runtime.cache import get_usable_folder, read_code, write_code
 
 INTRINSICS = {
     "sqrt": "sqrt",
@@ -267,7 +267,7 @@ def compiled(text: str) -> Program:
     key = hashlib.sha256("\n".join([text, llvmlite.__version__, *_processor()]).encode()).hexdigest()
     name, features = _processor()
     machine = llvm.Target.from_default_triple().create_target_machine(cpu=name, features=features, opt=2)
-    folder = usable_folder()
+    folder = get_usable_folder()
     path = None if folder is None else folder / f"native-{key}"
     code = None if path is None else read_code(path)
     if code is None:

@@ -11,7 +11,7 @@ import threading
 from functools import lru_cache
 
 from switchfit.discretization.nodes import AT_TRANSITIONS
-from switchfit.discretization.tableaus import EXPLICIT, tableau_of
+from switchfit.discretization.tableaus import EXPLICIT, get_tableau
 from switchfit.engine.native.adaptive import write_control, write_slope
 from switchfit.engine.native.driver import Driver
 from switchfit.engine.native.frame import handler
@@ -20,7 +20,7 @@ from switchfit.engine.native.llvm import Module, Program, compiled
 from switchfit.engine.native.scalars import Graph
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.engine.native.trace import Unsupported
-from switchfit.problem.functions import float64
+from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
 
 _one_at_a_time = threading.Lock()
@@ -57,12 +57,12 @@ def _program_of(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> 
 
 
 def _compiled(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> Program:
-    if tableau_of(library.solver) is not EXPLICIT:
+    if get_tableau(library.solver) is not EXPLICIT:
         raise Unsupported(f"solver={library.solver!r} takes implicit steps")
     if sizes.D == 0:
         raise Unsupported("an experiment has no unknowns")
     module = Module(sizes.width)
-    with float64():
+    with use_float64():
         for order in orders:
             module.prefix = PREFIX[order]
             _write(module, library, sizes, order)

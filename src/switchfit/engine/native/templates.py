@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from switchfit.discretization.arguments import Arguments, Samples
-from switchfit.discretization.model import Model, Piece, weighted
-from switchfit.discretization.nodes import TransitionKind, end_constraints, end_cost, transition_function
+from switchfit.discretization.model import Model, Piece, apply_weights
+from switchfit.discretization.nodes import TransitionKind, get_end_constraints, get_end_cost, get_transition_function
 from switchfit.engine.native.scalars import Template
 from switchfit.engine.native.trace import traced
 from switchfit.problem.structure import Structure
@@ -183,7 +183,7 @@ class Templates:
         def time(t: Any, p: Any, *constants: Any) -> Any:
             model = self.model(constants)
             nothing = jnp.zeros(0)
-            seen = lambda p: model.seen_at(k, Samples(jnp.zeros((), int), t, nothing, nothing), p).time  # noqa: E731
+            seen = lambda p: model.correct_delay(k, Samples(jnp.zeros((), int), t, nothing, nothing), p).time  # noqa: E731
             return [seen(p), jax.grad(seen)(p)]
 
         return traced(time, (), (self.sizes.M,), *self.sizes.constants, name="delay of Measurements")
@@ -192,7 +192,7 @@ class Templates:
         """The terminal costs."""
 
         def end(x: Any, p: Any, *constants: Any) -> Any:
-            cost = end_cost(self.model(constants))
+            cost = get_end_cost(self.model(constants))
             if cost is None:
                 raise ValueError("there is no terminal cost")
             if self.order != Order.GAUSS_NEWTON:
@@ -209,7 +209,7 @@ class Templates:
         """
 
         def at(t: Any, x: Any, p: Any, weight: Any, *constants: Any) -> Any:
-            function = transition_function(self.model(constants), kind, which)
+            function = get_transition_function(self.model(constants), kind, which)
             if function is None:
                 raise ValueError("there is no function at this transition")
             if not kind.constraint:  # whose own second derivatives belong to the Gauss-Newton matrix too
@@ -224,7 +224,7 @@ class Templates:
         """All terminal constraints and their first derivatives, then those of the weighted sum."""
 
         def end(x: Any, p: Any, weights: Any, *constants: Any) -> Any:
-            function = end_constraints(self.model(constants))
+            function = get_end_constraints(self.model(constants))
             if function is None:
                 raise ValueError("there is no terminal constraint")
             return self._constraint(function, jnp.zeros(()), x, p, weights)
@@ -265,7 +265,7 @@ class Templates:
             model = self.model(constants)
 
             def seen(x: Any, p: Any) -> Any:
-                each = [model.observed(observe, t, x, p) for observe, _ in self.library.outputs]
+                each = [model.observe(observe, t, x, p) for observe, _ in self.library.outputs]
                 return jnp.concatenate([jnp.zeros(0), *each])
 
             return [seen(x, p), *(jax.jacfwd(seen, argnums=(0, 1))(x, p) if self.order > Order.GRADIENT else ())]
@@ -321,7 +321,7 @@ def _normal_matrix(r_d: tuple[Any, Any, Any], weigh: Callable[[Any], Any]) -> li
 
 
 def _weigh(W: Any, factor: Any, A: Any) -> Any:
-    return factor * weighted(W, A)
+    return factor * apply_weights(W, A)
 
 
 def _added(one: list[Any], other: list[Any]) -> list[Any]:

@@ -1,0 +1,66 @@
+"""A heater that is switched off: the smallest problem with a transition, to try things out with."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from switchfit.problem.data import Measurements
+from switchfit.problem.experiment import Experiment
+from switchfit.problem.parameter import Parameter
+from switchfit.problem.problem import Problem
+from switchfit.problem.system import HybridSystem
+
+OFF, LOSS, NOISE = 2.5, 0.4, 0.2
+"""What the log was made with: when the heater is switched off (h), rate of the loss (1/h), noise (K)."""
+
+
+def heater_problem() -> Problem:
+    """Return a small problem with made-up data: when was the heater switched off, and how fast does the heat leave?
+
+    The state is the temperature above that of the room (K), 0 at first:
+
+    on: ``dT/dt = power - k T``; off: ``dT/dt = -k T``.
+
+    Returns
+    -------
+    Problem
+        Its unknowns are ``tau_1`` (h), first guess 2, and ``k`` (1/h), first guess 0.5; ``power`` is known, 10 K/h.
+        The 24 measurements, one every quarter of an hour, were made with tau_1 = 2.5 h and k = 0.4/h, and noise of
+        0.2 K.
+
+    See Also
+    --------
+    switchfit.models.sliding_block, switchfit.models.skid_steer : models to fit to a log.
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> sf.estimate(heater_problem()).theta.round(1)
+    array([2.5, 0.4])
+    """
+    times = np.linspace(0.25, 6.0, 24)
+    noise = NOISE * np.random.default_rng(0).normal(size=len(times))
+    log = Measurements(times, _temperature(times) + noise, sigma=NOISE, names=("thermometer",))
+    system = HybridSystem({"on": _on, "off": _off}, [0.0], state_names=("T",), state_units=("K",))
+    parameters = {
+        "k": Parameter(0.5, lower=0.01, upper=5.0, unit="1/h"),
+        "power": Parameter(10.0, fixed=True, unit="K/h"),
+    }
+    return Problem(system, Experiment(log, ("on", "off"), (2.0,), 0.0, 6.0, time_unit="h"), parameters)
+
+
+def _on(t: Any, x: Any, p: Any) -> Any:
+    return p["power"] - p["k"] * x
+
+
+def _off(t: Any, x: Any, p: Any) -> Any:
+    return -p["k"] * x
+
+
+def _temperature(times: Any) -> Any:
+    """The closed form of the solution with `OFF` and `LOSS`."""
+    on = np.minimum(times, OFF)
+    return 10.0 / LOSS * (1.0 - np.exp(-LOSS * on)) * np.exp(-LOSS * (times - on))

@@ -1,0 +1,93 @@
+"""Docstrings of what is public: each has examples that run, and says what to look at next."""
+
+import doctest
+import inspect
+import re
+
+import matplotlib
+import numpy as np
+import pytest
+
+import switchfit as sf
+from switchfit.models import heater_problem
+
+matplotlib.use("agg")
+
+#: Modules whose docstrings have no examples yet.
+LATER = ("switchfit.fit.", "switchfit.optimize.")
+
+
+def public():
+    """Functions, classes and their public methods by name, each method under the class that defines it."""
+    found = {f"models.{heater_problem.__name__}": heater_problem}
+    for name in sf.__all__:
+        item = getattr(sf, name)
+        found[name] = item
+        for base in item.__mro__ if inspect.isclass(item) else ():
+            for method, raw in vars(base).items():
+                function = getattr(raw, "__func__", raw)
+                if not method.startswith("_") and inspect.isfunction(function):
+                    found[f"{base.__name__}.{method}"] = function
+    return {name: item for name, item in found.items() if item.__module__.startswith("switchfit.")}
+
+
+PUBLIC = public()
+DEMANDED = {name: item for name, item in PUBLIC.items() if not item.__module__.startswith(LATER)}
+
+
+def section(item, title):
+    """Lines of a section of a numpydoc docstring."""
+    text = inspect.getdoc(item) or ""
+    match = re.search(rf"^{title}\n-+\n(.*?)(?=\n\n[A-Z][A-Za-z ]+\n-{{3,}}\n|\Z)", text, re.MULTILINE | re.DOTALL)
+    return match[1] if match else ""
+
+
+def exists(name):
+    """Whether a name in See Also leads to something, from the package or from its root."""
+    item = sf
+    for part in name.removeprefix("switchfit.").split("."):
+        fields = getattr(item, "__annotations__", {}) if inspect.isclass(item) else {}
+        inherited = {field for base in getattr(item, "__mro__", ()) for field in getattr(base, "__annotations__", {})}
+        if part in fields or part in inherited:
+            return True
+        if not hasattr(item, part):
+            return False
+        item = getattr(item, part)
+    return True
+
+
+@pytest.mark.parametrize("name", DEMANDED)
+def test_there_are_examples_and_references(name):
+    assert ">>>" in section(DEMANDED[name], "Examples"), f"{name} has no Examples section"
+    assert section(DEMANDED[name], "See Also"), f"{name} has no See Also section"
+
+
+@pytest.mark.parametrize("name", [name for name, item in PUBLIC.items() if section(item, "Examples")])
+def test_examples_run_and_print_what_they_say(name):
+    """Each by itself: what it needs, it imports."""
+    (examples,) = doctest.DocTestFinder(recurse=False).find(PUBLIC[name], name, globs={})
+    report = []
+    result = doctest.DocTestRunner(verbose=False).run(examples, out=report.append)
+    assert result.failed == 0, "".join(report)
+    assert result.attempted > 1
+
+
+@pytest.mark.parametrize("name", [name for name, item in PUBLIC.items() if section(item, "See Also")])
+def test_references_lead_somewhere(name):
+    for line in section(PUBLIC[name], "See Also").splitlines():
+        for reference in line.partition(" : ")[0].split(","):
+            assert exists(reference.strip()), f"{name}: See Also names {reference.strip()!r}, which is not there"
+            assert reference.strip() != name, f"{name}: See Also names itself"
+
+
+def test_the_heater_is_what_its_docstring_says():
+    """The closed form of its temperature, and the numbers that the log was made with."""
+    problem = heater_problem()
+    assert problem.theta_names == ("tau_1", "k")
+    np.testing.assert_array_equal(problem.initial_theta, [2.0, 0.5])
+    path = sf.simulate(problem, [2.5, 0.4])
+    on = np.minimum(path.times, 2.5)
+    expected = 25.0 * (1.0 - np.exp(-0.4 * on)) * np.exp(-0.4 * (path.times - on))
+    np.testing.assert_allclose(path.states[:, 0], expected, rtol=1e-8, atol=1e-8)
+    fit = sf.estimate(problem)
+    assert np.all(np.abs(fit.theta - [2.5, 0.4]) < 3 * fit.standard_errors)
