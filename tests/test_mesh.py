@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
 
 import switchfit as sf
 from switchfit.discretization.arguments import arguments_of
@@ -327,8 +328,11 @@ def swinging(t, x, p, u):
     return jnp.array([x[1], -4.0 * x[0] + u - 0.3 * x[1] ** 3])
 
 
-def test_the_compiled_solver_takes_the_steps_of_scipy():
-    """Also across the knots of a reference signal, from rest (a first step of its own kind) and in two modes."""
+def test_both_engines_take_the_steps_of_scipy():
+    """Those of machine code and those of Python.
+
+    Also across the knots of a reference signal, from rest (a first step of its own kind) and in two modes.
+    """
     times = np.linspace(0.0, 6.0, 14)
     signal = sf.ReferenceSignal.from_samples(times, np.sin(times))
     system = sf.HybridSystem({"a": swinging, "b": lambda t, x, p, u: jnp.array([-x[0], -8.0 * x[1]])}, [0.0, 0.0])
@@ -340,13 +344,28 @@ def test_the_compiled_solver_takes_the_steps_of_scipy():
     arguments = arguments_of(problem, 0, coarse)
     native = native_experiment(problem.structures[0], arguments, coarse.times, 0)
     given = (problem, problem.structures[0], arguments.without_mesh(), arguments.signals, coarse)
+    last = coarse.cells - 1
+
+    def steps_of_scipy(mode, start, end, x):
+        def slope(t, y):
+            return native.slope(mode, t, y, np.zeros(0), cell_of(t, start, end))
+
+        def cell_of(t, start, end):
+            inside = min(max(t, np.nextafter(start, end)), np.nextafter(end, start))
+            return min(int(coarse.times.searchsorted(inside, "right")) - 1, last)
+
+        found = solve_ivp(slope, (start, end), [*x, 0.0], "RK45", rtol=problem.rtol, atol=problem.atol)
+        return found.t[1:], found.y[:-1, -1]
+
     for mode, start, end, x in ((0, 0.0, 1.7, [0.0, 0.0]), (1, 1.7, 2.5, [0.4, 1.0]), (0, 2.9, 6.0, [0.1, -0.2])):
+        expected, state = steps_of_scipy(mode, start, end, x)
         with float64():
-            steps, after = _solve_natively(problem, native, mode, start, end, np.array(x), np.zeros(0))
-            expected, state = _solve(*given, mode, start, end, np.array(x), np.zeros(0))
-        assert len(steps) == len(expected) > 10
-        np.testing.assert_allclose(steps, expected, rtol=0, atol=1e-4 * (end - start))
-        np.testing.assert_allclose(after, state, rtol=0, atol=1e-8)
+            natively = _solve_natively(problem, native, mode, start, end, np.array(x), np.zeros(0))
+            in_python = _solve(*given, mode, start, end, np.array(x), np.zeros(0))
+        for steps, after in (natively, in_python):
+            assert len(steps) == len(expected) > 10
+            np.testing.assert_allclose(steps, expected, rtol=0, atol=1e-4 * (end - start))
+            np.testing.assert_allclose(after, state, rtol=0, atol=1e-8)
 
 
 def test_a_mesh_for_several_thetas_is_as_dense_as_the_densest():

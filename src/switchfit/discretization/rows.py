@@ -53,9 +53,14 @@ def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, e
     found = Stages([], [], [])
     for row, c in zip(tableau.a, tableau.c.tolist(), strict=True):
         found.times.append(start + c * h)
-        found.states.append(_plus(x, h, combine(row, found.slopes)))
+        found.states.append(stage_state(row, h, x, found.slopes))
         found.slopes.append(f(found.times[-1], found.states[-1]))
     return found
+
+
+def stage_state(row: FloatArray, h: Array, x: Array, slopes: Sequence[Array]) -> Array:
+    """Return the state (n,) of a stage from the slopes of those before it; `row` is its row of a."""
+    return _plus(x, h, combine(row, slopes))
 
 
 def end_of_row(tableau: Tableau, h: Array, x: Array, slopes: Sequence[Array]) -> Array:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -163,6 +164,21 @@ class Node:
 
     def __neg__(self) -> Node:
         return self.graph.apply("neg", self)
+
+    def __lt__(self, other: Any) -> Any:
+        return self._with("lt", self, other)
+
+    def __le__(self, other: Any) -> Any:
+        return self._with("le", self, other)
+
+    def __gt__(self, other: Any) -> Any:
+        return self._with("lt", other, self)
+
+    def __ge__(self, other: Any) -> Any:
+        return self._with("le", other, self)
+
+    def __bool__(self) -> bool:
+        raise TypeError("a node is known only at run time: use apply('select', ...)")
 
 
 TYPES = {op: (op in LOGIC, op in LOGIC or op in COMPARISONS) for op in FOLDED if op != "select"}
@@ -349,6 +365,33 @@ class Graph:
             self._known[key] = node
             self.nodes.append(node)
         return node
+
+
+class Namespace:
+    """Functions of NumPy, by their names there, for arrays of nodes: the `xp` of functions shared with NumPy.
+
+    Comparisons of nodes are truth values, but ``==`` says whether two are the same node.
+    """
+
+    def __init__(self, graph: Graph) -> None:
+        self._graph = graph
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        if name not in OF_NUMPY:
+            raise AttributeError(f"there is no operation for numpy.{name}")
+        op, count = OF_NUMPY[name]
+        return np.frompyfunc(partial(self._graph.apply, op), count, 1)
+
+    def isnan(self, a: Any) -> Any:
+        """Return whether entries are not a number."""
+        return np.frompyfunc(lambda node: self._graph.apply("ne", node, node), 1, 1)(a)
+
+
+OF_NUMPY = {
+    **{"where": ("select", 3), "maximum": ("max", 2), "minimum": ("min", 2), "power": ("pow", 2)},
+    **{"abs": ("abs", 1), "sqrt": ("sqrt", 1)},
+    **{"logical_and": ("and", 2), "logical_or": ("or", 2), "logical_not": ("not", 1)},
+}
 
 
 def as_objects(values: Sequence[Any]) -> Objects:
