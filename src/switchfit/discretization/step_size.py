@@ -26,6 +26,8 @@ Array = Any
 
 SAFETY, SMALLEST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
 
+EPS, SMALLEST = float(np.finfo(float).eps), float(np.nextafter(0.0, 1.0))
+
 EXPONENT = -1 / 5
 """Minus one over the order of the error, which is one more than that of the estimate."""
 
@@ -62,7 +64,7 @@ def error_norm(error: Array, y: Array, after: Array, tolerances: Tolerances, xp:
 
 def shortest_step(t: Array, xp: Any = np) -> Array:
     """Return the shortest step that is tried at t: about ten units in the last place."""
-    return 10.0 * xp.maximum(np.finfo(float).eps * xp.abs(t), float(np.nextafter(0.0, 1.0)))
+    return xp.maximum(10.0 * EPS * xp.abs(t), 10.0 * SMALLEST)
 
 
 def limit_step(t: Array, step: Array, end: Array, xp: Any = np) -> Array:
@@ -76,7 +78,7 @@ def judge_step(
     tolerances: Tolerances,
     y: Array,
     after: Array,
-    slopes: Sequence[Array],
+    slopes: Sequence[Array] | FloatArray,
     xp: Any = np,
 ) -> tuple[Progress, Array]:
     """Accept or refuse a step, and choose the length of the next one.
@@ -84,14 +86,13 @@ def judge_step(
     Parameters
     ----------
     y, after : (n,), before and behind the step
-    slopes : s + 1 arrays (n,), of the stages and behind the step
+    slopes : (s + 1, n), of the stages and behind the step
     """
     norm = error_norm(at.step * combine(ADAPTIVE.error, slopes), y, after, tolerances, xp)
     accepted = norm < 1.0
-    factor = xp.minimum(xp.maximum(SAFETY * xp.power(norm, EXPONENT), SMALLEST_FACTOR), LARGEST_FACTOR)
-    factor = xp.where(xp.logical_and(accepted, at.refused), xp.minimum(factor, 1.0), factor)
-    factor = xp.where(xp.isnan(norm), SMALLEST_FACTOR, factor)
-    step = at.step * factor
+    largest = xp.where(at.refused, 1.0, LARGEST_FACTOR)
+    factor = xp.minimum(xp.maximum(SAFETY * xp.power(norm, EXPONENT), SMALLEST_FACTOR), largest)
+    step = at.step * xp.where(norm >= 0.0, factor, SMALLEST_FACTOR)  # a norm that is not a number compares as false
     # A length that is not a number compares as false: it is stuck, not tried for ever.
     stuck = xp.logical_not(xp.logical_or(accepted, shortest_step(at.t, xp) <= step))
     t = xp.where(accepted, xp.where(end - at.t <= at.step, end, at.t + at.step), at.t)

@@ -226,22 +226,23 @@ class ExplicitSolver(scipy.integrate.OdeSolver):
     ) -> None:
         super().__init__(slope, t0, y0, end, vectorized=False)
         self._tolerances, self._end = Tolerances(rtol, atol), end
-        self._slope = self.fun(t0, y0)
-        step = first_step(self.fun, t0, y0, self._slope, end, self._tolerances)
+        self._slopes = np.zeros((len(ADAPTIVE.error), len(y0)))
+        self._slopes[0] = self.fun(t0, y0)
+        step = first_step(self.fun, t0, y0, self._slopes[0], end, self._tolerances)
         self._at = Progress(t0, step, False, False)
 
     def _step_impl(self) -> tuple[bool, str | None]:
         """Try steps until one is accepted; return whether one was, and the reason if not."""
-        tableau, t, y = ADAPTIVE.tableau, self._at.t, self.y
+        tableau, K, t, y = ADAPTIVE.tableau, self._slopes, self._at.t, self.y
         while not self._at.stuck:
-            step, slopes = self._at.step, [self._slope]
-            for row, c in zip(tableau.a[1:], tableau.c[1:].tolist(), strict=True):
-                slopes.append(self.fun(t + c * step, stage_state(row, step, y, slopes)))
-            after = end_of_row(tableau, step, y, slopes)
-            slopes.append(self.fun(t + step, after))
-            self._at, self.y = judge_step(self._at, self._end, self._tolerances, y, after, slopes)
+            step = self._at.step
+            for j, c in enumerate(tableau.c[1:].tolist(), start=1):
+                K[j] = self.fun(t + c * step, stage_state(tableau.a[j], step, y, K[:j]))
+            after = end_of_row(tableau, step, y, K[:-1])
+            K[-1] = self.fun(t + step, after)
+            self._at, self.y = judge_step(self._at, self._end, self._tolerances, y, after, K)
             if not self._at.refused:
-                self.t, self._slope = float(self._at.t), slopes[-1]
+                self.t, K[0] = float(self._at.t), K[-1]
                 return True, None
         return False, self.TOO_SMALL_STEP
 

@@ -382,10 +382,6 @@ class Namespace:
         op, count = OF_NUMPY[name]
         return np.frompyfunc(partial(self._graph.apply, op), count, 1)
 
-    def isnan(self, a: Any) -> Any:
-        """Return whether entries are not a number."""
-        return np.frompyfunc(lambda node: self._graph.apply("ne", node, node), 1, 1)(a)
-
 
 OF_NUMPY = {
     **{"where": ("select", 3), "maximum": ("max", 2), "minimum": ("min", 2), "power": ("pow", 2)},
