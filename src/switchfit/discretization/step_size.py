@@ -91,13 +91,13 @@ def judge_step(
     norm = error_norm(at.step * combine(ADAPTIVE.error, slopes), y, after, tolerances, xp)
     accepted = norm < 1.0
     largest = xp.where(at.refused, 1.0, LARGEST_FACTOR)
-    factor = xp.minimum(xp.maximum(SAFETY * xp.power(norm, EXPONENT), SMALLEST_FACTOR), largest)
+    factor = xp.minimum(xp.maximum(SAFETY * xp.float_power(norm, EXPONENT), SMALLEST_FACTOR), largest)
     step = at.step * xp.where(norm >= 0.0, factor, SMALLEST_FACTOR)  # a norm that is not a number compares as false
     # A length that is not a number compares as false: it is stuck, not tried for ever.
-    stuck = xp.logical_not(xp.logical_or(accepted, shortest_step(at.t, xp) <= step))
+    stuck = ~(accepted | (shortest_step(at.t, xp) <= step))
     t = xp.where(accepted, xp.where(end - at.t <= at.step, end, at.t + at.step), at.t)
     step = xp.where(accepted, xp.maximum(step, shortest_step(t, xp)), step)
-    now = Progress(t, limit_step(t, step, end, xp), xp.logical_not(accepted), stuck)
+    now = Progress(t, limit_step(t, step, end, xp), ~accepted, stuck)
     return now, xp.where(accepted, after, y)
 
 
