@@ -324,7 +324,7 @@ def _total(
         ) -> tuple[jax.Array, jax.Array, jax.Array]:
             own, tau, p = given
             found: tuple[jax.Array, jax.Array, jax.Array] = traced_derivatives(
-                structure, own, tau, p, natively=layout.natively
+                structure, own, tau, p, jnp.ones(()), natively=layout.natively
             )
             return found
 
