@@ -9,14 +9,18 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
 
 import switchfit as sf
+from switchfit.discretization import step_size
 from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import CHUNK, Mesh, build_rows, count_chunks, find_row_ending_cell, pad_length
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import compute_path_cost, propagate
+from switchfit.discretization.tableaus import ADAPTIVE
 from switchfit.engine.adaptive import _solve, _solve_natively, fixed_nodes, refined_mesh
 from switchfit.engine.native.experiment import native_experiment
+from switchfit.engine.native.scalars import Graph, Namespace, as_objects
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.functions import use_float64
 
@@ -329,8 +333,11 @@ def swinging(t, x, p, u):
     return jnp.array([x[1], -4.0 * x[0] + u - 0.3 * x[1] ** 3])
 
 
-def test_the_compiled_solver_takes_the_steps_of_scipy():
-    """Also across the knots of a reference signal, from rest (a first step of its own kind) and in two modes."""
+def test_both_engines_take_the_steps_of_scipy():
+    """Those of machine code and those of Python.
+
+    Also across the knots of a reference signal, from rest (a first step of its own kind) and in two modes.
+    """
     times = np.linspace(0.0, 6.0, 14)
     signal = sf.ReferenceSignal.from_samples(times, np.sin(times))
     system = sf.HybridSystem({"a": swinging, "b": lambda t, x, p, u: jnp.array([-x[0], -8.0 * x[1]])}, [0.0, 0.0])
@@ -342,13 +349,86 @@ def test_the_compiled_solver_takes_the_steps_of_scipy():
     arguments = build_arguments(problem, 0, coarse)
     native = native_experiment(problem.structures[0], arguments, coarse.times, 0)
     given = (problem, problem.structures[0], arguments.without_mesh(), arguments.signals, coarse)
+    last = coarse.cells - 1
+
+    def steps_of_scipy(mode, start, end, x):
+        def slope(t, y):
+            return native.slope(mode, t, y, np.zeros(0), cell_of(t, start, end))
+
+        def cell_of(t, start, end):
+            inside = min(max(t, np.nextafter(start, end)), np.nextafter(end, start))
+            return min(int(coarse.times.searchsorted(inside, "right")) - 1, last)
+
+        found = solve_ivp(slope, (start, end), [*x, 0.0], "RK45", rtol=problem.rtol, atol=problem.atol)
+        return found.t[1:], found.y[:-1, -1]
+
     for mode, start, end, x in ((0, 0.0, 1.7, [0.0, 0.0]), (1, 1.7, 2.5, [0.4, 1.0]), (0, 2.9, 6.0, [0.1, -0.2])):
+        expected, state = steps_of_scipy(mode, start, end, x)
         with use_float64():
-            steps, after = _solve_natively(problem, native, mode, start, end, np.array(x), np.zeros(0))
-            expected, state = _solve(*given, mode, start, end, np.array(x), np.zeros(0))
-        assert len(steps) == len(expected) > 10
-        np.testing.assert_allclose(steps, expected, rtol=0, atol=1e-4 * (end - start))
-        np.testing.assert_allclose(after, state, rtol=0, atol=1e-8)
+            natively = _solve_natively(problem, native, mode, start, end, np.array(x), np.zeros(0))
+            in_python = _solve(*given, mode, start, end, np.array(x), np.zeros(0))
+        for steps, after in (natively, in_python):
+            assert len(steps) == len(expected) > 10
+            np.testing.assert_allclose(steps, expected, rtol=0, atol=1e-4 * (end - start))
+            np.testing.assert_allclose(after, state, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("in_graph", [False, True])
+@pytest.mark.parametrize(
+    ("norm", "refused", "accepted", "factor"),
+    [
+        (0.5, 0.0, True, 0.9 * 2.0**0.2),
+        (0.5, 1.0, True, 1.0),  # not longer after a step that was refused
+        (0.9999, 1.0, True, 0.9 * 0.9999**-0.2),
+        (1.0001, 0.0, False, 0.9 * 1.0001**-0.2),
+        (1e9, 1.0, False, 0.2),
+        (0.0, 0.0, True, 10.0),
+        (np.nan, 0.0, False, 0.2),
+    ],
+)
+def test_a_step_is_accepted_or_refused_and_the_next_one_follows_from_its_error(
+    norm, refused, accepted, factor, in_graph
+):
+    t, step, end, atol = 2.0, 1e-3, 3.0, 1e-9
+    graph = Graph()
+    number = graph.constant if in_graph else np.float64
+    flag = bool(refused)
+    slopes = np.zeros((len(ADAPTIVE.error), 2))
+    slopes[0] = norm * atol / (step * ADAPTIVE.error[0])
+    at = step_size.Progress(*(number(value) for value in (t, step)), flag, False)
+    if in_graph:
+        at = at._replace(refused=graph.constant(flag), stuck=graph.constant(False))
+        slopes = as_objects([graph.constant(value) for value in slopes.ravel()]).reshape(slopes.shape)
+    nothing = np.array([number(0.0)] * 2)
+    after = np.array([number(-0.0)] * 2)
+    xp = Namespace(graph) if in_graph else np
+    with np.errstate(divide="ignore"):
+        now, y = step_size.judge_step(at, end, step_size.Tolerances(0.0, atol), nothing, after, slopes, xp)
+    found = [value.number if in_graph else value for value in (*now, *y)]
+    assert found[0] == (t + step if accepted else t)
+    assert found[1] == pytest.approx(step * factor, rel=1e-12)
+    assert found[2] == (not accepted)
+    assert not found[3]
+    assert np.signbit(found[4]) == accepted, "the state behind the step if it was accepted, else that before it"
+
+
+def test_the_last_step_ends_at_the_end_and_one_shorter_than_rounding_is_stuck():
+    slopes, y = np.zeros((len(ADAPTIVE.error), 1)), np.zeros(1)
+    tolerances = step_size.Tolerances(1e-8, 1e-9)
+    third = 1.0 / 3.0
+    with np.errstate(divide="ignore"):
+        at = step_size.Progress(third, step_size.limit_step(third, 5.0, 0.7), False, False)
+        now, _ = step_size.judge_step(at, 0.7, tolerances, y, y, slopes)
+        assert now.t == 0.7
+        bad = slopes + 1e100
+        short = step_size.Progress(1.0, 3e-15, False, False)
+        now, _ = step_size.judge_step(short, 2.0, tolerances, y, y, bad)
+        assert now.stuck
+        assert not step_size.judge_step(short._replace(step=1e-12), 2.0, tolerances, y, y, bad)[0].stuck
+        undefined = step_size.Progress(1.0, np.nan, False, False)
+        assert step_size.judge_step(undefined, 2.0, tolerances, y, y, slopes)[0].stuck
+        after, _ = step_size.judge_step(short._replace(step=1e-30), 2.0, tolerances, y, y, slopes)
+        assert 1.0 + after.step > 1.0, "a step after an accepted one changes t"
 
 
 def test_a_mesh_for_several_thetas_is_as_dense_as_the_densest():

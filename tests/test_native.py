@@ -430,12 +430,14 @@ def test_inside_a_program_of_jax():
     arguments, tau = this.arguments(), np.array(INSIDE["resets"])
     expected = this.discrete(arguments, tau, P0)
     with use_float64():
-        one = jax.jit(lambda a, tau, p: foreign_derivatives(this.structure, a, tau, p))
+        one = jax.jit(lambda a, tau, p: foreign_derivatives(this.structure, a, tau, p, 1.0))
         assert_close(tuple(map(np.asarray, one(arguments, tau, P0))), expected)
-        many = jax.jit(lambda a, taus, p: jax.lax.map(lambda t: foreign_derivatives(this.structure, a, t, p), taus))
+        many = jax.jit(
+            lambda a, taus, p: jax.lax.map(lambda t: foreign_derivatives(this.structure, a, t, p, 1.0), taus)
+        )
         J, g, H = map(np.asarray, many(arguments, np.stack([tau, tau + 0.01]), P0))
         at_once = jax.jit(
-            jax.vmap(lambda a, t, p: foreign_derivatives(this.structure, a, t, p), in_axes=(None, 0, None))
+            jax.vmap(lambda a, t, p: foreign_derivatives(this.structure, a, t, p, 1.0), in_axes=(None, 0, None))
         )
         together = tuple(map(np.asarray, at_once(arguments, np.stack([tau, tau + 0.01]), P0)))
     for k, shift in enumerate((0.0, 0.01)):

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import switchfit as sf
+from switchfit.discretization.arguments import arguments_of
+from switchfit.discretization.mesh import Mesh
+from switchfit.engine.choice import runs_natively, traced_derivatives
+from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.native import program
+from switchfit.engine.native.experiment import places_in_library
 from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.problem.functions import use_float64
 
 TIMES = np.linspace(0.0, 3.0, 16)
 VALUES = np.random.default_rng(5).normal(size=(16, 2))
@@ -198,6 +206,39 @@ def test_sequences_of_any_length_run_in_a_program_with_room_for_them(data):
             np.testing.assert_allclose(one.hessian, other.hessian, rtol=1e-9, atol=1e-8)
         counts.append(programs())
     assert len(set(counts)) == 1
+
+
+@pytest.mark.parametrize("room", [2, 4])
+def test_one_program_of_jax_serves_every_sequence_of_the_same_length(room):
+    """Machine code inside it is told which mode a segment has; segments that are not needed stay idle."""
+    system = sf.HybridSystem(MODES, [0.4, 0.1], BOUNCE)
+    data = [*DATA["reference, running"][:2], *DATA["transitions"]]
+    traces = []
+
+    @partial(jax.jit, static_argnames="library")
+    def run(arguments, tau, p, side, places, library):
+        traces.append(library)
+        return traced_derivatives(library, arguments, tau, p, side, natively=True, places=places)
+
+    at_node, mesh = TIMES[6], Mesh.from_times(np.unique([*TIMES, *np.linspace(0.0, 3.0, 50)]))
+    for sequence in (("swing", "fall", "swing"), ("fall", "swing", "rest"), ("rest", "rest", "fall")):
+        given = problem(data, sequence, (at_node, 2.3), system, max_transitions=room)
+        structure = given.structures[0]
+        arguments = arguments_of(given, 0, mesh)
+        assert runs_natively([structure], [arguments])
+        tau, p = given.vectors(given.initial_theta, 0)
+        for side in (1.0, -1.0):
+            with use_float64():
+                J, g, H = map(
+                    np.asarray, run(arguments, tau, p, side, places_in_library(structure), library=structure.library)
+                )
+            by_jax = JaxEngine(structure, arguments, mesh).derivatives(tau, p, side, "exact")
+            np.testing.assert_allclose(J, by_jax.cost, rtol=1e-12)
+            np.testing.assert_allclose(g, by_jax.gradient, rtol=1e-10, atol=1e-11)
+            np.testing.assert_allclose(H, by_jax.hessian, rtol=1e-9, atol=1e-9)
+    assert len(traces) == 1
+    with pytest.raises(ValueError, match="programs are written for one sequence"):
+        traced_derivatives(structure, arguments, tau, p, 1.0, natively=False, places=places_in_library(structure))
 
 
 def test_room_for_fewer_transitions_than_there_are_is_refused():

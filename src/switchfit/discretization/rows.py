@@ -53,12 +53,17 @@ def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, e
     found = Stages([], [], [])
     for row, c in zip(tableau.a, tableau.c.tolist(), strict=True):
         found.times.append(start + c * h)
-        found.states.append(_plus(x, h, combine(row, found.slopes)))
+        found.states.append(stage_state(row, h, x, found.slopes))
         found.slopes.append(f(found.times[-1], found.states[-1]))
     return found
 
 
-def end_of_row(tableau: Tableau, h: Array, x: Array, slopes: Sequence[Array]) -> Array:
+def stage_state(row: FloatArray, h: Array, x: Array, slopes: Sequence[Array] | FloatArray) -> Array:
+    """Return the state (n,) of a stage from the slopes of those before it; `row` is its row of a."""
+    return _plus(x, h, combine(row, slopes))
+
+
+def end_of_row(tableau: Tableau, h: Array, x: Array, slopes: Sequence[Array] | FloatArray) -> Array:
     """Return the state behind a row: (n,)."""
     return _plus(x, h, combine(tableau.b, slopes))
 
@@ -168,8 +173,13 @@ def times_derivative(tableau: Tableau, start_d: Array, end_d: Array) -> list[Arr
     return [start_d + c * h_d for c in tableau.c.tolist()]
 
 
-def combine(weights: Sequence[float] | FloatArray, terms: Sequence[Array]) -> Array | None:
-    """Add terms with weights; zero weights cost nothing, and None is the sum of nothing."""
+def combine(weights: Sequence[float] | FloatArray, terms: Sequence[Array] | FloatArray) -> Array | None:
+    """Add terms with weights; zero weights cost nothing, and None is the sum of nothing.
+
+    Numbers may be one array of NumPy, the terms along its first axis.
+    """
+    if isinstance(terms, np.ndarray) and terms.dtype != object:
+        return np.asarray(weights)[: len(terms)] @ terms
     given = weights.tolist() if isinstance(weights, np.ndarray) else weights
     parts = [w * term for w, term in zip(given, terms, strict=False) if w != 0.0]
     return sum(parts[1:], parts[0]) if parts else None

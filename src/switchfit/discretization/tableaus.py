@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.integrate import RK45
 
 from switchfit.problem.data import FloatArray
 
@@ -46,7 +47,30 @@ def radau_iia() -> Tableau:
     return Tableau(a, a[2].copy(), np.array([(4 - r) / 10, (4 + r) / 10, 1.0]), 5)
 
 
+class EmbeddedPair(NamedTuple):
+    """A method with an estimate of its error.
+
+    Attributes
+    ----------
+    tableau : Tableau
+    error : (s + 1,)
+        Weights of the slopes of the stages, then of the slope behind the step, in the error of a step of length 1.
+    """
+
+    tableau: Tableau
+    error: FloatArray
+
+
+def dormand_prince() -> EmbeddedPair:
+    """Dormand and Prince (1980), order 5 with an error estimate of order 4; the coefficients are SciPy's.
+
+    Hairer, Norsett and Wanner I, table II.5.2.
+    """
+    return EmbeddedPair(Tableau(RK45.A, RK45.B, RK45.C, 5), RK45.E)
+
+
 EXPLICIT, STIFF = butcher(), radau_iia()
+ADAPTIVE = dormand_prince()
 
 
 def get_tableau(solver: str) -> Tableau:

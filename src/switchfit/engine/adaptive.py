@@ -4,8 +4,9 @@ The adaptive solve has the same order as the fixed steps that follow. It also in
 they are resolved as well. Its steps are turned into a refinement of the intervals between the nodes that have to be
 there anyway; the mesh then stays as it is while theta moves.
 
-Explicit solves take SciPy's RK45 step by step, in machine code where there is any: a hundred steps cost less than a
-tenth of a millisecond there, ten in Python. SciPy itself solves all else, and says what is wrong where a solve fails.
+Explicit solves run in machine code if there is any: a hundred steps cost less than a tenth of a millisecond there, ten
+milliseconds in Python. The control of the step size is the same (`switchfit.discretization.step_size`). Python solves
+what has no machine code, and says what is wrong where a solve fails. SciPy's Radau solves stiff modes.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ import scipy.integrate
 from switchfit.discretization.arguments import Arguments, build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model, Piece
+from switchfit.discretization.rows import end_of_row, stage_state
+from switchfit.discretization.step_size import Progress, Tolerances, first_step, judge_step
+from switchfit.discretization.tableaus import ADAPTIVE
 from switchfit.engine.native.adaptive import Adaptive
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order
@@ -185,12 +189,14 @@ def _solve(
             )
         return value
 
-    method = scipy.integrate.RK45 if problem.solver == "explicit" else scipy.integrate.Radau
+    method = ExplicitSolver if problem.solver == "explicit" else scipy.integrate.Radau
     with np.errstate(all="ignore"):  # a slope of 1e300 is refused in words
         solver = method(right_hand_side, start, np.append(x, 0.0), end, rtol=problem.rtol, atol=problem.atol)
     accepted = [start]
     while solver.status == "running":
-        with np.errstate(over="ignore", invalid="ignore"):  # a state that overflows is refused in words
+        with np.errstate(
+            over="ignore", invalid="ignore", divide="ignore"
+        ):  # a state that overflows is refused in words
             message = solver.step()
         if solver.status == "failed" or _too_many(accepted, end):
             remedy = "use solver='stiff', or a better guess" if problem.solver == "explicit" else "use a better guess"
@@ -203,6 +209,44 @@ def _solve(
     return np.array(accepted[1:]), np.asarray(solver.y[:-1])
 
 
+class ExplicitSolver(scipy.integrate.OdeSolver):
+    """Steps of `switchfit.discretization.step_size` with slopes from Python, as one of SciPy's solvers."""
+
+    y: FloatArray
+
+    def __init__(
+        self,
+        slope: Callable[[float, FloatArray], FloatArray],
+        t0: float,
+        y0: FloatArray,
+        end: float,
+        *,
+        rtol: float,
+        atol: float,
+    ) -> None:
+        super().__init__(slope, t0, y0, end, vectorized=False)
+        self._tolerances, self._end = Tolerances(rtol, atol), end
+        self._slopes = np.zeros((len(ADAPTIVE.error), len(y0)))
+        self._slopes[0] = self.fun(t0, y0)
+        step = first_step(self.fun, t0, y0, self._slopes[0], end, self._tolerances)
+        self._at = Progress(t0, step, False, False)
+
+    def _step_impl(self) -> tuple[bool, str | None]:
+        """Try steps until one is accepted; return whether one was, and the reason if not."""
+        tableau, K, t, y = ADAPTIVE.tableau, self._slopes, self._at.t, self.y
+        while not self._at.stuck:
+            step = self._at.step
+            for j, c in enumerate(tableau.c[1:].tolist(), start=1):
+                K[j] = self.fun(t + c * step, stage_state(tableau.a[j], step, y, K[:j]))
+            after = end_of_row(tableau, step, y, K[:-1])
+            K[-1] = self.fun(t + step, after)
+            self._at, self.y = judge_step(self._at, self._end, self._tolerances, y, after, K)
+            if not self._at.refused:
+                self.t, K[0] = float(self._at.t), K[-1]
+                return True, None
+        return False, self.TOO_SMALL_STEP
+
+
 STEPS_AT_ONCE = 256
 """Steps that the compiled solver accepts in one call, at most."""
 
@@ -210,45 +254,20 @@ STEPS_AT_ONCE = 256
 def _solve_natively(
     problem: Problem, native: NativeExperiment, mode: int, start: float, end: float, x: FloatArray, p: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
-    """The same as `_solve` for the explicit method; None where it fails."""
+    """The same as `_solve` for the explicit method; None if it fails, of which `_solve` gives the reason."""
     y, at = np.append(x, 0.0), Adaptive()
     state = np.zeros(at.size)
     state[at.t], state[at.end], state[at.rtol], state[at.atol] = start, end, problem.rtol, problem.atol
     state[at.low], state[at.high] = np.nextafter(start, end), np.nextafter(end, start)
-    with np.errstate(all="ignore"):
-        state[at.h] = _first_step(problem, native, mode, start, end, y, p)
+
+    def slope(t: float, y: FloatArray) -> FloatArray:
+        return native.slope(mode, t, y, p)
+
+    state[at.step] = first_step(slope, start, y, slope(start, y), end, Tolerances(problem.rtol, problem.atol))
     accepted = np.array([start])
     while state[at.t] < end and not state[at.stuck] and not _too_many(accepted, end):
         accepted = np.append(accepted, native.adaptive_steps(mode, state, y, p, STEPS_AT_ONCE))
     return None if state[at.t] < end or not np.isfinite(y).all() else (accepted[1:], y[:-1])
-
-
-def _first_step(
-    problem: Problem, native: NativeExperiment, mode: int, start: float, end: float, y: FloatArray, p: FloatArray
-) -> float:
-    """Hairer, Norsett and Wanner I, section II.4, as SciPy has it.
-
-    NaN if the slope is not finite, 0 if it is too large to be squared: the compiled solver stops at either, and
-    `_solve` says what is wrong, or begins with the shortest step there is.
-    """
-
-    def size(error: FloatArray) -> float:
-        return float(np.sqrt(np.mean((error / (problem.atol + problem.rtol * np.abs(y))) ** 2)))
-
-    slope = native.slope(mode, start, y, p)
-    if not np.isfinite(slope).all():
-        return np.nan
-    of_state, of_slope = size(y), size(slope)
-    if not np.isfinite(of_slope):  # the first step then fails, and the caller says of what
-        return min(1e-6, end - start)
-    guess = min(1e-6 if of_state < 1e-5 or of_slope < 1e-5 else 0.01 * of_state / of_slope, end - start)
-    if guess == 0.0:
-        return 0.0
-    ahead = min(start + guess, float(np.nextafter(end, start)))
-    bend = size(native.slope(mode, ahead, y + guess * slope, p) - slope) / guess
-    flat = of_slope <= 1e-15 and bend <= 1e-15
-    other = max(1e-6, guess * 1e-3) if flat else (0.01 / max(of_slope, bend)) ** 0.2
-    return min(100 * guess, other, end - start)
 
 
 def _too_many(accepted: Sequence[float] | FloatArray, end: float) -> bool:

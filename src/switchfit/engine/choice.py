@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from switchfit.discretization.arguments import Arguments
@@ -62,13 +62,23 @@ def runs_natively(structures: Sequence[Structure], arguments: Sequence[Arguments
 
 
 def traced_derivatives(
-    structure: Structure, arguments: Arguments, tau: Any, p: Any, side: Any, *, natively: bool
+    structure: Structure,
+    arguments: Arguments,
+    tau: Any,
+    p: Any,
+    side: Any,
+    *,
+    natively: bool,
+    places: Mapping[str, Any] | None = None,
 ) -> Any:
     """Return cost, gradient (D,) and Hessian (D, D) of one experiment inside a program of JAX.
 
     By machine code, which runs on a CPU, where `runs_natively` says so; else by JAX. `side` is +1 or -1: the right or
-    left derivatives by a transition time that sits on a node.
+    left derivatives by a transition time that sits on a node. `places` are for machine code alone: given what
+    `places_in_library` returns, the structure may be a library, and one program serves all its sequences.
     """
     if natively:
-        return foreign_derivatives(structure, arguments, tau, p, side)
+        return foreign_derivatives(structure, arguments, tau, p, side, places)
+    if places is not None:
+        raise ValueError("JAX's programs are written for one sequence: give its structure, and no places.")
     return derivatives(arguments, tau, p, side, structure=structure, method="discrete-adjoint")

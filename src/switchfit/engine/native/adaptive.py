@@ -1,44 +1,48 @@
-"""The adaptive solver: SciPy's RK45 with its step size control, as straight lines around the slope of a mode."""
+"""The adaptive solve in machine code: `discretization.step_size` as straight lines between slopes of a mode."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from scipy.integrate import RK45
 
-from switchfit.discretization.rows import combine
+from switchfit.discretization.rows import end_of_row, stage_state
+from switchfit.discretization.step_size import Progress, Tolerances, judge_step
+from switchfit.discretization.tableaus import ADAPTIVE
 from switchfit.engine.native.llvm import Module
-from switchfit.engine.native.scalars import CHECKED, Graph, Objects, Template, as_objects
+from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Objects, Template
 from switchfit.engine.native.templates import ELL, F, Sizes
 
+STAGES = len(ADAPTIVE.tableau.b)
+STAGE_TIMES = [*ADAPTIVE.tableau.c.tolist(), 1.0]
+"""Where in a step its slopes are, the last one behind it."""
+
 SLOPE = ("c", "p", "moment", "signal", "y", "K", CHECKED)
-ADAPTIVE = ("state", "y", "argument", "K")
+STEP = ("state", "y", "argument", "K")
 
 
 class Adaptive(NamedTuple):
-    """Places in the state of the adaptive solver.
+    """Offsets in the state of the adaptive solver, in doubles.
 
-    t, h : where it is, and how long a step it will try; `step` is what it tries, which may be cut by the `end`
-    rtol, atol : tolerances
-    refused, stuck : 1 if the last step was refused; if the next would not change t
-    low, high : between which moments the field may be asked
+    t, step, refused, stuck : of `Progress`; truth values are 0 or 1
+    end : of the solve
+    rtol, atol : of `Tolerances`
+    low, high : the times between which a signal may be looked up
     """
 
     t: int = 0
-    h: int = 1
-    end: int = 2
-    rtol: int = 3
-    atol: int = 4
-    refused: int = 5
-    stuck: int = 6
+    step: int = 1
+    refused: int = 2
+    stuck: int = 3
+    end: int = 4
+    rtol: int = 5
+    atol: int = 6
     low: int = 7
     high: int = 8
-    step: int = 9
 
     @property
     def size(self) -> int:
-        """Number of places."""
+        """Number of doubles."""
         return len(self)
 
 
@@ -56,59 +60,41 @@ def write_slope(
     module.straight(name, SLOPE, stores + graph.check(), seen=True)
 
 
-def write_control(module: Module, sizes: Sizes) -> None:
-    """Write what the solver does between its slopes. Of its state, which lies in memory, `Adaptive` says the places."""
-    size = sizes.n + 1
-    A, B, E = RK45.A, RK45.B, RK45.E
-    at = Adaptive()
+def step_functions() -> list[str]:
+    """Return the names of what `write_step` writes, in the order in which a step calls them, a slope before each."""
+    return [*(f"adaptive_{j}" for j in range(1, STAGES)), "adaptive_after", "adaptive_judge"]
 
-    def begun() -> tuple[Graph, Objects, Objects]:
+
+def write_step(module: Module, sizes: Sizes) -> None:
+    """Write what a step computes between its slopes K: the states at which these are asked for, and the judgement."""
+    size, at = sizes.n + 1, Adaptive()
+
+    def begin(slopes: int) -> tuple[Graph, Objects, Objects, list[Objects]]:
         graph = Graph()
-        return graph, graph.loads("state", at.size), graph.loads("y", size)
+        K = [graph.loads("K", size, k * size) for k in range(slopes)]
+        return graph, graph.loads("state", at.size), graph.loads("y", size), K
 
-    graph, state, _ = begun()
-    t, h, end = state[at.t], state[at.h], state[at.end]
-    step = graph.apply("select", graph.apply("le", end, t + h), end - t, h)
-    module.straight("adaptive_begin", ADAPTIVE, [("state", at.step, step)])
-    for j in range(1, len(A)):
-        graph, state, y = begun()
-        K = [graph.loads("K", size, k * size) for k in range(j)]
-        argument = y + state[at.step] * combine(A[j].tolist(), K)
-        module.straight(f"adaptive_{j}", ADAPTIVE, [("argument", k, node) for k, node in enumerate(argument)])
-    graph, state, y = begun()
-    K = [graph.loads("K", size, k * size) for k in range(len(B))]
-    after = y + state[at.step] * combine(B.tolist(), K)
-    module.straight("adaptive_after", ADAPTIVE, [("argument", k, node) for k, node in enumerate(after)])
+    def write(name: str, values: Objects) -> None:
+        module.straight(name, STEP, [("argument", k, node) for k, node in enumerate(values)])
 
-    graph, state, y = begun()
+    *of_stages, of_end, of_judgement = step_functions()
+    for j, name in enumerate(of_stages, start=1):
+        _, state, y, K = begin(j)
+        write(name, stage_state(ADAPTIVE.tableau.a[j], state[at.step], y, K))
+    _, state, y, K = begin(STAGES)
+    write(of_end, end_of_row(ADAPTIVE.tableau, state[at.step], y, K))
+
+    graph, state, y, K = begin(STAGES + 1)
+    given = Progress(
+        state[at.t],
+        state[at.step],
+        graph.apply("ne", state[at.refused], 0.0),
+        graph.apply("ne", state[at.stuck], 0.0),
+    )
+    tolerances = Tolerances(state[at.rtol], state[at.atol])
     after = graph.loads("argument", size)
-    K = [graph.loads("K", size, k * size) for k in range(len(E))]
-    t, step, end = state[at.t], state[at.step], state[at.end]
-    error = step * combine(E.tolist(), K)
-    both = ((graph.apply("abs", old), graph.apply("abs", new)) for old, new in zip(y, after, strict=True))
-    larger = as_objects([graph.apply("max", old, new) for old, new in both])
-    relative = error / (state[at.atol] + state[at.rtol] * larger)
-    norm = graph.apply("sqrt", (relative * relative).sum() / size)
-    accepted = graph.apply("lt", norm, 1.0)
-    factor = 0.9 * graph.apply("pow", norm, -0.2)
-    factor = graph.apply("min", graph.apply("max", factor, 0.2), 10.0)
-    factor = graph.apply("select", graph.apply("eq", norm, 0.0), 10.0, factor)
-    again = graph.apply("and", accepted, graph.apply("ne", state[at.refused], 0.0))
-    factor = graph.apply("select", again, graph.apply("min", factor, 1.0), factor)
-    factor = graph.apply("select", graph.apply("ne", norm, norm), 0.2, factor)
-    reached = graph.apply("select", graph.apply("eq", step, end - t), end, t + step)
-    shortest = graph.apply("min", step, step * factor)
-    # Written so that a step which is not a number is stuck as well: it would be tried for ever.
-    goes_on = graph.apply("lt", 10 * np.finfo(float).eps * graph.apply("abs", t), shortest)
-    stuck = graph.apply("not", goes_on)
-    number = {name: graph.apply("select", flag, 1.0, 0.0) for name, flag in (("yes", accepted), ("stuck", stuck))}
-    stores = [
-        ("state", at.t, graph.apply("select", accepted, reached, t)),
-        ("state", at.h, step * factor),
-        ("state", at.refused, 1.0 - number["yes"]),
-        ("state", at.stuck, number["stuck"]),
-    ]
-    stores += [
-        ("y", k, graph.apply("select", accepted, new, old)) for k, (new, old) in enumerate(zip(after, y, strict=True))
-    ]
-    module.straight("adaptive_judge", ADAPTIVE, stores)
+    now, y_now = judge_step(given, state[at.end], tolerances, y, after, K, Namespace(graph))
+    stores = [("state", at.t, now.t), ("state", at.step, now.step)]
+    for place, flag in ((at.refused, now.refused), (at.stuck, now.stuck)):
+        stores.append(("state", place, graph.apply("select", flag, 1.0, 0.0)))
+    module.straight(of_judgement, STEP, stores + [("y", k, node) for k, node in enumerate(y_now)])

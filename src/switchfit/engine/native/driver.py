@@ -13,10 +13,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from scipy.integrate import RK45
-
 from switchfit.discretization.nodes import AT_TRANSITIONS
-from switchfit.engine.native.adaptive import ADAPTIVE, SLOPE, Adaptive
+from switchfit.engine.native.adaptive import SLOPE, STAGE_TIMES, STEP, Adaptive, step_functions
 from switchfit.engine.native.kernels import (
     BACKWARD,
     CONSTRAINT,
@@ -640,9 +638,10 @@ class Driver:
         Steps that are refused count for the budget too.
         """
         size, at = self.sizes.n + 1, Adaptive()
-        given = {name: f"%{name}" for name in ADAPTIVE}
+        given = {name: f"%{name}" for name in STEP}
+        functions = step_functions()
         self.line(f"%argument = alloca [{size} x double]")
-        self.line(f"%K = alloca [{(len(RK45.C) + 1) * size} x double]")
+        self.line(f"%K = alloca [{len(STAGE_TIMES) * size} x double]")
         self.line("br label %loop")
         self.label("loop")
         self.line("%done = phi i64 [0, %entry], [%more, %next]")
@@ -650,25 +649,21 @@ class Driver:
         t, end, stuck = (self.load("double", self.at("%state", k)) for k in (at.t, at.end, at.stuck))
         flags = [self.let(f"fcmp olt double {t}, {end}"), self.let(f"fcmp oeq double {stuck}, 0.0")]
         flags.append(self.let("icmp slt i64 %done, %most"))
-        steps = (f"adaptive_{j}" for j in range(1, len(RK45.C)))
-        between = sum(map(self.module.work, ("adaptive_begin", *steps, "adaptive_after", "adaptive_judge")))
-        work = (len(RK45.C) + 1) * self.module.work(f"slope_{mode}") + between
+        work = len(STAGE_TIMES) * self.module.work(f"slope_{mode}") + sum(map(self.module.work, functions))
         flags.append(self.let(f"icmp slt i64 %tried, {max(1, BUDGET // work)}"))
         goes_on = flags[0]
         for flag in flags[1:]:
             goes_on = self.let(f"and i1 {goes_on}, {flag}")
         self.line(f"br i1 {goes_on}, label %try, label %out")
         self.label("try")
-        self.call("adaptive_begin", ADAPTIVE, given)
         step = self.load("double", self.at("%state", at.step))
-        slope = f"call void @slope_at_{mode}({TABLE}, i64 %cells, ptr %state"
-        self.line(f"{slope}, double {t}, ptr %y, ptr %K)")
-        for j, c in enumerate([*RK45.C.tolist()[1:], 1.0], start=1):
-            self.call(f"adaptive_{j}" if j < len(RK45.C) else "adaptive_after", ADAPTIVE, given)
+        for j, (c, function) in enumerate(zip(STAGE_TIMES, functions, strict=True)):
             ahead = self.let(f"fmul double {step}, {literal(c)}")
             time = self.let(f"fadd double {t}, {ahead}")
-            self.line(f"{slope}, double {time}, ptr %argument, ptr {self.at('%K', j * size)})")
-        self.call("adaptive_judge", ADAPTIVE, given)
+            slope = self.at("%K", j * size)
+            at_state = f"double {time}, ptr {'%argument' if j else '%y'}, ptr {slope}"
+            self.line(f"call void @slope_at_{mode}({TABLE}, i64 %cells, ptr %state, {at_state})")
+            self.call(function, STEP, given)
         refused = self.load("double", self.at("%state", at.refused))
         accepted = self.let(f"fcmp oeq double {refused}, 0.0")
         self.line(f"br i1 {accepted}, label %keep, label %next")

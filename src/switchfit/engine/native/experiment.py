@@ -47,21 +47,22 @@ def reason_for_jax(structure: Structure, arguments: Arguments, order: Order) -> 
     return program if isinstance(program, str) else None
 
 
-def places_in_library(structure: Structure) -> dict[str, list[int]]:
-    """Which mode of the library each segment has, and which reset map and other function each transition, else -1.
+def places_in_library(structure: Structure) -> dict[str, NDArray[np.int64]]:
+    """Return which mode of the library each segment has, and which reset map and other function each transition.
 
-    Segments that the sequence does not need have its last mode, and their transitions nothing.
+    Transitions without one have -1. Segments that the sequence does not need have its last mode, and their transitions
+    nothing. A -1 that nobody reads ends each array, so that none is empty.
     """
     library, idle = structure.library, structure.transitions - structure.N
 
-    def of(own: Sequence[Any], all_of_them: Sequence[Any]) -> list[int]:
-        return [-1 if f is None else all_of_them.index(f) for f in own] + [-1] * idle
+    def find(own: Sequence[Any], available: Sequence[Any]) -> list[int]:
+        return [-1 if f is None else available.index(f) for f in own] + [-1] * idle
 
     modes = list(structure.mode_of_segment)
-    found = {"modes": modes + modes[-1:] * idle, "resets": of(structure.reset_maps, library.reset_maps)}
-    return found | {
-        kind.name: of(getattr(structure, kind.name), getattr(library, kind.name)) for kind in AT_TRANSITIONS
-    }
+    found = {"modes": modes + modes[-1:] * idle, "resets": find(structure.reset_maps, library.reset_maps)}
+    for kind in AT_TRANSITIONS:
+        found[kind.name] = find(getattr(structure, kind.name), getattr(library, kind.name))
+    return {name: np.array([*which, -1], dtype=np.int64) for name, which in found.items()}
 
 
 class Simulated(NamedTuple):
@@ -151,7 +152,7 @@ class NativeExperiment:
             "penalties": self._weights[1],
             "units": units,
         }
-        arrays |= {name: np.array(which, dtype=np.int64) for name, which in places_in_library(structure).items()}
+        arrays |= places_in_library(structure)
         arrays |= _parts(self._sums, lengths)
         self._check, self._J = arrays[CHECKED], arrays["J"]
         self._lengths = {name: length.at(cells + N) for name, length in memory(library, sizes, order).items()}

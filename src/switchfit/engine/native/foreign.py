@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -34,20 +35,32 @@ def _registered(library: Structure, sizes: Sizes) -> tuple[str, Program]:
 
 
 def can_be_foreign(structure: Structure) -> bool:
-    """Whether an experiment has what the operation knows: no late samples, and a program for itself alone."""
-    late = any(sensor.delay is not None for sensor in structure.measurements)
-    return not late and structure.transitions == structure.N
+    """Return whether the operation covers an experiment: it has no late samples."""
+    return all(sensor.delay is None for sensor in structure.measurements)
 
 
-def foreign_derivatives(structure: Structure, arguments: Arguments, tau: Any, p: Any, side: Any) -> Any:
+def foreign_derivatives(
+    structure: Structure,
+    arguments: Arguments,
+    tau: Any,
+    p: Any,
+    side: Any,
+    places: Mapping[str, Any] | None = None,
+) -> Any:
     """Cost, gradient (D,) and Hessian (D, D) of one experiment, inside a JAX program that runs on a CPU.
 
     For an experiment that `can_be_foreign` and for which there is machine code. `side` is +1 or -1: the right or left
     derivatives by a transition time that sits on a node.
+
+    Given `places`, what `places_in_library` returns, nothing else of the structure is used than its library: a program
+    of JAX that takes them as arguments serves all sequences of a library with the same number of transitions. It is
+    then keyed by ``structure.library``, which may be given in place of the structure.
     """
     sizes, library = Sizes.of(structure, arguments), structure.library
     name, _ = _registered(library, sizes)
     N, D, width = sizes.N, sizes.D, sizes.width
+    idle = N - tau.shape[0]  # segments that the sequence does not need: they begin and end at tf
+    places = places_in_library(structure) if places is None else places
     nodes = arguments.nodes
     cells = nodes.shape[0] - 1
     real_cells = jnp.sum(nodes[1:] > nodes[:-1])
@@ -61,13 +74,13 @@ def foreign_derivatives(structure: Structure, arguments: Arguments, tau: Any, p:
         "signals": arguments.signals,
         "c": jnp.concatenate([*(jnp.ravel(a) for a in constants_of(arguments)), jnp.zeros(1)]),
         "p": jnp.append(p, 0.0),
-        "bounds": jnp.concatenate([nodes[:1], tau, nodes[-1:]]),
-        "first_cell": jnp.concatenate([jnp.zeros(1, int), begins, jnp.full(1, cells - 1)]),
+        "bounds": jnp.concatenate([nodes[:1], tau, jnp.repeat(nodes[-1:], idle + 1)]),
+        "first_cell": jnp.concatenate([jnp.zeros(1, int), begins, jnp.full(idle + 1, cells - 1)]),
         "multipliers": np.zeros(count),
         "penalties": np.zeros(count),
         "units": units,
     }
-    given |= {key: np.array([*which, -1], dtype=np.int64) for key, which in places_in_library(structure).items()}
+    given |= places
     buffers = [given[key] for key in GIVEN]
     for samples in arguments.samples:
         buffers += [*samples, np.zeros(1, dtype=np.int64)]
@@ -78,4 +91,5 @@ def foreign_derivatives(structure: Structure, arguments: Arguments, tau: Any, p:
     ends = dict(zip(lengths, np.cumsum(list(lengths.values())).tolist(), strict=True))
     J, g, H = (totals[ends[key] - lengths[key] : ends[key]] for key in ("J", "g", "H"))
     cost = J[0] + totals[-1]  # not a number where JAX has to look again, which the finisher of a batch lets it do
-    return cost, g[:D], H.reshape(D, width)[:, :D]
+    own = np.concatenate([np.arange(N - idle), np.arange(N, D)])  # its unknowns among the program's
+    return cost, g[own], H.reshape(D, width)[np.ix_(own, own)]

@@ -22,33 +22,12 @@ import llvmlite.binding as llvm
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.engine.native.scalars import LOGIC, Node, needed
+from switchfit.engine.native.operations import FROM_LIBM, OPERATIONS, Operation
+from switchfit.engine.native.scalars import Node, needed
 from switchfit.runtime.cache import get_usable_folder, read_code, write_code
 
-INTRINSICS = {
-    "sqrt": "sqrt",
-    "abs": "fabs",
-    "floor": "floor",
-    "ceil": "ceil",
-    "trunc": "trunc",
-    "rint": "rint",
-    "round": "round",
-    "max": "maximum",
-    "min": "minimum",
-}
-"""Operations that are instructions of the processor."""
-
-BINARY = {"add": "fadd contract", "sub": "fsub contract", "mul": "fmul contract", "div": "fdiv"}
-COMPARISONS = {"lt": "fcmp olt", "le": "fcmp ole", "eq": "fcmp oeq", "ne": "fcmp une"}
-FROM_LIBM = {
-    **{op: op for op in ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "asinh")},
-    **{op: op for op in ("acosh", "atanh", "exp", "log", "pow", "expm1", "log1p", "cbrt", "exp2", "erf", "erfc")},
-    "rem": "fmod",
-}
-"""Functions of the C library."""
-
-EFFORT = {"div": 4, "sqrt": 4, "lookup": 3, **dict.fromkeys(FROM_LIBM, 20)}
-"""What operations cost where it is not about as much as an addition."""
+LOOKUP = 3
+"""Cost of a lookup in a table, in additions."""
 
 BUDGET = 20_000_000
 """Work, in additions, after which a loop returns to Python, so that Ctrl-C is heard: measured, it takes 2 to 10 ms."""
@@ -106,7 +85,9 @@ class Module:
         return self._work[self.prefix + name]
 
     def _effort(self, node: Node) -> int:
-        return EFFORT.get(node.op, 1) * (1 + self.width // 4 if node.vector else 1)
+        operation = OPERATIONS.get(node.op)
+        effort = LOOKUP if node.op == "lookup" else 1 if operation is None else operation.effort
+        return effort * (1 + self.width // 4 if node.vector else 1)
 
     def add(self, text: str) -> None:
         """A function written by hand, which calls none but those of the same prefix, and LLVM's."""
@@ -120,6 +101,13 @@ class Module:
     def text(self) -> str:
         """The whole module."""
         return "\n".join([*self._declared.values(), *self.functions])
+
+
+def _declaration(operation: Operation) -> str:
+    """Return the declaration of the function that an operation calls; those of the C library have no side effects."""
+    operands = ", ".join(["double"] * operation.operands)
+    memory = " memory(none) nounwind willreturn" if operation.function in FROM_LIBM else ""
+    return f"declare double @{operation.function}({operands}){memory}"
 
 
 class _Writer:
@@ -161,24 +149,10 @@ class _Writer:
             index = self.emit(f"fptosi double {self.value(args[1])} to i64")
             address = self.emit(f"getelementptr inbounds double, ptr {self.value(args[0])}, i64 {index}")
             return self.emit(f"load double, ptr {address}, align 8")
-        kind = self._type(node)
-        a = [self._as(argument, node.vector) for argument in args]
-        if op in BINARY:
-            return self.emit(f"{BINARY[op]} {kind} {a[0]}, {a[1]}")
-        if op == "neg":
-            return self.emit(f"fneg {kind} {a[0]}")
-        if op in COMPARISONS:
-            return self.emit(f"{COMPARISONS[op]} double {a[0]}, {a[1]}")
-        if op in LOGIC:
-            return self.emit(f"xor i1 {a[0]}, true" if op == "not" else f"{op} i1 {a[0]}, {a[1]}")
-        if op == "select":
-            return self.emit(f"select i1 {self.value(args[0])}, {kind} {a[1]}, {kind} {a[2]}")
-        given = ", ".join(f"double {x}" for x in a)
-        name = f"llvm.{INTRINSICS[op]}.f64" if op in INTRINSICS else FROM_LIBM[op]
-        types = ", ".join("double" for _ in a)
-        memory = "" if op in INTRINSICS else " memory(none) nounwind willreturn"
-        self.module.declare(name, f"declare double @{name}({types}){memory}")
-        return self.emit(f"call double @{name}({given})")
+        operation = OPERATIONS[op]
+        if operation.function is not None:
+            self.module.declare(operation.function, _declaration(operation))
+        return self.emit(operation.code.format(*(self._as(a, node.vector) for a in args), type=self._type(node)))
 
     def _table(self, values: NDArray[np.float64]) -> str:
         """The name of a constant array, which the functions of a module share."""
@@ -205,7 +179,7 @@ class _Writer:
 
     def _as(self, node: Node, vector: bool) -> str:
         """A value as an operand of an operation on vectors, or on scalars."""
-        if not vector or node.vector:
+        if not vector or node.vector or node.truth:
             return self.value(node)
         name = self.splats.get(node.index)
         if name is None:
@@ -299,7 +273,7 @@ def _processor() -> tuple[str, str]:
 def _start() -> None:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    for name in (*FROM_LIBM.values(), "sincos"):
+    for name in (*FROM_LIBM, "sincos"):
         address = _address(name)
         if address is not None:
             llvm.add_symbol(name, address)

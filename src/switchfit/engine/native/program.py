@@ -12,7 +12,7 @@ from functools import lru_cache
 
 from switchfit.discretization.nodes import AT_TRANSITIONS
 from switchfit.discretization.tableaus import EXPLICIT, get_tableau
-from switchfit.engine.native.adaptive import write_control, write_slope
+from switchfit.engine.native.adaptive import write_slope, write_step
 from switchfit.engine.native.driver import Driver
 from switchfit.engine.native.frame import handler
 from switchfit.engine.native.kernels import Kernels
@@ -81,7 +81,7 @@ def _write(module: Module, library: Structure, sizes: Sizes, order: Order) -> No
     driver = Driver(library, sizes, order, kernels, module)
     late = [k for k, sensor in enumerate(library.measurements) if sensor.delay is not None]
     if order == Order.COST:
-        write_control(module, sizes)
+        write_step(module, sizes)
     late_counts = [_write_mode(kernels, driver, mode, bool(late)) for mode in range(len(library.modes))]
     for k in range(len(library.measurements)):
         kernels.sample(k)

@@ -14,80 +14,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.engine.native.operations import BY_VALUE, COMMUTATIVE, COMPARISONS, INTEGERS, MAY_FAIL, OPERATIONS
+
 Objects = NDArray[np.object_]
-
-FOLDED: dict[str, Callable[..., Any]] = {
-    "add": lambda a, b: a + b,
-    "sub": lambda a, b: a - b,
-    "mul": lambda a, b: a * b,
-    "div": lambda a, b: np.float64(a) / b,
-    "neg": lambda a: -a,
-    "lt": lambda a, b: a < b,
-    "le": lambda a, b: a <= b,
-    "eq": lambda a, b: a == b,
-    "ne": lambda a, b: a != b,
-    "and": lambda a, b: a and b,
-    "or": lambda a, b: a or b,
-    "xor": lambda a, b: a != b,
-    "not": lambda a: not a,
-    "select": lambda c, a, b: a if c else b,
-    "max": np.maximum,
-    "min": np.minimum,
-    "abs": abs,
-    "floor": np.floor,
-    "ceil": np.ceil,
-    "trunc": np.trunc,
-    "rint": np.rint,
-    "round": lambda a: np.copysign(np.floor(abs(a)) + (abs(a) - np.floor(abs(a)) >= 0.5), a),
-    "sqrt": np.sqrt,
-    "exp": np.exp,
-    "log": np.log,
-    "pow": np.float_power,
-    "sin": np.sin,
-    "cos": np.cos,
-    "tan": np.tan,
-    "asin": np.arcsin,
-    "acos": np.arccos,
-    "atan": np.arctan,
-    "atan2": np.arctan2,
-    "rem": np.fmod,
-    "sinh": np.sinh,
-    "cosh": np.cosh,
-    "tanh": np.tanh,
-    "asinh": np.arcsinh,
-    "acosh": np.arccosh,
-    "atanh": np.arctanh,
-    "expm1": np.expm1,
-    "log1p": np.log1p,
-    "cbrt": np.cbrt,
-    "exp2": np.exp2,
-    "erf": math.erf,
-    "erfc": math.erfc,
-}
-"""Every operation, with its value for numbers."""
-
-MAY_FAIL = frozenset(
-    {"div", "sqrt", "log", "log1p", "pow", "exp", "expm1", "exp2", "sinh", "cosh", "asin", "acos", "acosh", "atanh"}
-    | {"rem"}
-)
-"""Operations that are infinite or not a number for some finite arguments; sums and products that overflow aside."""
-
-COMPARISONS = ("lt", "le", "eq", "ne")
-"""From doubles to a truth value."""
-
-LOGIC = ("and", "or", "xor", "not")
-"""From truth values to a truth value."""
-
-WHOLE = ("floor", "ceil", "rint", "round", "trunc")
-"""From a double to an integer, as a double."""
-
-COMMUTATIVE = ("add", "mul", "eq", "ne", "and", "or", "xor", "max", "min")
-
 
 CHECKED = "check"
 """Pointer to what is not a number once a presumption was wrong."""
@@ -116,7 +51,7 @@ class Node:
     Attributes
     ----------
     index : its place in the graph, after those of its arguments
-    op : an operation of `FOLDED`, "const", "load", "table" (numbers in memory) or "lookup" (one of them)
+    op : one of `OPERATIONS`, "const", "load", "table" (numbers in memory) or "lookup" (one of them)
     args : its arguments; the number of a constant; (pointer, offset) of what is loaded; the `Table`; (table, index)
     vector, truth : whether it is a vector; whether it is a truth value, else it is a double or doubles
     """
@@ -164,24 +99,44 @@ class Node:
     def __neg__(self) -> Node:
         return self.graph.apply("neg", self)
 
+    def __lt__(self, other: Any) -> Any:
+        return self._with("lt", self, other)
 
-TYPES = {op: (op in LOGIC, op in LOGIC or op in COMPARISONS) for op in FOLDED if op != "select"}
-"""Whether an operation takes truth values, and whether it yields one."""
+    def __le__(self, other: Any) -> Any:
+        return self._with("le", self, other)
+
+    def __gt__(self, other: Any) -> Any:
+        return self._with("lt", other, self)
+
+    def __ge__(self, other: Any) -> Any:
+        return self._with("le", other, self)
+
+    def __and__(self, other: Any) -> Any:
+        return self._with("and", self, other)
+
+    def __or__(self, other: Any) -> Any:
+        return self._with("or", self, other)
+
+    def __invert__(self) -> Node:
+        return self.graph.apply("not", self)
+
+    def __bool__(self) -> bool:
+        raise TypeError("a node is known only at run time: use apply('select', ...)")
 
 
 def _is_truth(op: str, args: tuple[Any, ...]) -> bool:
     """Return whether an operation yields a truth value; raise TypeError if its arguments have the wrong type for it."""
-    types = TYPES.get(op)
-    if types is not None:
-        for a in args:
-            if a.truth is not types[0]:
-                raise TypeError(f"{op} does not take {'a truth value' if a.truth else 'a double'}")
-        return types[1]
+    operation = OPERATIONS.get(op)
     if op == "select":
         condition, yes, no = args
         if not condition.truth or yes.truth is not no.truth:
             raise TypeError("select takes a truth value, then two cases of one type")
         return bool(yes.truth)
+    if operation is not None:
+        for a in args:
+            if a.truth is not operation.takes_truth:
+                raise TypeError(f"{op} does not take {'a truth value' if a.truth else 'a double'}")
+        return operation.gives_truth
     return op == "const" and isinstance(args[0], bool)
 
 
@@ -202,6 +157,8 @@ class Graph:
 
     def constant(self, number: Any) -> Node:
         """A number, or a truth value."""
+        if isinstance(number, np.ndarray):
+            number = number.item()
         number = bool(number) if isinstance(number, bool | np.bool_) else float(number)
         return self._node("const", (number,), False, key=("const", type(number), number, math.copysign(1.0, number)))
 
@@ -238,7 +195,7 @@ class Graph:
         args = tuple(a if isinstance(a, Node) else self.constant(a) for a in given)
         if args[0].op == "const" and all(a.op == "const" for a in args):
             with np.errstate(all="ignore"):
-                return self.constant(FOLDED[op](*(a.args[0] for a in args)))
+                return self.constant(OPERATIONS[op].value(*(a.args[0] for a in args)))
         simpler = self._simpler(op, args)
         if simpler is not None:
             return simpler
@@ -315,7 +272,7 @@ class Graph:
                 return args[1]
             if self._is_zero_in_any_case(*args):
                 return args[2]
-        elif op == "trunc" and a.op in WHOLE:
+        elif op == "trunc" and a.op in INTEGERS:
             return a
         elif op == "lookup":
             if b.number is not None:
@@ -336,7 +293,7 @@ class Graph:
         if a is b or (a.op == b.op and a.args[1] is b.args[1]) or "const" in (a.op, b.op):
             sides = [node.args[0].args[0].values if node.op == "lookup" else node.number for node in (a, b)]
             if np.size(sides[0]) == np.size(sides[1]) or 1 in map(np.size, sides):
-                found = FOLDED[op](*sides)
+                found = OPERATIONS[op].value(*sides)
                 if found.all() or not found.any():
                     return self.constant(bool(found.all()))
         return None
@@ -349,6 +306,22 @@ class Graph:
             self._known[key] = node
             self.nodes.append(node)
         return node
+
+
+class Namespace:
+    """Functions of NumPy, by their names there, for arrays of nodes: the `xp` of functions shared with NumPy.
+
+    Comparisons of nodes are truth values, but ``==`` says whether two are the same node.
+    """
+
+    def __init__(self, graph: Graph) -> None:
+        self._graph = graph
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        operation = BY_VALUE.get(getattr(np, name))
+        if operation is None:
+            raise AttributeError(f"there is no operation for numpy.{name}: add it to engine/native/operations.py")
+        return np.frompyfunc(partial(self._graph.apply, operation.name), operation.operands, 1)
 
 
 def as_objects(values: Sequence[Any]) -> Objects:

@@ -23,7 +23,8 @@ from switchfit.engine.native.entries import Integer, Unsupported, choose, is_tra
 from switchfit.engine.native.indexing import added, dynamic_slice, dynamic_update_slice, gather, scatter
 from switchfit.engine.native.integers import OF_INTEGERS, from_double, invert
 from switchfit.engine.native.matrices import MATRICES
-from switchfit.engine.native.scalars import FOLDED, LOGIC, Graph, Node, Objects, Template, as_objects
+from switchfit.engine.native.operations import OPERATIONS
+from switchfit.engine.native.scalars import Graph, Node, Objects, Template, as_objects
 from switchfit.engine.native.sorting import SORTING, compare_in_order, search
 
 __all__ = ["Unsupported", "traced"]
@@ -393,17 +394,14 @@ NUMPY: dict[str, Callable[..., Any]] = {
         + np.zeros(params["shape"], int)
     ),
     "convert_element_type": lambda params, a: a,
-    "add": lambda params, a, b: a + b,
-    "sub": lambda params, a, b: a - b,
-    "mul": lambda params, a, b: a * b,
-    "eq": lambda params, a, b: a == b,
-    "ne": lambda params, a, b: a != b,
-    "lt": lambda params, a, b: a < b,
-    "le": lambda params, a, b: a <= b,
-    "ge": lambda params, a, b: a >= b,
+    **{
+        name: lambda params, *args, value=operation.value: value(*args)
+        for operation in OPERATIONS.values()
+        if operation.known_alike
+        for name in (*operation.primitives, *operation.of_truth[:1])
+    },
     "gt": lambda params, a, b: a > b,
-    "and": lambda params, a, b: a & b,
-    "or": lambda params, a, b: a | b,
+    "ge": lambda params, a, b: a >= b,
     "select_n": lambda params, which, *cases: np.choose(which.astype(int), cases),
 }
 """Operations on known numbers that models have often, without a start of XLA for each."""
@@ -477,10 +475,7 @@ def _sign(graph: Graph, params: Any) -> Callable[[Any], Any]:
 
 
 MEANINGS: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
-    **{op: _simply(op) for op in FOLDED if op not in ("select", "lt", "le", "round", *LOGIC)},
-    "add_any": _simply("add"),
-    "lt": _simply("lt"),
-    "le": _simply("le"),
+    **{name: _simply(op) for op, operation in OPERATIONS.items() for name in operation.primitives},
     "gt": _swapped("lt"),
     "ge": _swapped("le"),
     "convert_element_type": _convert_number,
@@ -518,11 +513,8 @@ def _convert_truth(graph: Graph, params: Any) -> Callable[[Any], Any]:
 
 
 OF_TRUTH: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
-    **{op: _simply(op) for op in LOGIC},
-    "max": _simply("or"),
-    "min": _simply("and"),
+    **{name: _simply(op) for op, operation in OPERATIONS.items() for name in operation.of_truth},
     "eq": _logic(lambda do, a, b: do("not", do("xor", a, b))),
-    "ne": _simply("xor"),
     "lt": _logic(lambda do, a, b: do("and", do("not", a), b)),
     "le": _logic(lambda do, a, b: do("or", do("not", a), b)),
     "gt": _logic(lambda do, a, b: do("and", a, do("not", b))),
