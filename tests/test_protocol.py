@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.discretization.arguments import arguments_of
+from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.choice import runs_natively, traced_derivatives
 from switchfit.engine.jax.engine import JaxEngine
@@ -224,7 +224,7 @@ def test_one_program_of_jax_serves_every_sequence_of_the_same_length(room):
     for sequence in (("swing", "fall", "swing"), ("fall", "swing", "rest"), ("rest", "rest", "fall")):
         given = problem(data, sequence, (at_node, 2.3), system, max_transitions=room)
         structure = given.structures[0]
-        arguments = arguments_of(given, 0, mesh)
+        arguments = build_arguments(given, 0, mesh)
         assert runs_natively([structure], [arguments])
         tau, p = given.vectors(given.initial_theta, 0)
         for side in (1.0, -1.0):
