@@ -682,6 +682,8 @@ def test_convergence_of_nothing(values):
     figure, ax = axes()
     plot_convergence([IterationRecord(k, 1.0, v, 1.0, np.zeros(1), k) for k, v in enumerate(values)], ax)
     figure.draw_without_rendering()
+    assert ax.get_yscale() == "log"
+    np.testing.assert_array_equal(ax.lines[0].get_ydata(), np.full(len(values), np.nan))
 
 
 def test_states_are_drawn_where_there_is_no_data():

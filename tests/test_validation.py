@@ -142,9 +142,9 @@ def test_single_precision_is_refused_if_and_only_if_a_shortest_text_is_another_d
 
 @given(st.integers(-(2**24), 2**24), st.integers(-999_999, 999_999))
 def test_integers_and_short_decimals_that_a_float32_holds_pass(whole, thousands):
-    refuse_single_precision(np.float32(whole), "value")
+    assert refuse_single_precision(np.float32(whole), "value") is None
     if float(np.float32(thousands / 1000)) == thousands / 1000:
-        refuse_single_precision(np.float32(thousands / 1000), "value")
+        assert refuse_single_precision(np.float32(thousands / 1000), "value") is None
 
 
 @pytest.mark.parametrize("kind", [np.float16, jnp.bfloat16, np.float32])
