@@ -16,7 +16,7 @@ from scipy.optimize import nnls
 import switchfit as sf
 from switchfit.batch import simulated as module
 from switchfit.batch.chunks import run_chunks
-from switchfit.batch.program import CHUNK, Varying, fit_chunk
+from switchfit.batch.program import CHUNK, Varying, _fits, fit_chunk
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import minimized
 from switchfit.optimize import LinearConstraints, minimize
