@@ -91,7 +91,7 @@ def test_augmented_lagrangian_has_exact_derivatives(solver: str, relative: float
         J, slope, H, c, A = (
             found  # H is that of J + weights . c: the product of the constraints' slopes is added outside
         )
-        return J, slope, H + (A.T * penalty) @ A, c, A
+        return J, slope, H + (A.T * penalty[None]) @ A, c, A
 
     found = compiled(differentiate)(arguments, TAU, P0)
     assert np.abs(expected[2]).min() > 1e-3, "an entry is not tested"
