@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from models import climb_at_one, decay, rest
 from scipy.optimize import nnls
 
 import switchfit as sf
@@ -32,16 +33,12 @@ def heating(t, x, p):
     return 1.0 - p["k"] * x
 
 
-def cooling(t, x, p):
-    return -p["k"] * x
-
-
 def root(t, x, p):
     return jnp.sqrt(1.0 + x)
 
 
-ROOM = sf.HybridSystem({"on": heating, "off": cooling}, [0.2])
-OTHER = sf.HybridSystem({"on": lambda t, x, p: 2.0 * heating(t, x, p), "off": cooling}, [0.2])
+ROOM = sf.HybridSystem({"on": heating, "off": decay}, [0.2])
+OTHER = sf.HybridSystem({"on": lambda t, x, p: 2.0 * heating(t, x, p), "off": decay}, [0.2])
 
 
 def room(data=None, guess=(1.7, 1.0), upper=5.0, **settings):
@@ -214,7 +211,7 @@ def test_fits_that_do_not_converge_are_listed():
 
 
 def test_a_model_that_is_not_finite_somewhere_does_not_stop_the_others():
-    system = sf.HybridSystem({"a": root, "b": lambda t, x, p: -p["k"] * x}, [0.5])
+    system = sf.HybridSystem({"a": root, "b": decay}, [0.5])
     run = sf.Experiment(sf.Measurements(TIMES, np.ones(24), sigma=0.1), ("a", "b"), (2.0,), 0.0, 6.0)
     problem = sf.Problem(system, run, {"k": sf.Parameter(0.5, lower=-1e4, upper=5.0)})
     study = sf.multistart(problem, [[2.0, 0.5], [2.0, -9e3], [2.5, 0.3]])
@@ -392,7 +389,7 @@ def test_a_log_that_needs_a_finer_mesh_is_done_again_by_itself():
 
 def test_logs_that_end_at_a_kink_end_at_their_own_sample():
     """A ramp that may start at a sample: the residual there says later, the one after it says earlier."""
-    modes = {"rest": lambda t, x, p: 0.0 * x, "ramp": lambda t, x, p: 1.0 + 0.0 * x}
+    modes = {"rest": rest, "ramp": climb_at_one}
     system = sf.HybridSystem(modes, [0.0])
 
     def log(shift):
@@ -550,7 +547,7 @@ def _(primals, tangents):
     return table(*primals), tangents[0]
 
 
-FAILING = sf.HybridSystem({"on": lambda t, x, p: 1.0 - table(p["k"]) * x, "off": cooling}, [0.2])
+FAILING = sf.HybridSystem({"on": lambda t, x, p: 1.0 - table(p["k"]) * x, "off": decay}, [0.2])
 
 
 def failing_room(values, guess=(1.7, 1.0)):

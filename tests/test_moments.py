@@ -1,6 +1,7 @@
 """Hard moments: transitions at samples, at each other and at the ends; switches that a function hides."""
 
 import jax.numpy as jnp
+import models
 import numpy as np
 import pytest
 
@@ -174,7 +175,7 @@ def test_a_coarse_mesh_is_no_jump():
 
 def test_a_perfect_fit_is_no_jump():
     """J is 1e-20 there, rounding alone, and its integration error is all of it."""
-    system = sf.HybridSystem({"m": lambda t, x, p: -p["k"] * x}, [1.0])
+    system = sf.HybridSystem({"m": models.decay}, [1.0])
     data = sf.Measurements(TIMES, np.exp(-TIMES), sigma=0.1)
     run = sf.Experiment(data, ("m",), (), 0.0, 4.0)
     found = sf.estimate(sf.Problem(system, run, {"k": 1.0}, rtol=1e-11, atol=1e-13), start=[1.0])
