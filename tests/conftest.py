@@ -1,4 +1,4 @@
-"""Settings for all tests: the same examples in every run, and compiled programs let go after each file."""
+"""Settings for all tests: the same examples in every run, strict promotion, programs dropped after each file."""
 
 import jax
 import pytest
@@ -8,6 +8,33 @@ from switchfit.engine.native.program import forget_programs
 
 settings.register_profile("switchfit", derandomize=True, deadline=None)
 settings.load_profile("switchfit")
+
+PROMOTION = {
+    "jax_numpy_dtype_promotion": ("strict", "standard"),
+    "jax_numpy_rank_promotion": ("raise", "allow"),
+}
+"""JAX's settings in the tests, and its defaults.
+
+switchfit's own code must not rely on implicit conversions: an int32 that meets a float64, or a vector that is taken for
+a row of a matrix, is more often a mistake than meant. Users' functions may, and JAX's defaults are in force for them;
+tests of such functions are marked with `promotes`.
+"""
+
+for name, (strict, _) in PROMOTION.items():
+    jax.config.update(name, strict)
+
+
+@pytest.fixture(autouse=True)
+def _promotion(request):
+    """JAX's defaults for a test that is marked with `promotes`; in all threads, which a context would not be."""
+    if request.node.get_closest_marker("promotes") is None:
+        yield
+        return
+    for name, (_, default) in PROMOTION.items():
+        jax.config.update(name, default)
+    yield
+    for name, (strict, _) in PROMOTION.items():
+        jax.config.update(name, strict)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -1,9 +1,7 @@
-"""Seed mistakes into the mathematics, one at a time, and see that the tests notice each of them.
+"""Mistakes in the mathematics that the tests must notice, one at a time: `test_mutations.py` seeds them.
 
-Run as ``python tests/mutate.py``, or with the names of some parts: paper, rows, native, sqp. Every mistake is a
-replacement in a temporary copy of the package, whose text must be found exactly once; the tests of its part then run
-against the copy and must fail, while they must pass without a mistake. Exits with 1 if a mistake survives, with 2 if
-its text is not found or the tests fail without any.
+Every mistake is a replacement in a temporary copy of the package, whose text must be found exactly once. The tests of
+its part then run against the copy and must fail, while they must pass without a mistake.
 """
 
 from __future__ import annotations
@@ -13,11 +11,10 @@ import re
 import shutil
 import subprocess
 import sys
-import tempfile
-import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+SOURCE = ROOT / "src" / "switchfit"
 
 PAPER, ROWS = "paper_adjoint.py", "discretization/rows.py"
 ALGEBRA = "optimize/algebra.py"
@@ -139,68 +136,61 @@ IN_SQP: dict[str, tuple[str, Replacements]] = {
 }
 
 
-def mutated(source: str, replacements: list[tuple[str, str]]) -> str:
-    """`source` with each text replaced; exits with 2 unless it occurs exactly once."""
+MISTAKES: dict[tuple[str, str], tuple[str, Replacements]] = {
+    **{("paper", name): (PAPER, replacements) for name, replacements in IN_PAPER.items()},
+    **{("rows", name): (ROWS, replacements) for name, replacements in IN_ROWS.items()},
+    **{("native", name): mistake for name, mistake in IN_NATIVE.items()},
+    **{("sqp", name): mistake for name, mistake in IN_SQP.items()},
+}
+"""All mistakes by part and name: the file, and what is replaced in it."""
+
+
+def mutate(part: str, name: str) -> tuple[str, str]:
+    """Return the file of a mistake and its text with the mistake; ValueError unless each text occurs exactly once."""
+    path, replacements = MISTAKES[part, name]
+    text = (SOURCE / path).read_text()
     for old, new in replacements:
-        if source.count(old) != 1:
-            print(f"found {source.count(old)} times instead of once: {old!r}")
-            sys.exit(2)
-        source = source.replace(old, new)
-    return source
+        if text.count(old) != 1:
+            raise ValueError(f"{path}: found {text.count(old)} times instead of once: {old!r}")
+        text = text.replace(old, new)
+    return path, text
 
 
-def run_tests(package: Path, tests: list[list[str]]) -> tuple[bool, str]:
-    """Whether one of some runs of tests fails against the package below a folder, and the first test that does."""
-    environment = os.environ | {"PYTHONPATH": str(package), "PYTHONDONTWRITEBYTECODE": "1", "SWITCHFIT_CACHE": "off"}
-    for selection in tests:
+def copy_package(folder: Path) -> Path:
+    """Copy the package below a folder and return its path."""
+    ignored = shutil.ignore_patterns("__pycache__")
+    return Path(shutil.copytree(SOURCE, folder / "switchfit", ignore=ignored))
+
+
+def find_failure(package: Path, part: str, cache: Path) -> str | None:
+    """Run the tests of a part against a copy of the package and return the first test that fails, or None.
+
+    Parameters
+    ----------
+    package : Path
+        As of `copy_package`.
+    part : str
+    cache : Path
+        Folder for compiled programs, which may be shared: they are found by their text, which a mistake changes.
+
+    Raises
+    ------
+    RuntimeError
+        If the tests cannot be collected, or the interpreter crashes.
+    """
+    environment = os.environ | {
+        "PYTHONPATH": str(package.parent),
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "SWITCHFIT_CACHE": str(cache),
+        "OMP_NUM_THREADS": "1",
+    }
+    environment.pop("PYTEST_ADDOPTS", None)
+    for selection in TESTS[part]:
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", *selection]
-        found = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-        failed = re.findall(r"^(?:FAILED|ERROR) \S+?::(.*?)(?: - .*)?$", found.stdout, re.MULTILINE)
-        if found.returncode not in (0, 1) or (found.returncode == 1 and not failed):
-            print(found.stdout[-3000:], found.stderr[-3000:])
-            sys.exit(2)
-        if found.returncode == 1:
-            return True, failed[0]
-    return False, "none"
-
-
-def mistakes(part: str) -> dict[str, tuple[str, Replacements]]:
-    """The mistakes of a part: where, and what is replaced."""
-    if part == "paper":
-        return {name: (PAPER, replacements) for name, replacements in IN_PAPER.items()}
-    if part == "rows":
-        return {name: (ROWS, replacements) for name, replacements in IN_ROWS.items()}
-    return {"native": IN_NATIVE, "sqp": IN_SQP}[part]
-
-
-def main(parts: list[str]) -> int:
-    """Run all mistakes of some parts and print what noticed them; the number of survivors decides the exit status."""
-    survivors = count = 0
-    source = ROOT / "src" / "switchfit"
-    for part in parts or list(TESTS):
-        variants = {
-            name: (path, mutated((source / path).read_text(), replacements))
-            for name, (path, replacements) in mistakes(part).items()
-        }
-        with tempfile.TemporaryDirectory() as folder:
-            package = Path(folder)
-            shutil.copytree(source, package / "switchfit")
-            failed, test = run_tests(package, TESTS[part])
-            if failed:
-                print(f"without any mistake {test} fails")
-                return 2
-            print(f"{part + ': mistake':46} {'':8} first test that fails", flush=True)
-            for name, (path, text) in variants.items():
-                (package / "switchfit" / path).write_text(text)
-                started = time.monotonic()
-                caught, test = run_tests(package, TESTS[part])
-                (package / "switchfit" / path).write_text((source / path).read_text())
-                survivors, count = survivors + (not caught), count + 1
-                verdict = "caught" if caught else "SURVIVES"
-                print(f"{name:46} {verdict:8} {test} ({time.monotonic() - started:.0f} s)", flush=True)
-    print(f"{count - survivors} of {count} mistakes caught")
-    return int(survivors > 0)
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+        run = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+        failed = re.findall(r"^(?:FAILED|ERROR) \S+?::(.*?)(?: - .*)?$", run.stdout, re.MULTILINE)
+        if run.returncode not in (0, 1) or (run.returncode == 1 and not failed):
+            raise RuntimeError(f"pytest ended with {run.returncode}:\n{run.stdout[-3000:]}\n{run.stderr[-3000:]}")
+        if run.returncode == 1:
+            return str(failed[0])
+    return None

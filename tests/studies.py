@@ -2,64 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
+from models import drive, first_state, fishing, heated_room, linear, positions, rest
 
 import switchfit as sf
-from switchfit.models import skid_steer
-
-# --- costs without data: switching-time optimisation ------------------------------------------------------------------
-
-
-def _fleet(u: float) -> Any:
-    return lambda t, x, p: jnp.stack([x[0] - x[0] * x[1] - 0.4 * u * x[0], x[0] * x[1] - x[1] - 0.2 * u * x[1]])
-
-
-FISHING = sf.HybridSystem({"idle": _fleet(0.0), "fishing": _fleet(1.0)}, [0.5, 0.7])
-
-
-def fishing() -> sf.Problem:
-    """Lotka-Volterra fishing, eight switches on twelve time units: many local minima, most with collapsed modes."""
-    cost = sf.RunningCost(lambda t, x, p: (x[0] - 1.0) ** 2 + (x[1] - 1.0) ** 2)
-    times = tuple(12.0 * np.arange(1, 9) / 9)
-    return sf.Problem(FISHING, sf.Experiment(cost, ("idle", "fishing") * 4 + ("idle",), times, 0.0, 12.0))
-
-
-A1, A2 = np.array([[-1.0, 0.0], [1.0, 2.0]]), np.array([[1.0, 1.0], [1.0, -2.0]])
-LINEAR = sf.HybridSystem({"A1": lambda t, x, p: A1 @ x, "A2": lambda t, x, p: A2 @ x}, [1.0, 1.0])
-
-
-def linear() -> sf.Problem:
-    """Two linear modes in turn, five switches."""
-    run = sf.Experiment(sf.RunningCost(lambda t, x, p: x @ x), ("A1", "A2") * 3, tuple(np.arange(1, 6) / 6), 0.0, 1.0)
-    return sf.Problem(LINEAR, run)
 
 
 def vehicle() -> sf.Problem:
     """The paper's vehicle with the cost 1/2 |x|^2: two switches and the friction."""
-    cost = sf.RunningCost(lambda t, x, p: 0.5 * (x @ x))
-    run = sf.Experiment(cost, ("stick", "slip", "stick"), (5.0, 9.0), 0.0, 15.0)
-    return sf.Problem(skid_steer(), run, {"mu": sf.Parameter(0.8, lower=0.05, upper=2.0)})
-
-
-# --- fits of measurements ---------------------------------------------------------------------------------------------
+    return drive(sf.RunningCost(lambda t, x, p: 0.5 * (x @ x)))
 
 
 def driven() -> tuple[sf.Problem, np.ndarray]:
     """The vehicle with its position measured four times a second; and a truth."""
-    times = np.arange(1, 61) / 4.0
-    data = sf.Measurements(times, np.zeros((60, 2)), observe=lambda t, x, p: x[jnp.array([0, 2])], sigma=0.05)
-    run = sf.Experiment(data, ("stick", "slip", "stick"), (5.0, 9.0), 0.0, 15.0)
-    problem = sf.Problem(skid_steer(), run, {"mu": sf.Parameter(0.8, lower=0.05, upper=2.0)})
-    return problem, np.array([5.6, 9.7, 0.7])
+    return drive(positions(np.arange(1, 61) / 4.0, 0.05)), np.array([5.6, 9.7, 0.7])
 
 
-ROOM = sf.HybridSystem(
-    {"on": lambda t, x, p: p["heat"] - p["k"] * x, "off": lambda t, x, p: -p["k"] * x},
-    [0.2],
-)
+ROOM = heated_room()
 
 
 def thermostat() -> tuple[sf.Problem, np.ndarray]:
@@ -67,12 +27,12 @@ def thermostat() -> tuple[sf.Problem, np.ndarray]:
     times = np.linspace(0.25, 10.0, 40)
     data = sf.Measurements(times, np.zeros(40), sigma=0.02)
     run = sf.Experiment(data, ("on", "off", "on", "off", "on", "off"), (1.5, 3.5, 5.0, 6.5, 8.5), 0.0, 10.0)
-    parameters = {"heat": sf.Parameter(1.2, lower=0.2, upper=5.0), "k": sf.Parameter(0.6, lower=0.05, upper=3.0)}
+    parameters = {"power": sf.Parameter(1.2, lower=0.2, upper=5.0), "k": sf.Parameter(0.6, lower=0.05, upper=3.0)}
     return sf.Problem(ROOM, run, parameters), np.array([1.83, 3.4, 5.32, 6.7, 8.1, 1.0, 0.8])
 
 
 RAMPS = sf.HybridSystem(
-    {"rest": lambda t, x, p: 0.0 * x, "up": lambda t, x, p: 0.0 * x + p["rate"], "down": lambda t, x, p: 0.0 * x - 1.0},
+    {"rest": rest, "up": lambda t, x, p: 0.0 * x + p["rate"], "down": lambda t, x, p: 0.0 * x - 1.0},
     [0.0],
 )
 
@@ -101,7 +61,7 @@ def joint() -> tuple[sf.Problem, np.ndarray]:
         for e in range(3)
     ]
     problem = sf.Problem(
-        ROOM, runs, {"heat": sf.Parameter(1.0, lower=0.2, upper=5.0), "k": sf.Parameter(0.6, lower=0.05, upper=3.0)}
+        ROOM, runs, {"power": sf.Parameter(1.0, lower=0.2, upper=5.0), "k": sf.Parameter(0.6, lower=0.05, upper=3.0)}
     )
     return problem, np.array([1.4, 3.3, 1.9, 4.0, 2.1, 3.2, 1.1, 0.7, 0.8, 0.4, 0.6])
 
@@ -109,7 +69,7 @@ def joint() -> tuple[sf.Problem, np.ndarray]:
 SLIDE = sf.HybridSystem(
     {
         "slide": lambda t, x, p: jnp.stack([x[1], -9.81 * p["mu"] + 0.0 * x[1]]),
-        "stick": lambda t, x, p: 0.0 * x,
+        "stick": rest,
     },
     [0.0, 2.0],
 )
@@ -118,7 +78,7 @@ SLIDE = sf.HybridSystem(
 def sliding() -> tuple[sf.Problem, np.ndarray]:
     """A block that slides until it sticks: at the truth the vector field of the position does not jump."""
     times = np.linspace(0.02, 1.0, 25)
-    data = sf.Measurements(times, np.zeros(25), observe=lambda t, x, p: x[:1], sigma=0.01)
+    data = sf.Measurements(times, np.zeros(25), observe=first_state, sigma=0.01)
     run = sf.Experiment(data, ("slide", "stick"), (0.5,), 0.0, 1.0)
     return sf.Problem(SLIDE, run, {"mu": sf.Parameter(0.4, lower=0.01, upper=2.0)}), np.array([0.65, 0.3])
 

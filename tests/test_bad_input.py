@@ -6,6 +6,7 @@ import time
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from models import decay, first_state
 
 import switchfit as sf
 from switchfit.discretization.model import Model
@@ -17,20 +18,12 @@ def grow(t, x, p):
     return p["k"] * x
 
 
-def shrink(t, x, p):
-    return -p["k"] * x
-
-
-def first_state(t, x, p):
-    return x[:1]
-
-
 TIMES = np.linspace(0.0, 1.0, 5)
 SAMPLES = sf.Measurements(TIMES, np.ones(5), observe=first_state, sigma=0.1)
 
 
 def system(**changes):
-    given = {"modes": {"grow": grow, "shrink": shrink}, "initial_state": [1.0]}
+    given = {"modes": {"grow": grow, "shrink": decay}, "initial_state": [1.0]}
     return sf.HybridSystem(**(given | changes))
 
 
@@ -54,7 +47,7 @@ def problem(run=None, of=None, parameters=None, **settings):
 
 def with_mode(mode, **changes):
     """A problem in which the mode "grow" is replaced."""
-    return problem(of=system(modes={"grow": mode, "shrink": shrink}, **changes))
+    return problem(of=system(modes={"grow": mode, "shrink": decay}, **changes))
 
 
 def reference(times=TIMES, values=TIMES, **settings):
@@ -377,7 +370,7 @@ def test_a_vector_field_gets_inputs_only_where_there_are_any():
 
 
 def test_a_scalar_is_not_taken_for_a_state_of_two():
-    two = system(modes={"grow": lambda t, x, p: x[0], "shrink": shrink}, initial_state=[1.0, 2.0])
+    two = system(modes={"grow": lambda t, x, p: x[0], "shrink": decay}, initial_state=[1.0, 2.0])
     refused(lambda: problem(of=two), ValueError, "mode 'grow'", "shape (2,); got shape ()")
 
 
@@ -449,7 +442,7 @@ def broken_beyond_half(t, x, p):
 
 def on_a_long_horizon(mode, **settings):
     run = experiment(transition_times=(5.0,), tf=10.0)
-    return problem(run, system(modes={"grow": mode, "shrink": shrink}), **settings)
+    return problem(run, system(modes={"grow": mode, "shrink": decay}), **settings)
 
 
 def test_a_vector_field_that_returns_nan_is_named_with_t_and_x():

@@ -8,15 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from models import RAMP, STILL, curve
 
 import switchfit as sf
 from switchfit.batch.resampling import _compute_acceleration, _Draw, _Runs
 
 TIMES = np.linspace(0.1, 4.0, 40)
-
-
-def still(t, x, p):
-    return 0.0 * x
 
 
 def level(t, x, p):
@@ -27,17 +24,8 @@ def line(t, x, p):
     return jnp.array([p["m"] + p["s"] * t])
 
 
-def up(t, x, p):
-    return p["v"] + 0.0 * x
-
-
-STILL = sf.HybridSystem({"still": still}, [0.0])
-RAMP = sf.HybridSystem({"up": up, "rest": still}, [0.0])
-
-
 def mean_of(values, sigma=None):
-    data = sf.Measurements(TIMES[: len(values)], values, observe=level, sigma=sigma)
-    return sf.estimate(sf.Problem(STILL, sf.Experiment(data, ("still",), (), 0.0, 4.0), {"m": 0.0}))
+    return sf.estimate(curve(level, TIMES[: len(values)], values, {"m": 0.0}, sigma=sigma, tf=4.0))
 
 
 def skewed(seed=0, count=40):
@@ -86,8 +74,7 @@ def test_wild_follows_noise_that_grows():
     rng = np.random.default_rng(3)
     size = np.linspace(0.1, 2.0, 40) ** 2
     values = 1.0 + 0.5 * TIMES + size * rng.standard_normal(40)
-    data = sf.Measurements(TIMES, values, observe=line)
-    fit = sf.estimate(sf.Problem(STILL, sf.Experiment(data, ("still",), (), 0.0, 4.0), {"m": 0.0, "s": 0.0}))
+    fit = sf.estimate(curve(line, TIMES, values, {"m": 0.0, "s": 0.0}, tf=4.0))
     design = np.stack([np.ones(40), TIMES], axis=1)
     residual = values - design @ fit.theta
     inverse = np.linalg.inv(design.T @ design)
@@ -104,8 +91,7 @@ def test_blocks_follow_noise_that_is_correlated():
     for k in range(1, n):
         noise[k] = r * noise[k - 1] + rng.standard_normal()
     times = np.linspace(0.001, 4.0, n)
-    data = sf.Measurements(times, 1.0 + noise, observe=level)
-    fit = sf.estimate(sf.Problem(STILL, sf.Experiment(data, ("still",), (), 0.0, 4.0), {"m": 0.0}))
+    fit = sf.estimate(curve(level, times, 1.0 + noise, {"m": 0.0}, tf=4.0))
     blocks = sf.bootstrap(fit, 1000, resample="blocks")
     single = sf.bootstrap(fit, 1000)
     assert 10 < blocks.block < 60
@@ -164,8 +150,7 @@ def test_missing_values_stay_missing_and_channels_stay_together():
     def two(t, x, p):
         return jnp.array([p["m"], p["n"]])
 
-    data = sf.Measurements(TIMES, values, observe=two)
-    fit = sf.estimate(sf.Problem(STILL, sf.Experiment(data, ("still",), (), 0.0, 4.0), {"m": 0.0, "n": 0.0}))
+    fit = sf.estimate(curve(two, TIMES, values, {"m": 0.0, "n": 0.0}, tf=4.0))
     study = sf.bootstrap(fit, 300)
     assert study.samples.tolist() == [78] * 300
     assert np.corrcoef(study.theta.T)[0, 1] < -0.9

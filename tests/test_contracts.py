@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from models import charge, first_state
+from models import decay as decay_at_k
 
 import switchfit as sf
 from switchfit.discretization.mesh import pad_length
@@ -39,10 +41,6 @@ def damped(t, x, p):
     return counted(t, x, p) - p["damping"] * x
 
 
-def position(t, x, p):
-    return x[:1]
-
-
 TOLERANCES = {"rtol": 1e-9, "atol": 1e-11}
 OSCILLATOR = sf.HybridSystem({"free": counted, "damped": damped}, [1.0, 0.0])
 
@@ -52,7 +50,7 @@ def oscillator(tau=1.1, k=2.0, damping=0.3, samples=9, seed=0, start=None):
     times = np.linspace(0.0, 3.3, samples)
     values = np.cos(np.sqrt(2.1) * times) * np.exp(-0.3 * np.maximum(times - 1.2, 0.0))
     values += 0.01 * np.random.default_rng(seed).normal(size=samples)
-    data = sf.Measurements(times, values, observe=position, sigma=0.01)
+    data = sf.Measurements(times, values, observe=first_state, sigma=0.01)
     run = sf.Experiment(data, ("free", "damped"), (tau,), 0.0, 3.3, initial_state=start)
     return sf.Problem(OSCILLATOR, run, {"k": k, "damping": damping}, **TOLERANCES)
 
@@ -144,7 +142,7 @@ def test_another_number_of_transitions_compiles_one_program_another_number_of_sa
     assert counts == [1 if "transitions" in change else 0, 0, 0, 0, 0]
 
 
-ROOM = sf.HybridSystem({"on": lambda t, x, p: p["k"] * (1.0 - x), "off": lambda t, x, p: -p["k"] * x}, [0.3])
+ROOM = sf.HybridSystem({"on": charge, "off": decay_at_k}, [0.3])
 
 
 def test_the_mesh_is_made_once(compiled):

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from models import decay, rest
 from numpy.polynomial import Polynomial
 
 import switchfit as sf
@@ -228,10 +229,6 @@ def test_a_broken_reference_signal_is_integrated_up_to_the_break_and_from_it():
 # Measurements
 
 
-def first_mode(t, x, p):
-    return -p["k"] * x
-
-
 def second_mode(t, x, p):
     return jnp.array([-p["k"] * x[0], p["k"] * x[0] - x[1]])
 
@@ -240,7 +237,7 @@ def seen(t, x, p):
     return jnp.array([x[0] + x[1], p["k"] * x[1]])
 
 
-DECAYS = sf.HybridSystem({"first": first_mode, "second": second_mode}, [1.5, 0.8])
+DECAYS = sf.HybridSystem({"first": decay, "second": second_mode}, [1.5, 0.8])
 THETA = np.array([0.83, 1.4])
 SAMPLED = np.array([0.0, 0.011, 0.4, 0.41, 0.8, 1.25, 2.0])
 RNG = np.random.default_rng(5)
@@ -329,7 +326,7 @@ def test_weights_and_count():
 
 def test_a_sample_at_a_transition_with_a_reset_map_is_of_the_state_before_the_jump():
     """x = 1, halved at tau = 0.5, where a sample is: the cost is that of the 1, whatever the side of tau."""
-    system = sf.HybridSystem({"a": lambda t, x, p: 0.0 * x}, [1.0], {("a", "a"): lambda t, x, p: p["e"] * x})
+    system = sf.HybridSystem({"a": rest}, [1.0], {("a", "a"): lambda t, x, p: p["e"] * x})
     run = sf.Experiment(sf.Measurements([0.5, 1.0], [0.0, 0.0]), ("a", "a"), (0.5,), 0.0, 1.0)
     problem = sf.Problem(system, run, {"e": 0.5})
     found = sf.evaluate(problem)
@@ -339,7 +336,7 @@ def test_a_sample_at_a_transition_with_a_reset_map_is_of_the_state_before_the_ju
 
 def test_costs_of_several_data_add_up():
     """Two Measurements, a reference and running and terminal costs at once, each with a cost of its own size."""
-    system = sf.HybridSystem({"a": lambda t, x, p: 0.0 * x}, lambda p: jnp.array([p["c"]]))
+    system = sf.HybridSystem({"a": rest}, lambda p: jnp.array([p["c"]]))
     data = [
         sf.Measurements([0.5], [0.0], sigma=0.1),
         sf.RunningCost(lambda t, x, p: 3.0 * x[0]),

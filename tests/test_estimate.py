@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import cache
 
 import jax.numpy as jnp
+import models
 import numpy as np
 import pytest
 import scipy.optimize
@@ -154,23 +155,12 @@ def test_a_minimum_duration_that_is_reached_is_named():
 # Kinks
 
 
-def wait(t, x, p):
-    return 0.0 * x
-
-
-def ramp(t, x, p):
-    return 0.0 * x + 1.0
-
-
-RAMP = sf.HybridSystem({"wait": wait, "ramp": ramp}, [0.0])
-
-
 @pytest.mark.parametrize("guess", [0.15, 0.45, 0.7])
 def test_a_transition_that_ends_at_a_sample_is_reported_as_a_kink(guess):
     """x = max(t - tau, 0). Later samples pull tau below 0.5 with the force 0.3, and a sample at 0.5 that is far too
     low pushes it up with the force 1, but only while tau is below 0.5."""
     data = sf.Measurements([0.5, 0.8, 1.0], [-1.0, 0.5, 0.6], sigma=1.0)
-    found = sf.estimate(sf.Problem(RAMP, sf.Experiment(data, ("wait", "ramp"), (guess,), 0.0, 1.0)))
+    found = sf.estimate(sf.Problem(models.LATE_RAMP, sf.Experiment(data, ("wait", "ramp"), (guess,), 0.0, 1.0)))
     assert found.status is sf.Status.CONVERGED_AT_KINK
     assert found.success
     assert found.theta[0] == 0.5
@@ -188,7 +178,7 @@ def test_a_transition_that_ends_at_a_sample_is_reported_as_a_kink(guess):
 def test_a_fit_that_passes_samples_does_not_stop_at_them():
     """The same with a better sample at 0.5: the minimum is at 0.35, where the derivative vanishes."""
     data = sf.Measurements([0.5, 0.8, 1.0], [0.15, 0.45, 0.65], sigma=1.0)
-    found = sf.estimate(sf.Problem(RAMP, sf.Experiment(data, ("wait", "ramp"), (0.9,), 0.0, 1.0)))
+    found = sf.estimate(sf.Problem(models.LATE_RAMP, sf.Experiment(data, ("wait", "ramp"), (0.9,), 0.0, 1.0)))
     assert found.status is sf.Status.CONVERGED
     assert found.theta[0] == pytest.approx(0.35, abs=1e-9)
 
@@ -425,8 +415,7 @@ def test_a_mode_that_collapses_where_the_data_are_met_exactly_is_reported_as_suc
     """J is zero but for the integration error, whose minimum is where the mode lasts about 1e-12 of the horizon."""
     times = np.linspace(0.1, 6.0, 40)
     charged, left = 1.0 - np.exp(-rate * np.minimum(times, 3.0)), np.exp(-rate * np.maximum(times - 3.0, 0.0))
-    modes = {"on": lambda t, x, p: p["k"] * (1.0 - x), "off": lambda t, x, p: -p["k"] * x}
-    system = sf.HybridSystem(modes, [0.0])
+    system = sf.HybridSystem({"on": models.charge, "off": models.decay}, [0.0])
     run = sf.Experiment(sf.Measurements(times, charged * left, sigma=0.01), ("on", "off", "on", "off"), guess, 0.0, 6.0)
     found = sf.estimate(sf.Problem(system, run, {"k": sf.Parameter(1.2, lower=0.01)}))
     assert found.status is sf.Status.COLLAPSED

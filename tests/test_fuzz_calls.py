@@ -23,6 +23,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from models import charge as rise
+from models import decay as fall
 
 import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
@@ -34,20 +36,8 @@ SECONDS_WITH_JAX = 120
 LONGEST = 600
 
 
-def fall(t, x, p):
-    return -p["k"] * x
-
-
-def rise(t, x, p):
-    return p["k"] * (1.0 - x)
-
-
 def driven(t, x, p, u):
     return -p["k"] * x + u
-
-
-def first(t, x, p):
-    return x[:1]
 
 
 def low(t, x, p):

@@ -1,11 +1,10 @@
 """Guards and terminal constraints: derivatives against closed forms and JAX, fits with known answers."""
 
-from functools import cache
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from models import BALL_G, BALL_HEIGHT, ball, ball_system, constrained, decay
 
 import switchfit as sf
 from switchfit.discretization.model import Model
@@ -13,48 +12,35 @@ from switchfit.discretization.propagation import compute_path_cost, propagate
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.functions import use_float64
 
-G = 9.8
-HEIGHT, END, TARGET = 50.0, 15.0, 20.0
+END, TARGET = 15.0, 20.0
 
 
 # --- known answers ----------------------------------------------------------------------------------------------------
 
 
-def ball_falls(t, x, p):
-    return jnp.stack([x[1], -G + 0 * x[0]])
+GROUND = {("air", "air"): lambda t, x, p: x[0]}
+"""An impact is where the height is 0."""
 
 
-def ball_bounces(t, x, p):
-    return jnp.stack([0 * x[0], -p["e"] * x[1]])
-
-
-def ball(e=0.8, bounces=3, guess=(3.0, 8.0, 12.0)):
-    """A ball is dropped; its restitution e is to bring it to 20 m at 15 s (SciML's problem)."""
-    system = sf.HybridSystem(
-        {"air": ball_falls},
-        [HEIGHT, 0.0],
-        reset_maps={("air", "air"): ball_bounces},
-        guards={("air", "air"): lambda t, x, p: x[0]},
-    )
-    cost = sf.TerminalCost(lambda x, p: (x[0] - TARGET) ** 2)
-    run = sf.Experiment(cost, ("air",) * (bounces + 1), guess, 0.0, END)
-    return sf.Problem(system, run, {"e": sf.Parameter(e, lower=0.1, upper=1.0)})
+def guarded_ball(times=(3.0, 8.0, 12.0)):
+    """SciML's problem: the restitution is to bring a dropped ball to 20 m at 15 s."""
+    return ball(times, system=ball_system(guards=GROUND))
 
 
 def ball_in_closed_form(e):
-    t, v = jnp.sqrt(2 * HEIGHT / G), e * jnp.sqrt(2 * G * HEIGHT)
+    t, v = jnp.sqrt(2 * BALL_HEIGHT / BALL_G), e * jnp.sqrt(2 * BALL_G * BALL_HEIGHT)
     for _ in range(2):
-        t, v = t + 2 * v / G, e * v
+        t, v = t + 2 * v / BALL_G, e * v
     s = END - t
-    return (v * s - G * s**2 / 2 - TARGET) ** 2
+    return (v * s - BALL_G * s**2 / 2 - TARGET) ** 2
 
 
 def test_bouncing_ball_has_the_derivatives_of_its_closed_form():
-    found = sf.evaluate_on_guards(ball())
+    found = sf.evaluate_on_guards(guarded_ball())
     with use_float64():
         at, cost = jnp.float64(0.8), ball_in_closed_form
         J, g, H = cost(at), jax.grad(cost)(at), jax.hessian(cost)(at)
-        rest = np.sqrt(2 * HEIGHT / G)
+        rest = np.sqrt(2 * BALL_HEIGHT / BALL_G)
     assert found.names == ("e",)
     np.testing.assert_allclose(found.times, rest + 2 * rest * np.array([0.0, 0.8, 0.8 + 0.64]), rtol=1e-13)
     assert found.cost == pytest.approx(float(J), rel=1e-12)
@@ -63,7 +49,7 @@ def test_bouncing_ball_has_the_derivatives_of_its_closed_form():
 
 
 def test_bouncing_ball_is_fitted_to_twelve_digits():
-    fit = sf.estimate(ball())
+    fit = sf.estimate(guarded_ball())
     assert fit.success
     assert fit.parameters["e"] == pytest.approx(0.86655410543691079, abs=1e-12)
     assert max(abs(value) for _, value, _ in fit.constraints) < 1e-9
@@ -225,37 +211,6 @@ def test_constraints_are_saved_and_loaded(tmp_path):
 # --- derivatives ------------------------------------------------------------------------------------------------------
 
 
-@cache
-def everything():
-    """Two runs with guards, reset maps, samples, a running cost and terminal constraints, all depending on t, x, p."""
-
-    def first(t, x, p):
-        return jnp.stack([x[1] * jnp.cos(t), -p["a"] * x[0] + 0.3 * x[1] ** 2])
-
-    def second(t, x, p):
-        return jnp.stack([p["b"] * x[1] ** 2 - x[0], jnp.sin(x[0]) * p["a"] - 0.2 * x[1]])
-
-    system = sf.HybridSystem(
-        {"first": first, "second": second},
-        lambda p: jnp.stack([1.0 + 0.1 * p["a"], p["b"]]),
-        reset_maps={("first", "second"): lambda t, x, p: jnp.stack([x[0] * p["a"], x[1] + 0.1 * x[0] ** 2 * t])},
-        guards={
-            ("first", "second"): lambda t, x, p: x[0] * p["b"] - jnp.sin(t) * x[1],
-            ("second", "first"): lambda t, x, p: p["a"] ** 2 * x[1] ** 2 + t * x[0] - 1.0,
-        },
-    )
-    data = [
-        sf.Measurements([0.5, 1.4, 2.6], [[0.3, 0.2], [0.4, -0.2], [0.1, 0.5]], sigma=0.5),
-        sf.RunningCost(lambda t, x, p: p["b"] * x[0] ** 2 * jnp.cos(t)),
-        sf.TerminalConstraint(lambda x, p: jnp.stack([x[0] * x[1] - p["a"], p["b"] * x[0] ** 2])),
-    ]
-    runs = [
-        sf.Experiment(data, ("first", "second", "first"), (1.0, 2.0), 0.0, 3.0),
-        sf.Experiment(data[0], ("second", "first"), (1.2,), 0.0, 3.0),
-    ]
-    return Evaluator(sf.Problem(system, runs, {"a": 0.7, "b": 0.4}))
-
-
 def by_jax(evaluator, theta, multipliers, penalty):
     """The augmented Lagrangian by running the constraints through JAX as they are written."""
     problem = evaluator.problem
@@ -281,7 +236,7 @@ def by_jax(evaluator, theta, multipliers, penalty):
 
 
 def test_augmented_lagrangian_has_exact_derivatives():
-    evaluator = everything()
+    evaluator = Evaluator(constrained(second_run=True))
     problem = evaluator.problem
     assert problem.constraint_names == (
         "run1.guard of tau_1 (first -> second)",
@@ -309,7 +264,7 @@ def test_augmented_lagrangian_has_exact_derivatives():
 
 
 def test_constraints_that_cannot_be_met_are_named():
-    system = sf.HybridSystem({"decay": lambda t, x, p: -p["k"] * x}, [1.0])
+    system = sf.HybridSystem({"decay": decay}, [1.0])
     costs = [sf.TerminalCost(lambda x, p: p["k"] ** 2), sf.TerminalConstraint(lambda x, p: x[0] + 1.0)]
     problem = sf.Problem(system, sf.Experiment(costs, ("decay",), (), 0.0, 1.0), {"k": sf.Parameter(1.0, 0.1, 5.0)})
     fit = sf.estimate(problem)
@@ -319,15 +274,15 @@ def test_constraints_that_cannot_be_met_are_named():
 
 
 def test_a_guard_that_is_not_reached_is_told():
-    problem = ball(guess=(3.0, 8.0, 12.0))
-    high = sf.HybridSystem({"air": ball_falls}, [HEIGHT, 0.0], guards={("air", "air"): lambda t, x, p: x[0] - 60.0})
+    problem = guarded_ball()
+    high = ball_system(guards={("air", "air"): lambda t, x, p: x[0] - 60.0})
     run = sf.Experiment(problem.experiments[0].data, ("air", "air"), (3.0,), 0.0, END)
     with pytest.raises(ValueError, match=r"No transition times near .* put tau_1 on their guards"):
         sf.evaluate_on_guards(sf.Problem(high, run, {"e": 0.5}))
 
 
 def test_without_guards_there_is_nothing_to_be_on():
-    system = sf.HybridSystem({"decay": lambda t, x, p: -p["k"] * x}, [1.0])
+    system = sf.HybridSystem({"decay": decay}, [1.0])
     run = sf.Experiment(sf.TerminalCost(lambda x, p: x[0]), ("decay",), (), 0.0, 1.0)
     with pytest.raises(ValueError, match="This problem has no guards"):
         sf.evaluate_on_guards(sf.Problem(system, run, {"k": 1.0}))
@@ -335,7 +290,7 @@ def test_without_guards_there_is_nothing_to_be_on():
 
 def test_a_guarded_time_cannot_be_fixed():
     with pytest.raises(ValueError, match="A transition with a guard cannot have a fixed time"):
-        sf.evaluate_on_guards(ball(bounces=1, guess=(sf.Parameter(3.2, fixed=True),)))
+        sf.evaluate_on_guards(guarded_ball((sf.Parameter(3.2, fixed=True),)))
 
 
 @pytest.mark.parametrize("kind", ["gauss-newton", "block-diagonal", "descent-first", "none"])

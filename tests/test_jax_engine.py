@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from models import constrained
 from systems import compiled
 
 import switchfit as sf
@@ -24,33 +25,6 @@ from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hess
 TAU, P0 = np.array([0.93, 2.07]), np.array([0.7, 0.4])
 
 
-def problem_of(solver: str) -> sf.Problem:
-    """Guards, reset maps, samples, a running cost and terminal constraints that depend on t, x, p."""
-
-    def first(t, x, p):
-        return jnp.stack([x[1] * jnp.cos(t), -p["a"] * x[0] + 0.3 * x[1] ** 2])
-
-    def second(t, x, p):
-        return jnp.stack([p["b"] * x[1] ** 2 - x[0], jnp.sin(x[0]) * p["a"] - 0.2 * x[1]])
-
-    system = sf.HybridSystem(
-        {"first": first, "second": second},
-        lambda p: jnp.stack([1.0 + 0.1 * p["a"] ** 2, p["b"]]),
-        reset_maps={("first", "second"): lambda t, x, p: jnp.stack([x[0] * p["a"], x[1] + 0.1 * x[0] ** 2 * t])},
-        guards={
-            ("first", "second"): lambda t, x, p: x[0] * p["b"] - jnp.sin(t) * x[1],
-            ("second", "first"): lambda t, x, p: p["a"] ** 2 * x[1] ** 2 + t * x[0] - 1.0,
-        },
-    )
-    data = [
-        sf.Measurements([0.5, 1.4, 2.6], [[0.3, 0.2], [0.4, -0.2], [0.1, 0.5]], sigma=0.5),
-        sf.RunningCost(lambda t, x, p: p["b"] * x[0] ** 2 * jnp.cos(t)),
-        sf.TerminalConstraint(lambda x, p: jnp.stack([x[0] * x[1] - p["a"], p["b"] * x[0] ** 2])),
-    ]
-    run = sf.Experiment(data, ("first", "second", "first"), TAU, 0.0, 3.0)
-    return sf.Problem(system, run, {"a": P0[0], "b": P0[1]}, solver=solver)
-
-
 def program_inputs(problem: sf.Problem):
     """The structure, and the arguments on a mesh of 12 cells."""
     times = np.unique(np.concatenate([np.linspace(0.0, 3.0, 11), [0.5, 1.4, 2.6]]).round(12))
@@ -64,7 +38,7 @@ def assert_close(found, expected, relative: float) -> None:
 
 @pytest.mark.parametrize(("solver", "relative"), [("explicit", 1e-12), ("stiff", 1e-9)])
 def test_augmented_lagrangian_has_exact_derivatives(solver: str, relative: float) -> None:
-    structure, arguments = program_inputs(problem_of(solver))
+    structure, arguments = program_inputs(constrained(TAU, solver=solver))
     multipliers, penalty = np.array([0.3, -1.1, 0.7, 0.4]), np.array([1.3, 0.6, 0.8, 1.9])
 
     def constraints_of(model, path, theta):
@@ -91,7 +65,7 @@ def test_augmented_lagrangian_has_exact_derivatives(solver: str, relative: float
         J, slope, H, c, A = (
             found  # H is that of J + weights . c: the product of the constraints' slopes is added outside
         )
-        return J, slope, H + (A.T * penalty) @ A, c, A
+        return J, slope, H + (A.T * penalty[None]) @ A, c, A
 
     found = compiled(differentiate)(arguments, TAU, P0)
     assert np.abs(expected[2]).min() > 1e-3, "an entry is not tested"
@@ -100,7 +74,7 @@ def test_augmented_lagrangian_has_exact_derivatives(solver: str, relative: float
 
 def test_costs_at_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
     """A kind of node at transitions that is a cost: here the guards, taken for one."""
-    structure, arguments = program_inputs(problem_of("explicit"))
+    structure, arguments = program_inputs(constrained(TAU))
     without = compiled(
         lambda a, tau, p, side: compute_path_cost(m := Model(structure, a), propagate(m, tau, p, side), p)
     )

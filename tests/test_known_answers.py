@@ -3,27 +3,15 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from models import ball, fishing, linear, tracked_drive
 
 import switchfit as sf
-
-A1 = np.array([[-1.0, 0.0], [1.0, 2.0]])
-A2 = np.array([[1.0, 1.0], [1.0, -2.0]])
-
-
-def linear_problem(times, **settings):
-    """Two unstable linear modes in turn, J = integral of x'x: a standard example of switching-time optimisation."""
-    system = sf.HybridSystem({"A1": lambda t, x, p: A1 @ x, "A2": lambda t, x, p: A2 @ x}, [1.0, 1.0])
-    cost = sf.RunningCost(lambda t, x, p: x @ x)
-    sequence = ("A1", "A2") * (len(times) // 2 + 1)
-    run = sf.Experiment(cost, sequence[: len(times) + 1], times, t0=0.0, tf=1.0)
-    return sf.Problem(system, run, **settings)
-
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-14}
 
 
 def test_one_switch():
-    problem = linear_problem((0.5,), **TIGHT)
+    problem = linear((0.5,), **TIGHT)
     start = sf.evaluate(problem)
     assert start.cost == pytest.approx(7.033595807668208, rel=1e-11)
     assert start.gradient[0] == pytest.approx(15.980536237752, rel=1e-10)
@@ -35,11 +23,11 @@ def test_one_switch():
 
 
 def test_default_tolerances_give_the_cost_to_1e_8():
-    assert sf.evaluate(linear_problem((0.5,))).cost == pytest.approx(7.033595807668208, rel=1e-8)
+    assert sf.evaluate(linear((0.5,))).cost == pytest.approx(7.033595807668208, rel=1e-8)
 
 
 def test_five_switches_from_equal_spacing():
-    problem = linear_problem(tuple(np.arange(1, 6) / 6), **TIGHT)
+    problem = linear(**TIGHT)
     assert sf.evaluate(problem).cost == pytest.approx(4.912678, abs=5e-7)
     found = sf.estimate(problem)
     assert found.success
@@ -48,22 +36,10 @@ def test_five_switches_from_equal_spacing():
     np.testing.assert_allclose(found.transition_times[0], expected, rtol=0, atol=1e-9)
 
 
-def fishing_problem(times, **settings):
-    """Lotka-Volterra fishing, the fishing fleet being out or not: J = integral of squared deviation from (1, 1)."""
-
-    def mode(u):
-        return lambda t, x, p: jnp.array([x[0] - x[0] * x[1] - 0.4 * x[0] * u, -x[1] + x[0] * x[1] - 0.2 * x[1] * u])
-
-    system = sf.HybridSystem({"idle": mode(0.0), "fishing": mode(1.0)}, [0.5, 0.7])
-    cost = sf.RunningCost(lambda t, x, p: (x[0] - 1.0) ** 2 + (x[1] - 1.0) ** 2)
-    run = sf.Experiment(cost, ("idle", "fishing") * 4 + ("idle",), times, t0=0.0, tf=12.0)
-    return sf.Problem(system, run, **settings)
-
-
 def test_fishing_from_published_times():
     published = (2.4434718158206916, 4.122552522089049, 4.433072844963807, 4.68252002334217,
                  5.201667827750571, 5.369908894975762, 6.376845190917198, 6.47160340206027)  # fmt: skip
-    found = sf.estimate(fishing_problem(published, rtol=1e-11, atol=1e-13))
+    found = sf.estimate(fishing(published, rtol=1e-11, atol=1e-13))
     assert found.success
     assert found.cost == pytest.approx(1.345295218283, abs=1e-9)
     expected = [2.4420392297, 4.1168721058, 4.4197702383, 4.6699644285,
@@ -73,7 +49,7 @@ def test_fishing_from_published_times():
 
 def test_fishing_from_equal_spacing():
     """A clean KKT point below 1.35: published solvers end with collapsed modes at 1.3463 or higher."""
-    found = sf.estimate(fishing_problem(tuple(12.0 * np.arange(1, 9) / 9)))
+    found = sf.estimate(fishing())
     assert found.success
     assert found.optimality < 1e-7
     assert found.cost < 1.35
@@ -82,7 +58,7 @@ def test_fishing_from_equal_spacing():
 def test_collapsed_modes_are_named():
     """Fishing all of the time between the second and the third switch: two modes too many, which must vanish."""
     times = (2.4, 4.1, 4.5, 4.6, 8.0, 8.5, 9.0, 10.0)
-    found = sf.estimate(fishing_problem(times))
+    found = sf.estimate(fishing(times))
     assert found.success
     assert found.optimality < 1e-7
     tau = found.transition_times[0]
@@ -91,18 +67,6 @@ def test_collapsed_modes_are_named():
     for i in collapsed:
         assert ("collapsed", i + 1) in [(constraint.kind, constraint.position) for constraint in found.active]
     assert "has collapsed" in str(found)
-
-
-def bouncing_ball(times, tf=15.0, **settings):
-    """Free flight, impacts as free transitions with the restitution e in a reset map."""
-    system = sf.HybridSystem(
-        {"flight": lambda t, x, p: jnp.array([x[1], -9.8])},
-        [50.0, 0.0],
-        reset_maps={("flight", "flight"): lambda t, x, p: jnp.array([x[0], -p["e"] * x[1]])},
-    )
-    cost = sf.TerminalCost(lambda x, p: (x[0] - 20.0) ** 2)
-    run = sf.Experiment(cost, ("flight",) * (len(times) + 1), times, t0=0.0, tf=tf)
-    return sf.Problem(system, run, {"e": sf.Parameter(0.8, lower=0.1, upper=1.0)}, **settings)
 
 
 @pytest.mark.parametrize("method", ["forward", "discrete-adjoint", "adjoint"])
@@ -123,7 +87,7 @@ def test_bouncing_ball_against_closed_form(method):
     with jax.enable_x64(True):
         theta = jnp.array([*times, e])
         J, g, H = height(theta), jax.grad(height)(theta), jax.hessian(height)(theta)
-    found = sf.evaluate(bouncing_ball(times), method=method)
+    found = sf.evaluate(ball(times), method=method)
     assert found.cost == pytest.approx(float(J), rel=1e-10)
     np.testing.assert_allclose(found.gradient, g, rtol=1e-10)
     np.testing.assert_allclose(found.hessian, H, rtol=1e-10)
@@ -168,7 +132,7 @@ def test_stiff_van_der_pol_switched_to_another_mode():
 
 def test_exact_orders_of_the_skid_steered_vehicle():
     """The simulated problem of the paper, equation (18): 10 iterations at most, the last ones quadratic."""
-    found = sf.estimate(vehicle_problem())
+    found = sf.estimate(tracked_drive())
     assert found.success
     assert found.optimality < 1e-7
     assert found.iterations <= 10
@@ -181,22 +145,8 @@ def test_exact_orders_of_the_skid_steered_vehicle():
     assert ratios[-1] > 1.5 or optimality[-2] < 1e-9
 
 
-def vehicle_problem(step=0.1):
-    from switchfit.models.skid_steer import skid_steer
-
-    system = skid_steer()
-    times = np.linspace(0.0, 15.0, round(15.0 / step) + 1)
-    sequence = ("stick", "slip", "stick")
-    blank = sf.Measurements(times, np.zeros((len(times), 6)))
-    truth = sf.Problem(system, sf.Experiment(blank, sequence, (6.0, 10.0), 0.0, 15.0), {"mu": 0.7})
-    path = sf.simulate(truth)
-    reference = sf.ReferenceSignal.from_samples(path.times, path.states)
-    run = sf.Experiment(reference, sequence, (5.0, 9.0), 0.0, 15.0)
-    return sf.Problem(system, run, {"mu": sf.Parameter(0.8, lower=0.05, upper=2.0)})
-
-
 def test_all_quadratic_terms_reach_the_same_optimum_and_the_others_are_far_slower():
-    problem = vehicle_problem()
+    problem = tracked_drive()
     exact = sf.estimate(problem)
     block = sf.estimate(problem, hessian="block-diagonal", max_iterations=5000)
     gauss_newton = sf.estimate(problem, hessian="gauss-newton")
@@ -210,10 +160,10 @@ def test_all_quadratic_terms_reach_the_same_optimum_and_the_others_are_far_slowe
 
 def test_the_scheme_of_the_paper_descends_until_the_hessian_is_positive_definite():
     """Section II-A; the Hessian at the start has a negative eigenvalue, so that the first steps are along −DJ."""
-    found = sf.estimate(vehicle_problem(), hessian="descent-first")
+    found = sf.estimate(tracked_drive(), hessian="descent-first")
     assert found.success
     np.testing.assert_allclose(found.theta, [6.0, 10.0, 0.7], rtol=0, atol=1e-6)
-    problem = vehicle_problem()
+    problem = tracked_drive()
     positive = [np.linalg.eigvalsh(sf.evaluate(problem, record.theta).hessian)[0] > 0 for record in found.history]
     first = positive.index(True)
     assert first > 5
@@ -228,7 +178,7 @@ def test_the_scheme_of_the_paper_descends_until_the_hessian_is_positive_definite
 
 @pytest.mark.slow
 def test_steepest_descent_reaches_the_same_optimum_after_thousands_of_iterations():
-    problem = vehicle_problem()
+    problem = tracked_drive()
     exact = sf.estimate(problem)
     steepest = sf.estimate(problem, hessian="none", max_iterations=20000)
     assert steepest.optimality < 1e-7
@@ -237,8 +187,8 @@ def test_steepest_descent_reaches_the_same_optimum_after_thousands_of_iterations
 
 
 def test_steepest_descent_is_slow():
-    exact = sf.estimate(vehicle_problem())
-    steepest = sf.estimate(vehicle_problem(), hessian="none", max_iterations=100)
+    exact = sf.estimate(tracked_drive())
+    steepest = sf.estimate(tracked_drive(), hessian="none", max_iterations=100)
     assert steepest.status is sf.Status.MAX_ITERATIONS
     assert steepest.cost > 100 * exact.cost
     assert steepest.cost < steepest.history[0].cost / 5

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
+import models
 import numpy as np
 import pytest
 from hypothesis import example, given
@@ -273,12 +274,8 @@ def steps_and_springs():
 
 
 def fishing():
-    def mode(u):
-        return lambda t, x, p: jnp.array([x[0] - x[0] * x[1] - 0.4 * x[0] * u, -x[1] + x[0] * x[1] - 0.2 * x[1] * u])
-
-    system = sf.HybridSystem({"idle": mode(0.0), "fishing": mode(1.0)}, [0.5, 0.7])
-    cost = sf.RunningCost(lambda t, x, p: (x[0] - 1.0) ** 2 + (x[1] - 1.0) ** 2)
-    return system, sf.Experiment(cost, ("idle", "fishing", "idle"), (2.4, 4.3), 0.0, 12.0)
+    problem = models.fishing((2.4, 4.3))
+    return problem.system, problem.experiments[0]
 
 
 def fast_cost():

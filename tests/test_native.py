@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from models import decay
 from systems import KINDS, NODES, P0, case, problem_of, weighted
 
 import switchfit as sf
@@ -484,10 +485,6 @@ def _only_empty(parse):
 # Which engine, and why
 
 
-def squared(t, x, p):
-    return -p["k"] * x
-
-
 def copied(t, x, p):
     return -p["k"] * jnp.copysign(x, x)
 
@@ -510,7 +507,7 @@ def line_of(function, text):
 
 
 def test_an_estimate_says_that_machine_code_evaluated_it(tmp_path):
-    estimate = fitted_with(squared)
+    estimate = fitted_with(decay)
     assert (estimate.engine.name, estimate.engine.reason) == ("native", None)
     assert "Evaluated in machine code." in str(estimate)
     estimate.save(tmp_path / "fit.json")
@@ -573,7 +570,7 @@ def test_other_reasons_for_jax(settings, reason):
     data = settings.get("data", sf.Measurements(TIMES, VALUES, sigma=1.0))
     run = sf.Experiment(data, ("m",), (), 0.0, 3.0)
     solver = settings.get("solver", "explicit")
-    problem = sf.Problem(sf.HybridSystem({"m": squared}, [0.4, 0.1]), run, {"k": sf.Parameter(1.0)}, solver=solver)
+    problem = sf.Problem(sf.HybridSystem({"m": decay}, [0.4, 0.1]), run, {"k": sf.Parameter(1.0)}, solver=solver)
     assert evaluator_of(problem).engine.name == "jax"
     assert evaluator_of(problem).engine.reason.startswith(reason)
 
@@ -586,7 +583,7 @@ def test_a_defect_of_ours_falls_back_and_says_so(place, error, monkeypatch):
 
     forget_programs()
     monkeypatch.setattr(program_module, place, fails)
-    estimate = fitted_with(squared)
+    estimate = fitted_with(decay)
     assert estimate.engine.name == "jax"
     assert estimate.engine.reason == f"internal: {type(error).__name__}: {error}"
     assert estimate.iterations == 1

@@ -12,6 +12,8 @@ import pytest
 import switchfit as sf
 from switchfit.io.python_file import call, load_object
 
+pytestmark = pytest.mark.promotes
+
 K = jnp.array(0.1)  # JAX is in 32-bit mode here, as it is in a user's module
 EXACT = jnp.array([0.5, 2.0])
 TIMES = np.linspace(0.0, 1.0, 9)
@@ -134,18 +136,20 @@ def test_a_function_that_casts_is_refused(mode):
 
 
 @pytest.mark.parametrize(
-    "mode",
+    ("mode", "rate"),
     [
-        lambda t, x, p: -EXACT[0] * p["a"] * x,
-        lambda t, x, p: -jnp.array([0.1]) * p["a"] * x,
-        lambda t, x, p: x[jnp.array([0])] * p["a"],
-        lambda t, x, p: -np.float64(0.1) * x,
-        lambda t, x, p: -(EXACT[0] * EXACT[1]) * x,
-        lambda t, x, p: jnp.where(EXACT[:1] > 0.25, x, -x),
+        (lambda t, x, p: -EXACT[0] * p["a"] * x, lambda a: -0.5 * a),
+        (lambda t, x, p: -jnp.array([0.1]) * p["a"] * x, lambda a: -0.1 * a),
+        (lambda t, x, p: x[jnp.array([0])] * p["a"], lambda a: a),
+        (lambda t, x, p: -np.float64(0.1) * x, lambda a: -0.1),
+        (lambda t, x, p: -(EXACT[0] * EXACT[1]) * x, lambda a: -1.0),
+        (lambda t, x, p: jnp.where(EXACT[:1] > 0.25, x, -x), lambda a: 1.0),
     ],
 )
-def test_constants_that_lost_nothing_are_taken(mode):
-    sf.evaluate(problem_of(mode))
+def test_constants_that_lost_nothing_are_taken(mode, rate):
+    found, meant = (sf.evaluate(problem_of(f)) for f in (mode, lambda t, x, p: rate(p["a"]) * x))
+    assert found.cost == pytest.approx(meant.cost, rel=1e-14)
+    np.testing.assert_allclose(found.gradient, meant.gradient, rtol=1e-12)
 
 
 def test_what_is_taken_is_what_was_meant():

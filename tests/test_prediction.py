@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import jax.numpy as jnp
+import models
 import numpy as np
 import pytest
+from models import heated_room
 from systems import problem_of
 
 import switchfit as sf
@@ -18,27 +20,19 @@ SIGMA = 0.1
 TIMES = np.linspace(0.25, 6.0, 24)
 
 
-def heating(t, x, p):
-    return p["power"] - p["k"] * x
-
-
-def cooling(t, x, p):
-    return -p["k"] * x
-
-
 def doubled(t, x, p):
     return 2.0 * x + p["power"]
 
 
-ROOM = sf.HybridSystem({"on": heating, "off": cooling}, [0.5], state_names=("T",), state_units=("K",))
-JUMPING = sf.HybridSystem({"on": heating, "off": cooling}, [0.5], {("on", "off"): doubled})
+ROOM = heated_room(0.5)
+JUMPING = heated_room(0.5, reset_maps={("on", "off"): doubled})
 
 
 def temperature(t, tau, power, k, *, jump=False):
     """The closed form; after a jump at tau x becomes 2 x + power."""
-    on = power / k + (0.5 - power / k) * np.exp(-k * np.minimum(t, tau))
-    after = 2.0 * on + power if jump else on
-    return np.where(t <= tau, on, after * np.exp(-k * np.maximum(t - tau, 0.0)))
+    x = models.temperature(t, tau, power, k, start=0.5)
+    at_tau = models.temperature(tau, tau, power, k, start=0.5)
+    return np.where(t <= tau, x, x * (2.0 * at_tau + power) / at_tau) if jump else x
 
 
 def slopes(t, tau, power, k, *, jump=False):

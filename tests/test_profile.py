@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from models import curve, rest
 from scipy.optimize import brentq
 
 import switchfit as sf
@@ -26,16 +27,7 @@ def moving(t, x, p):
     return p["v"] + 0.0 * x
 
 
-def resting(t, x, p):
-    return 0.0 * x
-
-
-def still(t, x, p):
-    return 0.0 * x
-
-
-RAMP = sf.HybridSystem({"up": moving, "rest": resting}, [0.0], state_names=("x",), state_units=("m",))
-STILL = sf.HybridSystem({"still": still}, [0.0])
+RAMP = sf.HybridSystem({"up": moving, "rest": rest}, [0.0], state_names=("x",), state_units=("m",))
 
 
 def parabola(t, x, p):
@@ -52,8 +44,7 @@ def square(t, x, p):
 
 def observed(h, values, parameters, sigma=SIGMA, times=TIMES):
     """A fit of h(t, p) alone: the state rests at 0."""
-    data = sf.Measurements(times, values, observe=h, sigma=sigma)
-    return sf.estimate(sf.Problem(STILL, sf.Experiment(data, ("still",), (), 0.0, 4.0), parameters))
+    return sf.estimate(curve(h, times, values, parameters, sigma=sigma, tf=4.0))
 
 
 def ramp(values, tau=2.1, sigma=SIGMA, v=1.0):
@@ -122,7 +113,7 @@ def test_others_are_fitted_again_and_pushed_away_in_time():
     rng = np.random.default_rng(0)
     true = np.minimum(TIMES, 2.0) + 0.5 * np.maximum(TIMES - 2.4, 0.0)
     values = true + 0.3 * rng.standard_normal(len(TIMES))
-    system = sf.HybridSystem({"up": moving, "rest": resting, "half": lambda t, x, p: 0.5 * p["v"] + 0.0 * x}, [0.0])
+    system = sf.HybridSystem({"up": moving, "rest": rest, "half": lambda t, x, p: 0.5 * p["v"] + 0.0 * x}, [0.0])
 
     def problem(tau_1):
         data = sf.Measurements(TIMES, values, sigma=0.3)

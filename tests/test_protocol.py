@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from models import LATE_RAMP, decay, rest
 
 import switchfit as sf
 from switchfit.discretization.arguments import build_arguments
@@ -32,11 +33,7 @@ def fall(t, x, p):
     return jnp.array([x[1], -p["g"] + 0.1 * t * x[0]])
 
 
-def rest(t, x, p):
-    return -p["k"] * x
-
-
-MODES = {"swing": swing, "fall": fall, "rest": rest}
+MODES = {"swing": swing, "fall": fall, "rest": decay}
 BOUNCE = {("fall", "swing"): lambda t, x, p: jnp.array([x[0], -0.7 * p["k"] * x[1] + 0.1 * t])}
 GUARDS = {("swing", "fall"): lambda t, x, p: x[0] - 0.3 * p["k"] + 0.1 * t * x[1]}
 SYSTEM = sf.HybridSystem(MODES, [0.4, 0.1], BOUNCE)
@@ -107,11 +104,7 @@ def test_constraints_are_the_same():
 
 def test_the_cost_of_transitions_in_closed_form():
     """x = x0 exp(-k t): ``mu = (x - a)^2 + c t`` at tau, of which the other transition has nothing."""
-    modes = {
-        "decay": lambda t, x, p: -p["k"] * x,
-        "stand": lambda t, x, p: 0.0 * x,
-        "again": lambda t, x, p: -p["k"] * x,
-    }
+    modes = {"decay": decay, "stand": rest, "again": decay}
     cost = sf.TransitionCost(lambda t, x, p: (x[0] - 0.4) ** 2 + 0.3 * t, after="stand")
     run = sf.Experiment(cost, ("decay", "stand", "again"), (0.8, 1.7), 0.0, 3.0)
     given = sf.Problem(sf.HybridSystem(modes, [1.0]), run, {"k": 0.9})
@@ -150,11 +143,10 @@ def test_two_costs_at_one_transition_are_refused():
 
 def test_a_fit_with_the_cost_of_a_switch():
     """Minimum of J in closed form: the time that a transition would have alone is drawn to where it is cheap."""
-    modes = {"wait": lambda t, x, p: 0.0 * x, "go": lambda t, x, p: 0.0 * x + 1.0}
     data = sf.Measurements([3.0], [[1.8]], sigma=0.5)  # x(3) = 3 - tau
-    wish = sf.TransitionCost(lambda t, x, p: 0.5 * ((t - 1.0) / 0.25) ** 2, before="wait", after="go")
-    run = sf.Experiment([data, wish], ("wait", "go"), (1.5,), 0.0, 3.0)
-    found = sf.estimate(sf.Problem(sf.HybridSystem(modes, [0.0]), run))
+    wish = sf.TransitionCost(lambda t, x, p: 0.5 * ((t - 1.0) / 0.25) ** 2, before="wait", after="ramp")
+    run = sf.Experiment([data, wish], ("wait", "ramp"), (1.5,), 0.0, 3.0)
+    found = sf.estimate(sf.Problem(LATE_RAMP, run))
     assert found.theta[0] == pytest.approx((1.2 / 0.25 + 1.0 / 0.0625) / (1 / 0.25 + 1 / 0.0625), rel=1e-9)
 
 

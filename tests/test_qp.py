@@ -232,4 +232,7 @@ def test_a_face_that_is_nearly_flat_leaves_a_definite_matrix():
     for flat in np.logspace(-12, -2, 200):
         hessian = flat * np.outer(along, along) + np.outer(across, across) + np.diag([0.0, 0.0, 1.0])
         hessian += 0.8 * (np.outer(along, across) + np.outer(across, along))
-        solve_qp(np.ones(3), convexify(hessian, normals), normals, np.zeros(1))
+        B = convexify(hessian, normals)
+        unit = np.sqrt(np.diag(B))
+        assert np.linalg.eigvalsh(B / np.outer(unit, unit))[0] > 0.0
+        assert_kkt(np.ones(3), B, normals, np.zeros(1), solve_qp(np.ones(3), B, normals, np.zeros(1)))

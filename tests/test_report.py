@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from models import heated_room, temperature
 
 import switchfit as sf
 from switchfit.fit.result import Fit
@@ -684,6 +685,8 @@ def test_convergence_of_nothing(values):
     figure, ax = axes()
     plot_convergence([IterationRecord(k, 1.0, v, 1.0, np.zeros(1), k) for k, v in enumerate(values)], ax)
     figure.draw_without_rendering()
+    assert ax.get_yscale() == "log"
+    np.testing.assert_array_equal(ax.lines[0].get_ydata(), np.full(len(values), np.nan))
 
 
 def test_states_are_drawn_where_there_is_no_data():
@@ -739,18 +742,14 @@ def test_importing_switchfit_does_not_import_matplotlib():
 @pytest.fixture(scope="session")
 def heater() -> sf.Estimate:
     """A heater goes off at 4 s; sigma is 0.05."""
-    system = sf.HybridSystem(
-        {"on": lambda t, x, p: p["power"] - 0.3 * x, "off": lambda t, x, p: -0.3 * x}, [0.0], state_names=("T",),
-        state_units=("K",),
-    )  # fmt: skip
     times = np.linspace(0.1, 9.9, 41)
-    on = 2.0 / 0.3 * (1 - np.exp(-0.3 * np.minimum(times, 4.0)))
-    values = on * np.exp(-0.3 * np.maximum(times - 4.0, 0.0)) + 0.05 * np.random.default_rng(3).standard_normal(41)
+    values = temperature(times, 4.0, 2.0, 0.3, start=0.0) + 0.05 * np.random.default_rng(3).standard_normal(41)
     run = sf.Experiment(
         sf.Measurements(times, values, observe=lambda t, x, p: jnp.array([x[0]]), sigma=0.05, names=("T",)),
         ("on", "off"), (5.0,), 0.0, 10.0,
     )  # fmt: skip
-    return sf.estimate(sf.Problem(system, run, {"power": sf.Parameter(1.5, lower=0.0, unit="K/s")}))
+    parameters = {"power": sf.Parameter(1.5, lower=0.0, unit="K/s"), "k": sf.Parameter(0.3, fixed=True)}
+    return sf.estimate(sf.Problem(heated_room(0.0), run, parameters))
 
 
 def test_report_of_a_real_fit(heater):

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from models import decay
 from typer.testing import CliRunner
 
 import switchfit as sf
@@ -231,10 +232,10 @@ def test_a_run_is_differentiated_in_what_its_functions_ask_for():
 
 
 def test_a_target_is_there_under_its_own_name_too_if_asked_for():
-    system = sf.HybridSystem({"m": lambda t, x, p: -p["k"] * x}, [1.0])
+    system = sf.HybridSystem({"m": decay}, [1.0])
     cost = sf.TerminalCost(lambda x, p: x[0])
     plain = sf.Experiment(cost, ("m",), (), 0.0, 1.0)
-    doubled = sf.HybridSystem({"m": lambda t, x, p: -p["k"] * x, "n": lambda t, x, p: -p["k1"] * p["k2"] * x}, [1.0])
+    doubled = sf.HybridSystem({"m": decay, "n": lambda t, x, p: -p["k1"] * p["k2"] * x}, [1.0])
     mapped = sf.Experiment(cost, ("n",), (), 0.0, 1.0, parameter_map={"k1": "k", "k2": "k"})
     both = sf.Problem(doubled, [plain, mapped], {"k": 0.5})
     assert names_of(both, 0) == ["k"]

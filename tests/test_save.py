@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from models import RAMP
 from test_report import comparison_of, made, several, trajectory_of
 
 import switchfit as sf
@@ -160,10 +161,9 @@ def test_a_subclass_is_saved_as_a_fit(tmp_path):
 
 
 def test_a_real_fit_comes_back(tmp_path):
-    system = sf.HybridSystem({"up": lambda t, x, p: p["v"] + 0 * x, "rest": lambda t, x, p: 0 * x}, [0.0])
     times = np.linspace(0.05, 1.95, 20)
     data = sf.Measurements(times, 3.0 * np.minimum(times, 1.23) + 0.01 * np.cos(40 * times))
-    problem = sf.Problem(system, sf.Experiment(data, ("up", "rest"), (1.0,), 0.0, 2.0), {"v": 2.0})
+    problem = sf.Problem(RAMP, sf.Experiment(data, ("up", "rest"), (1.0,), 0.0, 2.0), {"v": 2.0})
     estimate = sf.estimate(problem)
     estimate.save(tmp_path / "fit.json")
     loaded = sf.Estimate.load(tmp_path / "fit.json")
@@ -174,7 +174,7 @@ def test_a_real_fit_comes_back(tmp_path):
         loaded.profile("v")
     with_model = sf.Estimate.load(tmp_path / "fit.json", problem=problem)
     np.testing.assert_allclose(with_model.predict([1.0]).outputs, estimate.predict([1.0]).outputs, rtol=1e-9)
-    other = sf.Problem(system, problem.experiments[0], {"v": sf.Parameter(2.0, fixed=True)})
+    other = sf.Problem(RAMP, problem.experiments[0], {"v": sf.Parameter(2.0, fixed=True)})
     with pytest.raises(ValueError, match="holds the unknowns tau_1, v, the problem has tau_1: it is the fit of"):
         sf.Estimate.load(tmp_path / "fit.json", problem=other)
     assert_same(estimate.certificate, loaded.certificate)

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from models import STILL, VEHICLE_TRUTH, curve, drive, positions
 from test_report import comparison_of, made, trajectory_of, warnings_of
 
 import switchfit as sf
 from switchfit.fit.evaluator import Evaluation, Evaluator, evaluator_of
 from switchfit.fit.result import disagreement
-from switchfit.models import skid_steer
 from switchfit.optimize import Status
 from switchfit.report.text import report
 from switchfit.uncertainty.certificate import certify
@@ -23,16 +23,8 @@ from switchfit.uncertainty.residuals import diagnose, diagnose_channel
 TIMES = np.linspace(0.25, 6.0, 24)
 
 
-def still(t, x, p):
-    return 0.0 * x
-
-
-STILL = sf.HybridSystem({"still": still}, [0.0])
-
-
 def observed(h, values, parameters, sigma, times=TIMES):
-    data = sf.Measurements(times, values, observe=h, sigma=sigma)
-    return sf.Problem(STILL, sf.Experiment(data, ("still",), (), 0.0, 6.0), parameters)
+    return curve(h, times, values, parameters, sigma=sigma, tf=6.0)
 
 
 def decay(t, x, p):
@@ -365,22 +357,15 @@ def test_a_wrong_hessian_fails_the_certificate_and_the_report_says_so():
 # Coverage
 
 
-def position(t, x, p):
-    return x[jnp.array([0, 2])]
-
-
-def vehicle(rate=10.0, sigma=0.1, guess=(6.0, 10.0, 0.7)):
-    """The paper's simulated vehicle: positions at a rate (Hz) on [0, 15] s."""
-    times = np.arange(1, round(15 * rate)) / rate
-    data = sf.Measurements(times, np.zeros((len(times), 2)), observe=position, sigma=sigma, names=("X", "Y"))
-    run = sf.Experiment(data, ("stick", "slip", "stick"), guess[:2], 0.0, 15.0)
-    return sf.Problem(skid_steer(), run, {"mu": sf.Parameter(guess[2], lower=0.05, upper=2.0)})
+def vehicle(rate=10.0, sigma=0.1):
+    """The paper's simulated vehicle, guessed right: positions at a rate (Hz) on [0, 15] s."""
+    return drive(positions(np.arange(1, round(15 * rate)) / rate, sigma), VEHICLE_TRUTH)
 
 
 @pytest.mark.slow
 def test_intervals_cover_the_truth_of_the_papers_vehicle():
     """2,400 runs: the fraction of 95 % intervals that cover has a standard deviation of 0.45 %."""
-    study = sf.monte_carlo(vehicle(), 2400, theta=[6.0, 10.0, 0.7], seed=1)
+    study = sf.monte_carlo(vehicle(), 2400, theta=VEHICLE_TRUTH, seed=1)
     assert study.success.sum() >= 2395
     coverage = study.coverage(0.95)
     assert np.all((coverage > 0.93) & (coverage < 0.97)), coverage
@@ -413,12 +398,11 @@ def test_where_quadratic_intervals_fail_profiles_do_better():
 def test_a_profile_of_the_sparse_vehicle_is_the_lowest_cost_there_is():
     """One position every 2 s, noise of 1 m: other starts of the other unknowns find nothing lower along the profile."""
     problem = vehicle(rate=0.5, sigma=1.0)
-    truth = [6.0, 10.0, 0.7]
     item = problem.experiments[0].data[0]
-    clean = sf.estimate(problem, start=truth, max_iterations=0).comparisons[0][0].fitted
+    clean = sf.estimate(problem, start=VEHICLE_TRUTH, max_iterations=0).comparisons[0][0].fitted
     noise = np.random.default_rng([3, 1]).standard_normal(clean.shape)
     run = replace(problem.experiments[0], data=replace(item, values=clean + noise))
-    fit = sf.estimate(replace(problem, experiments=run), start=truth)
+    fit = sf.estimate(replace(problem, experiments=run), start=VEHICLE_TRUTH)
     found = fit.profile("tau_2")
     low, high = found.interval()
     assert high > fit.confidence_intervals()[1, 1] + 0.5

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from models import decay, first_state
 
 import switchfit as sf
 from switchfit.problem.validation import (
@@ -29,15 +30,6 @@ from switchfit.problem.validation import (
     refuse_single_precision,
     shorten,
 )
-
-
-def decay(t, x, p):
-    return -p["k"] * x
-
-
-def first(t, x, p):
-    return x[:1]
-
 
 # Single precision
 
@@ -130,7 +122,7 @@ def test_the_same_number_in_double_precision_passes(door, monkeypatch):
 
 @given(arrays(np.float32, st.integers(1, 20), elements=st.floats(width=32)))
 def test_single_precision_is_refused_if_and_only_if_a_shortest_text_is_another_double(values):
-    """The first, fast test of exactness may pass no number that the texts refuse."""
+    """The first_state, fast test of exactness may pass no number that the texts refuse."""
     finite = values[np.isfinite(values)]
     changes = any(float(str(value)) != float(value) for value in finite)
     if not changes:
@@ -142,9 +134,9 @@ def test_single_precision_is_refused_if_and_only_if_a_shortest_text_is_another_d
 
 @given(st.integers(-(2**24), 2**24), st.integers(-999_999, 999_999))
 def test_integers_and_short_decimals_that_a_float32_holds_pass(whole, thousands):
-    refuse_single_precision(np.float32(whole), "value")
+    assert refuse_single_precision(np.float32(whole), "value") is None
     if float(np.float32(thousands / 1000)) == thousands / 1000:
-        refuse_single_precision(np.float32(thousands / 1000), "value")
+        assert refuse_single_precision(np.float32(thousands / 1000), "value") is None
 
 
 @pytest.mark.parametrize("kind", [np.float16, jnp.bfloat16, np.float32])
@@ -347,7 +339,7 @@ def test_sequences_have_an_order_and_can_be_read_twice(given):
 
 
 def test_functions():
-    assert as_callable(first, "observe", "a function h(t, x, p)", arguments=3) is first
+    assert as_callable(first_state, "observe", "a function h(t, x, p)", arguments=3) is first_state
     assert as_callable(max, "observe", "a function", arguments=2) is max  # no signature
     with pytest.raises(
         TypeError, match=r"callback must be a function callback\(record\); got one that cannot be called with 1"

@@ -580,7 +580,7 @@ def step_linear(tableau: Tableau, rate: Callable[[Any, Any], Any], h: Array, giv
             inside = combine(a[j], slopes)
             slopes.append(slope(at_stage, flat if inside is None else flat + h * inside))
         K = jnp.stack(slopes)
-    return jax.vmap(unravel)(flat + h * (a @ K)), unravel(flat + h * (b @ K))
+    return jax.vmap(unravel)(flat[None] + h * (a @ K)), unravel(flat + h * (b @ K))
 
 
 def differentiate_twice(

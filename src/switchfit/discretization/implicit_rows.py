@@ -32,7 +32,7 @@ def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, e
     times = start + tableau.c * h
 
     def residual(Z: Array) -> Array:
-        return Z - h * (tableau.a @ jax.vmap(f)(times, x + Z))
+        return Z - h * (tableau.a @ jax.vmap(f)(times, x[None] + Z))
 
     def newton(function: Callable[[Array], Array], guess: Array) -> Array:
         def correct(_: int, Z: Array) -> Array:
@@ -46,7 +46,7 @@ def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, e
         return jnp.linalg.solve(jacobian, right.reshape(-1)).reshape(s, n)
 
     Z = lax.custom_root(residual, jnp.zeros((s, n)), newton, tangent_solve)
-    X = x + Z
+    X = x[None] + Z
     # K from Z instead of f(X): the stiff components of f amplify the rounding of X, A^-1 Z does not.
     K = (np.linalg.inv(tableau.a) @ Z) / jnp.where(h == 0, 1.0, h)
     K = jnp.where(h == 0, jax.vmap(f)(times, X), K)
@@ -65,7 +65,7 @@ def tangent(
     """Differentiate a row along one direction."""
     a, b = jnp.asarray(tableau.a), jnp.asarray(tableau.b)
     A, K = jnp.stack(f_x), jnp.stack(slopes)
-    base = x_d if h_d is None else x_d + h_d * (a @ K)  # (n,) or (s, n)
+    base = x_d[None] if h_d is None else x_d[None] + h_d * (a @ K)  # (1, n) or (s, n)
     right = jnp.stack(forcing) + (A * jnp.expand_dims(base, -2)).sum(-1)
     K_d = times_vector(_inverse(tableau, h, A), right.reshape(-1)).reshape(K.shape)
     X_d = base + h * (a @ K_d)
@@ -80,7 +80,7 @@ def adjoint(tableau: Tableau, h: Array, psi: Array, pull: Pull) -> Adjoint:
     # What pull returns is linear in (w, hb): D_1 f at each stage, row by row, and h b_j D_1 ell.
     f_x = jnp.stack([jax.vmap(lambda w, j=j: pull(j, w, 0.0)[1])(jnp.eye(n)) for j in range(s)])
     costs = jnp.stack([pull(j, jnp.zeros(n), h * b[j])[1] for j in range(s)])
-    right = h * (b[:, None] * psi + a.T @ costs)
+    right = h * (b[:, None] * psi[None] + a.T @ costs)
     w = (right.reshape(-1) @ _inverse(tableau, h, f_x)).reshape(s, n)
     times, mu, parameters = zip(*(pull(j, w[j], h * b[j]) for j in range(s)), strict=True)
     return Adjoint(list(w), list(mu), psi + sum(mu), list(times), sum(parameters))

@@ -141,7 +141,7 @@ def build_rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
 
     q = xp.arange(count_chunks(cells, N))
     segment = (q[:, None] >= first_chunk[None, 1:]).sum(1)
-    offset = (q - first_chunk[segment])[:, None] * CHUNK + xp.arange(CHUNK)
+    offset = (q - first_chunk[segment])[:, None] * CHUNK + xp.arange(CHUNK)[None]
     rows_here = count[segment][:, None]
     padding = offset >= rows_here
     cell = first_cell[segment][:, None] + xp.minimum(offset, rows_here - 1)

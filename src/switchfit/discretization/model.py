@@ -211,4 +211,6 @@ class Model:
 
 def apply_weights(W: Array, r: Array) -> Array:
     """``W r`` for a W given by its diagonal (q,) or in full (q, q); r is (q,) or (q, D)."""
-    return W @ r if W.ndim == 2 else (W * r.T).T
+    if W.ndim == 2:
+        return W @ r
+    return W * r if r.ndim == 1 else W[:, None] * r

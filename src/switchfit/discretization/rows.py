@@ -187,7 +187,7 @@ def combine(weights: Sequence[float] | FloatArray, terms: Sequence[Array] | Floa
 
 def times_vector(A: Array, v: Array) -> Array:
     """``A v`` for small A (m, n) and v (n,): products and a sum, without the overhead of a call to a library."""
-    return (A * v).sum(-1)
+    return (A * v[None]).sum(-1)
 
 
 def _plus(x: Array, h: Array, slope: Array | None) -> Array:

@@ -100,13 +100,14 @@ def parameter_directions(model: Model) -> Array:
 
 def unit(D: int, i: int) -> Array:
     """Derivative of tau_i in theta, i from 0: (D,)."""
-    return (jnp.arange(D) == i) * 1.0
+    return (jnp.arange(D) == i).astype(float)
 
 
 def time_directions(model: Model, layout: Rows) -> tuple[Array, Array]:
     """Derivatives of the start and the end of each row in theta: two (Q, C, D) arrays of zeros and ones."""
-    index = jnp.arange(model.structure.N + model.structure.M)
-    return (layout.starts_at[..., None] == index) * 1.0, (layout.ends_at[..., None] == index) * 1.0
+    index = jnp.arange(model.structure.N + model.structure.M)[None, None]
+    starts_at, ends_at = layout.starts_at[..., None], layout.ends_at[..., None]
+    return (starts_at == index).astype(float), (ends_at == index).astype(float)
 
 
 def stage_jacobians(model: Model, path: Path, p: Array) -> StageJacobians:
@@ -166,7 +167,7 @@ def tangents(model: Model, path: Path, jacobians: StageJacobians, resets: ResetJ
     def chunk(X: Array, given: Any) -> tuple[Array, tuple[Array, ...]]:
         segment, opens, h, slopes, at, start_d, end_d = given
         if resets is not None:
-            behind = resets.x[segment] @ X + resets.p[segment] @ P + resets.t[segment][:, None] * start_d[0]
+            behind = resets.x[segment] @ X + resets.p[segment] @ P + resets.t[segment][:, None] * start_d[0][None]
             X = jnp.where(opens, behind, X)
         # For all rows of a chunk at once, outside of the loop over them: a tenth of an evaluation.
         direct = jax.vmap(partial(direct_derivatives, model))(at, start_d, end_d)

@@ -168,7 +168,7 @@ def _through_reset(
     reset = Model(structure, arguments).reset(i)
     if not tangents:
         return reset(t, x, p), X
-    at_transition = 1.0 * (jnp.arange(X.shape[1]) == i)
+    at_transition = (jnp.arange(X.shape[1]) == i).astype(float)
     after, linear = jax.linearize(reset, t, x, p)
     return after, jax.vmap(linear, in_axes=(0, 1, 1), out_axes=1)(at_transition, X, _of_parameters(X, p))
 
@@ -203,8 +203,8 @@ def _block(
 
             _, linear = jax.linearize(advance, start, end, x, p)
             X_after = jax.vmap(linear, in_axes=(0, 0, 1, 1), out_axes=1)(start_d, end_d, X, P)
-            before_d = X - f(start, x, p)[:, None] * start_d
-            after_d = X_after - f(end, after, p)[:, None] * end_d
+            before_d = X - jnp.outer(f(start, x, p), start_d)
+            after_d = X_after - jnp.outer(f(end, after, p), end_d)
             return (after, X_after), (cost, x, after, before_d, after_d)
 
         return lambda x, X: lax.scan(row, (x, X), given)

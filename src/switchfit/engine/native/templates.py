@@ -165,7 +165,7 @@ class Templates:
             residual = lambda t, x, p: model.sample_residual(k, given(t), x, p)  # noqa: E731
             information = model.sample_information(k, given(time), x, p)
             second = _normal_matrix(
-                jax.jacfwd(residual, argnums=(0, 1, 2))(time, x, p), lambda A: (information * A.T).T
+                jax.jacfwd(residual, argnums=(0, 1, 2))(time, x, p), lambda A: apply_weights(information, A)
             )
             if self.library.measurements[k].sigma:
                 # Fisher's information of normal noise: 2 of log sigma, none between sigma and the rest.
