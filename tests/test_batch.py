@@ -119,7 +119,7 @@ KNOTS = np.arange(0.0, 10.05, 0.5)
 def kinked(theta, side, H, centre, weights, xp):
     """½ (theta − c)ᵀ H (theta − c) and weights |theta_i − b| for each knot b."""
     e = theta - centre
-    gaps = theta[:, None] - KNOTS
+    gaps = theta[:, None] - KNOTS[None]
     slopes = xp.where(gaps == 0.0, side, xp.sign(gaps))
     return 0.5 * e @ H @ e + xp.sum(weights * xp.abs(gaps)), H @ e + xp.sum(weights * slopes, axis=1), H
 

@@ -407,7 +407,7 @@ def _steepest(left: Array, right: Array, kink: Array) -> Array:
 
 def _without(held: Array, hessian: Array) -> Array:
     """The Hessian (d, d) with rows and columns of the identity for coordinates that are held."""
-    either = held[:, None] | held
+    either = held[:, None] | held[None]
     return jnp.where(either, jnp.eye(held.shape[0]), hessian)
 
 
@@ -486,7 +486,7 @@ def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints)
     """Step (d,) of the quadratic programme, and its slope gᵀd."""
     theta, sides = state.theta, state.sides
     held = sides == 0
-    pair = sides[:, None] + sides
+    pair = sides[:, None] + sides[None]
     left, right = state.left.hessian, state.right.hessian
     hessian = _without(held, jnp.where(pair > 0, right, jnp.where(pair < 0, left, 0.5 * (right + left))))
     gradient = _steepest(state.left.gradient, state.right.gradient, state.kink)
@@ -502,7 +502,7 @@ def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints)
 
     def absolute() -> Array:
         values, vectors = jnp.linalg.eigh(scaled)
-        return (vectors * algebra.positive_eigenvalues(values, jnp)) @ vectors.T
+        return (vectors * algebra.positive_eigenvalues(values, jnp)[None]) @ vectors.T
 
     matrix = lax.cond(definite, lambda: scaled, absolute)
     factor = jnp.linalg.cholesky(matrix)
@@ -520,7 +520,7 @@ def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints)
     def solve_constrained() -> Array:
         # In white variables e = Lᵀ D d: minimise ½‖e − e_0‖² subject to G e >= c with unit rows, by its dual.
         normals = constraints.normals
-        rows = jax.scipy.linalg.solve_triangular(factor, (normals / scaling).T, lower=True).T
+        rows = jax.scipy.linalg.solve_triangular(factor, (normals / scaling[None]).T, lower=True).T
         unit, norms = algebra.unit_rows(rows, jnp)
         gap = (normals @ newton - offsets) / norms
         allowed = jnp.isfinite(gap)

@@ -64,7 +64,7 @@ def foreign_derivatives(
     nodes = arguments.nodes
     cells = nodes.shape[0] - 1
     real_cells = jnp.sum(nodes[1:] > nodes[:-1])
-    passed = jnp.sum(jnp.where(side > 0.0, nodes <= tau[:, None], nodes < tau[:, None]), axis=1)
+    passed = jnp.sum(jnp.where(side > 0.0, nodes[None] <= tau[:, None], nodes[None] < tau[:, None]), axis=1)
     begins = jnp.clip(passed - 1, 0, real_cells - 1)
     units = np.zeros((D + 1, width))
     units[1:, :D] = np.eye(D)
