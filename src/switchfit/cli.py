@@ -265,7 +265,9 @@ def _explain(error: BaseException, *, users: bool, debug: bool) -> NoReturn:
 
 @contextlib.contextmanager
 def _handle_interrupt(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-    """Context in which Ctrl-C calls a handler; not where it is ignored, nor outside the main thread, which has them."""
+    """Return a context in which Ctrl-C calls a handler; not where it is ignored, nor outside the main thread, which has
+    them.
+    """
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or before in (signal.SIG_IGN, None):
         yield
@@ -292,7 +294,7 @@ def _load(problem: Path) -> ProblemFile:
 
 
 def _check_files(problem: Path) -> None:
-    """What can be known of a problem without running a Python file."""
+    """Print what can be known of a problem without running a Python file."""
     from switchfit.io.problem_file import read_experiments
     from switchfit.io.summary import describe_experiments
 
@@ -303,7 +305,7 @@ def _check_files(problem: Path) -> None:
 
 
 def _estimate(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: bool) -> Any:
-    """`switchfit.estimate` with a live line on stderr; Ctrl-C ends it after the iteration under way."""
+    """Call `switchfit.estimate` with a live line on stderr; Ctrl-C ends it after the iteration under way."""
     import switchfit as sf
 
     if prepare_figures:  # matplotlib, which must not look for a display, loads while XLA compiles
@@ -334,7 +336,7 @@ def _save(estimate: Any, path: Path, *, complete: bool) -> None:
 
 @contextlib.contextmanager
 def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """The first Ctrl-C only asks to stop, the second is a KeyboardInterrupt."""
+    """Return a context in which the first Ctrl-C only asks to stop; the second is a KeyboardInterrupt."""
     asked = threading.Event()
 
     def ask(number: int, frame: FrameType | None) -> None:
@@ -349,7 +351,7 @@ def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def _show_progress() -> Iterator[Callable[[Any], None]]:
-    """A live line on stderr where that is a terminal, nothing otherwise."""
+    """Return a context that yields what shows a record in a live line on stderr; nothing if that is no terminal."""
     if not sys.stderr.isatty():
         yield lambda record: None
         return
@@ -384,7 +386,7 @@ def _make_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def _explain_write_errors(path: Path) -> Iterator[Path]:
-    """Context that says in an InputError which file cannot be written, and why."""
+    """Return a context that says in an InputError which file cannot be written, and why."""
     from switchfit.runtime.errors import InputError
 
     try:

@@ -64,7 +64,7 @@ def runs_natively(structures: Sequence[Structure], arguments: Sequence[Arguments
 
 
 def traced_derivatives(structure: Structure, arguments: Arguments, tau: Any, p: Any, *, natively: bool) -> Any:
-    """Return cost, gradient (D,) and Hessian (D, D) of one experiment inside a program of JAX.
+    """Return the cost, gradient (D,) and Hessian (D, D) of one experiment inside a program of JAX.
 
     By machine code, which runs on a CPU, where `runs_natively` says so; else by JAX.
     """

@@ -186,7 +186,7 @@ class Identifiability:
 
 
 def identifiability(subject: Any) -> Identifiability:
-    """How well the data determine the unknowns, at the solution of a fit or, before any fit, at the first guess.
+    """Return how well the data determine the unknowns, at the solution of a fit or, before any fit, at the first guess.
 
     Parameters
     ----------
@@ -258,7 +258,7 @@ def analyse_solution(fit: Fit, evaluator: Evaluator | None) -> Identifiability:
 
 
 def _analyse_first_guess(problem: Problem) -> Identifiability:
-    """At the first guess, with the data that it would itself produce, where they are Measurements."""
+    """Analyse a problem at its first guess, with the data that it would itself produce, where they are Measurements."""
     theta, unknowns = problem.initial_theta, problem.unknowns
     own = evaluator_of(problem)
     refuse_hidden_switches(own, theta, own(theta).gradient)
@@ -296,7 +296,7 @@ def _analyse_first_guess(problem: Problem) -> Identifiability:
 
 
 def _drop_noise(problem: Problem, evaluator: Evaluator) -> Problem:
-    """The problem with the values that its first guess produces; missing ones stay missing."""
+    """Return the problem with the values that its first guess produces; missing ones stay missing."""
     theta = problem.initial_theta
     comparisons = compare(problem, theta, evaluator.simulate(theta))[1]
     experiments = []
@@ -310,7 +310,7 @@ def _drop_noise(problem: Problem, evaluator: Evaluator) -> Problem:
 
 
 def _measure_variation(problem: Problem) -> float:
-    """Half the weighted sum of squares of what is measured about its mean, channel by channel."""
+    """Return half the weighted sum of squares of what is measured about its mean, channel by channel."""
     total = 0.0
     for experiment in problem.experiments:
         for item in experiment.data:
@@ -345,7 +345,7 @@ def analyse(
     allowed: Callable[[FloatArray], bool] | None = None,
     base: float = np.nan,
 ) -> Identifiability:
-    """The badly determined directions of a Hessian, tried out with the cost it belongs to.
+    """Return the badly determined directions of a Hessian, tried out with the cost it belongs to.
 
     Parameters
     ----------
@@ -399,7 +399,9 @@ def _try_direction(
     rise: float,
     allowed: Callable[[FloatArray], bool] | None,
 ) -> tuple[FloatArray, tuple[float, float]]:
-    """The change along a direction (d,) at which J should rise by `rise`, and by how much it does on both sides."""
+    """Return the change along a direction (d,) at which J should rise by `rise`, and by how much it does
+    on both sides.
+    """
     known = theta != 0
     # No unknown moves by more than its own size, where it has one.
     share = np.max(np.abs(direction[known] / theta[known]), initial=0.0)

@@ -259,7 +259,9 @@ def diagnose_channel(comparison: Comparison, k: int, experiment: int = 0, time_u
 
 
 def compute_autocorrelation(z: FloatArray, lags: int) -> FloatArray:
-    """Correlation of z (n,) with itself at lags 1 .. lags, about zero, where residuals should be: (lags,)."""
+    """Return the correlation of z (n,) with itself at lags 1 .. lags, about zero, where residuals should
+    be: (lags,).
+    """
     square = float(z @ z)
     if square == 0:
         return np.zeros(lags)
