@@ -49,7 +49,7 @@ def _print_version(asked: bool) -> None:
     if asked:
         from importlib.metadata import version
 
-        typer.echo(f"switchfit {version('switchfit')}")
+        _print(f"switchfit {version('switchfit')}")
         raise typer.Exit
 
 
@@ -100,7 +100,7 @@ def fit(
         estimate = _estimate(loaded, options, prepare_figures=figures)
         checked = f"\n\nCertificate\n{estimate.certificate}" if certificate else ""
         report = str(estimate) + checked  # after the certificate, which it begins with where that fails
-        typer.echo(report)
+        _print(report)
         if out is not None:
             _write(out / "report.txt", report + "\n")
             with _explain_write_errors(out / "estimate.json") as path:
@@ -109,9 +109,9 @@ def fit(
                 figure = io.BytesIO()
                 estimate.plot().savefig(figure, format="png", dpi=150)
                 _write(out / "fit.png", figure.getvalue())
-            typer.echo(f"written to {out}", err=True)
+            _print(f"written to {out}", err=True)
     if not estimate.success:
-        typer.echo(f"switchfit: not converged. {estimate.message}", err=True)
+        _print(f"switchfit: not converged. {estimate.message}", err=True)
         raise typer.Exit(NOT_CONVERGED)
 
 
@@ -136,10 +136,10 @@ def check(
         import switchfit as sf
         from switchfit.io.summary import describe
 
-        typer.echo(f"{describe(loaded.problem)}\n")
+        _print(f"{describe(loaded.problem)}\n")
         derivatives = sf.check_derivatives(loaded.problem)
-        typer.echo(f"{derivatives}\n")
-        typer.echo(sf.identifiability(loaded.problem))
+        _print(f"{derivatives}\n")
+        _print(sf.identifiability(loaded.problem))
     if not derivatives.passed:
         raise typer.Exit(NOT_CONVERGED)
 
@@ -206,13 +206,30 @@ def paper(
 
         _make_folder(out)
         try:
-            run(out, quick=quick, only=only, say=lambda text: typer.echo(text, err=True))
+            run(out, quick=quick, only=only, say=lambda text: _print(text, err=True))
         except KeyboardInterrupt:
             _fail("interrupted; the same command goes on from here.", INTERRUPTED)
         except OSError as error:
             raise InputError(f"{out} cannot be written: {error.strerror}; name another with --out.") from error
-        typer.echo((out / TABLE).read_text(encoding="utf-8"))
-        typer.echo(f"written to {out}", err=True)
+        _print((out / TABLE).read_text(encoding="utf-8"))
+        _print(f"written to {out}", err=True)
+
+
+# --- output -----------------------------------------------------------------------------------------------------------
+
+
+def _print(text: object, *, err: bool = False) -> None:
+    """Print to stdout or stderr; if its reader is gone, as ``head`` after its lines, print nothing from then on.
+
+    The command goes on: what it writes to files and its exit code do not depend on who reads along.
+    """
+    try:
+        typer.echo(text, err=err)
+    except BrokenPipeError:
+        stream = sys.stderr if err else sys.stdout
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())  # what is buffered is flushed there, at the latest when Python exits
+        os.close(nowhere)
 
 
 # --- errors -----------------------------------------------------------------------------------------------------------
@@ -280,7 +297,7 @@ def _handle_interrupt(handler: Callable[[int, FrameType | None], object]) -> Ite
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    typer.echo(f"switchfit: {message}", err=True)
+    _print(f"switchfit: {message}", err=True)
     raise typer.Exit(code)
 
 
@@ -300,8 +317,8 @@ def _check_files(problem: Path) -> None:
 
     experiments = read_experiments(problem)
     if experiments:
-        typer.echo(f"{describe_experiments(experiments)}\n")
-    typer.echo("No Python file was run: modes, states, functions and names of parameters are not checked.")
+        _print(f"{describe_experiments(experiments)}\n")
+    _print("No Python file was run: modes, states, functions and names of parameters are not checked.")
 
 
 def _estimate(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: bool) -> Any:
@@ -343,7 +360,7 @@ def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
         if asked.is_set():
             raise _CtrlC
         asked.set()
-        typer.echo("stopping after this iteration; Ctrl-C again to stop at once", err=True)
+        _print("stopping after this iteration; Ctrl-C again to stop at once", err=True)
 
     with _handle_interrupt(ask):
         yield asked.is_set

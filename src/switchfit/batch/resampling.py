@@ -74,7 +74,7 @@ class Bootstrap(Fits):
         Of the data as they are.
     resample : str
     block : int
-        Length of the blocks, in samples; 1 where there are none.
+        Length of the blocks, in samples; 1 if single residuals are drawn.
     acceleration : (d,)
         How the standard error changes with the estimate, for "bca" intervals.
     resampled : (d,) bool

@@ -258,7 +258,7 @@ def _read_described_array(value: dict[str, Any]) -> NDArray[Any]:
         raise ValueError(f"must be an array; got {_shorten(value)}")
     name = _require_type(value["dtype"], str)
     if not DTYPES.fullmatch(name):  # NumPy knows others, some of which it only warns of
-        raise ValueError(f"has the dtype {name!r}, which is none of numbers or text")
+        raise ValueError(f"has the dtype {name!r}, which is neither of numbers nor of text")
     try:
         dtype = np.dtype(name)
     except TypeError as error:

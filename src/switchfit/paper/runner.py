@@ -122,7 +122,7 @@ def _line(row: Row) -> str:
 
 
 def _read_kept(path: Path) -> dict[str, Any] | None:
-    """Return the entry of a part that was done before; None if there is none, or a damaged one, which is set aside."""
+    """Return the entry of a part that was done before; None if it is missing, or damaged and set aside."""
     try:
         content = path.read_bytes()
     except FileNotFoundError:

@@ -63,7 +63,7 @@ class Experiment:
         or a transition time has another unit.
     TypeError
         If an argument is of the wrong type: times that are not numbers (dates among them), mode names that are no
-        strings, data that are none of the kinds above.
+        strings, data of another kind than those above.
 
     Notes
     -----

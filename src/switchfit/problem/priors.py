@@ -167,7 +167,7 @@ class PriorTerms(NamedTuple):
         return 0.5 * xp.sum(w * e * e), w * e * v_p, w * (v_p**2 + e * v_pp)
 
     def texts(self) -> list[str]:
-        """Return each prior in words; empty where there is none."""
+        """Return each prior in words; empty for an unknown without a prior."""
         found = []
         for center, precision, log in zip(self.center, self.precision, self.log, strict=True):
             sd = precision**-0.5 if precision > 0 else 0.0

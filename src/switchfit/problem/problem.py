@@ -121,7 +121,7 @@ class Problem:
 
     engine : {"auto", "native", "jax"}, optional
         What evaluates the cost and its derivatives: machine code wherever the model has it and JAX otherwise; machine
-        code, with an error that says why where there is none; or JAX.
+        code, with an error that gives the reason where the model cannot be compiled; or JAX.
     max_transitions : int, optional
         Compile machine code for every sequence of the system's modes with up to so many transitions, so that problems
         with other sequences, but the same functions, data and `max_transitions`, need no compilation of their own.

@@ -49,7 +49,7 @@ class NotPlain(Exception):  # noqa: N818  # control flow: the caller traces
 
 
 def read_contents(function: Any) -> Hashable | None:
-    """Return all that a function reads, by content; None where that cannot be told, so that it has to be traced."""
+    """Return all that a function reads, by content; None if that is unknown, so that it has to be traced."""
     try:
         return _read(function, DEPTH)
     except NotPlain:

@@ -255,7 +255,7 @@ def trace_structure(
     def at_transitions(
         given: Mapping[tuple[str, str], Callable[..., Any]], shape: Shape, what: str, form: str
     ) -> tuple[tuple[Function | None, ...], tuple[Function, ...]]:
-        """Return the function of each transition, None where there is none, and all that there may be."""
+        """Return the function of each transition, None where it has none, and those of all that may happen."""
         own = list(pairwise(experiment.mode_sequence))
         here = given if transitions is not None else own
         traced = {pair: trace(g, at, shape, f"{what} {pair}", form) for pair, g in given.items() if pair in here}

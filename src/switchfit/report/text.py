@@ -186,7 +186,7 @@ def _format_channels(fit: Fit) -> list[str]:
 
 
 def _format_residuals(comparison: Comparison, k: int) -> tuple[str, str, str]:
-    """Return the number of values, rmse and rmse / sigma of one channel; blank where there are none."""
+    """Return the number of values, rmse and rmse / sigma of one channel; blank if it has no samples."""
     residual = comparison.measured[:, k] - comparison.fitted[:, k]
     there = np.isfinite(residual)
     count = str(there.sum()) if comparison.kind == "measurements" else "signal"

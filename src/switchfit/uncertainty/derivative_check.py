@@ -69,7 +69,7 @@ class DerivativeCheck:
         The same with every step halved: smaller by ``2**order`` of the integrator, down to rounding.
     theta : (d,) array
     stiff : bool
-        With the stiff solver the gaps are told but not judged: the paper's adjoints have boundary layers of their own
+        With the stiff solver the gaps are reported, not judged: the paper's adjoints have boundary layers of their own
         at transitions and samples, which a mesh refined for the state does not resolve.
 
     See Also

@@ -32,9 +32,9 @@ from switchfit.problem.problem import Problem
 from switchfit.runtime.presentation import format_text
 
 WEAK = 0.05
-"""Scaled eigenvalues below this are told: standard errors along them are 4.5 times those of each unknown alone."""
+"""Scaled eigenvalues below this are reported: standard errors along them are 4.5 times those of each unknown alone."""
 MOST = 3
-"""Directions that are told."""
+"""Most directions that are reported."""
 NAMED = 0.2
 """Unknowns with less than this part of the largest weight in a direction are not named."""
 UNDETERMINED = 1e-10
@@ -375,7 +375,7 @@ def analyse(
     without = tuple(n for n, f, nothing in zip(names, free, flat, strict=True) if f and nothing)
     spectrum = scaled_spectrum(hessian, basis)
     values, vectors = spectrum.values, spectrum.vectors
-    # What the cost does not depend on at all is told by itself.
+    # What the cost does not depend on at all is reported separately.
     dead = np.array([n in without for n in names])
     kept = [k for k in range(len(values)) if not np.sum(vectors[dead, k] ** 2) > 0.5]
     values, vectors = values[kept], vectors[:, kept]

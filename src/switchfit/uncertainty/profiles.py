@@ -148,7 +148,7 @@ class Trace:
         """Return the feasible point nearest to `target` with its value of the unknown, from one that is feasible
         without it.
 
-        None where there is none, which rounding may bring about at a limit.
+        None if no point is feasible, which rounding may cause at a limit.
         """
         k, c = self.index, self.constraints
         value = target[k]
@@ -428,7 +428,7 @@ class Trace:
         return float(side * np.inf) if end == "flat" else float("nan")
 
     def edges(self, threshold: float) -> list[Point]:
-        """Return, on each side, the first point beyond the threshold, or the last one if there is none."""
+        """Return, on each side, the first point beyond the threshold, or the last one below it."""
         sides = [self.side(side) for side in (-1, 1)]
         return [next((q for q in points if abs(self.zeta(q)) >= threshold), points[-1]) for points in sides]
 

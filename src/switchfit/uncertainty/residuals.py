@@ -106,7 +106,7 @@ class ChannelResiduals:
 
     @property
     def correlation(self) -> float:
-        """Correlation of neighbouring residuals, at lag 1; 0 where there is none."""
+        """Correlation of neighbouring residuals, at lag 1; 0 if there are too few residuals."""
         return float(self.autocorrelation[0]) if self.lags else 0.0
 
     @property
