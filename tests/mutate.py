@@ -48,8 +48,8 @@ IN_PAPER: dict[str, Replacements] = {
             "[evaluate_transition(model, path, i, tau[j], p).D1f_im1 for j in range(i)])",
         ),
         (
-            "def compute_tau_tau(i: int, here: Transition, adjoints: Adjoints, minus: Sensitivities, "
-            "plus: Sensitivities)",
+            "def compute_tau_tau("
+            "i: int, here: Transition, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities)",
             "def compute_tau_tau(i, here, adjoints, minus, plus, misprinted)",
         ),
         ("X_ij = D1f_im1 @ minus.Phi_X[:, j]", "X_ij = misprinted[j] @ minus.Phi_X[:, j]"),

@@ -208,7 +208,7 @@ class Endless:
             self.released.wait(60.0)
         return {"run": np.array(runs)}
 
-    def fingerprint(self):
+    def compute_fingerprint(self):
         return "endless"
 
 

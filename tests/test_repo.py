@@ -182,3 +182,42 @@ def test_optimiser_knows_no_differential_equation():
     for path in (ROOT / "src" / "switchfit" / "optimize").glob("*.py"):
         imports = re.findall(r"^\s*from (switchfit\S*) import|^\s*import (switchfit\S*)", path.read_text(), re.M)
         assert all((a or b).startswith("switchfit.optimize") for a, b in imports), path.name
+
+
+VERBS_IN = (
+    "batch", "cli", "discretization", "estimation", "io", "models", "paper", "paper_adjoint", "problem", "report",
+    "runtime", "uncertainty",
+)  # fmt: skip
+"""Rooms in which functions are named by imperative verbs."""
+
+NOT_PARTICIPLES = {"sliding_block": "the model of a block that slides, by its name in problem files"}
+"""Names whose first word only looks like a participle, or has to be one; and why."""
+
+OTHERS_FILES = {"batch/program.py"}
+
+
+def functions_of(path):
+    """Names of functions and methods in a file; properties are nouns."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            decorators = [ast.unparse(decorator) for decorator in node.decorator_list]
+            if not any("property" in decorator for decorator in decorators):
+                yield node.name
+
+
+def test_functions_are_not_named_by_participles():
+    """`minimize` and not `minimized`: a function does something, and its name says what."""
+    package = ROOT / "src" / "switchfit"
+    seen, wrong = 0, []
+    for path in sorted(package.rglob("*.py")):
+        file = path.relative_to(package)
+        if file.parts[0].removesuffix(".py") not in VERBS_IN or file.as_posix() in OTHERS_FILES:
+            continue
+        names = list(functions_of(path))
+        seen += len(names)
+        first = {name: name.strip("_").partition("_")[0] for name in names}
+        wrong += [f"{file}: {name}" for name, word in first.items() if re.fullmatch(r"\w{2,}(ed|ing)", word)]
+    assert seen > 500
+    exempt = {name for name in NOT_PARTICIPLES if any(entry.endswith(f": {name}") for entry in wrong)}
+    assert exempt == set(NOT_PARTICIPLES), "an exception that is no longer needed"
+    assert not [entry for entry in wrong if entry.rpartition(": ")[2] not in NOT_PARTICIPLES]

@@ -49,7 +49,7 @@ def _print_version(asked: bool) -> None:
     if asked:
         from importlib.metadata import version
 
-        typer.echo(f"switchfit {version('switchfit')}")
+        _print(f"switchfit {version('switchfit')}")
         raise typer.Exit
 
 
@@ -100,7 +100,7 @@ def fit(
         estimate = _estimate(loaded, options, prepare_figures=figures)
         checked = f"\n\nCertificate\n{estimate.certificate}" if certificate else ""
         report = str(estimate) + checked  # after the certificate, which it begins with where that fails
-        typer.echo(report)
+        _print(report)
         if out is not None:
             _write(out / "report.txt", report + "\n")
             with _explain_write_errors(out / "estimate.json") as path:
@@ -109,9 +109,9 @@ def fit(
                 figure = io.BytesIO()
                 estimate.plot().savefig(figure, format="png", dpi=150)
                 _write(out / "fit.png", figure.getvalue())
-            typer.echo(f"written to {out}", err=True)
+            _print(f"written to {out}", err=True)
     if not estimate.success:
-        typer.echo(f"switchfit: not converged. {estimate.message}", err=True)
+        _print(f"switchfit: not converged. {estimate.message}", err=True)
         raise typer.Exit(NOT_CONVERGED)
 
 
@@ -136,10 +136,10 @@ def check(
         import switchfit as sf
         from switchfit.io.summary import describe
 
-        typer.echo(f"{describe(loaded.problem)}\n")
+        _print(f"{describe(loaded.problem)}\n")
         derivatives = sf.check_derivatives(loaded.problem)
-        typer.echo(f"{derivatives}\n")
-        typer.echo(sf.identifiability(loaded.problem))
+        _print(f"{derivatives}\n")
+        _print(sf.identifiability(loaded.problem))
     if not derivatives.passed:
         raise typer.Exit(NOT_CONVERGED)
 
@@ -206,13 +206,30 @@ def paper(
 
         _make_folder(out)
         try:
-            run(out, quick=quick, only=only, say=lambda text: typer.echo(text, err=True))
+            run(out, quick=quick, only=only, say=lambda text: _print(text, err=True))
         except KeyboardInterrupt:
             _fail("interrupted; the same command goes on from here.", INTERRUPTED)
         except OSError as error:
             raise InputError(f"{out} cannot be written: {error.strerror}; name another with --out.") from error
-        typer.echo((out / TABLE).read_text(encoding="utf-8"))
-        typer.echo(f"written to {out}", err=True)
+        _print((out / TABLE).read_text(encoding="utf-8"))
+        _print(f"written to {out}", err=True)
+
+
+# --- output -----------------------------------------------------------------------------------------------------------
+
+
+def _print(text: object, *, err: bool = False) -> None:
+    """Print to stdout or stderr; if its reader is gone, as ``head`` after its lines, print nothing from then on.
+
+    The command goes on: what it writes to files and its exit code do not depend on who reads along.
+    """
+    try:
+        typer.echo(text, err=err)
+    except BrokenPipeError:
+        stream = sys.stderr if err else sys.stdout
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())  # what is buffered is flushed there, at the latest when Python exits
+        os.close(nowhere)
 
 
 # --- errors -----------------------------------------------------------------------------------------------------------
@@ -265,7 +282,9 @@ def _explain(error: BaseException, *, users: bool, debug: bool) -> NoReturn:
 
 @contextlib.contextmanager
 def _handle_interrupt(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-    """Context in which Ctrl-C calls a handler; not where it is ignored, nor outside the main thread, which has them."""
+    """Return a context in which Ctrl-C calls a handler; not where it is ignored, nor outside the main thread, which has
+    them.
+    """
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or before in (signal.SIG_IGN, None):
         yield
@@ -278,7 +297,7 @@ def _handle_interrupt(handler: Callable[[int, FrameType | None], object]) -> Ite
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    typer.echo(f"switchfit: {message}", err=True)
+    _print(f"switchfit: {message}", err=True)
     raise typer.Exit(code)
 
 
@@ -292,18 +311,18 @@ def _load(problem: Path) -> ProblemFile:
 
 
 def _check_files(problem: Path) -> None:
-    """What can be known of a problem without running a Python file."""
+    """Print what can be known of a problem without running a Python file."""
     from switchfit.io.problem_file import read_experiments
     from switchfit.io.summary import describe_experiments
 
     experiments = read_experiments(problem)
     if experiments:
-        typer.echo(f"{describe_experiments(experiments)}\n")
-    typer.echo("No Python file was run: modes, states, functions and names of parameters are not checked.")
+        _print(f"{describe_experiments(experiments)}\n")
+    _print("No Python file was run: modes, states, functions and names of parameters are not checked.")
 
 
 def _estimate(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: bool) -> Any:
-    """`switchfit.estimate` with a live line on stderr; Ctrl-C ends it after the iteration under way."""
+    """Call `switchfit.estimate` with a live line on stderr; Ctrl-C ends it after the iteration under way."""
     import switchfit as sf
 
     if prepare_figures:  # matplotlib, which must not look for a display, loads while XLA compiles
@@ -334,14 +353,14 @@ def _save(estimate: Any, path: Path, *, complete: bool) -> None:
 
 @contextlib.contextmanager
 def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """The first Ctrl-C only asks to stop, the second is a KeyboardInterrupt."""
+    """Return a context in which the first Ctrl-C only asks to stop; the second is a KeyboardInterrupt."""
     asked = threading.Event()
 
     def ask(number: int, frame: FrameType | None) -> None:
         if asked.is_set():
             raise _CtrlC
         asked.set()
-        typer.echo("stopping after this iteration; Ctrl-C again to stop at once", err=True)
+        _print("stopping after this iteration; Ctrl-C again to stop at once", err=True)
 
     with _handle_interrupt(ask):
         yield asked.is_set
@@ -349,7 +368,7 @@ def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def _show_progress() -> Iterator[Callable[[Any], None]]:
-    """A live line on stderr where that is a terminal, nothing otherwise."""
+    """Return a context that yields what shows a record in a live line on stderr; nothing if that is no terminal."""
     if not sys.stderr.isatty():
         yield lambda record: None
         return
@@ -384,7 +403,7 @@ def _make_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def _explain_write_errors(path: Path) -> Iterator[Path]:
-    """Context that says in an InputError which file cannot be written, and why."""
+    """Return a context that says in an InputError which file cannot be written, and why."""
     from switchfit.runtime.errors import InputError
 
     try:

@@ -164,7 +164,7 @@ class Transition(NamedTuple):
 
 
 def compute_paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -> tuple[Array, Array, Array]:
-    """Cost, gradient and Hessian by the paper's adjoint equations.
+    """Return the cost, gradient and Hessian by the paper's adjoint equations.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ def compute_paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -
 
 
 def assemble(rows_tau: list[Array], DpDp_J: Array) -> Array:
-    """The Hessian, equation (3), from rows (N + M,) of the tau block, zero for j > i, and the p block."""
+    """Return the Hessian, equation (3), from rows (N + M,) of the tau block, zero for j > i, and the p block."""
     N, D = len(rows_tau), len(rows_tau) + DpDp_J.shape[0]
     H = jnp.zeros((D, D)).at[N:, N:].set(DpDp_J)
     for i, row in enumerate(rows_tau):
@@ -226,7 +226,7 @@ def assemble(rows_tau: list[Array], DpDp_J: Array) -> Array:
 
 
 def compute_tau_tau(i: int, here: Transition, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities) -> Array:
-    """D_{tau_j} D_{tau_i} J for all j <= i, equations (11) and (13): (N,), zero for j > i."""
+    """Return D_{tau_j} D_{tau_i} J for all j <= i, equations (11) and (13): (N,), zero for j > i."""
     psi, Omega, _ = adjoints
     X, xdot = here.X, here.xdot
     f_im1, D1f_im1, D2f_im1 = here.f_im1, here.D1f_im1, here.D2f_im1
@@ -244,7 +244,7 @@ def compute_tau_tau(i: int, here: Transition, adjoints: Adjoints, minus: Sensiti
 
 
 def compute_tau_p(here: Transition, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities) -> Array:
-    """D_{tau_i} D_p J, equation (16): (M,)."""
+    """Return D_{tau_i} D_p J, equation (16): (M,)."""
     psi, _, Omega_p = adjoints
     X_taup = here.D1f_im1 @ minus.Dp_x - here.D1f_i @ plus.Dp_x + here.Dpf_im1 - here.Dpf_i  # (17)
     jump = here.D1Lambda @ minus.Dp_x + here.DpLambda  # the jump of ell at a reset map, else 0
@@ -252,7 +252,7 @@ def compute_tau_p(here: Transition, adjoints: Adjoints, minus: Sensitivities, pl
 
 
 def evaluate_transition(model: Model, path: Path, i: int, tau_i: Array, p: Array) -> Transition:
-    """The vector fields, ell and the reset map on both sides of transition i (from 0), equation (8)."""
+    """Return the vector fields, ell and the reset map on both sides of transition i (from 0), equation (8)."""
     opening = path.layout.first_chunk[i + 1]
     piece: Piece = pick(path.pieces, opening, 0)
     modes = model.structure.mode_of_segment
@@ -260,7 +260,7 @@ def evaluate_transition(model: Model, path: Path, i: int, tau_i: Array, p: Array
     R = model.reset(i) if i in model.structure.resets else lambda t, x, p: x
 
     def carry_over(t: Array, x: Array, p: Array) -> Array:
-        """F_{i-1} = D_t R + D_x R f_{i-1}, which is f_{i-1} without a reset map."""
+        """Return F_{i-1} = D_t R + D_x R f_{i-1}, which is f_{i-1} without a reset map."""
         direction = (jnp.ones(()), f_before(t, x, p), jnp.zeros_like(p))
         return jax.jvp(R, (t, x, p), direction)[1]
 
@@ -303,7 +303,9 @@ def evaluate_transition(model: Model, path: Path, i: int, tau_i: Array, p: Array
 def integrate_sensitivities(
     model: Model, path: Path, transitions: list[Transition], p: Array
 ) -> tuple[Sensitivities, Sensitivities]:
-    """Phi(t, tau_j) X^j and D_p x at the start and at the end of each row: (Q, C, n, N) and (Q, C, n, M) arrays."""
+    """Return Phi(t, tau_j) X^j and D_p x at the start and at the end of each row: (Q, C, n, N) and (Q,
+    C, n, M) arrays.
+    """
     n, N = model.structure.n, model.structure.N
     tableau = model.tableau
     D1R = jnp.stack([jnp.eye(n), *(t.D1R for t in transitions)])
@@ -349,7 +351,7 @@ def integrate_sensitivities(
 
 
 def evaluate_adjoint_rate(d: Along, adjoints: Adjoints) -> Adjoints:
-    """Right-hand sides of the adjoint equations at one time; affine in the adjoints."""
+    """Return right-hand sides of the adjoint equations at one time; affine in the adjoints."""
     psi, Omega, Omega_p = adjoints
     psi_dot = -d.D1ell - psi @ d.D1f  # (7)
     Omega_dot = -d.D1D1ell - contract(psi, d.D1D1f) - d.D1f.T @ Omega - Omega @ d.D1f  # (12)
@@ -360,7 +362,9 @@ def evaluate_adjoint_rate(d: Along, adjoints: Adjoints) -> Adjoints:
 
 
 def evaluate_integrands(d: Along, adjoints: Adjoints) -> Quadratures:
-    """Integrands of D_p J and D_p D_p J; the terms in ell are ours. (15) is followed by a stray integral sign."""
+    """Return integrands of D_p J and D_p D_p J; the terms in ell are ours. (15) is followed by a stray
+    integral sign.
+    """
     psi, _, Omega_p = adjoints
     first = psi @ d.Dpf + d.Dpell  # (9)
     second = (
@@ -372,7 +376,8 @@ def evaluate_integrands(d: Along, adjoints: Adjoints) -> Quadratures:
 def sweep_backward(
     model: Model, path: Path, transitions: list[Transition], Dp_x: Sensitivities, p: Array
 ) -> tuple[Adjoints, Adjoints, Quadratures]:
-    """Adjoints at t0, the adjoints where each chunk opens (Q, ...; tau_i+ where it opens a segment), and (9), (14).
+    """Return adjoints at t0, the adjoints where each chunk opens (Q, ...; tau_i+ where it opens a segment), and (9),
+    (14).
 
     `Dp_x` holds D_p x at the start and at the end of each row, two (Q, C, n, M) arrays.
     """
@@ -409,7 +414,7 @@ def sweep_backward(
 def differentiate_along_rows(
     model: Model, segment: Array, p: Array, start: Array, end: Array, pieces: Piece, *values: Array
 ) -> Along:
-    """`Along` at the stages of the backward sweep through a chunk of rows of one segment, (C, s, ...).
+    """Return `Along` at the stages of the backward sweep through a chunk of rows of one segment, (C, s, ...).
 
     `values` are x and D_p x at the start and at the end of each row: x_k, x_{k+1}, D_p x_k, D_p x_{k+1}.
     """
@@ -438,7 +443,7 @@ def differentiate_along_rows(
 
 
 def interpolate(f: Field, s: Array, start: Array, end: Array, x_k: Array, x_k1: Array, p: Array) -> Array:
-    """x at ``start + s (end - start)``, s in [0, 1], by quintic Hermite interpolation of one row: (n,).
+    """Return x at ``start + s (end - start)``, s in [0, 1], by quintic Hermite interpolation of one row: (n,).
 
     From x, x_dot = f and x_ddot = D_2 f + D_1 f f at both ends; the error is of order 6 in the row's length.
     """
@@ -462,7 +467,9 @@ def interpolate(f: Field, s: Array, start: Array, end: Array, x_k: Array, x_k1: 
 def add_point_cost(
     cost: Callable[[Array, Array], Array], x: Array, Dp_x: Array, p: Array
 ) -> tuple[Adjoints, Quadratures]:
-    """What a cost of x at one time, a sample or the terminal cost, adds to the adjoints there and to (9), (14)."""
+    """Return what a cost of x at one time, a sample or the terminal cost, adds to the adjoints there and
+    to (9), (14).
+    """
     (Dell, Dpell) = jax.grad(cost, argnums=(0, 1))(x, p)
     (D2ell, DpD1ell), (D1Dpell, DpDpell) = jax.hessian(cost, argnums=(0, 1))(x, p)
     jump = Adjoints(Dell, D2ell, D2ell @ Dp_x + DpD1ell)
@@ -472,7 +479,9 @@ def add_point_cost(
 def add_sample_jumps(
     model: Model, path: Path, Dp_x_before: Array, Dp_x_after: Array, p: Array
 ) -> tuple[Adjoints, Adjoints, Quadratures]:
-    """Jumps of the adjoints at t0, those at the end of each row (Q, C, ...), and what samples add to (9), (14)."""
+    """Return jumps of the adjoints at t0, those at the end of each row (Q, C, ...), and what samples add
+    to (9), (14).
+    """
     Q, C, n = path.after.shape
     M = p.shape[0]
     jumps = Adjoints(jnp.zeros((Q * C + 1, n)), jnp.zeros((Q * C + 1, n, n)), jnp.zeros((Q * C + 1, n, M)))
@@ -494,7 +503,8 @@ def add_sample_jumps(
 
 
 def add_late_jumps(model: Model, path: Path, Dp_x_before: Array, p: Array) -> tuple[tuple[Adjoints, ...], Quadratures]:
-    """Jumps of the adjoints at the start of each row by samples that are seen late, and what these add to (9), (14).
+    """Return jumps of the adjoints at the start of each row by samples that are seen late, and what these add to (9),
+    (14).
 
     A late sample is a cost of the state at the start of the row that holds ``t - delay``. The jumps are one tuple of
     (Q, C, ...) arrays, or none where nothing is late.
@@ -519,7 +529,7 @@ def add_late_jumps(model: Model, path: Path, Dp_x_before: Array, p: Array) -> tu
 def pass_reset(
     transitions: list[Transition], segment: Array, opens: Array, adjoints: Adjoints, Dp_x: Array
 ) -> Adjoints:
-    """The adjoints at tau_i- from those at tau_i+, where a chunk opens a segment; `Dp_x` is that at tau_i-."""
+    """Return the adjoints at tau_i- from those at tau_i+, where a chunk opens a segment; `Dp_x` is that at tau_i-."""
 
     def through(here: Transition) -> Adjoints:
         psi, Omega, Omega_p = adjoints
@@ -536,7 +546,7 @@ def pass_reset(
 
 
 def add_reset(here: Transition, adjoints: Adjoints, Dp_x: Array) -> Quadratures:
-    """What the reset map's own dependence on p adds to (9) and (14); `Dp_x` is that at tau_i-, (n, M)."""
+    """Return what the reset map's own dependence on p adds to (9) and (14); `Dp_x` is that at tau_i-, (n, M)."""
     psi, _, Omega_p = adjoints
     return Quadratures(
         psi @ here.DpR,
@@ -545,7 +555,7 @@ def add_reset(here: Transition, adjoints: Adjoints, Dp_x: Array) -> Quadratures:
 
 
 def add_initial_state(model: Model, adjoints: Adjoints, p: Array) -> Quadratures:
-    """What an initial state x0(p) adds to (9) and (14)."""
+    """Return what an initial state x0(p) adds to (9) and (14)."""
     Dp_x0 = jax.jacfwd(model.initial_state)(p)
     DpDp_x0 = jax.jacfwd(jax.jacfwd(model.initial_state))(p)
     psi, _, Omega_p = adjoints
@@ -556,7 +566,8 @@ def add_initial_state(model: Model, adjoints: Adjoints, p: Array) -> Quadratures
 
 
 def step_linear(tableau: Tableau, rate: Callable[[Any, Any], Any], h: Array, given: Any, y: Any) -> tuple[Any, Any]:
-    """One Runge-Kutta step of ``dy/dt = rate(given, y)``, affine in y: its stage states (s, ...) and y at its end.
+    """Return one Runge-Kutta step of ``dy/dt = rate(given, y)``, affine in y: its stage states (s, ...) and y at its
+    end.
 
     `given` holds what varies in time, at the s stages; h < 0 steps backward.
     """
@@ -586,7 +597,9 @@ def step_linear(tableau: Tableau, rate: Callable[[Any, Any], Any], h: Array, giv
 def differentiate_twice(
     function: Callable[[Array, Array, Array], Array], t: Array, x: Array, p: Array
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """``D1, Dp, D1D1, DpD1, D1Dp, DpDp`` of a function of (t, x, p); the outermost derivative is the last axis."""
+    """Return ``D1, Dp, D1D1, DpD1, D1Dp, DpDp`` of a function of (t, x, p); the outermost derivative is
+    the last axis.
+    """
 
     def first(t: Array, x: Array, p: Array) -> tuple[Any, Any]:
         derivatives = jax.jacfwd(function, argnums=(1, 2))(t, x, p)
@@ -598,22 +611,22 @@ def differentiate_twice(
 
 
 def contract(psi: Array, second: Array) -> Array:
-    """``psi . D^2``: the row vector psi (n,) times the first axis of a (n, ., .) array."""
+    """Return ``psi . D^2``: the row vector psi (n,) times the first axis of a (n, ., .) array."""
     return jnp.tensordot(psi, second, 1)
 
 
 def add(one: Any, other: Any) -> Any:
-    """Sum of two tuples of arrays."""
+    """Return the sum of two tuples of arrays."""
     return jax.tree.map(jnp.add, one, other)
 
 
 def where(condition: Array, one: Any, other: Any) -> Any:
-    """`one` or `other`, tuples of arrays."""
+    """Return `one` or `other`, tuples of arrays."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)
 
 
 def pick(values: Any, *index: Any) -> Any:
-    """``values[index]`` of a tuple of arrays."""
+    """Return ``values[index]`` of a tuple of arrays."""
     return jax.tree.map(lambda a: a[index], values)
 
 
@@ -621,5 +634,5 @@ def pick(values: Any, *index: Any) -> Any:
 def evaluate_paper(
     arguments: Arguments, tau: Array, p: Array, side: Array, *, structure: Structure
 ) -> tuple[Array, Array, Array]:
-    """J, its gradient (D,) and its Hessian (D, D) of one experiment, as of `compute_paper_derivatives`."""
+    """Return J, its gradient (D,) and its Hessian (D, D) of one experiment, as of `compute_paper_derivatives`."""
     return compute_paper_derivatives(Model(structure, arguments), tau, p, side)

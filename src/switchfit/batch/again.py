@@ -20,7 +20,8 @@ from switchfit.problem.problem import Problem
 def redo_unresolved(
     chunk: Chunk, problem_of: Callable[[int], Problem], meshes: Sequence[Mesh], *, tolerance: float, max_iterations: int
 ) -> Chunk:
-    """The chunk with fits that failed where the shared meshes are too coarse replaced by those that `estimate` finds.
+    """Return the chunk with fits that failed where the shared meshes are too coarse replaced by those that `estimate`
+    finds.
 
     A mode that is active elsewhere than where the meshes were refined may find cells there that are far too long for
     it: what stops the optimiser is then the mesh and not the model. A fit that fails again is left as it was.
@@ -53,7 +54,9 @@ def redo_unresolved(
 
 
 def is_resolved(problem: Problem, meshes: Sequence[Mesh], theta: Any, cost: float | None = None) -> bool:
-    """Whether cutting all steps in two changes J at theta by no more than the integration error that is allowed."""
+    """Return whether cutting all steps in two changes J at theta by no more than the integration error
+    that is allowed.
+    """
     evaluator = Evaluator(problem, meshes=meshes)
     here = evaluator.cost(theta) if cost is None else cost
     fine = evaluator.divide().cost(theta)

@@ -46,7 +46,7 @@ class Work(Protocol):
         ...
 
     def compute_fingerprint(self) -> str:
-        """Changes with everything that a result depends on."""
+        """Return a digest that changes with everything that a result depends on."""
         ...
 
 
@@ -117,12 +117,12 @@ def _close_generator(generator: Iterator[Any]) -> Iterator[None]:
 
 
 def count_cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _run_in_threads(work: Work, chunks: list[range]) -> Iterator[tuple[range, Arrays]]:
-    """Chunks as they are done by threads; JAX's programs run outside Python's lock."""
+    """Yield chunks as they are done by threads; JAX's programs run outside Python's lock."""
     pool = ThreadPoolExecutor(count_cores())
     try:
         futures: dict[Future[Arrays], range] = {pool.submit(work, chunk): chunk for chunk in chunks}
@@ -137,7 +137,7 @@ def _run_in_threads(work: Work, chunks: list[range]) -> Iterator[tuple[range, Ar
 
 
 def _run_on_cluster(work: Work, chunks: list[range], client: Any) -> Iterator[tuple[range, Arrays]]:
-    """Chunks as they are done by the workers of a Dask cluster.
+    """Yield chunks as they are done by the workers of a Dask cluster.
 
     The work travels as bytes that are themselves the result of a task, so that they outlive the workers that hold
     them; a worker unpickles them once, or it would compile the model's functions anew for every chunk.
@@ -201,7 +201,8 @@ class _Store:
             write_atomically(json.dumps(description), label)
 
     def _check_unlabelled(self, label: str) -> None:
-        """Without run.json: ValueError if the folder holds intact chunks of another run, or no chunk but other files.
+        """Raise ValueError if a folder without run.json holds intact chunks of another run, or no chunk but other
+        files.
 
         Chunks that are damaged are no reason to refuse: `load` sets them aside, and nothing of them is used.
         """
@@ -215,7 +216,7 @@ class _Store:
             raise ValueError(f"{self.folder} holds other files: give an empty or a new folder for the results.")
 
     def load(self, chunk: range) -> Arrays | None:
-        """The chunk's arrays; None if it is not there, or damaged and therefore set aside."""
+        """Return the chunk's arrays; None if it is not there, or damaged and therefore set aside."""
         path = self._path(chunk)
         if not path.exists():
             return None
@@ -251,7 +252,7 @@ _ANOTHER_RUN = (
 
 
 def _read_label(path: Path) -> tuple[dict[str, Any] | None, str]:
-    """What run.json says, or None and what is wrong with it: nothing if it is not there."""
+    """Return what run.json says, or None and what is wrong with it: nothing if it is not there."""
     try:
         there = json.loads(path.read_bytes())
     except FileNotFoundError:
@@ -265,7 +266,9 @@ def _read_label(path: Path) -> tuple[dict[str, Any] | None, str]:
 
 
 def _read_chunk(path: Path) -> tuple[Arrays | None, str]:
-    """The arrays of a chunk with its fingerprint and runs but not its seal; or None and what is wrong with it."""
+    """Return the arrays of a chunk with its fingerprint and runs but not its seal; or None and what is
+    wrong with it.
+    """
     content = path.read_bytes()  # OSError names the file
     if not content:
         return None, "it is empty"
@@ -281,12 +284,12 @@ def _read_chunk(path: Path) -> tuple[Arrays | None, str]:
 
 
 def _seal(arrays: Arrays) -> str:
-    """A digest of names, types, shapes and numbers."""
+    """Return a digest of names, types, shapes and numbers."""
     return compute_fingerprint(*(part for name in sorted(arrays) for part in (name, np.asarray(arrays[name]))))
 
 
 def compute_fingerprint(*parts: Any) -> str:
-    """A digest of numbers, strings and arrays."""
+    """Return a digest of numbers, strings and arrays."""
     digest = hashlib.sha256()
     for part in parts:
         if isinstance(part, np.ndarray):

@@ -118,7 +118,7 @@ class Fits:
             return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
     def confidence_intervals(self, level: float = 0.95) -> FloatArray:
-        """Intervals of each fit: (R, d, 2); see `Estimate.confidence_intervals`.
+        """Return intervals of each fit: (R, d, 2); see `Estimate.confidence_intervals`.
 
         See Also
         --------
@@ -192,7 +192,7 @@ def repeat(
 
 
 def _refuse_hidden_switches(problem: Problem) -> None:
-    """What `estimate` refuses for the model's sake, before thousands of fits list it one by one."""
+    """Raise what `estimate` would raise about the model, before thousands of fits list it one by one."""
     try:
         evaluator, theta = evaluator_of(problem), problem.initial_theta
         gradient = evaluator(theta).gradient
@@ -205,7 +205,9 @@ def _refuse_hidden_switches(problem: Problem) -> None:
 def _collect_fields(
     problem: Problem, requested: int, runs: NDArray[np.intp], arrays: dict[str, NDArray[Any]], seconds: float
 ) -> dict[str, Any]:
-    """The fields of `Fits` from what the chunks found, covariances scaled by the residual variance where needed."""
+    """Return the fields of `Fits` from what the chunks found, covariances scaled by the residual
+    variance where needed.
+    """
     known = is_sigma_known(problem)
     samples = arrays["samples"]
     freedom = samples - arrays["free"]
@@ -228,5 +230,5 @@ def _collect_fields(
 
 
 def count_samples(problem: Problem) -> int:
-    """Measured values that are not missing."""
+    """Return the measured values that are not missing."""
     return sum(item.count for run in problem.experiments for item in run.data if isinstance(item, Measurements))

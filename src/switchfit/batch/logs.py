@@ -146,7 +146,7 @@ class _Work:
         return {**arrays, "start": starts, "samples": np.array([count_samples(problem) for problem in problems])}
 
     def _list_failed(self, errors: dict[int, Exception]) -> Arrays:
-        """Arrays for problems that could not be begun."""
+        """Return arrays for problems that could not be begun."""
         starts = np.array([self.problems[k].initial_theta for k in errors])
         found = make_failed_chunk(starts, dict(enumerate(errors.values())))
         samples = np.array([count_samples(self.problems[k]) for k in errors])
@@ -174,7 +174,7 @@ class _Work:
 
 
 def _get_kind(problem: Problem) -> Any:
-    """Equal for problems that one program can fit with one set of constraints."""
+    """Return a key that is equal for problems that one program can fit with one set of constraints."""
     evaluator = evaluator_of(problem)
     shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(tuple(evaluator.arguments)))
     unknowns = problem.unknowns

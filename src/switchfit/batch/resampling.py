@@ -74,7 +74,7 @@ class Bootstrap(Fits):
         Of the data as they are.
     resample : str
     block : int
-        Length of the blocks, in samples; 1 where there are none.
+        Length of the blocks, in samples; 1 if single residuals are drawn.
     acceleration : (d,)
         How the standard error changes with the estimate, for "bca" intervals.
     resampled : (d,) bool
@@ -112,7 +112,7 @@ class Bootstrap(Fits):
         return np.where(self.resampled, self.theta[self.success].mean(0) - self.estimate, np.nan)
 
     def intervals(self, level: float = 0.95, *, method: Interval = "bca") -> FloatArray:
-        """Confidence intervals: (d, 2); NaN where nothing was resampled.
+        """Return confidence intervals: (d, 2); NaN where nothing was resampled.
 
         Parameters
         ----------
@@ -157,7 +157,7 @@ class Bootstrap(Fits):
         return found
 
     def plot(self) -> Figure:
-        """Histogram of the estimates of each unknown with its interval, as a matplotlib Figure.
+        """Draw a histogram of the estimates of each unknown with its interval, as a matplotlib Figure.
 
         See Also
         --------
@@ -285,7 +285,8 @@ def _check_data(problem: Problem) -> None:
 
 
 def _compute_acceleration(estimate: Estimate, *, by_run: bool) -> FloatArray:
-    """``sum l^3 / (6 (sum l^2)^(3/2))`` over the influence l of each sample, or run, on each unknown ([5]_): (d,).
+    """Return ``sum l^3 / (6 (sum l^2)^(3/2))`` over the influence l of each sample, or run, on each unknown ([5]_):
+    (d,).
 
     A sample's influence is to first order ``-H^-1 g``, g being the gradient of its part of the cost.
     """
@@ -323,7 +324,7 @@ class _Draw:
                 raise ValueError(f"block must lie between 1 and the {longest} samples there are; got {block}.")
 
     def _length(self) -> int:
-        """Of a block, by the channel with the largest correlation of neighbours."""
+        """Return the length of a block, by the channel with the largest correlation of neighbours."""
         lengths = [1.0]
         for pool in self.pools:
             for channel in pool.T:
@@ -353,7 +354,7 @@ class _Draw:
 
 
 def _get_sigma(item: Measurements) -> FloatArray:
-    """Standard deviation of each sample, 1 where it is unknown: (K, q)."""
+    """Return the standard deviation of each sample, 1 where it is unknown: (K, q)."""
     return np.broadcast_to(1.0 if item.sigma is None else item.sigma, item.values.shape)
 
 
@@ -373,7 +374,7 @@ class _Runs:
         return chunk_size()
 
     def weights(self, run: int) -> FloatArray:
-        """How often each experiment was drawn: (E,)."""
+        """Return how often each experiment was drawn: (E,)."""
         count = len(self.problem.experiments)
         drawn = np.random.default_rng([self.seed, run]).integers(count, size=count)
         return np.maximum(np.bincount(drawn, minlength=count), LEFT_OUT)
@@ -392,7 +393,7 @@ class _Runs:
         return {**found._asdict(), "start": starts, "samples": np.full(len(runs), count_samples(self.problem))}
 
     def _stack_values(self, weights: FloatArray) -> Varying:
-        """The weights of all samples (R, K, q), times those of their experiments."""
+        """Return the weights of all samples (R, K, q), times those of their experiments."""
         arguments = tuple(Evaluator(self.problem, meshes=self.meshes).arguments)
         leaves, tree = jax.tree.flatten(arguments)
         places = jax.tree.unflatten(tree, range(len(leaves)))

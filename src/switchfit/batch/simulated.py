@@ -83,7 +83,8 @@ class MonteCarlo(Fits):
         return self.errors.std(0, ddof=1)
 
     def coverage(self, level: float = 0.95) -> FloatArray:
-        """Part of the fits that converged whose interval contains the truth: (d,); NaN without a noise model.
+        """Return the part of the fits that converged whose interval contains the truth: (d,); NaN without a noise
+        model.
 
         See Also
         --------
@@ -104,7 +105,7 @@ class MonteCarlo(Fits):
         return np.where(np.isnan(low).any(0), np.nan, inside.mean(0))
 
     def plot(self) -> Figure:
-        """Histogram of the estimates of each unknown with the truth, as a matplotlib Figure.
+        """Draw a histogram of the estimates of each unknown with the truth, as a matplotlib Figure.
 
         See Also
         --------
@@ -246,7 +247,7 @@ def fit_simulated(
     folder: str | Path | None,
     callback: Callable[[int, int], object] | None,
 ) -> tuple[dict[str, Any], float]:
-    """Fits of simulated data: the fields of `Fits`, and the integration error at the truth.
+    """Return fits of simulated data: the fields of `Fits`, and the integration error at the truth.
 
     Parameters
     ----------
@@ -266,7 +267,9 @@ def fit_simulated(
 
 
 def _simulate_clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray | None]]:
-    """What each of the data of each experiment would be without noise: (K, q) arrays; None for costs without data."""
+    """Return what each of the data of each experiment would be without noise: (K, q) arrays; None for costs without
+    data.
+    """
     sampled, which = [], []
     for experiment in problem.experiments:
         items, kept = [], []
@@ -301,7 +304,8 @@ def _simulate_clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray
 
 
 def _build_meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tuple[list[Mesh], float]:
-    """Meshes that resolve the trajectories at the start and at the truth, and the integration error at the truth.
+    """Return meshes that resolve the trajectories at the start and at the truth, and the integration error at the
+    truth.
 
     A mode that is active in another part of the horizon at the start would run over cells that are far too long for it,
     and lead somewhere else altogether.
@@ -354,7 +358,7 @@ class _Work:
         raise errors[0]
 
     def _draw_run(self, run: int) -> dict[tuple[int, int], FloatArray]:
-        """Values of the k-th data of experiment e, in one run."""
+        """Return values of the k-th data of experiment e, in one run."""
         rng = np.random.default_rng([self.seed, run])
         drawn = {}
         for e, items in enumerate(self.clean):
@@ -390,7 +394,7 @@ class _Work:
         return clean + spread * rng.standard_normal(clean.shape)
 
     def problem_of(self, run: int) -> Problem:
-        """The problem with the data of one run."""
+        """Return the problem with the data of one run."""
         noisy = self._draw_run(run)
         experiments = []
         for e, experiment in enumerate(self.problem.experiments):
@@ -425,11 +429,11 @@ class _Work:
         return {**found._asdict(), "start": starts, "samples": np.full(len(runs), count_samples(self.problem))}
 
     def _without_noise(self) -> dict[tuple[int, int], FloatArray]:
-        """What stands for the values of a run that could not be drawn."""
+        """Return what stands for the values of a run that could not be drawn."""
         return {(e, k): v for e, items in enumerate(self.clean) for k, v in enumerate(items) if v is not None}
 
     def _stack_values(self, values: dict[tuple[int, int], FloatArray]) -> Varying:
-        """Noisy values (R, K, q) of all data as leaves of the arguments."""
+        """Return noisy values (R, K, q) of all data as leaves of the arguments."""
         arguments = tuple(build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes))
         leaves, tree = jax.tree.flatten(arguments)
         places = jax.tree.unflatten(tree, range(len(leaves)))
@@ -468,7 +472,7 @@ class _Work:
 
 
 def _replace_values(item: Any, values: FloatArray) -> Any:
-    """The same kind of data with other values; missing ones stay missing."""
+    """Return the same kind of data with other values; missing ones stay missing."""
     if isinstance(item, Measurements):
         return replace(item, values=np.where(np.isnan(item.values), np.nan, values))
     measured = item.samples[1]
@@ -483,7 +487,7 @@ def _replace_values(item: Any, values: FloatArray) -> Any:
 
 
 def _find_cells(item: ReferenceSignal, values: FloatArray, mesh: Mesh) -> FloatArray:
-    """Reference signals made from values (R, K, q), as cubics in the cells of a mesh: (R, G, 4, q).
+    """Return reference signals made from values (R, K, q), as cubics in the cells of a mesh: (R, G, 4, q).
 
     All R at once: interpolation and filter treat channels one by one, so that runs can be channels too.
     """

@@ -77,7 +77,7 @@ class Multistart(Fits):
     best: Estimate | None
 
     def plot(self) -> Figure:
-        """Waterfall: the cost at the end of every start, ascending, as a matplotlib Figure.
+        """Draw a waterfall: the cost at the end of every start, ascending, as a matplotlib Figure.
 
         See Also
         --------
@@ -170,7 +170,7 @@ def multistart(
 def _find_best(
     problem: Problem, fits: Fits, tolerance: float, max_iterations: int
 ) -> tuple[Estimate | None, dict[int, Exception]]:
-    """A full estimate, resumed at the lowest end that allows one, and the errors of the ends that do not."""
+    """Return a full estimate, resumed at the lowest end that allows one, and the errors of the ends that do not."""
     errors: dict[int, Exception] = {}
     for k in np.lexsort((np.nan_to_num(fits.cost, nan=np.inf), ~fits.success))[:ENDS_TRIED].tolist():
         start = fits.theta[k] if np.isfinite(fits.theta[k]).all() else fits.start[k]
@@ -218,7 +218,7 @@ class _Work:
 
 
 def _check_starts(problem: Problem, starts: Any) -> FloatArray:
-    """Starts of the user's, checked."""
+    """Return starts of the user's, checked."""
     points = as_array(starts, "starts")
     d = len(problem.theta_names)
     if points.ndim != 2 or points.shape[1] != d or len(points) == 0:
@@ -232,7 +232,7 @@ def _check_starts(problem: Problem, starts: Any) -> FloatArray:
 
 
 def _draw_starts(problem: Problem, starts: Any, seed: int) -> FloatArray:
-    """Starts from a Sobol sequence: (S, d)."""
+    """Return starts from a Sobol sequence: (S, d)."""
     from scipy.stats import qmc  # here, since importing it takes longer than most fits
 
     count = as_count(starts, "starts", at_least=1, at_most=MOST_DRAWN)
@@ -265,14 +265,14 @@ def _draw_starts(problem: Problem, starts: Any, seed: int) -> FloatArray:
 
 
 def _list_stretches(experiment: Any, where: NDArray[np.intp]) -> list[tuple[float, float, NDArray[np.intp]]]:
-    """Groups of free transition times with the fixed times (or ends of the horizon) that enclose them."""
+    """Return groups of free transition times with the fixed times (or ends of the horizon) that enclose them."""
     knots = np.concatenate([[experiment.t0], experiment.initial_times, [experiment.tf]])
     fixed = [0, *(np.flatnonzero(where < 0) + 1).tolist(), len(knots) - 1]
     return [(float(knots[a]), float(knots[b]), where[a : b - 1]) for a, b in pairwise(fixed) if b - a > 1]
 
 
 def _find_nearest_feasible(problem: Problem, point: FloatArray) -> FloatArray:
-    """The feasible point nearest to `point`, each unknown measured by its own range."""
+    """Return the feasible point nearest to `point`, each unknown measured by its own range."""
     constraints = constraints_of(problem)
     inside = problem.initial_theta
     if np.all(constraints.slack(point) >= 0):
@@ -285,7 +285,7 @@ def _find_nearest_feasible(problem: Problem, point: FloatArray) -> FloatArray:
 
 
 def _find_clusters(problem: Problem, fits: Fits) -> NDArray[np.int64]:
-    """Number of the minimum in which each fit ended, ascending in cost; -1 where it did not converge."""
+    """Return the number of the minimum in which each fit ended, ascending in cost; -1 where it did not converge."""
     labels = np.full(len(fits), -1)
     unknowns = problem.unknowns
     times = np.concatenate(unknowns.times)
@@ -314,7 +314,7 @@ def _find_clusters(problem: Problem, fits: Fits) -> NDArray[np.int64]:
 
 
 def _build_schedule(problem: Problem, theta: FloatArray) -> list[Any]:
-    """For each experiment its modes without the collapsed ones, and when they switch as parts of the horizon."""
+    """Return each experiment's modes without the collapsed ones, and when they switch as parts of the horizon."""
     schedules = []
     for experiment, times in zip(problem.experiments, problem.split(theta)[0], strict=True):
         knots = np.concatenate([[experiment.t0], times, [experiment.tf]])

@@ -48,12 +48,14 @@ class Arguments(NamedTuple):
     weights: tuple[Array, ...]
 
     def without_mesh(self) -> Arguments:
-        """What the functions of the model need of them: shapes do not depend on the number of nodes or samples."""
+        """Return what the functions of the model need of them: shapes do not depend on the number of
+        nodes or samples.
+        """
         return self._replace(nodes=np.zeros(2), signals=np.zeros((1, *self.signals.shape[1:])), samples=())  # type: ignore[arg-type]
 
 
 def build_arguments(problem: Problem, e: int, mesh: Mesh) -> Arguments:
-    """The arrays (NumPy's) of experiment e on a mesh that holds all its sample times and knots as nodes."""
+    """Return the arrays (NumPy's) of experiment e on a mesh that holds all its sample times and knots as nodes."""
     structure, experiment = problem.structures[e], problem.experiments[e]
     initial = initial_state_of(problem.system, experiment)
     mapped = experiment.parameter_map
@@ -69,13 +71,15 @@ def build_arguments(problem: Problem, e: int, mesh: Mesh) -> Arguments:
 
 
 def _drop_off_diagonal_zeros(W: FloatArray) -> FloatArray:
-    """The diagonal of a diagonal matrix: it costs q products instead of q squared at every stage of every step."""
+    """Return the diagonal of a diagonal matrix: it costs q products instead of q squared at every stage
+    of every step.
+    """
     diagonal = np.diag(W)
     return diagonal if np.array_equal(W, np.diag(diagonal)) else W
 
 
 def _pad_samples(item: Measurements, length: int, mesh: Mesh) -> Samples:
-    """Samples of one Measurements, padded with missing ones to a length."""
+    """Return samples of one Measurements, padded with missing ones to a length."""
     extra = length - len(item.times)
     rows = ((0, extra), (0, 0))
     return Samples(
@@ -87,14 +91,14 @@ def _pad_samples(item: Measurements, length: int, mesh: Mesh) -> Samples:
 
 
 def _split_signals_by_cell(experiment: Experiment, mesh: Mesh) -> FloatArray:
-    """Every signal as a cubic in each cell, in powers of the time since the cell's first node: (G, 4, S)."""
+    """Return every signal as a cubic in each cell, in powers of the time since the cell's first node: (G, 4, S)."""
     signals = [split_by_cell(signal, mesh) for signal in list_signals(experiment)]
     none = np.zeros((len(mesh.nodes) - 1, 4, 0))
     return signals[0] if len(signals) == 1 else np.concatenate([none, *signals], axis=2)
 
 
 def split_by_cell(signal: PiecewisePolynomial, mesh: Mesh) -> FloatArray:
-    """One signal as a cubic in each cell of a mesh that has its knots as nodes: (G, 4, q)."""
+    """Return one signal as a cubic in each cell of a mesh that has its knots as nodes: (G, 4, q)."""
     starts = mesh.nodes[:-1]
     middles = 0.5 * (mesh.nodes[:-1] + mesh.nodes[1:])
     k = signal.interval(middles)

@@ -46,12 +46,12 @@ class Mesh:
 
     @classmethod
     def from_times(cls, times: FloatArray) -> Mesh:
-        """The mesh whose nodes are `times`, in any order and with repetitions."""
+        """Return the mesh whose nodes are `times`, in any order and with repetitions."""
         return cls.pad(np.unique(times))
 
     @classmethod
     def pad(cls, nodes: FloatArray) -> Mesh:
-        """The mesh with these nodes, which increase strictly, and padding of a usual length."""
+        """Return the mesh with these nodes, which increase strictly, and padding of a usual length."""
         cells = len(nodes) - 1
         padding = np.full(pad_length(cells) - cells, nodes[-1])
         return cls(np.concatenate([nodes, padding]), cells)
@@ -62,11 +62,11 @@ class Mesh:
         return self.nodes[: self.cells + 1]
 
     def pad_to(self, cells: int) -> Mesh:
-        """The mesh with its padding made so long that it has the given number of cells."""
+        """Return the mesh with its padding made so long that it has the given number of cells."""
         return Mesh(np.append(self.times, np.full(cells - self.cells, self.times[-1])), self.cells)
 
     def divide(self, parts: int = 2) -> Mesh:
-        """The mesh with every cell cut into equal parts."""
+        """Return the mesh with every cell cut into equal parts."""
         nodes = self.times
         inside = nodes[:-1, None] + np.diff(nodes)[:, None] * np.arange(parts) / parts
         divided = np.append(inside, nodes[-1])
@@ -74,12 +74,12 @@ class Mesh:
         return Mesh.pad(divided) if (divided[1:] > divided[:-1]).all() else Mesh.from_times(divided)
 
     def cell_ending_at(self, times: FloatArray) -> NDArray[np.intp]:
-        """Index of the cell that ends at each of `times`, which must be nodes; -1 for t0."""
+        """Return the index of the cell that ends at each of `times`, which must be nodes; -1 for t0."""
         return np.searchsorted(self.times, times) - 1
 
 
 def pad_to_common_lengths(problem: Problem, meshes: Sequence[Mesh]) -> list[Mesh]:
-    """The meshes of all experiments, those of experiments that are alike padded to common lengths."""
+    """Return the meshes of all experiments, those of experiments that are alike padded to common lengths."""
     padded = list(meshes)
     if len(padded) == 1:
         return padded
@@ -118,7 +118,10 @@ class Rows(NamedTuple):
 
 
 def count_chunks(cells: int, transitions: int) -> int:
-    """Chunks that hold all rows wherever the transition times lie: the padding wastes at most C - 1 rows a segment."""
+    """Return how many chunks hold all rows wherever the transition times lie.
+
+    The padding wastes at most C - 1 rows a segment.
+    """
     return (cells + transitions + (transitions + 1) * (CHUNK - 1)) // CHUNK
 
 
@@ -160,7 +163,7 @@ def build_rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
 
 
 def find_row_ending_cell(layout: Rows, cell: jax.Array) -> jax.Array:
-    """Flat index of the last row inside each of the given cells (K,); -1 for cell -1."""
+    """Return the flat index of the last row inside each of the given cells (K,); -1 for cell -1."""
     segment = (cell[:, None] >= layout.first_cell[None, 1:]).sum(1)
     row = layout.first_chunk[segment] * CHUNK + cell - layout.first_cell[segment]
     return jnp.where(cell < 0, -1, row)

@@ -39,7 +39,7 @@ class Piece(NamedTuple):
 
 @jax.custom_jvp
 def _polynomial(s: Array, c: Array) -> Array:
-    """``c[0] + c[1] s + c[2] s**2 + ...``: (S,).
+    """Return ``c[0] + c[1] s + c[2] s**2 + ...``: (S,).
 
     Its derivative in s is given as a polynomial too. Differentiated by JAX, Horner's scheme carries a tangent through
     each of its steps in every direction: with a reference signal a quarter of an evaluation went into that.
@@ -71,7 +71,7 @@ class Model:
         self.tableau = get_tableau(structure.solver)
 
     def parameters(self, p: Array) -> Mapping[str, Array]:
-        """The dict the user's functions get."""
+        """Return the dict the user's functions get."""
         named: dict[str, Array] = {}
         fixed = iter(self.arguments.fixed)
         position = 0
@@ -85,7 +85,7 @@ class Model:
         return named
 
     def field(self, mode: int, piece: Piece) -> Field:
-        """Vector field of a mode inside one cell."""
+        """Return the vector field of a mode inside one cell."""
         structure = self.structure
         function = structure.modes[mode]
 
@@ -104,7 +104,7 @@ class Model:
         return bool(self.structure.running or self.structure.references)
 
     def density(self, piece: Piece) -> Density:
-        """Sum of all running costs inside one cell, reference signals included."""
+        """Return the sum of all running costs inside one cell, reference signals included."""
 
         def ell(t: Array, x: Array, p: Array) -> Array:
             total = jnp.zeros(())
@@ -118,7 +118,7 @@ class Model:
         return ell
 
     def reference_residuals(self, piece: Piece) -> list[Callable[[Array, Array, Array], Array]]:
-        """``y(t, x, p) - y_m(t)`` of each reference signal, (q,)."""
+        """Return ``y(t, x, p) - y_m(t)`` of each reference signal, (q,)."""
         ends = np.cumsum([0, *(channels for _, channels in self.structure.references)]).tolist()
         return [
             partial(self._reference_residual, k, slice(first, last), piece)
@@ -129,29 +129,31 @@ class Model:
         return self.observe(self.structure.references[k][0], t, x, p) - piece(t)[channels]
 
     def observe(self, observe: Function | None, t: Array, x: Array, p: Array) -> Array:
-        """What a sensor sees: (q,)."""
+        """Return what a sensor sees: (q,)."""
         return x if observe is None else observe(t, x, self.parameters(p))
 
     def sample_residual(self, k: int, sample: Samples, x: Array, p: Array) -> Array:
-        """``h - y`` of one sample of the k-th Measurements, 0 where it is missing: (q,)."""
+        """Return ``h - y`` of one sample of the k-th Measurements, 0 where it is missing: (q,)."""
         sensor = self.structure.measurements[k]
         h = self.observe(sensor.observe, sample.time, x, p)
         return jnp.where(sample.weight > 0, h - sample.value, 0.0)
 
     def correct_delay(self, k: int, sample: Samples, p: Array) -> Samples:
-        """A late sample with the time of the state that it is of, ``t - delay``, in place of its own."""
+        """Return a late sample with the time of the state that it is of, ``t - delay``, in place of its own."""
         delay = self.structure.measurements[k].delay
         return sample if delay is None else sample._replace(time=sample.time - self.parameters(p)[delay])
 
     def log_sigma(self, k: int, sample: Samples, p: Array) -> Array:
-        """Logarithm of the sigma of each channel that is a parameter and has a value in this sample, else 0: (q,)."""
+        """Return the logarithm of the sigma of each channel that is a parameter and has a value in this sample, else 0:
+        (q,).
+        """
         named = self.structure.measurements[k].sigma
         parameters = self.parameters(p)
         sigma = [jnp.ones(()) if name is None else parameters[name] for name in named]
         return jnp.where(sample.weight > 0, jnp.log(jnp.stack(sigma)), 0.0)
 
     def sample_cost(self, k: int, sample: Samples, x: Array, p: Array) -> Array:
-        """``1/2 sum C**2 rho(((h - y) / sigma)**2 / C**2) + sum log sigma`` of one sample.
+        """Return ``1/2 sum C**2 rho(((h - y) / sigma)**2 / C**2) + sum log sigma`` of one sample.
 
         Without a robust loss rho is the identity; log sigma is there where sigma is a parameter.
         """
@@ -165,7 +167,7 @@ class Model:
         return jnp.sum(0.5 * robust(sensor.loss, sensor.loss_scale, u, jnp) + log_sigma)
 
     def sample_information(self, k: int, sample: Samples, x: Array, p: Array) -> Array:
-        """Weight of each channel of one sample in the Gauss-Newton matrix, ``rho' / sigma**2``: (q,)."""
+        """Return the weight of each channel of one sample in the Gauss-Newton matrix, ``rho' / sigma**2``: (q,)."""
         sensor = self.structure.measurements[k]
         weight = sample.weight
         if sensor.sigma:
@@ -176,18 +178,18 @@ class Model:
         return weight * influence(sensor.loss, sensor.loss_scale, weight * r * r, jnp)
 
     def terminal(self, x: Array, p: Array) -> Array:
-        """Sum of the terminal costs."""
+        """Return the sum of the terminal costs."""
         total = jnp.zeros(())
         for phi in self.structure.terminal:
             total = total + phi(x, self.parameters(p))
         return total
 
     def reset(self, i: int) -> Callable[[Array, Array, Array], Array]:
-        """Reset map R_i(t, x, p) of transition i, which must have one."""
+        """Return the reset map R_i(t, x, p) of transition i, which must have one."""
         return self._at_transition(self.structure.reset_maps[i], f"transition {i + 1} has no reset map.")
 
     def guard(self, i: int) -> Callable[[Array, Array, Array], Array]:
-        """Guard g_i(t, x, p) of transition i, which must have one."""
+        """Return the guard g_i(t, x, p) of transition i, which must have one."""
         return self._at_transition(self.structure.guards[i], f"transition {i + 1} has no guard.")
 
     def _at_transition(self, function: Function | None, missing: str) -> Callable[[Array, Array, Array], Array]:
@@ -196,12 +198,12 @@ class Model:
         return lambda t, x, p: function(t, x, self.parameters(p))
 
     def terminal_constraint(self, x: Array, p: Array) -> Array:
-        """All terminal constraints in one: (m,)."""
+        """Return all terminal constraints in one: (m,)."""
         parts = [psi(x, self.parameters(p)) for psi in self.structure.terminal_constraints]
         return jnp.concatenate([part.reshape(-1) for part in parts])
 
     def initial_state(self, p: Array) -> Array:
-        """x(t0), (n,)."""
+        """Return x(t0), (n,)."""
         if self.structure.initial_state is None:
             unknown = self.structure.unknown_states
             x0 = self.arguments.initial_state
@@ -210,7 +212,7 @@ class Model:
 
 
 def apply_weights(W: Array, r: Array) -> Array:
-    """``W r`` for a W given by its diagonal (q,) or in full (q, q); r is (q,) or (q, D)."""
+    """Return ``W r`` for a W given by its diagonal (q,) or in full (q, q); r is (q,) or (q, D)."""
     if W.ndim == 2:
         return W @ r
     return W * r if r.ndim == 1 else W[:, None] * r

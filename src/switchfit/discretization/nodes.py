@@ -28,7 +28,7 @@ class TransitionKind(NamedTuple):
     Attributes
     ----------
     name : str
-        The field of `Structure` that has its function for each transition, None where there is none.
+        The field of `Structure` that has its function for each transition, None where it has no such function.
     constraint : bool
         Whether its function has to be zero; else it is a cost.
     """
@@ -70,12 +70,12 @@ def _at_transitions(model: Model, constraint: bool) -> list[tuple[int, NodeFunct
 
 
 def get_end_cost(model: Model) -> NodeFunction | None:
-    """Return the sum of the terminal costs; None if there are none."""
+    """Return the sum of the terminal costs; None without any."""
     return (lambda t, x, p: model.terminal(x, p)) if model.structure.terminal else None
 
 
 def get_end_constraints(model: Model) -> NodeFunction | None:
-    """Return all terminal constraints in one, which returns (m,); None if there are none."""
+    """Return all terminal constraints in one, which returns (m,); None without any."""
     if not model.structure.terminal_constraints:
         return None
     return lambda t, x, p: model.terminal_constraint(x, p)

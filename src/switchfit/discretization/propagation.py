@@ -39,24 +39,24 @@ class Path(NamedTuple):
     slopes: Array
 
     def at_transition(self, i: int) -> tuple[Array, Array]:
-        """tau_i and x(tau_i-) of transition i (from 0): (), (n,)."""
+        """Return tau_i and x(tau_i-) of transition i (from 0): (), (n,)."""
         return self.layout.end[self.layout.first_chunk[i + 1] - 1, -1], self.before_transition(i)
 
     def at_end(self) -> tuple[Array, Array]:
-        """tf and x(tf): (), (n,)."""
+        """Return tf and x(tf): (), (n,)."""
         return self.layout.end[-1, -1], self.after[-1, -1]
 
     def before_transition(self, i: Array | int) -> Array:
-        """x(tau_i-), the state before the reset map of transition i (from 0): (n,)."""
+        """Return x(tau_i-), the state before the reset map of transition i (from 0): (n,)."""
         return self.after[self.layout.first_chunk[jnp.asarray(i) + 1] - 1, -1]
 
     def at_samples(self, cell: Array) -> Array:
-        """State at the ends of the given cells (K,), the one before a jump: (K, n)."""
+        """Return the state at the ends of the given cells (K,), the one before a jump: (K, n)."""
         return pick_at_cells(self.layout, self.before[0, 0], self.after, cell)
 
 
 def flatten_rows(values: Array) -> Array:
-    """Values (Q, C, ...) as (Q C, ...): one entry a row."""
+    """Return values (Q, C, ...) as (Q C, ...): one entry a row."""
     return values.reshape((values.shape[0] * values.shape[1], *values.shape[2:]))
 
 
@@ -102,7 +102,7 @@ def propagate(model: Model, tau: Array, p: Array, side: Array) -> Path:
 
 
 def apply_reset(model: Model, tau: Array, x: Array, p: Array, segment: Array, opens: Array) -> Array:
-    """``x(tau+) = R(tau, x(tau-), p)`` where a chunk opens a segment whose transition has a reset map."""
+    """Return x(tau+), ``R(tau, x(tau-), p)`` where a chunk opens a segment whose transition has a reset map."""
     resets = model.structure.resets
     if not resets:
         return x
@@ -145,7 +145,7 @@ def add_point_costs(model: Model, path: Path, p: Array) -> Array:
 
 
 def add_sample_costs(model: Model, path: Path, p: Array) -> Array:
-    """Sum of the costs of all discrete samples."""
+    """Return the sum of the costs of all discrete samples."""
     total = jnp.zeros(())
     for k, samples in enumerate(model.arguments.samples):
         if model.structure.measurements[k].delay is None:
@@ -159,7 +159,7 @@ def add_sample_costs(model: Model, path: Path, p: Array) -> Array:
 
 
 def find_late_rows(model: Model, path: Path, k: int, p: Array) -> tuple[Array, Array, Piece, Array, Array]:
-    """The rows with ``start < t - delay <= end`` for the samples of the k-th Measurements, which is late.
+    """Return the rows with ``start < t - delay <= end`` for the samples of the k-th Measurements, which is late.
 
     Returns
     -------
@@ -180,7 +180,7 @@ def find_late_rows(model: Model, path: Path, k: int, p: Array) -> tuple[Array, A
 def step_to_late_sample(
     model: Model, k: int, sample: Samples, segment: Array, piece: Piece, start: Array, x: Array, p: Array
 ) -> tuple[Samples, Array]:
-    """One late sample with the time of the state that it is of, and that state, one step from `start`: (n,)."""
+    """Return one late sample with the time of the state that it is of, and that state, one step from `start`: (n,)."""
     there = model.correct_delay(k, sample, p)
 
     def through(mode: int) -> Callable[..., Array]:

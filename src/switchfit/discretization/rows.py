@@ -153,7 +153,7 @@ def adjoint(tableau: Tableau, h: Array, psi: Array, pull: Pull) -> Adjoint:
 def length_factor(
     tableau: Tableau, psi: Array, mu: Sequence[Array], slopes: Sequence[Array], densities: Sequence[Array]
 ) -> Array:
-    """What the length of a row multiplies in the cost to go, V: (). Given K_j' and ell_j', its derivative.
+    """Return what the length of a row multiplies in the cost to go, V: (). Given K_j' and ell_j', its derivative.
 
     V is linear in the slopes K_j (n,) and the densities ell_j ().
     """
@@ -168,7 +168,7 @@ def length_factor(
 
 
 def times_derivative(tableau: Tableau, start_d: Array, end_d: Array) -> list[Array]:
-    """Derivatives of the times of the stages, ``start' + c_j h'``: s entries ()."""
+    """Return the derivatives of the times of the stages, ``start' + c_j h'``: s entries ()."""
     h_d = end_d - start_d
     return [start_d + c * h_d for c in tableau.c.tolist()]
 
@@ -186,7 +186,7 @@ def combine(weights: Sequence[float] | FloatArray, terms: Sequence[Array] | Floa
 
 
 def times_vector(A: Array, v: Array) -> Array:
-    """``A v`` for small A (m, n) and v (n,): products and a sum, without the overhead of a call to a library."""
+    """Return ``A v`` for small A (m, n) and v (n,): products and a sum, without the overhead of a call to a library."""
     return (A * v[None]).sum(-1)
 
 

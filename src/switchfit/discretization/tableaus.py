@@ -20,7 +20,7 @@ class Tableau(NamedTuple):
 
 
 def butcher() -> Tableau:
-    """Butcher (1964), order 5 with six stages.
+    """Return the tableau of Butcher (1964), order 5 with six stages.
 
     All weights are positive or zero, so that the integral of a positive running cost is positive whatever the step;
     those of Dormand and Prince are not.
@@ -35,7 +35,9 @@ def butcher() -> Tableau:
 
 
 def radau_iia() -> Tableau:
-    """Radau IIA of order 5 with three stages (Hairer and Wanner II, table IV.5.6): L-stable, stiffly accurate."""
+    """Return the tableau of Radau IIA of order 5 with three stages (Hairer and Wanner II, table IV.5.6): L-stable,
+    stiffly accurate.
+    """
     r = np.sqrt(6.0)
     a = np.array(
         [

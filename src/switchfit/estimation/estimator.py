@@ -156,7 +156,7 @@ class Estimate(Fit):
         return self.evaluator_at_solution()(self.theta, matrix="gauss-newton").hessian
 
     def has_room_for_sensitivities(self) -> bool:
-        """Whether the derivatives of states and outputs at all nodes take less memory than `MOST_SENSITIVITIES`.
+        """Return whether the derivatives of states and outputs at all nodes take less memory than `MOST_SENSITIVITIES`.
 
         See Also
         --------
@@ -186,7 +186,7 @@ class Estimate(Fit):
         return tuple(compute_sensitivity(evaluator.problem, e, self.theta, mesh) for e, mesh in meshes)
 
     def evaluator_at_solution(self) -> Evaluator:
-        """The problem on the meshes of the fit.
+        """Return the problem on the meshes of the fit.
 
         Raises
         ------
@@ -214,7 +214,7 @@ class Estimate(Fit):
         return self.evaluator or Evaluator(self.problem, theta=self.theta)
 
     def profile(self, name: str, *, level: float = 0.95, callback: Progress | None = None) -> Profile:
-        """Profile likelihood of one parameter or transition time, see `switchfit.profile`.
+        """Return the profile likelihood of one parameter or transition time, see `switchfit.profile`.
 
         Parameters
         ----------
@@ -241,7 +241,7 @@ class Estimate(Fit):
         return format_text(self)
 
     def plot(self, *, bands: bool = True, level: float = 0.95) -> Any:
-        """Measured against fitted over time with the modes shaded, as a matplotlib Figure.
+        """Draw measured against fitted over time with the modes shaded, as a matplotlib Figure.
 
         Parameters
         ----------
@@ -268,7 +268,7 @@ class Estimate(Fit):
         return draw_figure(self, bands=bands, level=level)
 
     def predict(self, times: ArrayLike | None = None, *, experiment: int = 0) -> Prediction:
-        """States and outputs at any times with their standard errors and bands, see `switchfit.predict`.
+        """Return states and outputs at any times with their standard errors and bands, see `switchfit.predict`.
 
         Parameters
         ----------
@@ -297,7 +297,7 @@ class Estimate(Fit):
         return diagnose(self)
 
     def plot_residuals(self) -> Any:
-        """Residuals in time, their autocorrelation and their quantiles, as a matplotlib Figure.
+        """Draw residuals in time, their autocorrelation and their quantiles, as a matplotlib Figure.
 
         See Also
         --------
@@ -343,7 +343,7 @@ class Estimate(Fit):
         save_fit(self.complete(), self.certificate, file)
 
     def complete(self) -> Estimate:
-        """The same with everything that is saved, which is the Gauss-Newton matrix.
+        """Return the same with everything that is saved, which is the Gauss-Newton matrix.
 
         See Also
         --------
@@ -537,7 +537,7 @@ def check_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:
 
 
 def _prepare_start(problem: Problem, start: ArrayLike | None) -> tuple[FloatArray, Evaluator]:
-    """Where a fit begins (d,), guarded transitions on their guards if that is near, and the meshes for it."""
+    """Return where a fit begins (d,), guarded transitions on their guards if that is near, and the meshes for it."""
     theta = problem.check_theta(start, "start")
     evaluator = evaluator_of(problem) if start is None else Evaluator(problem, theta)
     placed = place_on_near_guards(evaluator, theta)
@@ -547,7 +547,8 @@ def _prepare_start(problem: Problem, start: ArrayLike | None) -> tuple[FloatArra
 
 
 def _refine(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:
-    """The problem on finer meshes: cells cut in two, or, where that is not enough, refined at the start and at theta.
+    """Return the problem on finer meshes: cells cut in two, or, where that is not enough, refined at the start and at
+    theta.
 
     A mode that has come to be active in another part of the horizon may find cells there that are far too long for it.
     """

@@ -127,7 +127,7 @@ def load_fit(path: Path) -> tuple[Fit, Certificate]:
 
 
 def _to_json(record: Any, kind: type) -> Any:
-    """A dataclass by the fields of `kind` in terms of dict, list, str, int, finite float, bool and None."""
+    """Return a dataclass by the fields of `kind` in terms of dict, list, str, int, finite float, bool and None."""
     from pydantic_core import to_json  # here, since importing it takes longer than a small fit
 
     values = {f.name: getattr(record, f.name) for f in fields(kind)}
@@ -144,7 +144,7 @@ def _array_to_json(value: Any) -> Any:
 
 
 def _lay_out(value: Any, indent: str = "") -> str:
-    """JSON with one entry of an object or one row of an array on a line."""
+    """Return JSON with one entry of an object or one row of an array on a line."""
     deeper = indent + "  "
     if isinstance(value, dict) and value:
         entries = [f"{json.dumps(name)}: {_lay_out(entry, deeper)}" for name, entry in value.items()]
@@ -164,7 +164,7 @@ def _refuse_constant(name: str) -> NoReturn:
 
 
 def _refuse_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object, none of whose names stands there twice."""
+    """Return an object, none of whose names stands there twice."""
     found = dict(pairs)
     if len(found) < len(pairs):
         names = [name for name, _ in pairs]
@@ -173,7 +173,7 @@ def _refuse_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _from_json(kind: type, content: Any, where: str) -> Any:
-    """A dataclass from JSON; ValueError that says which entry is wrong."""
+    """Return a dataclass from JSON; ValueError that says which entry is wrong."""
     import pydantic
 
     try:
@@ -184,14 +184,16 @@ def _from_json(kind: type, content: Any, where: str) -> Any:
 
 @cache
 def _make_adapter(kind: type) -> Any:
-    """pydantic's validator of a dataclass."""
+    """Return pydantic's validator of a dataclass."""
     import pydantic
 
     return pydantic.TypeAdapter(_convert_hint(kind))
 
 
 def _convert_hint(hint: Any) -> Any:
-    """The type hint of a field as pydantic is to read it from JSON: arrays, names of statuses, lists for tuples."""
+    """Return the type hint of a field as pydantic is to read it from JSON: arrays, names of statuses,
+    lists for tuples.
+    """
     from pydantic import AfterValidator, BeforeValidator, ConfigDict, PlainValidator, Strict, create_model
 
     origin, inner = get_origin(hint), get_args(hint)
@@ -219,7 +221,7 @@ def _convert_hint(hint: Any) -> Any:
 
 
 def _as_dataclass(kind: type) -> Any:
-    """pydantic's step from a model with the fields of a dataclass to that dataclass."""
+    """Return pydantic's step from a model with the fields of a dataclass to that dataclass."""
     from pydantic import AfterValidator
 
     names = [f.name for f in fields(kind)]
@@ -237,7 +239,7 @@ def _read_member(kind: type[Enum], value: Any) -> Enum:
 
 
 def _read_array(declared: np.dtype[Any], value: Any) -> NDArray[Any]:
-    """An array of the declared type from a list of numbers, or from its dtype, shape and values."""
+    """Return an array of the declared type from a list of numbers, or from its dtype, shape and values."""
     if isinstance(value, dict):
         array = _read_described_array(value)
     elif declared.kind == "f":
@@ -251,12 +253,12 @@ def _read_array(declared: np.dtype[Any], value: Any) -> NDArray[Any]:
 
 
 def _read_described_array(value: dict[str, Any]) -> NDArray[Any]:
-    """An array from its dtype, shape and values."""
+    """Return an array from its dtype, shape and values."""
     if set(value) != {"dtype", "shape", "values"}:
         raise ValueError(f"must be an array; got {_shorten(value)}")
     name = _require_type(value["dtype"], str)
     if not DTYPES.fullmatch(name):  # NumPy knows others, some of which it only warns of
-        raise ValueError(f"has the dtype {name!r}, which is none of numbers or text")
+        raise ValueError(f"has the dtype {name!r}, which is neither of numbers nor of text")
     try:
         dtype = np.dtype(name)
     except TypeError as error:
@@ -282,7 +284,7 @@ def _build_array(values: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
 
 
 def _read_numbers(value: Any) -> Any:
-    """Nested lists of floats."""
+    """Return nested lists of floats."""
     if isinstance(value, list):
         return [_read_numbers(entry) for entry in value]
     return _read_number(value)
@@ -296,7 +298,7 @@ def _read_number(value: Any) -> float:
 
 
 def _require_type(value: Any, kind: type) -> Any:
-    """`value`, which has to be exactly of a JSON type."""
+    """Return `value`, which has to be exactly of a JSON type."""
     if type(value) is not kind:
         words = {list: "a list", str: "a string", int: "an integer", bool: "true or false"}
         raise ValueError(f"must be {words[kind]}; got {_shorten(value)}")
@@ -304,7 +306,7 @@ def _require_type(value: Any, kind: type) -> Any:
 
 
 def _check_text(value: str) -> str:
-    """`value`; ValueError for half of a surrogate pair, which can be written as JSON, but is no text."""
+    """Return `value`; ValueError for half of a surrogate pair, which can be written as JSON, but is no text."""
     value.encode()
     return value
 
@@ -326,7 +328,7 @@ WORDS = {
 
 
 def _describe_error(error: Mapping[str, Any], content: Any, top: str) -> str:
-    """One of pydantic's errors: where, what is wrong, what was given."""
+    """Return one of pydantic's errors as a sentence: where, what is wrong, what was given."""
     kind, given = error["type"], error["input"]
     where = _describe_place(error["loc"], content, top)
     if kind == "missing":
@@ -343,7 +345,7 @@ def _describe_error(error: Mapping[str, Any], content: Any, top: str) -> str:
 
 
 def _describe_place(loc: Iterable[Any], content: Any, top: str) -> str:
-    """The path of an entry, as in ``fit.history[1].cost``; what pydantic adds to a path is left out."""
+    """Return the path of an entry, as in ``fit.history[1].cost``; what pydantic adds to a path is left out."""
     where, value = top, content
     for step in loc:
         if isinstance(value, list) and isinstance(step, int):
@@ -395,7 +397,7 @@ def _upgrade_certificate(certificate: dict[str, Any], fit: dict[str, Any]) -> No
 
 
 def _find_transitions(fit: dict[str, Any]) -> tuple[list[str], list[Any]]:
-    """Names of the runs, and where the transition times stand in theta, from the names of the unknowns.
+    """Return names of the runs, and where the transition times stand in theta, from the names of the unknowns.
 
     The free ones stand first, in their order, called ``tau_i`` or ``run.tau_i``.
     """
@@ -417,7 +419,7 @@ def _find_transitions(fit: dict[str, Any]) -> tuple[list[str], list[Any]]:
 
 
 def _list_possible_constraints(fit: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Every linear constraint that may be active, by the sentence that stands for it in version 3."""
+    """Return every linear constraint that may be active, by the sentence that stands for it in version 3."""
     found = {}
     for name, low, high in zip(fit["theta_names"], fit["lower"], fit["upper"], strict=False):
         for side, value in (("lower", low), ("upper", high)):
@@ -438,7 +440,7 @@ def _list_possible_constraints(fit: dict[str, Any]) -> dict[str, dict[str, Any]]
 
 
 def _check_fit(fit: Fit) -> None:
-    """ValueError if sizes, names or times do not fit one another."""
+    """Raise ValueError if sizes, names or times do not fit one another."""
     d, experiments = len(fit.theta_names), len(fit.trajectories)
     unknowns = f"since fit.theta_names has {d} entries"
     _check_size("fit.theta_units", fit.theta_units, (d,), unknowns)
@@ -514,13 +516,13 @@ def _check_size(where: str, value: Any, shape: tuple[int, ...], reason: str) -> 
 
 
 def _check_times(where: str, times: FloatArray) -> None:
-    """Times up to 1e100 in size, beyond which no axis can be drawn."""
+    """Raise ValueError for times above 1e100 in size, beyond which no axis can be drawn."""
     if times.ndim != 1 or not (np.abs(times) < 1e100).all() or np.any(np.diff(times) < 0):
         raise ValueError(f"{where} must be a list of finite numbers (below 1e100) that do not decrease")
 
 
 def _check_basis(basis: FloatArray, d: int) -> None:
-    """Columns of length 1 at right angles to one another."""
+    """Raise ValueError unless all columns have length 1 and are at right angles to one another."""
     if basis.ndim != 2 or basis.shape[0] != d or basis.shape[1] > d:
         raise ValueError(f"fit.free_basis must have {d} rows and at most as many columns; got the shape {basis.shape}")
     if not (np.abs(basis) <= 2).all() or not np.allclose(basis.T @ basis, np.eye(basis.shape[1]), atol=1e-6):

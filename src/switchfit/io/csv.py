@@ -56,7 +56,7 @@ def read_columns(path: str | Path, columns: Sequence[str]) -> FloatArray:
 
 
 def _read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Line number and stripped cells of each line that is neither empty nor a comment."""
+    """Yield the line number and stripped cells of each line that is neither empty nor a comment."""
     if is_device(path):
         raise InputError(f"{path} is a device; name a CSV file.")
     try:

@@ -114,22 +114,22 @@ class _Table(pydantic.BaseModel):
 
 
 def _number_as_table(given: Any) -> Any:
-    """``mu = 0.8`` means ``mu = { value = 0.8 }``."""
+    """Return ``{ value = 0.8 }`` for ``0.8``, the guess of an unknown."""
     return {"value": given} if isinstance(given, (int, float, list)) and not isinstance(given, bool) else given
 
 
 def _known_as_table(given: Any) -> Any:
-    """``0.5`` means ``{ value = 0.5, fixed = true }``: a state at t0 that is given as a number is known."""
+    """Return ``{ value = 0.5, fixed = true }`` for ``0.5``: a state at t0 that is given as a number is known."""
     return {"value": given, "fixed": True} if isinstance(given, (int, float)) and not isinstance(given, bool) else given
 
 
 def _name_as_table(given: Any) -> Any:
-    """``model = "skid_steer"`` means ``model = { name = "skid_steer" }``."""
+    """Return ``{ name = "skid_steer" }`` for ``"skid_steer"``, a model without arguments."""
     return {"name": given} if isinstance(given, str) else given
 
 
 def _table_as_list(given: Any) -> Any:
-    """One table where several may stand."""
+    """Return a list of tables, of one table a list of one."""
     return [given] if isinstance(given, dict) else given
 
 
@@ -348,7 +348,7 @@ def _validate(path: Path, given: dict[str, Any]) -> Contents:
 
 
 def _describe_error(error: pydantic.ValidationError) -> str:
-    """The first thing that is wrong, in words."""
+    """Return the first thing that is wrong, in words."""
     errors = sorted(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
     first = errors[0]
     table, steps = _follow_location(first["loc"])
@@ -367,7 +367,7 @@ def _describe_error(error: pydantic.ValidationError) -> str:
 
 
 def _follow_location(location: Sequence[str | int]) -> tuple[type[_Table] | None, list[str | int]]:
-    """The table that holds the key at a location, and the location without pydantic's names for unions."""
+    """Return the table that holds the key at a location, and the location without pydantic's names for unions."""
     table: type[_Table] | None = Contents
     holder = table
     steps: list[str | int] = []
@@ -398,7 +398,7 @@ def _find_table(annotation: Any) -> type[_Table] | None:
 
 
 def _join_steps(steps: Sequence[str | int]) -> str:
-    """``'experiments[1].data[2].file'``, counted from 1."""
+    """Return ``'experiments[1].data[2].file'``, counted from 1."""
     text = ""
     for step in steps:
         text += f"[{step + 1}]" if isinstance(step, int) else f".{step}" if text else step
@@ -412,7 +412,7 @@ def _get_description(table: type[_Table] | None, steps: Sequence[str | int]) -> 
 
 
 def _rephrase(error: Any) -> str:
-    """pydantic's message as the end of a sentence: 'Input should be a valid number' -> 'must be a number'."""
+    """Return pydantic's message as the end of a sentence: 'Input should be a valid number' -> 'must be a number'."""
     if error["type"] in ("too_short", "too_long"):
         bound, size = next((k, v) for k, v in error["ctx"].items() if k in ("min_length", "max_length"))
         return f"must have at {'least' if bound == 'min_length' else 'most'} {size} entries"
@@ -458,7 +458,7 @@ def _build_from_tables(path: Path, contents: Contents) -> Problem:
 
 
 def _build_experiments(path: Path, contents: Contents, system: HybridSystem | None) -> tuple[Experiment, ...]:
-    """The experiments; without a system their observations are left out."""
+    """Return the experiments; without a system their observations are left out."""
     experiments = []
     for k, table in enumerate(contents.experiments, start=1):
         where = f"{path}: experiments[{k}]"
@@ -509,7 +509,7 @@ def _check_model_name(what: str, table: ModelTable) -> None:
 
 
 def _check_arguments(factory: Callable[..., Any], table: ModelTable, what: str) -> dict[str, Any]:
-    """The arguments, if the factory takes them."""
+    """Return the arguments of a table; raise if the factory does not take them."""
     try:
         inspect.signature(factory).bind(**table.arguments)
     except TypeError as error:
@@ -519,7 +519,7 @@ def _check_arguments(factory: Callable[..., Any], table: ModelTable, what: str) 
 
 
 def _build_parameter(table: ParameterTable | TransitionTable | StateTable, **more: Any) -> Parameter:
-    """The unknown that a table describes."""
+    """Return the unknown that a table describes."""
     given = table.model_dump(exclude={"prior"})
     return Parameter(**given, prior=None if table.prior is None else _build_prior(table.prior), **more)
 
@@ -557,7 +557,7 @@ def _build_experiment(
 
 
 def _build_initial_state(table: ExperimentTable) -> list[Parameter] | list[float] | None:
-    """State at t0 for an Experiment: plain numbers where all of it is known."""
+    """Return the state at t0 for an Experiment: plain numbers where all of it is known."""
     if table.initial_state is None:
         return None
     if all(entry.fixed for entry in table.initial_state):
@@ -600,7 +600,7 @@ def _build_data(
 
 
 def _find_sigma_columns(table: DataTable, parameters: frozenset[str]) -> list[str]:
-    """The columns that hold sigma; none where it is numbers, or names of parameters."""
+    """Return the columns that hold sigma; none where it is numbers, or names of parameters."""
     given = table.sigma if isinstance(table.sigma, list) else []
     named = [entry for entry in given if isinstance(entry, str)]
     if not named or all(name in parameters for name in named):
@@ -643,7 +643,7 @@ def _read_log(folder: Path, table: LogTable, columns: Sequence[str]) -> tuple[Fl
 def _build_observe(
     folder: Path, table: DataTable, system: HybridSystem | None, where: str
 ) -> Callable[..., Any] | None:
-    """The observation h(t, x, p), or None for the whole state, and where there is no system to observe."""
+    """Return the observation h(t, x, p), or None for the whole state, and where there is no system to observe."""
     if table.observe is None:
         return None
     if isinstance(table.observe, str):
@@ -672,7 +672,7 @@ def _build_observe(
 
 @functools.cache
 def select_states(indices: tuple[int, ...]) -> Callable[..., Any]:
-    """The observation ``h(t, x, p) = x[indices]``; the same function for the same indices, so it compiles once.
+    """Return the observation ``h(t, x, p) = x[indices]``; the same function for the same indices, so it compiles once.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ from switchfit.runtime.files import is_regular
 
 
 def load_object(reference: str, folder: Path, what: str) -> Any:
-    """The object that ``"file.py:object"`` names.
+    """Return the object that ``"file.py:object"`` names.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def load_object(reference: str, folder: Path, what: str) -> Any:
 
 
 def find_object(reference: str, folder: Path, what: str) -> tuple[Path, str]:
-    """The file and the name that ``"file.py:object"`` stands for; the file is not run.
+    """Return the file and the name that ``"file.py:object"`` stands for; the file is not run.
 
     Parameters
     ----------
@@ -70,14 +70,14 @@ def call(function: Any, what: str, **arguments: Any) -> Any:
 
 
 def describe_error(error: BaseException) -> str:
-    """An exception with the place in a user's file it came from, as far as it has one."""
+    """Return an exception with the place in a user's file it came from, as far as it has one."""
     explained = error.__cause__ is not None and isinstance(error, ValueError)
     place, what = find_user_place(error), (str(error) if explained else get_first_line(error)).rstrip(".")
     return f"{place}: {what}" if place else what
 
 
 def find_user_place(error: BaseException | None) -> str | None:
-    """``"file.py, line 3, in slip"`` for the innermost frame that is in a file loaded by `load_object`.
+    """Return ``"file.py, line 3, in slip"`` for the innermost frame that is in a file loaded by `load_object`.
 
     The exception that caused this one goes first: it was raised further inside.
     """
@@ -97,7 +97,7 @@ def find_user_place(error: BaseException | None) -> str | None:
 
 
 def _use_double_precision() -> Any:
-    """Context in which what a file makes with jax.numpy is as precise as what it computes with later."""
+    """Return a context in which what a file makes with jax.numpy is as precise as what it computes with later."""
     import jax  # here, since a file that is only read needs none of it
 
     return jax.enable_x64(True)
@@ -111,7 +111,7 @@ _modules: dict[str, tuple[int, Any]] = {}
 
 
 def _run(path: Path) -> Any:
-    """The module that a file makes; a file that several keys name runs once while it does not change."""
+    """Return the module that a file makes; a file that several keys name runs once while it does not change."""
     key = str(path.resolve())
     stamp = path.stat().st_mtime_ns
     if key in _modules and _modules[key][0] == stamp:

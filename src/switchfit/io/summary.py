@@ -14,7 +14,7 @@ from switchfit.report.tables import format_table
 
 
 def describe(problem: Problem) -> str:
-    """Experiments, data and unknowns of a problem as text.
+    """Return experiments, data and unknowns of a problem as text.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def describe(problem: Problem) -> str:
 
 
 def describe_experiments(experiments: Sequence[Experiment]) -> str:
-    """Modes, horizon and data of experiments as text.
+    """Return modes, horizon and data of experiments as text.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def _describe_experiment(experiment: Experiment) -> list[str]:
 
 
 def _describe_sensor(item: Measurements, unit: str) -> str:
-    """What is to be said of delay, noise and loss, where there is anything."""
+    """Return what is to be said of delay, noise and loss, where there is anything."""
     named = sorted({name for name in item.sigma_names if name})
     said = [
         f"late by {item.delay}{'' if isinstance(item.delay, str) else unit}" if item.delay else "",

@@ -61,6 +61,6 @@ def _off(t: Any, x: Any, p: Any) -> Any:
 
 
 def _temperature(times: Any) -> Any:
-    """The closed form of the solution with `OFF` and `LOSS`."""
+    """Return the closed form of the solution with `OFF` and `LOSS`."""
     on = np.minimum(times, OFF)
     return 10.0 / LOSS * (1.0 - np.exp(-LOSS * on)) * np.exp(-LOSS * (times - on))

@@ -28,7 +28,7 @@ SMALL_SLIP = 1e-3
 
 
 def longitudinal_force(slip: Any, load: Any, p: Mapping[str, Any]) -> Any:
-    """Longitudinal force of a tyre (N) at a slip ratio in % and a load in kN; `p` holds a_x1 to a_x8."""
+    """Return the longitudinal force of a tyre (N) at a slip ratio in % and a load in kN; `p` holds a_x1 to a_x8."""
     a_1, a_2, a_3, a_4, a_5, a_6, a_7, a_8 = (p[f"a_x{i}"] for i in range(1, 9))
     D = a_1 * load**2 + a_2 * load
     BCD = (a_3 * load**2 + a_4 * load) * jnp.exp(-a_5 * load)
@@ -37,7 +37,7 @@ def longitudinal_force(slip: Any, load: Any, p: Mapping[str, Any]) -> Any:
 
 
 def lateral_force(angle: Any, load: Any, p: Mapping[str, Any]) -> Any:
-    """Lateral force of a tyre (N) at a slip angle in degrees and a load in kN; `p` holds a_y1 to a_y8."""
+    """Return the lateral force of a tyre (N) at a slip angle in degrees and a load in kN; `p` holds a_y1 to a_y8."""
     a_1, a_2, a_3, a_4, a_5, a_6, a_7, a_8 = (p[f"a_y{i}"] for i in range(1, 9))
     D = a_1 * load**2 + a_2 * load
     BCD = a_3 * jnp.sin(a_4 * jnp.arctan(a_5 * load))
@@ -64,7 +64,7 @@ def magic_formula(
     b: float = 0.23,
     g: float = 9.81,
 ) -> HybridSystem:
-    r"""The vehicle of `skid_steer` on tyres of the Magic Formula, driven by wheel speeds; one mode, ``"drive"``.
+    r"""Return the vehicle of `skid_steer` on tyres of the Magic Formula, driven by wheel speeds; one mode, ``"drive"``.
 
     The input ``u`` holds the angular velocities w1 to w4 of the wheels (rad/s). Wheels 1 and 4 are those on the right
     (front and rear), 2 and 3 those on the left, as in equation (18): more speed on 1 and 4 turns to the left. With the
@@ -130,7 +130,7 @@ def _drive(
     b: float,
     g: float,
 ) -> Callable[..., Any]:
-    """Vector field; the same function for the same constants, so that nothing is compiled twice."""
+    """Return the vector field; the same function for the same constants, so that nothing is compiled twice."""
     m = m_b + 4 * m_w
     inertia = m_b * (B_l**2 + B_w**2) / 12 + 4 * m_w * (a**2 + b**2)
     load = 1e-3 * g * m / 4

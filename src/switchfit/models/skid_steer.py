@@ -30,7 +30,8 @@ def skid_steer(
     c_2: float = 0.92,
     g: float = 9.81,
 ) -> HybridSystem:
-    r"""A vehicle with four driven wheels that turns by skidding, modes ``"stick"`` and ``"slip"``, equation (18).
+    r"""Return a vehicle with four driven wheels that turns by skidding, modes ``"stick"`` and ``"slip"``, equation
+    (18).
 
     With ``m = m_b + 4 m_w``, ``F`` the sum of the wheel forces and the lateral velocity
     ``v = -sin(theta) dX + cos(theta) dY``:
@@ -107,7 +108,9 @@ def _functions(
     c_2: float,
     g: float,
 ) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
-    """Vector fields and reset map; the same functions for the same constants, so that nothing is compiled twice."""
+    """Return vector fields and reset map; the same functions for the same constants, so that nothing is
+    compiled twice.
+    """
     m = m_b + 4 * m_w
     inertia = 4 * m_w * (12 * a**2 + 12 * b**2) + m_b * (B_l**2 + B_w**2)
     total_stick, total_slip = sum(stick_forces), sum(slip_forces)

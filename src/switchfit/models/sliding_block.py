@@ -12,7 +12,7 @@ from switchfit.problem.system import HybridSystem
 
 
 def sliding_block(*, g: float = 9.81) -> HybridSystem:
-    r"""A body sliding on a level plane, modes ``"slide"`` and ``"stick"``, state ``(x, y, vx, vy)``.
+    r"""Return a body sliding on a level plane, modes ``"slide"`` and ``"stick"``, state ``(x, y, vx, vy)``.
 
     Friction acts against the velocity and so along it: the body stays on a straight line. With ``e`` the unit
     vector along the initial velocity ``(vx0, vy0)``,
@@ -51,7 +51,7 @@ def sliding_block(*, g: float = 9.81) -> HybridSystem:
 
 @cache
 def _functions(g: float) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
-    """Vector fields and initial state; the same functions for the same g, so that nothing is compiled twice."""
+    """Return vector fields and initial state; the same functions for the same g, so that nothing is compiled twice."""
 
     def slide(t: Any, x: Any, p: Any) -> Any:
         speed = jnp.sqrt(p["vx0"] ** 2 + p["vy0"] ** 2)

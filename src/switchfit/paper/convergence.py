@@ -29,7 +29,7 @@ KEPT = 300
 
 
 def thin(fit: Estimate) -> list[list[Any]]:
-    """Iterations and norms of the gradient; of a long history those evenly spaced in the logarithm."""
+    """Return iterations and norms of the gradient; of a long history those evenly spaced in the logarithm."""
     norms = [record.optimality for record in fit.history]
     last = len(norms) - 1
     kept = np.arange(last + 1) if last < KEPT else np.unique(np.geomspace(1, last + 1, KEPT).astype(int)) - 1
@@ -37,7 +37,7 @@ def thin(fit: Estimate) -> list[list[Any]]:
 
 
 def compute(quick: bool, folder: Path, say: Say) -> Found:
-    """Every algorithm to 1e-7."""
+    """Fit with every algorithm, to 1e-7."""
     problem = build_simulated_problem()
     found: Found = {
         "truth": list(TRUTH),
@@ -55,7 +55,7 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
 
 
 def draw_histories(ax: Axes, fits: Found) -> Axes:
-    """Norm of the gradient against iteration, both logarithmic, for several algorithms."""
+    """Draw the norm of the gradient against iteration, both logarithmic, for several algorithms."""
     for kind, fit in fits.items():
         iterations, norms = fit["history"]
         ax.loglog(np.array(iterations) + 1, np.maximum(norms, 1e-13), linewidth=1.2, **LOOKS[kind])
@@ -65,7 +65,7 @@ def draw_histories(ax: Axes, fits: Found) -> Axes:
 
 
 def convergence_figure(fits: Found) -> Figure:
-    """`draw_histories` as a figure of one column."""
+    """Return the figure of `draw_histories`, one column wide."""
     figure = new_figure(COLUMN, 3.0)
     draw_histories(figure.subplots(), fits)
     figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=6.5)
@@ -73,26 +73,26 @@ def convergence_figure(fits: Found) -> Figure:
 
 
 def draw(found: Found) -> dict[str, Figure]:
-    """Figure 4."""
+    """Draw figure 4."""
     return {"fig4-convergence": convergence_figure(found["fits"])}
 
 
 def order(history: list[list[float]]) -> float:
-    """Observed order of the last steps above rounding: log(e_{k+1}/e_k) / log(e_k/e_{k-1})."""
+    """Return the observed order of the last steps above rounding: log(e_{k+1}/e_k) / log(e_k/e_{k-1})."""
     norms = np.array([n for n in history[1] if n > 1e-10])
     slopes = np.diff(np.log(norms))
     return float(slopes[-1] / slopes[-2])
 
 
 def factor(history: list[list[float]]) -> float:
-    """Factor by which the norm of the gradient falls in one iteration, over the last half of them."""
+    """Return the factor by which the norm of the gradient falls in one iteration, over the last half of them."""
     iterations, norms = np.array(history)
     middle = int(np.searchsorted(iterations, iterations[-1] / 2))
     return float((norms[-1] / norms[middle]) ** (1 / (iterations[-1] - iterations[middle])))
 
 
 def rows(found: Found) -> list[Row]:
-    """Lines of the table."""
+    """Return the lines of the table."""
     fits = found["fits"]
     block, exact, first = fits["block-diagonal"], fits["exact"], fits["descent-first"]
     result = fits["exact"]["theta"]

@@ -35,7 +35,7 @@ NEAR = 1e-4
 
 
 def compute(quick: bool, folder: Path, say: Say) -> Found:
-    """The same fit on horizons of different lengths."""
+    """Do the same fit on horizons of different lengths."""
     runs, starts = (QUICK_RUNS, QUICK_STARTS) if quick else (RUNS, STARTS)
     found: Found = {"runs": runs, "starts": starts, "horizons": []}
     for tf in QUICK_ENDS if quick else ENDS:
@@ -45,7 +45,9 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
 
 
 def _horizon(tf: float, runs: int, starts: int, folder: Path) -> Found:
-    """Accuracy and conditioning with noisy positions; convergence of the noise-free fit of Fig. 4 from many starts."""
+    """Return accuracy and conditioning with noisy positions; convergence of the noise-free fit of Fig. 4 from many
+    starts.
+    """
     path = simulate_drive(tf=max(tf, HORIZON))
     times = np.arange(round(RATE * tf) + 1) / RATE
     names = NAMES if tf > TRUTH[1] else (NAMES[0], NAMES[2])
@@ -69,7 +71,7 @@ def _horizon(tf: float, runs: int, starts: int, folder: Path) -> Found:
 
 
 def _starts(d: int, tf: float, count: int) -> FloatArray:
-    """Ordered transition times all over the horizon and mu from 0.2 to 2, as a Sobol sequence spreads them."""
+    """Return ordered transition times all over the horizon and mu from 0.2 to 2, as a Sobol sequence spreads them."""
     from scipy.stats import qmc  # here, since it takes long to import
 
     cube = qmc.Sobol(d, seed=0).random(count)
@@ -79,7 +81,7 @@ def _starts(d: int, tf: float, count: int) -> FloatArray:
 
 
 def draw(found: Found) -> dict[str, Figure]:
-    """Accuracy, conditioning and region of convergence against the end of the horizon."""
+    """Draw accuracy, conditioning and region of convergence against the end of the horizon."""
     figure = new_figure(COLUMN, 5.6)
     accuracy, conditioning, region = figure.subplots(3, 1, sharex=True, height_ratios=(1.6, 1, 1))
     levels = found["horizons"]
@@ -107,7 +109,7 @@ def draw(found: Found) -> dict[str, Figure]:
 
 
 def rows(found: Found) -> list[Row]:
-    """Lines of the table."""
+    """Return the lines of the table."""
     remark = f"{RATE} Hz positions, sigma {SIGMA:g} m; {found['runs']} runs, {found['starts']} starts"
     return [
         Row(f"Horizon 0 to {level['tf']:g} s", "left for further analysis", _line(level), remark)

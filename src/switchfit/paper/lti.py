@@ -39,7 +39,9 @@ KINDS: tuple[HessianKind, ...] = ("none", "block-diagonal", "exact")
 
 
 def problem(start: tuple[float, float, float] = START) -> Problem:
-    """tau, k and c from the whole state; the reference is a spline through exact samples, broken at its switch."""
+    """Return tau, k and c from the whole state; the reference is a spline through exact samples, broken
+    at its switch.
+    """
     system = HybridSystem(
         modes={
             "free": lambda t, x, p: jnp.stack([x[1], -p["k"] * x[0]]),
@@ -77,7 +79,7 @@ def _matrix(k: Any, c: Any) -> Any:
 
 
 def exact(theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-    """J, its gradient and its Hessian from matrix exponentials, at tau before or at that of the truth."""
+    """Return J, its gradient and its Hessian from matrix exponentials, at tau before or at that of the truth."""
     with use_float64():
         cost, gradient, hessian = _exact(jnp.asarray(theta))
         return float(cost), np.asarray(gradient), np.asarray(hessian)
@@ -103,7 +105,7 @@ def _cost(theta: Any) -> Any:
 
 
 def compute(quick: bool, folder: Path, say: Say) -> Found:
-    """Derivatives against the closed form, and the three algorithms."""
+    """Return derivatives against the closed form, and the three algorithms."""
     here = problem()
     say("derivatives")
     ours = evaluate(here)
@@ -133,12 +135,12 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
 
 
 def draw(found: Found) -> dict[str, Figure]:
-    """Gradient norm against iteration."""
+    """Draw the gradient norm against iteration."""
     return {"lti": convergence_figure(found["fits"])}
 
 
 def rows(found: Found) -> list[Row]:
-    """Lines of the table."""
+    """Return the lines of the table."""
     fits = found["fits"]
     counts = {kind: str(fit["iterations"]) for kind, fit in fits.items()}
     J, g, H = found["gaps"]

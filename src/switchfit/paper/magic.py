@@ -42,7 +42,7 @@ ROUNDING = 1e-15
 
 
 def compute(quick: bool, folder: Path, say: Say) -> Found:
-    """The log, both fits of it, the Hessian in the 16 coefficients at the truth."""
+    """Return the log, both fits of it, the Hessian in the 16 coefficients at the truth."""
     say("simulating the vehicle on tyres")
     speeds = wheel_speeds()
     positions, path = log_on_tyres(SECONDS, speeds)
@@ -69,7 +69,7 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
 
 
 def _coefficients(speeds: Any, say: Say) -> Found:
-    """The Hessian in the 16 coefficients at their true values, each in units of its own value."""
+    """Return the Hessian in the 16 coefficients at their true values, each in units of its own value."""
     say("Hessian in the 16 coefficients")
     times = np.linspace(0.0, 15.0, 151)
     exact, _ = log_on_tyres(times, speeds)
@@ -87,7 +87,7 @@ def _coefficients(speeds: Any, say: Say) -> Found:
 
 
 def draw(found: Found) -> dict[str, Figure]:
-    """Figure 3: the paths, the yaw rates that explain the second transition, the eigenvalues."""
+    """Draw figure 3: the paths, the yaw rates that explain the second transition, the eigenvalues."""
     figure = new_figure(PAGE, 2.9)
     paths, yaw, spectrum = figure.subplots(1, 3, width_ratios=(1.2, 1.2, 1.0))
     reference, literal, reset = np.array(found["path"]), found["fits"]["continuous"], found["fits"]["reset"]
@@ -117,7 +117,7 @@ def draw(found: Found) -> dict[str, Figure]:
 
 
 def rows(found: Found) -> list[Row]:
-    """Lines of the table."""
+    """Return the lines of the table."""
     literal, reset = found["fits"]["continuous"], found["fits"]["reset"]
     ours, other = literal["theta"], reset["theta"]
     values = np.array(found["eigenvalues"])

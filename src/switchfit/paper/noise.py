@@ -42,7 +42,7 @@ FILTERED, DIRECT = "interpolated and filtered", "samples fitted directly"
 
 
 def problems() -> dict[str, Problem]:
-    """The two ways to fit the same samples."""
+    """Return the problems of the two ways to fit the same samples."""
     clean = states_at(simulate_drive(step=1.0), TIMES)[:, [0, 2]]
     return {
         FILTERED: stick_slip(gps_reference(TIMES, clean)),
@@ -51,7 +51,7 @@ def problems() -> dict[str, Problem]:
 
 
 def set_sigma(problem: Problem, sigma: float) -> Problem:
-    """The problem with another known noise; a reference signal has none."""
+    """Return the problem with another known noise; a reference signal has none."""
     (run,) = problem.experiments
     (data,) = run.data
     if not isinstance(data, Measurements) or sigma == 0:
@@ -60,7 +60,7 @@ def set_sigma(problem: Problem, sigma: float) -> Problem:
 
 
 def compute(quick: bool, folder: Path, say: Say) -> Found:
-    """Monte Carlo at every level, in both ways, from the paper's start."""
+    """Do a Monte Carlo study at every level of noise, in both ways, from the paper's start."""
     levels, runs = (QUICK_LEVELS, QUICK_RUNS) if quick else (LEVELS, RUNS)
     found: Found = {"sigma": list(levels), "runs": runs, "ways": {}}
     for way, problem in problems().items():
@@ -84,7 +84,7 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
 
 
 def _level(study: MonteCarlo, sigma: float, noise_free: FloatArray) -> Found:
-    """Percentiles of the estimates, errors and coverage at one level of noise."""
+    """Return percentiles of the estimates, errors and coverage at one level of noise."""
     theta = study.theta[study.success]
     normalised = study.errors / TRUTH
     return {
@@ -99,7 +99,7 @@ def _level(study: MonteCarlo, sigma: float, noise_free: FloatArray) -> Found:
 
 
 def _coverage(study: MonteCarlo, sigma: float) -> FloatArray:
-    """Part of the 95 % intervals that hold the truth: (3,).
+    """Return the part of the 95 % intervals that hold the truth: (3,).
 
     A reference signal has no noise model. What one would take for it: the integral is a sum over samples one second
     apart, so that J / sigma² times 1/s is minus the logarithm of a likelihood, and the covariance sigma² (1 s) H⁻¹.
@@ -114,7 +114,7 @@ def _coverage(study: MonteCarlo, sigma: float) -> FloatArray:
 
 
 def draw(found: Found) -> dict[str, Figure]:
-    """Figure 5, with the standard deviation on a second axis, and the coverage below."""
+    """Draw figure 5, with the standard deviation on a second axis, and the coverage below."""
     figure = new_figure(PAGE, 4.6)
     axes = figure.subplots(2, 3, sharex=True, height_ratios=(1.6, 1.0))
     variance = np.array(found["sigma"]) ** 2
@@ -153,7 +153,7 @@ def draw(found: Found) -> dict[str, Figure]:
 
 
 def rows(found: Found) -> list[Row]:
-    """Lines of the table."""
+    """Return the lines of the table."""
     filtered, direct = found["ways"][FILTERED], found["ways"][DIRECT]
     last, quarter = -1, found["sigma"].index(0.25)
     runs, sigma = found["runs"], found["sigma"][last]
@@ -207,7 +207,7 @@ def rows(found: Found) -> list[Row]:
 
 
 def _some(levels: list[Any]) -> list[Any]:
-    """The first level with noise, the middle one and the last."""
+    """Return the first level with noise, the middle one and the last."""
     return [levels[1], levels[len(levels) // 2], levels[-1]]
 
 

@@ -35,27 +35,27 @@ class Part(Protocol):
     TITLE: str
 
     def compute(self, quick: bool, folder: Path, say: Say) -> Found:
-        """What there is to find, as it is written to JSON; long studies keep what is done in `folder`."""
+        """Return what there is to find, as it is written to JSON; long studies keep what is done in `folder`."""
         ...
 
     def draw(self, found: Found) -> dict[str, Figure]:
-        """Figures by the name of their file."""
+        """Return figures by the name of their file."""
         ...
 
     def rows(self, found: Found) -> list[Row]:
-        """Lines of the table."""
+        """Return the lines of the table."""
         ...
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure with small type."""
+    """Return an empty figure with small type."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def tidy(ax: Axes, xlabel: str, ylabel: str, *, letter: str = "") -> Axes:
-    """Labels at a size for a column, thin frame, panel's letter."""
+    """Set labels at a size for a column, thin frame, panel's letter."""
     ax.set_xlabel(xlabel, fontsize=8)
     ax.set_ylabel(ylabel, fontsize=8)
     ax.tick_params(labelsize=7)
@@ -66,7 +66,7 @@ def tidy(ax: Axes, xlabel: str, ylabel: str, *, letter: str = "") -> Axes:
 
 
 def conditions(found: Found) -> str:
-    """The second-order sufficient conditions of one fit, in words."""
+    """Return the second-order sufficient conditions of one fit, in words."""
     if not found["sufficient"]:
         return "not satisfied"
     return f"satisfied: ‖DJ‖ = {found['gradient_norm']:.0e}, smallest eigenvalue {found['smallest_eigenvalue']:.3g}"

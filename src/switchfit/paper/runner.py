@@ -100,7 +100,7 @@ def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say | N
 
 
 def table(results: Mapping[str, Found]) -> str:
-    """The paper's numbers beside ours as Markdown, from the content of ``results.json``."""
+    """Return the paper's numbers beside ours as Markdown, from the content of ``results.json``."""
     lines = ["| claim | paper | switchfit | remark |", "|---|---|---|---|"]
     for name, entry in results.items():
         lines += [_line(row) for row in PARTS[name].rows(entry["found"])]
@@ -113,7 +113,7 @@ def table(results: Mapping[str, Found]) -> str:
 
 
 def _lines(results: Mapping[str, Found]) -> str:
-    """JSON with a line for each part."""
+    """Return JSON with a line for each part."""
     return "{\n" + ",\n".join(f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in results.items()) + "\n}\n"
 
 
@@ -122,7 +122,7 @@ def _line(row: Row) -> str:
 
 
 def _read_kept(path: Path) -> dict[str, Any] | None:
-    """The entry of a part that was done before; None if there is none, or a damaged one, which is set aside."""
+    """Return the entry of a part that was done before; None if it is missing, or damaged and set aside."""
     try:
         content = path.read_bytes()
     except FileNotFoundError:
@@ -144,7 +144,7 @@ def _digest(entry: dict[str, Any]) -> str:
 
 
 def _earlier(path: Path) -> dict[str, Any]:
-    """Results of parts that were run before; none if the file is missing, or damaged and therefore set aside."""
+    """Return results of parts that were run before; none if the file is missing, or damaged and therefore set aside."""
     try:
         earlier = json.loads(path.read_bytes())
     except FileNotFoundError:
@@ -161,7 +161,7 @@ def _earlier(path: Path) -> dict[str, Any]:
 
 
 def _save(figure: Any, path: Path) -> None:
-    """A figure as a file that is whole or not there."""
+    """Write a figure to a file, whole or not at all."""
     content = BytesIO()
     figure.savefig(content, dpi=200, format=path.suffix[1:])
     write_atomically(content.getvalue(), path)

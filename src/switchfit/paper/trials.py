@@ -34,7 +34,7 @@ LABELS = {
 
 
 def compute(quick: bool, folder: Path, say: Say) -> Found:
-    """Five logs, each fitted with both models of re-stick."""
+    """Fit five logs, each with both models of re-stick."""
     found: Found = {"trials": []}
     for number, (force, differential) in enumerate(TRIALS, start=1):
         say(f"trial {number}")
@@ -64,7 +64,7 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
 
 
 def draw(found: Found) -> dict[str, Figure]:
-    """Figure 6: raw points, filtered curve, initial and optimal trajectory of each trial, shifted along X."""
+    """Draw figure 6: raw points, filtered curve, initial and optimal trajectory of each trial, shifted along X."""
     return {
         "fig6-trials": _paths(found, "continuous"),
         "fig6-trials-reset": _paths(found, "reset"),
@@ -107,7 +107,7 @@ def _paths(found: Found, restick: str) -> Figure:
 
 
 def rows(found: Found) -> list[Row]:
-    """Lines of the table."""
+    """Return the lines of the table."""
     trials = found["trials"]
     lines = []
     for k, trial in enumerate(trials, start=1):

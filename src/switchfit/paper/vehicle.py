@@ -39,7 +39,7 @@ Restick = Literal["continuous", "reset"]
 
 
 def position(t: Any, x: Any, p: Any) -> Any:
-    """What GPS sees: (X, Y)."""
+    """Return what GPS sees: (X, Y)."""
     return x[jnp.array([0, 2])]
 
 
@@ -51,7 +51,9 @@ def stick_slip(
     stick_force: float = 15.0,
     restick: Restick = "continuous",
 ) -> Problem:
-    """The estimation problem of equation (18): the transition times and mu from `data`, in this order in `start`."""
+    """Return the estimation problem of equation (18): the transition times and mu from `data`, in this order in
+    `start`.
+    """
     system = skid_steer(stick_forces=(stick_force,) * 4, restick=restick)
     run = Experiment(data, SEQUENCE[: len(start)], start[:-1], 0.0, tf)
     return Problem(system, run, {"mu": Parameter(start[-1], lower=0.05, upper=2.0, unit="1")})
@@ -65,20 +67,21 @@ def simulate_drive(
     restick: Restick = "continuous",
     step: float = 0.1,
 ) -> Trajectory:
-    """What equation (18) does at given transition times and mu, with a node every `step` seconds."""
+    """Return what equation (18) does at given transition times and mu, with a node every `step` seconds."""
     times = step * np.arange(round(tf / step) + 1)
     nothing = Measurements(times, np.zeros((len(times), 6)))
     return simulate(stick_slip(nothing, theta, tf=tf, stick_force=stick_force, restick=restick))
 
 
 def build_simulated_problem(start: tuple[float, float, float] = START, tf: float = HORIZON) -> Problem:
-    """The simulated problem of Section V-A 2: the whole state of (18) at TRUTH is the reference signal."""
+    """Return the simulated problem of Section V-A 2: the whole state of (18) at TRUTH is the reference signal."""
     path = simulate_drive(tf=tf)
     return stick_slip(ReferenceSignal.from_samples(path.times, path.states), start, tf=tf)
 
 
 def wheel_speeds(differential: float = DIFFERENTIAL, stick_force: float = 15.0) -> Input:
-    """Wheel speeds of the Magic Formula vehicle (rad/s): the paper does not print its own, so these are a choice.
+    """Return wheel speeds of the Magic Formula vehicle (rad/s): the paper does not print its own, so these are a
+    choice.
 
     The mean speed of the treads is the forward speed that (18) has with the paper's torques, mu = 0.7 and slip from 5
     to 10 s (with reset at re-stick, so that it drives straight on). From 5 to 10 s wheels 1 and 4 are `differential`
@@ -96,20 +99,22 @@ def wheel_speeds(differential: float = DIFFERENTIAL, stick_force: float = 15.0) 
 
 
 def on_tyres(data: Data, speeds: Input, parameters: dict[str, Any] | None = None) -> Problem:
-    """The Magic Formula vehicle under given wheel speeds; `parameters` are its coefficients, published if left out."""
+    """Return the Magic Formula vehicle under given wheel speeds; `parameters` are its coefficients, published if left
+    out.
+    """
     run = Experiment(data, ("drive",), (), 0.0, HORIZON, inputs=speeds)
     coefficients = dict(MAGIC_FORMULA) if parameters is None else parameters
     return Problem(magic_formula(wheel_radius=WHEEL_RADIUS), run, coefficients, solver="stiff")
 
 
 def log_on_tyres(times: FloatArray, speeds: Input) -> tuple[FloatArray, Trajectory]:
-    """Positions (K, 2) of the Magic Formula vehicle at `times`, and its trajectory."""
+    """Return positions (K, 2) of the Magic Formula vehicle at `times`, and its trajectory."""
     path = simulate(on_tyres(Measurements(times, np.zeros((len(times), 2)), position), speeds))
     return states_at(path, times)[:, [0, 2]], path
 
 
 def states_at(path: Trajectory, times: FloatArray) -> FloatArray:
-    """States (K, n) at times that are nodes of the trajectory."""
+    """Return states (K, n) at times that are nodes of the trajectory."""
     nodes = np.searchsorted(path.times, np.asarray(times) - 1e-9)
     if not np.allclose(path.times[nodes], times, rtol=0, atol=1e-9):
         raise ValueError("these times are no nodes of the trajectory.")
@@ -117,13 +122,13 @@ def states_at(path: Trajectory, times: FloatArray) -> FloatArray:
 
 
 def curve(path: Trajectory) -> FloatArray:
-    """Positions (K, 2) along a trajectory, a tenth of a second or less apart, for figures."""
+    """Return positions (K, 2) along a trajectory, a tenth of a second or less apart, for figures."""
     at = np.linspace(path.times[0], path.times[-1], 151)
     return np.stack([np.interp(at, path.times, path.states[:, i]) for i in (0, 2)], axis=1).round(4)
 
 
 def gps_reference(times: FloatArray, positions: FloatArray) -> ReferenceSignal:
-    """1 Hz positions interpolated and low-pass filtered, as in the paper."""
+    """Return 1 Hz positions interpolated and low-pass filtered, as in the paper."""
     return ReferenceSignal.from_samples(times, positions, observe=position, lowpass_hz=LOWPASS_HZ, names=("X", "Y"))
 
 
@@ -131,14 +136,14 @@ Study = TypeVar("Study", bound=Fits)
 
 
 def complete(study: Study) -> Study:
-    """The study itself; KeyboardInterrupt if it was stopped before its end."""
+    """Return the study itself; raise KeyboardInterrupt if it was stopped before its end."""
     if len(study) < study.requested:
         raise KeyboardInterrupt
     return study
 
 
 def summary(fit: Estimate) -> dict[str, Any]:
-    """What a fit found, with the second-order sufficient conditions, as plain numbers."""
+    """Return what a fit found, with the second-order sufficient conditions, as plain numbers."""
     if fit.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
     curvature = free_curvature(fit)

@@ -64,7 +64,9 @@ class PiecewisePolynomial:
         return int(self.coefficients.shape[2])
 
     def interval(self, times: FloatArray) -> NDArray[np.intp]:
-        """Index of the knot interval that holds each of `times`; beyond the ends the first or the last one."""
+        """Return the index of the knot interval that holds each of `times`; beyond the ends the first or
+        the last one.
+        """
         return np.clip(np.searchsorted(self.knots, times, side="right") - 1, 0, len(self.knots) - 2)
 
     def __call__(self, times: ArrayLike) -> FloatArray:
@@ -152,7 +154,7 @@ class Input:
         return (len(self.values),) if self.names else tuple(self.values.shape[1:])
 
     def signal(self, t0: float, tf: float) -> PiecewisePolynomial:
-        """The input as a piecewise polynomial over ``[t0, tf]``.
+        """Return the input as a piecewise polynomial over ``[t0, tf]``.
 
         See Also
         --------
@@ -276,7 +278,7 @@ class TransitionCost:
                 as_name(getattr(self, name), name, "the name of a mode")
 
     def counts_between(self, before: str, after: str) -> bool:
-        """Whether it counts at a transition from a mode to another.
+        """Return whether this cost counts at a transition from a mode to another.
 
         See Also
         --------
@@ -559,7 +561,8 @@ class Measurements:
         return tuple(entry if isinstance(entry, str) else None for entry in self.sigma)
 
     def noise(self, parameters: Mapping[str, Any]) -> FloatArray | None:
-        """Standard deviation of each sample, a (K, q) array, given the model's parameters; None where it is unknown.
+        """Return the standard deviation of each sample, a (K, q) array, given the model's parameters; None where it is
+        unknown.
 
         See Also
         --------
@@ -674,7 +677,7 @@ def _check_inverse_square(sigma: Any) -> None:
 
 
 def _check_sigma_of_channels(sigma: Sequence[Any], channels: int) -> tuple[str | float, ...]:
-    """Names of parameters and numbers, one a channel."""
+    """Return names of parameters and numbers, one a channel."""
     if len(sigma) != channels:
         raise ValueError(f"sigma must have one entry for each of the {channels} channels; got {shorten(sigma)}.")
     if any(entry is None for entry in sigma):
@@ -703,7 +706,7 @@ def _check_channel_names(names: Sequence[str] | None, channels: int) -> tuple[st
 
 
 def _build_weight_matrix(weights: ArrayLike | None, channels: int) -> FloatArray:
-    """W as a symmetric positive semi-definite ``(q, q)`` matrix."""
+    """Return W as a symmetric positive semi-definite ``(q, q)`` matrix."""
     if weights is None:
         return np.eye(channels)
     matrix = as_array(weights, "weights")
@@ -719,7 +722,7 @@ def _build_weight_matrix(weights: ArrayLike | None, channels: int) -> FloatArray
 
 
 def _build_polynomial(knots: FloatArray, powers: list[FloatArray]) -> PiecewisePolynomial:
-    """Polynomial with the given coefficient arrays ``(K - 1, q)``, lowest power first, the rest zero."""
+    """Return the polynomial with the given coefficient arrays ``(K - 1, q)``, lowest power first, the rest zero."""
     coefficients = np.zeros((len(knots) - 1, 4, powers[0].shape[1]))
     for i, power in enumerate(powers):
         coefficients[:, i] = power
@@ -727,7 +730,7 @@ def _build_polynomial(knots: FloatArray, powers: list[FloatArray]) -> PiecewiseP
 
 
 def _fit_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
-    """Not-a-knot cubic spline through ``values`` (K, q)."""
+    """Return the not-a-knot cubic spline through ``values`` (K, q)."""
     from scipy.interpolate import CubicSpline  # here, since importing it takes longer than most fits
 
     try:
@@ -739,13 +742,13 @@ def _fit_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
 
 
 def _join_signals(parts: list[PiecewisePolynomial]) -> PiecewisePolynomial:
-    """One signal out of several that follow each other."""
+    """Return one signal out of several that follow each other."""
     knots = np.concatenate([part.knots[:-1] for part in parts[:-1]] + [parts[-1].knots])
     return PiecewisePolynomial(knots, np.concatenate([part.coefficients for part in parts]))
 
 
 def _fit_bridged_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
-    """Spline through the samples that are there, each channel's gaps bridged by its own spline first."""
+    """Return the spline through the samples that are there, each channel's gaps bridged by its own spline first."""
     filled = values.copy()
     for channel in filled.T:
         known = np.isfinite(channel)
@@ -757,7 +760,9 @@ def _fit_bridged_spline(times: FloatArray, values: FloatArray) -> PiecewisePolyn
 
 
 def _filter_lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePolynomial:
-    """Butterworth filter of second order forward and backward, on a grid of ten points a period of the cut-off."""
+    """Filter a signal by Butterworth's filter of second order, forward and backward, on a grid of ten points a period
+    of the cut-off.
+    """
     import scipy.signal  # here, since importing it takes longer than most fits
 
     start, end = signal.knots[[0, -1]].tolist()

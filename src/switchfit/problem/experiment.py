@@ -63,7 +63,7 @@ class Experiment:
         or a transition time has another unit.
     TypeError
         If an argument is of the wrong type: times that are not numbers (dates among them), mode names that are no
-        strings, data that are none of the kinds above.
+        strings, data of another kind than those above.
 
     Notes
     -----
@@ -175,12 +175,12 @@ class Experiment:
 
 
 def initial_state_of(system: HybridSystem, experiment: Experiment) -> Any:
-    """The experiment's initial state, or the system's where it has none of its own."""
+    """Return the experiment's initial state, or the system's where it has none of its own."""
     return system.initial_state if experiment.initial_state is None else experiment.initial_state
 
 
 def list_signals(experiment: Experiment) -> tuple[PiecewisePolynomial, ...]:
-    """Reference signals in the order of the data, then the input: all that varies in time beside the modes."""
+    """Return reference signals in the order of the data, then the input: all that varies in time beside the modes."""
     signals = [item.signal for item in experiment.data if isinstance(item, ReferenceSignal)]
     if experiment.inputs is not None:
         signals.append(experiment.inputs.signal(experiment.t0, experiment.tf))
@@ -188,12 +188,12 @@ def list_signals(experiment: Experiment) -> tuple[PiecewisePolynomial, ...]:
 
 
 def name_runs(experiments: Sequence[Experiment]) -> tuple[str, ...]:
-    """What each experiment is called: its name, or run1, run2, ..."""
+    """Return what each experiment is called: its name, or run1, run2, ..."""
     return tuple(experiment.name or f"run{e + 1}" for e, experiment in enumerate(experiments))
 
 
 def _check_map(given: Any) -> Mapping[str, str]:
-    """A map of the model's names to the problem's; empty for None."""
+    """Return a map of the model's names to the problem's; empty for None."""
     names = {} if given is None else given
     strings = isinstance(names, Mapping) and all(isinstance(name, str) for pair in names.items() for name in pair)
     if not strings:

@@ -30,7 +30,7 @@ Shape = tuple[int, ...]
 
 
 def use_float64() -> Any:
-    """Context in which JAX computes in float64; the user's setting is back in force afterwards."""
+    """Return a context in which JAX computes in float64; the user's setting is back in force afterwards."""
     return jax.enable_x64(True)
 
 
@@ -76,7 +76,7 @@ class Function:
 
 
 def _as_float64(value: Any) -> Any:
-    """A float64 array as the jaxpr expects it: Python's numbers have a weak type."""
+    """Return a value as a float64 array as the jaxpr expects it: Python's numbers have a weak type."""
     if (
         isinstance(value, (np.ndarray, jax.Array))
         and value.dtype == np.float64
@@ -158,7 +158,7 @@ def trace_function(
 
 
 def _without_jit(function: Any) -> Any:
-    """The function that was handed to `jax.jit`, which would not look at it again."""
+    """Return the function that was handed to `jax.jit`, which would not look at it again."""
     while type(function) is JITTED and hasattr(function, "__wrapped__"):
         function = function.__wrapped__
     return function
@@ -221,7 +221,7 @@ def _trace_with(function: Callable[..., Any], given: _Call, names: tuple[str, ..
 def _build_function(
     closed: Any, count: int, names: tuple[str, ...], used: tuple[str, ...], function: Any, given: _Call
 ) -> Function:
-    """The jaxpr with the parameters that are used, its constants copied: what they came from may change."""
+    """Return the jaxpr with the parameters that are used, its constants copied: what they came from may change."""
     refuse_single_precision_in(closed, function, given.what)
     invars = closed.jaxpr.invars
     kept = [*invars[:count], *(v for name, v in zip(names, invars[count:], strict=True) if name in used)]
@@ -259,7 +259,7 @@ RULES = ("jvp_jaxpr_fun", "jvp_jaxpr_thunk", "fwd_jaxpr_thunk", "bwd", "out_tree
 
 
 def _describe_content(closed: Any) -> tuple[list[str], tuple[Any, ...]]:
-    """A jaxpr as text, with the values of its constants; and the objects in it that have no text."""
+    """Return a jaxpr as text, with the values of its constants; and the objects in it that have no text."""
     text, opaque = _Text.of(closed)
     if text.has_rules:
         try:
@@ -271,7 +271,7 @@ def _describe_content(closed: Any) -> tuple[list[str], tuple[Any, ...]]:
 
 
 def _differentiate_twice(closed: Any) -> Any:
-    """First and second derivatives along all arguments: custom rules have been applied in it."""
+    """Return the first and second derivatives along all arguments: custom rules have been applied in it."""
 
     def value(*arguments: Any) -> Any:
         return jax.core.eval_jaxpr(closed.jaxpr, closed.consts, *arguments)[0]
@@ -374,7 +374,7 @@ class WatchedParameters(dict[str, Array]):
         return self[name] if name in self.list_keys() or name in self.others else default
 
     def list_keys(self) -> Any:
-        """The names, without asking for them."""
+        """Return the names, without asking for them."""
         return super().keys()
 
     def __iter__(self) -> Iterator[str]:
@@ -393,7 +393,7 @@ class WatchedParameters(dict[str, Array]):
         return self.read_all().items()
 
     def read_all(self) -> dict[str, Array]:
-        """All that is shown, which counts as asked for."""
+        """Return all that is shown as a plain dict; all of it then counts as asked for."""
         self.asked.update(self.list_keys())
         return {name: super(WatchedParameters, self).__getitem__(name) for name in self.list_keys()}
 
@@ -436,7 +436,7 @@ def _describe_missing_name(name: Any, arguments: tuple[Any, ...]) -> str:
 
 
 def _check_signature(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, form: str) -> None:
-    """ValueError if a function does not take as many arguments as it is called with."""
+    """Raise ValueError if a function does not take as many arguments as it is called with."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):  # it does not tell
@@ -451,7 +451,7 @@ def _check_signature(function: Callable[..., Any], arguments: tuple[Any, ...], w
 def call_for_vector(
     function: Callable[..., Any], arguments: tuple[Any, ...], shape: Shape | None, what: str, form: str
 ) -> Array:
-    """What a function of the user's returns, checked (while tracing) to be a float64 array of the given shape.
+    """Return what a function of the user's returns, checked (while tracing) to be a float64 array of the given shape.
 
     Without a shape, an array of any.
     """

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 
 def pad_length(length: int) -> int:
-    """`length` rounded up to four significant bits: at most an eighth too long, few distinct values."""
+    """Return `length` rounded up to four significant bits: at most an eighth too long, few distinct values."""
     unit = 1 << max(int(length).bit_length() - 4, 3)
     return -(-length // unit) * unit
 
@@ -17,7 +17,7 @@ its own. Compiling a program costs as much as some thousand evaluations, a row o
 
 
 def choose_common_lengths(lengths: Sequence[int]) -> list[int]:
-    """Lengths out of `pad_length`, as few distinct ones as `LONGEST_PADDING` allows."""
+    """Return lengths out of `pad_length`, as few distinct ones as `LONGEST_PADDING` allows."""
     padded = [pad_length(length) for length in lengths]
     common: dict[int, int] = {}
     for length in sorted(set(padded), reverse=True):

@@ -21,7 +21,7 @@ LOSSES = ("linear", "soft_l1", "huber", "cauchy")
 
 
 def robust(loss: str, scale: float, u: Any, xp: Any = np) -> Any:
-    """``C**2 rho(u / C**2)``: what stands in the cost in place of u; the same shape.
+    """Return ``C**2 rho(u / C**2)``: what stands in the cost in place of u; the same shape.
 
     Parameters
     ----------
@@ -43,7 +43,9 @@ def robust(loss: str, scale: float, u: Any, xp: Any = np) -> Any:
 
 
 def influence(loss: str, scale: float, u: Any, xp: Any = np) -> Any:
-    """``rho'(u / C**2)``, between 0 and 1: the weight of a residual in the Gauss-Newton matrix; the same shape."""
+    """Return ``rho'(u / C**2)``, between 0 and 1: the weight of a residual in the Gauss-Newton matrix;
+    the same shape.
+    """
     z = u / scale**2
     if loss == "cauchy":
         return 1.0 / (1.0 + z)

@@ -130,7 +130,7 @@ class Parameter:
         return self.scale == "log" or bool(np.all(self.lower > 0))
 
     def entries(self) -> tuple[Parameter, ...]:
-        """A scalar `Parameter` for each entry, in their order.
+        """Return a scalar `Parameter` for each entry, in their order.
 
         See Also
         --------
@@ -163,7 +163,7 @@ def unit_suffix(unit: str) -> str:
 
 
 def as_parameter(value: Any, what: str) -> Parameter:
-    """`value` itself if it is a `Parameter`, otherwise a free one without bounds; errors call it `what`."""
+    """Return `value` itself if it is a `Parameter`, otherwise a free one without bounds; errors call it `what`."""
     if isinstance(value, Parameter):
         return value
     form = "a number, an array or an sf.Parameter"

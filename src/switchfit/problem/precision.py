@@ -25,7 +25,7 @@ MOVES = frozenset(
 
 
 def refuse_single_precision_in(closed: Any, function: Any, what: str) -> None:
-    """ValueError if a traced function uses numbers that lost digits, or computes in less than double precision.
+    """Raise ValueError if a traced function uses numbers that lost digits, or computes in less than double precision.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def _has_short(jaxpr: Any, consts: Sequence[Any]) -> bool:
 
 
 def _find_inner_jaxprs(equation: Any) -> list[tuple[Any, Sequence[Any]]]:
-    """The jaxprs that an operation calls, each with its constants."""
+    """Return the jaxprs that an operation calls, each with its constants."""
     found = []
     for value in equation.params.values():
         for entry in value if isinstance(value, (tuple, list)) else (value,):
@@ -69,7 +69,7 @@ class _Walk:
         self.what = what
 
     def through(self, jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> list[Any]:
-        """Values of the results, None where they depend on the arguments."""
+        """Return the values of the results, None where they depend on the arguments."""
         known: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
         known |= {v: a for v, a in zip(jaxpr.invars, arguments, strict=True) if a is not None}
         for const in consts:
@@ -106,14 +106,14 @@ class _Walk:
         return [value(a) for a in jaxpr.outvars]
 
     def calls(self, equation: Any, inner: list[Any], given: list[Any]) -> list[Any]:
-        """Functions that an operation calls: a plain call is followed with its arguments, loops without."""
+        """Follow the functions that an operation calls: a plain call with its arguments, loops without."""
         for jaxpr, consts in inner:
             plain = len(inner) == 1 and len(jaxpr.invars) == len(given) and equation.primitive.name == "jit"
             results = self.through(jaxpr, consts, given if plain else [None] * len(jaxpr.invars))
         return results if plain else [None] * len(equation.outvars)
 
     def check(self, number: Any, where: str = "") -> None:
-        """ValueError if a known number lost digits."""
+        """Raise ValueError if a known number lost digits."""
         refuse_single_precision(number, f"a constant of {self.what}{where}")
 
     def refuse_cast(self, variable: Any, equation: Any) -> None:
@@ -124,6 +124,6 @@ class _Walk:
 
 
 def _find_line(equation: Any) -> str:
-    """Where in the user's code an operation stands, as " (file.py:12)"; empty where that is not known."""
+    """Return where in the user's code an operation stands, as " (file.py:12)"; empty where that is not known."""
     frame = source_info_util.user_frame(equation.source_info.traceback)
     return "" if frame is None else f" ({frame.file_name.rpartition('/')[2]}:{frame.start_line})"

@@ -131,7 +131,7 @@ class PriorTerms(NamedTuple):
 
     @classmethod
     def of(cls, prior: Prior | None, shape: tuple[int, ...]) -> PriorTerms:
-        """The terms of one unknown of some shape, flat."""
+        """Return the terms of one unknown of some shape, flat."""
         size = int(np.prod(shape))
         if prior is None:
             return cls(np.zeros(size), np.zeros(size), np.zeros(size, bool))
@@ -145,7 +145,7 @@ class PriorTerms(NamedTuple):
 
     @classmethod
     def join(cls, parts: list[PriorTerms]) -> PriorTerms:
-        """The terms of several unknowns, one after the other."""
+        """Return the terms of several unknowns, one after the other."""
         return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     @property
@@ -154,7 +154,8 @@ class PriorTerms(NamedTuple):
         return bool(np.any(self.precision > 0))
 
     def evaluate(self, theta: Any, xp: Any = np, *, gauss_newton: bool = False) -> tuple[Any, Any, Any]:
-        """Cost (), gradient (d,) and diagonal of the Hessian (d,), or of the Gauss-Newton matrix, at theta (d,).
+        """Return the cost (), gradient (d,) and diagonal of the Hessian (d,), or of the Gauss-Newton matrix, at theta
+        (d,).
 
         With ``e = (v - center) / sd``, v being p or log p, the cost is ``1/2 sum e**2``.
         """
@@ -166,7 +167,7 @@ class PriorTerms(NamedTuple):
         return 0.5 * xp.sum(w * e * e), w * e * v_p, w * (v_p**2 + e * v_pp)
 
     def texts(self) -> list[str]:
-        """Each prior in words; empty where there is none."""
+        """Return each prior in words; empty for an unknown without a prior."""
         found = []
         for center, precision, log in zip(self.center, self.precision, self.log, strict=True):
             sd = precision**-0.5 if precision > 0 else 0.0

@@ -121,7 +121,7 @@ class Problem:
 
     engine : {"auto", "native", "jax"}, optional
         What evaluates the cost and its derivatives: machine code wherever the model has it and JAX otherwise; machine
-        code, with an error that says why where there is none; or JAX.
+        code, with an error that gives the reason where the model cannot be compiled; or JAX.
     max_transitions : int, optional
         Compile machine code for every sequence of the system's modes with up to so many transitions, so that problems
         with other sequences, but the same functions, data and `max_transitions`, need no compilation of their own.
@@ -248,7 +248,7 @@ class Problem:
                     )
 
     def _check_noise(self) -> None:
-        """Parameters that are a sigma, and whether the noise is known where something is weighed against it."""
+        """Check the parameters that are a sigma, and that the noise is known where something is weighed against it."""
         items = [(e, item) for e in self.experiments for item in e.data if isinstance(item, Measurements)]
         for experiment, item in items:
             for name in filter(None, item.sigma_names):
@@ -277,7 +277,9 @@ class Problem:
             )
 
     def _check_delays(self) -> None:
-        """Parameters that are a delay: within their bounds all samples must be of moments inside the horizon."""
+        """Check the parameters that are a delay: within their bounds all samples must be of times inside
+        the horizon.
+        """
         for experiment in self.experiments:
             for item in experiment.data:
                 if not (isinstance(item, Measurements) and isinstance(item.delay, str)):
@@ -301,7 +303,7 @@ class Problem:
                     )
 
     def _check_delay_unit(self, experiment: Experiment, delay: str) -> None:
-        """A delay is a time: in the unit of the experiment, and shared by experiments of one time unit alone."""
+        """Check that a delay is in the unit of its experiment, and shared only by experiments of one time unit."""
         name = experiment.parameter_map.get(delay, delay)
         unit = self.parameters[name].unit
         if unit not in ("", experiment.time_unit):
@@ -314,7 +316,7 @@ class Problem:
         _require_one_time_unit(units, f"the delay {name!r}", "give each run a delay of its own (parameter_map)")
 
     def _check_states(self) -> None:
-        """Sizes of initial states that are no functions."""
+        """Check the sizes of initial states that are not functions."""
         own = self.system.initial_state
         for e, experiment in enumerate(self.experiments):
             initial = initial_state_of(self.system, experiment)
@@ -395,7 +397,7 @@ class Problem:
         return sizes
 
     def measure_from_start(self, theta: FloatArray) -> FloatArray:
-        """theta with transition times counted from their experiment's t0, (d,): it does not depend on the clock.
+        """Return theta with transition times counted from their experiment's t0, (d,): it does not depend on the clock.
 
         See Also
         --------
@@ -416,7 +418,7 @@ class Problem:
         return counted
 
     def vectors(self, theta: FloatArray, e: int) -> tuple[FloatArray, FloatArray]:
-        """What the compiled programs of experiment e take: its transition times (N,) and its p (M,).
+        """Return what the compiled programs of experiment e take: its transition times (N,) and its p (M,).
 
         See Also
         --------
@@ -458,7 +460,7 @@ class Problem:
         return tuple(tuple(lengths) for lengths in counts)
 
     def name_parameters(self, theta: FloatArray, e: int) -> dict[str, FloatArray]:
-        """The parameters of experiment e under the names that the model has for them.
+        """Return the parameters of experiment e under the names that the model has for them.
 
         See Also
         --------
@@ -478,7 +480,7 @@ class Problem:
         return own | {name: own[target] for name, target in mapped.items()}
 
     def late_times(self, theta: FloatArray, e: int) -> FloatArray:
-        """Moments of which the samples of experiment e are whose delay is a parameter: (K,), in no order.
+        """Return the times of the states that late samples of experiment e saw, if their delay is a parameter: (K,).
 
         See Also
         --------
@@ -557,7 +559,8 @@ class Problem:
                 )
 
     def split(self, theta: FloatArray) -> tuple[list[FloatArray], dict[str, FloatArray]]:
-        """All transition times, one ``(N,)`` array an experiment, and all parameters by name, fixed ones included.
+        """Return all transition times, one ``(N,)`` array an experiment, and all parameters by name, fixed ones
+        included.
 
         See Also
         --------
@@ -586,7 +589,9 @@ class Problem:
 
 
 def _clock(experiment: Experiment) -> float:
-    """Size of the times of an experiment, of which rounding is a part: the horizon, or the clock's reading if more."""
+    """Return the size of the times of an experiment, of which rounding is a part: the horizon, or the clock's reading
+    if more.
+    """
     return max(experiment.tf - experiment.t0, abs(experiment.t0), abs(experiment.tf))
 
 
@@ -647,7 +652,7 @@ def _list_unknowns(
 
 
 def _find_delay_targets(experiment: Experiment) -> set[str]:
-    """Names of the problem's parameters that are delays in an experiment."""
+    """Return names of the problem's parameters that are delays in an experiment."""
     delays = [item.delay for item in experiment.data if isinstance(item, Measurements)]
     return {experiment.parameter_map.get(delay, delay) for delay in delays if isinstance(delay, str)}
 
@@ -669,7 +674,7 @@ def _index(k: tuple[int, ...]) -> str:
 def _build_ordering(
     experiments: tuple[Experiment, ...], where: list[NDArray[np.intp]], d: int, dwell: float
 ) -> tuple[FloatArray, FloatArray, tuple[Constraint, ...]]:
-    """Rows ``tau_{i+1} - tau_i >= min_duration`` for every mode of every experiment with a free end."""
+    """Return rows ``tau_{i+1} - tau_i >= min_duration`` for every mode of every experiment with a free end."""
     if not (np.isfinite(dwell) and dwell >= 0):
         raise ValueError(f"min_duration must be zero or positive; got {dwell}.")
     rows, bounds, constraints = [], [], []

@@ -49,7 +49,7 @@ class NotPlain(Exception):  # noqa: N818  # control flow: the caller traces
 
 
 def read_contents(function: Any) -> Hashable | None:
-    """All that a function reads, by content; None where that cannot be told, so that it has to be traced."""
+    """Return all that a function reads, by content; None if that is unknown, so that it has to be traced."""
     try:
         return _read(function, DEPTH)
     except NotPlain:
@@ -57,7 +57,8 @@ def read_contents(function: Any) -> Hashable | None:
 
 
 def find_named_values(function: Any) -> dict[str, Any]:
-    """What a function reads by name: defaults, globals, its closure, attributes of its object, entries of its dicts.
+    """Return what a function reads by name: defaults, globals, its closure, attributes of its object, entries of its
+    dicts.
 
     Of dicts and objects what the code names: keys that it holds as constants, attributes that it loads.
     """
@@ -149,7 +150,7 @@ def _read_function(function: types.FunctionType, depth: int) -> Hashable:
 
 
 def _is_trusted(value: Any) -> bool:
-    """Whether a value is a module, function or class of a library that does not change."""
+    """Return whether a value is a module, function or class of a library that does not change."""
     if isinstance(value, types.ModuleType):
         return _is_library(value.__name__)
     if isinstance(value, types.BuiltinFunctionType):

@@ -41,7 +41,7 @@ class Sensor(NamedTuple):
 
     @classmethod
     def of(cls, item: Measurements, observe: Function | None) -> Sensor:
-        """That of one of the data."""
+        """Return the sensor of one of the data."""
         delay = item.delay if isinstance(item.delay, str) else None
         return cls(observe, item.values.shape[1], item.sigma_names, item.loss, item.loss_scale, delay)
 
@@ -177,7 +177,7 @@ class Functions:
         self._traced: dict[Any, Function] = {}
 
     def of(self, experiment: Experiment) -> _Tracer:
-        """What traces the functions of one experiment."""
+        """Return a tracer of the functions of one experiment."""
         mapped = experiment.parameter_map
         order = {name: k for k, name in enumerate(self.parameters)}
         # The same order in every run, whatever its map: runs then share a program.
@@ -255,7 +255,7 @@ def trace_structure(
     def at_transitions(
         given: Mapping[tuple[str, str], Callable[..., Any]], shape: Shape, what: str, form: str
     ) -> tuple[tuple[Function | None, ...], tuple[Function, ...]]:
-        """The function of each transition, None where there is none, and all that there may be."""
+        """Return the function of each transition, None where it has none, and those of all that may happen."""
         own = list(pairwise(experiment.mode_sequence))
         here = given if transitions is not None else own
         traced = {pair: trace(g, at, shape, f"{what} {pair}", form) for pair, g in given.items() if pair in here}
@@ -322,7 +322,7 @@ def trace_structure(
 def _choose_transition_costs(
     items: list[TransitionCost], modes: tuple[str, ...]
 ) -> dict[tuple[str, str], Callable[..., Any]]:
-    """The cost of each transition that may happen and has one."""
+    """Return the cost of each transition that may happen and has one."""
     found = {}
     for before, after in product(modes, modes):
         here = [item.mu for item in items if item.counts_between(before, after)]
@@ -337,10 +337,10 @@ def _choose_transition_costs(
 
 
 def read_initial_values(initial: Any) -> FloatArray:
-    """An initial state that is no function, as numbers (n,): where it is unknown, its guess."""
+    """Return an initial state that is no function, as numbers (n,): where it is unknown, its guess."""
     return np.array([x.value if isinstance(x, Parameter) else x for x in initial], dtype=np.float64)
 
 
 def select_kind(data: tuple[Any, ...], kind: type) -> list[Any]:
-    """The items of an experiment's data that are of a kind, in order."""
+    """Return the items of an experiment's data that are of a kind, in order."""
     return [item for item in data if isinstance(item, kind)]

@@ -118,7 +118,7 @@ class HybridSystem:
             self.check_labels_of(len(self.initial_state))
 
     def check_labels_of(self, n: int) -> None:
-        """ValueError unless names and units, where given, have one entry for each of n states.
+        """Raise ValueError unless names and units, where given, have one entry for each of n states.
 
         See Also
         --------
@@ -138,7 +138,7 @@ class HybridSystem:
                 )
 
     def reset_map(self, before: str, after: str) -> ResetMap | None:
-        """The map applied at a transition from mode `before` to mode `after`; None where x is continuous.
+        """Return the map applied at a transition from mode `before` to mode `after`; None where x is continuous.
 
         See Also
         --------
@@ -157,7 +157,7 @@ class HybridSystem:
         return self.reset_maps.get((before, after))
 
     def guard(self, before: str, after: str) -> Guard | None:
-        """What is zero at a transition from mode `before` to mode `after`; None where it is free.
+        """Return what is zero at a transition from mode `before` to mode `after`; None where it is free.
 
         See Also
         --------
@@ -174,7 +174,7 @@ class HybridSystem:
 
 
 def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ...]:
-    """`value` as a finite, read-only ``(n,)`` float64 array, or as n `Parameter` where it has any.
+    """Return `value` as a finite, read-only ``(n,)`` float64 array, or as n `Parameter` where it has any.
 
     Raises
     ------
@@ -197,7 +197,7 @@ def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ..
 
 
 def _as_entry(entry: Any, name: str) -> Parameter:
-    """One entry of an initial state that has unknown ones: a number is known."""
+    """Return one entry of an initial state that has unknown ones: a number is known."""
     if isinstance(entry, Parameter):
         parameter = entry
     else:
@@ -216,7 +216,7 @@ def _as_entry(entry: Any, name: str) -> Parameter:
 def _check_pairs(
     given: Mapping[tuple[str, str], Callable[..., Any]] | None, name: str, modes: Mapping[str, VectorField]
 ) -> dict[tuple[str, str], Callable[..., Any]]:
-    """Functions of transitions, by the modes before and after."""
+    """Return functions of transitions, by the modes before and after."""
     if not isinstance(given, Mapping | None):
         raise TypeError(f"{name} must be a dict of (mode before, mode after) -> function; got {shorten(given)}.")
     checked = {} if given is None else dict(given)

@@ -82,7 +82,7 @@ class _Short(reprlib.Repr):
         return f"an array of shape {array.shape} ({array.dtype})"
 
     def repr_instance(self, x: Any, level: int) -> str:
-        """A problem holds all its data: its type says enough."""
+        """Return the type alone of a dataclass: a problem holds all its data."""
         return (
             f"<{type(x).__name__}>" if is_dataclass(x) and not isinstance(x, type) else super().repr_instance(x, level)
         )
@@ -322,7 +322,7 @@ def _refuse_dates(value: Any, door: _Door) -> NoReturn:
 
 
 def is_low_precision(dtype: Any) -> bool:
-    """Whether this is the dtype of floating-point numbers of less than double precision."""
+    """Return whether this is the dtype of floating-point numbers of less than double precision."""
     return bool(np.dtype(dtype).itemsize < 8 and jax.dtypes.issubdtype(dtype, np.floating))
 
 

@@ -28,7 +28,7 @@ class Variables(NamedTuple):
     def of(
         cls, theta: FloatArray, lower: FloatArray, upper: FloatArray, log: NDArray[np.bool_], keep: NDArray[np.bool_]
     ) -> Variables:
-        """Variables for unknowns of the size of a first guess, or of the bounds where that is 0.
+        """Return variables for unknowns of the size of a first guess, or of the bounds where that is 0.
 
         Parameters
         ----------
@@ -50,29 +50,29 @@ class Variables(NamedTuple):
         return not self.log.any() and bool(np.all(self.size == 1.0))
 
     def outward(self, z: Any, xp: Any = np) -> Any:
-        """theta at z: (d,)."""
+        """Return theta at z: (d,)."""
         return xp.where(self.log, xp.exp(xp.where(self.log, z, 0.0)), self.size * z)
 
     def inward(self, theta: Any, xp: Any = np) -> Any:
-        """z at theta (d,): a bound of 0 becomes one of minus infinity for a logarithm."""
+        """Return z at theta (d,): a bound of 0 becomes one of minus infinity for a logarithm."""
         positive = xp.where(self.log & (theta > 0), theta, 1.0)
         return xp.where(self.log, xp.where(theta > 0, xp.log(positive), -xp.inf), theta / self.size)
 
     def sizes_inward(self, sizes: FloatArray) -> FloatArray:
-        """Sizes of z for sizes of theta (d,): rounding of a logarithm is measured by 1."""
+        """Return sizes of z for sizes of theta (d,): rounding of a logarithm is measured by 1."""
         return np.where(self.log, 1.0, sizes / self.size)
 
     def slopes(self, theta: Any, xp: Any = np) -> tuple[Any, Any]:
-        """D and E at theta: (d,) each."""
+        """Return D and E at theta: (d,) each."""
         return xp.where(self.log, theta, self.size), xp.where(self.log, theta, 0.0)
 
     def derivatives_outward(self, theta: Any, gradient: Any, hessian: Any, xp: Any = np) -> tuple[Any, Any]:
-        """Gradient and Hessian in theta from those in z."""
+        """Return the gradient and Hessian in theta from those in z."""
         D, E = self.slopes(theta, xp)
         gradient = gradient / D
         return gradient, (hessian - xp.diag(E * gradient)) / xp.outer(D, D)
 
     def derivatives_inward(self, theta: Any, gradient: Any, hessian: Any, xp: Any = np) -> tuple[Any, Any]:
-        """Gradient and Hessian in z from those in theta."""
+        """Return the gradient and Hessian in z from those in theta."""
         D, E = self.slopes(theta, xp)
         return D * gradient, hessian * xp.outer(D, D) + xp.diag(E * gradient)

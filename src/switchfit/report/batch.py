@@ -34,7 +34,7 @@ BOOTSTRAP_TITLES = {
 
 
 def summarise(fits: Fits) -> list[str]:
-    """How many fits were done, how they ended, and the first that did not converge.
+    """Return how many fits were done, how they ended, and the first that did not converge.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def summarise(fits: Fits) -> list[str]:
 
 @format_text.register(Fits)
 def write_fits(fits: Fits) -> str:
-    """How the fits ended.
+    """Return how the fits ended.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def write_fits(fits: Fits) -> str:
 
 @format_text.register(MonteCarlo)
 def write_monte_carlo(study: MonteCarlo) -> str:
-    """How the fits ended, and a line for each unknown.
+    """Return how the fits ended, and a line for each unknown.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def write_monte_carlo(study: MonteCarlo) -> str:
 
 @format_text.register(Bootstrap)
 def write_bootstrap(study: Bootstrap) -> str:
-    """How the fits ended, what was resampled, and a line for each unknown.
+    """Return how the fits ended, what was resampled, and a line for each unknown.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def write_bootstrap(study: Bootstrap) -> str:
 
 @format_text.register(Multistart)
 def write_multistart(study: Multistart) -> str:
-    """How the fits ended, and a line for each of the ten lowest minima.
+    """Return how the fits ended, and a line for each of the ten lowest minima.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def write_multistart(study: Multistart) -> str:
 
 
 def tabulate_monte_carlo(study: MonteCarlo) -> list[str]:
-    """One line an unknown: truth, mean error with its own error, spread, standard error, coverage."""
+    """Return one line an unknown: truth, mean error with its own error, spread, standard error, coverage."""
     count = int(study.success.sum())
     if count < 2:
         return ["Fewer than two fits converged: no statistics."]
@@ -135,7 +135,7 @@ def tabulate_monte_carlo(study: MonteCarlo) -> list[str]:
 
 
 def tabulate_bootstrap(study: Bootstrap) -> list[str]:
-    """One line an unknown: estimate, bias, bootstrap standard error, 95 % interval (BCa)."""
+    """Return one line an unknown: estimate, bias, bootstrap standard error, 95 % interval (BCa)."""
     if int(study.success.sum()) < 2:
         return ["Fewer than two fits converged: no statistics."]
     rows: list[Sequence[str]] = [("", "estimate", "bias", "standard error", "95 % interval (BCa)")]
@@ -152,7 +152,7 @@ def tabulate_bootstrap(study: Bootstrap) -> list[str]:
 
 @draw_figure.register(Bootstrap)
 def plot_bootstrap(study: Bootstrap) -> Figure:
-    """A histogram an unknown: estimates of the resampled data, the estimate, and its 95 % interval."""
+    """Draw a histogram an unknown: estimates of the resampled data, the estimate, and its 95 % interval."""
     from matplotlib.figure import Figure
 
     shown = np.flatnonzero(study.resampled)
@@ -179,14 +179,14 @@ def plot_bootstrap(study: Bootstrap) -> Figure:
 
 
 def _choose_limits(values: FloatArray, centre: float) -> tuple[float, float]:
-    """What a histogram of estimates shows: all but the farthest hundredth, with a margin."""
+    """Return what a histogram of estimates shows: all but the farthest hundredth, with a margin."""
     middle = np.percentile(values, [0.5, 99.5])
     reach = max(float(np.ptp(middle)), 1e-12 * abs(centre), np.finfo(float).tiny)
     return float(middle[0] - 0.25 * reach), float(middle[1] + 0.25 * reach)
 
 
 def _draw_histogram_axis(study: Fits, k: int, limits: tuple[float, float], ax: Axes) -> None:
-    """Name and unit of unknown k along the axis, and few ticks."""
+    """Write name and unit of unknown k along the axis, with few ticks."""
     unit = study.theta_units[k]
     ax.set_xlabel(study.theta_names[k] + (f" ({unit})" if unit and unit != "1" else ""))
     ax.set_xlim(limits)
@@ -197,7 +197,7 @@ def _draw_histogram_axis(study: Fits, k: int, limits: tuple[float, float], ax: A
 
 @draw_figure.register(MonteCarlo)
 def plot_monte_carlo(study: MonteCarlo) -> Figure:
-    """A histogram an unknown: estimates, truth, and the normal density of the reported standard error."""
+    """Draw a histogram an unknown: estimates, truth, and the normal density of the reported standard error."""
     from matplotlib.figure import Figure
 
     d = len(study.theta_names)
@@ -233,7 +233,7 @@ def plot_monte_carlo(study: MonteCarlo) -> Figure:
 
 @draw_figure.register(Multistart)
 def plot_waterfall(study: Multistart) -> Figure:
-    """Final cost of every start, ascending, above the best; starts that ended together share a colour."""
+    """Draw the final cost of every start, ascending, above the best; starts that ended together share a colour."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.0, 3.6), layout="constrained")

@@ -8,7 +8,7 @@ from switchfit.fit.trajectory import Trajectory
 
 
 def format_rounded(value: float, error: float) -> tuple[str, str, str]:
-    """Value, "± error" and "(relative error)" as text, the value to the two significant digits of its error.
+    """Return value, "± error" and "(relative error)" as text, the value to the two significant digits of its error.
 
     Parameters
     ----------
@@ -37,11 +37,11 @@ def format_unit(unit: str) -> str:
 
 
 def get_unit(channel: str, trajectory: Trajectory) -> str:
-    """The unit of a channel that is called like a state; "" for any other, and for a pure number."""
+    """Return the unit of a channel that is called like a state; "" for any other, and for a pure number."""
     units = dict(zip(trajectory.state_names, trajectory.state_units, strict=True))
     return format_unit(units.get(channel, ""))
 
 
 def label_time(unit: str) -> str:
-    """The label of an axis of times in a unit, such as "time (min)"."""
+    """Return the label of an axis of times in a unit, such as "time (min)"."""
     return f"time ({unit})" if format_unit(unit) else "time"

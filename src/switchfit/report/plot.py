@@ -66,7 +66,7 @@ class Bands:
 
     @classmethod
     def of(cls, prediction: Any, quantile: float, level: float) -> Bands:
-        """Of a `Prediction` at all nodes."""
+        """Return the bands of a `Prediction` at all nodes."""
         jumps = np.flatnonzero(np.diff(prediction.times) == 0) + 1
         half = quantile * prediction.state_errors
         errors = quantile * prediction.output_errors, quantile * np.hypot(prediction.output_errors, prediction.noise)
@@ -83,7 +83,7 @@ class Bands:
 
 @draw_figure.register(Estimate)
 def plot_estimate(estimate: Estimate, *, bands: bool = True, level: float = 0.95) -> Figure:
-    """As `plot_fit`, with bands of what is fitted where there is a model and a covariance.
+    """Draw what `plot_fit` does, with bands of what is fitted where there is a model and a covariance.
 
     Parameters
     ----------
@@ -101,7 +101,8 @@ def plot_estimate(estimate: Estimate, *, bands: bool = True, level: float = 0.95
 
 
 def plot_fit(fit: Fit, bands: Sequence[Bands] = ()) -> Figure:
-    """Every channel of every experiment, measured and fitted, with its residuals below; states where there is no data.
+    """Draw every channel of every experiment, measured and fitted, with its residuals below; states where there is no
+    data.
 
     Parameters
     ----------
@@ -136,7 +137,7 @@ def plot_fit(fit: Fit, bands: Sequence[Bands] = ()) -> Figure:
 
 
 def plot_comparison(comparison: Comparison, trajectory: Trajectory, channel: int, ax: Axes) -> Axes:
-    """One channel over time: samples as dots (a reference signal dashed) and the fitted output as a line.
+    """Draw one channel over time: samples as dots (a reference signal dashed) and the fitted output as a line.
 
     Parameters
     ----------
@@ -164,7 +165,7 @@ def plot_comparison(comparison: Comparison, trajectory: Trajectory, channel: int
 
 
 def plot_residuals(comparison: Comparison, trajectory: Trajectory, channel: int, ax: Axes) -> Axes:
-    """Measured less fitted of one channel over time, with a band of one sigma to either side where it is known.
+    """Draw measured less fitted of one channel over time, with a band of one sigma to either side where it is known.
 
     Parameters
     ----------
@@ -197,7 +198,7 @@ def plot_residuals(comparison: Comparison, trajectory: Trajectory, channel: int,
 
 
 def plot_state(trajectory: Trajectory, state: int, ax: Axes) -> Axes:
-    """One state over time.
+    """Draw one state over time.
 
     Parameters
     ----------
@@ -258,7 +259,7 @@ def plot_modes(
 
 
 def plot_transitions(times: Sequence[float], errors: Sequence[float], ax: Axes) -> Axes:
-    """Transition times as vertical lines, each in a band of one standard error to either side.
+    """Draw the transition times as vertical lines, each in a band of one standard error to either side.
 
     Parameters
     ----------
@@ -278,7 +279,7 @@ def plot_transitions(times: Sequence[float], errors: Sequence[float], ax: Axes) 
 
 
 def plot_convergence(history: Sequence[IterationRecord], ax: Axes, *, tolerance: float | None = None) -> Axes:
-    """Optimality against iteration on a logarithmic scale.
+    """Draw the optimality against iteration on a logarithmic scale.
 
     Parameters
     ----------
@@ -316,7 +317,7 @@ def plot_convergence(history: Sequence[IterationRecord], ax: Axes, *, tolerance:
 
 
 def choose_mode_colours(trajectories: Sequence[Trajectory]) -> dict[str, str]:
-    """A colour for each mode that occurs, in the order of first occurrence.
+    """Return a colour for each mode that occurs, in the order of first occurrence.
 
     Parameters
     ----------
@@ -330,7 +331,7 @@ def choose_mode_colours(trajectories: Sequence[Trajectory]) -> dict[str, str]:
 
 
 def _list_panels(fit: Fit, e: int) -> list[tuple[Comparison | None, int]]:
-    """What the panels of an experiment show: (comparison, channel), or (None, state) where there is no data."""
+    """Return what the panels of an experiment show: (comparison, channel), or (None, state) where there is no data."""
     channels: list[tuple[Comparison | None, int]] = [(c, k) for c in fit.comparisons[e] for k in range(len(c.names))]
     return channels or [(None, k) for k in range(len(fit.trajectories[e].state_names))]
 
@@ -367,7 +368,7 @@ def _draw_experiment(fit: Fit, e: int, block: Any, rows: int, colours: Mapping[s
 
 
 def _draw_bands(fit: Fit, e: int, axes: Sequence[Axes], bands: Bands) -> None:
-    """Bands in the panels of one experiment; its channels come with their residuals, states alone."""
+    """Draw bands in the panels of one experiment; its channels come with their residuals, states alone."""
     panels = _list_panels(fit, e)
     if panels[0][0] is None:
         for ax, band in zip(axes, np.moveaxis(bands.states, 1, 0), strict=True):
@@ -388,7 +389,7 @@ def _draw_bands(fit: Fit, e: int, axes: Sequence[Axes], bands: Bands) -> None:
 
 
 def plot_band(bands: Bands, band: FloatArray, ax: Axes, *, alpha: float, label: str) -> Axes:
-    """A band about a fitted curve, broken at the transitions, where it jumps.
+    """Draw a band about a fitted curve, broken at the transitions, where it jumps.
 
     Parameters
     ----------
@@ -412,7 +413,7 @@ def plot_band(bands: Bands, band: FloatArray, ax: Axes, *, alpha: float, label: 
 
 
 def _draw_head(fit: Fit, figure: Figure, shown: int, colours: Mapping[str, str]) -> None:
-    """Legend, a warning where the fit did not succeed, and a note where not everything is shown."""
+    """Draw the legend, a warning where the fit did not succeed, and a note where not everything is shown."""
     from matplotlib.patches import Patch
 
     handles: dict[str, Any] = {}
@@ -435,7 +436,7 @@ def _draw_head(fit: Fit, figure: Figure, shown: int, colours: Mapping[str, str])
 
 
 def _make_transition_handles(fit: Fit) -> dict[str, Any]:
-    """Entries of the legend for the transitions and their standard errors."""
+    """Return entries of the legend for the transitions and their standard errors."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -452,7 +453,7 @@ def _make_transition_handles(fit: Fit) -> dict[str, Any]:
 
 
 def _draw_dots(count: int) -> dict[str, Any]:
-    """Dots that become smaller the more there are; thousands are one picture in a vector file."""
+    """Draw dots that become smaller the more there are; thousands are one picture in a vector file."""
     size = 4.5 if count <= 100 else 3.0 if count <= 400 else 1.5
     return {
         "linestyle": "none",
@@ -466,7 +467,7 @@ def _draw_dots(count: int) -> dict[str, Any]:
 
 
 def _mark_outliers(comparison: Comparison, values: FloatArray, channel: int, ax: Axes) -> None:
-    """Circles round the samples that a robust loss weighs down."""
+    """Draw circles round the samples that a robust loss weighs down."""
     if comparison.downweighted is None or not comparison.downweighted[:, channel].any():
         return
     there = comparison.downweighted[:, channel]
@@ -477,12 +478,12 @@ def _mark_outliers(comparison: Comparison, values: FloatArray, channel: int, ax:
 
 
 def _replace_infinities(values: FloatArray) -> FloatArray:
-    """Values with NaN where they are too large for an axis, as a sigma of 1e308 is that takes a sample out."""
+    """Return values with NaN where they are too large for an axis, as a sigma of 1e308 is that takes a sample out."""
     return np.where(np.abs(values) < LARGEST_DRAWN, values, np.nan)
 
 
 def _break_at_gaps(times: FloatArray, values: FloatArray, trajectory: Trajectory) -> tuple[FloatArray, FloatArray]:
-    """A curve over the trajectory's nodes with a gap at each transition, where a reset map may make it jump."""
+    """Return a curve over the trajectory's nodes with a gap at each transition, where a reset map may make it jump."""
     values = _replace_infinities(values)
     if len(times) != len(trajectory.times):
         return times, values
@@ -496,7 +497,7 @@ def _add_unit(name: str, trajectory: Trajectory) -> str:
 
 
 def _label_time_axis(ax: Axes, trajectory: Trajectory) -> Axes:
-    """The experiment's horizon, labelled."""
+    """Label the axis of times, and limit it to the experiment's horizon."""
     ax.set_xlim(float(trajectory.times[0]), float(trajectory.times[-1]))
     ax.set_xlabel(label_time(trajectory.time_unit))
     return ax

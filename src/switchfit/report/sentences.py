@@ -31,7 +31,7 @@ def _describe_mode(position: float, mode: str, run: str) -> str:
 
 @format_text.register(Constraint)
 def write_constraint(constraint: Constraint) -> str:
-    """What it says of a fit that this constraint is active."""
+    """Return what it says of a fit that this constraint is active."""
     if constraint.position is None:
         return f"{constraint.unknown} at its {constraint.kind} {constraint.value:g}"
     state = "has collapsed to nothing" if constraint.kind == "collapsed" else "is at its minimum duration"
@@ -40,13 +40,13 @@ def write_constraint(constraint: Constraint) -> str:
 
 @format_text.register(Kink)
 def write_kink(kink: Kink) -> str:
-    """Which unknown is at a kink, and the derivatives on both sides."""
+    """Return which unknown is at a kink, and the derivatives on both sides."""
     return f"{kink.unknown} at a kink ({kink.left:.1e}, {kink.right:.1e})"
 
 
 @format_text.register(Combination)
 def write_combination(combination: Combination) -> str:
-    """Which unknowns trade off."""
+    """Return which unknowns trade off."""
     names = combination.unknowns
     if not names:
         return "none"
@@ -58,7 +58,7 @@ def write_combination(combination: Combination) -> str:
 
 @format_text.register(Termination)
 def write_termination(ended: Termination) -> str:
-    """How a fit ended, the numbers that say so, what to do, and the active constraints."""
+    """Return how a fit ended, the numbers that say so, what to do, and the active constraints."""
     if ended.reason is not None and ended.reason.kind == "message":
         return str(ended.reason)
     active = f" Active: {'; '.join(map(str, ended.active))}." if ended.active else ""
@@ -146,13 +146,13 @@ _ENDINGS: dict[Status, Callable[[Termination], str]] = {
 
 
 def _get(issue: Issue, name: str) -> float:
-    """A figure that is one number; NaN if the issue lacks it."""
+    """Return a figure that is one number; NaN if the issue lacks it."""
     value = issue.figures.get(name, np.nan)
     return np.nan if isinstance(value, tuple) else value
 
 
 def _pair_figures(issue: Issue, name: str) -> list[tuple[str, float]]:
-    """A figure that has a number for each subject: (subject, number)."""
+    """Return a figure that has a number for each subject: (subject, number)."""
     value = issue.figures.get(name, ())
     return list(zip(issue.subjects, value if isinstance(value, tuple) else (value,), strict=False))
 
@@ -163,7 +163,7 @@ def _join(issue: Issue) -> str:
 
 @format_text.register(Issue)
 def write_issue(issue: Issue) -> str:
-    """An issue as a sentence or two."""
+    """Return an issue as a sentence or two."""
     if issue.kind in _ISSUES:
         return _ISSUES[issue.kind](issue)
     return f"{issue.kind}: {_join(issue)}" if issue.subjects else issue.kind
@@ -280,7 +280,7 @@ def _describe_near_kink(issue: Issue) -> str:
 
 
 def _add_delay_hint(sentence: Callable[[Issue], str]) -> Callable[[Issue], str]:
-    """The reason why a line search failed, and what an estimated delay may have to do with it."""
+    """Return the reason why a line search failed, and what an estimated delay may have to do with it."""
 
     def write(issue: Issue) -> str:
         hint = (

@@ -37,7 +37,7 @@ METHODS = {
 
 
 def report(fit: Fit, certificate: Certificate | None = None, found: Identifiability | None = None) -> str:
-    """What was fitted, how it ended, how well it fits, the unknowns with their errors, and what to be wary of.
+    """Return what was fitted, how it ended, how well it fits, the unknowns with their errors, and what to be wary of.
 
     Parameters
     ----------
@@ -69,13 +69,15 @@ def report(fit: Fit, certificate: Certificate | None = None, found: Identifiabil
 
 @format_text.register(Fit)
 def write_fit(fit: Fit) -> str:
-    """The report of a fit, with what can be checked without its model."""
+    """Return the report of a fit, with what can be checked without its model."""
     return report(fit)
 
 
 @format_text.register(Estimate)
 def write_estimate(estimate: Estimate) -> str:
-    """The report of an estimate, with its certificate if that is known already, and J evaluated where it is weak."""
+    """Return the report of an estimate, with its certificate if that is known already, and J evaluated where it is
+    weak.
+    """
     return report(estimate, estimate.known_certificate, estimate.identifiability)
 
 
@@ -83,7 +85,9 @@ def write_estimate(estimate: Estimate) -> str:
 
 
 def _format_failure(fit: Fit, certificate: Certificate) -> list[str]:
-    """Lines in capitals, unless a minimum was found, it is the only one nearby, and nothing that was checked failed."""
+    """Return lines in capitals, unless a minimum was found, it is the only one nearby, and nothing that was checked
+    failed.
+    """
     if not fit.status.is_strict_minimum:
         return [f"*** {_FAILURES.get(fit.status, 'NOT CONVERGED: the numbers below are not a minimum')}. ***"]
     if certificate.passed:
@@ -104,7 +108,7 @@ _FAILURES = {
 
 
 def _format_experiments(fit: Fit) -> Iterator[str]:
-    """For each experiment its modes, its horizon and its data."""
+    """Return each experiment's modes, its horizon and its data."""
     single = len(fit.trajectories) == 1
     names = ["experiment"] if single else fit.run_names
     for name, trajectory, run in list(zip(names, fit.trajectories, fit.comparisons, strict=True))[:LISTED_EXPERIMENTS]:
@@ -120,7 +124,7 @@ def _format_experiments(fit: Fit) -> Iterator[str]:
 
 
 def _format_data(comparison: Comparison) -> str:
-    """One of the data in words."""
+    """Return one of the data in words."""
     names = ", ".join(comparison.names)
     if comparison.kind != "measurements":
         return f"{names}: reference signal"
@@ -132,7 +136,7 @@ def _format_data(comparison: Comparison) -> str:
 
 
 def _format_course(fit: Fit) -> Iterator[str]:
-    """Method, effort, and how it ended."""
+    """Return method, effort, and how it ended."""
     yield from _format_row("method", METHODS.get(fit.hessian_kind, fit.hessian_kind))
     effort = f"{_count(fit.iterations, 'iteration')}, {_count(fit.evaluations, 'evaluation')}, {fit.seconds:.3g} s"
     yield from _format_row("effort", effort)
@@ -142,7 +146,7 @@ def _format_course(fit: Fit) -> Iterator[str]:
 
 
 def _format_quality(fit: Fit) -> Iterator[str]:
-    """Cost, optimality, residual variance, integration error."""
+    """Return cost, optimality, residual variance, integration error."""
     start = f"   (first guess: {fit.history[0].cost:.8g})" if fit.history else ""
     yield from _format_row("cost J", f"{fit.cost:.8g}{start}")
     yield from _format_row("KKT residual", f"{fit.optimality:.1e}   (tolerance: {fit.tolerance:.1e})")
@@ -164,7 +168,7 @@ def _format_quality(fit: Fit) -> Iterator[str]:
 
 
 def _format_channels(fit: Fit) -> list[str]:
-    """A table of the channels: root mean square of the residuals, in units and in sigmas."""
+    """Return a table of the channels: root mean square of the residuals, in units and in sigmas."""
     single = len(fit.trajectories) == 1
     rows = []
     for name, trajectory, run in zip(fit.run_names, fit.trajectories, fit.comparisons, strict=True):
@@ -182,7 +186,7 @@ def _format_channels(fit: Fit) -> list[str]:
 
 
 def _format_residuals(comparison: Comparison, k: int) -> tuple[str, str, str]:
-    """Number of values, rmse and rmse / sigma of one channel; blank where there are none."""
+    """Return the number of values, rmse and rmse / sigma of one channel; blank if it has no samples."""
     residual = comparison.measured[:, k] - comparison.fitted[:, k]
     there = np.isfinite(residual)
     count = str(there.sum()) if comparison.kind == "measurements" else "signal"
@@ -194,7 +198,7 @@ def _format_residuals(comparison: Comparison, k: int) -> tuple[str, str, str]:
 
 
 def _format_unknowns(fit: Fit) -> list[str]:
-    """The table of the unknowns."""
+    """Return the table of the unknowns."""
     errors = fit.standard_errors
     known = bool(np.isfinite(errors).any())
     joins = {t.index: f"{t.before} -> {t.after}" for t in fit.transitions}
@@ -214,7 +218,7 @@ def _format_unknowns(fit: Fit) -> list[str]:
 
 
 def _compare_covariances(fit: Fit) -> str:
-    """How the other covariance compares."""
+    """Return how the other covariance compares."""
     found = disagreement(fit)
     if found is None:
         return ""
@@ -222,7 +226,7 @@ def _compare_covariances(fit: Fit) -> str:
 
 
 def _format_log_scale(fit: Fit, i: int) -> str:
-    """The interval of an unknown on a logarithmic scale, which its standard error does not say."""
+    """Return the interval of an unknown on a logarithmic scale, which its standard error does not say."""
     if fit.theta_names[i] not in fit.log_scaled:
         return ""
     low, high = fit.confidence_intervals()[i]
@@ -230,7 +234,7 @@ def _format_log_scale(fit: Fit, i: int) -> str:
 
 
 def _mark_unknown(fit: Fit, name: str) -> str:
-    """What holds an unknown, in capitals."""
+    """Return what holds an unknown, in capitals."""
     if name in fit.idle:
         return "MODE COLLAPSED"
     bounds = [constraint.kind for constraint in fit.active if constraint.unknown == name]
@@ -240,7 +244,7 @@ def _mark_unknown(fit: Fit, name: str) -> str:
 
 
 def _format_fixed(fit: Fit) -> list[str]:
-    """Transition times and parameters that were not estimated."""
+    """Return transition times and parameters that were not estimated."""
     fixed = [t for t in fit.transitions if t.index is None]
     rows = [[t.name, f"{t.time:.8g}", format_unit(t.unit), f"{t.before} -> {t.after}"] for t in fixed]
     for name in fit.fixed:
@@ -250,7 +254,7 @@ def _format_fixed(fit: Fit) -> list[str]:
 
 
 def _format_correlations(fit: Fit) -> list[str]:
-    """The largest correlations."""
+    """Return the largest correlations."""
     if not np.isfinite(fit.standard_errors).any():
         return []
     correlation = np.nan_to_num(np.tril(fit.correlation, -1))
@@ -263,7 +267,7 @@ def _format_correlations(fit: Fit) -> list[str]:
 
 
 def _describe_weak(fit: Fit, found: Identifiability) -> list[str]:
-    """The combinations of unknowns that the data hardly see, if there are any."""
+    """Return the combinations of unknowns that the data hardly see, if there are any."""
     weak = [d for d in found.directions if d.eigenvalue < WEAK] if fit.success else []
     return [line for direction in weak for line in _wrap(write_direction(found, direction), "  - ", "    ")]
 
@@ -276,7 +280,7 @@ def _format_section(title: str, lines: Sequence[str]) -> list[str]:
 
 
 def _format_row(label: str, text: str) -> list[str]:
-    """A label at the left and text, wrapped, beside it."""
+    """Return a label at the left and text, wrapped, beside it."""
     if len(label) > LABEL:
         return [f"  {label}", *_wrap(text, " " * (LABEL + 4), " " * (LABEL + 4))]
     return _wrap(text, f"  {label:<{LABEL}}  ", " " * (LABEL + 4))

@@ -36,7 +36,7 @@ LARGEST_FIGURE = 10
 
 @format_text.register(Certificate)
 def write_certificate(certificate: Certificate) -> str:
-    """Every check with its number, and the verdict.
+    """Return every check with its number, and the verdict.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def _format_orders(orders: tuple[float, ...]) -> str:
 
 @format_text.register(DerivativeCheck)
 def write_derivative_check(check: DerivativeCheck) -> str:
-    """The Taylor table, the gaps between the methods, and the verdict.
+    """Return the Taylor table, the gaps between the methods, and the verdict.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ _RISES = {
 
 @format_text.register(Identifiability)
 def write_identifiability(found: Identifiability) -> str:
-    """How many unknowns the data determine, and the combinations that they determine badly.
+    """Return how many unknowns the data determine, and the combinations that they determine badly.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def write_identifiability(found: Identifiability) -> str:
 
 
 def write_direction(found: Identifiability, direction: Direction) -> str:
-    """Which unknowns trade off along a direction, the change that was tried, and by how much J rises.
+    """Return which unknowns trade off along a direction, the change that was tried, and by how much J rises.
 
     Parameters
     ----------
@@ -175,14 +175,14 @@ def write_direction(found: Identifiability, direction: Direction) -> str:
 
 
 def _format_move(found: Identifiability, i: int, change: float) -> str:
-    """A change in words: later or earlier for a transition time, higher or lower for anything else."""
+    """Return a change in words: later or earlier for a transition time, higher or lower for anything else."""
     up, down = ("later", "earlier") if found.is_time[i] else ("higher", "lower")
     size = f"{abs(change):.2g}{unit_suffix(found.theta_units[i])}"
     return f"{found.theta_names[i]} {size} {up if change > 0 else down}"
 
 
 def _format_rises(direction: Direction, rise: str, cost: float) -> str:
-    """What was found on both sides of a change, the end of a sentence."""
+    """Return what was found on both sides of a change, the end of a sentence."""
     finite = [r for r in direction.rises if np.isfinite(r)]
     if not finite:
         return ": J could not be evaluated there."
@@ -198,7 +198,7 @@ def _format_rises(direction: Direction, rise: str, cost: float) -> str:
 
 @format_text.register(ResidualDiagnostics)
 def write_diagnostics(diagnostics: ResidualDiagnostics) -> str:
-    """A line for each channel, and what fails.
+    """Return a line for each channel, and what fails.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ def _format_probability(value: float) -> str:
 
 @format_text.register(Profile)
 def write_profile(profile: Profile) -> str:
-    """The estimate, both intervals, how each side ended, and what to be wary of.
+    """Return the estimate, both intervals, how each side ended, and what to be wary of.
 
     Parameters
     ----------
@@ -269,14 +269,14 @@ def write_profile(profile: Profile) -> str:
 
 
 def _format_number(value: float, error: float) -> str:
-    """A number to the second digit of an error."""
+    """Return a number to the second digit of an error."""
     if not np.isfinite(value):
         return {np.inf: "inf", -np.inf: "-inf"}.get(value, "?")
     return format_rounded(value, error)[0] if error > 0 else f"{value:.6g}"
 
 
 def list_profile_notes(profile: Profile) -> list[str]:
-    """What is not as in the textbook, a sentence each.
+    """Return what is not as in the textbook, a sentence each.
 
     Parameters
     ----------
@@ -320,7 +320,7 @@ def list_profile_notes(profile: Profile) -> list[str]:
 
 @draw_figure.register(Profile)
 def plot_profile(profile: Profile) -> Figure:
-    """A figure of one profile.
+    """Draw a figure of one profile.
 
     Parameters
     ----------
@@ -334,7 +334,7 @@ def plot_profile(profile: Profile) -> Figure:
 
 
 def draw_profile(profile: Profile, ax: Axes) -> Axes:
-    """The likelihood ratio against the value, with the thresholds, the interval, and the quadratic approximation.
+    """Draw the likelihood ratio against the value, with the thresholds, the interval, and the quadratic approximation.
 
     Parameters
     ----------
@@ -398,7 +398,8 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
 
 @draw_figure.register(ResidualDiagnostics)
 def plot_diagnostics(diagnostics: ResidualDiagnostics) -> Figure:
-    """A row a channel: residuals in time, their autocorrelation, and their quantiles against those of a normal one.
+    """Draw a row a channel: residuals in time, their autocorrelation, and their quantiles against those of a normal
+    one.
 
     Parameters
     ----------
@@ -430,7 +431,7 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics) -> Figure:
 
 
 def draw_in_time(channel: ChannelResiduals, ax: Axes) -> Axes:
-    """Standardised residuals over time with lines at two standard deviations.
+    """Draw standardised residuals over time with lines at two standard deviations.
 
     Parameters
     ----------
@@ -450,7 +451,7 @@ def draw_in_time(channel: ChannelResiduals, ax: Axes) -> Axes:
 
 
 def draw_autocorrelation(channel: ChannelResiduals, ax: Axes) -> Axes:
-    """Autocorrelation against lag, with the limits within which that of white noise lies in 95 %.
+    """Draw the autocorrelation against lag, with the limits within which that of white noise lies in 95 %.
 
     Parameters
     ----------
@@ -473,7 +474,7 @@ def draw_autocorrelation(channel: ChannelResiduals, ax: Axes) -> Axes:
 
 
 def draw_quantiles(channel: ChannelResiduals, ax: Axes) -> Axes:
-    """Sorted standardised residuals against the quantiles of the normal distribution: a straight line if normal.
+    """Draw sorted standardised residuals against the quantiles of the normal distribution: a straight line if normal.
 
     Parameters
     ----------

@@ -35,7 +35,7 @@ SETTINGS: dict[str, Any] = {
 
 
 def find_folder() -> Path | None:
-    """Where compiled programs are kept; None if the cache is off."""
+    """Return where compiled programs are kept; None if the cache is off."""
     chosen = os.environ.get("SWITCHFIT_CACHE", "")
     if chosen.lower() == "off":
         return None
@@ -44,7 +44,9 @@ def find_folder() -> Path | None:
 
 @contextmanager
 def use_compilation_cache() -> Iterator[None]:
-    """Context in which JAX reads and writes compiled programs in `find_folder`; everything is as before afterwards."""
+    """Return a context in which JAX reads and writes compiled programs in `find_folder`; everything is as before
+    afterwards.
+    """
     path = get_usable_folder()
     before = {name: getattr(jax.config, name) for name in SETTINGS}
     if path is None or before["jax_compilation_cache_dir"]:

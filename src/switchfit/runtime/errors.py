@@ -8,6 +8,6 @@ class InputError(ValueError):
 
 
 def get_first_line(error: BaseException) -> str:
-    """An exception in one line: its type and the first line of its message."""
+    """Return an exception in one line: its type and the first line of its message."""
     message = str(error).strip().splitlines()
     return f"{type(error).__name__}: {message[0]}" if message else type(error).__name__

@@ -89,7 +89,7 @@ def _delete_abandoned(folder: Path) -> None:
 
 
 def is_regular(path: Path) -> bool:
-    """Whether there is a file of that name; False for names that no file can have."""
+    """Return whether there is a file of that name; False for names that no file can have."""
     try:
         return path.is_file()
     except (OSError, ValueError):  # too long; a null character
@@ -97,7 +97,7 @@ def is_regular(path: Path) -> bool:
 
 
 def is_device(path: Path) -> bool:
-    """Whether it is a device, such as a terminal or ``/dev/zero``, which can be read without end."""
+    """Return whether it is a device, such as a terminal or ``/dev/zero``, which can be read without end."""
     try:
         return path.is_char_device() or path.is_block_device()
     except (OSError, ValueError):

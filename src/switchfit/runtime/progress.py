@@ -10,7 +10,7 @@ Progress = Callable[[int, int], object]
 
 
 def show_progress(callback: Progress | None, title: str) -> tuple[Progress, Callable[[], None]]:
-    """What a long run calls with (done, total), true to stop: the user's callback, and a bar on a terminal.
+    """Return a context that yields the callback of a long run: the user's, with a bar on a terminal.
 
     Parameters
     ----------

@@ -155,7 +155,7 @@ def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
 def _find_failures(
     fit: Fit, smallest: float, gaps: tuple[float, float], orders: tuple[float, ...], *, stiff: bool
 ) -> Iterator[Issue]:
-    """The checks that failed."""
+    """Return the checks that failed."""
     if fit.status is not Status.CONVERGED_PRECISION and not fit.optimality <= fit.tolerance:
         yield Issue("optimality", figures={"optimality": fit.optimality, "tolerance": fit.tolerance})
     if smallest < NEGATIVE:

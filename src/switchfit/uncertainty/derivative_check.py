@@ -28,7 +28,7 @@ class TaylorTable(NamedTuple):
 
 
 def build_taylor_table(evaluator: Evaluator, theta: FloatArray, *, seed: int = 0) -> TaylorTable:
-    """Remainders of J with its gradient and its Hessian along a random direction, at theta but off the nodes."""
+    """Return remainders of J with its gradient and its Hessian along a random direction, at theta but off the nodes."""
     at = _move_off_nodes(evaluator, theta)
     base = evaluator(at)
     direction = np.random.default_rng(seed).choice([-1.0, 1.0], size=len(at)) * _choose_scales(base, at)
@@ -42,12 +42,12 @@ def build_taylor_table(evaluator: Evaluator, theta: FloatArray, *, seed: int = 0
 
 
 def estimate_orders(orders: FloatArray) -> tuple[float, ...]:
-    """Median order of each remainder over the steps at which it is not yet rounding; NaN if it always is."""
+    """Return the median order of each remainder over the steps at which it is not yet rounding; NaN if it always is."""
     return tuple(_take_median(orders[:, k]) for k in range(3))
 
 
 def are_orders_right(observed: tuple[float, ...]) -> bool:
-    """Whether they are 1, 2, 3 or more within 0.25, or beyond what can be seen."""
+    """Return whether the orders are 1, 2, 3 or more within 0.25, or beyond what can be seen."""
     return all(order > k - 0.25 or np.isnan(order) for k, order in enumerate(observed, start=1))
 
 
@@ -69,7 +69,7 @@ class DerivativeCheck:
         The same with every step halved: smaller by ``2**order`` of the integrator, down to rounding.
     theta : (d,) array
     stiff : bool
-        With the stiff solver the gaps are told but not judged: the paper's adjoints have boundary layers of their own
+        With the stiff solver the gaps are reported, not judged: the paper's adjoints have boundary layers of their own
         at transitions and samples, which a mesh refined for the state does not resolve.
 
     See Also
@@ -162,7 +162,7 @@ def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, seed:
 
 
 def measure_derivative_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[float, float]:
-    """Relative gap of gradient and Hessian between the paper's equations and the discretised cost.
+    """Return the relative gap of gradient and Hessian between the paper's equations and the discretised cost.
 
     NaN where the cost has what the paper's equations do not know. Unknowns are scaled to unit curvature each. Near a
     minimum the gradient vanishes; its gap is then relative to the gradient that a change of all unknowns by 0.1 % would
@@ -185,14 +185,14 @@ def _measure_gap(a: FloatArray, b: FloatArray, floor: float) -> float:
 
 
 def _choose_scales(base: Evaluation, theta: FloatArray) -> FloatArray:
-    """Changes of the unknowns that each change J by about as much as the others."""
+    """Return changes of the unknowns that each change J by about as much as the others."""
     curvature = np.abs(np.diag(base.hessian))
     typical = np.where(theta != 0, np.abs(theta), 1.0)
     return np.where(curvature > 0, 1.0 / np.sqrt(np.where(curvature > 0, curvature, 1.0)), typical)
 
 
 def _move_off_nodes(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
-    """theta with each transition time in the middle of the cell it is in, where J is smooth for longest."""
+    """Return theta with each transition time in the middle of the cell it is in, where J is smooth for longest."""
     moved = theta.copy()
     late = _list_late_times(evaluator, theta)
     for i, nodes in enumerate(evaluator.breakpoints()):
@@ -204,7 +204,7 @@ def _move_off_nodes(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
 
 
 def _find_room(evaluator: Evaluator, theta: FloatArray, direction: FloatArray) -> float:
-    """Largest step that leaves every transition time in its cell, and every unknown near its size.
+    """Return the largest step that leaves every transition time in its cell, and every unknown near its size.
 
     No transition may pass what a late sample sees, either, which moves with the delay.
     """
@@ -220,7 +220,7 @@ def _find_room(evaluator: Evaluator, theta: FloatArray, direction: FloatArray) -
 
 
 def _list_late_times(evaluator: Evaluator, theta: FloatArray) -> dict[int, FloatArray]:
-    """For each transition time in theta the moments that late samples of its run see, if there are any."""
+    """Return, for each transition time in theta, the times that late samples of its run see, if there are any."""
     problem = evaluator.problem
     found: dict[int, FloatArray] = {}
     for e, where in enumerate(problem.unknowns.times):

@@ -32,9 +32,9 @@ from switchfit.problem.problem import Problem
 from switchfit.runtime.presentation import format_text
 
 WEAK = 0.05
-"""Scaled eigenvalues below this are told: standard errors along them are 4.5 times those of each unknown alone."""
+"""Scaled eigenvalues below this are reported: standard errors along them are 4.5 times those of each unknown alone."""
 MOST = 3
-"""Directions that are told."""
+"""Most directions that are reported."""
 NAMED = 0.2
 """Unknowns with less than this part of the largest weight in a direction are not named."""
 UNDETERMINED = 1e-10
@@ -186,7 +186,7 @@ class Identifiability:
 
 
 def identifiability(subject: Any) -> Identifiability:
-    """How well the data determine the unknowns, at the solution of a fit or, before any fit, at the first guess.
+    """Return how well the data determine the unknowns, at the solution of a fit or, before any fit, at the first guess.
 
     Parameters
     ----------
@@ -258,7 +258,7 @@ def analyse_solution(fit: Fit, evaluator: Evaluator | None) -> Identifiability:
 
 
 def _analyse_first_guess(problem: Problem) -> Identifiability:
-    """At the first guess, with the data that it would itself produce, where they are Measurements."""
+    """Analyse a problem at its first guess, with the data that it would itself produce, where they are Measurements."""
     theta, unknowns = problem.initial_theta, problem.unknowns
     own = evaluator_of(problem)
     refuse_hidden_switches(own, theta, own(theta).gradient)
@@ -296,7 +296,7 @@ def _analyse_first_guess(problem: Problem) -> Identifiability:
 
 
 def _drop_noise(problem: Problem, evaluator: Evaluator) -> Problem:
-    """The problem with the values that its first guess produces; missing ones stay missing."""
+    """Return the problem with the values that its first guess produces; missing ones stay missing."""
     theta = problem.initial_theta
     comparisons = compare(problem, theta, evaluator.simulate(theta))[1]
     experiments = []
@@ -310,7 +310,7 @@ def _drop_noise(problem: Problem, evaluator: Evaluator) -> Problem:
 
 
 def _measure_variation(problem: Problem) -> float:
-    """Half the weighted sum of squares of what is measured about its mean, channel by channel."""
+    """Return half the weighted sum of squares of what is measured about its mean, channel by channel."""
     total = 0.0
     for experiment in problem.experiments:
         for item in experiment.data:
@@ -345,7 +345,7 @@ def analyse(
     allowed: Callable[[FloatArray], bool] | None = None,
     base: float = np.nan,
 ) -> Identifiability:
-    """The badly determined directions of a Hessian, tried out with the cost it belongs to.
+    """Return the badly determined directions of a Hessian, tried out with the cost it belongs to.
 
     Parameters
     ----------
@@ -375,7 +375,7 @@ def analyse(
     without = tuple(n for n, f, nothing in zip(names, free, flat, strict=True) if f and nothing)
     spectrum = scaled_spectrum(hessian, basis)
     values, vectors = spectrum.values, spectrum.vectors
-    # What the cost does not depend on at all is told by itself.
+    # What the cost does not depend on at all is reported separately.
     dead = np.array([n in without for n in names])
     kept = [k for k in range(len(values)) if not np.sum(vectors[dead, k] ** 2) > 0.5]
     values, vectors = values[kept], vectors[:, kept]
@@ -399,7 +399,9 @@ def _try_direction(
     rise: float,
     allowed: Callable[[FloatArray], bool] | None,
 ) -> tuple[FloatArray, tuple[float, float]]:
-    """The change along a direction (d,) at which J should rise by `rise`, and by how much it does on both sides."""
+    """Return the change along a direction (d,) at which J should rise by `rise`, and by how much it does
+    on both sides.
+    """
     known = theta != 0
     # No unknown moves by more than its own size, where it has one.
     share = np.max(np.abs(direction[known] / theta[known]), initial=0.0)

@@ -46,7 +46,7 @@ def find_issues(fit: Fit) -> list[Issue]:
 
 
 def _find_active(fit: Fit) -> Iterator[Issue]:
-    """Constraints that hold with equality."""
+    """Find the constraints that hold with equality."""
     for constraint in fit.active:
         if constraint.position is not None:
             figures = {"position": float(constraint.position), "value": constraint.value}
@@ -57,7 +57,7 @@ def _find_active(fit: Fit) -> Iterator[Issue]:
 
 
 def _find_idle(fit: Fit) -> Iterator[Issue]:
-    """Unknowns on which the cost does not depend, because a mode has collapsed."""
+    """Find unknowns on which the cost does not depend, because a mode has collapsed."""
     times = {name for name, is_time in zip(fit.theta_names, fit.is_time.tolist(), strict=True) if is_time}
     for kind, names in (
         ("idle times", tuple(name for name in fit.idle if name in times)),
@@ -68,20 +68,20 @@ def _find_idle(fit: Fit) -> Iterator[Issue]:
 
 
 def _find_kinks(fit: Fit) -> Iterator[Issue]:
-    """Unknowns at which the derivative jumps through zero."""
+    """Find unknowns at which the derivative jumps through zero."""
     for kink in fit.kinks:
         yield Issue("at a kink", (kink.unknown,), {"left": kink.left, "right": kink.right})
 
 
 def _find_undetermined(fit: Fit) -> Iterator[Issue]:
-    """A direction along which the cost hardly changes."""
+    """Find a direction along which the cost hardly changes."""
     curvature = free_curvature(fit)
     if len(curvature.scaled) and abs(smallest := float(curvature.scaled[0])) < BARELY_DETERMINED:
         yield Issue("hardly determined", curvature.weakest, {"eigenvalue": smallest})
 
 
 def _find_missing_errors(fit: Fit) -> Iterator[Issue]:
-    """Why there are no standard errors."""
+    """Find out why there are no standard errors."""
     if np.isfinite(fit.standard_errors).all():
         return
     k = fit.free_basis.shape[1]
@@ -97,7 +97,7 @@ def _find_missing_errors(fit: Fit) -> Iterator[Issue]:
 
 
 def _check_noise(fit: Fit) -> Iterator[Issue]:
-    """Where sigma is known and the residuals contradict it: 2 J should be chi-square distributed."""
+    """Find out whether a known sigma contradicts the residuals: 2 J should be chi-square distributed."""
     variance = fit.residual_variance
     if not (fit.success and fit.sigma_known and np.isfinite(variance)):
         return
@@ -109,13 +109,13 @@ def _check_noise(fit: Fit) -> Iterator[Issue]:
 
 
 def _check_residuals(fit: Fit) -> Iterator[Issue]:
-    """Residuals that are no white, normal noise."""
+    """Find residuals that are not white, normal noise."""
     if fit.success and fit.sigma_known is not None:
         yield from diagnose(fit).issues
 
 
 def _compare_covariances(fit: Fit) -> Iterator[Issue]:
-    """Where the exact Hessian and the Gauss-Newton matrix give different standard errors."""
+    """Find out whether the exact Hessian and the Gauss-Newton matrix give different standard errors."""
     found = disagreement(fit) if fit.success else None
     if found is not None and found.factor > DIFFERENT:
         kind = "known to second order" if found.factor > UNSEEN else "covariances differ"
@@ -124,6 +124,6 @@ def _compare_covariances(fit: Fit) -> Iterator[Issue]:
 
 
 def _check_integration(fit: Fit) -> Iterator[Issue]:
-    """A trajectory that is not accurate enough."""
+    """Find out whether the integration is not accurate enough."""
     if not fit.integration_error <= LARGE_INTEGRATION_ERROR:
         yield Issue("large integration error", (fit.integration_error_of,), {"error": fit.integration_error})

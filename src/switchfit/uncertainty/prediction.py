@@ -85,7 +85,7 @@ class Prediction:
     fit: Fit = field(repr=False)
 
     def state_band(self, level: float = 0.95) -> FloatArray:
-        """Confidence band of the states at each time: (K, n, 2).
+        """Return the confidence band of the states at each time: (K, n, 2).
 
         See Also
         --------
@@ -105,7 +105,7 @@ class Prediction:
         return _build_band(self.states, self.fit.quantile(level) * self.state_errors)
 
     def output_band(self, level: float = 0.95) -> FloatArray:
-        """Confidence band of the outputs, of their mean without noise, at each time: (K, q, 2).
+        """Return the confidence band of the outputs, of their mean without noise, at each time: (K, q, 2).
 
         See Also
         --------
@@ -125,7 +125,7 @@ class Prediction:
         return _build_band(self.outputs, self.fit.quantile(level) * self.output_errors)
 
     def prediction_band(self, level: float = 0.95) -> FloatArray:
-        """Where a new sample would fall at each time, noise included: (K, q, 2).
+        """Return where a new sample would fall at each time, noise included: (K, q, 2).
 
         See Also
         --------
@@ -150,7 +150,7 @@ def _build_band(values: FloatArray, half: FloatArray) -> FloatArray:
 
 
 def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 0) -> Prediction:
-    """States and outputs at any times with their standard errors and bands.
+    """Return states and outputs at any times with their standard errors and bands.
 
     Parameters
     ----------
@@ -232,13 +232,13 @@ def _build_prediction(fit: Fit, problem: Problem, e: int, points: Points) -> Pre
 
 
 def _compute_errors(derivative: FloatArray, covariance: FloatArray) -> FloatArray:
-    """``sqrt(X C X')`` of derivatives (K, q, d): (K, q)."""
+    """Return ``sqrt(X C X')`` of derivatives (K, q, d): (K, q)."""
     variance = np.einsum("kqd,de,kqe->kq", derivative, covariance, derivative)
     return np.sqrt(np.maximum(variance, 0.0))
 
 
 def _get_noise(fit: Fit, problem: Problem, e: int, times: FloatArray) -> FloatArray:
-    """Standard deviation of one sample of each output at each time: (K, q)."""
+    """Return the standard deviation of one sample of each output at each time: (K, q)."""
     columns = [np.full((len(times), q), np.nan) for _, q in problem.structures[e].references]
     for item, comparison in zip(_list_compared(problem, e), fit.comparisons[e], strict=True):
         if isinstance(item, Measurements):
@@ -250,7 +250,7 @@ def _get_noise(fit: Fit, problem: Problem, e: int, times: FloatArray) -> FloatAr
 
 
 def _list_compared(problem: Problem, e: int) -> list[Any]:
-    """The data of experiment e that have a comparison, in its order."""
+    """Return the data of experiment e that have a comparison, in its order."""
     return [item for item in problem.experiments[e].data if isinstance(item, (Measurements, ReferenceSignal))]
 
 

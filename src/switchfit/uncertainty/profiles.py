@@ -116,12 +116,12 @@ class Trace:
     # --- what the points say
 
     def zeta(self, point: Point) -> float:
-        """Signed root of the likelihood ratio; 0 where the cost is below that of the estimate."""
+        """Return the signed root of the likelihood ratio; 0 where the cost is below that of the estimate."""
         root = np.sqrt(max(2 * (point.cost - self.centre.cost) / self.scale, 0.0))
         return float(root if point.value > self.centre.value else -root)
 
     def side(self, side: int) -> list[Point]:
-        """The points of one side from the estimate outwards, the estimate first."""
+        """Return the points of one side from the estimate outwards, the estimate first."""
         chosen = [q for q in self.points if side * (q.value - self.centre.value) >= 0]
         return sorted(chosen, key=lambda q: side * q.value)
 
@@ -133,7 +133,7 @@ class Trace:
     # --- making points
 
     def _limit(self, side: int) -> float:
-        """How far the constraints let the unknown go."""
+        """Return how far the constraints let the unknown go."""
         k, c = self.index, self.constraints
         coupled = np.flatnonzero(np.any(c.A != 0, axis=0))
         if k not in coupled:
@@ -145,9 +145,10 @@ class Trace:
         return side * max(side * float(found.x[coupled == k][0]), side * float(self.fit.theta[k]))
 
     def _feasible(self, target: FloatArray, inside: FloatArray) -> FloatArray | None:
-        """The feasible point nearest to `target` with its value of the unknown, from one that is feasible without it.
+        """Return the feasible point nearest to `target` with its value of the unknown, from one that is feasible
+        without it.
 
-        None where there is none, which rounding may bring about at a limit.
+        None if no point is feasible, which rounding may cause at a limit.
         """
         k, c = self.index, self.constraints
         value = target[k]
@@ -174,7 +175,7 @@ class Trace:
         return start if np.all(violated >= -1e-9 * (1 + np.abs(c.b))) else None
 
     def _extreme(self, side: int, inside: FloatArray) -> FloatArray:
-        """A feasible point at the limit; unknowns that no constraint couples with this one stay."""
+        """Return a feasible point at the limit; unknowns that no constraint couples with this one stay."""
         c = self.constraints
         coupled = np.flatnonzero(np.any(c.A != 0, axis=0))
         objective = np.where(coupled == self.index, -float(side), 0.0)
@@ -184,7 +185,7 @@ class Trace:
         return found
 
     def _fit(self, value: float, start: FloatArray) -> Point | None:
-        """The point at `value`, fitted from `start`; None where that fails."""
+        """Return the point at `value`, fitted from `start`; None where that fails."""
         lower, upper = self.constraints.lower.copy(), self.constraints.upper.copy()
         lower[self.index] = upper[self.index] = value
         held = replace(self.constraints, lower=lower, upper=upper)
@@ -204,7 +205,7 @@ class Trace:
         return Point(value, result.cost, slope, result.theta, good)
 
     def add(self, value: float, near: Point, before: Point | None = None) -> Point | None:
-        """A new point, from a neighbour or along the line through two of them; None where no fit succeeds."""
+        """Return a new point, from a neighbour or along the line through two of them; None where no fit succeeds."""
         k = self.index
         starts = []
         if before is not None and before.value != near.value:
@@ -227,7 +228,9 @@ class Trace:
         return best
 
     def _suspicious(self, point: Point, near: Point) -> bool:
-        """Whether zeta has risen so much faster than a straight line that this may be another, higher minimum."""
+        """Return whether zeta has risen so much faster than a straight line that this may be another,
+        higher minimum.
+        """
         distance, reached = abs(point.value - self.centre.value), abs(near.value - self.centre.value)
         if reached > 0:
             expected = abs(self.zeta(near)) * distance / reached
@@ -283,7 +286,7 @@ class Trace:
     def _next(
         self, side: int, points: list[Point], step: float, spacing: float, threshold: float, *, looking: bool
     ) -> Point | None:
-        """The next point outwards, nearer where a fit fails or zeta rises too much at once."""
+        """Return the next point outwards, nearer where a fit fails or zeta rises too much at once."""
         last = points[-1]
         before = points[-2] if len(points) > 1 else self._along_covariance(last)
         limit = self.limits[side]
@@ -314,7 +317,7 @@ class Trace:
         return None
 
     def _fill(self, inner: Point, outer: Point, spacing: float) -> None:
-        """Points between two, evenly in zeta as far as a straight line tells."""
+        """Add points between two, evenly in zeta as far as a straight line tells."""
         count = int(abs(self.zeta(outer) - self.zeta(inner)) / spacing)
         previous: Point = inner
         for part in np.arange(1, count) / count:
@@ -322,7 +325,7 @@ class Trace:
             previous = found if found is not None else previous
 
     def _dip(self, side: int) -> None:
-        """Points at minima that the slopes tell of between points far apart."""
+        """Add points at minima that the slopes tell of between points far apart."""
         points = self.side(side)[1:]
         for inner, outer in pairwise(points):
             if side * inner.slope < 0 < side * outer.slope:
@@ -338,7 +341,7 @@ class Trace:
                 )
 
     def _sweep_inward(self, side: int) -> None:
-        """A branch that is lower further out may be lower further in as well: follow it back."""
+        """Follow a branch that is lower further out back in, where it may be lower as well."""
         outer, *inward = self.side(side)[:0:-1]
         for inner in inward:
             start = outer.theta.copy()
@@ -351,7 +354,7 @@ class Trace:
             outer = found
 
     def _along_covariance(self, centre: Point) -> Point | None:
-        """A second point on the tangent of the path of the others at the estimate: theta moves along C e_k."""
+        """Return a second point on the tangent of the path of the others at the estimate: theta moves along C e_k."""
         column = self.fit.covariance[:, self.index]
         if not (np.isfinite(column).all() and column[self.index] > 0):
             return None
@@ -359,7 +362,9 @@ class Trace:
         return Point(float(theta[self.index]), np.nan, np.nan, theta, True)
 
     def _first_step(self, side: int, spacing: float) -> float:
-        """A length after which zeta should be the spacing: by the standard error; at a kink or a bound by the slope."""
+        """Return a length after which zeta should be the spacing: by the standard error; at a kink or a bound by the
+        slope.
+        """
         k, size = self.index, self._size
         error = self.fit.standard_errors[k]
         if np.isfinite(error) and error > 0:
@@ -382,7 +387,7 @@ class Trace:
     # --- where it crosses
 
     def find_crossing(self, a: Point, b: Point, threshold: float) -> float:
-        """Where |zeta| is the threshold between two neighbouring points on different sides of it."""
+        """Return where |zeta| is the threshold between two neighbouring points on different sides of it."""
         found = {a.value: a, b.value: b}
         inner = min((a, b), key=lambda q: abs(q.value - self.centre.value))
 
@@ -400,7 +405,7 @@ class Trace:
         return root
 
     def regions(self, threshold: float) -> list[tuple[float, float]]:
-        """All intervals found in which |zeta| is at most the threshold, ascending; open ends are infinite."""
+        """Return all intervals found in which |zeta| is at most the threshold, ascending; open ends are infinite."""
         points = list(self.points)
         inside = [abs(self.zeta(q)) <= threshold for q in points]
         low = self._open_end(-1) if inside[0] else None
@@ -416,26 +421,28 @@ class Trace:
         return found if low is None else [*found, (low, self._open_end(1))]
 
     def _open_end(self, side: int) -> float:
-        """Where a region ends that was not left on this side."""
+        """Return where a region ends that was not left on this side."""
         end, last = self.ends.get(side, "stopped"), self.side(side)[-1].value
         if end in ("limit", "crossed"):
             return last
         return float(side * np.inf) if end == "flat" else float("nan")
 
     def edges(self, threshold: float) -> list[Point]:
-        """On each side the first point beyond the threshold, or the last one if there is none."""
+        """Return, on each side, the first point beyond the threshold, or the last one below it."""
         sides = [self.side(side) for side in (-1, 1)]
         return [next((q for q in points if abs(self.zeta(q)) >= threshold), points[-1]) for points in sides]
 
     def integration_error(self, threshold: float) -> float:
-        """Largest error of zeta^2 by the integration where it crosses the threshold, by halving all steps."""
+        """Return the largest error of zeta^2 by the integration where it crosses the threshold, by
+        halving all steps.
+        """
         fine = self.evaluator.divide()
         base = fine.cost(self.centre.theta) - self.centre.cost
         ends = self.edges(threshold)
         return max(abs(fine.cost(q.theta) - q.cost - base) * 2 / self.scale for q in ends)
 
     def add_kinks(self, times: FloatArray, threshold: float) -> None:
-        """Points at the sample times up to the threshold, where the slope may jump, unless there are many."""
+        """Add points at the sample times up to the threshold, where the slope may jump, unless there are many."""
         low, high = (q.value for q in self.edges(threshold))
         inside = times[(times > low) & (times < high)]
         for time in inside if len(inside) <= MOST_KINKS else ():
@@ -530,7 +537,7 @@ class Profile:
         return best.theta.copy() if better else None
 
     def regions(self, level: float | None = None) -> list[tuple[float, float]]:
-        """All confidence intervals found at a level: one, unless the profile has several minima.
+        """Return all confidence intervals found at a level: one, unless the profile has several minima.
 
         Parameters
         ----------
@@ -565,7 +572,7 @@ class Profile:
             return [(np.nan, np.nan)]
 
     def interval(self, level: float | None = None) -> tuple[float, float]:
-        """The likelihood-ratio confidence interval that contains the estimate: (low, high).
+        """Return the likelihood-ratio confidence interval that contains the estimate: (low, high).
 
         Parameters
         ----------
@@ -592,7 +599,7 @@ class Profile:
         return format_text(self)
 
     def plot(self) -> Figure:
-        """The likelihood ratio with its thresholds, and the quadratic approximation beside it.
+        """Draw the likelihood ratio with its thresholds, and the quadratic approximation beside it.
 
         See Also
         --------
@@ -612,7 +619,7 @@ class Profile:
 
 
 def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress | None = None) -> Profile:
-    """Profile likelihood of one parameter or transition time.
+    """Return the profile likelihood of one parameter or transition time.
 
     Parameters
     ----------
@@ -693,7 +700,9 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
 
 
 def _refine_mesh(problem: Problem, trace: Trace, threshold: float) -> Evaluator | None:
-    """The problem on meshes that resolve both ends of a profile as well; None where these cannot be integrated."""
+    """Return the problem on meshes that resolve both ends of a profile as well; None where these cannot
+    be integrated.
+    """
     thetas = [trace.centre.theta, *(q.theta for q in trace.edges(threshold))]
     try:
         meshes = [refined_mesh(problem, e, *thetas, finer=2.0) for e in range(len(problem.experiments))]
@@ -717,7 +726,7 @@ def _check(fit: Fit) -> None:
 
 
 def _sample_times(evaluator: Evaluator, index: int) -> FloatArray:
-    """Sample times of the run whose transition time this unknown is; none for a parameter."""
+    """Return sample times of the run whose transition time this unknown is; none for a parameter."""
     problem = evaluator.problem
     for experiment, where in zip(problem.experiments, problem.unknowns.times, strict=True):
         if index in where:

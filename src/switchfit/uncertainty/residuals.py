@@ -106,7 +106,7 @@ class ChannelResiduals:
 
     @property
     def correlation(self) -> float:
-        """Correlation of neighbouring residuals, at lag 1; 0 where there is none."""
+        """Correlation of neighbouring residuals, at lag 1; 0 if there are too few residuals."""
         return float(self.autocorrelation[0]) if self.lags else 0.0
 
     @property
@@ -259,7 +259,9 @@ def diagnose_channel(comparison: Comparison, k: int, experiment: int = 0, time_u
 
 
 def compute_autocorrelation(z: FloatArray, lags: int) -> FloatArray:
-    """Correlation of z (n,) with itself at lags 1 .. lags, about zero, where residuals should be: (lags,)."""
+    """Return the correlation of z (n,) with itself at lags 1 .. lags, about zero, where residuals should
+    be: (lags,).
+    """
     square = float(z @ z)
     if square == 0:
         return np.zeros(lags)

@@ -68,7 +68,9 @@ class Sensitivity:
         return Points(times, states, self._in_theta(states_d), outputs, self._in_theta(outputs_d))
 
     def at(self, times: FloatArray) -> Points:
-        """At nodes (K,) of the mesh; at a transition what is just before it, as a sample there is."""
+        """Return the sensitivity at nodes (K,) of the mesh; at a transition what is just before it, as a sample there
+        is.
+        """
         s, along = self.simulation, self._tangents
         row = s.row_ending(np.searchsorted(s.nodes, times) - 1)
 
@@ -87,7 +89,7 @@ class Sensitivity:
         return self.simulation.tangents
 
     def _in_theta(self, derivative: FloatArray) -> FloatArray:
-        """Derivatives in theta (..., d) from those in the experiment's own unknowns (..., D)."""
+        """Return derivatives in theta (..., d) from those in the experiment's own unknowns (..., D)."""
         own = self.places >= 0
         full = np.zeros((*derivative.shape[:-1], self.d))
         # Two names of the model may mean one parameter: both count.
@@ -140,7 +142,7 @@ class SampleDerivatives(NamedTuple):
 
 
 def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensitivity]) -> SampleDerivatives:
-    """Residuals of all samples and the derivatives of what is fitted to them.
+    """Return residuals of all samples and the derivatives of what is fitted to them.
 
     Parameters
     ----------
@@ -177,5 +179,5 @@ def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensiti
 
 
 def build_gauss_newton(samples: SampleDerivatives) -> FloatArray:
-    """The Gauss-Newton matrix ``sum_k w_k (D h_k)' D h_k`` of all samples: (d, d)."""
+    """Return the Gauss-Newton matrix ``sum_k w_k (D h_k)' D h_k`` of all samples: (d, d)."""
     return samples.derivative.T @ (samples.weight[:, None] * samples.derivative)

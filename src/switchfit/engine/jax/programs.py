@@ -34,7 +34,7 @@ def derivatives(
     method: Method,
     matrix: Matrix = "exact",
 ) -> tuple[Array, Array, Array]:
-    """Return cost, gradient (D,) and Hessian (D, D) of one experiment in its transition times (N,) and its p (M,).
+    """Return the cost, gradient (D,) and Hessian (D, D) of one experiment in its transition times (N,) and its p (M,).
 
     With the matrix "none" the Hessian is NaN.
     """
