@@ -570,6 +570,35 @@ def test_nothing_is_compiled_for_other_data_or_another_number_of_runs():
     assert _fits._cache_size() == count
 
 
+def test_another_sequence_of_the_same_length_compiles_nothing():
+    """What comes when is read at run time; the answers are those of fits by themselves.
+
+    There is one program for each padded length of a mesh.
+    """
+    system = sf.HybridSystem(
+        {
+            "on": lambda t, x, p: 1.0 - p["k"] * x,
+            "off": lambda t, x, p: -p["k"] * x,
+            "slow": lambda t, x, p: 0.1 - 0.1 * p["k"] * x,
+        },
+        [0.2],
+        {("on", "off"): lambda t, x, p: 0.9 * x},
+    )
+    count, lengths = _fits._cache_size(), set()
+    for sequence in (("on", "off", "slow"), ("slow", "on", "off"), ("off", "slow", "off")):
+        run = sf.Experiment(sf.Measurements(TIMES, np.zeros(24), sigma=0.01), sequence, [2.05, 4.1], 0.0, 6.0)
+        problem = sf.Problem(system, run, {"k": sf.Parameter(0.8, lower=0.1, upper=5.0)}, max_transitions=3)
+        theta = problem.initial_theta
+        study = sf.monte_carlo(problem, 8, theta=theta, seed=1)
+        assert study.success.all()
+        work = work_of(problem, theta, theta, seed=1)
+        lengths.add(len(work.meshes[0].nodes))
+        single = minimize_cost(Evaluator(work.problem_of(0), meshes=work.meshes), theta, "exact", 1e-7, 200)
+        np.testing.assert_allclose(study.theta[0], single.theta, rtol=0, atol=1e-8)
+    assert len(lengths) < 3
+    assert _fits._cache_size() == count + len(lengths)
+
+
 def test_starts_that_differ_in_the_transition_time_alone_end_in_one_minimum():
     noisy = 0.4 + 0.05 * np.random.default_rng(2).standard_normal(24) + 0.3 * (np.abs(TIMES - 2.5) < 1.5)
     study = sf.multistart(room(sf.Measurements(TIMES, noisy, sigma=0.05)), [[tau, 1.0] for tau in (2.9, 3.0, 3.1)])

@@ -10,7 +10,7 @@ from models import decay
 from typer.testing import CliRunner
 
 import switchfit as sf
-from switchfit.batch.program import Layout, _total
+from switchfit.batch.program import Layout, _total, read_sequences
 from switchfit.cli import app
 from switchfit.discretization.mesh import choose_common_lengths, pad_length
 from switchfit.engine.native.program import _program_of
@@ -504,10 +504,13 @@ def test_a_batch_of_runs_with_times_that_are_known():
     evaluator, theta = evaluator_of(problem), problem.initial_theta + 0.1
     places = tuple(tuple(where.tolist()) for where in problem.places)
     for lockstep in (False, True):
-        layout = Layout(problem.structures, places, (), lockstep, not lockstep, 1e-7, 10)
+        natively = not lockstep
+        structures = tuple(s.library for s in problem.structures) if natively else problem.structures
+        lengths = tuple(s.N for s in problem.structures)
+        layout = Layout(structures, lengths, places, (), lockstep, natively, 1e-7, 10)
         times = tuple(run.initial_times for run in problem.experiments)
         with jax.enable_x64(True):
-            given_here = layout, tuple(evaluator.arguments), times
+            given_here = layout, tuple(evaluator.arguments), times, read_sequences(layout, problem.structures)
             found = jax.jit(lambda theta, here=given_here: _total(*here, theta, jnp.ones(())))(theta)
         expected = evaluator(theta)
         for one, other in zip(found, (expected.cost, expected.gradient, expected.hessian), strict=True):

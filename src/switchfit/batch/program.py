@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.choice import runs_natively, traced_derivatives
+from switchfit.engine.native.experiment import places_in_library
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.guards import place_on_near_guards
 from switchfit.fit.result import inverse_on
@@ -75,7 +76,8 @@ class Varying(NamedTuple):
 class Layout:
     """What the compiled program depends on: structures, and where in theta each experiment's unknowns stand."""
 
-    structures: tuple[Structure, ...]
+    structures: tuple[Structure, ...]  # where machine code evaluates J, what their sequences have in common alone
+    transitions: tuple[int, ...]
     places: tuple[tuple[int, ...], ...]  # of the N transition times and M parameters, -1 where fixed
     varying: tuple[int, ...]
     lockstep: bool
@@ -177,8 +179,10 @@ def fit_chunk(
     lockstep = in_lockstep() if lockstep is None else lockstep
     evaluator = Evaluator(problem, meshes=meshes)
     natively = not lockstep and problem.engine != "jax" and runs_natively(problem.structures, evaluator.arguments)
+    structures = problem.structures
     layout = Layout(
-        problem.structures,
+        tuple(structure.library for structure in structures) if natively else structures,
+        tuple(structure.N for structure in structures),
         tuple(tuple(int(k) for k in places) for places in problem.places),
         varying.places,
         lockstep,
@@ -196,6 +200,7 @@ def fit_chunk(
             tuple(evaluator.arguments),
             tuple(_pad(value, size) for value in varying.values),
             tuple(experiment.initial_times for experiment in problem.experiments),
+            read_sequences(layout, structures),
             Constraints(*map(jnp.asarray, constraints)),
             Unscaled(variables, unknowns.priors, unknowns.lower, unknowns.upper),
             _pad(variables.inward(np.asarray(starts)), size),
@@ -247,6 +252,7 @@ def _fits(
     arguments: tuple[Arguments, ...],
     values: tuple[jax.Array, ...],
     times: tuple[jax.Array, ...],
+    sequences: tuple[dict[str, jax.Array], ...],
     constraints: Constraints,
     unscaled: Unscaled,
     starts: jax.Array,
@@ -262,7 +268,7 @@ def _fits(
 
         def evaluate(z: jax.Array, side: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             theta = unscaled.theta(z)
-            J, g, H = _total(layout, here, times, theta, side)
+            J, g, H = _total(layout, here, times, sequences, theta, side)
             prior, prior_g, prior_h = unscaled.priors.evaluate(theta, jnp)
             given = unscaled.variables.derivatives_inward(theta, g + prior_g, H + jnp.diag(prior_h), jnp)
             return J + prior, *given
@@ -293,12 +299,19 @@ def _fits(
     return lax.fori_loop(0, count, one, empty)
 
 
+def read_sequences(layout: Layout, structures: Sequence[Structure]) -> tuple[dict[str, NDArray[np.int64]], ...]:
+    """Return what machine code reads at run time of the sequence of modes of each experiment; JAX is written for it."""
+    if not layout.natively:
+        return tuple({} for _ in structures)
+    return tuple(places_in_library(structure) for structure in structures)
+
+
 def _breakpoints(layout: Layout, arguments: tuple[Arguments, ...]) -> Breakpoints:
     """The nodes of each free transition time; these are not scaled."""
     nodes = {
         place: own.nodes
-        for own, structure, places in zip(arguments, layout.structures, layout.places, strict=True)
-        for place in places[: structure.N]
+        for own, N, places in zip(arguments, layout.transitions, layout.places, strict=True)
+        for place in places[:N]
         if place >= 0
     }
     if not nodes:
@@ -312,6 +325,7 @@ def _total(
     layout: Layout,
     arguments: tuple[Arguments, ...],
     times: tuple[jax.Array, ...],
+    sequences: tuple[dict[str, jax.Array], ...],
     theta: jax.Array,
     side: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -323,20 +337,20 @@ def _total(
     J, g, H = jnp.zeros(()), jnp.zeros(d), jnp.zeros((d, d))
     extended = jnp.append(theta, 0.0)
     for group in _group_alike(layout, arguments):
-        structure = layout.structures[group[0]]
-        N = structure.N
+        structure, N = layout.structures[group[0]], layout.transitions[group[0]]
         where = np.array([layout.places[e] for e in group])
         where = np.where(where < 0, d, where)  # what is fixed stands one past the last, and is dropped below
         fixed = jnp.stack([times[e] for e in group])
         tau = jnp.where(where[:, :N] < d, extended[where[:, :N]], fixed)
-        given = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(arguments[e] for e in group))
+        given = jax.tree.map(lambda *leaves: jnp.stack(leaves), *((arguments[e], sequences[e]) for e in group))
 
         def one(
-            given: tuple[Arguments, jax.Array, jax.Array], structure: Structure = structure
+            given: tuple[tuple[Arguments, dict[str, jax.Array]], jax.Array, jax.Array],
+            structure: Structure = structure,
         ) -> tuple[jax.Array, jax.Array, jax.Array]:
-            own, tau, p = given
+            (own, sequence), tau, p = given
             found: tuple[jax.Array, jax.Array, jax.Array] = traced_derivatives(
-                structure, own, tau, p, side, natively=layout.natively
+                structure, own, tau, p, side, natively=layout.natively, places=sequence or None
             )
             return found
 
@@ -354,9 +368,9 @@ def _total(
 def _group_alike(layout: Layout, arguments: tuple[Arguments, ...]) -> list[list[int]]:
     """Groups of experiments that one program can take."""
     groups: dict[Any, list[int]] = {}
-    for e, (structure, own) in enumerate(zip(layout.structures, arguments, strict=True)):
+    for e, (structure, N, own) in enumerate(zip(layout.structures, layout.transitions, arguments, strict=True)):
         shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(own))
-        groups.setdefault((structure, shapes), []).append(e)
+        groups.setdefault((structure, N, shapes), []).append(e)
     return list(groups.values())
 
 
