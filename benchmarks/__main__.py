@@ -1,18 +1,25 @@
-"""Run all benchmarks, print Markdown tables and write them to benchmarks/results: ``python -m benchmarks``."""
+"""Run all benchmarks, print Markdown tables and write them to benchmarks/results: ``python -m benchmarks``.
+
+``python -m benchmarks sizes REVISION...`` measures nothing but how large the code is (`benchmarks.sizes`).
+"""
 
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 
-from benchmarks import machine
+from benchmarks import machine, sizes
 
 PARTS = ("derivatives", "peers", "fit", "fits", "cold", "many", "scaling", "runs")
 
 
 def main() -> None:
     """Parse the command line and run the parts asked for."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    if sys.argv[1:2] == ["sizes"]:
+        sizes.main(sys.argv[2:])
+        return
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__.partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="fewer cases and repetitions; some minutes")
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"only these of: {', '.join(PARTS)}")
     options = parser.parse_args()

@@ -482,18 +482,12 @@ def estimate(
         raise ValueError(f"with guards or terminal constraints hessian must be 'exact'; got {hessian!r}.")
     began = time.perf_counter()
     theta, evaluator = _prepare_start(problem, start)
-    constraints = constraints_of(problem)
-    held: tuple[tuple[str, float, float], ...] = ()
     history: list[IterationRecord] = []
     evaluations = 0
     for attempt in range(REFINEMENTS + 1):
-        last = history[-1] if history else None
-        told = None if callback is None else lambda record, last=last: callback(record.continue_from(last))
         earlier = max(len(history) - 1, 0)
-        if problem.constraint_names:
-            result, held = minimize_with_constraints(evaluator, theta, tolerance, max_iterations, told)
-        else:
-            result = minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, told, constraints)
+        last = history[-1] if history else None
+        result, held = _minimize(evaluator, theta, hessian, tolerance, max_iterations, callback, last)
         records = [record.continue_from(last) for record in result.history]
         history += records[1:] if history else records
         evaluations += result.evaluations
@@ -544,6 +538,28 @@ def _prepare_start(problem: Problem, start: ArrayLike | None) -> tuple[FloatArra
     if not np.array_equal(placed, theta):
         theta, evaluator = placed, Evaluator(problem, placed)
     return theta, evaluator
+
+
+Held = tuple[tuple[str, float, float], ...]
+"""Name, value and multiplier of each guard and terminal constraint at a solution."""
+
+
+def _minimize(
+    evaluator: Evaluator,
+    theta: FloatArray,
+    hessian: HessianKind,
+    tolerance: float,
+    max_iterations: int,
+    callback: Callable[[IterationRecord], object] | None,
+    last: IterationRecord | None,
+) -> tuple[Result, Held]:
+    """Minimize the cost on the meshes of an evaluator; the callback's records count on from `last`."""
+    report = None if callback is None else lambda record: callback(record.continue_from(last))
+    problem = evaluator.problem
+    if problem.constraint_names:
+        return minimize_with_constraints(evaluator, theta, tolerance, max_iterations, report)
+    constraints = constraints_of(problem)
+    return minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, report, constraints), ()
 
 
 def _refine(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:

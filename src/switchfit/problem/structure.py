@@ -240,12 +240,7 @@ def trace_structure(
     trace = functions.of(experiment)
     used = system.modes if transitions is not None else set(experiment.mode_sequence)
     names = tuple(name for name in system.modes if name in used)  # in the same order for every sequence
-    initial = initial_state_of(system, experiment)
-    x0 = trace(initial, (None,), None, "initial_state", "initial_state(p)") if callable(initial) else None
-    if x0 is not None and (len(x0.shape) != 1 or x0.shape == (0,)):
-        raise ValueError(f"initial_state(p) must return an array of shape (n,); got shape {x0.shape}.")
-    n = len(initial) if x0 is None else x0.shape[0]
-    unknown = () if callable(initial) else tuple(k for k, x in enumerate(initial) if not getattr(x, "fixed", True))
+    x0, n, unknown = _trace_initial_state(trace, initial_state_of(system, experiment))
     items = partial(select_kind, experiment.data)
     at: tuple[Shape | None, ...] = ((), (n,), None)
     inputs = None if experiment.inputs is None else experiment.inputs.shape
@@ -261,27 +256,9 @@ def trace_structure(
         traced = {pair: trace(g, at, shape, f"{what} {pair}", form) for pair, g in given.items() if pair in here}
         return tuple(traced.get(pair) for pair in own), tuple(dict.fromkeys(traced.values()))
 
-    def observe(item: Measurements | ReferenceSignal, channels: int) -> Function | None:
-        if item.observe is not None:
-            return trace(item.observe, at, (channels,), "observe", "h(t, x, p)")
-        if channels != n:
-            raise ValueError(
-                f"Without observe the whole state is compared: its {n} entries need as many channels of data; got "
-                f"{channels}. Give observe=h(t, x, p) -> ({channels},)."
-            )
-        return None
-
     modes = tuple(trace(system.modes[name], in_mode, (n,), f"mode {name!r}", form, input_names) for name in names)
     references = ((item, item.signal.channels) for item in items(ReferenceSignal))
     measurements = ((item, item.values.shape[1]) for item in items(Measurements))
-    constraints = tuple(
-        trace(item.psi, at[1:], None, "TerminalConstraint", "psi(x, p)") for item in items(TerminalConstraint)
-    )
-    for psi in constraints:
-        if len(psi.shape) > 1:
-            raise ValueError(
-                f"TerminalConstraint: psi(x, p) must return a number or an array of shape (m,); got shape {psi.shape}."
-            )
     reset_maps, reset_library = at_transitions(system.reset_maps, (n,), "reset map", "R(t, x, p)")
     guards, guard_library = at_transitions(system.guards, (), "guard", "g(t, x, p)")
     costs = _choose_transition_costs(items(TransitionCost), names)
@@ -296,11 +273,11 @@ def trace_structure(
         unknown_states=unknown,
         parameters=(),
         running=tuple(trace(item.ell, at, (), "RunningCost", "ell(t, x, p)") for item in items(RunningCost)),
-        references=tuple((observe(item, channels), channels) for item, channels in references),
-        measurements=tuple(Sensor.of(item, observe(item, channels)) for item, channels in measurements),
+        references=tuple((_trace_observe(trace, item, q, n), q) for item, q in references),
+        measurements=tuple(Sensor.of(item, _trace_observe(trace, item, q, n)) for item, q in measurements),
         terminal=tuple(trace(item.phi, at[1:], (), "TerminalCost", "phi(x, p)") for item in items(TerminalCost)),
         guards=guards,
-        terminal_constraints=constraints,
+        terminal_constraints=tuple(_trace_terminal_constraint(trace, item, n) for item in items(TerminalConstraint)),
         input_shape=inputs,
         solver=solver,
         transitions=len(reset_maps) if transitions is None else transitions,
@@ -309,14 +286,52 @@ def trace_structure(
         transition_costs=transition_costs,
         transition_cost_library=transition_cost_library,
     )
+    return replace(structure, parameters=_select_parameters(trace, structure))
+
+
+def _trace_initial_state(trace: _Tracer, initial: Any) -> tuple[Function | None, int, tuple[int, ...]]:
+    """Return the function x0(p), None for an array; the number of states; and which entries are estimated."""
+    if not callable(initial):
+        return None, len(initial), tuple(k for k, x in enumerate(initial) if not getattr(x, "fixed", True))
+    x0 = trace(initial, (None,), None, "initial_state", "initial_state(p)")
+    if len(x0.shape) != 1 or x0.shape == (0,):
+        raise ValueError(f"initial_state(p) must return an array of shape (n,); got shape {x0.shape}.")
+    return x0, x0.shape[0], ()
+
+
+def _trace_observe(trace: _Tracer, item: Measurements | ReferenceSignal, channels: int, n: int) -> Function | None:
+    """Return the function h(t, x, p) of one of the data; None if the whole state is compared."""
+    if item.observe is not None:
+        return trace(item.observe, ((), (n,), None), (channels,), "observe", "h(t, x, p)")
+    if channels != n:
+        raise ValueError(
+            f"Without observe the whole state is compared: its {n} entries need as many channels of data; got "
+            f"{channels}. Give observe=h(t, x, p) -> ({channels},)."
+        )
+    return None
+
+
+def _trace_terminal_constraint(trace: _Tracer, item: TerminalConstraint, n: int) -> Function:
+    """Return the function psi(x, p) of a terminal constraint, which returns a number or (m,)."""
+    psi = trace(item.psi, ((n,), None), None, "TerminalConstraint", "psi(x, p)")
+    if len(psi.shape) > 1:
+        raise ValueError(
+            f"TerminalConstraint: psi(x, p) must return a number or an array of shape (m,); got shape {psi.shape}."
+        )
+    return psi
+
+
+def _select_parameters(trace: _Tracer, structure: Structure) -> tuple[tuple[str, tuple[int, ...], bool], ...]:
+    """Return name, shape and whether it is free of each parameter that the functions asked for, and of all fixed ones.
+
+    What is fixed costs nothing.
+    """
     asked = trace.asked.union(*(sensor.named for sensor in structure.measurements))
-    # What is fixed costs nothing.
-    parameters = tuple(
+    return tuple(
         (name, q.shape, not q.fixed)
         for name, q in trace.named.items()
         if name in asked or (q.fixed and name not in trace.hidden)
     )
-    return replace(structure, parameters=parameters)
 
 
 def _choose_transition_costs(
