@@ -102,7 +102,7 @@ class Unscaled(NamedTuple):
     upper: Any
 
     def theta(self, z: Any) -> Any:
-        """theta at z: (d,)."""
+        """Return theta at z: (d,)."""
         return jnp.clip(self.variables.outward(z, jnp), self.lower, self.upper)
 
 
@@ -138,12 +138,12 @@ class Chunk(NamedTuple):
 
 
 def in_lockstep() -> bool:
-    """Whether fits go in lockstep: where JAX's default device is not a CPU."""
+    """Return whether fits go in lockstep: where JAX's default device is not a CPU."""
     return str(jax.default_backend()) != "cpu"
 
 
 def chunk_size(lockstep: bool | None = None) -> int:
-    """How many fits one call of `fit_chunk` should take."""
+    """Return how many fits one call of `fit_chunk` should take."""
     return CHUNK_IN_LOCKSTEP if (in_lockstep() if lockstep is None else lockstep) else CHUNK
 
 
@@ -217,7 +217,7 @@ def fit_chunk(
 def replace_leaves(
     arguments: Sequence[Arguments], places: tuple[int, ...], values: Sequence[Any]
 ) -> tuple[Arguments, ...]:
-    """The arguments of all experiments with some of their leaves replaced."""
+    """Return the arguments of all experiments with some of their leaves replaced."""
     leaves, tree = jax.tree.flatten(tuple(arguments))
     for place, value in zip(places, values, strict=True):
         leaves[place] = value
@@ -230,7 +230,7 @@ _lock = threading.Lock()
 
 @contextmanager
 def _compile_once(layout: Layout, given: Any) -> Iterator[None]:
-    """Context of a call of the program: the first one compiles, in the compilation cache, and others wait for it."""
+    """Let the first call of the program compile it, in the compilation cache, while others wait."""
     key = (layout, tuple(np.shape(leaf) for leaf in jax.tree.leaves(given)))
     with _lock:
         if key not in _known:
@@ -242,7 +242,7 @@ def _compile_once(layout: Layout, given: Any) -> Iterator[None]:
 
 
 def _pad(values: Any, size: int) -> FloatArray:
-    """`values` (R, ...) with the last one repeated to `size`: the number of fits must not shape the program."""
+    """Repeat the last of `values` (R, ...) up to `size`: the number of fits must not shape the program."""
     array = np.asarray(values)
     return np.concatenate([array, np.repeat(array[-1:], size - len(array), axis=0)]) if len(array) < size else array
 
@@ -260,10 +260,10 @@ def _fits(
     *,
     layout: Layout,
 ) -> Outcome:
-    """Outcomes of the first `count` fits."""
+    """Return the outcomes of the first `count` fits."""
 
     def functions(own: tuple[jax.Array, ...]) -> tuple[Any, Breakpoints]:
-        """What `minimize_traced` is given for the fit with some numbers of its own: evaluate and breakpoints."""
+        """Return what `minimize_traced` is given for the fit with some numbers of its own: evaluate and breakpoints."""
         here = replace_leaves(arguments, layout.varying, own)
 
         def evaluate(z: jax.Array, side: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -307,7 +307,7 @@ def read_sequences(layout: Layout, structures: Sequence[Structure]) -> tuple[dic
 
 
 def _breakpoints(layout: Layout, arguments: tuple[Arguments, ...]) -> Breakpoints:
-    """The nodes of each free transition time; these are not scaled."""
+    """Return the nodes of each free transition time; these are not scaled."""
     nodes = {
         place: own.nodes
         for own, N, places in zip(arguments, layout.transitions, layout.places, strict=True)
@@ -329,7 +329,7 @@ def _total(
     theta: jax.Array,
     side: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Cost, gradient and Hessian of all experiments together.
+    """Return the cost, gradient and Hessian of all experiments together.
 
     Those that share a structure and all lengths are taken in a loop, so that the program does not grow with them.
     """
@@ -366,7 +366,7 @@ def _total(
 
 
 def _group_alike(layout: Layout, arguments: tuple[Arguments, ...]) -> list[list[int]]:
-    """Groups of experiments that one program can take."""
+    """Return the groups of experiments that one program can take."""
     groups: dict[Any, list[int]] = {}
     for e, (structure, N, own) in enumerate(zip(layout.structures, layout.transitions, arguments, strict=True)):
         shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(own))
@@ -375,7 +375,7 @@ def _group_alike(layout: Layout, arguments: tuple[Arguments, ...]) -> list[list[
 
 
 def error_message(error: BaseException) -> str:
-    """What to list for a fit that ended with an error, on one line."""
+    """Return what to list for a fit that ended with an error, on one line."""
     text = str(error)
     if "Traceback" in text:  # as JAX hands on what a callback raised: its last line says what it was
         raised = [line.strip() for line in text.splitlines() if RAISED.match(line)]
@@ -386,7 +386,7 @@ def error_message(error: BaseException) -> str:
 
 
 def with_errors(chunk: Chunk, errors: Mapping[int, BaseException]) -> Chunk:
-    """The chunk with some of its fits listed as failed, which had no data of their own to fit.
+    """Return the chunk with some of its fits listed as failed, which had no data of their own to fit.
 
     Parameters
     ----------
@@ -407,7 +407,7 @@ def with_errors(chunk: Chunk, errors: Mapping[int, BaseException]) -> Chunk:
 
 
 def make_failed_chunk(starts: FloatArray, errors: Mapping[int, BaseException]) -> Chunk:
-    """A chunk of fits (R, d) none of which could begin."""
+    """Return a chunk of fits (R, d) none of which could begin."""
     R, d = starts.shape
     nothing, none, blank = np.full(R, np.nan), np.zeros(R, dtype=int), np.full(R, "", dtype=object)
     square = np.full((R, d, d), np.nan)
@@ -418,7 +418,7 @@ def make_failed_chunk(starts: FloatArray, errors: Mapping[int, BaseException]) -
 
 
 def _leave_all(starts: FloatArray) -> Outcome:
-    """Outcomes of fits (R, d) that are all left to `minimize`."""
+    """Return the outcomes of fits (R, d) that are all left to `minimize`."""
     R, d = starts.shape
     nothing, none, no = np.full(R, np.nan), np.zeros(R, dtype=int), np.zeros(R, dtype=bool)
     slopes, square = np.full((R, d), np.nan), np.full((R, d, d), np.nan)
@@ -427,7 +427,7 @@ def _leave_all(starts: FloatArray) -> Outcome:
 
 
 def _at_kink(problem: Problem, outcome: Outcome, k: int, tolerance: float) -> Termination:
-    """How fit k ended, one that kinks hold."""
+    """Describe how fit k ended, one that kinks hold."""
     names, theta = problem.unknowns.names, outcome.theta[k]
     kinks = tuple(
         Kink(names[i], float(theta[i]), float(outcome.left[k, i]), float(outcome.gradient[k, i]))
@@ -451,7 +451,7 @@ def _finish_rest(
     tolerance: float,
     max_iterations: int,
 ) -> Chunk:
-    """The outcomes, with every fit that did not settle finished by `minimize`."""
+    """Return the outcomes, with every fit that did not settle finished by `minimize`."""
     R, d = outcome.theta.shape
     found = {name: np.array(getattr(outcome, name)) for name in Outcome._fields[:7]}
     status = np.full(R, Status.CONVERGED.name, dtype=object)

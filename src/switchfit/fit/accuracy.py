@@ -112,7 +112,7 @@ def constraint_values(
 def _constraint_values(
     arguments: Arguments, tau: jax.Array, ends: jax.Array, p: jax.Array, *, structure: Structure
 ) -> tuple[jax.Array, jax.Array]:
-    """Guards, then terminal constraints, (m,), at the state at the end of each segment, (N + 1, n); and D c, (m, n)."""
+    """Return guards, then terminal constraints c (m,) at the ends (N + 1, n) of the segments; and D c, (m, n)."""
     model = Model(structure, arguments)
     values, slopes = [], []
     for i in structure.guarded:

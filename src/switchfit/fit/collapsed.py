@@ -30,7 +30,7 @@ OPENED = 1e-3
 
 
 def idle_unknowns(evaluator: Evaluator, theta: FloatArray, parameters: bool) -> NDArray[np.bool_]:
-    """Which unknowns may be held because J does not depend on them while the modes that have collapsed stay so: (d,).
+    """Return which unknowns may be held, as J does not depend on them while the collapsed modes stay so: (d,).
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def idle_unknowns(evaluator: Evaluator, theta: FloatArray, parameters: bool) -> 
     idle = np.zeros(len(theta), dtype=bool)
     for group in _idle_groups(problem, theta):
         idle[group[0]] = True
-    opened = _opened(problem, theta) if parameters else theta
+    opened = _open_modes(problem, theta) if parameters else theta
     if not np.array_equal(opened, theta):
         for i in _parameters(problem):
             idle[i] = _is_idle(evaluator, theta, opened, i)
@@ -52,7 +52,7 @@ def idle_unknowns(evaluator: Evaluator, theta: FloatArray, parameters: bool) -> 
 
 
 def _idle_groups(problem: Problem, theta: FloatArray) -> Iterator[NDArray[np.intp]]:
-    """Places in theta of transitions that coincide and may move together without an effect.
+    """Return the places in theta of transitions that coincide and may move together without an effect.
 
     None of them is fixed or at an end of the horizon, the mode before them is the mode after them, and no reset map
     or guard stands between.
@@ -68,9 +68,9 @@ def _idle_groups(problem: Problem, theta: FloatArray) -> Iterator[NDArray[np.int
 
 
 def _coincident(problem: Problem, theta: FloatArray, e: int) -> Iterator[tuple[int, int]]:
-    """First and last of two or more transitions of experiment e that coincide strictly inside the horizon."""
+    """Return the first and last of two or more transitions that coincide strictly inside the horizon."""
     experiment, times = problem.experiments[e], problem.vectors(theta, e)[0]
-    if not np.any(times[1:] - times[:-1] <= _rounding(experiment)):  # the rule, and asked at every step
+    if not np.any(times[1:] - times[:-1] <= _estimate_rounding(experiment)):  # the rule, and asked at every step
         return
     short, room = _lengths(problem, theta, e)
     first = 0
@@ -82,8 +82,8 @@ def _coincident(problem: Problem, theta: FloatArray, e: int) -> Iterator[tuple[i
         first = i
 
 
-def _opened(problem: Problem, theta: FloatArray) -> FloatArray:
-    """theta with its free transition times moved so that every collapsed mode lasts a little, where there is room."""
+def _open_modes(problem: Problem, theta: FloatArray) -> FloatArray:
+    """Return theta with transition times moved so that every collapsed mode lasts a little, if there is room."""
     opened = theta.copy()
     for e, (experiment, where) in enumerate(zip(problem.experiments, problem.unknowns.times, strict=True)):
         times, short = problem.vectors(theta, e)[0], _lengths(problem, theta, e)[0]
@@ -100,26 +100,26 @@ def _opened(problem: Problem, theta: FloatArray) -> FloatArray:
 
 
 def _lengths(problem: Problem, theta: FloatArray, e: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which modes of experiment e have no duration (N + 1,), and which transitions are at an end of it (N,)."""
+    """Return which modes of experiment e have no duration (N + 1,), and which transitions are at an end of it (N,)."""
     experiment = problem.experiments[e]
-    times, rounding = problem.vectors(theta, e)[0], _rounding(experiment)
+    times, rounding = problem.vectors(theta, e)[0], _estimate_rounding(experiment)
     knots = np.concatenate([[experiment.t0], times, [experiment.tf]])
     at_end = (times - experiment.t0 <= rounding) | (experiment.tf - times <= rounding)
     return np.diff(knots) <= rounding, at_end
 
 
-def _rounding(experiment: Experiment) -> float:
-    """Rounding error of the difference of two times of an experiment."""
+def _estimate_rounding(experiment: Experiment) -> float:
+    """Return the rounding error of the difference of two times of an experiment."""
     return 32 * EPS * max(experiment.tf - experiment.t0, abs(experiment.t0), abs(experiment.tf))
 
 
 def _parameters(problem: Problem) -> list[int]:
-    """Places in theta of the model's parameters."""
+    """Return the places in theta of the model's parameters."""
     return [i for span in problem.unknowns.parameters.values() for i in range(span.start, span.stop)]
 
 
 def _is_idle(evaluator: Evaluator, theta: FloatArray, opened: FloatArray, i: int) -> bool:
-    """Whether parameter i has no effect on J at theta, but has one where the collapsed modes last a little."""
+    """Return whether parameter i has no effect on J at theta, but has one where the collapsed modes last a little."""
     unknowns = evaluator.problem.unknowns
     low, high = unknowns.lower[i], unknowns.upper[i]
     size = abs(theta[i]) or (high - low if np.isfinite(high - low) else 1.0)

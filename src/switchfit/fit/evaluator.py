@@ -99,13 +99,13 @@ class Evaluator:
         self._priors = problem.unknowns.priors if problem.unknowns.priors.any else None
 
     def divide(self, parts: int = 2) -> Evaluator:
-        """The same problem with every cell of its meshes cut into equal parts."""
+        """Return the same problem with every cell of its meshes cut into equal parts."""
         return Evaluator(self.problem, meshes=[mesh.divide(parts) for mesh in self.meshes])
 
     def __call__(
         self, theta: FloatArray, side: int = 1, method: Method = "auto", matrix: Matrix = "exact"
     ) -> Evaluation:
-        """Cost, gradient and Hessian; where a transition time sits on a node, the derivatives to its `side`.
+        """Return the cost, gradient and Hessian; where a transition time sits on a node, the derivatives to its `side`.
 
         `matrix` asks for the Gauss-Newton matrix in place of the Hessian, or for none (it is NaN then).
         """
@@ -128,7 +128,7 @@ class Evaluator:
     def constrained(
         self, theta: FloatArray, side: int = 1, multipliers: ArrayLike = 0.0, penalty: ArrayLike = 0.0
     ) -> ConstrainedEvaluation:
-        """Cost, constraints and their augmented Lagrangian with the given multipliers and penalties, (m,) or ()."""
+        """Return cost, constraints and the augmented Lagrangian with multipliers and penalties, (m,) or ()."""
         d, count = len(theta), len(self.problem.constraint_names)
         multipliers, penalty = (np.broadcast_to(np.asarray(a, float), count) for a in (multipliers, penalty))
         cost, value, gradient, slope, hessian = 0.0, 0.0, np.zeros(d), np.zeros(d), np.zeros((d, d))
@@ -153,7 +153,7 @@ class Evaluator:
         return ConstrainedEvaluation(cost, gradient, value, slope, hessian, c, jacobian)
 
     def arrow(self, theta: FloatArray, side: int = 1, matrix: Matrix = "exact") -> ArrowEvaluation:
-        """The same by the method "auto", in time and memory that are linear in the number of experiments."""
+        """Evaluate the same by the method "auto", in time and memory that are linear in the number of experiments."""
         total, gradient, parts = 0.0, np.zeros(len(theta)), []
         size = self.layout.own.shape[1] + len(self.layout.shared)
         results = self._results(theta, side, "auto", matrix)
@@ -179,14 +179,14 @@ class Evaluator:
         return [self.layout.slots(e, mine) for e, (_, mine) in enumerate(self.problem.own_places)]
 
     def replace_arguments(self, arguments: Sequence[Arguments]) -> None:
-        """Work with other numbers from now on, on the meshes that they have."""
+        """Replace data and constants; the meshes are those of the new nodes."""
         self.arguments = list(arguments)
         self.meshes = [Mesh.from_times(np.asarray(own.nodes)) for own in arguments]
         given = enumerate(zip(self.arguments, self.meshes, strict=True))
         self.engines = [engine_of(self.problem, e, own, mesh) for e, (own, mesh) in given]
 
     def cost(self, theta: FloatArray) -> float:
-        """J alone."""
+        """Return J alone."""
         costs = [engine.cost(*self.problem.vectors(theta, e)) for e, engine in enumerate(self.engines)]
         return sum(costs, 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0]))
 
@@ -196,12 +196,12 @@ class Evaluator:
         return summarize(self.engines, name_runs(self.problem.experiments))
 
     def simulate(self, theta: FloatArray, *, tangents: bool = False) -> list[Simulation]:
-        """All experiments row by row, with their derivatives in their own unknowns if asked for."""
+        """Simulate all experiments row by row, with their derivatives in their own unknowns if asked for."""
         vectors = (self.problem.vectors(theta, e) for e in range(len(self.engines)))
         return [engine.simulate(*at, tangents=tangents) for engine, at in zip(self.engines, vectors, strict=True)]
 
     def _results(self, theta: FloatArray, side: int, method: Method, matrix: Matrix) -> list[Derivatives]:
-        """Cost, gradient and Hessian of each experiment in its own unknowns."""
+        """Return the cost, gradient and Hessian of each experiment in its own unknowns."""
         theta = np.asarray(theta, dtype=np.float64)
         vectors = [self.problem.vectors(theta, e) for e in range(len(self.engines))]
         if method == "auto":
@@ -216,7 +216,7 @@ class Evaluator:
         return [JaxEngine(s, a, mesh).derivatives(*at, side, matrix, method) for s, a, mesh, at in given]
 
     def breakpoints(self) -> list[FloatArray]:
-        """For each entry of theta the nodes at which derivatives may jump: none for parameters."""
+        """Return the nodes at which derivatives may jump for each entry of theta: an empty array for parameters."""
         points = [np.zeros(0)] * len(self.problem.theta_names)
         for mesh, where in zip(self.meshes, self.problem.unknowns.times, strict=True):
             times = mesh.times
@@ -231,7 +231,7 @@ def knows_paper(problem: Problem) -> bool:
 
 
 def evaluator_of(problem: Problem) -> Evaluator:
-    """The problem's own evaluator, its meshes refined at the initial guess; made once and kept with the problem."""
+    """Return the problem's own evaluator, made once and kept with it; its meshes are refined at the initial guess."""
     if "evaluator" not in problem.__dict__:
         object.__setattr__(problem, "evaluator", Evaluator(problem))
     own: Evaluator = problem.__dict__["evaluator"]
@@ -239,7 +239,7 @@ def evaluator_of(problem: Problem) -> Evaluator:
 
 
 def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method = "auto") -> Evaluation:
-    """Cost, exact gradient and exact Hessian of a problem.
+    """Evaluate the cost, the exact gradient and the exact Hessian of a problem.
 
     Parameters
     ----------

@@ -51,7 +51,7 @@ class GuardedEvaluation:
 
 
 def evaluate_on_guards(problem: Problem, theta: ArrayLike | None = None) -> GuardedEvaluation:
-    """Cost, exact gradient and exact Hessian with guarded transitions where their guards put them.
+    """Evaluate cost, exact gradient and exact Hessian with guarded transitions where their guards put them.
 
     Parameters
     ----------
@@ -72,12 +72,12 @@ def evaluate_on_guards(problem: Problem, theta: ArrayLike | None = None) -> Guar
         If an argument is of the wrong type.
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
-    guarded_places(problem)  # an error where there are no guards
+    find_guarded_places(problem)  # an error where there are no guards
     evaluator = evaluator_of(problem)
     at = on_guards(evaluator, problem.check_theta(theta))
     evaluator = Evaluator(problem, at)  # a mesh for where the transitions really are
     at = on_guards(evaluator, at)
-    guarded = guarded_places(problem)
+    guarded = find_guarded_places(problem)
     free = np.setdiff1d(np.arange(len(at)), guarded)
     rows = guard_rows(problem)
     here = evaluator.constrained(at)
@@ -100,7 +100,7 @@ def evaluate_on_guards(problem: Problem, theta: ArrayLike | None = None) -> Guar
 
 
 def on_guards(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
-    """`theta` with its guarded transition times moved onto their guards, by Newton's method.
+    """Move the guarded transition times of `theta` onto their guards, by Newton's method.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def on_guards(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
         If they cannot be.
     """
     problem = evaluator.problem
-    guarded, rows = guarded_places(problem), guard_rows(problem)
+    guarded, rows = find_guarded_places(problem), guard_rows(problem)
     theta = theta.copy()
     for _ in range(ITERATIONS):
         here = evaluator.constrained(theta)
@@ -144,7 +144,7 @@ def place_on_near_guards(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
 
 
 def _fraction(problem: Problem, theta: FloatArray, step: FloatArray) -> float:
-    """How much of a step keeps the transitions in order."""
+    """Return the fraction of a step that keeps the transitions in order."""
     unknowns = problem.unknowns
     slack, change = unknowns.A @ theta, unknowns.A @ step
     room = slack - unknowns.b
@@ -152,8 +152,8 @@ def _fraction(problem: Problem, theta: FloatArray, step: FloatArray) -> float:
     return float(min(1.0, ROOM * np.min(np.maximum(room[closing], 0.0) / -change[closing], initial=np.inf)))
 
 
-def guarded_places(problem: Problem) -> NDArray[np.intp]:
-    """Positions in theta of the guarded transition times, in the order of the guards."""
+def find_guarded_places(problem: Problem) -> NDArray[np.intp]:
+    """Return the positions in theta of the guarded transition times, in the order of the guards."""
     places = [problem.unknowns.times[e][list(s.guarded)] for e, s in enumerate(problem.structures)]
     found = np.concatenate(places).astype(np.intp)
     if len(found) == 0:
@@ -164,7 +164,7 @@ def guarded_places(problem: Problem) -> NDArray[np.intp]:
 
 
 def guard_rows(problem: Problem) -> NDArray[np.intp]:
-    """Positions of the guards among the constraints."""
+    """Return the positions of the guards among the constraints."""
     rows, last = [], 0
     for count, structure in zip(problem.constraint_counts, problem.structures, strict=True):
         rows.append(last + np.arange(len(structure.guarded)))

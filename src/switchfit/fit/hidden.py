@@ -22,7 +22,7 @@ CHANGED = 1e-9
 
 
 def refuse_hidden_switches(evaluator: Evaluator, theta: FloatArray, gradient: FloatArray) -> None:
-    """ValueError for a parameter whose derivative is exactly 0 although the cost depends on it.
+    """Raise ValueError for a parameter whose derivative is exactly 0 although the cost depends on it.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def refuse_hidden_switches(evaluator: Evaluator, theta: FloatArray, gradient: Fl
 
 
 def refuse_jumps(evaluator: Evaluator, theta: FloatArray) -> None:
-    """ValueError for a parameter with which the cost jumps, although it has a derivative that is right in between.
+    """Raise ValueError for a parameter at which the cost jumps although its derivative is right in between.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def refuse_jumps(evaluator: Evaluator, theta: FloatArray) -> None:
 
 
 def _advice(name: str) -> str:
-    """What a function does with such a parameter, and what to write instead."""
+    """Return what a function does with such a parameter, and what to write instead."""
     return (
         f'a function decides by comparing with it, as in jnp.where(t < p["{name}"], a, b), and derivatives do not see '
         "where such a switch happens. If it is a moment, make it a transition time: a mode for a and a mode for b, "
@@ -80,7 +80,7 @@ def _advice(name: str) -> str:
 
 
 def _jump(evaluator: Evaluator, theta: FloatArray, i: int) -> tuple[float, Finding] | None:
-    """Where the cost jumps as unknown i changes, and from what to what; None if it was not seen to."""
+    """Find where the cost jumps as unknown i changes, and from what to what; None if no jump was seen."""
     lower, upper = evaluator.problem.unknowns.lower[i], evaluator.problem.unknowns.upper[i]
 
     def line(value: float) -> tuple[float, float] | None:
@@ -106,7 +106,7 @@ def _jump(evaluator: Evaluator, theta: FloatArray, i: int) -> tuple[float, Findi
 
 
 def _is_hidden(evaluator: Evaluator, theta: FloatArray, i: int, base: float) -> bool:
-    """Whether the cost differs where unknown i is changed, its derivative being 0 there too."""
+    """Return whether the cost differs where unknown i is changed, its derivative being 0 there too."""
     unknowns = evaluator.problem.unknowns
     lower, upper = unknowns.lower[i], unknowns.upper[i]
     size = abs(theta[i]) or (upper - lower if np.isfinite(upper - lower) else 1.0)

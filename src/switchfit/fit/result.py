@@ -268,7 +268,7 @@ class Fit:
         return self.covariance_from("exact")
 
     def covariance_from(self, hessian: CovarianceKind) -> FloatArray:
-        """Covariance of theta from the exact Hessian or from the Gauss-Newton matrix: (d, d).
+        """Return the covariance of theta from the exact Hessian or from the Gauss-Newton matrix: (d, d).
 
         Parameters
         ----------
@@ -304,14 +304,14 @@ class Fit:
         return correlation_of(self.covariance)
 
     def quantile(self, level: float) -> float:
-        """Two-sided quantile: of Student's t where sigma is unknown, of the normal distribution where it is known."""
+        """Return the two-sided quantile: of Student's t where sigma is unknown, of the normal distribution else."""
         level = as_level(level)
         tail = 0.5 + level / 2
         freedom = max(self.freedom, 1)
         return float(scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail))
 
     def confidence_intervals(self, level: float = 0.95, *, hessian: CovarianceKind = "exact") -> FloatArray:
-        """Intervals theta +- quantile x standard error, cut off at the bounds: (d, 2).
+        """Return the intervals theta +- quantile x standard error, cut off at the bounds: (d, 2).
 
         Of unknowns on a logarithmic scale theta times or by exp(quantile x relative standard error).
         NaN for an unknown that is held by a bound, a collapsed mode or a kink: the quadratic approximation knows no
@@ -331,7 +331,7 @@ class Fit:
 
 
 def correlation_of(covariance: FloatArray) -> FloatArray:
-    """Correlations (d, d) from covariances; NaN where a variance is 0."""
+    """Return the correlations (d, d) from covariances; NaN where a variance is 0."""
     errors = np.sqrt(np.diag(covariance))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(covariance / np.outer(errors, errors))
@@ -381,14 +381,14 @@ def disagreement(fit: Fit) -> Disagreement | None:
 
 
 def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_]) -> FloatArray:
-    """``theta -+ half``, or where `log` ``theta exp(-+ half / theta)``: (..., 2)."""
+    """Return ``theta -+ half``, or where `log` ``theta exp(-+ half / theta)``: (..., 2)."""
     size = np.where(log, theta, 1.0)
     factor = np.exp(np.where(log, half / size, 0.0))
     return np.stack([np.where(log, theta / factor, theta - half), np.where(log, theta * factor, theta + half)], axis=-1)
 
 
 def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:
-    """``Z (Z' H Z)^-1 Z'``: (d, d); NaN where H is not finite, or not positive definite on the directions Z (d, k)."""
+    """Return ``Z (Z' H Z)^-1 Z'``: (d, d); NaN where H is not finite, or not positive definite on Z (d, k)."""
     nothing = np.full(hessian.shape, np.nan)
     if not np.isfinite(hessian).all():
         return nothing
@@ -424,11 +424,11 @@ class FreeCurvature(NamedTuple):
 
 
 def free_curvature(fit: Fit) -> FreeCurvature:
-    """How well a fit's unknowns are determined, from its exact Hessian."""
+    """Return how well a fit's unknowns are determined, from its exact Hessian."""
     Z = fit.free_basis
     if Z.shape[1] == 0 or not np.isfinite(fit.hessian).all():
         return FreeCurvature(np.nan, np.zeros(0), ())
-    spectrum = scaled_spectrum(fit.hessian, Z)
+    spectrum = compute_scaled_spectrum(fit.hessian, Z)
     weight = np.abs(spectrum.vectors[:, 0])
     strong = [i for i in np.argsort(-weight, kind="stable") if weight[i] > 0.3 * weight.max()][:4]
     smallest = float(np.linalg.eigvalsh(Z.T @ fit.hessian @ Z)[0])
@@ -446,8 +446,8 @@ class ScaledSpectrum(NamedTuple):
     size: FloatArray
 
 
-def scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> ScaledSpectrum:
-    """Of a finite Hessian (d, d) on the directions Z (d, k)."""
+def compute_scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> ScaledSpectrum:
+    """Return the scaled spectrum of a finite Hessian (d, d) on the directions Z (d, k)."""
     diagonal = np.abs(np.diag(hessian))
     size = 1 / np.sqrt(np.where(diagonal > np.finfo(float).tiny, diagonal, 1.0))
     basis = np.linalg.qr(Z / size[:, None])[0]

@@ -36,7 +36,7 @@ class CostAndGradient:
 
 
 def constraints_of(problem: Problem) -> LinearConstraints:
-    """Ordering, minimum durations and bounds of a problem as the optimiser takes them."""
+    """Return the ordering, minimum durations and bounds of a problem as the optimiser takes them."""
     unknowns = problem.unknowns
     return LinearConstraints(unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, linear_constraints_of(problem))
 
@@ -51,7 +51,7 @@ def minimize_cost(
     constraints: LinearConstraints | None = None,
     by_blocks: bool | None = None,
 ) -> Result:
-    """One run of the optimiser on the evaluator's meshes; arguments as of `estimate`.
+    """Run the optimiser once on the evaluator's meshes; arguments as of `estimate`.
 
     The problem's own constraints hold unless others are given. `by_blocks` says whether to use the shape that the
     Hessian of several runs has; left out, where it pays.
@@ -112,7 +112,7 @@ def minimize_with_constraints(
     max_iterations: int,
     callback: Callable[[IterationRecord], object] | None = None,
 ) -> tuple[Result, tuple[tuple[str, float, float], ...]]:
-    """One run of the optimiser with guards and terminal constraints; arguments as of `estimate`.
+    """Run the optimiser once with guards and terminal constraints; arguments as of `estimate`.
 
     Returns its result, and each constraint with its value and its multiplier.
     """
@@ -135,12 +135,12 @@ def minimize_with_constraints(
 
 
 def _to_theta(variables: Variables, constraints: LinearConstraints, z: FloatArray) -> FloatArray:
-    """theta at z, inside its bounds whatever the rounding."""
+    """Return theta at z, inside its bounds whatever the rounding."""
     return np.asarray(np.clip(variables.outward(z), constraints.lower, constraints.upper))
 
 
 def _to_variables(variables: Variables, theta: FloatArray, here: Any) -> Any:
-    """An evaluation at theta as one of the optimiser's variables."""
+    """Return an evaluation at theta as one of the optimiser's variables."""
     if here.hessian is None:
         return CostAndGradient(here.cost, variables.slopes(theta)[0] * here.gradient)
     if isinstance(here.hessian, Arrow):
@@ -151,18 +151,18 @@ def _to_variables(variables: Variables, theta: FloatArray, here: Any) -> Any:
 
 
 def _convert_constraints(variables: Variables, constraints: LinearConstraints) -> LinearConstraints:
-    """Bounds of the optimiser's variables; the rows join transition times alone, which are not changed."""
+    """Return the bounds of the optimiser's variables; the rows join transition times alone, which are not changed."""
     lower, upper = variables.inward(constraints.lower), variables.inward(constraints.upper)
     return replace(constraints, lower=lower, upper=upper)
 
 
 def _convert_record(variables: Variables, constraints: LinearConstraints, record: IterationRecord) -> IterationRecord:
-    """A record of the optimiser's with theta in place of its own variables."""
+    """Return a record of the optimiser's with theta in place of its own variables."""
     return replace(record, theta=_to_theta(variables, constraints, record.theta))
 
 
 def _convert_result(variables: Variables, constraints: LinearConstraints, result: Result) -> Result:
-    """The optimiser's result in theta; its optimality and its eigenvalues stay those of its own variables."""
+    """Return the optimiser's result in theta; its optimality and its eigenvalues stay those of its own variables."""
     theta = _to_theta(variables, constraints, result.theta)
     slopes = variables.slopes(theta)[0]
     rows = np.ones(len(constraints.b))  # these join transition times alone, which are not changed
@@ -180,7 +180,7 @@ def _convert_result(variables: Variables, constraints: LinearConstraints, result
 
 
 def _convert_reason(variables: Variables, z: FloatArray, slopes: FloatArray, found: Finding) -> Finding:
-    """Why the line search failed, in theta in place of the optimiser's variables z (d,); `slopes`: dtheta/dz (d,)."""
+    """Return why the line search failed, in theta instead of the variables z (d,); `slopes`: dtheta/dz (d,)."""
     places = []
     for i, value in found.places:
         there = z.copy()
@@ -191,7 +191,7 @@ def _convert_reason(variables: Variables, z: FloatArray, slopes: FloatArray, fou
 
 
 def smallest_cost(problem: Problem) -> float:
-    """A cost below which an error is not measured against it.
+    """Return a cost below which an error is not measured against it.
 
     The negative logarithm of a likelihood may be anything, 0 too; its parts are of the size of half the samples.
     """
@@ -200,20 +200,20 @@ def smallest_cost(problem: Problem) -> float:
 
 
 def is_least_squares(problem: Problem) -> bool:
-    """Whether J is half a sum of squares: no loss is robust, no sigma a parameter."""
+    """Return whether J is half a sum of squares: no loss is robust, no sigma a parameter."""
     items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
     return not any(item.sigma_names or item.loss != "linear" for item in items)
 
 
 def is_plain_least_squares(problem: Problem) -> bool:
-    """Whether J is half a sum of squares of the samples alone, each of the moment at which it was taken."""
+    """Return whether J is half a sum of squares of the samples alone, each of the moment at which it was taken."""
     items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
     delayed = any(isinstance(item.delay, str) for item in items)
     return is_least_squares(problem) and not problem.unknowns.priors.any and not delayed
 
 
 def is_sigma_known(problem: Problem) -> bool | None:
-    """Whether sigma is known for all measurements, as a number or as a parameter beside the others.
+    """Return whether sigma is known for all measurements, as a number or as a parameter beside the others.
 
     None where the cost is not made of measurements alone.
     """

@@ -84,7 +84,7 @@ class Termination:
 
     @classmethod
     def of_error(cls, text: str) -> Termination:
-        """Of a fit that an error ended; `text` says which."""
+        """Describe a fit that an error ended; `text` says which."""
         return cls(Status.ERROR, reason=Issue("error", (text,)))
 
     def __str__(self) -> str:
@@ -92,7 +92,7 @@ class Termination:
 
 
 def termination_of(result: Result, problem: Problem) -> Termination:
-    """How a fit ended, from what the optimiser found.
+    """Return how a fit ended, from what the optimiser found.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def termination_of(result: Result, problem: Problem) -> Termination:
 
 
 def linear_constraints_of(problem: Problem) -> tuple[Constraint, ...]:
-    """Order and durations, then all lower bounds, then all upper bounds, infinite ones included."""
+    """Return the order and durations, then all lower bounds, then all upper bounds, infinite ones included."""
     unknowns = problem.unknowns
     lower = map(partial(Constraint, "lower bound"), unknowns.lower.tolist(), unknowns.names)
     upper = map(partial(Constraint, "upper bound"), unknowns.upper.tolist(), unknowns.names)
@@ -140,7 +140,7 @@ def _active(result: Result, problem: Problem) -> tuple[ActiveConstraint, ...]:
 
 
 def _reason(found: Finding, problem: Problem) -> Issue:
-    """Why the line search failed, with the unknowns called by their names."""
+    """Return why the line search failed, with the unknowns called by their names."""
     names = problem.unknowns.names
     figures: dict[str, float | tuple[float, ...]] = {}
     subjects: tuple[str, ...] = ()

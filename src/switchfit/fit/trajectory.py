@@ -157,7 +157,7 @@ class SimulatedProblem:
 
 
 def cost_of(problem: Problem, theta: FloatArray, simulations: Sequence[Simulation]) -> float:
-    """Total cost, priors included."""
+    """Return the total cost, priors included."""
     priors = problem.unknowns.priors
     own = float(priors.evaluate(theta)[0]) if priors.any else 0.0
     return sum((simulation.cost for simulation in simulations), own)
@@ -173,7 +173,7 @@ def compare(
 
 
 def select_visible(simulation: Simulation, before: FloatArray, after: FloatArray) -> FloatArray:
-    """Of values at the starts and ends of all rows those that a trajectory shows.
+    """Select what a trajectory shows of the values at the starts and ends of all rows.
 
     The start of every segment, and the ends of all its rows that are not empty.
     """
@@ -204,7 +204,7 @@ def _trajectory(problem: Problem, e: int, simulation: Simulation) -> Trajectory:
 def _comparisons(
     problem: Problem, e: int, theta: FloatArray, simulation: Simulation, trajectory: Trajectory
 ) -> tuple[Comparison, ...]:
-    """Measured against fitted for each reference signal and each Measurements."""
+    """Compare measured with fitted for each reference signal and each Measurements."""
     data, times = problem.experiments[e].data, trajectory.times
     curves = select_visible(simulation, simulation.y_before, simulation.y_after)
     comparisons = []

@@ -58,7 +58,7 @@ class ArrowLayout:
 
     @classmethod
     def of(cls, size: int, places: Sequence[IntArray]) -> ArrowLayout:
-        """The layout of runs that depend on the unknowns at the given places each."""
+        """Return the layout of runs, each of which depends on the unknowns at the given places."""
         used = [np.unique(where[where >= 0]) for where in places]
         count = np.bincount(np.concatenate(used), minlength=size)
         alone = [where[count[where] == 1] for where in used]
@@ -68,7 +68,7 @@ class ArrowLayout:
         return cls(size, own, np.flatnonzero(count != 1))
 
     def slots(self, e: int, places: IntArray) -> IntArray:
-        """Index of unknowns of run e in its own (k) and the shared (s) ones, one after the other."""
+        """Return the index of unknowns of run e in its own (k) and the shared (s) ones, one after the other."""
         slot = np.full(self.size, -1, dtype=np.intp)
         k = self.own.shape[1]
         here = self.own[e][self.own[e] < self.size]
@@ -77,11 +77,11 @@ class ArrowLayout:
         return slot[places]
 
     def split(self, vector: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Own (R, k), zero where padded, and shared (s,) entries of a vector (d,)."""
+        """Return the own (R, k), zero where padded, and shared (s,) entries of a vector (d,)."""
         return np.append(vector, 0.0)[self.own], vector[self.shared]
 
     def join(self, own: FloatArray, shared: FloatArray) -> FloatArray:
-        """The vector (d,) with these own (R, k) and shared (s,) entries."""
+        """Return the vector (d,) with these own (R, k) and shared (s,) entries."""
         vector = np.zeros(self.size + 1)
         vector[self.own] = own
         vector[self.shared] = shared
@@ -107,7 +107,7 @@ class Arrow:
 
     @classmethod
     def of_runs(cls, layout: ArrowLayout, parts: Sequence[FloatArray]) -> Arrow:
-        """Sum of symmetric matrices (k + s, k + s), one a run, in the order of `ArrowLayout.slots`."""
+        """Return the sum of symmetric matrices (k + s, k + s), one a run, in the order of `ArrowLayout.slots`."""
         k = layout.own.shape[1]
         stacked = np.asarray(parts)
         stacked = 0.5 * (stacked + np.swapaxes(stacked, 1, 2))
@@ -134,13 +134,13 @@ class Arrow:
         return self.layout.join(np.diagonal(self.blocks, axis1=1, axis2=2), np.diagonal(self.corner))
 
     def largest_in_rows(self) -> FloatArray:
-        """Largest entry of each row: (d,)."""
+        """Return the largest entry of each row: (d,)."""
         own = np.maximum(self.blocks.max(2, initial=0.0), self.borders.max(2, initial=0.0))
         shared = np.maximum(self.borders.max((0, 1), initial=0.0), self.corner.max(1, initial=0.0))
         return self.layout.join(own, shared)
 
     def dense(self) -> FloatArray:
-        """The matrix in full: (d, d)."""
+        """Return the matrix in full: (d, d)."""
         d, layout = self.layout.size, self.layout
         full = np.zeros((d + 1, d + 1))
         full[layout.own[:, :, None], layout.own[:, None, :]] = self.blocks
@@ -150,18 +150,18 @@ class Arrow:
         return full[:d, :d]
 
     def _pairs(self, vector: FloatArray, padding: float) -> tuple[tuple[FloatArray, FloatArray], ...]:
-        """Of a vector (d,) the entries of rows and columns of blocks, borders and corner, to be broadcast."""
+        """Return the entries of a vector (d,) for rows and columns of blocks, borders and corner, to be broadcast."""
         own = np.append(vector, padding)[self.layout.own]
         shared = vector[self.layout.shared]
         return (own[:, :, None], own[:, None, :]), (own[:, :, None], shared), (shared[:, None], shared)
 
     def scale(self, scaling: FloatArray) -> Arrow:
-        """D⁻¹ H D⁻¹ for a diagonal D (d,)."""
+        """Return D⁻¹ H D⁻¹ for a diagonal D (d,)."""
         pairs = self._pairs(scaling, 1.0)
         return Arrow(self.layout, *(part / (a * b) for part, (a, b) in zip(self._parts, pairs, strict=True)))
 
     def plus_diagonal(self, value: float | FloatArray) -> Arrow:
-        """H + value I, or H + diag(value) for a value (d,)."""
+        """Return H + value I, or H + diag(value) for a value (d,)."""
         k, s = self.borders.shape[1:]
         if not isinstance(value, np.ndarray):
             return replace(self, blocks=self.blocks + value * np.eye(k), corner=self.corner + value * np.eye(s))
@@ -169,7 +169,7 @@ class Arrow:
         return replace(self, blocks=self.blocks + own[:, :, None] * np.eye(k), corner=self.corner + np.diag(shared))
 
     def held(self, free: NDArray[np.bool_]) -> Arrow:
-        """The matrix with rows and columns of the identity for the unknowns that are not free."""
+        """Return the matrix with rows and columns of the identity for the unknowns that are not free."""
         pairs = self._pairs(np.asarray(free, dtype=float), 1.0)
         blocks, borders, corner = (part * a * b for part, (a, b) in zip(self._parts, pairs, strict=True))
         own, shared = self.layout.split(np.where(free, 0.0, 1.0))
@@ -179,7 +179,7 @@ class Arrow:
         return Arrow(self.layout, blocks, borders, corner)
 
     def mask(self, labels: FloatArray) -> Arrow:
-        """The matrix without the entries that join unknowns of different labels (d,)."""
+        """Return the matrix without the entries that join unknowns of different labels (d,)."""
         pairs = self._pairs(labels, np.nan)
         blocks, borders, corner = (part * (a == b) for part, (a, b) in zip(self._parts, pairs, strict=True))
         k = blocks.shape[1]
@@ -187,7 +187,7 @@ class Arrow:
         return Arrow(self.layout, blocks, borders, corner)
 
     def mix_sides(self, minus: Arrow, sides: FloatArray) -> Arrow:
-        """This matrix where two unknowns are to the right (sides 1), `minus` to the left (-1), else their mean."""
+        """Mix with `minus`: this one where two unknowns are on the right (sides 1), it on the left, else the mean."""
 
         def mix(right: FloatArray, left: FloatArray, pair: FloatArray) -> FloatArray:
             return np.where(pair > 0, right, np.where(pair < 0, left, 0.5 * (right + left)))
@@ -201,7 +201,7 @@ class Arrow:
         return self.blocks, self.borders, self.corner
 
     def is_definite_on(self, free: NDArray[np.bool_] | None) -> bool:
-        """Whether it is positive definite on the free unknowns (d,) of bool, or on all."""
+        """Return whether it is positive definite on the free unknowns (d,) of bool, or on all."""
         return ArrowFactor.of(self if free is None else self.held(free)) is not None
 
     def minimize_model(
@@ -228,7 +228,7 @@ class Arrow:
     def curvature(
         self, constraints: LinearConstraints, rows: NDArray[np.intp], held: NDArray[np.bool_], flat: FloatArray
     ) -> Curvature:
-        """Curvature in the null space of constraints; see `switchfit.optimize.matrix.SymmetricMatrix`.
+        """Return the curvature in the null space of constraints; see `switchfit.optimize.matrix.SymmetricMatrix`.
 
         The smallest eigenvalue alone, where only bounds are active and it is positive. All other cases are rare enough
         to be left to the algebra of full matrices.
@@ -242,7 +242,7 @@ class Arrow:
         return Curvature(np.eye(d)[:, ~left_out], partial(self._spectrum, left_out, flat, in_full))
 
     def _spectrum(self, held: NDArray[np.bool_], flat: FloatArray, in_full: Callable[[], Spectrum]) -> Spectrum:
-        """The smallest eigenvalues without the coordinates held (d,), or, where one is not positive, all of them."""
+        """Return the smallest eigenvalues without the coordinates held (d,); all of them where one is not positive."""
         kept = self.held(~held)
         scaling = diagonal_scaling(kept, flat)
         smallest, lowest = _smallest_eigenvalue(kept.scale(scaling), ~held)
@@ -273,7 +273,7 @@ class ArrowFactor:
 
     @classmethod
     def of(cls, matrix: Arrow) -> ArrowFactor | None:
-        """The factorisation; None where the matrix is not positive definite."""
+        """Return the factorisation; None where the matrix is not positive definite."""
         variances = matrix.diagonal()
         if not np.all(variances > 0.0):
             return None
@@ -293,7 +293,7 @@ class ArrowFactor:
         return np.asarray(np.linalg.inv(self.own), float), np.asarray(np.linalg.inv(self.shared), float)
 
     def whiten(self, vectors: FloatArray) -> FloatArray:
-        """L⁻¹ D⁻¹ v for a vector (d,) or each of the rows (r, d)."""
+        """Return L⁻¹ D⁻¹ v for a vector (d,) or each of the rows (r, d)."""
         if vectors.ndim == 2:
             return np.array([self.whiten(row) for row in vectors]).reshape(len(vectors), -1)
         of_own, of_shared = self._inverses
@@ -302,7 +302,7 @@ class ArrowFactor:
         return np.concatenate([y.ravel(), of_shared @ (shared - np.einsum("eks,ek->s", self.border, y))])
 
     def unwhiten(self, vector: FloatArray) -> FloatArray:
-        """D⁻¹ L⁻ᵀ v."""
+        """Return D⁻¹ L⁻ᵀ v."""
         of_own, of_shared = self._inverses
         R, k, _ = self.border.shape
         shared = of_shared.T @ vector[R * k :]
@@ -310,7 +310,7 @@ class ArrowFactor:
         return self.layout.join((np.swapaxes(of_own, 1, 2) @ own[..., None])[..., 0], shared) / self.scaling
 
     def solve(self, vector: FloatArray) -> FloatArray:
-        """B⁻¹ v."""
+        """Return B⁻¹ v."""
         return self.unwhiten(self.whiten(vector))
 
 
@@ -353,7 +353,7 @@ def solve_arrow_qp(
 
 
 def convexify_arrow(hessian: Arrow, normals: FloatArray, floor: FloatArray) -> Arrow:
-    """Positive definite B of the same shape that equals H wherever H can be kept.
+    """Return a positive definite B of the same shape that equals H wherever H can be kept.
 
     A positive definite H is kept. Otherwise its blocks are made positive definite, each by `convexify`, and then the
     Schur complement of the shared unknowns. With Z the directions free of the presumably active constraints: where
@@ -397,7 +397,7 @@ def convexify_arrow(hessian: Arrow, normals: FloatArray, floor: FloatArray) -> A
 
 
 def _convex_blocks(scaled: Arrow, pressed: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Positive definite blocks, and projections on what is across the active constraints of each run: (R, k, k)."""
+    """Return positive definite blocks, and projections across each run's active constraints: (R, k, k)."""
     values, vectors = np.linalg.eigh(scaled.blocks)
     # An eigenvalue that is replaced is made large enough for the shared unknowns not to lose their own curvature to it.
     coupling = (np.swapaxes(vectors, 1, 2) @ scaled.borders) ** 2
@@ -418,7 +418,7 @@ def _convex_blocks(scaled: Arrow, pressed: FloatArray) -> tuple[FloatArray, Floa
 
 
 def _smallest_eigenvalue(matrix: Arrow, free: NDArray[np.bool_]) -> tuple[float, FloatArray | None]:
-    """Smallest eigenvalue on the free coordinates, and its eigenvector, by inverse iteration; None if it is not > 0."""
+    """Return the smallest eigenvalue on the free coordinates, and its vector; None if it is not positive."""
     factor = ArrowFactor.of(matrix)
     if factor is None:
         return np.nan, None

@@ -170,7 +170,7 @@ def _finish(
     tolerance: float,
     d: int,
 ) -> ConstrainedResult:
-    """The last minimisation's result in terms of J."""
+    """Return the last minimisation's result in terms of J."""
     side = 1
     here = evaluate(result.theta, side, multipliers, np.zeros(len(names)))
     left = here.jacobian @ result.free_basis
@@ -210,6 +210,6 @@ def _lagrangian(here: Constrained) -> _Lagrangian:
 
 
 def _lengths(rows: FloatArray) -> FloatArray:
-    """Norm of each row, 1 where it vanishes: (m,)."""
+    """Return the norm of each row, 1 where it vanishes: (m,)."""
     norms = np.linalg.norm(rows, axis=1)
     return np.where(np.isfinite(norms) & (norms > 0.0), norms, 1.0)

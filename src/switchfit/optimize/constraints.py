@@ -80,7 +80,7 @@ class LinearConstraints:
 
     @classmethod
     def box(cls, lower: ArrayLike, upper: ArrayLike, *, unknowns: Sequence[str] | None = None) -> LinearConstraints:
-        """Bounds alone, named after the unknowns (``theta[i]`` if these have no names)."""
+        """Return the bounds alone, named after the unknowns (``theta[i]`` if these have no names)."""
         low = np.atleast_1d(np.asarray(lower, dtype=float))
         labels = [f"theta[{i}]" for i in range(low.size)] if unknowns is None else list(unknowns)
         names = [f"{label} at lower bound" for label in labels] + [f"{label} at upper bound" for label in labels]
@@ -128,7 +128,7 @@ class LinearConstraints:
         return found
 
     def rows(self, index: NDArray[np.intp]) -> FloatArray:
-        """The normals at the given places, shape (k, d)."""
+        """Return the normals at the given places, shape (k, d)."""
         m, d = self.b.size, self.size
         chosen = np.zeros((index.size, d))
         if index.size == 0:
@@ -146,15 +146,15 @@ class LinearConstraints:
         return np.concatenate([np.linalg.norm(self.A, axis=1), np.ones(2 * self.size)])
 
     def slopes(self, step: FloatArray) -> FloatArray:
-        """Products of the normals with a step, shape (m + 2 d,)."""
+        """Return the products of the normals with a step, shape (m + 2 d,)."""
         return np.concatenate([self.A @ step, step, -step])
 
     def slack(self, theta: FloatArray) -> FloatArray:
-        """How far theta is inside each constraint, shape (m + 2 d,); negative where violated."""
+        """Return how far theta is inside each constraint, shape (m + 2 d,); negative where violated."""
         return np.asarray(algebra.slack(self, theta))
 
     def violation(self, theta: FloatArray) -> float:
-        """Largest violation of a row; 0 if all hold."""
+        """Return the largest violation of a row; 0 if all hold."""
         return float(np.max(self.b - self.A @ theta, initial=0.0))
 
     @cached_property
@@ -169,7 +169,7 @@ class LinearConstraints:
         return float(np.max(A.sum(1), initial=0.0)), float(np.max(b, initial=0.0))
 
     def are_far(self, slack: FloatArray, size: float) -> bool:
-        """Whether none of the constraints holds with equality, nor nearly, as at most points.
+        """Return whether none of the constraints holds with equality, nor nearly, as at most points.
 
         Parameters
         ----------
@@ -182,7 +182,7 @@ class LinearConstraints:
         return bool(slack.min() > 32 * EPS * (b + max(A, 1.0) * size))
 
     def active(self, slack: FloatArray, size: FloatArray) -> NDArray[np.intp]:
-        """Places, ascending, of the constraints that hold with equality up to rounding.
+        """Return the places, ascending, of the constraints that hold with equality up to rounding.
 
         Parameters
         ----------

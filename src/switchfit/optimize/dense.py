@@ -39,13 +39,13 @@ class Dense:
 
     @classmethod
     def of(cls, entries: ArrayLike, d: int) -> Dense:
-        """The symmetric part of a matrix (d, d)."""
+        """Return the symmetric part of a matrix (d, d)."""
         array = np.asarray(entries, dtype=float).reshape(d, d)
         return cls(0.5 * (array + array.T))
 
     @classmethod
     def identity(cls, d: int, factor: float) -> Dense:
-        """A multiple of the identity (d, d)."""
+        """Return a multiple of the identity (d, d)."""
         return cls(factor * np.eye(d))
 
     @property
@@ -54,15 +54,15 @@ class Dense:
         return bool(np.isfinite(self.array).all())
 
     def dense(self) -> FloatArray:
-        """The matrix in full: (d, d)."""
+        """Return the matrix in full: (d, d)."""
         return self.array
 
     def diagonal(self) -> FloatArray:
-        """Its diagonal: (d,)."""
+        """Return its diagonal: (d,)."""
         return self.array.diagonal()
 
     def largest_in_rows(self) -> FloatArray:
-        """Largest entry of each row, with its sign: (d,)."""
+        """Return the largest entry of each row, with its sign: (d,)."""
         return np.asarray(self.array.max(axis=1, initial=0.0))
 
     def __matmul__(self, vector: FloatArray) -> FloatArray:
@@ -72,21 +72,21 @@ class Dense:
         return Dense(np.abs(self.array))
 
     def scale(self, scaling: FloatArray) -> Dense:
-        """D⁻¹ H D⁻¹ for a diagonal D (d,)."""
+        """Return D⁻¹ H D⁻¹ for a diagonal D (d,)."""
         return Dense(self.array / (scaling[:, None] * scaling))
 
     def mask(self, labels: FloatArray) -> Dense:
-        """The matrix without the entries that join unknowns of different labels (d,)."""
+        """Return the matrix without the entries that join unknowns of different labels (d,)."""
         return Dense(self.array * (labels[:, None] == labels))
 
     def mix_sides(self, minus: Dense, sides: FloatArray) -> Dense:
-        """This matrix where two unknowns are to the right (sides 1), `minus` to the left (-1), else their mean."""
+        """Mix with `minus`: this one where two unknowns are on the right (sides 1), it on the left, else the mean."""
         pair = sides[:, None] + sides
         right, left = self.array, minus.array
         return Dense(np.where(pair > 0, right, np.where(pair < 0, left, 0.5 * (right + left))))
 
     def is_definite_on(self, free: NDArray[np.bool_] | None) -> bool:
-        """Whether it is positive definite on the free unknowns (d,) of bool, or on all."""
+        """Return whether it is positive definite on the free unknowns (d,) of bool, or on all."""
         part = self.array if free is None else self.array[np.ix_(free, free)]
         return bool(np.all(np.linalg.eigvalsh(part) > 0.0))
 
@@ -118,7 +118,7 @@ class Dense:
     def curvature(
         self, constraints: LinearConstraints, rows: NDArray[np.intp], held: NDArray[np.bool_], flat: FloatArray
     ) -> Curvature:
-        """Curvature in the null space of constraints; see `switchfit.optimize.matrix.SymmetricMatrix`."""
+        """Return the curvature in the null space of constraints; see `switchfit.optimize.matrix.SymmetricMatrix`."""
         d = len(self.array)
         free = np.flatnonzero(~held)
         if free.size == d and rows.size == 0:
@@ -131,7 +131,7 @@ class Dense:
 
 
 def _spectrum(array: FloatArray, flat: FloatArray) -> Spectrum:
-    """Eigenvalues of a matrix (d, d) with all directions free."""
+    """Return the eigenvalues of a matrix (d, d) with all directions free."""
     if not Dense(array).finite:
         return _no_spectrum(*array.shape)
     scaling = diagonal_scaling(Dense(array), flat)
@@ -143,7 +143,7 @@ def _spectrum(array: FloatArray, flat: FloatArray) -> Spectrum:
 def _spectrum_on(
     array: FloatArray, flat: FloatArray, basis: FloatArray, free: NDArray[np.intp], normals: FloatArray
 ) -> Spectrum:
-    """Eigenvalues of a matrix (d, d) on the null space of normals in the free coordinates, whose basis is given."""
+    """Return the eigenvalues of a matrix (d, d) on the null space of normals, whose basis is given."""
     d, count = basis.shape
     if count == 0 or not Dense(array).finite:
         return _no_spectrum(d, count)
@@ -171,7 +171,7 @@ def _minimize(
     pressed: FloatArray,
     floor: FloatArray | None,
 ) -> ModelStep:
-    """The programme of `Dense.minimize_model` in unknowns that are all free."""
+    """Solve the programme of `Dense.minimize_model` in unknowns that are all free."""
     convex, factor = convexify_and_factor(hessian, pressed, floor)
     step = newton_step(gradient, convex, factor)
     if (normals @ step >= offsets).all():
@@ -183,12 +183,12 @@ def _minimize(
 
 
 def null_space(normals: FloatArray) -> FloatArray:
-    """Orthonormal basis of the null space of normals (k, d): shape (d, d - r)."""
+    """Return an orthonormal basis of the null space of normals (k, d): shape (d, d - r)."""
     return split_space(normals)[0]
 
 
 def split_space(normals: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Orthonormal bases of the null space, shape (d, d - r), and of the row space, shape (d, r), of the normals."""
+    """Return orthonormal bases of the null space, (d, d - r), and of the row space, (d, r), of the normals."""
     d = normals.shape[1]
     if normals.shape[0] == 0:
         return np.eye(d), np.zeros((d, 0))
@@ -202,7 +202,7 @@ def split_space(normals: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def convexify(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None = None) -> FloatArray:
-    """Positive definite B that equals H wherever H can be kept.
+    """Return a positive definite B that equals H wherever H can be kept.
 
     In scaled variables, with Z the directions free of the (presumably) active constraints and Y their normals: a
     positive definite H is kept; otherwise ZᵀHZ is kept if it is positive definite, which leaves Newton's step on the
@@ -228,7 +228,7 @@ def convexify(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None
 def convexify_and_factor(
     hessian: FloatArray, normals: FloatArray, floor: FloatArray | None
 ) -> tuple[FloatArray, CholeskyFactor]:
-    """The matrix B of `convexify` and its factorisation; d > 0."""
+    """Return the matrix B of `convexify` and its factorisation; d > 0."""
     square = hessian.diagonal() if floor is None else np.maximum(hessian.diagonal(), floor)
     if square.min() > 0.0:
         # A positive definite matrix needs no more than Jacobi's scaling.
@@ -242,14 +242,14 @@ def convexify_and_factor(
 
 
 def _shift(matrix: FloatArray) -> FloatArray:
-    """The matrix less what counts as no curvature on its diagonal."""
+    """Return the matrix less what counts as no curvature on its diagonal."""
     shifted = matrix.copy()
     shifted.reshape(-1)[:: len(matrix) + 1] -= EIGENVALUE_FLOOR
     return shifted
 
 
 def _convex(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None) -> FloatArray:
-    """B for a matrix that is not positive definite, or was not found to be with Jacobi's scaling."""
+    """Return B for a matrix that is not positive definite, or was not found to be with Jacobi's scaling."""
     scaling = diagonal_scaling(Dense(hessian), floor)
     weight = scaling[:, None] * scaling
     scaled = hessian / weight
@@ -272,7 +272,7 @@ def _convex(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None) 
 
 
 def _absolute(matrix: FloatArray) -> FloatArray:
-    """The matrix with eigenvalues that are not positive replaced by absolute values; itself if there are none."""
+    """Return the matrix with eigenvalues that are not positive replaced by absolute values; itself if all are."""
     symmetric = 0.5 * (matrix + matrix.T)
     values, vectors = np.linalg.eigh(symmetric)
     if values.size == 0 or values[0] > EIGENVALUE_FLOOR:

@@ -53,7 +53,7 @@ class Finding:
 
 
 def find_reason(line: Line, noise: float, smooth: float) -> Finding:
-    """Why no fraction of a step decreases J although its slope is negative.
+    """Find out why no fraction of a step decreases J although its slope is negative.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def find_reason(line: Line, noise: float, smooth: float) -> Finding:
 
 
 def find_jump(line: Line, low: float, high: float, noise: float) -> Finding | None:
-    """Where J jumps between two fractions of a step, which its slopes on both sides do not account for; None: nowhere.
+    """Find where J jumps between two fractions of a step, unexplained by its slopes on both sides; None: nowhere.
 
     Bisection keeps the half in which J and the mean of its slopes at the ends disagree more; a jump stays where the
     disagreement of a smooth function, or of one with a kink, vanishes with the length.
@@ -119,12 +119,12 @@ def find_jump(line: Line, low: float, high: float, noise: float) -> Finding | No
 
 
 def _excess(low: float, left: tuple[float, float], high: float, right: tuple[float, float]) -> float:
-    """By how much J rises more than its slopes at the ends say."""
+    """Return by how much J rises more than its slopes at the ends say."""
     return right[0] - left[0] - 0.5 * (high - low) * (left[1] + right[1])
 
 
 def wrong_slope(line: Line, noise: float, smooth: float) -> float | None:
-    """What differences of J say in place of its slope at 0, if they contradict it; None if they do not.
+    """Return what differences of J say in place of its slope at 0, if they contradict it; None if they do not.
 
     They have to contradict the slopes farther on as well: at a kink within the shortest difference they do not.
     """

@@ -68,7 +68,7 @@ def find_direction(problem: Problem, state: State, piece: tuple[FloatArray, Floa
 def _solve_on_sides(
     problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[FloatArray, FloatArray] | None
 ) -> tuple[Direction, FloatArray]:
-    """The quadratic programme with kinks held or confined as `sides` say, and the force on each coordinate.
+    """Solve the quadratic programme with kinks held or confined as `sides` say; with the force on each coordinate.
 
     The force is Aᵀ lam − B d: at a coordinate that does not move, the derivative that would balance the others.
     """
@@ -87,7 +87,7 @@ def _solve_on_sides(
 
 
 def _room(problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[FloatArray, FloatArray] | None) -> Room:
-    """Where the step may go: inside the constraints and the piece, and to the given sides of kinks."""
+    """Return where the step may go: inside the constraints and the piece, and to the given sides of kinks."""
     point, constraints = state.point, problem.constraints
     m, d = constraints.b.size, constraints.size
     offsets = -point.slack
@@ -110,7 +110,7 @@ def _room(problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[
 def _model(
     problem: Problem, state: State, hessian: SymmetricMatrix, free: NDArray[np.bool_] | None
 ) -> tuple[SymmetricMatrix, FloatArray | None]:
-    """The matrix of the programme, to be made positive definite, and the curvature of each unknown that counts as none.
+    """Return the programme's matrix, to be made positive definite, and the curvature that counts as zero, (d,).
 
     After a failed line search each unknown is taken by itself.
     """

@@ -41,7 +41,7 @@ def explain_failure(oracle: Oracle, state: State, direction: Direction) -> Findi
 
 
 def _wrong_entries(oracle: Oracle, state: State, noise: float) -> tuple[tuple[int, float, float], ...]:
-    """Up to four coordinates whose derivative is not that of J: (coordinate, derivative, difference quotient)."""
+    """Find up to four coordinates whose derivative is not that of J: (coordinate, derivative, difference quotient)."""
     theta, problem = state.point.theta, oracle.problem
     wrong = []
     for i in np.flatnonzero(problem.constraints.movable):
@@ -63,7 +63,7 @@ def _wrong_entries(oracle: Oracle, state: State, noise: float) -> tuple[tuple[in
 
 
 def _who_bends(oracle: Oracle, theta: FloatArray, step: FloatArray, found: Finding) -> list[int]:
-    """The coordinates along which the derivative of J jumps at a kink on the line."""
+    """Find the coordinates along which the derivative of J jumps at a kink on the line."""
     width = max(2.0**-40 * found.at, 1e-15)
     sides = [oracle.sample(theta + (found.at + w) * step, 1) for w in (-width, width)]
     moving = np.flatnonzero(step).tolist()
@@ -74,7 +74,7 @@ def _who_bends(oracle: Oracle, theta: FloatArray, step: FloatArray, found: Findi
 
 
 def _who_jumps(oracle: Oracle, theta: FloatArray, step: FloatArray, found: Finding) -> tuple[tuple[int, float], ...]:
-    """The coordinate whose change by a hair across a jump of J makes it jump, with its value there.
+    """Find the coordinate whose change by a hair across a jump of J makes it jump, and its value there.
 
     Up to four coordinates that the step moves, where none of them does so alone.
     """

@@ -39,7 +39,7 @@ class Trial(NamedTuple):
 
     @classmethod
     def at(cls, constraints: LinearConstraints, theta: FloatArray) -> Trial:
-        """At a theta (d,) that is feasible."""
+        """Return the trial at a theta (d,) that is feasible."""
         return cls(theta, constraints.slack(theta), False)
 
 

@@ -78,7 +78,7 @@ def steepest_descent(
 
 
 def _choices(sides: NDArray[np.int_], concave: NDArray[np.bool_], normals: FloatArray) -> Iterator[NDArray[np.int_]]:
-    """The given sides, then others for the concave kinks: alone each takes its steeper side, a constraint may differ.
+    """Yield the given sides, then others for the concave kinks: a constraint may make a less steep side the better one.
 
     All to the right and all to the left suffice to find a descent where constraints keep coordinates in order: the
     extreme directions move a group of them, all to one side.

@@ -17,7 +17,7 @@ from switchfit.optimize.algebra import FloatArray, unit_rows
 
 
 def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tuple[float, FloatArray]:
-    """Distance of the gradient from the cone of the active constraints, and the multipliers that attain it.
+    """Return the distance of the gradient from the cone of the active constraints, and the multipliers that attain it.
 
     min over lam >= 0 and low <= g <= high of ‖g − Nᵀ lam‖₂, where low = high except at coordinates held at a kink.
 
@@ -53,7 +53,7 @@ def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tupl
 
 
 def _cone_projection(unit: FloatArray, gradient: FloatArray) -> FloatArray:
-    """Argument of min over lam >= 0 of ‖g − Nᵀ lam‖.
+    """Return the argument of min over lam >= 0 of ‖g − Nᵀ lam‖.
 
     SciPy's nnls is fast, but from version 1.15 on its answer may be wrong for dependent rows, and its residual with it
     (https://github.com/scipy/scipy/issues/25389), so that the answer is checked.
@@ -74,7 +74,7 @@ def _cone_projection(unit: FloatArray, gradient: FloatArray) -> FloatArray:
 def _box_projection(
     unit: FloatArray, low: FloatArray, width: FloatArray, wide: NDArray[np.intp]
 ) -> tuple[FloatArray, FloatArray]:
-    """Arguments of min over lam >= 0, 0 <= s <= width of ‖low + s − Nᵀ lam‖: lam and s.
+    """Return the arguments of min over lam >= 0, 0 <= s <= width of ‖low + s − Nᵀ lam‖: lam and s.
 
     With s inside its interval a coordinate puts no condition on lam, at an end of it an ordinary one: nonnegative
     least squares with the coordinates so labelled, until the labels agree with the solution. Should they cycle, a
@@ -95,23 +95,23 @@ def _box_projection(
         if np.array_equal(relabelled, label):
             return multipliers, shifts
         label = relabelled
-    candidates.append(_bounded_least_squares(unit, low, width, wide))
+    candidates.append(_solve_bounded_least_squares(unit, low, width, wide))
     return min(candidates, key=lambda pair: _distance(unit, low, wide, *pair))
 
 
 def _distance(
     unit: FloatArray, low: FloatArray, wide: NDArray[np.intp], multipliers: FloatArray, shifts: FloatArray
 ) -> float:
-    """‖low + s − Nᵀ lam‖."""
+    """Return ‖low + s − Nᵀ lam‖."""
     difference = low - unit.T @ multipliers
     difference[wide] += shifts
     return float(np.linalg.norm(difference))
 
 
-def _bounded_least_squares(
+def _solve_bounded_least_squares(
     unit: FloatArray, low: FloatArray, width: FloatArray, wide: NDArray[np.intp]
 ) -> tuple[FloatArray, FloatArray]:
-    """The problem of `_box_projection` by a general solver."""
+    """Solve the problem of `_box_projection` by a general solver."""
     k, d = unit.shape
     columns = np.zeros((d, wide.size))
     columns[wide, np.arange(wide.size)] = -1.0

@@ -45,7 +45,7 @@ def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | Non
 
 
 def _backtrack(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
-    """Armijo backtracking from the full step ([1]_, algorithm 3.1)."""
+    """Backtrack from the full step by Armijo's rule ([1]_, algorithm 3.1)."""
     alpha = 1.0
     for k in range(MAX_BACKTRACKS):
         accepted = _attempt(oracle, state, direction, alpha, ARMIJO)
@@ -58,7 +58,7 @@ def _backtrack(oracle: Oracle, state: State, direction: Direction) -> Accepted |
 
 
 def _attempt(oracle: Oracle, state: State, direction: Direction, alpha: float, fraction: float) -> Accepted | None:
-    """The point at step length alpha if it is acceptable.
+    """Return the point at step length alpha if it is acceptable.
 
     Where the predicted decrease is below the rounding error of J, comparing costs says nothing ([2]_): then a
     smaller KKT residual counts, or a cost below every earlier one.
@@ -82,7 +82,7 @@ def _attempt(oracle: Oracle, state: State, direction: Direction, alpha: float, f
 
 
 def _blind_step(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
-    """The full step on the word of the derivatives, where J is a small difference of large terms.
+    """Take the full step on the word of the derivatives, where J is a small difference of large terms.
 
     The rounding error of such a J is that of the largest cost seen, not of J; the KKT residual has to halve.
     """

@@ -79,7 +79,7 @@ class Spectrum(NamedTuple):
     lowest: FloatArray
 
     def itself(self) -> Spectrum:
-        """The spectrum, for a `Curvature` whose spectrum is known."""
+        """Return the spectrum, for a `Curvature` whose spectrum is known."""
         return self
 
 
@@ -122,15 +122,15 @@ class SymmetricMatrix(Protocol):
         ...
 
     def dense(self) -> FloatArray:
-        """The matrix in full: (d, d)."""
+        """Return the matrix in full: (d, d)."""
         ...
 
     def diagonal(self) -> FloatArray:
-        """Its diagonal: (d,)."""
+        """Return its diagonal: (d,)."""
         ...
 
     def largest_in_rows(self) -> FloatArray:
-        """Largest entry of each row, with its sign: (d,)."""
+        """Return the largest entry of each row, with its sign: (d,)."""
         ...
 
     def __matmul__(self, vector: FloatArray, /) -> FloatArray: ...
@@ -138,19 +138,19 @@ class SymmetricMatrix(Protocol):
     def __abs__(self) -> Self: ...
 
     def scale(self, scaling: FloatArray, /) -> Self:
-        """D⁻¹ H D⁻¹ for a diagonal D (d,)."""
+        """Return D⁻¹ H D⁻¹ for a diagonal D (d,)."""
         ...
 
     def mask(self, labels: FloatArray, /) -> Self:
-        """The matrix without the entries that join unknowns of different labels (d,)."""
+        """Return the matrix without the entries that join unknowns of different labels (d,)."""
         ...
 
     def mix_sides(self, minus: Any, sides: FloatArray, /) -> Self:
-        """This matrix where two unknowns are to the right (sides 1), `minus` to the left (-1), else their mean."""
+        """Mix with `minus`: this one where two unknowns are on the right (sides 1), it on the left, else the mean."""
         ...
 
     def is_definite_on(self, free: NDArray[np.bool_] | None, /) -> bool:
-        """Whether it is positive definite on the free unknowns (d,) of bool, or on all."""
+        """Return whether it is positive definite on the free unknowns (d,) of bool, or on all."""
         ...
 
     def minimize_model(
@@ -172,7 +172,7 @@ class SymmetricMatrix(Protocol):
     def curvature(
         self, constraints: LinearConstraints, rows: NDArray[np.intp], held: NDArray[np.bool_], flat: FloatArray, /
     ) -> Curvature:
-        """Curvature, unmodified, in the null space of the constraints at `rows`, without the coordinates held (d,).
+        """Return the unmodified curvature in the null space of the constraints at `rows`, without those held (d,).
 
         Diagonal entries below `flat` (d,) count as zero.
         """
@@ -180,7 +180,7 @@ class SymmetricMatrix(Protocol):
 
 
 def diagonal_scaling(matrix: SymmetricMatrix, floor: FloatArray | None = None) -> FloatArray:
-    """Positive D, shape (d,), for which D⁻¹ H D⁻¹ has rows of largest entry about one.
+    """Return a positive D, shape (d,), for which D⁻¹ H D⁻¹ has rows of largest entry about one.
 
     For a positive semi-definite H this is the root of the diagonal (Jacobi), so that everything computed in the
     scaled variables is the same whatever the units of the unknowns. Where off-diagonal entries are larger, as they

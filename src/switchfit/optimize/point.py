@@ -99,7 +99,7 @@ class Point:
         return self.side if self.kink is None else np.where(self.kink, 1, self.side)
 
     def derivatives(self, sides: NDArray[np.int_]) -> tuple[FloatArray, SymmetricMatrix]:
-        """Gradient and Hessian on the given sides (+1, -1; 0 for their mean).
+        """Return the gradient and Hessian on the given sides (+1, -1; 0 for their mean).
 
         An entry of the Hessian that joins a left and a right coordinate is known from neither evaluation: the mean.
         """
@@ -136,12 +136,12 @@ class Oracle:
         return Sample(cost, gradient, hessian)
 
     def first(self, trial: Trial) -> Sample | None:
-        """The evaluation that suffices to judge the cost."""
+        """Do the evaluation that suffices to judge the cost."""
         kink, side = self._sides(trial.theta)
         return self.sample(trial.theta, -1 if kink is None and side is not self._no_side and (side < 0).any() else 1)
 
     def complete(self, trial: Trial, first: Sample, scale: FloatArray) -> Point | None:
-        """The point: the other side is evaluated only if some coordinate is on a breakpoint and has room there.
+        """Complete the point: the other side is evaluated only if a coordinate is on a breakpoint with room there.
 
         `scale` (d,) is the size of the unknowns so far. None if the other side is not finite.
         """
@@ -172,19 +172,19 @@ class Oracle:
         return Point(theta, plus, minus, kink, side, slack, active, optimality, multipliers, downhill, idle)
 
     def point(self, trial: Trial, scale: FloatArray) -> Point | None:
-        """The point at a trial, evaluated; None if J is not finite there."""
+        """Return the point at a trial, evaluated; None if J is not finite there."""
         first = self.first(trial)
         return None if first is None else self.complete(trial, first, scale)
 
     def _idle(self, theta: FloatArray, active: NDArray[np.intp]) -> NDArray[np.bool_] | None:
-        """Coordinates on which J does not depend while the active rows stay active: (d,); None if there are none."""
+        """Return the coordinates on which J does not depend while active rows stay so: (d,) of bool, or None."""
         if self.problem.idle is None or not self.problem.rows_hold(active):
             return None
         idle = self.problem.idle(theta.copy(), False)
         return idle if idle.any() else None
 
     def _sides(self, theta: FloatArray) -> tuple[NDArray[np.bool_] | None, NDArray[np.int_]]:
-        """`Point.kink` and `Point.side` at theta."""
+        """Return `Point.kink` and `Point.side` at theta."""
         met = self.problem.breakpoints.find_met(theta)
         if not met:
             return None, self._no_side

@@ -125,7 +125,7 @@ class Problem:
         return self.hessian != "none"
 
     def rows_hold(self, active: NDArray[np.intp]) -> bool:
-        """Whether rows are among the active constraints, and not bounds alone; these are in ascending order."""
+        """Return whether rows are among the active constraints, and not bounds alone; these are in ascending order."""
         return bool(active.size and active[0] < self.constraints.b.size)
 
 
@@ -141,7 +141,7 @@ class Breakpoints:
 
     @classmethod
     def of(cls, given: Sequence[ArrayLike] | None, d: int) -> Breakpoints:
-        """One array for each of d coordinates, checked; coordinates may share one, which is read once."""
+        """Check one array for each of d coordinates; coordinates may share one, which is read once."""
         given = [()] * d if given is None else given
         if len(given) != d:
             raise ValueError(
@@ -162,7 +162,7 @@ class Breakpoints:
         return cls(tuple(found))
 
     def find_met(self, theta: FloatArray) -> list[int]:
-        """Coordinates of theta (d,) that sit exactly on one of their breakpoints."""
+        """Return the coordinates of theta (d,) that sit exactly on one of their breakpoints."""
         values = theta.tolist()
         return [
             i
@@ -186,7 +186,7 @@ class Breakpoints:
         return found
 
     def count_crossed(self, theta: FloatArray, step: FloatArray) -> int:
-        """Largest number of breakpoints that a coordinate passes strictly inside a step (d,)."""
+        """Return the largest number of breakpoints that a coordinate passes strictly inside a step (d,)."""
         largest = 0
         starts, ends = theta.tolist(), (theta + step).tolist()
         for i, points in self.of_coordinates:
@@ -195,7 +195,7 @@ class Breakpoints:
         return largest
 
     def piece(self, theta: FloatArray, lower: FloatArray, upper: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The smooth piece around theta: bounds (d,) tightened to the next breakpoint on either side."""
+        """Return the smooth piece around theta: bounds (d,) tightened to the next breakpoint on either side."""
         low, high = lower.copy(), upper.copy()
         for i, points in self.of_coordinates:
             below, above = bisect_left(points, theta[i]), bisect_right(points, theta[i])
@@ -206,7 +206,7 @@ class Breakpoints:
         return low, high
 
     def next_on(self, theta: FloatArray, step: FloatArray) -> float:
-        """Fraction of a step (d,) up to the first breakpoint that a coordinate meets; infinite if none does."""
+        """Return the fraction of a step (d,) up to the first breakpoint that a coordinate meets, or infinity."""
         fractions = [_next(points, float(theta[i]), float(step[i])) for i, points in self.of_coordinates]
         return min(fractions, default=np.inf)
 
@@ -219,13 +219,13 @@ def _nearest(points: list[float], x: float) -> float:
 
 
 def _next(points: list[float], x: float, step: float) -> float:
-    """Fraction of a step of one coordinate up to the next breakpoint that it meets; infinite if it meets none."""
+    """Return the fraction of a step of one coordinate up to the next breakpoint; infinite if it meets none."""
     k = bisect_right(points, x) if step > 0.0 else bisect_left(points, x) - 1
     return (points[k] - x) / step if step != 0.0 and 0 <= k < len(points) else np.inf
 
 
 def _labels(hessian: HessianKind, blocks: ArrayLike | None, d: int) -> FloatArray | None:
-    """Labels of the blocks; None unless the Hessian is to be cut into blocks."""
+    """Return the labels of the blocks; None unless the Hessian is to be cut into blocks."""
     if hessian != "block-diagonal":
         return None
     labels = np.asarray(blocks)

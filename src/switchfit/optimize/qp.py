@@ -37,7 +37,7 @@ _WHITE_TOLERANCE = 1e-12
 
 
 def nearest_feasible(constraints: LinearConstraints, theta: FloatArray) -> FloatArray:
-    """The feasible point nearest to theta (d,), up to rounding.
+    """Return the feasible point nearest to theta (d,), up to rounding.
 
     ``min ||s||²`` subject to ``N s >= -slack`` is a nonnegative least-squares problem ([1]_, chapter 23, section 4).
     """
@@ -104,15 +104,15 @@ class Factor(Protocol):
     """A factorisation B = D L Lᵀ D, of a matrix whatever its shape."""
 
     def whiten(self, vectors: FloatArray) -> FloatArray:
-        """L⁻¹ D⁻¹ v for a vector or each of the rows v."""
+        """Return L⁻¹ D⁻¹ v for a vector or each of the rows v."""
         ...
 
     def unwhiten(self, vector: FloatArray) -> FloatArray:
-        """D⁻¹ L⁻ᵀ v."""
+        """Return D⁻¹ L⁻ᵀ v."""
         ...
 
     def solve(self, vector: FloatArray) -> FloatArray:
-        """B⁻¹ v."""
+        """Return B⁻¹ v."""
         ...
 
 
@@ -132,7 +132,7 @@ def newton_step(gradient: FloatArray, matrix: Matrix, factor: Factor) -> FloatAr
 def solve_whitened(
     gradient: FloatArray, matrix: Matrix, factor: Factor, normals: FloatArray, offsets: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Step and multipliers of a quadratic programme whose matrix has been factorised, in white variables.
+    """Return the step and multipliers of a quadratic programme whose matrix has been factorised, in white variables.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ class CholeskyFactor:
 
     @classmethod
     def of(cls, matrix: FloatArray) -> CholeskyFactor:
-        """The factorisation of a matrix (d, d); ValueError if it is not positive definite."""
+        """Return the factorisation of a matrix (d, d); ValueError if it is not positive definite."""
         variances = matrix.diagonal()
         if np.all(variances > 0.0):
             diagonal = np.sqrt(variances)
@@ -176,30 +176,30 @@ class CholeskyFactor:
 
     @classmethod
     def of_scaled(cls, scaled: FloatArray, diagonal: FloatArray) -> CholeskyFactor | None:
-        """The factorisation of D S D (d, d) from S and D; None if S is not positive definite."""
+        """Return the factorisation of D S D (d, d) from S and D; None if S is not positive definite."""
         lower, failed = dpotrf(scaled, lower=1)
         return None if failed else cls(diagonal, lower)
 
     def solve(self, vector: FloatArray) -> FloatArray:
-        """B⁻¹ v."""
+        """Return B⁻¹ v."""
         return np.asarray(dpotrs(self.lower, vector / self.diagonal, lower=1)[0] / self.diagonal)
 
     def whiten(self, vectors: FloatArray) -> FloatArray:
-        """L⁻¹ D⁻¹ v for each of the rows v."""
+        """Return L⁻¹ D⁻¹ v for each of the rows v."""
         return _solve_triangular(self.lower, (vectors / self.diagonal).T, lower=1).T
 
     def unwhiten(self, vector: FloatArray) -> FloatArray:
-        """D⁻¹ L⁻ᵀ v."""
+        """Return D⁻¹ L⁻ᵀ v."""
         return _solve_triangular(self.lower, vector, lower=1, trans=1) / self.diagonal
 
 
 def is_definite(matrix: FloatArray) -> bool:
-    """Whether a symmetric matrix (d, d) has a Cholesky factorisation."""
+    """Return whether a symmetric matrix (d, d) has a Cholesky factorisation."""
     return not dpotrf(matrix, lower=1)[1]
 
 
 def _solve_triangular(matrix: FloatArray, right: FloatArray, lower: int = 0, trans: int = 0) -> FloatArray:
-    """LAPACK's solution; `scipy.linalg.solve_triangular` takes ten times longer on a small system."""
+    """Return LAPACK's solution; `scipy.linalg.solve_triangular` takes ten times longer on a small system."""
     solution, singular = dtrtrs(matrix, right, lower=lower, trans=trans)
     return np.full_like(right, np.nan) if singular else np.asarray(solution)
 
@@ -253,7 +253,7 @@ def _least_distance(target: FloatArray, rows: FloatArray, offsets: FloatArray) -
 
 
 def _lawson_hanson(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> FloatArray | None:
-    """Multipliers by the equivalent nonnegative least-squares problem ([1]_, chapter 23, algorithm LDP)."""
+    """Return the multipliers by the equivalent nonnegative least-squares problem ([1]_, chapter 23, algorithm LDP)."""
     stacked = np.vstack([rows.T, offsets + rows @ target])
     goal = np.zeros(target.size + 1)
     goal[-1] = 1.0
@@ -276,7 +276,7 @@ def _equality_solution(target: FloatArray, rows: FloatArray, offsets: FloatArray
 
 
 def _select_independent(rows: FloatArray, working: NDArray[np.intp]) -> NDArray[np.intp]:
-    """A maximal linearly independent part of the working set (unit rows)."""
+    """Return a maximal linearly independent part of the working set (unit rows)."""
     if working.size <= 1:
         return working
     R, order, *_ = dgeqp3(rows[working].T)
@@ -287,7 +287,7 @@ def _select_independent(rows: FloatArray, working: NDArray[np.intp]) -> NDArray[
 def _polish(
     target: FloatArray, rows: FloatArray, offsets: FloatArray, working: NDArray[np.intp]
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Solution on the working set if it is primal and dual feasible, otherwise None."""
+    """Return the solution on the working set if it is primal and dual feasible, otherwise None."""
     working = _select_independent(rows, working)
     e, active_multipliers = _equality_solution(target, rows[working], offsets[working])
     size = max(1.0, float(np.max(np.abs(active_multipliers), initial=0.0)))
@@ -300,7 +300,7 @@ def _polish(
 
 
 def _primal_active_set(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> NDArray[np.intp] | None:
-    """Optimal working set by the primal active-set method ([2]_, algorithm 16.3) with Bland's rule against cycling."""
+    """Find the optimal working set by the primal active-set method ([2]_, algorithm 16.3), with Bland's rule."""
     e = np.zeros(target.size)
     working: list[int] = []
     for _ in range(50 + 20 * offsets.size):
@@ -329,7 +329,7 @@ def _primal_active_set(target: FloatArray, rows: FloatArray, offsets: FloatArray
 def _feasible_fraction(
     target: FloatArray, rows: FloatArray, offsets: FloatArray, multipliers: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Last resort: the unpolished solution, shortened until feasible, which is still a descent step."""
+    """Return the unpolished solution as a last resort, shortened until feasible, which is still a descent step."""
     e = rows.T @ multipliers - target
     if e @ target >= 0.0:
         e = np.zeros_like(target)
@@ -342,7 +342,7 @@ def _feasible_fraction(
 def _refine(
     white: _White, e: FloatArray, multipliers: FloatArray, gradient: FloatArray, matrix: Matrix
 ) -> tuple[FloatArray, FloatArray]:
-    """One step of iterative refinement: the residual is computed with B itself, not with its factor."""
+    """Do one step of iterative refinement: the residual is computed with B itself, not with its factor."""
     working = np.flatnonzero(multipliers > 0.0)
     if working.size > e.size:
         return e, multipliers

@@ -55,7 +55,7 @@ def escape(oracle: Oracle, state: State) -> Accepted | None:
 
 
 def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | None:
-    """Backtracking on the quadratic decrease ½ t² rayᵀH ray, starting at a tenth of the size of the unknowns."""
+    """Backtrack on the quadratic decrease ½ t² rayᵀH ray, starting at a tenth of the size of the unknowns."""
     problem, point = oracle.problem, state.point
     _, hessian = point.derivatives(point.reported_sides)
     bending = float(ray @ (hessian @ ray))

@@ -135,7 +135,7 @@ def minimize(
 
 
 def _step(oracle: Oracle, state: State) -> State:
-    """One iteration: the next state, or the same point with a status."""
+    """Do one iteration: return the next state, or the same point with a status."""
     problem = oracle.problem
     direction = find_direction(problem, state)
     if _is_settled(problem, state, direction):
@@ -149,7 +149,7 @@ def _step(oracle: Oracle, state: State) -> State:
 
 
 def _is_settled(problem: Problem, state: State, direction: Direction) -> bool:
-    """Optimality below the tolerance and, since J may be badly scaled, the next step negligible as well."""
+    """Return whether the optimality is below the tolerance and, as J may be badly scaled, the next step negligible."""
     if state.point.optimality > problem.tolerance:
         return False
     if not problem.uses_hessian or state.settled >= EXTRA_ITERATIONS:
@@ -158,7 +158,7 @@ def _is_settled(problem: Problem, state: State, direction: Direction) -> bool:
 
 
 def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
-    """The line search found nothing: tell convergence and the limit of precision from failure."""
+    """Tell convergence and the limit of precision from failure where the line search found nothing."""
     if state.point.optimality <= oracle.problem.tolerance:
         return _finish(oracle, state, direction, Status.CONVERGED)
     floor = state.gradient_scale
@@ -181,7 +181,7 @@ def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
 
 
 def _finish(oracle: Oracle, state: State, direction: Direction, status: Status) -> State:
-    """At a KKT point: leave a saddle if possible, otherwise classify the point by its free curvature."""
+    """Leave a saddle at a KKT point if possible, otherwise classify the point by its free curvature."""
     problem = oracle.problem
     if problem.uses_hessian or state.point.plus.hessian.finite:
         closed = close_gaps(oracle, state)
@@ -215,7 +215,7 @@ def _record(oracle: Oracle, state: State) -> IterationRecord:
 
 
 def _result(oracle: Oracle, state: State, status: Status, history: tuple[IterationRecord, ...]) -> Result:
-    """The result at the state's point."""
+    """Return the result at the state's point."""
     problem, point = oracle.problem, state.point
     gradient, hessian = point.derivatives(point.reported_sides)
     curvature = curvature_at(problem, state, point.active)
@@ -241,7 +241,7 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
 
 
 def _nonfinite_start(oracle: Oracle, theta: FloatArray) -> Result:
-    """A result without numbers."""
+    """Return a result without numbers."""
     d = theta.size
     return Result(
         theta=theta,

@@ -59,7 +59,7 @@ class State:
 
     @classmethod
     def at(cls, point: Point) -> State:
-        """The state before the first iteration."""
+        """Return the state before the first iteration."""
         return cls(
             point=point,
             metric=1.0 / max(1.0, point.optimality),
@@ -70,7 +70,7 @@ class State:
         )
 
     def advance(self, accepted: Accepted, tolerance: float) -> State:
-        """The state after an accepted step."""
+        """Return the state after an accepted step."""
         point, alpha = accepted.point, accepted.step_length
         return State(
             point=point,

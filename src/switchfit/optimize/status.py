@@ -76,7 +76,7 @@ class IterationRecord:
     evaluations: int
 
     def continue_from(self, last: IterationRecord | None) -> IterationRecord:
-        """This record of a minimisation that was resumed, counted on from the last record before; None: the first."""
+        """Return this record of a resumed minimisation, counted on from the last one before (None: the first)."""
         if last is None:
             return self
         return replace(self, iteration=self.iteration + last.iteration, evaluations=self.evaluations + last.evaluations)

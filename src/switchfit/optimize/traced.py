@@ -134,7 +134,7 @@ class Breakpoints(NamedTuple):
         return moved.at[where].set(jnp.where(near, mark, x))
 
     def _neighbours(self, theta: Array) -> tuple[Array, Array]:
-        """Last breakpoint below and first one above each of the coordinates, infinite where there is none."""
+        """Return the last breakpoint below each coordinate and the first one above, infinite if there is none."""
         x = theta[np.array(self.coordinates, dtype=int), None]
         below = jnp.max(jnp.where(self.points < x, self.points, -jnp.inf), axis=1, initial=-jnp.inf)
         above = jnp.min(jnp.where(self.points > x, self.points, jnp.inf), axis=1, initial=jnp.inf)
@@ -342,7 +342,7 @@ def outcome_of(state: State, constraints: Constraints) -> Outcome:
     jump = state.right.gradient - state.left.gradient
     held = state.kink & (jump > SMALLEST_JUMP * state.gradient_scale)
     hessian = _without(held, state.right.hessian)
-    scaling = _scaling(hessian, algebra.flatness(state.scale, state.cost_scale, jnp))
+    scaling = _compute_scaling(hessian, algebra.flatness(state.scale, state.cost_scale, jnp))
     smallest = jnp.linalg.eigvalsh(jnp.nan_to_num(hessian / jnp.outer(scaling, scaling)))[0]
     settled = state.stationary & interior & (smallest > EIGENVALUE_FLOOR)
     return Outcome(
@@ -394,31 +394,31 @@ def begin(start: Array) -> State:
 
 
 def _sides(left: Array, right: Array, kink: Array) -> Array:
-    """As `switchfit.optimize.kinks.steepest_descent` chooses them where no constraint is active: (d,)."""
+    """Choose sides as `switchfit.optimize.kinks.steepest_descent` does where no constraint is active: (d,)."""
     alone = jnp.where((left <= 0.0) & (right >= 0.0), 0, jnp.where(-right >= left, 1, -1))
     return jnp.where(kink, alone, 1)
 
 
 def _steepest(left: Array, right: Array, kink: Array) -> Array:
-    """The derivative on the side to which each coordinate descends, 0 where a kink holds it: (d,)."""
+    """Return the derivative on the side to which each coordinate descends, 0 where a kink holds it: (d,)."""
     sides = _sides(left, right, kink)
     return jnp.where(sides == 0, 0.0, jnp.where(sides > 0, right, left))
 
 
 def _without(held: Array, hessian: Array) -> Array:
-    """The Hessian (d, d) with rows and columns of the identity for coordinates that are held."""
+    """Return the Hessian (d, d) with rows and columns of the identity for coordinates that are held."""
     either = held[:, None] | held[None]
     return jnp.where(either, jnp.eye(held.shape[0]), hessian)
 
 
 def _active(constraints: Constraints, theta: Array, scale: Array) -> Array:
-    """Which constraints hold with equality up to rounding: (m + 2 d,) bool."""
+    """Return which constraints hold with equality up to rounding: (m + 2 d,) bool."""
     size = jnp.maximum(jnp.maximum(scale, constraints.size), jnp.abs(theta))
     return algebra.is_active(constraints.slack(theta), size, jnp.abs(constraints.A), jnp.abs(constraints.b), jnp)
 
 
 def _kkt_residual(constraints: Constraints, theta: Array, scale: Array, gradient: Array) -> Array:
-    """min over lam >= 0, on the active constraints, of ‖g − Nᵀ lam‖."""
+    """Return min over lam >= 0, on the active constraints, of ‖g − Nᵀ lam‖."""
     active = _active(constraints, theta, scale)
 
     def solve_constrained() -> Array:
@@ -471,8 +471,8 @@ def nonnegative_minimum(matrix: Array, vector: Array, allowed: Array) -> Array:
     return lax.while_loop(lambda state: ~state[3] & (state[2] < 3 * k + 10), body, start)[0]
 
 
-def _scaling(hessian: Array, floor: Array) -> Array:
-    """As `switchfit.optimize.matrix.diagonal_scaling`, all rounds of it: (d,)."""
+def _compute_scaling(hessian: Array, floor: Array) -> Array:
+    """Scale as `switchfit.optimize.matrix.diagonal_scaling` does, all rounds of it: (d,)."""
     size = jnp.abs(hessian)
 
     def equilibrate(_: int, scaling: Array) -> Array:
@@ -483,7 +483,7 @@ def _scaling(hessian: Array, floor: Array) -> Array:
 
 
 def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints) -> tuple[Array, Array]:
-    """Step (d,) of the quadratic programme, and its slope gᵀd."""
+    """Return the step (d,) of the quadratic programme, and its slope gᵀd."""
     theta, sides = state.theta, state.sides
     held = sides == 0
     pair = sides[:, None] + sides[None]
@@ -495,7 +495,7 @@ def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints)
     upper = jnp.where(state.inside, narrowed[1], constraints.upper)
     slopes = jnp.maximum(jnp.abs(state.right.gradient), jnp.abs(state.left.gradient))
     floor = algebra.curvature_floor(state.scale, state.cost_scale, slopes, jnp)
-    scaling = _scaling(hessian, floor)
+    scaling = _compute_scaling(hessian, floor)
     scaled = hessian / jnp.outer(scaling, scaling)
     identity = jnp.eye(theta.shape[0])
     definite = jnp.all(jnp.isfinite(jnp.linalg.cholesky(scaled - EIGENVALUE_FLOOR * identity)))
@@ -535,7 +535,7 @@ def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints)
 
 
 def _move(constraints: Constraints, breakpoints: Breakpoints, theta: Array, step: Array) -> Array:
-    """theta + step, on the breakpoints that it reaches, with violations of the size of rounding removed."""
+    """Return theta + step, on the breakpoints that it reaches, with violations of the size of rounding removed."""
 
     def project(i: int, moved: Array) -> Array:
         normal, bound = constraints.A[i], constraints.b[i]

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.hidden import refuse_hidden_switches
-from switchfit.fit.result import Fit, scaled_spectrum
+from switchfit.fit.result import Fit, compute_scaled_spectrum
 from switchfit.fit.solution import is_least_squares
 from switchfit.fit.trajectory import compare
 from switchfit.problem.data import FloatArray, Measurements
@@ -373,7 +373,7 @@ def analyse(
         return Identifiability(names, units, is_time, *nothing, rise, meaning, where, base, cost is not None)
     flat = np.all(hessian == 0.0, axis=1).tolist()
     without = tuple(n for n, f, nothing in zip(names, free, flat, strict=True) if f and nothing)
-    spectrum = scaled_spectrum(hessian, basis)
+    spectrum = compute_scaled_spectrum(hessian, basis)
     values, vectors = spectrum.values, spectrum.vectors
     # What the cost does not depend on at all is reported separately.
     dead = np.array([n in without for n in names])
