@@ -14,10 +14,11 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from switchfit.discretization.arguments import Samples
 from switchfit.discretization.mesh import Rows
 from switchfit.discretization.model import Model, Piece
 from switchfit.discretization.propagation import Path, at_cells, by_mode, propagate
-from switchfit.discretization.rows import times_derivative
+from switchfit.discretization.rows import cost_of_row, times_derivative
 from switchfit.discretization.steps import row_functions
 
 Array = jax.Array
@@ -233,3 +234,17 @@ def tangents_again(
 ) -> tuple[Array, Array, Array]:
     """What `row_tangents` returned for one row."""
     return row_tangents(model, x_d, h, slopes, at.f_x, *direct_derivatives(model, at, start_d, end_d))
+
+
+def running_cost(model: Model, first: Forward) -> Array:
+    """Return the integral of the running costs over all rows: ()."""
+    layout, densities = first.path.layout, first.jacobians.l
+    if densities is None:
+        return jnp.zeros(())
+    return cost_of_row(model.tableau, layout.end - layout.start, list(jnp.moveaxis(densities, -1, 0))).sum()
+
+
+def sample_gradients(model: Model, path: Path, k: int, samples: Samples, p: Array) -> tuple[Array, tuple[Array, Array]]:
+    """Return the cost (K,) of each sample of the k-th Measurements, and its derivatives in x (K, n) and p (K, M)."""
+    gradient = jax.value_and_grad(partial(model.sample_cost, k), argnums=(1, 2))
+    return jax.vmap(gradient, in_axes=(0, 0, None))(samples, path.at_samples(samples.cell), p)
