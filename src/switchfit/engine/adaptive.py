@@ -48,7 +48,7 @@ PACE = 1000
 
 
 def fixed_nodes(experiment: Experiment) -> FloatArray:
-    """Moments that must be nodes: t0, tf, sample times, knots of inputs and reference signals inside the horizon."""
+    """Return the times that must be nodes: t0, tf, and samples and knots of signals inside the horizon."""
     t0, tf = experiment.t0, experiment.tf
     times = [np.array([t0, tf])]
     times += [item.seen_times for item in experiment.data if isinstance(item, Measurements)]
@@ -58,7 +58,7 @@ def fixed_nodes(experiment: Experiment) -> FloatArray:
 
 
 def refined_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1.0) -> Mesh:
-    """Mesh of experiment e on which its trajectory meets the problem's tolerances at each of the given thetas.
+    """Return a mesh of experiment e that meets the problem's tolerances at each of the given thetas.
 
     Parameters
     ----------
@@ -79,26 +79,26 @@ def refined_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1
 
 
 class _Steps(NamedTuple):
-    """How many steps a solver takes up to each time: linear between `times` (K,), where it is `counts` (K,)."""
+    """Number of solver steps up to each time: `counts` (K,) at `times` (K,), linear in between."""
 
     times: FloatArray
     counts: FloatArray
 
     @classmethod
     def densest(cls, solutions: list[FloatArray]) -> _Steps:
-        """The steps of several solutions (all their times), at every moment those of the one with the shortest."""
+        """Combine the step times of several solutions: at each time, the smallest step of any of them counts."""
         times = np.unique(np.concatenate(solutions))
         middles = 0.5 * (times[:-1] + times[1:])
         lengths = [np.diff(steps)[np.searchsorted(steps, middles) - 1] for steps in solutions]
         return cls(times, np.concatenate([[0.0], np.cumsum(np.diff(times) / np.min(lengths, axis=0))]))
 
     def up_to(self, t: FloatArray) -> FloatArray:
-        """Steps taken up to times t."""
+        """Return the number of steps up to times t."""
         return np.interp(t, self.times, self.counts)
 
 
 def _graded(ends: FloatArray, steps: _Steps, pieces: int) -> FloatArray:
-    """Nodes between two ends: half of them as dense as the solver's steps are, half of them evenly.
+    """Return the nodes between two ends: half of them follow the density of the solver's steps, half are even.
 
     The steps are short in the layers of a stiff mode, which evenly spaced nodes would miss; but layers move with the
     transition times, and the mesh does not.
@@ -111,7 +111,7 @@ def _graded(ends: FloatArray, steps: _Steps, pieces: int) -> FloatArray:
 
 
 def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -> FloatArray:
-    """All times at which the adaptive solver stopped, from t0 to tf, strictly increasing."""
+    """Return the accepted times of the adaptive solver from t0 to tf, strictly increasing."""
     experiment, structure = problem.experiments[e], problem.structures[e]
     whole = arguments_of(problem, e, coarse)
     arguments, signals = whole.without_mesh(), np.asarray(whole.signals)
@@ -150,7 +150,7 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
 
 
 def _by_jax(function: Callable[..., T], *given: Any, **settings: Any) -> T:
-    """Call a function that runs JAX's programs; what surrounds it takes longer than most solves in machine code."""
+    """Call a function that runs programs of JAX; entering these contexts takes longer than most native solves."""
     with float64(), compilation_cache():
         return function(*given, **settings)
 
@@ -168,7 +168,7 @@ def _solve(
     p: FloatArray,
     unit: str = "",
 ) -> tuple[FloatArray, FloatArray]:
-    """Adaptive solve of one mode from start to end: accepted times (start left out) and the final state."""
+    """Solve one mode adaptively; return the accepted times after `start` and the final state."""
     name = structure.mode_names[mode]
     function = partial(_field_and_density, structure=structure.functions, mode=mode)
     last = len(coarse.times) - 2
@@ -254,7 +254,7 @@ STEPS_AT_ONCE = 256
 def _solve_natively(
     problem: Problem, native: NativeExperiment, mode: int, start: float, end: float, x: FloatArray, p: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
-    """The same as `_solve` for the explicit method; None if it fails, of which `_solve` gives the reason."""
+    """Do what `_solve` does for explicit steps, in machine code; None if it fails: `_solve` then says why."""
     y, at = np.append(x, 0.0), Adaptive()
     state = np.zeros(at.size)
     state[at.t], state[at.end], state[at.rtol], state[at.atol] = start, end, problem.rtol, problem.atol
@@ -271,7 +271,7 @@ def _solve_natively(
 
 
 def _too_many(accepted: Sequence[float] | FloatArray, end: float) -> bool:
-    """Whether more than `MAX_STEPS` have been taken, or will be at the pace of the last `PACE` steps."""
+    """Return whether more than `MAX_STEPS` have been taken, or will be at the pace of the last `PACE` steps."""
     if len(accepted) < 5 * PACE:
         return False
     return len(accepted) + PACE * (end - accepted[-1]) / (accepted[-1] - accepted[-PACE - 1]) > MAX_STEPS
@@ -285,7 +285,7 @@ def _finite(value: jax.Array | FloatArray, what: str) -> FloatArray:
 
 
 def _rounded(parameters: Mapping[str, FloatArray]) -> dict[str, Any]:
-    """Parameters for a message."""
+    """Return the parameters rounded for a message."""
     return {name: np.round(value, 6).tolist() for name, value in parameters.items()}
 
 
@@ -309,7 +309,7 @@ def _field_and_density(
 
 @partial(jax.jit, static_argnames=("structure",))
 def initial_state(arguments: Arguments, p: jax.Array, *, structure: Structure) -> jax.Array:
-    """x(t0): (n,)."""
+    """Return x(t0): (n,)."""
     return Model(structure, arguments).initial_state(p)
 
 
@@ -317,5 +317,5 @@ def initial_state(arguments: Arguments, p: jax.Array, *, structure: Structure) -
 def after_reset(
     arguments: Arguments, t: jax.Array, x: jax.Array, p: jax.Array, *, structure: Structure, i: int
 ) -> jax.Array:
-    """State after the reset map of transition i (from 0): (n,)."""
+    """Return the state after the reset map of transition i (from 0): (n,)."""
     return Model(structure, arguments).reset(i)(t, x, p)

@@ -39,7 +39,7 @@ class Costates(NamedTuple):
 
 
 class Backward(NamedTuple):
-    """What the backward sweep finds: the cost J, costates, and the derivatives in tau (N,) and in p (M,)."""
+    """Result of the backward sweep: the cost J, costates, and the derivatives in tau (N,) and in p (M,)."""
 
     cost: Array
     costates: Costates
@@ -94,7 +94,7 @@ def backward_sweep(model: Model, first: Forward, p: Array, weights: Array | None
 
 
 class NodeGradients(NamedTuple):
-    """What is paid at single moments, without constraints, and its derivatives, with them.
+    """Costs at nodes, without constraints, and their derivatives, with constraints.
 
     Attributes
     ----------
@@ -170,13 +170,13 @@ def pull_of(jacobians: StageJacobians) -> Pull:
 
 
 def rows_at_transitions(first: Forward) -> Array:
-    """Flat indices of the rows that start (first line) and that end (second line) at each transition: (2, N)."""
+    """Return the flat indices of the rows that start (first) and that end (second) at each transition: (2, N)."""
     layout = first.path.layout
     return jnp.stack([layout.first_chunk[1:] * layout.start.shape[1], layout.last_row[:-1]])
 
 
 def row_ends_gradient(model: Model, first: Forward, psi: Costates) -> Array:
-    """Derivative of the cost in the times at which rows start or end: ``V h' + sum_j (w_j . f + h b_j ell)_t t_j'``."""
+    """Return the derivative of the cost in tau: ``V h' + sum_j (w_j . f + h b_j ell)_t t_j'`` of the rows beside it."""
     tableau, layout = model.tableau, first.path.layout
     if model.structure.N == 0:
         return jnp.zeros(0)

@@ -58,7 +58,7 @@ class Second(NamedTuple):
 
 
 def forward_hessian(model: Model, first: Forward, p: Array) -> Array:
-    """Hessian (D, D) of the discretised cost, D = N + M, without an adjoint.
+    """Return the Hessian (D, D) of the discretised cost, D = N + M, without an adjoint.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ def running_gradient(model: Model, first: Forward) -> Array:
 
 
 def second_tangents(model: Model, first: Forward, p: Array) -> tuple[Array, Second]:
-    """``x_tt`` along the path, and the part of the Hessian that the running costs make up, (B,)."""
+    """Return the Hessian of the running costs (B,), and ``x_tt`` along the path."""
     P = parameter_directions(model)
 
     def of_mode(mode: int) -> Callable[..., tuple[Array, ...]]:
@@ -186,7 +186,7 @@ def second_tangents(model: Model, first: Forward, p: Array) -> tuple[Array, Seco
 
 
 def reset_sources(model: Model, first: Forward, p: Array) -> tuple[Array, Array] | None:
-    """``D_x R`` (N + 1, n, n) and ``D^2 R (Z, Z)`` (N + 1, n, B) where each segment opens; None without reset maps."""
+    """Return ``D_x R`` (N + 1, n, n) and ``D^2 R (Z, Z)`` (N + 1, n, B) by segments; None without reset maps."""
     if first.resets is None:
         return None
     P = parameter_directions(model)
@@ -200,7 +200,7 @@ def reset_sources(model: Model, first: Forward, p: Array) -> tuple[Array, Array]
 
 
 def sample_second(model: Model, first: Forward, second: Second, k: int, p: Array) -> Array:
-    """Second derivative of the costs of the k-th Measurements: (B,)."""
+    """Return the second derivative of the costs of the k-th Measurements: (B,)."""
     P = parameter_directions(model)
     samples = model.arguments.samples[k]
     if model.structure.measurements[k].delay is not None:
@@ -223,12 +223,12 @@ def sample_second(model: Model, first: Forward, second: Second, k: int, p: Array
 
 
 def pairs(D: int) -> tuple[np.ndarray, np.ndarray]:
-    """The B = D (D + 1) / 2 pairs i <= j: two (B,) int arrays."""
+    """Return the B = D (D + 1) / 2 pairs i <= j: two (B,) int arrays."""
     return np.triu_indices(D)
 
 
 def along_pairs(function: Callable[..., Any], at: tuple[Array, ...], directions: tuple[Array, ...]) -> Any:
-    """Second derivative of `function` along all pairs of D directions (last axis of `directions`): (..., B)."""
+    """Return the second derivative of `function` along all pairs of the D `directions` (last axes): (..., B)."""
     i, j = pairs(directions[-1].shape[-1])
 
     def one(u: tuple[Array, ...], v: tuple[Array, ...]) -> Any:
@@ -239,6 +239,6 @@ def along_pairs(function: Callable[..., Any], at: tuple[Array, ...], directions:
 
 
 def symmetric(values: Array, D: int) -> Array:
-    """The symmetric (D, D) matrix with `values` (B,) on and above its diagonal."""
+    """Return the symmetric (D, D) matrix with `values` (B,) on and above its diagonal."""
     i, j = pairs(D)
     return jnp.zeros((D, D)).at[i, j].set(values).at[j, i].set(values)

@@ -68,16 +68,16 @@ class Tangents(NamedTuple):
     stages: Array | None
 
     def before_transition(self, layout: Rows, i: int) -> Array:
-        """At tau_i-: (n, D)."""
+        """Return the tangent at tau_i-: (n, D)."""
         return self.after[layout.first_chunk[i + 1] - 1, -1]
 
     def at_samples(self, layout: Rows, cell: Array) -> Array:
-        """At the ends of the given cells (K,): (K, n, D)."""
+        """Return the tangents at the ends of the given cells (K,): (K, n, D)."""
         return at_cells(layout, self.before[0, 0], self.after, cell)
 
 
 class Forward(NamedTuple):
-    """What the forward sweep finds. What of it nobody reads, XLA leaves out."""
+    """Result of the forward sweep. XLA does not compute those fields that a program does not read."""
 
     path: Path
     jacobians: StageJacobians
@@ -94,24 +94,24 @@ def forward_sweep(model: Model, tau: Array, p: Array, side: Array) -> Forward:
 
 
 def parameter_directions(model: Model) -> Array:
-    """Derivative of p in theta, ``[0 | I]``: (M, D)."""
+    """Return the derivative of p in theta, ``[0 | I]``: (M, D)."""
     N, M = model.structure.N, model.structure.M
     return jnp.concatenate([jnp.zeros((M, N)), jnp.eye(M)], axis=1)
 
 
 def unit(D: int, i: int) -> Array:
-    """Derivative of tau_i in theta, i from 0: (D,)."""
+    """Return the derivative of tau_i in theta, i from 0: (D,)."""
     return (jnp.arange(D) == i) * 1.0
 
 
 def time_directions(model: Model, layout: Rows) -> tuple[Array, Array]:
-    """Derivatives of the start and the end of each row in theta: two (Q, C, D) arrays of zeros and ones."""
+    """Return the derivatives of the start and the end of each row in theta: two (Q, C, D) arrays of zeros and ones."""
     index = jnp.arange(model.structure.N + model.structure.M)
     return (layout.starts_at[..., None] == index) * 1.0, (layout.ends_at[..., None] == index) * 1.0
 
 
 def stage_jacobians(model: Model, path: Path, p: Array) -> StageJacobians:
-    """D_2 f, D_1 f, D_p f at all stages, by forward differentiation, and the gradient of ell."""
+    """Return D_2 f, D_1 f, D_p f at all stages, by forward differentiation, and the gradient of ell."""
 
     def of_mode(mode: int) -> Callable[..., StageJacobians]:
         def at_stage(piece: Piece, t: Array, x: Array) -> StageJacobians:
@@ -139,7 +139,7 @@ def stage_jacobians(model: Model, path: Path, p: Array) -> StageJacobians:
 
 
 def reset_jacobians(model: Model, path: Path, p: Array) -> ResetJacobians | None:
-    """Jacobians of the reset maps; None where no transition has one."""
+    """Return the Jacobians of the reset maps; None if no transition has one."""
     structure = model.structure
     if not structure.resets:
         return None
@@ -152,7 +152,7 @@ def reset_jacobians(model: Model, path: Path, p: Array) -> ResetJacobians | None
 
 
 def tangents(model: Model, path: Path, jacobians: StageJacobians, resets: ResetJacobians | None, p: Array) -> Tangents:
-    """``x_theta`` along the path: forward, linear, one row after another.
+    """Return ``x_theta`` along the path: a linear recursion over the rows.
 
     Every row is treated as if both its ends moved, which only those beside a transition do. Measured, that costs no
     more than treating those rows by themselves and adding what they give.
@@ -181,7 +181,7 @@ def tangents(model: Model, path: Path, jacobians: StageJacobians, resets: ResetJ
 
 
 def direct_derivatives(model: Model, at: StageJacobians, start_d: Array, end_d: Array) -> tuple[Array, Array | None]:
-    """Derivatives of one row that do not come by way of its states: its forcing (s, n, D), and of its length (D,)."""
+    """Return the forcing of the tangents of one row (s, n, D), and the derivative of its length (D,)."""
     N = model.structure.N
     forcing = jnp.pad(at.f_p, ((0, 0), (0, 0), (N, 0)))
     if N == 0:
@@ -212,9 +212,9 @@ def row_tangents(
 
 
 def stages_along(model: Model, first: Forward) -> tuple[tuple[Any, ...], Callable[..., Array]]:
-    """What of each row the derivatives at its stages follow from, (Q, C, ...), and how: a function of one row's.
+    """Return arrays (Q, C, ...), and a function that computes the tangents of the stages of a row from its slices.
 
-    These are the derivatives themselves, (s, n, D) for each row, where they have been kept.
+    The arrays are these tangents themselves, (s, n, D) for each row, if they were kept.
     """
     kept = first.tangents.stages
     if kept is not None:
@@ -223,7 +223,7 @@ def stages_along(model: Model, first: Forward) -> tuple[tuple[Any, ...], Callabl
 
 
 def of_rows(model: Model, first: Forward) -> tuple[Any, ...]:
-    """What `tangents_again` takes, of all rows: (Q, C, ...)."""
+    """Return the arguments of `tangents_again` for all rows: (Q, C, ...)."""
     layout = first.path.layout
     lengths = layout.end - layout.start
     return (first.tangents.before, lengths, first.path.slopes, first.jacobians, *time_directions(model, layout))
@@ -232,7 +232,7 @@ def of_rows(model: Model, first: Forward) -> tuple[Any, ...]:
 def tangents_again(
     model: Model, x_d: Array, h: Array, slopes: Array, at: StageJacobians, start_d: Array, end_d: Array
 ) -> tuple[Array, Array, Array]:
-    """What `row_tangents` returned for one row."""
+    """Compute the result of `row_tangents` for one row again."""
     return row_tangents(model, x_d, h, slopes, at.f_x, *direct_derivatives(model, at, start_d, end_d))
 
 

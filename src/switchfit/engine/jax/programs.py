@@ -83,7 +83,7 @@ def constrained_derivatives(
 
 
 def _autodiff(model: Model, tau: Array, p: Array, side: Array) -> tuple[Array, Array, Array]:
-    """J and its derivatives by JAX alone, forward over forward."""
+    """Return J and its derivatives by JAX alone, forward over forward."""
     N = model.structure.N
 
     def cost(theta: Array) -> Array:

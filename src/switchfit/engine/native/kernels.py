@@ -16,7 +16,7 @@ What a straight line reads and writes it finds behind pointers. Every pointer me
                     of some constraints: (m,), (m,), their values (m,) and derivatives (m, width)
     moment          (t, first node of the cell), for the adaptive solver; its y is (x, running cost)
     entries         second derivatives at the stages of a row, (s, count)
-    check           not a number once something was not finite that had been presumed so, else 0
+    check           NaN once something presumed finite was not, else 0
 """
 
 from __future__ import annotations
@@ -382,7 +382,7 @@ class Kernels:
     # What they have in common
 
     def inputs(self, graph: Graph) -> tuple[Objects, list[Objects]]:
-        """p and the constants."""
+        """Load p and the constants."""
         p, offset, constants = graph.loads("p", self.sizes.M), 0, []
         for shape in self.sizes.constants:
             count = int(np.prod(shape))
@@ -391,7 +391,7 @@ class Kernels:
         return p, constants
 
     def _row(self, graph: Graph) -> Any:
-        """What the functions of a stage are given, of (t, x, w, hb); w and hb are zero if they are left out."""
+        """Return the inputs of a stage as a function of (t, x, w, hb); w and hb default to zero."""
         p, constants = self.inputs(graph)
         origin, signal = graph.load("row", 2), graph.loads("signal", 4 * self.sizes.signals)
         nothing = graph.constant(0.0)
@@ -402,18 +402,18 @@ class Kernels:
         return graph.load("opens", 0, vector=True), graph.load("closes", 0, vector=True)
 
     def _units(self, graph: Graph) -> list[Node]:
-        """Derivatives of p along theta."""
+        """Return the derivatives of p along theta."""
         return [graph.unit(self.sizes.N + k) for k in range(self.sizes.M)]
 
     def _along_p(self, graph: Graph, derivatives: Objects) -> Any:
-        """``sum_k derivatives[..., k] p_k'``: of shape (...)."""
+        """Return ``sum_k derivatives[..., k] p_k'``: of shape (...)."""
         total: Any = 0.0 if derivatives.ndim == 1 else np.zeros(derivatives.shape[:-1])
         for k, unit in enumerate(self._units(graph)):
             total = total + derivatives[..., k] * unit
         return total
 
     def _scalar(self, graph: Graph, derivatives: Sequence[Objects], moving: bool) -> list[Store]:
-        """Stores of g and H with a scalar's derivatives added, g_t, g_x, g_p and the second ones, at x, Z."""
+        """Return stores that add the derivatives of a scalar, g_t, g_x, g_p and the second ones, to g and H."""
         g_t, _, g_p, *second = derivatives
         g = graph.load("g", 0, vector=True) + self._along_p(graph, g_p)
         if moving:
@@ -430,7 +430,7 @@ class Kernels:
         return stores
 
     def _cost(self, graph: Graph, found: Sequence[Objects], moving: bool) -> list[Store]:
-        """Stores of a cost of (t, x, p) at one moment: J, g and H grow, and the costate by its derivative."""
+        """Return stores that add a cost at a node to J, g, H and the costate."""
         cost, *derivatives = found
         stores = [("J", 0, graph.load("J", 0) + cost.item())]
         if self.order == Order.COST:
@@ -441,13 +441,13 @@ class Kernels:
     def _weights(
         self, graph: Graph, template: Template, given: tuple[Any, ...], constants: list[Objects], count: int
     ) -> Objects:
-        """``multiplier + penalty c`` of some constraints, what weighs their second derivatives in a Lagrangian."""
+        """Return ``multiplier + penalty c``: the weights of the constraints in the Lagrangian."""
         none = np.full(count, graph.constant(0.0), dtype=object)
         (c,) = template(graph, *given, none, *constants, only=(0,))
         return graph.loads("multiplier", count) + graph.loads("penalty", count) * c
 
     def _constraint(self, graph: Graph, found: Sequence[Objects], moving: bool) -> list[Store]:
-        """Stores of constraints: their values and derivatives, and those of the weighted sum beside those of J."""
+        """Return stores of constraints and their tangents, and those that add ``weights . c`` to g, H and psi."""
         stores = _stored("constraint", 0, found[0])
         if self.order == Order.COST:
             return stores
@@ -461,7 +461,7 @@ class Kernels:
         return stores + self._scalar(graph, derivatives, moving)
 
     def _state_directions(self, graph: Graph, pointer: str, first: int = 0) -> Along:
-        """The derivative of each entry of x along theta."""
+        """Load the derivative of each entry of x along theta."""
         n, D, width = self.sizes.n, self.sizes.D, self.sizes.width
         return [
             (graph.load(pointer, k, vector=True), [graph.load(pointer, k * width + d) for d in range(D)])
@@ -469,7 +469,7 @@ class Kernels:
         ]
 
     def _curved(self, graph: Graph, H: list[Node], second: dict[tuple[int, int], Node], along: Along) -> list[Node]:
-        """Rows of H with ``Z' S Z`` added, S given by its lower half along (t, x, p); `along` is Z of t and x."""
+        """Add ``Z' S Z`` to the rows of H, S given by its lower half along (t, x, p); `along` is Z of t and x."""
         n, N = self.sizes.n, self.sizes.N
         vectors = [vector for vector, _ in along] + self._units(graph)
         product: dict[int, Any] = {}
@@ -488,7 +488,7 @@ class Kernels:
 
 
 def _entries(second: Sequence[Objects], with_time: bool) -> dict[tuple[int, int], Node]:
-    """The lower half of a second derivative along (t, x, p), as entries of one matrix; zeros are left out."""
+    """Return the lower half of a second derivative along (t, x, p), as entries of one matrix; zeros are left out."""
     tt, xt, xx, pt, px, pp = second
     n, M = len(xt), len(pt)
     entries = {(1 + i, 1 + j): xx[i, j] for i in range(n) for j in range(i + 1)}
@@ -505,7 +505,7 @@ def _changed(H: list[Node], rows: list[Node]) -> list[Store]:
 
 
 def _as_vector(graph: Graph, value: Any) -> Node:
-    """A vector node, also where the value turned out to be zero."""
+    """Return a vector node, also if the value turned out to be a scalar zero."""
     if isinstance(value, Node) and value.vector:
         return value
     return graph.zeros()

@@ -24,14 +24,14 @@ MOST_KNOWN_ROWS = 30
 
 
 def _for_each(function: Callable[..., tuple[Any, ...]], *arrays: Any) -> list[Any]:
-    """Results of a function of matrices, for arrays of matrices."""
+    """Map a function of matrices over arrays of matrices."""
     batch = arrays[0].shape[:-2]
     parts = [function(*(np.asarray(a[place], dtype=object) for a in arrays)) for place in np.ndindex(*batch)]
     return [np.stack(column).reshape(*batch, *np.shape(column[0])) for column in zip(*parts, strict=True)]
 
 
 def lu(graph: Graph, equation: Any, a: Any) -> list[Any]:
-    """As `jax.lax.linalg.lu`: L and U in one matrix, the row that each step exchanges, and the order of the rows."""
+    """Do what `jax.lax.linalg.lu` does: L and U in one matrix, the row that each step exchanges, the order."""
     _check_rows(max(a.shape[-2:]), MOST_ROWS_TO_PIVOT)
     return _for_each(lambda matrix: _lu(graph, matrix), a)
 
@@ -58,7 +58,7 @@ def _lu(graph: Graph, matrix: Objects) -> tuple[Any, ...]:
 
 
 def _largest(graph: Graph, column: Objects, k: int) -> Any:
-    """Where the largest entry from k on is, the first of several; entries that are zero in any case are left out."""
+    """Return the index of the largest entry from k on, the first of several; entries known to be zero are skipped."""
     size, found = graph.apply("abs", column[k]), k
     for i in range(k + 1, len(column)):
         other = graph.apply("abs", column[i])
@@ -70,7 +70,7 @@ def _largest(graph: Graph, column: Objects, k: int) -> Any:
 
 
 def _exchanged(graph: Graph, a: Any, k: int, other: Any) -> Any:
-    """Rows with row k and another one from k on, which is known or an `Integer`, in each other's place."""
+    """Exchange row k with another one from k on, whose index is known or an `Integer`."""
     result = a.copy()
     if isinstance(other, int):
         result[[k, other]] = a[[other, k]]
@@ -82,7 +82,7 @@ def _exchanged(graph: Graph, a: Any, k: int, other: Any) -> Any:
 
 
 def cholesky(graph: Graph, equation: Any, a: Any) -> list[Any]:
-    """As `jax.lax.linalg.cholesky` of a symmetric matrix; all is NaN if it is not positive definite."""
+    """Do what `jax.lax.linalg.cholesky` does for a symmetric matrix; all is NaN if it is not positive definite."""
     _check_rows(a.shape[-1], MOST_ROWS)
     return _for_each(lambda matrix: (_cholesky(graph, matrix),), a)
 
@@ -116,7 +116,7 @@ def _sum_of_products(graph: Graph, a: Any, b: Any) -> Any:
 
 
 def triangular_solve(graph: Graph, equation: Any, a: Any, b: Any) -> list[Any]:
-    """As `jax.lax.linalg.triangular_solve`."""
+    """Do what `jax.lax.linalg.triangular_solve` does."""
     params = equation.params
     _check_rows(a.shape[-1], MOST_ROWS if a.dtype == object else MOST_KNOWN_ROWS)
     lower = params["lower"] != params["transpose_a"]

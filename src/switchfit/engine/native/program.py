@@ -1,7 +1,7 @@
 """Machine code for a library of modes: written, compiled, kept.
 
 A program goes through the segments forward, then through samples and terminal costs, then backward. It is written for
-a library: which mode comes when is among what it is given.
+a library: which mode a segment has is read at run time.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ PREFIX = {Order.COST: "plain_", Order.GRADIENT: "first_", Order.HESSIAN: "", Ord
 
 
 def program_of(library: Structure, sizes: Sizes, order: Order) -> Program | str:
-    """Machine code for a library, with derivatives of an order; or the reason why JAX has to do its work.
+    """Return machine code for a library with derivatives of an order, or the reason why there is none.
 
-    That is so for implicit steps, and for functions that cannot be written as a straight line of scalars. A fit needs
-    simulations and second derivatives: they are one program. Whatever else goes wrong is a defect of this package: JAX
-    then does the work as well, and the reason begins with "internal: ".
+    There is none for implicit steps, and for functions that cannot be written as a straight line of scalars. A fit
+    needs simulations and second derivatives: they are one program. Any other failure is a defect of this package: the
+    caller falls back to JAX as well, and the reason begins with "internal: ".
     """
     with _one_at_a_time:
         both = (Order.COST, Order.HESSIAN)
@@ -70,7 +70,7 @@ def _compiled(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> Pr
 
 
 def forget_programs() -> None:
-    """Let go of all machine code that nothing works with."""
+    """Drop cached programs that are not in use."""
     with _one_at_a_time:
         _program_of.cache_clear()
 

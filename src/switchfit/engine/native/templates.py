@@ -60,24 +60,24 @@ class Sizes:
 
     @classmethod
     def of(cls, structure: Structure, arguments: Arguments) -> Sizes:
-        """Those of one experiment."""
+        """Return the sizes of one experiment."""
         constants = tuple(np.shape(a) for a in constants_of(arguments))
         count = structure.terminal_constraint_count
         return cls(structure.n, structure.transitions, structure.M, arguments.signals.shape[2], count, constants)
 
     @property
     def D(self) -> int:
-        """Unknowns: all transition times, then p."""
+        """Number of unknowns: all transition times, then p."""
         return self.N + self.M
 
     @property
     def width(self) -> int:
-        """Entries of a vector: even, so that vector instructions of the processor fit."""
+        """Number of entries of a vector: even, so that vector instructions of the processor fit."""
         return self.D if self.D == 1 else self.D + self.D % 2
 
 
 def constants_of(arguments: Arguments) -> list[Any]:
-    """What functions of the model look at beside t, x, p and signals."""
+    """Return the arrays that functions of the model read beside t, x, p and signals."""
     return [*arguments.fixed, *arguments.weights, arguments.initial_state]
 
 
@@ -92,7 +92,7 @@ class Templates:
         self.library, self.sizes, self.order = library, sizes, order
 
     def model(self, constants: tuple[Any, ...]) -> Model:
-        """The model with traced constants."""
+        """Return the model with traced constants."""
         fixed = sum(not free for _, _, free in self.library.parameters)
         arguments = Arguments(
             nodes=jnp.zeros(2),
@@ -105,7 +105,7 @@ class Templates:
         return Model(self.library, arguments)
 
     def stage(self, mode: int, running: bool = True) -> Template:
-        """f, ell, their derivatives and those of ``w . f + hb ell``; `F` and what follows it say the places.
+        """Trace f, ell, their derivatives and those of ``w . f + hb ell``; `F` to `SECOND` are their places.
 
         Without `running` ell is left out.
         """
@@ -150,7 +150,7 @@ class Templates:
         return traced(stage, (), (n,), (M,), (n,), (), (), (4, S), *self.sizes.constants, name=name)
 
     def sample(self, k: int) -> Template:
-        """Cost of a sample and its derivatives."""
+        """Trace the cost of a sample and its derivatives."""
         q = self.library.measurements[k].channels
 
         def sample(time: Any, value: Any, weight: Any, x: Any, p: Any, *constants: Any) -> Any:
@@ -178,7 +178,7 @@ class Templates:
         return traced(sample, *shapes, *self.sizes.constants, name="observe of Measurements")
 
     def late_time(self, k: int) -> Template:
-        """Of the k-th Measurements the moment of which a late sample is, and its derivative in p."""
+        """Trace the time at which a late sample of the k-th Measurements saw the state, and its derivative in p."""
 
         def time(t: Any, p: Any, *constants: Any) -> Any:
             model = self.model(constants)
@@ -189,7 +189,7 @@ class Templates:
         return traced(time, (), (self.sizes.M,), *self.sizes.constants, name="delay of Measurements")
 
     def end(self) -> Template:
-        """The terminal costs."""
+        """Trace the terminal costs."""
 
         def end(x: Any, p: Any, *constants: Any) -> Any:
             cost = end_cost(self.model(constants))
@@ -203,7 +203,7 @@ class Templates:
         return traced(end, (self.sizes.n,), (self.sizes.M,), *self.sizes.constants, name="a terminal cost")
 
     def transition(self, kind: TransitionKind, which: int) -> Template:
-        """One of the functions at transitions: a cost, or ``weight`` times a constraint beside its own first ones.
+        """Trace a function at transitions: a cost, or a constraint and ``weight`` times it.
 
         The outputs of a constraint are its value and first derivatives, then those of the weighted one.
         """
@@ -221,7 +221,7 @@ class Templates:
         return traced(at, *shapes, *self.sizes.constants, name=f"one of the {kind.name}")
 
     def end_constraint(self) -> Template:
-        """All terminal constraints and their first derivatives, then those of the weighted sum."""
+        """Trace all terminal constraints and their first derivatives, then those of the weighted sum."""
 
         def end(x: Any, p: Any, weights: Any, *constants: Any) -> Any:
             function = end_constraints(self.model(constants))
@@ -233,7 +233,7 @@ class Templates:
         return traced(end, *shapes, *self.sizes.constants, name="a terminal constraint")
 
     def reset(self, which: int) -> Template:
-        """A reset map, its Jacobians, and the derivatives of ``w . R``."""
+        """Trace a reset map, its Jacobians, and the derivatives of ``w . R``."""
 
         def reset(t: Any, x: Any, p: Any, w: Any, *constants: Any) -> Any:
             R = self.model(constants).reset(which)
@@ -246,7 +246,7 @@ class Templates:
         return traced(reset, (), (n,), (self.sizes.M,), (n,), *self.sizes.constants, name="a reset map")
 
     def start(self) -> Template:
-        """x(t0), its Jacobian (n, M) in p, and the derivatives of ``w . x(t0)``: (M,) and (M, M)."""
+        """Trace x(t0), its Jacobian (n, M) in p, and the derivatives of ``w . x(t0)``: (M,) and (M, M)."""
 
         def start(p: Any, w: Any, *constants: Any) -> Any:
             x0 = self.model(constants).initial_state
@@ -259,7 +259,7 @@ class Templates:
         return traced(start, (self.sizes.M,), (self.sizes.n,), *self.sizes.constants, name="initial_state")
 
     def outputs(self) -> Template:
-        """What all sensors see, references first, then Measurements, and its derivatives in x and p."""
+        """Trace the outputs, of references, then of Measurements, and their derivatives in x and p."""
 
         def outputs(t: Any, x: Any, p: Any, *constants: Any) -> Any:
             model = self.model(constants)
@@ -273,13 +273,13 @@ class Templates:
         return traced(outputs, (), (self.sizes.n,), (self.sizes.M,), *self.sizes.constants, name="observe")
 
     def _cost(self, value: Callable[..., Any], t: Any, x: Any, p: Any) -> list[Any]:
-        """A cost with its derivatives, as far as the order asks for them."""
+        """Return a cost with the derivatives of the order."""
         if self.order == Order.COST:
             return [value(t, x, p)]
         return [value(t, x, p), *self._derivatives(value, t, x, p)]
 
     def _constraint(self, function: Callable[..., Any], t: Any, x: Any, p: Any, weights: Any) -> list[Any]:
-        """Values (m,) with Jacobians in t, x and p, then the derivatives of ``weights . c``."""
+        """Return values (m,) with Jacobians in t, x and p, then the derivatives of ``weights . c``."""
         if self.order == Order.COST:
             return [function(t, x, p)]
         jacobians = jax.jacfwd(function, argnums=(0, 1, 2))(t, x, p)
@@ -290,7 +290,7 @@ class Templates:
         ]
 
     def _derivatives(self, value: Callable[..., Any], t: Any, x: Any, p: Any) -> list[Any]:
-        """First and second derivatives; at the order of Gauss-Newton the second ones are left out."""
+        """Return first and second derivatives; at the order of Gauss-Newton the second ones are zero."""
         if self.order != Order.GAUSS_NEWTON:
             return _first_and_second(value, t, x, p)
         return [*jax.grad(value, argnums=(0, 1, 2))(t, x, p), *self._no_second()]
@@ -300,21 +300,21 @@ class Templates:
         return [jnp.zeros(shape) for shape in ((), (n,), (n, n), (M,), (M, n), (M, M))]
 
     def _second_in_state(self, value: Callable[..., Any], x: Any, p: Any) -> list[Any]:
-        """Second derivatives of a function of (x, p), those in t being zero."""
+        """Return the second derivatives of a function of (x, p); those in t are zero."""
         (xx, _), (px, pp) = jax.jacfwd(jax.grad(value, argnums=(0, 1)), argnums=(0, 1))(x, p)
         tt, xt, _, pt, _, _ = self._no_second()
         return [tt, xt, xx, pt, px, pp]
 
 
 def _first_and_second(value: Callable[..., Any], *at: Any) -> list[Any]:
-    """First derivatives of a scalar in t, x, p, and second in tt, xt, xx, pt, px, pp."""
+    """Return the first derivatives of a scalar in t, x, p, and second in tt, xt, xx, pt, px, pp."""
     gradient = jax.grad(value, argnums=(0, 1, 2))
     (tt, _, _), (xt, xx, _), (pt, px, pp) = jax.jacfwd(gradient, argnums=(0, 1, 2))(*at)
     return [*gradient(*at), tt, xt, xx, pt, px, pp]
 
 
 def _normal_matrix(r_d: tuple[Any, Any, Any], weigh: Callable[[Any], Any]) -> list[Any]:
-    """``r_d' W r_d`` along (t, x, p) by its parts tt, xt, xx, pt, px, pp; `weigh` multiplies by W from the left."""
+    """Return ``r_d' W r_d`` along (t, x, p) by its parts tt, xt, xx, pt, px, pp; `weigh` multiplies by W."""
     t, x, p = r_d
     Wt, Wx, Wp = weigh(t[:, None])[:, 0], weigh(x), weigh(p)
     return [t @ Wt, x.T @ Wt, x.T @ Wx, p.T @ Wt, p.T @ Wx, p.T @ Wp]

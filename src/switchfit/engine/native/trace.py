@@ -38,7 +38,7 @@ MOST_TURNS = 100_000
 
 
 def traced(function: Callable[..., Sequence[Any]], *shapes: tuple[int, ...], name: str = "the function") -> Template:
-    """A function of float64 arrays of the given shapes, which returns a flat list of arrays.
+    """Trace a function of float64 arrays of the given shapes, which returns a flat list of arrays.
 
     Raises
     ------
@@ -89,13 +89,13 @@ def _run(graph: Graph, jaxpr: Any, consts: Sequence[Any], inputs: Sequence[Any])
 
 
 def _as_array(value: Any) -> Any:
-    """A NumPy array; keys of random numbers, which NumPy does not know, stay as they are."""
+    """Return a NumPy array; keys of random numbers, which NumPy does not know, stay as they are."""
     extended = isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended)
     return value if extended or isinstance(value, np.ndarray) else np.asarray(value)
 
 
 def _located(error: Unsupported, equation: Any) -> Unsupported:
-    """The same with the line of the user's code, and the name of JAX's function that this line calls.
+    """Add the line of the user's code, and the name of JAX's function that it calls.
 
     Functions of JAX such as `jnp.sort` are traced once for all their callers. What their inner operations say of where
     they stand may thus be the place of another call.
@@ -111,7 +111,7 @@ def _located(error: Unsupported, equation: Any) -> Unsupported:
 
 
 def _public_name(jaxpr: Any) -> str | None:
-    """What users call a function of JAX; None for any other function."""
+    """Return the public name of a function of JAX; None for any other function."""
     info = getattr(jaxpr, "debug_info", None)
     file, name = getattr(info, "func_filename", None), str(getattr(info, "func_name", "")).lstrip("_")
     if file is None or not file.startswith(os.path.dirname(jax.__file__) + os.sep):
@@ -142,7 +142,7 @@ def _modules() -> list[tuple[str, Any]]:
 
 
 def _line_of(equation: Any) -> str | None:
-    """File and line of the user's code from which an operation comes; None if JAX does not say."""
+    """Return file and line of the user's code from which an operation comes; None if JAX does not say."""
     try:  # not public: what JAX says where it fails may be said in another way one day
         frame = source_info_util.user_frame(equation.source_info.traceback)
         return None if frame is None else f"{os.path.basename(frame.file_name)}:{frame.start_line}"
@@ -196,14 +196,14 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
 
 
 def _evaluated(equation: Any, args: list[Any]) -> list[Any]:
-    """An operation on known numbers, by JAX."""
+    """Evaluate an operation on known numbers by JAX."""
     with jax.ensure_compile_time_eval():
         results = equation.primitive.bind(*args, **equation.params)
     return [_as_array(a) for a in (results if equation.primitive.multiple_results else [results])]
 
 
 def _meaning(graph: Graph, name: str, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
-    """What an operation does to entries of arrays of a type."""
+    """Return what an operation does to entries of arrays of a type."""
     _check_type(dtype)
     if dtype.kind in "iu":
         if name in OF_INTEGERS:
@@ -223,7 +223,7 @@ def _check_type(dtype: np.dtype[Any]) -> None:
 
 
 def _is_search(equation: Any) -> bool:
-    """Whether JAX searches one sorted array with a loop, as `jnp.interp` does as well.
+    """Return whether JAX searches one sorted array with a loop, as `jnp.interp` does too.
 
     Behind the array and the numbers come tangents, which an index does not depend on.
     """
@@ -251,7 +251,7 @@ OTHER_NAMES = {"while": "jax.lax.while_loop", "eigh": "jnp.linalg.eigh", "eig": 
 
 
 def _scan(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
-    """A loop of known length, one turn after another."""
+    """Unroll a loop of known length."""
     params = equation.params
     fixed, carried, length = params["num_consts"], params["num_carry"], params["length"]
     consts, carry, columns = args[:fixed], args[fixed : fixed + carried], args[fixed + carried :]
@@ -269,7 +269,7 @@ def _scan(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
 
 
 def _while(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
-    """A loop whose condition never depends on the state."""
+    """Unroll a loop whose condition never depends on the state."""
     params = equation.params
     condition, body = params["cond_jaxpr"], params["body_jaxpr"]
     first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
@@ -285,7 +285,7 @@ def _while(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
 
 
 def _cond(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
-    """All branches, and a choice among their results."""
+    """Trace all branches, and choose among their results."""
     which, *operands = args
     branches = [
         (lambda branch=branch: _run(graph, branch.jaxpr, branch.consts, operands))
@@ -303,7 +303,7 @@ def _cond(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
 
 
 def _linear_solve(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
-    """A linear system, by the solver that comes with it; its derivatives have been taken before."""
+    """Trace the solver of a linear system; its derivatives have been taken before."""
     lengths, jaxprs = equation.params["const_lengths"], equation.params["jaxprs"]
     before = lengths.matvec + lengths.vecmat
     right = before + lengths.solve + (lengths.transpose_solve if jaxprs.transpose_solve is not None else 0)
@@ -349,7 +349,7 @@ def _slice(params: Any, a: Any) -> Any:
 
 
 def _pad(params: Any, a: Any, value: Any) -> Any:
-    """Entries between and around those of an array; a negative number at an end cuts entries off."""
+    """Add entries between and around those of an array; a negative number at an end cuts entries off."""
     config = params["padding_config"]
     whole = [n + max(n - 1, 0) * inner for n, (_, _, inner) in zip(a.shape, config, strict=True)]
     shape = [max(low, 0) + n + max(high, 0) for n, (low, high, _) in zip(whole, config, strict=True)]
@@ -445,7 +445,7 @@ def _integer_power(graph: Graph, params: Any) -> Callable[[Any], Any]:
 
 
 def _select(graph: Graph, params: Any) -> Callable[..., Any]:
-    """Of several cases that which a truth value or an integer says."""
+    """Select one of several cases by a truth value or an integer."""
 
     def select(which: Any, *cases: Any) -> Any:
         if not isinstance(which, Node | Integer):
@@ -461,7 +461,7 @@ def _select(graph: Graph, params: Any) -> Callable[..., Any]:
 
 
 def _round(graph: Graph, params: Any) -> Callable[[Any], Any]:
-    """To the nearest integer; of two the even one, or the one farther from zero."""
+    """Round to the nearest integer; a half to the even one, or away from zero."""
     to_even = params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN
     return partial(graph.apply, "rint" if to_even else "round")
 
@@ -552,7 +552,7 @@ def _contract(a: Any, b: Any, axes: Any) -> Objects:
 
 
 def _reduced(name: str) -> Callable[..., Any]:
-    """One operation over some axes."""
+    """Reduce over axes by an operation."""
 
     def over(graph: Graph, equation: Any, a: Any) -> Any:
         axes, dtype = equation.params["axes"], equation.invars[0].aval.dtype
@@ -566,7 +566,7 @@ def _reduced(name: str) -> Callable[..., Any]:
 
 
 def _accumulated(name: str) -> Callable[..., Any]:
-    """One operation over all entries up to each along an axis."""
+    """Accumulate along an axis by an operation."""
 
     def along(graph: Graph, equation: Any, a: Any) -> Any:
         axis, turned = equation.params["axis"], equation.params["reverse"]
@@ -579,7 +579,7 @@ def _accumulated(name: str) -> Callable[..., Any]:
 
 
 def _first(name: str) -> Callable[..., Any]:
-    """Where along an axis the largest (or smallest) entry is, the first of several; a NaN counts as such."""
+    """Find the largest (or smallest) entry along an axis, the first of several; a NaN counts as such."""
 
     def along(graph: Graph, equation: Any, a: Any) -> Any:
         (axis,), dtype = equation.params["axes"], equation.invars[0].aval.dtype
@@ -621,7 +621,7 @@ ARRAYS: dict[str, Callable[..., Any]] = {
 
 
 def _scatter(name: str | None) -> Callable[..., Any]:
-    """A scatter that combines old entries with updates by an operation, or replaces them."""
+    """Return a scatter that combines old entries with updates by an operation, or replaces them."""
 
     def scattered(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any) -> Any:
         dtype = equation.outvars[0].aval.dtype
