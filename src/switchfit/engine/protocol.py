@@ -125,7 +125,7 @@ class Tangents(NamedTuple):
     y_after: FloatArray
 
 
-def with_samples(
+def add_samples(
     simulation: Simulation, structure: Structure, arguments: Arguments, late: Mapping[int, FloatArray]
 ) -> Simulation:
     """Return the simulation with what each of the Measurements sees at its samples.

@@ -219,17 +219,17 @@ def stages_along(model: Model, first: Forward) -> tuple[tuple[Any, ...], Callabl
     kept = first.tangents.stages
     if kept is not None:
         return (kept,), lambda stages_d: stages_d
-    return of_rows(model, first), lambda *row: tangents_again(model, *row)[0]
+    return row_operands(model, first), lambda *row: recompute_tangents(model, *row)[0]
 
 
-def of_rows(model: Model, first: Forward) -> tuple[Any, ...]:
-    """Return the arguments of `tangents_again` for all rows: (Q, C, ...)."""
+def row_operands(model: Model, first: Forward) -> tuple[Any, ...]:
+    """Return the arguments of `recompute_tangents` for all rows: (Q, C, ...)."""
     layout = first.path.layout
     lengths = layout.end - layout.start
     return (first.tangents.before, lengths, first.path.slopes, first.jacobians, *time_directions(model, layout))
 
 
-def tangents_again(
+def recompute_tangents(
     model: Model, x_d: Array, h: Array, slopes: Array, at: StageJacobians, start_d: Array, end_d: Array
 ) -> tuple[Array, Array, Array]:
     """Compute the result of `row_tangents` for one row again."""

@@ -31,10 +31,10 @@ from switchfit.engine.jax.constraints import terms_at_end, terms_at_transitions
 from switchfit.engine.jax.forward_sweep import (
     Forward,
     Tangents,
-    of_rows,
     parameter_directions,
+    recompute_tangents,
+    row_operands,
     stages_along,
-    tangents_again,
     time_directions,
     unit,
 )
@@ -152,10 +152,10 @@ def step_length_curvature(model: Model, first: Forward, psi: Costates) -> Array:
 
     def of_row(row: Array) -> Array:
         """Return V' of one row: (D,)."""
-        all_rows = of_rows(model, first), psi.after, psi.mu
+        all_rows = row_operands(model, first), psi.after, psi.mu
         given, after, mu = jax.tree.map(lambda values: by_row(values)[row], all_rows)
         _, _, _, at, start_d, end_d = given
-        X_d, K_d, _ = tangents_again(model, *given)
+        X_d, K_d, _ = recompute_tangents(model, *given)
         ell_d = jnp.zeros((len(tableau.b), P.shape[1]))
         if at.l is not None:
             times_d = jnp.stack(times_derivative(tableau, start_d, end_d))

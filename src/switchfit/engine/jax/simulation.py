@@ -23,7 +23,7 @@ from switchfit.discretization.mesh import CHUNK, Mesh, rows
 from switchfit.discretization.model import Model, Piece
 from switchfit.discretization.nodes import costs_at_transitions
 from switchfit.discretization.steps import step
-from switchfit.engine.protocol import Simulation, Tangents, with_samples
+from switchfit.engine.protocol import Simulation, Tangents, add_samples
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import float64
 from switchfit.problem.losses import robust
@@ -85,7 +85,7 @@ def simulate_by_jax(
         for k, sensor in enumerate(structure.measurements)
         if sensor.delay is not None
     }
-    found = with_samples(simulation, structure, whole, late)
+    found = add_samples(simulation, structure, whole, late)
     return replace(found, cost=cost + _cost_of_samples(structure, whole, found.seen, p))
 
 

@@ -109,7 +109,7 @@ class Driver:
         self.line(f"switch i64 {which}, label %{name}_end [{cases}]")
         return labels
 
-    def resumed(self) -> tuple[str, str]:
+    def load_progress(self) -> tuple[str, str]:
         """Load from `progress` how many turns of a loop are done, and what is left of the budget."""
         places = (self.let(f"getelementptr inbounds i64, ptr %progress, i64 {k}") for k in (1, 2))
         turns, left = (self.load("i64", place) for place in places)
@@ -131,7 +131,7 @@ class Driver:
             self.line(f"store i64 {value}, ptr {place}")
         self.line(f"ret i1 {done}")
 
-    def finished(self, signature: str, returns: bool = True) -> str:
+    def end_function(self, signature: str, returns: bool = True) -> str:
         """Wrap the emitted lines into one LLVM function and reset; `returns` adds a return at its end."""
         end = "\n  ret void" if returns else ""
         text = f"define {signature} {{\nentry:\n" + "\n".join(self.lines) + f"{end}\n}}\n"
@@ -183,7 +183,7 @@ class Driver:
         """Write the loop over all rows of a segment in a mode, forward."""
         self.line("%row = alloca [3 x double]")
         found = self.pointers()
-        before, left = self.resumed()
+        before, left = self.load_progress()
         self.line(f"%start = add i64 %first, {before}")
         self.line("br label %loop")
         self.label("loop")
@@ -209,7 +209,7 @@ class Driver:
         self.line("%more = add i64 %cell, 1")
         self.line("%done = icmp sgt i64 %more, %last")
         self.next_turn(self.let("sub i64 %cell, %first"), "%done")
-        return self.finished(f"internal i1 @forward_{mode}({SEGMENT}, ptr %x, ptr %Z)", returns=False)
+        return self.end_function(f"internal i1 @forward_{mode}({SEGMENT}, ptr %x, ptr %Z)", returns=False)
 
     def backward_segment(self, mode: int, inner: int, end: int) -> str:
         """Write the loop over all rows of a segment in a mode, backward.
@@ -219,7 +219,7 @@ class Driver:
         n = self.sizes.n
         self.line("%row = alloca [3 x double]")
         found = self.pointers()
-        before, left = self.resumed()
+        before, left = self.load_progress()
         self.line(f"%start = sub i64 %last, {before}")
         self.line("br label %loop")
         self.label("loop")
@@ -243,7 +243,7 @@ class Driver:
         self.line("%less = sub i64 %cell, 1")
         self.line("%done = icmp slt i64 %less, %first")
         self.next_turn(self.let("sub i64 %last, %cell"), "%done")
-        return self.finished(f"internal i1 @backward_{mode}({SEGMENT})", returns=False)
+        return self.end_function(f"internal i1 @backward_{mode}({SEGMENT})", returns=False)
 
     def _curvature(self, name: str, given: dict[str, str], count: int, moving: bool) -> int:
         """Add to H what `count` entries a stage say, and the length of a row that moves: what it costs."""
@@ -315,7 +315,7 @@ class Driver:
         if self.sizes.N:
             self._transition(found, place, state)
         self.line("ret i1 true")
-        return self.finished(f"internal i1 @forward_any({WHOLE})", returns=False)
+        return self.end_function(f"internal i1 @forward_any({WHOLE})", returns=False)
 
     def _transition(self, found: dict[str, str], place: dict[str, str], state: dict[str, str]) -> None:
         """Call the functions at the transition that ends a segment."""
@@ -374,7 +374,7 @@ class Driver:
                 self.line("br label %reset_end")
             self.label("reset_end")
         self.line("ret i1 true")
-        return self.finished(f"internal i1 @backward_any({WHOLE})", returns=False)
+        return self.end_function(f"internal i1 @backward_any({WHOLE})", returns=False)
 
     # Samples
 
@@ -383,7 +383,7 @@ class Driver:
         n, N, q = self.sizes.n, self.sizes.N, self.library.measurements[k].channels
         found, own = self.pointers(), self.samples_of(k)
         begins = [self.load("i64", self.at(found["first_cell"], i)) for i in range(1, N + 1)]
-        before, left = self.resumed()
+        before, left = self.load_progress()
         self.line("br label %loop")
         self.label("loop")
         self.line(f"%sample = phi i64 [{before}, %entry], [%more, %loop]")
@@ -397,7 +397,7 @@ class Driver:
         given |= {"moves": found["units"], "time": self.at(own["time"], "%sample")}
         given["jump"] = self.at(found["jumps"], index, n) if self.order else found["jumps"]
         self._next_sample(self.call(f"sample_{k}", SAMPLE, given))
-        return self.finished(f"internal i1 @samples_{k}({TABLE}, i64 %count, ptr %progress)", returns=False)
+        return self.end_function(f"internal i1 @samples_{k}({TABLE}, i64 %count, ptr %progress)", returns=False)
 
     def _sample(self, own: dict[str, str], q: int) -> dict[str, str]:
         return {"value": self.at(own["value"], "%sample", q), "weight": self.at(own["weight"], "%sample", q)}
@@ -461,7 +461,7 @@ class Driver:
         """
         n, q = self.sizes.n, self.library.measurements[k].channels
         found, own = self.pointers(), self.samples_of(k)
-        before, left = self.resumed()
+        before, left = self.load_progress()
         self.line("br label %loop")
         self.label("loop")
         self.line(f"%sample = phi i64 [{before}, %entry], [%more, %next]")
@@ -487,7 +487,7 @@ class Driver:
         self.line("br label %next")
         self.label("next")
         self._next_sample(work)
-        return self.finished(f"internal i1 @samples_{k}({TABLE}, i64 %count, ptr %progress)", returns=False)
+        return self.end_function(f"internal i1 @samples_{k}({TABLE}, i64 %count, ptr %progress)", returns=False)
 
     def late_states(self, k: int) -> str:
         """Write a loop that stores the times at which late samples saw the state, and these states."""
@@ -507,7 +507,7 @@ class Driver:
         self.line("%done = icmp sge i64 %more, %count")
         self.line("br i1 %done, label %out, label %loop")
         self.label("out")
-        return self.finished(f"void @late_states_{k}({TABLE}, i64 %count, ptr %times, ptr %states)")
+        return self.end_function(f"void @late_states_{k}({TABLE}, i64 %count, ptr %times, ptr %states)")
 
     # Everything
 
@@ -568,14 +568,14 @@ class Driver:
         self.label("pause")
         self.line("store i64 %now, ptr %progress")
         given = "".join(f", i64 {count}" for count in counts)
-        return self.finished(f"void @evaluate({TABLE}, ptr %progress{given})")
+        return self.end_function(f"void @evaluate({TABLE}, ptr %progress{given})")
 
     def outputs(self) -> str:
         """Write the loop over the outputs of given states at given times."""
         n, width = self.sizes.n, self.sizes.width
         q = sum(channels for _, channels in self.library.outputs)
         found = self.pointers()
-        before, left = self.resumed()
+        before, left = self.load_progress()
         self.line("br label %loop")
         self.label("loop")
         self.line(f"%k = phi i64 [{before}, %entry], [%more, %loop]")
@@ -595,7 +595,7 @@ class Driver:
         self.line("store i64 %phase, ptr %progress")
         self.next_turn("%k", "%done")
         given_ = "ptr %times, ptr %x, ptr %Z, ptr %y, ptr %Y"
-        return self.finished(f"i1 @all_outputs({TABLE}, ptr %progress, i64 %count, {given_})", returns=False)
+        return self.end_function(f"i1 @all_outputs({TABLE}, ptr %progress, i64 %count, {given_})", returns=False)
 
     # The adaptive solver
 
@@ -633,7 +633,7 @@ class Driver:
         given = found | {"moment": "%moment", "signal": found["signals"], "y": "%y", "K": "%K"}
         self.call(f"slope_{mode}", SLOPE, given)
         signature = f"internal void @slope_at_{mode}({TABLE}, i64 %cells, ptr %state, double %time, ptr %y, ptr %K)"
-        return self.finished(signature)
+        return self.end_function(signature)
 
     def adaptive(self, mode: int) -> str:
         """Write adaptive steps in one mode, until the end, `most` of them or the budget; they store the accepted times.
@@ -680,6 +680,6 @@ class Driver:
         self.line("br label %loop")
         self.label("out")
         self.line("store i64 %done, ptr %count")
-        return self.finished(
+        return self.end_function(
             f"void @adaptive_{mode}_steps({TABLE}, i64 %cells, ptr %state, ptr %y, ptr %times, i64 %most, ptr %count)"
         )

@@ -18,7 +18,7 @@ from switchfit.engine.protocol import (
     Matrix,
     Simulation,
     Tangents,
-    with_samples,
+    add_samples,
 )
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
@@ -100,7 +100,7 @@ def _simulation(
     Machine code has the derivatives at the ends of rows, which move where they are transitions. At the time at which
     such an end is they are less dx/dt.
     """
-    found = native.simulated(tau, p)
+    found = native.simulate(tau, p)
     if found is None:
         return None
     first_cell, start, end = found.first_cell.astype(np.intp), found.times[:-1], found.times[1:]
@@ -142,4 +142,4 @@ def _simulation(
     late = {k: native.outputs(times, states, p) for k, (times, states) in found.late.items()}
     if None in late.values():
         return None
-    return with_samples(simulation, structure, arguments, {k: y[0] for k, y in late.items() if y is not None})
+    return add_samples(simulation, structure, arguments, {k: y[0] for k, y in late.items() if y is not None})

@@ -185,7 +185,7 @@ class NativeExperiment:
         """
         with self._workspace.lock:
             self._run(tau, p, side)
-            if self._presumed_wrongly:
+            if self._is_presumption_wrong:
                 return None
             g, H = self._result
             if not self._all_own:
@@ -207,7 +207,7 @@ class NativeExperiment:
                 self._run(tau, p, side)
             finally:
                 self._weights[:] = 0.0
-            if self._presumed_wrongly:
+            if self._is_presumption_wrong:
                 return None
             (g, H), own = self._result, self._own
             c = self._named["constraints"][where]
@@ -217,10 +217,10 @@ class NativeExperiment:
     def program_at(self, tau: FloatArray, p: FloatArray) -> Callable[[], object]:
         """Return a function that runs the machine code alone, for benchmarks."""
         self(tau, p, 1.0)
-        return lambda: self._in_pieces(self._evaluate, *self._counts)
+        return lambda: self._call_in_pieces(self._evaluate, *self._counts)
 
     @property
-    def _presumed_wrongly(self) -> bool:
+    def _is_presumption_wrong(self) -> bool:
         """Whether a product with zero was left out whose other factor was not finite.
 
         A cost that is not finite says enough as it is.
@@ -232,16 +232,16 @@ class NativeExperiment:
         """Return J alone; None if a presumption was wrong."""
         with self._workspace.lock:
             self._run(tau, p, 1.0)
-            return None if self._presumed_wrongly else self._J.item(0)
+            return None if self._is_presumption_wrong else self._J.item(0)
 
-    def simulated(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
+    def simulate(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
         """Return the states at all ends of rows, in second order with tangents; None if a presumption was wrong."""
         with self._workspace.lock:
-            return self._simulated(tau, p)
+            return self._simulate(tau, p)
 
-    def _simulated(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
+    def _simulate(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
         self._run(tau, p, 1.0)
-        if self._presumed_wrongly:
+        if self._is_presumption_wrong:
             return None
         n, N, cells = self.sizes.n, self.structure.N, self._cells
         first_cell = self._first_cell[: N + 1].copy()
@@ -294,7 +294,7 @@ class NativeExperiment:
             function = self._program.function(f"{self._prefix}all_outputs", *types)
             given = [np.ascontiguousarray(times), np.ascontiguousarray(states), Z, y, Y]
             self._check[0] = 0.0
-            self._in_pieces(function, count, *(a.ctypes.data for a in given))
+            self._call_in_pieces(function, count, *(a.ctypes.data for a in given))
             if np.isnan(self._check[0]):
                 return None
         return y, Y[..., self._own]
@@ -372,9 +372,9 @@ class NativeExperiment:
             part[:] = 0.0
         if self._late:
             self._place_late(p)
-        self._in_pieces(self._evaluate, *self._counts)
+        self._call_in_pieces(self._evaluate, *self._counts)
 
-    def _in_pieces(self, function: Callable[..., object], *given: Any) -> None:
+    def _call_in_pieces(self, function: Callable[..., object], *given: Any) -> None:
         """Call a function of the driver until it has finished; Ctrl-C is handled after each call."""
         progress, address = self._progress, ctypes.addressof(self._progress)
         progress[0] = progress[1] = 0

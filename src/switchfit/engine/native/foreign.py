@@ -21,7 +21,7 @@ from switchfit.problem.structure import Structure
 
 
 @cache  # XLA keeps the address: the program must stay alive
-def _registered(library: Structure, sizes: Sizes) -> tuple[str, Program]:
+def _register(library: Structure, sizes: Sizes) -> tuple[str, Program]:
     """Register the operation of a library with XLA; return its name and its program."""
     program = program_of(library, sizes, Order.HESSIAN)
     if isinstance(program, str):
@@ -57,7 +57,7 @@ def foreign_derivatives(
     then keyed by ``structure.library``, which may be given in place of the structure.
     """
     sizes, library = Sizes.of(structure, arguments), structure.library
-    name, _ = _registered(library, sizes)
+    name, _ = _register(library, sizes)
     N, D, width = sizes.N, sizes.D, sizes.width
     idle = N - tau.shape[0]  # segments that the sequence does not need: they begin and end at tf
     places = places_in_library(structure) if places is None else places

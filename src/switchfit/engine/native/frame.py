@@ -22,7 +22,7 @@ RANKS = {"signals": 3, "units": 2, "value": 2, "weight": 2}
 """Numbers of dimensions of what one experiment is given, where they are not 1."""
 
 
-def handler(driver: Driver) -> str:
+def write_handler(driver: Driver) -> str:
     """Return the handler's text: it fills the table of pointers and calls the driver, once per entry of a batch.
 
     Its arguments are those of `workspace.GIVEN`, then those of the samples; its results are all sums in one, and the

@@ -20,9 +20,9 @@ from switchfit.engine.native.entries import (
     both,
     choose,
     clamp,
-    e_number,
     equal,
     is_traced,
+    known_number,
     less,
     pick,
 )
@@ -37,7 +37,7 @@ def take(graph: Graph, a: Any, starts: Sequence[Any], sizes: Sequence[int]) -> A
     """Return a window of an array: (sizes); each start is in range, an int or an `Integer`."""
     moving = [k for k, start in enumerate(starts) if isinstance(start, Integer)]
     a = a[tuple(_reach(start, size) for start, size in zip(starts, sizes, strict=True))]
-    if len(moving) > 1 and not any(is_traced(e) and e_number(e) is None for e in a.reshape(-1)):
+    if len(moving) > 1 and not any(is_traced(e) and known_number(e) is None for e in a.reshape(-1)):
         return _from_table(graph, a, [starts[k] for k in moving], moving, sizes)
     for axis in moving:
         rows = np.moveaxis(a, axis, 0)
@@ -198,7 +198,7 @@ def scatter(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any, com
     return result
 
 
-def added(graph: Graph, add: Callable[[Any, Any], Any], of_integers: bool) -> Combine:
+def add_where(graph: Graph, add: Callable[[Any, Any], Any], of_integers: bool) -> Combine:
     """Return how an update is added where a condition holds."""
 
     def combine(here: Any, old: Any, update: Any) -> Any:

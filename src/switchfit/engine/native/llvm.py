@@ -60,13 +60,13 @@ class Module:
         self._work: dict[str, int] = {}
         self._declared: dict[str, str] = {}
 
-    def straight(
-        self, name: str, pointers: Sequence[str], stores: Sequence[tuple[str, int, Node]], seen: bool = False
+    def write_straight_line(
+        self, name: str, pointers: Sequence[str], stores: Sequence[tuple[str, int, Node]], exported: bool = False
     ) -> None:
         """Write a function of pointers that loads, computes and stores: ``(pointer, offset, node)``.
 
         Everything is loaded before anything is stored. Offsets count doubles, those of vectors vectors. Only what is
-        `seen` can be called from Python.
+        `exported` can be called from Python.
         """
         writer = _Writer(self)
         nodes = needed([node for _, _, node in stores])
@@ -77,7 +77,7 @@ class Module:
             writer.store(pointer, offset, node)
         arguments = ", ".join(f"ptr %{pointer}" for pointer in pointers)
         body = "\n".join(writer.lines)
-        linkage = "" if seen else "internal "
+        linkage = "" if exported else "internal "
         self.functions.append(f"define {linkage}void @{self.prefix}{name}({arguments}) {{\n{body}\n  ret void\n}}\n")
 
     def work(self, name: str) -> int:
@@ -235,7 +235,7 @@ class Program:
         return self._functions[name]
 
 
-def compiled(text: str) -> Program:
+def compile_module(text: str) -> Program:
     """Compile a module for this processor, or load its code from the cache."""
     _start()
     key = hashlib.sha256("\n".join([text, llvmlite.__version__, *_processor()]).encode()).hexdigest()

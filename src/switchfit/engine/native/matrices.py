@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.engine.native.entries import Unsupported, both, choose, e_number, equal, pick
+from switchfit.engine.native.entries import Unsupported, both, choose, equal, known_number, pick
 from switchfit.engine.native.scalars import Graph, Objects
 
 MOST_ROWS_TO_PIVOT = 5
@@ -44,8 +44,8 @@ def _lu(graph: Graph, matrix: Objects) -> tuple[Any, ...]:
     for k in range(min(rows, columns)):
         pivots[k] = _largest(graph, a[:, k], k)
         if pivots[k] != k:
-            a = _exchanged(graph, a, k, pivots[k])
-            order = _exchanged(graph, order[:, None], k, pivots[k])[:, 0]
+            a = _exchange_rows(graph, a, k, pivots[k])
+            order = _exchange_rows(graph, order[:, None], k, pivots[k])[:, 0]
         pivot = a[k, k]
         # LAPACK leaves a column of zeros as it is.
         inverse = graph.apply("div", 1.0, choose(graph, graph.apply("eq", pivot, 0.0), 1.0, pivot))
@@ -62,14 +62,14 @@ def _largest(graph: Graph, column: Objects, k: int) -> Any:
     size, found = graph.apply("abs", column[k]), k
     for i in range(k + 1, len(column)):
         other = graph.apply("abs", column[i])
-        if e_number(other) == 0.0:
+        if known_number(other) == 0.0:
             continue
         larger = graph.apply("lt", size, other)
         size, found = graph.apply("select", larger, other, size), choose(graph, larger, i, found)
     return found
 
 
-def _exchanged(graph: Graph, a: Any, k: int, other: Any) -> Any:
+def _exchange_rows(graph: Graph, a: Any, k: int, other: Any) -> Any:
     """Exchange row k with another one from k on, whose index is known or an `Integer`."""
     result = a.copy()
     if isinstance(other, int):
@@ -124,14 +124,14 @@ def triangular_solve(graph: Graph, equation: Any, a: Any, b: Any) -> list[Any]:
     def solve(matrix: Objects, right: Objects) -> tuple[Any, ...]:
         matrix = matrix.T if params["transpose_a"] else matrix
         if params["left_side"]:
-            return (_substituted(graph, matrix, right, lower, params["unit_diagonal"]),)
+            return (_substitute(graph, matrix, right, lower, params["unit_diagonal"]),)
         # x A = b is A' x' = b'
-        return (_substituted(graph, matrix.T, right.T, not lower, params["unit_diagonal"]).T,)
+        return (_substitute(graph, matrix.T, right.T, not lower, params["unit_diagonal"]).T,)
 
     return _for_each(solve, a, b)
 
 
-def _substituted(graph: Graph, a: Objects, b: Objects, lower: bool, unit_diagonal: bool) -> Objects:
+def _substitute(graph: Graph, a: Objects, b: Objects, lower: bool, unit_diagonal: bool) -> Objects:
     x = b.copy()
     n = len(a)
     for i in range(n) if lower else reversed(range(n)):

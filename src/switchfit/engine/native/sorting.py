@@ -15,9 +15,9 @@ from switchfit.engine.native.entries import (
     Unsupported,
     both,
     choose,
-    e_number,
     equal,
     is_traced,
+    known_number,
     less,
 )
 from switchfit.engine.native.scalars import Graph, Node, as_objects
@@ -42,14 +42,14 @@ def sort(graph: Graph, equation: Any, *arrays: Any) -> list[Any]:
     rows = [np.moveaxis(a, axis, -1).reshape(-1, shape[axis]) for a in arrays]
     found = [np.empty(row.shape, dtype=object) for row in rows]
     for k in range(len(rows[0])):
-        entries = _sorted(graph, list(zip(*(row[k].tolist() for row in rows), strict=True)), behind)
+        entries = _sort_entries(graph, list(zip(*(row[k].tolist() for row in rows), strict=True)), behind)
         for to, column in zip(found, zip(*entries, strict=True), strict=True):
             to[k] = as_objects(column)
     moved = tuple(n for k, n in enumerate(shape) if k != axis)
     return [np.moveaxis(each.reshape(*moved, shape[axis]), -1, axis) for each in found]
 
 
-def _sorted(
+def _sort_entries(
     graph: Graph, entries: list[Entries], behind: Callable[[Entries, Entries], Any], first: int | None = None
 ) -> list[Entries]:
     """Sort entries, or the first few of them, by exchanging neighbours."""
@@ -102,7 +102,7 @@ def top_k(graph: Graph, equation: Any, a: Any) -> list[Any]:
     values, places = np.empty((2, int(np.prod(shape[:-1])), k), dtype=object)
     for row, to, at in zip(a.reshape(-1, a.shape[-1]), values, places, strict=True):
         reciprocals = [graph.apply("div", 1.0, value) if kind == "f" else 0 for value in row]
-        found = _sorted(graph, list(zip(row.tolist(), range(len(row)), reciprocals, strict=True)), behind, k)[:k]
+        found = _sort_entries(graph, list(zip(row.tolist(), range(len(row)), reciprocals, strict=True)), behind, k)[:k]
         to[:], at[:], _ = (as_objects(column) for column in zip(*found, strict=True))
     return [values.reshape(shape), places.reshape(shape)]
 
@@ -120,7 +120,7 @@ def compare_in_order(graph: Graph, op: str, a: Any, b: Any) -> Any:
 
 def search(graph: Graph, table: Any, query: Any, right: bool) -> Any:
     """Do what `jnp.searchsorted` does: find before which entry of a sorted table (K,) each number belongs."""
-    entries = [e_number(e) if is_traced(e) else e for e in table.tolist()]
+    entries = [known_number(e) if is_traced(e) else e for e in table.tolist()]
     numbers = None if None in entries else np.array(entries, dtype=float)
     of_constants = numbers is not None and not any(a > b for a, b in pairwise(numbers)) and not np.isnan(numbers).any()
 

@@ -16,7 +16,7 @@ from switchfit.discretization.arguments import Arguments, Samples
 from switchfit.discretization.model import Model, Piece, weighted
 from switchfit.discretization.nodes import TransitionKind, end_constraints, end_cost, transition_function
 from switchfit.engine.native.scalars import Template
-from switchfit.engine.native.trace import traced
+from switchfit.engine.native.trace import trace_scalars
 from switchfit.problem.structure import Structure
 
 Shape = tuple[int, ...]
@@ -136,18 +136,18 @@ class Templates:
                 model.reference_residuals(piece) if costs else (), model.arguments.weights, strict=False
             ):
                 r_d = jax.jacfwd(residual, argnums=(0, 1, 2))(t, x, p)
-                second = _added(second, _normal_matrix(r_d, partial(_weigh, W, hb)))
+                second = _add_all(second, _normal_matrix(r_d, partial(_weigh, W, hb)))
             if costs and self.library.running:
 
                 def cost_of_state(x: Any, p: Any) -> Any:
                     return hb * sum(density(t, x, model.parameters(p)) for density in self.library.running)
 
-                second = _added(second, self._second_in_state(cost_of_state, x, p))
+                second = _add_all(second, self._second_in_state(cost_of_state, x, p))
             return [*slope, *cost, *jax.grad(cost_to_go, argnums=(0, 1, 2))(t, x, p), *second]
 
         also = " or a running cost" if running and (self.library.running or self.library.references) else ""
         name = f"mode {self.library.mode_names[mode]!r}{also}"
-        return traced(stage, (), (n,), (M,), (n,), (), (), (4, S), *self.sizes.constants, name=name)
+        return trace_scalars(stage, (), (n,), (M,), (n,), (), (), (4, S), *self.sizes.constants, name=name)
 
     def sample(self, k: int) -> Template:
         """Trace the cost of a sample and its derivatives."""
@@ -171,11 +171,11 @@ class Templates:
                 # Fisher's information of normal noise: 2 of log sigma, none between sigma and the rest.
                 log_sigma = lambda t, x, p: model.log_sigma(k, given(t), p)  # noqa: E731
                 s_d = jax.jacfwd(log_sigma, argnums=(0, 1, 2))(time, x, p)
-                second = _added(second, _normal_matrix(s_d, lambda A: 2.0 * A))
+                second = _add_all(second, _normal_matrix(s_d, lambda A: 2.0 * A))
             return [cost(time, x, p), *jax.grad(cost, argnums=(0, 1, 2))(time, x, p), *second]
 
         shapes = (), (q,), (q,), (self.sizes.n,), (self.sizes.M,)
-        return traced(sample, *shapes, *self.sizes.constants, name="observe of Measurements")
+        return trace_scalars(sample, *shapes, *self.sizes.constants, name="observe of Measurements")
 
     def late_time(self, k: int) -> Template:
         """Trace the time at which a late sample of the k-th Measurements saw the state, and its derivative in p."""
@@ -186,7 +186,7 @@ class Templates:
             seen = lambda p: model.seen_at(k, Samples(jnp.zeros((), int), t, nothing, nothing), p).time  # noqa: E731
             return [seen(p), jax.grad(seen)(p)]
 
-        return traced(time, (), (self.sizes.M,), *self.sizes.constants, name="delay of Measurements")
+        return trace_scalars(time, (), (self.sizes.M,), *self.sizes.constants, name="delay of Measurements")
 
     def end(self) -> Template:
         """Trace the terminal costs."""
@@ -200,7 +200,7 @@ class Templates:
             gradient = jax.grad(cost, argnums=(0, 1, 2))(0.0, x, p)
             return [cost(0.0, x, p), *gradient, *self._second_in_state(lambda x, p: cost(0.0, x, p), x, p)]
 
-        return traced(end, (self.sizes.n,), (self.sizes.M,), *self.sizes.constants, name="a terminal cost")
+        return trace_scalars(end, (self.sizes.n,), (self.sizes.M,), *self.sizes.constants, name="a terminal cost")
 
     def transition(self, kind: TransitionKind, which: int) -> Template:
         """Trace a function at transitions: a cost, or a constraint and ``weight`` times it.
@@ -218,7 +218,7 @@ class Templates:
             return self._constraint(lambda t, x, p: function(t, x, p)[None], t, x, p, weight)
 
         shapes = (), (self.sizes.n,), (self.sizes.M,), (1,)
-        return traced(at, *shapes, *self.sizes.constants, name=f"one of the {kind.name}")
+        return trace_scalars(at, *shapes, *self.sizes.constants, name=f"one of the {kind.name}")
 
     def end_constraint(self) -> Template:
         """Trace all terminal constraints and their first derivatives, then those of the weighted sum."""
@@ -230,7 +230,7 @@ class Templates:
             return self._constraint(function, jnp.zeros(()), x, p, weights)
 
         shapes = (self.sizes.n,), (self.sizes.M,), (self.sizes.m,)
-        return traced(end, *shapes, *self.sizes.constants, name="a terminal constraint")
+        return trace_scalars(end, *shapes, *self.sizes.constants, name="a terminal constraint")
 
     def reset(self, which: int) -> Template:
         """Trace a reset map, its Jacobians, and the derivatives of ``w . R``."""
@@ -243,7 +243,7 @@ class Templates:
             return [R(t, x, p), *jacobians, *self._derivatives(lambda t, x, p: w @ R(t, x, p), t, x, p)]
 
         n = self.sizes.n
-        return traced(reset, (), (n,), (self.sizes.M,), (n,), *self.sizes.constants, name="a reset map")
+        return trace_scalars(reset, (), (n,), (self.sizes.M,), (n,), *self.sizes.constants, name="a reset map")
 
     def start(self) -> Template:
         """Trace x(t0), its Jacobian (n, M) in p, and the derivatives of ``w . x(t0)``: (M,) and (M, M)."""
@@ -256,7 +256,7 @@ class Templates:
             second = jnp.zeros((p.size, p.size)) if self.order == Order.GAUSS_NEWTON else jax.jacfwd(jax.grad(value))(p)
             return [x0(p), jax.jacfwd(x0)(p), jax.grad(value)(p), second]
 
-        return traced(start, (self.sizes.M,), (self.sizes.n,), *self.sizes.constants, name="initial_state")
+        return trace_scalars(start, (self.sizes.M,), (self.sizes.n,), *self.sizes.constants, name="initial_state")
 
     def outputs(self) -> Template:
         """Trace the outputs, of references, then of Measurements, and their derivatives in x and p."""
@@ -270,7 +270,7 @@ class Templates:
 
             return [seen(x, p), *(jax.jacfwd(seen, argnums=(0, 1))(x, p) if self.order > Order.GRADIENT else ())]
 
-        return traced(outputs, (), (self.sizes.n,), (self.sizes.M,), *self.sizes.constants, name="observe")
+        return trace_scalars(outputs, (), (self.sizes.n,), (self.sizes.M,), *self.sizes.constants, name="observe")
 
     def _cost(self, value: Callable[..., Any], t: Any, x: Any, p: Any) -> list[Any]:
         """Return a cost with the derivatives of the order."""
@@ -324,5 +324,5 @@ def _weigh(W: Any, factor: Any, A: Any) -> Any:
     return factor * weighted(W, A)
 
 
-def _added(one: list[Any], other: list[Any]) -> list[Any]:
+def _add_all(one: list[Any], other: list[Any]) -> list[Any]:
     return [a + b for a, b in zip(one, other, strict=True)]

@@ -20,14 +20,14 @@ import numpy as np
 from jax._src import source_info_util
 
 from switchfit.engine.native.entries import Integer, Unsupported, choose, is_traced, less
-from switchfit.engine.native.indexing import added, dynamic_slice, dynamic_update_slice, gather, scatter
+from switchfit.engine.native.indexing import add_where, dynamic_slice, dynamic_update_slice, gather, scatter
 from switchfit.engine.native.integers import OF_INTEGERS, from_double, invert
 from switchfit.engine.native.matrices import MATRICES
 from switchfit.engine.native.operations import OPERATIONS
 from switchfit.engine.native.scalars import Graph, Node, Objects, Template, as_objects
 from switchfit.engine.native.sorting import SORTING, compare_in_order, search
 
-__all__ = ["Unsupported", "traced"]
+__all__ = ["Unsupported", "trace_scalars"]
 
 
 MOST_NODES = 10_000
@@ -37,7 +37,9 @@ MOST_TURNS = 100_000
 """Turns of a loop beyond which it is not followed."""
 
 
-def traced(function: Callable[..., Sequence[Any]], *shapes: tuple[int, ...], name: str = "the function") -> Template:
+def trace_scalars(
+    function: Callable[..., Sequence[Any]], *shapes: tuple[int, ...], name: str = "the function"
+) -> Template:
     """Trace a function of float64 arrays of the given shapes, which returns a flat list of arrays.
 
     Raises
@@ -82,7 +84,7 @@ def _run(graph: Graph, jaxpr: Any, consts: Sequence[Any], inputs: Sequence[Any])
                 raise Unsupported(f"takes more than {MOST_NODES} operations")
             results = _apply(graph, equation, [of(a) for a in equation.invars])
         except Unsupported as error:
-            raise _located(error, equation) from None
+            raise _add_location(error, equation) from None
         for variable, value in zip(equation.outvars, results, strict=True):
             known[variable] = _as_array(value)
     return [of(a) for a in jaxpr.outvars]
@@ -94,7 +96,7 @@ def _as_array(value: Any) -> Any:
     return value if extended or isinstance(value, np.ndarray) else np.asarray(value)
 
 
-def _located(error: Unsupported, equation: Any) -> Unsupported:
+def _add_location(error: Unsupported, equation: Any) -> Unsupported:
     """Add the line of the user's code, and the name of JAX's function that it calls.
 
     Functions of JAX such as `jnp.sort` are traced once for all their callers. What their inner operations say of where
@@ -171,7 +173,7 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
             dtype = equation.outvars[0].aval.dtype
             return [np.asarray(INDEXED[name](graph, equation, *args)).astype(dtype)]
     if known and name not in MOVES and name not in NUMPY:
-        return _evaluated(equation, args)
+        return _evaluate_known(equation, args)
     if name in LOOPS:
         return LOOPS[name](graph, equation, args)
     if name in MOVES:
@@ -180,7 +182,7 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
     if known:
         dtype = equation.outvars[0].aval.dtype
         if name == "convert_element_type" and args[0].dtype.kind == "f" and dtype.kind in "iu":
-            return _evaluated(equation, args)  # NumPy and JAX differ where a number does not fit
+            return _evaluate_known(equation, args)  # NumPy and JAX differ where a number does not fit
         return [np.asarray(NUMPY[name](params, *args)).astype(dtype).reshape(shapes[0])]
     if name in WRITTEN_OUT:
         for variable in equation.invars:
@@ -195,7 +197,7 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
     return [np.asarray(np.frompyfunc(meaning, len(args), 1)(*args), dtype=object)]
 
 
-def _evaluated(equation: Any, args: list[Any]) -> list[Any]:
+def _evaluate_known(equation: Any, args: list[Any]) -> list[Any]:
     """Evaluate an operation on known numbers by JAX."""
     with jax.ensure_compile_time_eval():
         results = equation.primitive.bind(*args, **equation.params)
@@ -410,11 +412,11 @@ NUMPY: dict[str, Callable[..., Any]] = {
 # Doubles
 
 
-def _simply(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
+def _apply_operation(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
     return lambda graph, params: partial(graph.apply, op)
 
 
-def _swapped(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
+def _apply_swapped(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
     return lambda graph, params: lambda a, b: graph.apply(op, b, a)
 
 
@@ -475,9 +477,9 @@ def _sign(graph: Graph, params: Any) -> Callable[[Any], Any]:
 
 
 MEANINGS: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
-    **{name: _simply(op) for op, operation in OPERATIONS.items() for name in operation.primitives},
-    "gt": _swapped("lt"),
-    "ge": _swapped("le"),
+    **{name: _apply_operation(op) for op, operation in OPERATIONS.items() for name in operation.primitives},
+    "gt": _apply_swapped("lt"),
+    "ge": _apply_swapped("le"),
     "convert_element_type": _convert_number,
     "integer_pow": _integer_power,
     "square": lambda graph, params: lambda a: a * a,
@@ -513,7 +515,7 @@ def _convert_truth(graph: Graph, params: Any) -> Callable[[Any], Any]:
 
 
 OF_TRUTH: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
-    **{name: _simply(op) for op, operation in OPERATIONS.items() for name in operation.of_truth},
+    **{name: _apply_operation(op) for op, operation in OPERATIONS.items() for name in operation.of_truth},
     "eq": _logic(lambda do, a, b: do("not", do("xor", a, b))),
     "lt": _logic(lambda do, a, b: do("and", do("not", a), b)),
     "le": _logic(lambda do, a, b: do("or", do("not", a), b)),
@@ -551,7 +553,7 @@ def _contract(a: Any, b: Any, axes: Any) -> Objects:
     return np.asarray(np.tensordot(a, b, axes=axes), dtype=object)
 
 
-def _reduced(name: str) -> Callable[..., Any]:
+def _reduce(name: str) -> Callable[..., Any]:
     """Reduce over axes by an operation."""
 
     def over(graph: Graph, equation: Any, a: Any) -> Any:
@@ -565,7 +567,7 @@ def _reduced(name: str) -> Callable[..., Any]:
     return over
 
 
-def _accumulated(name: str) -> Callable[..., Any]:
+def _accumulate(name: str) -> Callable[..., Any]:
     """Accumulate along an axis by an operation."""
 
     def along(graph: Graph, equation: Any, a: Any) -> Any:
@@ -578,7 +580,7 @@ def _accumulated(name: str) -> Callable[..., Any]:
     return along
 
 
-def _first(name: str) -> Callable[..., Any]:
+def _find_first(name: str) -> Callable[..., Any]:
     """Find the largest (or smallest) entry along an axis, the first of several; a NaN counts as such."""
 
     def along(graph: Graph, equation: Any, a: Any) -> Any:
@@ -602,20 +604,20 @@ def _first(name: str) -> Callable[..., Any]:
 
 
 ARRAYS: dict[str, Callable[..., Any]] = {
-    "argmax": _first("gt"),
-    "argmin": _first("lt"),
+    "argmax": _find_first("gt"),
+    "argmin": _find_first("lt"),
     "dot_general": _dot,
-    "reduce_sum": _reduced("add"),
-    "reduce_prod": _reduced("mul"),
-    "reduce_max": _reduced("max"),
-    "reduce_min": _reduced("min"),
-    "reduce_and": _reduced("and"),
-    "reduce_or": _reduced("or"),
-    "reduce_xor": _reduced("xor"),
-    "cumsum": _accumulated("add"),
-    "cumprod": _accumulated("mul"),
-    "cummax": _accumulated("max"),
-    "cummin": _accumulated("min"),
+    "reduce_sum": _reduce("add"),
+    "reduce_prod": _reduce("mul"),
+    "reduce_max": _reduce("max"),
+    "reduce_min": _reduce("min"),
+    "reduce_and": _reduce("and"),
+    "reduce_or": _reduce("or"),
+    "reduce_xor": _reduce("xor"),
+    "cumsum": _accumulate("add"),
+    "cumprod": _accumulate("mul"),
+    "cummax": _accumulate("max"),
+    "cummin": _accumulate("min"),
 }
 """Operations on whole arrays."""
 
@@ -634,7 +636,7 @@ def _scatter(name: str | None) -> Callable[..., Any]:
         def combine(here: Any, old: Any, update: Any) -> Any:
             return choose(graph, here, update if name is None else apply(old, update), old)
 
-        how = added(graph, apply, dtype.kind in "iu") if name == "add" else combine
+        how = add_where(graph, apply, dtype.kind in "iu") if name == "add" else combine
         return scatter(graph, equation, a, indices, updates, how)
 
     return scattered
