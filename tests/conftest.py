@@ -4,7 +4,7 @@ import jax
 import pytest
 from hypothesis import settings
 
-from switchfit.engine.native.program import forget_programs
+from switchfit.engine.native.program import drop_programs
 
 settings.register_profile("switchfit", derandomize=True, deadline=None)
 settings.load_profile("switchfit")
@@ -42,4 +42,4 @@ def _programs_let_go():
     """A process may map some 65,000 pieces of memory; the programs of all tests together need more, and XLA crashes."""
     yield
     jax.clear_caches()
-    forget_programs()
+    drop_programs()

@@ -20,7 +20,7 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import compute_path_cost, propagate
 from switchfit.engine.jax.backward_sweep import backward_sweep
-from switchfit.engine.jax.forward import forward_hessian
+from switchfit.engine.jax.forward import forward_gradient, forward_hessian
 from switchfit.engine.jax.forward_sweep import forward_sweep
 from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
 from switchfit.paper_adjoint import compute_paper_derivatives
@@ -212,8 +212,7 @@ class Case:
         def evaluate(arguments, tau, p, side):
             model = Model(self.structure, arguments)
             first = forward_sweep(model, tau, p, side)
-            back = backward_sweep(model, first, p)
-            return back.cost, back.gradient, forward_hessian(model, first, p)
+            return *forward_gradient(model, first, p), forward_hessian(model, first, p)
 
         return compiled(evaluate)
 

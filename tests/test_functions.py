@@ -13,10 +13,8 @@ from functions import FALLS_BACK, FUNCTIONS, LEFT_AT_SOME_POINTS, ZERO_TIMES_INF
 
 from switchfit.engine.native import llvm
 from switchfit.engine.native.scalars import CHECKED, Graph
-from switchfit.engine.native.trace import Unsupported, traced
+from switchfit.engine.native.trace import Unsupported, trace_scalars
 from switchfit.problem.functions import use_float64
-
-pytestmark = pytest.mark.promotes
 
 OFTEN = (
     *("arithmetic: mod", "arithmetic: power of a negative", "elementary: guarded log", "rounding: round away"),
@@ -69,8 +67,8 @@ def machine_code_of(template, count):
     nodes = np.concatenate([output.reshape(-1) for output in outputs])
     module = llvm.Module(4)
     stores = [("y", k, node) for k, node in enumerate(nodes)] + graph.check()
-    module.straight("f", ("x", "w", "y", CHECKED), stores, seen=True)
-    program = llvm.compiled(module.text)  # the code is gone with it
+    module.write_straight_line("f", ("x", "w", "y", CHECKED), stores, exported=True)
+    program = llvm.compile_module(module.text)  # the code is gone with it
 
     def evaluate(x, w):
         y, wrong = np.full(ends[-1], 7e77), np.zeros(1)
@@ -94,13 +92,13 @@ def assert_same_function(name):
     both = derivatives_of(FUNCTIONS[name])
     if name in FALLS_BACK:
         with use_float64(), pytest.raises(Unsupported) as caught:
-            traced(both, (3,), (40,))
+            trace_scalars(both, (3,), (40,))
         assert str(caught.value).startswith(f"the function {FALLS_BACK[name]}")
         assert "internal" not in str(caught.value)
         return
     with use_float64(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of JAX, about narrow types and the like
-        evaluate = machine_code_of(traced(both, (3,), (40,)), 40)
+        evaluate = machine_code_of(trace_scalars(both, (3,), (40,)), 40)
         by_jax = jax.jit(both)
         pairs = [(x, evaluate(x, weights), by_jax(x, weights)) for x in points_of(name)]
     relative = 1e-10 if name in LONG else 1e-12

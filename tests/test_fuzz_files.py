@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli, paper
-from switchfit.engine.native.program import forget_programs
+from switchfit.engine.native.program import drop_programs
 
 SIZES = [pytest.param(60, id="short"), pytest.param(1200, id="long", marks=pytest.mark.fuzz)]
 LONGEST = 120
@@ -199,7 +199,7 @@ def fuzz(count: int, folder: Path, name: str, damaged: Any, commands: Any, least
         found[said] += 1
         if number % 200 == 199:  # a process may map so many pieces of memory
             jax.clear_caches()
-            forget_programs()
+            drop_programs()
     (folder / name).write_bytes(whole)
     assert found["2"] >= least * count, found
 

@@ -18,7 +18,7 @@ from switchfit.batch.chunks import run_chunks
 from switchfit.engine.adaptive import refined_mesh
 from switchfit.engine.native import driver, experiment
 from switchfit.engine.native.experiment import native_experiment
-from switchfit.engine.native.program import forget_programs
+from switchfit.engine.native.program import drop_programs
 from switchfit.engine.native.templates import Order
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 
@@ -79,13 +79,13 @@ def row_by_row(monkeypatch):
     """Machine code that returns to Python after each row, sample and step."""
 
     def switch():
-        forget_programs()
+        drop_programs()
         monkeypatch.setattr(experiment, "BUDGET", 1)
         monkeypatch.setattr(driver, "BUDGET", 1)
 
     yield switch
     monkeypatch.undo()
-    forget_programs()
+    drop_programs()
 
 
 @pytest.mark.parametrize("tau", [[0.413, 0.791, 1.336], NODES[[4, 4, 13]]])
@@ -100,7 +100,7 @@ def test_evaluations_row_by_row_are_the_same_bit_by_bit(tau, row_by_row):
             native_experiment(this.structure, arguments, nodes, order)
             for order in (Order.COST, Order.GRADIENT, Order.HESSIAN)
         ]
-        simulated = orders[2].simulated(*given)
+        simulated = orders[2].simulate(*given)
         seen = orders[2].outputs(simulated.times, simulated.states, given[1], simulated.tangents)
         return [orders[0].cost(*given), *orders[1](*given, 1.0), *orders[2](*given, -1.0), *simulated[:-1], *seen]
 

@@ -15,12 +15,14 @@ from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import compute_path_cost, propagate
+from switchfit.engine.jax import programs
 from switchfit.engine.jax.backward_sweep import backward_sweep
 from switchfit.engine.jax.constraints import constraints
 from switchfit.engine.jax.forward import forward_hessian
 from switchfit.engine.jax.forward_sweep import forward_sweep
 from switchfit.engine.jax.programs import constrained_derivatives
 from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
+from switchfit.problem.functions import use_float64
 
 TAU, P0 = np.array([0.93, 2.07]), np.array([0.7, 0.4])
 
@@ -134,3 +136,32 @@ def test_costs_at_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
 
     expected = compiled(expected_added)(arguments, TAU, P0)
     np.testing.assert_allclose(added, expected, rtol=0.0, atol=1e-11 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(
+    ("method", "matrix"), [("forward", "exact"), ("forward", "none"), ("discrete-adjoint", "gauss-newton")]
+)
+def test_forward_mode_takes_nothing_from_the_adjoint(method, matrix, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that a mistake in one is not repeated in the other; the Gauss-Newton matrix does without it to be fast."""
+    structure, arguments = program_inputs(constrained(TAU))
+    given = arguments, TAU, P0, np.ones(())
+
+    def differentiate(method, matrix):
+        with use_float64():
+            return jax.jit(
+                lambda *at: programs.derivatives.__wrapped__(*at, structure=structure, method=method, matrix=matrix)
+            )(*given)
+
+    expected = differentiate("discrete-adjoint", "exact")
+
+    def fails(*_):
+        raise AssertionError("the backward sweep is not forward")
+
+    monkeypatch.setattr(programs, "backward_sweep", fails)
+    J, g, H = differentiate(method, matrix)
+    assert_close((J, g), expected[:2], 1e-12)
+    if matrix == "exact":
+        assert_close((H,), expected[2:], 1e-12)
+    assert bool(np.isnan(H).all()) is (matrix == "none")
+    with pytest.raises(AssertionError, match="not forward"):
+        differentiate("discrete-adjoint", "none")

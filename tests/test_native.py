@@ -24,9 +24,9 @@ from switchfit.engine.native import kernels, llvm
 from switchfit.engine.native import program as program_module
 from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.native.foreign import foreign_derivatives
-from switchfit.engine.native.program import forget_programs
+from switchfit.engine.native.program import drop_programs
 from switchfit.engine.native.scalars import Graph, Node
-from switchfit.engine.native.trace import Unsupported, traced
+from switchfit.engine.native.trace import Unsupported, trace_scalars
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.problem.functions import use_float64
 
@@ -137,7 +137,7 @@ def test_functions_as_scalars(name):
     x, A = random.uniform(0.3, 1.5, 4), random.uniform(0.3, 1.5, (3, 4))
     with use_float64():
         flat = lambda x, A: [jnp.asarray(value, jnp.float64) for value in FUNCTIONS[name](x, A)]  # noqa: E731
-        template = traced(flat, x.shape, A.shape)
+        template = trace_scalars(flat, x.shape, A.shape)
         expected = [np.asarray(value) for value in flat(jnp.asarray(x), jnp.asarray(A))]
     folded = template(Graph(), x, A)
     graph = Graph()
@@ -149,8 +149,8 @@ def test_functions_as_scalars(name):
         for k, node in enumerate(output.reshape(-1))
     ]
     module = llvm.Module(4)
-    module.straight("f", ("x", "A", "y"), stores, seen=True)
-    program, y = llvm.compiled(module.text), np.full(sizes[-1], np.nan)
+    module.write_straight_line("f", ("x", "A", "y"), stores, exported=True)
+    program, y = llvm.compile_module(module.text), np.full(sizes[-1], np.nan)
     program.function("f", *[llvm.ctypes.c_void_p] * 3)(x.ctypes.data, A.ctypes.data, y.ctypes.data)
     for k, value in enumerate(expected):
         numbers = np.array([node.number for node in folded[k].reshape(-1)], dtype=float).reshape(value.shape)
@@ -173,7 +173,7 @@ def test_functions_as_scalars(name):
 )
 def test_what_has_no_scalar_form_says_so(function):
     with use_float64(), pytest.raises(Unsupported):
-        traced(lambda x: [jnp.asarray(function(x), jnp.float64)], (4,))
+        trace_scalars(lambda x: [jnp.asarray(function(x), jnp.float64)], (4,))
 
 
 def test_structural_zeros_and_repetitions_are_gone():
@@ -249,11 +249,11 @@ def test_machine_code_anywhere(times, p, side):
 def test_stages_one_at_a_time(monkeypatch):
     """As where functions would become too long."""
     monkeypatch.setattr(kernels, "SHORT", 0)
-    forget_programs()
+    drop_programs()
     this = case("resets")
     at = this.arguments(), np.array(INSIDE["resets"]), P0
     assert_close(natively(this, *at), this.discrete(*at))
-    forget_programs()
+    drop_programs()
 
 
 def both(problem, relative=1e-11):
@@ -454,11 +454,11 @@ def test_machine_code_is_kept_and_read_again(tmp_path, monkeypatch):
     monkeypatch.setenv("SWITCHFIT_CACHE", str(tmp_path))
     module = llvm.Module(2)
     graph = Graph()
-    module.straight("f", ("x",), [("x", 1, graph.load("x", 0) * 3.0)], seen=True)
+    module.write_straight_line("f", ("x",), [("x", 1, graph.load("x", 0) * 3.0)], exported=True)
 
     def tripled():
         x = np.array([2.0, 0.0])
-        program = llvm.compiled(module.text)
+        program = llvm.compile_module(module.text)
         program.function("f", llvm.ctypes.c_void_p)(x.ctypes.data)
         return x[1]
 
@@ -516,7 +516,7 @@ def test_an_estimate_says_that_machine_code_evaluated_it(tmp_path):
 
 @pytest.mark.parametrize("mode", [copied, inner_copied])
 def test_an_estimate_says_which_line_of_the_model_has_no_machine_code(mode, tmp_path, caplog):
-    forget_programs()
+    drop_programs()
     with caplog.at_level(logging.INFO, "switchfit"):
         estimate = fitted_with(mode)
     reason = f"mode 'm' calls jnp.copysign (test_native.py:{line_of(mode, 'jnp.copysign')})"
@@ -543,7 +543,7 @@ def test_functions_of_jax_are_named_where_they_are_called():
             use_float64(),
             pytest.raises(Unsupported, match=rf"calls jnp.copysign \(test_native.py:{line_of(function, 'copysign')}"),
         ):
-            traced(lambda x, f=function: [f(x)], (4,))
+            trace_scalars(lambda x, f=function: [f(x)], (4,))
 
 
 @pytest.mark.parametrize(
@@ -575,25 +575,25 @@ def test_other_reasons_for_jax(settings, reason):
     assert evaluator_of(problem).engine.reason.startswith(reason)
 
 
-@pytest.mark.parametrize("place", ["_write", "compiled"])
+@pytest.mark.parametrize("place", ["_write", "compile_module"])
 @pytest.mark.parametrize("error", [KeyError("add"), TypeError("truth"), RuntimeError("LLVM IR parsing error")])
 def test_a_defect_of_ours_falls_back_and_says_so(place, error, monkeypatch):
     def fails(*_):
         raise error
 
-    forget_programs()
+    drop_programs()
     monkeypatch.setattr(program_module, place, fails)
     estimate = fitted_with(decay)
     assert estimate.engine.name == "jax"
     assert estimate.engine.reason == f"internal: {type(error).__name__}: {error}"
     assert estimate.iterations == 1
     monkeypatch.undo()
-    forget_programs()
+    drop_programs()
 
 
 def test_a_program_that_is_compiled_can_be_interrupted(monkeypatch):
     """Compiling takes seconds for long functions: the wait for it ends with Ctrl-C."""
-    forget_programs()
+    drop_programs()
     monkeypatch.setenv("SWITCHFIT_CACHE", "off")
     begun, done = threading.Event(), []
     parse = llvm.llvm.parse_assembly
@@ -615,4 +615,4 @@ def test_a_program_that_is_compiled_can_be_interrupted(monkeypatch):
         Evaluator(problem)
     assert not done, "not heard before the code was there"
     monkeypatch.undo()
-    forget_programs()
+    drop_programs()

@@ -9,7 +9,7 @@ import pytest
 
 import switchfit as sf
 from switchfit.engine.native.scalars import Graph
-from switchfit.engine.native.trace import traced
+from switchfit.engine.native.trace import trace_scalars
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.problem.functions import use_float64
 
@@ -131,7 +131,7 @@ def test_a_batch_hands_such_fits_to_the_single_optimiser():
 
 def presumed(function, *shapes):
     with use_float64():
-        return {node.op for node in traced(function, *shapes).presumed}
+        return {node.op for node in trace_scalars(function, *shapes).presumed}
 
 
 @pytest.mark.parametrize(

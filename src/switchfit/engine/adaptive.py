@@ -48,7 +48,7 @@ PACE = 1000
 
 
 def fixed_nodes(experiment: Experiment) -> FloatArray:
-    """Moments that must be nodes: t0, tf, sample times, knots of inputs and reference signals inside the horizon."""
+    """Return the times that must be nodes: t0, tf, and samples and knots of signals inside the horizon."""
     t0, tf = experiment.t0, experiment.tf
     times = [np.array([t0, tf])]
     times += [item.seen_times for item in experiment.data if isinstance(item, Measurements)]
@@ -58,7 +58,7 @@ def fixed_nodes(experiment: Experiment) -> FloatArray:
 
 
 def refined_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1.0) -> Mesh:
-    """Mesh of experiment e on which its trajectory meets the problem's tolerances at each of the given thetas.
+    """Return a mesh of experiment e that meets the problem's tolerances at each of the given thetas.
 
     Parameters
     ----------
@@ -72,33 +72,33 @@ def refined_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1
     """
     nodes = fixed_nodes(problem.experiments[e])
     coarse = Mesh.from_times(nodes)
-    steps = _Steps.densest([_adaptive_steps(problem, e, theta, coarse) for theta in thetas])
+    steps = _Steps.from_solutions([_adaptive_steps(problem, e, theta, coarse) for theta in thetas])
     pieces = np.maximum(np.ceil(finer * np.diff(steps.up_to(nodes)) - 0.05).astype(int), 1)
-    inside = [_graded(nodes[k : k + 2], steps, int(pieces[k])) for k in np.flatnonzero(pieces > 1)]
+    inside = [_grade_nodes(nodes[k : k + 2], steps, int(pieces[k])) for k in np.flatnonzero(pieces > 1)]
     return Mesh.from_times(np.concatenate([nodes, *inside]))
 
 
 class _Steps(NamedTuple):
-    """How many steps a solver takes up to each time: linear between `times` (K,), where it is `counts` (K,)."""
+    """Number of solver steps up to each time: `counts` (K,) at `times` (K,), linear in between."""
 
     times: FloatArray
     counts: FloatArray
 
     @classmethod
-    def densest(cls, solutions: list[FloatArray]) -> _Steps:
-        """The steps of several solutions (all their times), at every moment those of the one with the shortest."""
+    def from_solutions(cls, solutions: list[FloatArray]) -> _Steps:
+        """Combine the step times of several solutions: at each time, the smallest step of any of them counts."""
         times = np.unique(np.concatenate(solutions))
         middles = 0.5 * (times[:-1] + times[1:])
         lengths = [np.diff(steps)[np.searchsorted(steps, middles) - 1] for steps in solutions]
         return cls(times, np.concatenate([[0.0], np.cumsum(np.diff(times) / np.min(lengths, axis=0))]))
 
     def up_to(self, t: FloatArray) -> FloatArray:
-        """Steps taken up to times t."""
+        """Return the number of steps up to times t."""
         return np.interp(t, self.times, self.counts)
 
 
-def _graded(ends: FloatArray, steps: _Steps, pieces: int) -> FloatArray:
-    """Nodes between two ends: half of them as dense as the solver's steps are, half of them evenly.
+def _grade_nodes(ends: FloatArray, steps: _Steps, pieces: int) -> FloatArray:
+    """Return the nodes between two ends: half of them follow the density of the solver's steps, half are even.
 
     The steps are short in the layers of a stiff mode, which evenly spaced nodes would miss; but layers move with the
     transition times, and the mesh does not.
@@ -111,7 +111,7 @@ def _graded(ends: FloatArray, steps: _Steps, pieces: int) -> FloatArray:
 
 
 def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -> FloatArray:
-    """All times at which the adaptive solver stopped, from t0 to tf, strictly increasing."""
+    """Return the accepted times of the adaptive solver from t0 to tf, strictly increasing."""
     experiment, structure = problem.experiments[e], problem.structures[e]
     whole = build_arguments(problem, e, coarse)
     arguments, signals = whole.without_mesh(), np.asarray(whole.signals)
@@ -121,27 +121,27 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
     inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
     steps = [np.array([experiment.t0])]
     native = native_experiment(structure, whole, coarse.times, order=Order.COST)
-    x = _finite(
-        _by_jax(initial_state, arguments, p, structure=structure.functions)
+    x = _require_finite(
+        _call_jax(initial_state, arguments, p, structure=structure.functions)
         if native is None
         else native.initial_state(p),
-        f"initial_state at p = {_rounded(problem.split(theta)[1])}",
+        f"initial_state at p = {_round_parameters(problem.split(theta)[1])}",
     )
     for i, mode in enumerate(structure.mode_of_segment):
         if i > 0 and structure.reset_maps[i - 1] is not None:
             names = tuple(experiment.mode_sequence[i - 1 : i + 1])
             if native is None:
-                value = _by_jax(after_reset, arguments, ends[i], x, p, structure=structure, i=i - 1)
+                value = _call_jax(after_reset, arguments, ends[i], x, p, structure=structure, i=i - 1)
             else:
                 value = native.after_reset(i - 1, ends[i], x, p)
-            x = _finite(value, f"reset map {names} at t = {ends[i]:.6g}{unit}, x = {x.tolist()}")
+            x = _require_finite(value, f"reset map {names} at t = {ends[i]:.6g}{unit}, x = {x.tolist()}")
         knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
         stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
         for start, end in pairwise(stops.tolist()):
             if end > start:
                 found = None if native is None else _solve_natively(problem, native, mode, start, end, x, p)
                 if found is None:
-                    found = _by_jax(
+                    found = _call_jax(
                         _solve, problem, structure, arguments, signals, coarse, mode, start, end, x, p, unit
                     )
                 accepted, x = found
@@ -149,8 +149,8 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
     return np.concatenate(steps)
 
 
-def _by_jax(function: Callable[..., T], *given: Any, **settings: Any) -> T:
-    """Call a function that runs JAX's programs; what surrounds it takes longer than most solves in machine code."""
+def _call_jax(function: Callable[..., T], *given: Any, **settings: Any) -> T:
+    """Call a function that runs programs of JAX; entering these contexts takes longer than most native solves."""
     with use_float64(), use_compilation_cache():
         return function(*given, **settings)
 
@@ -168,7 +168,7 @@ def _solve(
     p: FloatArray,
     unit: str = "",
 ) -> tuple[FloatArray, FloatArray]:
-    """Adaptive solve of one mode from start to end: accepted times (start left out) and the final state."""
+    """Solve one mode adaptively; return the accepted times after `start` and the final state."""
     name = structure.mode_names[mode]
     function = partial(_field_and_density, structure=structure.functions, mode=mode)
     last = len(coarse.times) - 2
@@ -198,7 +198,7 @@ def _solve(
             over="ignore", invalid="ignore", divide="ignore"
         ):  # a state that overflows is refused in words
             message = solver.step()
-        if solver.status == "failed" or _too_many(accepted, end):
+        if solver.status == "failed" or _has_too_many_steps(accepted, end):
             remedy = "use solver='stiff', or a better guess" if problem.solver == "explicit" else "use a better guess"
             reason = message or f"it needs more than {MAX_STEPS} steps"
             raise ValueError(
@@ -254,7 +254,7 @@ STEPS_AT_ONCE = 256
 def _solve_natively(
     problem: Problem, native: NativeExperiment, mode: int, start: float, end: float, x: FloatArray, p: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
-    """The same as `_solve` for the explicit method; None if it fails, of which `_solve` gives the reason."""
+    """Do what `_solve` does for explicit steps, in machine code; None if it fails: `_solve` then says why."""
     y, at = np.append(x, 0.0), Adaptive()
     state = np.zeros(at.size)
     state[at.t], state[at.end], state[at.rtol], state[at.atol] = start, end, problem.rtol, problem.atol
@@ -265,27 +265,27 @@ def _solve_natively(
 
     state[at.step] = first_step(slope, start, y, slope(start, y), end, Tolerances(problem.rtol, problem.atol))
     accepted = np.array([start])
-    while state[at.t] < end and not state[at.stuck] and not _too_many(accepted, end):
+    while state[at.t] < end and not state[at.stuck] and not _has_too_many_steps(accepted, end):
         accepted = np.append(accepted, native.adaptive_steps(mode, state, y, p, STEPS_AT_ONCE))
     return None if state[at.t] < end or not np.isfinite(y).all() else (accepted[1:], y[:-1])
 
 
-def _too_many(accepted: Sequence[float] | FloatArray, end: float) -> bool:
-    """Whether more than `MAX_STEPS` have been taken, or will be at the pace of the last `PACE` steps."""
+def _has_too_many_steps(accepted: Sequence[float] | FloatArray, end: float) -> bool:
+    """Return whether more than `MAX_STEPS` have been taken, or will be at the pace of the last `PACE` steps."""
     if len(accepted) < 5 * PACE:
         return False
     return len(accepted) + PACE * (end - accepted[-1]) / (accepted[-1] - accepted[-PACE - 1]) > MAX_STEPS
 
 
-def _finite(value: jax.Array | FloatArray, what: str) -> FloatArray:
+def _require_finite(value: jax.Array | FloatArray, what: str) -> FloatArray:
     state = np.asarray(value)
     if not np.isfinite(state).all():
         raise ValueError(f"{what} returned {state.tolist()}, which is not finite: use a better guess.")
     return state
 
 
-def _rounded(parameters: Mapping[str, FloatArray]) -> dict[str, Any]:
-    """Parameters for a message."""
+def _round_parameters(parameters: Mapping[str, FloatArray]) -> dict[str, Any]:
+    """Return the parameters rounded for a message."""
     return {name: np.round(value, 6).tolist() for name, value in parameters.items()}
 
 
@@ -309,7 +309,7 @@ def _field_and_density(
 
 @partial(jax.jit, static_argnames=("structure",))
 def initial_state(arguments: Arguments, p: jax.Array, *, structure: Structure) -> jax.Array:
-    """x(t0): (n,)."""
+    """Return x(t0): (n,)."""
     return Model(structure, arguments).initial_state(p)
 
 
@@ -317,5 +317,5 @@ def initial_state(arguments: Arguments, p: jax.Array, *, structure: Structure) -
 def after_reset(
     arguments: Arguments, t: jax.Array, x: jax.Array, p: jax.Array, *, structure: Structure, i: int
 ) -> jax.Array:
-    """State after the reset map of transition i (from 0): (n,)."""
+    """Return the state after the reset map of transition i (from 0): (n,)."""
     return Model(structure, arguments).reset(i)(t, x, p)

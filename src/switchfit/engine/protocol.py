@@ -19,7 +19,7 @@ Matrix = Literal["exact", "gauss-newton", "none"]
 
 @dataclass(frozen=True)
 class Engine:
-    """What evaluated a cost and its derivatives.
+    """Name of what evaluated a cost and its derivatives, and the reason.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Engine:
 
     @classmethod
     def of(cls, reason: str | None) -> Engine:
-        """Machine code, unless there is a reason against it."""
+        """Return machine code if the reason is None, else JAX."""
         return cls("native") if reason is None else cls("jax", reason)
 
     def __str__(self) -> str:
@@ -105,13 +105,13 @@ class Simulation:
 
     @property
     def segments(self) -> list[slice]:
-        """The rows of each segment."""
+        """Slice of rows of each segment."""
         first = self.first_cell + np.arange(len(self.first_cell))
         ends = [*first[1:].tolist(), len(self.start)]
         return [slice(a, b) for a, b in zip(first.tolist(), ends, strict=True)]
 
     def row_ending(self, cells: NDArray[np.intp]) -> NDArray[np.intp]:
-        """The last row in each of some cells (K,): what stands before a jump there; -1 for cell -1."""
+        """Return the last row in each of the cells (K,), which is before a jump there; -1 for cell -1."""
         segment = (cells[:, None] >= self.first_cell[None, 1:]).sum(1)
         return np.where(cells < 0, -1, cells + segment)
 
@@ -125,7 +125,7 @@ class Tangents(NamedTuple):
     y_after: FloatArray
 
 
-def with_samples(
+def add_samples(
     simulation: Simulation, structure: Structure, arguments: Arguments, late: Mapping[int, FloatArray]
 ) -> Simulation:
     """Return the simulation with what each of the Measurements sees at its samples.
@@ -155,23 +155,23 @@ class ExperimentEngine(Protocol):
 
     @property
     def engine(self) -> Engine:
-        """Which one it is, and why."""
+        """Name of the engine, and why it was chosen."""
         ...
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
-        """J alone."""
+        """Return J alone."""
         ...
 
     def derivatives(self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix) -> Derivatives:
-        """J and its derivatives; where a transition is at a node, those to its `side`, +1 or -1."""
+        """Return J and its derivatives; if a transition is at a node, those to its `side`, +1 or -1."""
         ...
 
     def constrained(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
     ) -> Constrained:
-        """J and its constraints; the multipliers and penalties are (m,)."""
+        """Return J and its constraints; the multipliers and penalties are (m,)."""
         ...
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
-        """All rows, with their derivatives if asked for."""
+        """Return all rows, with their derivatives if `tangents`."""
         ...

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from switchfit.discretization.arguments import Samples
 from switchfit.discretization.mesh import find_row_ending_cell
 from switchfit.discretization.model import Model
-from switchfit.discretization.propagation import Path, add_point_costs, flatten_rows
-from switchfit.discretization.rows import Pull, cost_of_row, length_factor, times_derivative
+from switchfit.discretization.propagation import add_point_costs, flatten_rows
+from switchfit.discretization.rows import Pull, length_factor, times_derivative
 from switchfit.discretization.steps import row_functions
 from switchfit.engine.jax.constraints import terms_at_end, terms_at_transitions
-from switchfit.engine.jax.forward_sweep import Forward, StageJacobians
+from switchfit.engine.jax.forward_sweep import Forward, StageJacobians, running_cost, sample_gradients
 from switchfit.engine.jax.late_samples import anchors, late_gradients
 
 Array = jax.Array
@@ -41,7 +39,7 @@ class Costates(NamedTuple):
 
 
 class Backward(NamedTuple):
-    """What the backward sweep finds: the cost J, costates, and the derivatives in tau (N,) and in p (M,)."""
+    """Result of the backward sweep: the cost J, costates, and the derivatives in tau (N,) and in p (M,)."""
 
     cost: Array
     costates: Costates
@@ -95,16 +93,8 @@ def backward_sweep(model: Model, first: Forward, p: Array, weights: Array | None
     return Backward(nodes.cost + running_cost(model, first), costates, of_tau, of_p)
 
 
-def running_cost(model: Model, first: Forward) -> Array:
-    """Return the integral of the running costs over all rows: ()."""
-    layout, densities = first.path.layout, first.jacobians.l
-    if densities is None:
-        return jnp.zeros(())
-    return cost_of_row(model.tableau, layout.end - layout.start, list(jnp.moveaxis(densities, -1, 0))).sum()
-
-
 class NodeGradients(NamedTuple):
-    """What is paid at single moments, without constraints, and its derivatives, with them.
+    """Costs at nodes, without constraints, and their derivatives, with constraints.
 
     Attributes
     ----------
@@ -180,13 +170,13 @@ def pull_of(jacobians: StageJacobians) -> Pull:
 
 
 def rows_at_transitions(first: Forward) -> Array:
-    """Flat indices of the rows that start (first line) and that end (second line) at each transition: (2, N)."""
+    """Return the flat indices of the rows that start (first) and that end (second) at each transition: (2, N)."""
     layout = first.path.layout
     return jnp.stack([layout.first_chunk[1:] * layout.start.shape[1], layout.last_row[:-1]])
 
 
 def row_ends_gradient(model: Model, first: Forward, psi: Costates) -> Array:
-    """Derivative of the cost in the times at which rows start or end: ``V h' + sum_j (w_j . f + h b_j ell)_t t_j'``."""
+    """Return the derivative of the cost in tau: ``V h' + sum_j (w_j . f + h b_j ell)_t t_j'`` of the rows beside it."""
     tableau, layout = model.tableau, first.path.layout
     if model.structure.N == 0:
         return jnp.zeros(0)
@@ -205,9 +195,3 @@ def row_ends_gradient(model: Model, first: Forward, psi: Costates) -> Array:
     ends = jax.vmap(jax.vmap(beside, in_axes=(0, None, None)))
     starting, ending = jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])
     return ends(rows_at_transitions(first), starting, ending).sum(0)
-
-
-def sample_gradients(model: Model, path: Path, k: int, samples: Samples, p: Array) -> tuple[Array, tuple[Array, Array]]:
-    """Cost (K,) of each sample of the k-th Measurements, and its derivatives in x (K, n) and p (K, M)."""
-    gradient = jax.value_and_grad(partial(model.sample_cost, k), argnums=(1, 2))
-    return jax.vmap(gradient, in_axes=(0, 0, None))(samples, path.at_samples(samples.cell), p)

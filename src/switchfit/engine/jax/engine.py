@@ -19,12 +19,12 @@ from switchfit.runtime.cache import use_compilation_cache
 
 
 class JaxEngine:
-    """One experiment on one mesh by JAX.
+    """Evaluates one experiment on one mesh with programs of JAX.
 
     Attributes
     ----------
     reason : str
-        Why machine code does not do it.
+        Why there is no machine code.
     """
 
     def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh) -> None:
@@ -38,17 +38,17 @@ class JaxEngine:
 
     @property
     def engine(self) -> Engine:
-        """JAX, and why."""
+        """JAX, and why it evaluates."""
         return Engine("jax", self.reason)
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
-        """J alone."""
+        """Return J alone."""
         return self.simulate(tau, p, tangents=False).cost
 
     def derivatives(
         self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix, method: Method = "discrete-adjoint"
     ) -> Derivatives:
-        """J and its derivatives, by one of the methods."""
+        """Return J and its derivatives, by one of the methods."""
         compiled = (method, matrix) in self._compiled
         with use_float64(), nullcontext() if compiled else use_compilation_cache():
             given = self._given(), tau, p, float(side)
@@ -60,14 +60,14 @@ class JaxEngine:
     def constrained(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
     ) -> Constrained:
-        """J and its constraints."""
+        """Return J and its constraints."""
         with use_float64(), use_compilation_cache():
             given = self._given(), tau, p, float(side), multipliers, penalty
             J, slope, H, c, A = constrained_derivatives(*given, structure=self._structure)
         return Constrained(float(J), np.array(slope), np.array(H), np.array(c), np.array(A))
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
-        """All rows, with their derivatives if asked for."""
+        """Return all rows, with their derivatives if `tangents`."""
         key = np.concatenate([tau, p]).tobytes()
         if not tangents and self._last is not None and self._last[0] == key:
             return self._last[1]

@@ -1,7 +1,10 @@
-"""Exact Hessian of the *discretised* cost in forward mode, for few unknowns and as a check of the adjoint.
+"""Gradient and exact Hessian of the *discretised* cost in forward mode, for few unknowns and as a check of the adjoint.
 
-With z = (x_k, theta) the arguments of node map k and Z_k their derivative in theta, the second derivative of the state
-obeys
+With z = (x_k, theta) the arguments of node map k and Z_k their derivative in theta,
+
+    D J       = sum_k D L_k Z_k,
+
+and the second derivative of the state obeys
 
     x_tt, k+1 = F_x x_tt, k + S_k,      S_k = D^2 F_k (Z_k, Z_k),
     D^2 J     = sum_k L_x x_tt, k + D^2 L_k (Z_k, Z_k),
@@ -25,9 +28,18 @@ from jax import lax
 from switchfit.discretization.arguments import Samples
 from switchfit.discretization.model import Model, Piece
 from switchfit.discretization.nodes import get_end_cost, list_costs_at_transitions
-from switchfit.discretization.propagation import flatten_rows, pick_at_cells, switch_mode
+from switchfit.discretization.propagation import add_point_costs, flatten_rows, pick_at_cells, switch_mode
+from switchfit.discretization.rows import times_derivative
 from switchfit.discretization.steps import step
-from switchfit.engine.jax.forward_sweep import Forward, parameter_directions, time_directions, unit
+from switchfit.engine.jax.forward_sweep import (
+    Forward,
+    parameter_directions,
+    running_cost,
+    sample_gradients,
+    stages_along,
+    time_directions,
+    unit,
+)
 from switchfit.engine.jax.late_samples import anchors, late_curvature, late_gradients
 
 Array = jax.Array
@@ -46,7 +58,7 @@ class Second(NamedTuple):
 
 
 def forward_hessian(model: Model, first: Forward, p: Array) -> Array:
-    """Hessian (D, D) of the discretised cost, D = N + M, without an adjoint.
+    """Return the Hessian (D, D) of the discretised cost, D = N + M, without an adjoint.
 
     Parameters
     ----------
@@ -77,8 +89,65 @@ def forward_hessian(model: Model, first: Forward, p: Array) -> Array:
     return symmetric(H, P.shape[1])
 
 
+def forward_gradient(model: Model, first: Forward, p: Array) -> tuple[Array, Array]:
+    """Return the discretised cost () and its gradient (D,), without an adjoint.
+
+    The derivatives of all running costs, samples, transitions and terminal costs, along the tangents of the forward
+    sweep. The Gauss-Newton matrix needs these tangents too, and no adjoint.
+    """
+    P, path, X = parameter_directions(model), first.path, first.tangents
+    N = model.structure.N
+    cost = running_cost(model, first) + add_point_costs(model, path, p)
+    gradient = running_gradient(model, first)
+    for k, samples in enumerate(model.arguments.samples):
+        if model.structure.measurements[k].delay is None:
+            values, (g_x, g_p) = sample_gradients(model, path, k, samples, p)
+            x_d = X.at_samples(path.layout, samples.cell)
+        else:
+            at = anchors(model, path, k, p)
+            values, (g_start, g_x, g_p) = late_gradients(model, at, k, samples, p)
+            x_d = flatten_rows(X.before)[at.row]
+            # Entry 0 collects the rows that start at a node of the mesh, which stays where it is.
+            gradient = gradient.at[:N].add(jnp.zeros(N + 1).at[at.starts_at + 1].add(g_start)[1:])
+        cost = cost + values.sum()
+        gradient = gradient + jnp.einsum("kn,knd->d", g_x, x_d) + g_p.sum(0) @ P
+    for i, function in list_costs_at_transitions(model):
+        g_t, g_x, g_p = jax.grad(function, argnums=(0, 1, 2))(*path.at_transition(i), p)
+        gradient = (gradient + g_x @ X.before_transition(path.layout, i) + g_p @ P).at[i].add(g_t)
+    cost_at_end = get_end_cost(model)
+    if cost_at_end is not None:
+        g_x, g_p = jax.grad(cost_at_end, argnums=(1, 2))(*path.at_end(), p)
+        gradient = gradient + g_x @ X.after[-1, -1] + g_p @ P
+    return cost, gradient
+
+
+def running_gradient(model: Model, first: Forward) -> Array:
+    """Return the gradient of the running costs, ``sum_j h b_j ell_j' + h' sum_j b_j ell_j`` over all rows: (D,)."""
+    P = parameter_directions(model)
+    at = first.jacobians
+    if at.l is None:
+        return jnp.zeros(P.shape[1])
+    tableau, layout = model.tableau, first.path.layout
+    kept, along_row = stages_along(model, first)
+    b = jnp.asarray(tableau.b)
+
+    def row(start_d: Array, end_d: Array, at: tuple[Array, ...], *at_stages: Any) -> Array:
+        ell, l_t, l_x, l_p = at
+        times_d = jnp.stack(times_derivative(tableau, start_d, end_d))
+        ell_d = l_t @ times_d + jnp.einsum("sn,snd->d", l_x, along_row(*at_stages)) + l_p.sum(0) @ P
+        return ell_d + (end_d - start_d) * (b @ ell)
+
+    def chunk(total: Array, given: Any) -> tuple[Array, None]:
+        return total + jax.vmap(row)(*given).sum(0), None
+
+    hb = (layout.end - layout.start)[..., None] * b
+    of_stages = at.l, hb * at.l_t, hb[..., None] * at.l_x, hb[..., None] * at.l_p
+    given = (*time_directions(model, layout), of_stages, *kept)
+    return lax.scan(chunk, jnp.zeros(P.shape[1]), given)[0]
+
+
 def second_tangents(model: Model, first: Forward, p: Array) -> tuple[Array, Second]:
-    """``x_tt`` along the path, and the part of the Hessian that the running costs make up, (B,)."""
+    """Return the Hessian of the running costs (B,), and ``x_tt`` along the path."""
     P = parameter_directions(model)
 
     def of_mode(mode: int) -> Callable[..., tuple[Array, ...]]:
@@ -117,7 +186,7 @@ def second_tangents(model: Model, first: Forward, p: Array) -> tuple[Array, Seco
 
 
 def reset_sources(model: Model, first: Forward, p: Array) -> tuple[Array, Array] | None:
-    """``D_x R`` (N + 1, n, n) and ``D^2 R (Z, Z)`` (N + 1, n, B) where each segment opens; None without reset maps."""
+    """Return ``D_x R`` (N + 1, n, n) and ``D^2 R (Z, Z)`` (N + 1, n, B) by segments; None without reset maps."""
     if first.resets is None:
         return None
     P = parameter_directions(model)
@@ -131,7 +200,7 @@ def reset_sources(model: Model, first: Forward, p: Array) -> tuple[Array, Array]
 
 
 def sample_second(model: Model, first: Forward, second: Second, k: int, p: Array) -> Array:
-    """Second derivative of the costs of the k-th Measurements: (B,)."""
+    """Return the second derivative of the costs of the k-th Measurements: (B,)."""
     P = parameter_directions(model)
     samples = model.arguments.samples[k]
     if model.structure.measurements[k].delay is not None:
@@ -156,12 +225,12 @@ def sample_second(model: Model, first: Forward, second: Second, k: int, p: Array
 
 
 def pairs(D: int) -> tuple[np.ndarray, np.ndarray]:
-    """The B = D (D + 1) / 2 pairs i <= j: two (B,) int arrays."""
+    """Return the B = D (D + 1) / 2 pairs i <= j: two (B,) int arrays."""
     return np.triu_indices(D)
 
 
 def along_pairs(function: Callable[..., Any], at: tuple[Array, ...], directions: tuple[Array, ...]) -> Any:
-    """Second derivative of `function` along all pairs of D directions (last axis of `directions`): (..., B)."""
+    """Return the second derivative of `function` along all pairs of the D `directions` (last axes): (..., B)."""
     i, j = pairs(directions[-1].shape[-1])
 
     def one(u: tuple[Array, ...], v: tuple[Array, ...]) -> Any:
@@ -172,6 +241,6 @@ def along_pairs(function: Callable[..., Any], at: tuple[Array, ...], directions:
 
 
 def symmetric(values: Array, D: int) -> Array:
-    """The symmetric (D, D) matrix with `values` (B,) on and above its diagonal."""
+    """Return the symmetric (D, D) matrix with `values` (B,) on and above its diagonal."""
     i, j = pairs(D)
     return jnp.zeros((D, D)).at[i, j].set(values).at[j, i].set(values)

@@ -14,10 +14,11 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from switchfit.discretization.arguments import Samples
 from switchfit.discretization.mesh import Rows
 from switchfit.discretization.model import Model, Piece
 from switchfit.discretization.propagation import Path, pick_at_cells, propagate, switch_mode
-from switchfit.discretization.rows import times_derivative
+from switchfit.discretization.rows import cost_of_row, times_derivative
 from switchfit.discretization.steps import row_functions
 
 Array = jax.Array
@@ -67,16 +68,16 @@ class Tangents(NamedTuple):
     stages: Array | None
 
     def before_transition(self, layout: Rows, i: int) -> Array:
-        """At tau_i-: (n, D)."""
+        """Return the tangent at tau_i-: (n, D)."""
         return self.after[layout.first_chunk[i + 1] - 1, -1]
 
     def at_samples(self, layout: Rows, cell: Array) -> Array:
-        """At the ends of the given cells (K,): (K, n, D)."""
+        """Return the tangents at the ends of the given cells (K,): (K, n, D)."""
         return pick_at_cells(layout, self.before[0, 0], self.after, cell)
 
 
 class Forward(NamedTuple):
-    """What the forward sweep finds. What of it nobody reads, XLA leaves out."""
+    """Result of the forward sweep. XLA does not compute those fields that a program does not read."""
 
     path: Path
     jacobians: StageJacobians
@@ -93,25 +94,24 @@ def forward_sweep(model: Model, tau: Array, p: Array, side: Array) -> Forward:
 
 
 def parameter_directions(model: Model) -> Array:
-    """Derivative of p in theta, ``[0 | I]``: (M, D)."""
+    """Return the derivative of p in theta, ``[0 | I]``: (M, D)."""
     N, M = model.structure.N, model.structure.M
     return jnp.concatenate([jnp.zeros((M, N)), jnp.eye(M)], axis=1)
 
 
 def unit(D: int, i: int) -> Array:
-    """Derivative of tau_i in theta, i from 0: (D,)."""
-    return (jnp.arange(D) == i).astype(float)
+    """Return the derivative of tau_i in theta, i from 0: (D,)."""
+    return (jnp.arange(D) == i) * 1.0
 
 
 def time_directions(model: Model, layout: Rows) -> tuple[Array, Array]:
-    """Derivatives of the start and the end of each row in theta: two (Q, C, D) arrays of zeros and ones."""
-    index = jnp.arange(model.structure.N + model.structure.M)[None, None]
-    starts_at, ends_at = layout.starts_at[..., None], layout.ends_at[..., None]
-    return (starts_at == index).astype(float), (ends_at == index).astype(float)
+    """Return the derivatives of the start and the end of each row in theta: two (Q, C, D) arrays of zeros and ones."""
+    index = jnp.arange(model.structure.N + model.structure.M)
+    return (layout.starts_at[..., None] == index) * 1.0, (layout.ends_at[..., None] == index) * 1.0
 
 
 def stage_jacobians(model: Model, path: Path, p: Array) -> StageJacobians:
-    """D_2 f, D_1 f, D_p f at all stages, by forward differentiation, and the gradient of ell."""
+    """Return D_2 f, D_1 f, D_p f at all stages, by forward differentiation, and the gradient of ell."""
 
     def of_mode(mode: int) -> Callable[..., StageJacobians]:
         def at_stage(piece: Piece, t: Array, x: Array) -> StageJacobians:
@@ -139,7 +139,7 @@ def stage_jacobians(model: Model, path: Path, p: Array) -> StageJacobians:
 
 
 def reset_jacobians(model: Model, path: Path, p: Array) -> ResetJacobians | None:
-    """Jacobians of the reset maps; None where no transition has one."""
+    """Return the Jacobians of the reset maps; None if no transition has one."""
     structure = model.structure
     if not structure.resets:
         return None
@@ -152,7 +152,7 @@ def reset_jacobians(model: Model, path: Path, p: Array) -> ResetJacobians | None
 
 
 def tangents(model: Model, path: Path, jacobians: StageJacobians, resets: ResetJacobians | None, p: Array) -> Tangents:
-    """``x_theta`` along the path: forward, linear, one row after another.
+    """Return ``x_theta`` along the path: a linear recursion over the rows.
 
     Every row is treated as if both its ends moved, which only those beside a transition do. Measured, that costs no
     more than treating those rows by themselves and adding what they give.
@@ -181,7 +181,7 @@ def tangents(model: Model, path: Path, jacobians: StageJacobians, resets: ResetJ
 
 
 def direct_derivatives(model: Model, at: StageJacobians, start_d: Array, end_d: Array) -> tuple[Array, Array | None]:
-    """Derivatives of one row that do not come by way of its states: its forcing (s, n, D), and of its length (D,)."""
+    """Return the forcing of the tangents of one row (s, n, D), and the derivative of its length (D,)."""
     N = model.structure.N
     forcing = jnp.pad(at.f_p, ((0, 0), (0, 0), (N, 0)))
     if N == 0:
@@ -212,25 +212,39 @@ def row_tangents(
 
 
 def stages_along(model: Model, first: Forward) -> tuple[tuple[Any, ...], Callable[..., Array]]:
-    """What of each row the derivatives at its stages follow from, (Q, C, ...), and how: a function of one row's.
+    """Return arrays (Q, C, ...), and a function that computes the tangents of the stages of a row from its slices.
 
-    These are the derivatives themselves, (s, n, D) for each row, where they have been kept.
+    The arrays are these tangents themselves, (s, n, D) for each row, if they were kept.
     """
     kept = first.tangents.stages
     if kept is not None:
         return (kept,), lambda stages_d: stages_d
-    return of_rows(model, first), lambda *row: tangents_again(model, *row)[0]
+    return row_operands(model, first), lambda *row: recompute_tangents(model, *row)[0]
 
 
-def of_rows(model: Model, first: Forward) -> tuple[Any, ...]:
-    """What `tangents_again` takes, of all rows: (Q, C, ...)."""
+def row_operands(model: Model, first: Forward) -> tuple[Any, ...]:
+    """Return the arguments of `recompute_tangents` for all rows: (Q, C, ...)."""
     layout = first.path.layout
     lengths = layout.end - layout.start
     return (first.tangents.before, lengths, first.path.slopes, first.jacobians, *time_directions(model, layout))
 
 
-def tangents_again(
+def recompute_tangents(
     model: Model, x_d: Array, h: Array, slopes: Array, at: StageJacobians, start_d: Array, end_d: Array
 ) -> tuple[Array, Array, Array]:
-    """What `row_tangents` returned for one row."""
+    """Compute the result of `row_tangents` for one row again."""
     return row_tangents(model, x_d, h, slopes, at.f_x, *direct_derivatives(model, at, start_d, end_d))
+
+
+def running_cost(model: Model, first: Forward) -> Array:
+    """Return the integral of the running costs over all rows: ()."""
+    layout, densities = first.path.layout, first.jacobians.l
+    if densities is None:
+        return jnp.zeros(())
+    return cost_of_row(model.tableau, layout.end - layout.start, list(jnp.moveaxis(densities, -1, 0))).sum()
+
+
+def sample_gradients(model: Model, path: Path, k: int, samples: Samples, p: Array) -> tuple[Array, tuple[Array, Array]]:
+    """Return the cost (K,) of each sample of the k-th Measurements, and its derivatives in x (K, n) and p (K, M)."""
+    gradient = jax.value_and_grad(partial(model.sample_cost, k), argnums=(1, 2))
+    return jax.vmap(gradient, in_axes=(0, 0, None))(samples, path.at_samples(samples.cell), p)

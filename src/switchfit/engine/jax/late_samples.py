@@ -20,7 +20,7 @@ from jax import lax
 
 from switchfit.discretization.arguments import Samples
 from switchfit.discretization.model import Model, Piece
-from switchfit.discretization.propagation import Path, find_late_rows, flatten_rows, step_to_late_sample
+from switchfit.discretization.propagation import Path, flatten_rows, step_to_late_sample
 
 Array = jax.Array
 
@@ -29,7 +29,7 @@ SAMPLES_AT_ONCE = 1024
 
 
 class Anchors(NamedTuple):
-    """Where the late samples of one `Measurements` start from, K of them.
+    """Rows from whose start the K late samples of one `Measurements` are computed.
 
     Attributes
     ----------
@@ -49,13 +49,13 @@ class Anchors(NamedTuple):
 
 
 def anchors(model: Model, path: Path, k: int, p: Array) -> Anchors:
-    """Rows and states from which the samples of the k-th Measurements are seen."""
+    """Return the rows and states from which the samples of the k-th Measurements are computed."""
     row, segment, piece, start, x = find_late_rows(model, path, k, p)
     return Anchors(row, segment, flatten_rows(path.layout.starts_at)[row], piece, start, x)
 
 
 def _costs(model: Model, k: int) -> Callable[..., Array]:
-    """Cost of one late sample as a function of (start, x, p)."""
+    """Return the cost of one late sample as a function of (start, x, p)."""
 
     def cost(sample: Samples, segment: Array, piece: Piece, start: Array, x: Array, p: Array) -> Array:
         there, x_s = step_to_late_sample(model, k, sample, segment, piece, start, x, p)
@@ -65,14 +65,14 @@ def _costs(model: Model, k: int) -> Callable[..., Array]:
 
 
 def _each(function: Callable[..., Any], *given: Any) -> Any:
-    """``function(sample, anchor, ...)`` of all samples."""
+    """Map ``function(sample, anchor, ...)`` over all samples."""
     return lax.map(lambda of_sample: function(*of_sample), given, batch_size=SAMPLES_AT_ONCE)
 
 
 def late_gradients(
     model: Model, at: Anchors, k: int, samples: Samples, p: Array
 ) -> tuple[Array, tuple[Array, Array, Array]]:
-    """Cost (K,) of each sample, and its derivatives in (start of its row, state there, p): (K,), (K, n), (K, M)."""
+    """Return the cost (K,) of each sample, and its derivatives (K,), (K, n), (K, M) in (start of row, x there, p)."""
     cost = _costs(model, k)
 
     def one(sample: Samples, at: Anchors) -> tuple[Array, tuple[Array, Array, Array]]:
@@ -87,13 +87,13 @@ def late_gradients(
 
 
 def _along(model: Model, at: Anchors, x_d: Array, p: Array, e: Array) -> tuple[Array, Array, Array]:
-    """``(start, x, p)`` of one sample at ``theta + e``, to first order in e (D,); x_d is that of x, (n, D)."""
-    start_d = (jnp.arange(e.shape[0]) == at.starts_at).astype(float)
+    """Return ``(start, x, p)`` of one sample at ``theta + e``, to first order in e (D,); x_d is that of x, (n, D)."""
+    start_d = (jnp.arange(e.shape[0]) == at.starts_at) * 1.0
     return at.start + start_d @ e, at.x + x_d @ e, p + e[model.structure.N :]
 
 
 def late_curvature(model: Model, at: Anchors, x_d: Array, k: int, samples: Samples, p: Array) -> Array:
-    """``D^2 L_k (Z_k, Z_k)``, Z_k the derivative of (start, x, p) in theta, summed over the samples: (D, D).
+    """Return ``D^2 L_k (Z_k, Z_k)`` summed over the samples, Z_k the derivative of (start, x, p) in theta: (D, D).
 
     `x_d` (K, n, D) is the derivative of x.
     """
@@ -109,7 +109,7 @@ def late_curvature(model: Model, at: Anchors, x_d: Array, k: int, samples: Sampl
 
 
 def late_gauss_newton(model: Model, at: Anchors, x_d: Array, k: int, samples: Samples, p: Array) -> Array:
-    """Gauss-Newton matrix of the samples: (D, D)."""
+    """Return the Gauss-Newton matrix of the samples: (D, D)."""
 
     def one(sample: Samples, at: Anchors, x_d: Array) -> Array:
         def along(e: Array) -> tuple[Array, Array]:
@@ -129,7 +129,7 @@ def late_gauss_newton(model: Model, at: Anchors, x_d: Array, k: int, samples: Sa
 
 
 def late_state_derivatives(model: Model, at: Anchors, k: int, samples: Samples, p: Array) -> tuple[Any, Any]:
-    """First and second derivatives of each sample's cost in (x, p), x the state at the start of its row.
+    """Return first and second derivatives of each sample's cost in (x, p), x the state at the start of its row.
 
     Returns
     -------

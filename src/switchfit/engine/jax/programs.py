@@ -13,7 +13,7 @@ from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import compute_path_cost, propagate
 from switchfit.engine.jax.backward_sweep import backward_sweep
 from switchfit.engine.jax.constraints import constraints
-from switchfit.engine.jax.forward import forward_hessian
+from switchfit.engine.jax.forward import forward_gradient, forward_hessian
 from switchfit.engine.jax.forward_sweep import forward_sweep
 from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
 from switchfit.engine.protocol import Matrix
@@ -42,15 +42,18 @@ def derivatives(
     if method == "autodiff":
         return _autodiff(model, tau, p, side)
     first = forward_sweep(model, tau, p, side)
-    back = backward_sweep(model, first, p)
-    cost, gradient = back.cost, back.gradient
-    if matrix == "none":
-        return cost, gradient, jnp.full((gradient.size, gradient.size), jnp.nan)
-    if matrix == "gauss-newton":
-        return cost, gradient, gauss_newton_hessian(model, first, p)
-    if method == "forward":
-        return cost, gradient, forward_hessian(model, first, p)
-    return cost, gradient, adjoint_hessian(model, first, back, p)
+    if method == "forward" or matrix == "gauss-newton":  # which needs the tangents anyway, and no adjoint
+        cost, gradient = forward_gradient(model, first, p)
+        if matrix == "gauss-newton":
+            return cost, gradient, gauss_newton_hessian(model, first, p)
+        if matrix == "exact":
+            return cost, gradient, forward_hessian(model, first, p)
+    else:
+        back = backward_sweep(model, first, p)
+        cost, gradient = back.cost, back.gradient
+        if matrix == "exact":
+            return cost, gradient, adjoint_hessian(model, first, back, p)
+    return cost, gradient, jnp.full((gradient.size, gradient.size), jnp.nan)
 
 
 @partial(jax.jit, static_argnames=("structure",))
@@ -80,7 +83,7 @@ def constrained_derivatives(
 
 
 def _autodiff(model: Model, tau: Array, p: Array, side: Array) -> tuple[Array, Array, Array]:
-    """J and its derivatives by JAX alone, forward over forward."""
+    """Return J and its derivatives by JAX alone, forward over forward."""
     N = model.structure.N
 
     def cost(theta: Array) -> Array:

@@ -31,10 +31,10 @@ from switchfit.engine.jax.constraints import terms_at_end, terms_at_transitions
 from switchfit.engine.jax.forward_sweep import (
     Forward,
     Tangents,
-    of_rows,
     parameter_directions,
+    recompute_tangents,
+    row_operands,
     stages_along,
-    tangents_again,
     time_directions,
     unit,
 )
@@ -47,7 +47,7 @@ SAMPLES_AT_ONCE = 1024
 
 
 def adjoint_hessian(model: Model, first: Forward, back: Backward, p: Array, weights: Array | None = None) -> Array:
-    """Hessian (D, D) of the discretised cost, with ``weights . c`` of the constraints (m,) added where given.
+    """Return the Hessian (D, D) of the discretised cost, with ``weights . c`` of the constraints (m,) if given.
 
     `back` is the backward sweep of the same sum.
     """
@@ -67,7 +67,7 @@ def adjoint_hessian(model: Model, first: Forward, back: Backward, p: Array, weig
 
 
 def gauss_newton_hessian(model: Model, first: Forward, p: Array) -> Array:
-    """Hessian without the second derivatives of the trajectory and of the observations: (D, D).
+    """Return the Hessian without the second derivatives of the trajectory and of the observations: (D, D).
 
     For Measurements and ReferenceSignal this is the Gauss-Newton matrix, a robust loss weighing each residual by rho',
     which is never negative; a sigma that is a parameter contributes its Fisher information. Any other cost contributes
@@ -80,7 +80,7 @@ def gauss_newton_hessian(model: Model, first: Forward, p: Array) -> Array:
 
 
 def curvature_of_terms(model: Model, first: Forward, p: Array, weights: Array | None) -> Array:
-    """Second derivative of what ``J + weights . c`` has at transitions and at the end: (D, D)."""
+    """Return the second derivative of the terms of ``J + weights . c`` at transitions and at the end: (D, D)."""
     path, X = first.path, first.tangents
     P = parameter_directions(model)
     H = jnp.zeros((P.shape[1], P.shape[1]))
@@ -94,7 +94,7 @@ def curvature_of_terms(model: Model, first: Forward, p: Array, weights: Array | 
 
 
 def stage_curvature(model: Model, first: Forward, psi: Costates, p: Array) -> Array:
-    """``sum Z_j' D^2 (w_j . f + h b_j ell) Z_j`` over the stages of all rows, Z_j that of (t_j, X_j, p): (D, D).
+    """Return ``sum Z_j' D^2 (w_j . f + h b_j ell) Z_j`` over all stages, Z_j the tangent of (t_j, X_j, p): (D, D).
 
     Along theta directly, or along (t, x, p) where these are fewer.
     """
@@ -141,7 +141,7 @@ def stage_curvature(model: Model, first: Forward, psi: Costates, p: Array) -> Ar
 
 
 def step_length_curvature(model: Model, first: Forward, psi: Costates) -> Array:
-    """Second derivative of the products of row lengths with slopes: ``h' x V' + V' x h'``, (D, D).
+    """Return the second derivative of the products of row lengths with slopes: ``h' x V' + V' x h'``, (D, D).
 
     Only the first and the last row of a segment have a length that depends on theta.
     """
@@ -151,11 +151,11 @@ def step_length_curvature(model: Model, first: Forward, psi: Costates) -> Array:
         return jnp.zeros((P.shape[1], P.shape[1]))
 
     def of_row(row: Array) -> Array:
-        """V' of one row: (D,)."""
-        all_rows = of_rows(model, first), psi.after, psi.mu
+        """Return V' of one row: (D,)."""
+        all_rows = row_operands(model, first), psi.after, psi.mu
         given, after, mu = jax.tree.map(lambda values: flatten_rows(values)[row], all_rows)
         _, _, _, at, start_d, end_d = given
-        X_d, K_d, _ = tangents_again(model, *given)
+        X_d, K_d, _ = recompute_tangents(model, *given)
         ell_d = jnp.zeros((len(tableau.b), P.shape[1]))
         if at.l is not None:
             times_d = jnp.stack(times_derivative(tableau, start_d, end_d))
@@ -168,7 +168,7 @@ def step_length_curvature(model: Model, first: Forward, psi: Costates) -> Array:
 
 
 def stage_gauss_newton(model: Model, first: Forward, p: Array) -> Array:
-    """Gauss-Newton part of the running costs: (D, D)."""
+    """Return the Gauss-Newton part of the running costs: (D, D)."""
     path = first.path
     P = parameter_directions(model)
     if not model.has_running_cost:
@@ -210,7 +210,7 @@ def stage_gauss_newton(model: Model, first: Forward, p: Array) -> Array:
 def _sum_over_chunks(
     model: Model, of_mode: Callable[[int], Callable[..., Array]], segment: Array, operands: tuple[Any, ...]
 ) -> Array:
-    """Sum of (D, D) matrices over all chunks, each evaluated with the functions of its mode."""
+    """Sum (D, D) matrices over all chunks, each evaluated with the functions of its mode."""
     D = model.structure.N + model.structure.M
 
     def chunk(H: Array, given: Any) -> tuple[Array, None]:
@@ -223,7 +223,7 @@ def _sum_over_chunks(
 def sample_curvature(
     model: Model, path: Path, X: Tangents, k: int, samples: Samples, p: Array, *, gauss_newton: bool
 ) -> Array:
-    """Second derivative of the costs of the k-th Measurements: (D, D)."""
+    """Return the second derivative of the costs of the k-th Measurements: (D, D)."""
     P = parameter_directions(model)
     if model.structure.measurements[k].delay is not None:
         of_late, at = late_gauss_newton if gauss_newton else late_curvature, anchors(model, path, k, p)
@@ -261,7 +261,7 @@ def _weighted(function: Callable[..., Array], psi: Array) -> Callable[..., Array
 def _second(
     value: Callable[..., Array], at: tuple[Array, ...], along: tuple[Array, ...], P_last: bool = False
 ) -> Array:
-    """Second derivative of a scalar function along D directions (last axes of `along`): (D, D).
+    """Return the second derivative of a scalar function along D directions (last axes of `along`): (D, D).
 
     With `P_last` the last of `along` is that of p, [0 | I], whose product need not be computed.
     """
@@ -283,6 +283,6 @@ def _second(
 
 
 def _columns(function: Callable[..., Array], at: tuple[Array, ...], along: tuple[Array, ...]) -> Array:
-    """Derivatives (..., D) of a function along D directions (last axes of `along`)."""
+    """Return the derivatives (..., D) of a function along D directions (last axes of `along`)."""
     linear = jax.linearize(function, *at)[1]
     return jax.vmap(linear, in_axes=-1, out_axes=-1)(*along)

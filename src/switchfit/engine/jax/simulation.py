@@ -23,7 +23,7 @@ from switchfit.discretization.mesh import CHUNK, Mesh, build_rows
 from switchfit.discretization.model import Model, Piece
 from switchfit.discretization.nodes import list_costs_at_transitions
 from switchfit.discretization.steps import step
-from switchfit.engine.protocol import Simulation, Tangents, with_samples
+from switchfit.engine.protocol import Simulation, Tangents, add_samples
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.losses import robust
@@ -85,12 +85,12 @@ def simulate_by_jax(
         for k, sensor in enumerate(structure.measurements)
         if sensor.delay is not None
     }
-    found = with_samples(simulation, structure, whole, late)
+    found = add_samples(simulation, structure, whole, late)
     return replace(found, cost=cost + _cost_of_samples(structure, whole, found.seen, p))
 
 
 def _cost_of_samples(structure: Structure, arguments: Arguments, seen: tuple[FloatArray, ...], p: FloatArray) -> float:
-    """The costs of all samples from what is seen: without a program that is compiled for their number."""
+    """Return the costs of all samples from the outputs, in NumPy: a program of JAX would be compiled for each count."""
     named, total = _named(structure, arguments, p), 0.0
     for samples, sensor, y in zip(arguments.samples, structure.measurements, seen, strict=True):
         there = np.asarray(samples.weight) > 0
@@ -104,7 +104,7 @@ def _cost_of_samples(structure: Structure, arguments: Arguments, seen: tuple[Flo
 
 
 def _named(structure: Structure, arguments: Arguments, p: FloatArray) -> dict[str, Any]:
-    """The parameters by the model's names."""
+    """Return the parameters by the model's names."""
     return dict(Model(structure, arguments).parameters(p))  # type: ignore[arg-type]  # arrays of NumPy's
 
 
@@ -118,7 +118,7 @@ def _segment(
     given: tuple[FloatArray, FloatArray, FloatArray, FloatArray, Piece],
     tangents: bool,
 ) -> tuple[FloatArray, FloatArray, float, list[FloatArray]]:
-    """All rows of a segment, block by block; the last block is padded with rows of length zero at fixed times.
+    """Return all rows of a segment, block by block; the last block is padded with rows of length zero at fixed times.
 
     Returns the state behind it and its derivative, the running cost, and columns: states before and after, outputs
     before and after; then their derivatives, if asked for.
@@ -144,7 +144,7 @@ def _segment(
 def _start(
     arguments: Arguments, p: jax.Array, *, structure: Structure, N: int, tangents: bool
 ) -> tuple[jax.Array, jax.Array]:
-    """x(t0) and its derivative in (tau, p): (n,), (n, D)."""
+    """Return x(t0) and its derivative in (tau, p): (n,), (n, D)."""
     model = Model(structure, arguments)
     if not tangents:
         return model.initial_state(p), jnp.zeros((structure.n, 0))
@@ -164,7 +164,7 @@ def _through_reset(
     i: int,
     tangents: bool,
 ) -> tuple[jax.Array, jax.Array]:
-    """State after transition i (from 0) and its derivative in theta along the moving transition: (n,), (n, D)."""
+    """Return the state after transition i (from 0) and its derivative along the moving transition: (n,), (n, D)."""
     reset = Model(structure, arguments).reset(i)
     if not tangents:
         return reset(t, x, p), X
@@ -185,7 +185,7 @@ def _block(
     structure: Structure,
     tangents: bool,
 ) -> tuple[tuple[jax.Array, jax.Array], jax.Array, tuple[jax.Array, ...]]:
-    """A block of rows in one mode: x and X behind it, its running cost, and columns as of `_segment`."""
+    """Return x and X behind a block of rows in one mode, its running cost, and columns as of `_segment`."""
     model = Model(structure, arguments)
     P = _of_parameters(X, p) if tangents else X
 
@@ -229,7 +229,7 @@ def _block(
 
 
 def _of_parameters(X: jax.Array, p: jax.Array) -> jax.Array:
-    """Derivative of p in (tau, p), ``[0 | I]``: (M, D)."""
+    """Return the derivative of p in (tau, p), ``[0 | I]``: (M, D)."""
     M = p.shape[0]
     return jnp.pad(jnp.eye(M), ((0, 0), (X.shape[1] - M, 0)))
 
@@ -238,7 +238,7 @@ def _of_parameters(X: jax.Array, p: jax.Array) -> jax.Array:
 def _at_transition(
     arguments: Arguments, t: jax.Array, x: jax.Array, p: jax.Array, *, structure: Structure, i: int
 ) -> jax.Array:
-    """The costs at transition i (from 0)."""
+    """Return the costs at transition i (from 0)."""
     total = jnp.zeros(())
     for at, cost in list_costs_at_transitions(Model(structure, arguments)):
         total = total + cost(t, x, p) if at == i else total
@@ -253,7 +253,7 @@ def _terminal(arguments: Arguments, x: jax.Array, p: jax.Array, *, structure: St
 def _late_outputs(
     structure: Structure, whole: Arguments, simulation: Simulation, k: int, cell: NDArray[np.intp], p: FloatArray
 ) -> FloatArray:
-    """What all sensors see at the samples of the k-th Measurements, which are late by a parameter: (K, Q)."""
+    """Return the outputs of all sensors at the samples of the k-th Measurements, which are late: (K, Q)."""
     sensor, samples = structure.measurements[k], whole.samples[k]
     times = np.asarray(samples.time) - float(_named(structure, whole, p)[sensor.delay or ""])
     row = np.minimum(np.searchsorted(simulation.end, times), len(simulation.end) - 1)
@@ -282,7 +282,7 @@ def _late_block(
     *,
     structure: Structure,
 ) -> jax.Array:
-    """All outputs at times inside rows, a step from the start of each: (BLOCK, Q)."""
+    """Return all outputs at times inside rows, a step from the start of each: (BLOCK, Q)."""
     model = Model(structure, arguments)
 
     def one(time: jax.Array, mode: jax.Array, start: jax.Array, x: jax.Array, piece: Piece) -> jax.Array:

@@ -57,7 +57,7 @@ def write_slope(
     given = (t, graph.loads("y", sizes.n), p, none, graph.constant(0.0), origin, signal, *constants)
     f, ell = stage(graph, *given, only=(F, ELL), checked=True)
     stores = [("K", k, node) for k, node in enumerate([*f, ell.item()])]
-    module.straight(name, SLOPE, stores + graph.check(), seen=True)
+    module.write_straight_line(name, SLOPE, stores + graph.check(), exported=True)
 
 
 def step_functions() -> list[str]:
@@ -75,7 +75,7 @@ def write_step(module: Module, sizes: Sizes) -> None:
         return graph, graph.loads("state", at.size), graph.loads("y", size), K
 
     def write(name: str, values: Objects) -> None:
-        module.straight(name, STEP, [("argument", k, node) for k, node in enumerate(values)])
+        module.write_straight_line(name, STEP, [("argument", k, node) for k, node in enumerate(values)])
 
     *of_stages, of_end, of_judgement = step_functions()
     for j, name in enumerate(of_stages, start=1):
@@ -97,4 +97,4 @@ def write_step(module: Module, sizes: Sizes) -> None:
     stores = [("state", at.t, now.t), ("state", at.step, now.step)]
     for place, flag in ((at.refused, now.refused), (at.stuck, now.stuck)):
         stores.append(("state", place, graph.apply("select", flag, 1.0, 0.0)))
-    module.straight(of_judgement, STEP, stores + [("y", k, node) for k, node in enumerate(y_now)])
+    module.write_straight_line(of_judgement, STEP, stores + [("y", k, node) for k, node in enumerate(y_now)])

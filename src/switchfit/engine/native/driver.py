@@ -57,60 +57,60 @@ class Driver:
     # Lines
 
     def line(self, text: str) -> None:
-        """One more line."""
+        """Emit a line."""
         self.lines.append(f"  {text}")
 
     def label(self, name: str) -> None:
-        """The beginning of a block."""
+        """Emit a label: the start of a block."""
         self.lines.append(f"{name}:")
 
     def let(self, text: str) -> str:
-        """One more line with a value: its name."""
+        """Emit an instruction; return the name of its value."""
         self.count += 1
         self.line(f"%t{self.count} = {text}")
         return f"%t{self.count}"
 
     def load(self, kind: str, pointer: str) -> str:
-        """What is found behind a pointer."""
+        """Emit a load from a pointer; return the name of the value."""
         return self.let(f"load {kind}, ptr {pointer}")
 
     def at(self, pointer: str, *factors: Any) -> str:
-        """Address of ``pointer[product of the factors]``, in doubles."""
+        """Emit the address of ``pointer[product of the factors]``, in doubles."""
         offset = str(factors[0])
         for factor in factors[1:]:
             offset = self.let(f"mul i64 {offset}, {factor}")
         return self.let(f"getelementptr inbounds double, ptr {pointer}, i64 {offset}")
 
     def pointers(self) -> dict[str, str]:
-        """All pointers of the table, loaded."""
+        """Load all pointers of the table."""
         return {name: self.load("ptr", self.at("%table", k)) for k, name in enumerate(self.names)}
 
     def samples_of(self, k: int) -> dict[str, str]:
-        """The pointers of the k-th Measurements, loaded."""
+        """Load the pointers of the k-th Measurements."""
         first = len(self.names) + len(OF_SAMPLES) * k
         return {name: self.load("ptr", self.at("%table", first + m)) for m, name in enumerate(OF_SAMPLES)}
 
     def into(self, pointer: str, offset: int) -> str:
-        """Address of a byte behind a pointer."""
+        """Emit an address, in bytes from a pointer."""
         return self.let(f"getelementptr inbounds i8, ptr {pointer}, i64 {offset}")
 
     def call(self, name: str, order: tuple[str, ...], given: dict[str, str]) -> int:
-        """Call a straight line with its pointers in order: what it costs."""
+        """Call a straight line with its pointers in order; return its cost."""
         self.line(f"call void @{name}({', '.join(f'ptr {given[key]}' for key in order)})")
         return self.module.work(name)
 
     def choose(self, which: str, count: int, name: str) -> list[str]:
-        """Branch to the block of a choice at run time: labels of the blocks; all of them go on at ``{name}_end``.
+        """Switch to one of `count` blocks at run time; return their labels. Each block continues at ``{name}_end``.
 
-        Without a choice (-1) it goes there at once.
+        A choice of -1 goes there at once.
         """
         labels = [f"{name}_{k}" for k in range(count)]
         cases = " ".join(f"i64 {k}, label %{label}" for k, label in enumerate(labels))
         self.line(f"switch i64 {which}, label %{name}_end [{cases}]")
         return labels
 
-    def resumed(self) -> tuple[str, str]:
-        """How many turns of a loop are done, and what is left of the budget, when its function is called."""
+    def load_progress(self) -> tuple[str, str]:
+        """Load from `progress` how many turns of a loop are done, and what is left of the budget."""
         places = (self.let(f"getelementptr inbounds i64, ptr %progress, i64 {k}") for k in (1, 2))
         turns, left = (self.load("i64", place) for place in places)
         return turns, left
@@ -131,8 +131,8 @@ class Driver:
             self.line(f"store i64 {value}, ptr {place}")
         self.line(f"ret i1 {done}")
 
-    def finished(self, signature: str, returns: bool = True) -> str:
-        """The lines since the last function as a function, with a return at its end unless it has one."""
+    def end_function(self, signature: str, returns: bool = True) -> str:
+        """Wrap the emitted lines into one LLVM function and reset; `returns` adds a return at its end."""
         end = "\n  ret void" if returns else ""
         text = f"define {signature} {{\nentry:\n" + "\n".join(self.lines) + f"{end}\n}}\n"
         self.lines, self.count = [], 0
@@ -141,7 +141,7 @@ class Driver:
     # Rows of one mode
 
     def _row(self, found: dict[str, str], cell: str) -> dict[str, str]:
-        """Times, signals and directions of the row of a segment in a cell, and whether it moves."""
+        """Find times, signals and directions of the row of a segment in a cell, and whether it moves."""
         N, S, width = self.sizes.N, self.sizes.signals, self.sizes.width
         first, last = self.let(f"icmp eq i64 {cell}, %first"), self.let(f"icmp eq i64 {cell}, %last")
         here = self.load("double", self.at(found["nodes"], cell))
@@ -175,15 +175,15 @@ class Driver:
         }
 
     def _state(self, found: dict[str, str], index: str) -> dict[str, str]:
-        """The state and its derivative at the end of a row, by its index."""
+        """Return pointers to the state and its tangent at the end of a row, by its index."""
         n, width = self.sizes.n, self.sizes.width
         return {"x": self.at(found["states"], index, n), "Z": self.at(found["tangents"], index, n * width)}
 
     def forward_segment(self, mode: int) -> str:
-        """All rows of a segment in a mode, forward."""
+        """Write the loop over all rows of a segment in a mode, forward."""
         self.line("%row = alloca [3 x double]")
         found = self.pointers()
-        before, left = self.resumed()
+        before, left = self.load_progress()
         self.line(f"%start = add i64 %first, {before}")
         self.line("br label %loop")
         self.label("loop")
@@ -209,14 +209,17 @@ class Driver:
         self.line("%more = add i64 %cell, 1")
         self.line("%done = icmp sgt i64 %more, %last")
         self.next_turn(self.let("sub i64 %cell, %first"), "%done")
-        return self.finished(f"internal i1 @forward_{mode}({SEGMENT}, ptr %x, ptr %Z)", returns=False)
+        return self.end_function(f"internal i1 @forward_{mode}({SEGMENT}, ptr %x, ptr %Z)", returns=False)
 
     def backward_segment(self, mode: int, inner: int, end: int) -> str:
-        """All rows of a segment in a mode, backward; with the numbers of entries of the second derivatives."""
+        """Write the loop over all rows of a segment in a mode, backward.
+
+        `inner` and `end` count the entries of the second derivatives at each stage.
+        """
         n = self.sizes.n
         self.line("%row = alloca [3 x double]")
         found = self.pointers()
-        before, left = self.resumed()
+        before, left = self.load_progress()
         self.line(f"%start = sub i64 %last, {before}")
         self.line("br label %loop")
         self.label("loop")
@@ -240,7 +243,7 @@ class Driver:
         self.line("%less = sub i64 %cell, 1")
         self.line("%done = icmp slt i64 %less, %first")
         self.next_turn(self.let("sub i64 %last, %cell"), "%done")
-        return self.finished(f"internal i1 @backward_{mode}({SEGMENT})", returns=False)
+        return self.end_function(f"internal i1 @backward_{mode}({SEGMENT})", returns=False)
 
     def _curvature(self, name: str, given: dict[str, str], count: int, moving: bool) -> int:
         """Add to H what `count` entries a stage say, and the length of a row that moves: what it costs."""
@@ -258,7 +261,7 @@ class Driver:
     # Segments, whatever their mode
 
     def _segment(self, found: dict[str, str]) -> dict[str, str]:
-        """Where a segment begins and ends: cells, times, indices of states; and the arguments of its rows."""
+        """Find where a segment begins and ends: cells, times, indices of states; and the arguments of its rows."""
         next_ = self.let("add i64 %segment, 1")
         first, last = (self.load("i64", self.at(found["first_cell"], k)) for k in ("%segment", next_))
         begins, finishes = (self.load("double", self.at(found["bounds"], k)) for k in ("%segment", next_))
@@ -268,7 +271,7 @@ class Driver:
         return {"next": next_, "before": before, "after": after, "given": given}
 
     def _reset_of(self, found: dict[str, str], name: str) -> tuple[str, dict[str, str], list[str]]:
-        """Branch on the reset map at the beginning of a segment: its transition, what it is given, blocks."""
+        """Switch to the reset map at the start of a segment; return which it is, its pointers, and the blocks."""
         n, width = self.sizes.n, self.sizes.width
         transition = self.let("sub i64 %segment, 1")
         opens = self.let("icmp sgt i64 %segment, 0")
@@ -284,7 +287,7 @@ class Driver:
         return which, given, self.choose(which, len(self.library.reset_maps), name)
 
     def forward_any(self) -> str:
-        """A reset map, a segment, and what stands at its end, forward."""
+        """Write a segment of any mode forward: its reset map, its rows, and the functions at its end."""
         found = self.pointers()
         place = self._segment(found)
         state = self._state(found, place["before"])
@@ -312,10 +315,10 @@ class Driver:
         if self.sizes.N:
             self._transition(found, place, state)
         self.line("ret i1 true")
-        return self.finished(f"internal i1 @forward_any({WHOLE})", returns=False)
+        return self.end_function(f"internal i1 @forward_any({WHOLE})", returns=False)
 
     def _transition(self, found: dict[str, str], place: dict[str, str], state: dict[str, str]) -> None:
-        """What stands at the transition that ends a segment."""
+        """Call the functions at the transition that ends a segment."""
         n, width = self.sizes.n, self.sizes.width
         kinds = [kind for kind in AT_TRANSITIONS if getattr(self.library, kind.name)]
         if not kinds:
@@ -342,7 +345,7 @@ class Driver:
         self.label("no_transition")
 
     def _constraint(self, found: dict[str, str], row: str) -> dict[str, str]:
-        """Where the constraints that begin at a row stand."""
+        """Return pointers to the constraints from a row on."""
         return {
             "multiplier": self.at(found["multipliers"], row),
             "penalty": self.at(found["penalties"], row),
@@ -351,7 +354,7 @@ class Driver:
         }
 
     def backward_any(self) -> str:
-        """A segment, then the reset map at its beginning, backward."""
+        """Write a segment of any mode backward: its rows, then the reset map at its start."""
         found = self.pointers()
         place = self._segment(found)
         mode = self.load("i64", self.at(found["modes"], "%segment"))
@@ -371,16 +374,16 @@ class Driver:
                 self.line("br label %reset_end")
             self.label("reset_end")
         self.line("ret i1 true")
-        return self.finished(f"internal i1 @backward_any({WHOLE})", returns=False)
+        return self.end_function(f"internal i1 @backward_any({WHOLE})", returns=False)
 
     # Samples
 
     def samples(self, k: int) -> str:
-        """All samples of the k-th Measurements, which are at the ends of rows."""
+        """Write the loop over the samples of the k-th Measurements, which are at the ends of rows."""
         n, N, q = self.sizes.n, self.sizes.N, self.library.measurements[k].channels
         found, own = self.pointers(), self.samples_of(k)
         begins = [self.load("i64", self.at(found["first_cell"], i)) for i in range(1, N + 1)]
-        before, left = self.resumed()
+        before, left = self.load_progress()
         self.line("br label %loop")
         self.label("loop")
         self.line(f"%sample = phi i64 [{before}, %entry], [%more, %loop]")
@@ -394,7 +397,7 @@ class Driver:
         given |= {"moves": found["units"], "time": self.at(own["time"], "%sample")}
         given["jump"] = self.at(found["jumps"], index, n) if self.order else found["jumps"]
         self._next_sample(self.call(f"sample_{k}", SAMPLE, given))
-        return self.finished(f"internal i1 @samples_{k}({TABLE}, i64 %count, ptr %progress)", returns=False)
+        return self.end_function(f"internal i1 @samples_{k}({TABLE}, i64 %count, ptr %progress)", returns=False)
 
     def _sample(self, own: dict[str, str], q: int) -> dict[str, str]:
         return {"value": self.at(own["value"], "%sample", q), "weight": self.at(own["weight"], "%sample", q)}
@@ -406,7 +409,7 @@ class Driver:
         self.next_turn("%sample", "%done")
 
     def _late_row(self, k: int, found: dict[str, str], own: dict[str, str]) -> tuple[str, dict[str, str], str, int]:
-        """The row of a late sample, forward: the index of the row that holds its end, what it is given, mode, work."""
+        """Take the row of a late sample forward; return the index of the row that holds it, pointers, mode and work."""
         n, S, width = self.sizes.n, self.sizes.signals, self.sizes.width
         cell, segment = (self.load("i64", self.at(own[name], "%sample")) for name in ("cell", "segment"))
         row = self.let(f"add i64 {cell}, {segment}")
@@ -452,13 +455,13 @@ class Driver:
         return row, given, mode, work + longest
 
     def late_samples(self, k: int, counts: list[int]) -> str:
-        """All samples of the k-th Measurements, which are late: each at the end of a row of its own.
+        """Write the loop over the samples of the k-th Measurements, which are late: each ends a row of its own.
 
         `counts` are the numbers of entries of the second derivatives of such a row, by modes.
         """
         n, q = self.sizes.n, self.library.measurements[k].channels
         found, own = self.pointers(), self.samples_of(k)
-        before, left = self.resumed()
+        before, left = self.load_progress()
         self.line("br label %loop")
         self.label("loop")
         self.line(f"%sample = phi i64 [{before}, %entry], [%more, %next]")
@@ -484,10 +487,10 @@ class Driver:
         self.line("br label %next")
         self.label("next")
         self._next_sample(work)
-        return self.finished(f"internal i1 @samples_{k}({TABLE}, i64 %count, ptr %progress)", returns=False)
+        return self.end_function(f"internal i1 @samples_{k}({TABLE}, i64 %count, ptr %progress)", returns=False)
 
     def late_states(self, k: int) -> str:
-        """The moments of which the samples of the k-th Measurements are, and the states then."""
+        """Write a loop that stores the times at which late samples saw the state, and these states."""
         n = self.sizes.n
         found, own = self.pointers(), self.samples_of(k)
         self.line("br label %loop")
@@ -504,12 +507,12 @@ class Driver:
         self.line("%done = icmp sge i64 %more, %count")
         self.line("br i1 %done, label %out, label %loop")
         self.label("out")
-        return self.finished(f"void @late_states_{k}({TABLE}, i64 %count, ptr %times, ptr %states)")
+        return self.end_function(f"void @late_states_{k}({TABLE}, i64 %count, ptr %times, ptr %states)")
 
     # Everything
 
     def whole(self) -> str:
-        """Everything, in order: phases, of which those that are loops say whether they came to their end.
+        """Write `evaluate`: all phases in order; those that are loops return whether they are finished.
 
         They are the segments forward, the Measurements, the end, and the segments backward.
         """
@@ -565,14 +568,14 @@ class Driver:
         self.label("pause")
         self.line("store i64 %now, ptr %progress")
         given = "".join(f", i64 {count}" for count in counts)
-        return self.finished(f"void @evaluate({TABLE}, ptr %progress{given})")
+        return self.end_function(f"void @evaluate({TABLE}, ptr %progress{given})")
 
     def outputs(self) -> str:
-        """Outputs of any states, at moments."""
+        """Write the loop over the outputs of given states at given times."""
         n, width = self.sizes.n, self.sizes.width
         q = sum(channels for _, channels in self.library.outputs)
         found = self.pointers()
-        before, left = self.resumed()
+        before, left = self.load_progress()
         self.line("br label %loop")
         self.label("loop")
         self.line(f"%k = phi i64 [{before}, %entry], [%more, %loop]")
@@ -592,12 +595,12 @@ class Driver:
         self.line("store i64 %phase, ptr %progress")
         self.next_turn("%k", "%done")
         given_ = "ptr %times, ptr %x, ptr %Z, ptr %y, ptr %Y"
-        return self.finished(f"i1 @all_outputs({TABLE}, ptr %progress, i64 %count, {given_})", returns=False)
+        return self.end_function(f"i1 @all_outputs({TABLE}, ptr %progress, i64 %count, {given_})", returns=False)
 
     # The adaptive solver
 
     def slope_at(self, mode: int) -> str:
-        """Slope of one mode at any time: in the cell that holds it, or would if it were between `low` and `high`."""
+        """Write the slope of one mode at any time, with the signals of its cell; `low` and `high` limit the search."""
         S, at = self.sizes.signals, Adaptive()
         self.line("%moment = alloca [2 x double]")
         found = self.pointers()
@@ -630,12 +633,12 @@ class Driver:
         given = found | {"moment": "%moment", "signal": found["signals"], "y": "%y", "K": "%K"}
         self.call(f"slope_{mode}", SLOPE, given)
         signature = f"internal void @slope_at_{mode}({TABLE}, i64 %cells, ptr %state, double %time, ptr %y, ptr %K)"
-        return self.finished(signature)
+        return self.end_function(signature)
 
     def adaptive(self, mode: int) -> str:
-        """Adaptive steps in one mode until its end, `most` of them, or the budget: the moments reached, and how many.
+        """Write adaptive steps in one mode, until the end, `most` of them or the budget; they store the accepted times.
 
-        Steps that are refused count for the budget too.
+        Refused steps count for the budget too.
         """
         size, at = self.sizes.n + 1, Adaptive()
         given = {name: f"%{name}" for name in STEP}
@@ -677,6 +680,6 @@ class Driver:
         self.line("br label %loop")
         self.label("out")
         self.line("store i64 %done, ptr %count")
-        return self.finished(
+        return self.end_function(
             f"void @adaptive_{mode}_steps({TABLE}, i64 %cells, ptr %state, ptr %y, ptr %times, i64 %most, ptr %count)"
         )

@@ -18,7 +18,7 @@ from switchfit.engine.protocol import (
     Matrix,
     Simulation,
     Tangents,
-    with_samples,
+    add_samples,
 )
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
@@ -31,7 +31,7 @@ ORDERS: dict[Matrix, Order] = {
 
 
 class NativeEngine:
-    """One experiment on one mesh in machine code.
+    """Evaluates one experiment on one mesh in machine code.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class NativeEngine:
     arguments : Arguments
     mesh : Mesh
     otherwise : ExperimentEngine
-        What does an evaluation in which a product with zero was left out whose other factor was not finite.
+        Evaluates what machine code cannot: a product with zero was left out whose other factor is not finite.
     """
 
     def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh, otherwise: ExperimentEngine) -> None:
@@ -52,19 +52,19 @@ class NativeEngine:
         return Engine("native")
 
     def at(self, order: Order) -> NativeExperiment | None:
-        """The experiment with derivatives of an order; None if there is no machine code for that order alone."""
+        """Return the experiment with derivatives of an order; None if that order alone has no machine code."""
         if order not in self._experiments:
             self._experiments[order] = native_experiment(self._structure, self._arguments, self._mesh.times, order)
         return self._experiments[order]
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
-        """J alone."""
+        """Return J alone."""
         native = self.at(Order.COST)
         found = None if native is None else native.cost(tau, p)
         return self._otherwise.cost(tau, p) if found is None else found
 
     def derivatives(self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix) -> Derivatives:
-        """J and its derivatives."""
+        """Return J and its derivatives."""
         native = self.at(ORDERS[matrix])
         found = None if native is None else native(tau, p, side)
         return self._otherwise.derivatives(tau, p, side, matrix) if found is None else found
@@ -72,13 +72,13 @@ class NativeEngine:
     def constrained(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
     ) -> Constrained:
-        """J and its constraints."""
+        """Return J and its constraints."""
         native = self.at(Order.HESSIAN)
         found = None if native is None else native.constrained(tau, p, side, multipliers, penalty)
         return self._otherwise.constrained(tau, p, side, multipliers, penalty) if found is None else found
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
-        """All rows, with their derivatives if asked for."""
+        """Return all rows, with their derivatives if `tangents`."""
         native, plain = self.at(Order.HESSIAN if tangents else Order.COST), self.at(Order.COST)
         found = None
         if native is not None and plain is not None:
@@ -95,12 +95,12 @@ def _simulation(
     p: FloatArray,
     tangents: bool,
 ) -> Simulation | None:
-    """All rows; None if a presumption was wrong.
+    """Return all rows; None if a presumption was wrong.
 
     Machine code has the derivatives at the ends of rows, which move where they are transitions. At the time at which
     such an end is they are less dx/dt.
     """
-    found = native.simulated(tau, p)
+    found = native.simulate(tau, p)
     if found is None:
         return None
     first_cell, start, end = found.first_cell.astype(np.intp), found.times[:-1], found.times[1:]
@@ -142,4 +142,4 @@ def _simulation(
     late = {k: native.outputs(times, states, p) for k, (times, states) in found.late.items()}
     if None in late.values():
         return None
-    return with_samples(simulation, structure, arguments, {k: y[0] for k, y in late.items() if y is not None})
+    return add_samples(simulation, structure, arguments, {k: y[0] for k, y in late.items() if y is not None})

@@ -148,8 +148,8 @@ def pick(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
     starts = [k for k in range(len(entries)) if k == 0 or not _is_same(entries[k - 1], entries[k])]
     if len(starts) == 1:
         return entries[0]
-    if len(starts) > MOST_SELECTIONS and not any(is_traced(e) and e_number(e) is None for e in entries):
-        return _looked_up(graph, [e_number(e) if is_traced(e) else e for e in entries], index)
+    if len(starts) > MOST_SELECTIONS and not any(is_traced(e) and known_number(e) is None for e in entries):
+        return _look_up(graph, [known_number(e) if is_traced(e) else e for e in entries], index)
     if len(starts) > MOST_CHOICES:
         raise Unsupported(
             f"takes one of {len(starts)} numbers by an index that depends on the state (limit: {MOST_CHOICES})"
@@ -165,7 +165,7 @@ def pick(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
     return chosen(starts)
 
 
-def e_number(entry: Any) -> Any:
+def known_number(entry: Any) -> Any:
     """Return the number that an entry is; None if it depends on the state."""
     return entry.number if isinstance(entry, Node) else None
 
@@ -181,7 +181,7 @@ def _is_same(one: Any, other: Any) -> bool:
     return bool((one == other and np.signbit(one) == np.signbit(other)) or (one != one and other != other))
 
 
-def _looked_up(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
+def _look_up(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
     if len(entries) > MOST_ROWS_OF_TABLE:
         raise Unsupported(f"looks up numbers in a table of {len(entries)} entries (limit: {MOST_ROWS_OF_TABLE})")
     node = graph.lookup(np.array(entries, dtype=float), index.node - float(index.low))

@@ -35,14 +35,14 @@ from switchfit.problem.structure import Structure
 def native_experiment(
     structure: Structure, arguments: Arguments, times: FloatArray, order: Order
 ) -> NativeExperiment | None:
-    """One experiment in machine code, on the mesh with the nodes `times`; None if there is a `reason_for_jax`."""
+    """Return one experiment in machine code on the mesh with the nodes `times`; None if it cannot be compiled."""
     sizes = Sizes.of(structure, arguments)
     program = program_of(structure.library, sizes, order)
     return None if isinstance(program, str) else NativeExperiment(program, structure, sizes, arguments, times, order)
 
 
 def reason_for_jax(structure: Structure, arguments: Arguments, order: Order) -> str | None:
-    """Why JAX has to evaluate an experiment with derivatives of an order; None if machine code does."""
+    """Return why an experiment cannot be compiled with derivatives of an order; None if it can."""
     program = program_of(structure.library, Sizes.of(structure, arguments), order)
     return program if isinstance(program, str) else None
 
@@ -90,7 +90,7 @@ class Simulated(NamedTuple):
 
 
 class NativeExperiment:
-    """One experiment on one mesh in machine code.
+    """Arrays of one experiment on one mesh, and calls of its machine code.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ class NativeExperiment:
         self._all_own = structure.N == N
         counts = [_count(samples) for samples in arguments.samples]
         pointer, number = ctypes.c_void_p, ctypes.c_int64
-        self._program = program  # whose code must not go away
+        self._program = program  # keeps its code alive
         self._evaluate = program.function(f"{self._prefix}evaluate", pointer, pointer, *[number] * len(counts))
         self.times, self._cells, self._counts = times, cells, counts
         constants = [np.ravel(np.asarray(a, dtype=np.float64)) for a in constants_of(arguments)]
@@ -179,13 +179,13 @@ class NativeExperiment:
         self._delays = _places_of_delays(structure, arguments)
 
     def __call__(self, tau: FloatArray, p: FloatArray, side: float) -> Derivatives | None:
-        """J, its gradient (D,) and its Hessian (D, D), NaN without it.
+        """Return J, its gradient (D,) and its Hessian (D, D), NaN if the order has none.
 
-        None if a presumption was wrong: then JAX has to do it.
+        None if a presumption was wrong: the caller falls back to JAX.
         """
         with self._workspace.lock:
             self._run(tau, p, side)
-            if self._presumed_wrongly:
+            if self._is_presumption_wrong:
                 return None
             g, H = self._result
             if not self._all_own:
@@ -196,7 +196,7 @@ class NativeExperiment:
     def constrained(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
     ) -> Constrained | None:
-        """Cost, constraints and their derivatives; the multipliers and penalties are (m,).
+        """Return the cost, the constraints and their derivatives; the multipliers and penalties are (m,).
 
         None if a presumption was wrong.
         """
@@ -207,7 +207,7 @@ class NativeExperiment:
                 self._run(tau, p, side)
             finally:
                 self._weights[:] = 0.0
-            if self._presumed_wrongly:
+            if self._is_presumption_wrong:
                 return None
             (g, H), own = self._result, self._own
             c = self._named["constraints"][where]
@@ -215,12 +215,12 @@ class NativeExperiment:
             return Constrained(self._J.item(0), g[own], H[np.ix_(own, own)], c, A)
 
     def program_at(self, tau: FloatArray, p: FloatArray) -> Callable[[], object]:
-        """The machine code alone, to be measured."""
+        """Return a function that runs the machine code alone, for benchmarks."""
         self(tau, p, 1.0)
-        return lambda: self._in_pieces(self._evaluate, *self._counts)
+        return lambda: self._call_in_pieces(self._evaluate, *self._counts)
 
     @property
-    def _presumed_wrongly(self) -> bool:
+    def _is_presumption_wrong(self) -> bool:
         """Whether a product with zero was left out whose other factor was not finite.
 
         A cost that is not finite says enough as it is.
@@ -229,19 +229,19 @@ class NativeExperiment:
         return check != check and math.isfinite(self._J.item(0))
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float | None:
-        """J alone; None if a presumption was wrong."""
+        """Return J alone; None if a presumption was wrong."""
         with self._workspace.lock:
             self._run(tau, p, 1.0)
-            return None if self._presumed_wrongly else self._J.item(0)
+            return None if self._is_presumption_wrong else self._J.item(0)
 
-    def simulated(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
-        """States at all ends of rows, in second order with their derivatives; None if a presumption was wrong."""
+    def simulate(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
+        """Return the states at all ends of rows, in second order with tangents; None if a presumption was wrong."""
         with self._workspace.lock:
-            return self._simulated(tau, p)
+            return self._simulate(tau, p)
 
-    def _simulated(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
+    def _simulate(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
         self._run(tau, p, 1.0)
-        if self._presumed_wrongly:
+        if self._is_presumption_wrong:
             return None
         n, N, cells = self.sizes.n, self.structure.N, self._cells
         first_cell = self._first_cell[: N + 1].copy()
@@ -267,7 +267,7 @@ class NativeExperiment:
         )
 
     def _late_states(self, k: int, count: int) -> tuple[FloatArray, FloatArray]:
-        """Of which moments the samples of the k-th Measurements are, (K,), and the states then, (K, n)."""
+        """Return the times (K,) at which the late samples of the k-th Measurements saw the state, and it (K, n)."""
         times, states = np.zeros(count), np.zeros((count, self.sizes.n))
         pointer = ctypes.c_void_p
         types = [pointer, ctypes.c_int64, pointer, pointer]
@@ -278,7 +278,7 @@ class NativeExperiment:
     def outputs(
         self, times: FloatArray, states: FloatArray, p: FloatArray, tangents: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray] | None:
-        """What all sensors see, (L, q), and, where the derivatives (L, n, D) of the states are given, its own.
+        """Return the outputs of all sensors (L, q), and their tangents if those of the states (L, n, D) are given.
 
         None if a presumption was wrong.
         """
@@ -294,19 +294,19 @@ class NativeExperiment:
             function = self._program.function(f"{self._prefix}all_outputs", *types)
             given = [np.ascontiguousarray(times), np.ascontiguousarray(states), Z, y, Y]
             self._check[0] = 0.0
-            self._in_pieces(function, count, *(a.ctypes.data for a in given))
+            self._call_in_pieces(function, count, *(a.ctypes.data for a in given))
             if np.isnan(self._check[0]):
                 return None
         return y, Y[..., self._own]
 
     def initial_state(self, p: FloatArray) -> FloatArray:
-        """x(t0): (n,); NaN if a presumption was wrong."""
+        """Return x(t0): (n,); NaN if a presumption was wrong."""
         self._own_p[:] = p
         x = np.zeros(self.sizes.n)
         return x + self._call("start", START, {"x": x})
 
     def after_reset(self, i: int, t: float, x: FloatArray, p: FloatArray) -> FloatArray:
-        """State after the reset map of transition i (from 0): (n,); NaN if a presumption was wrong."""
+        """Return the state after the reset map of transition i (from 0): (n,); NaN if a presumption was wrong."""
         self._own_p[:] = p
         which = int(self._named["resets"][i])
         given = {"time": np.array([t]), "x": np.array(x, dtype=float), "x_after": np.zeros(self.sizes.n)}
@@ -314,7 +314,7 @@ class NativeExperiment:
         return given["x_after"] + self._call(f"reset_{which}", RESET, given)
 
     def slope(self, mode: int, t: float, y: FloatArray, p: FloatArray, cell: int | None = None) -> FloatArray:
-        """f and ell at t, y = (x, running cost so far): (n + 1,); NaN if a presumption was wrong.
+        """Return f and ell at t, y = (x, running cost so far): (n + 1,); NaN if a presumption was wrong.
 
         With the signals of a cell; left out, of the one that holds t, or begins there.
         """
@@ -326,11 +326,10 @@ class NativeExperiment:
         return slope + self._call(f"slope_{mode}", SLOPE, {"moment": moment, "signal": signal, "y": y, "K": slope})
 
     def adaptive_steps(self, mode: int, state: FloatArray, y: FloatArray, p: FloatArray, most: int) -> FloatArray:
-        """Up to `most` steps of SciPy's RK45, from `state` and y, which change: the moments reached.
+        """Take up to `most` adaptive steps from `state` and y, which are updated; return the accepted times.
 
-        y is NaN if a presumption was wrong.
-
-        They may be fewer, even none: after some work that takes milliseconds it returns, to be called again.
+        y is NaN if a presumption was wrong. It may return early, even without a step, when its budget is spent: call it
+        again.
 
         Parameters
         ----------
@@ -351,9 +350,9 @@ class NativeExperiment:
         return times[: count[0]]
 
     def _call(self, name: str, order: tuple[str, ...], given: dict[str, FloatArray]) -> float:
-        """One of the straight lines; what is not given it finds where the driver does.
+        """Call one of the straight lines; pointers that are not given are those of the driver.
 
-        Returns 0, or NaN if a presumption was wrong.
+        Return 0, or NaN if a presumption was wrong.
         """
         check = np.zeros(1)
         arrays = [given[key] if key in given else self._named.get(key) for key in order[:-1]]
@@ -373,10 +372,10 @@ class NativeExperiment:
             part[:] = 0.0
         if self._late:
             self._place_late(p)
-        self._in_pieces(self._evaluate, *self._counts)
+        self._call_in_pieces(self._evaluate, *self._counts)
 
-    def _in_pieces(self, function: Callable[..., object], *given: Any) -> None:
-        """Call a function of the driver until it is at its end; Ctrl-C is heard after each call."""
+    def _call_in_pieces(self, function: Callable[..., object], *given: Any) -> None:
+        """Call a function of the driver until it has finished; Ctrl-C is handled after each call."""
         progress, address = self._progress, ctypes.addressof(self._progress)
         progress[0] = progress[1] = 0
         while progress[0] >= 0:
@@ -384,7 +383,7 @@ class NativeExperiment:
             function(self._address, address, *given)
 
     def _bind(self, workspace: FloatArray) -> None:
-        """Let the table point to another workspace."""
+        """Store the addresses of another workspace in the table."""
         self._memory = workspace
         found = _parts(workspace, self._lengths)
         self._zeroed = [found[name] for name in ZEROED if found[name].size]
@@ -394,13 +393,13 @@ class NativeExperiment:
                 self._table[k] = found[name].ctypes.data
 
     def _place(self, tau: FloatArray, side: float) -> None:
-        """The cells in which segments begin, as in `switchfit.discretization.mesh.build_rows`."""
+        """Find the cells in which segments begin, as in `switchfit.discretization.mesh.rows`."""
         if len(tau):
             passed = self.times.searchsorted(tau, "right" if side > 0 else "left")
             self._begins[:] = np.minimum(np.maximum(passed - 1, 0), self._cells - 1)
 
     def _place_late(self, p: FloatArray) -> None:
-        """The rows with ``start < t - delay <= end``, by the cells and segments that hold the late samples."""
+        """Find the cells and segments of the late samples: those of the rows with ``start < t - delay <= end``."""
         for _, name, times, cell, segment in self._late:
             place, value = self._delays[name]
             seen = times - (value if place is None else p[place])
@@ -409,13 +408,13 @@ class NativeExperiment:
 
 
 def _parts(whole: FloatArray, lengths: dict[str, int]) -> dict[str, FloatArray]:
-    """Consecutive parts of an array by their names and lengths."""
+    """Return consecutive parts of an array by their names and lengths."""
     ends = np.cumsum(list(lengths.values())).tolist()
     return {name: whole[end - length : end] for (name, length), end in zip(lengths.items(), ends, strict=True)}
 
 
 def _places_of_delays(structure: Structure, arguments: Arguments) -> dict[str, tuple[int | None, float]]:
-    """Where in p each parameter of one number stands, or its value if it is fixed."""
+    """Return the position in p of each scalar parameter, or its value if it is fixed."""
     found: dict[str, tuple[int | None, float]] = {}
     fixed, position = iter(arguments.fixed), 0
     for name, shape, free in structure.parameters:
@@ -427,6 +426,6 @@ def _places_of_delays(structure: Structure, arguments: Arguments) -> dict[str, t
 
 
 def _count(samples: Samples) -> int:
-    """Number of samples up to the last that has a value: what follows is padding."""
+    """Return the number of samples up to the last that has a value: the rest is padding."""
     there = np.flatnonzero(np.asarray(samples.weight).any(1))
     return int(there[-1]) + 1 if len(there) else 1

@@ -20,9 +20,9 @@ from switchfit.engine.native.workspace import GIVEN, constraint_rows, memory, su
 from switchfit.problem.structure import Structure
 
 
-@cache  # what is registered must stay
-def _registered(library: Structure, sizes: Sizes) -> tuple[str, Program]:
-    """Name of the operation for a library."""
+@cache  # XLA keeps the address: the program must stay alive
+def _register(library: Structure, sizes: Sizes) -> tuple[str, Program]:
+    """Register the operation of a library with XLA; return its name and its program."""
     program = program_of(library, sizes, Order.HESSIAN)
     if isinstance(program, str):
         raise ValueError(f"there is no machine code: {program}")
@@ -47,7 +47,7 @@ def foreign_derivatives(
     side: Any,
     places: Mapping[str, Any] | None = None,
 ) -> Any:
-    """Cost, gradient (D,) and Hessian (D, D) of one experiment, inside a JAX program that runs on a CPU.
+    """Return cost, gradient (D,) and Hessian (D, D) of one experiment inside a JAX program that runs on a CPU.
 
     For an experiment that `can_be_foreign` and for which there is machine code. `side` is +1 or -1: the right or left
     derivatives by a transition time that sits on a node.
@@ -57,7 +57,7 @@ def foreign_derivatives(
     then keyed by ``structure.library``, which may be given in place of the structure.
     """
     sizes, library = Sizes.of(structure, arguments), structure.library
-    name, _ = _registered(library, sizes)
+    name, _ = _register(library, sizes)
     N, D, width = sizes.N, sizes.D, sizes.width
     idle = N - tau.shape[0]  # segments that the sequence does not need: they begin and end at tf
     places = places_in_library(structure) if places is None else places
@@ -90,6 +90,6 @@ def foreign_derivatives(
     totals = jax.ffi.ffi_call(name, results, vmap_method="expand_dims")(*buffers)[0]
     ends = dict(zip(lengths, np.cumsum(list(lengths.values())).tolist(), strict=True))
     J, g, H = (totals[ends[key] - lengths[key] : ends[key]] for key in ("J", "g", "H"))
-    cost = J[0] + totals[-1]  # not a number where JAX has to look again, which the finisher of a batch lets it do
+    cost = J[0] + totals[-1]  # NaN if a presumption was wrong: the finisher of a batch then falls back to JAX
     own = np.concatenate([np.arange(N - idle), np.arange(N, D)])  # its unknowns among the program's
     return cost, g[own], H.reshape(D, width)[np.ix_(own, own)]

@@ -22,8 +22,8 @@ RANKS = {"signals": 3, "units": 2, "value": 2, "weight": 2}
 """Numbers of dimensions of what one experiment is given, where they are not 1."""
 
 
-def handler(driver: Driver) -> str:
-    """The handler: it fills the table of pointers, and calls the driver, once for each of a batch.
+def write_handler(driver: Driver) -> str:
+    """Return the handler's text: it fills the table of pointers and calls the driver, once per entry of a batch.
 
     Its arguments are those of `workspace.GIVEN`, then those of the samples; its results are all sums in one, and the
     memory. In a batch all of them have one dimension more, of length 1 where they are the same for all; the memory of
@@ -48,7 +48,7 @@ def handler(driver: Driver) -> str:
     arguments, results = (driver.load("ptr", driver.into("%frame", place)) for place in (ARGUMENTS, RESULTS))
 
     def buffer(buffers: str, k: int) -> tuple[str, str, str]:
-        """Data, number of dimensions and dimensions of a buffer."""
+        """Load data, rank and dimensions of a buffer."""
         pointer = driver.load("ptr", driver.into(buffers, 8 * k))
         data, dimensions = (driver.load("ptr", driver.into(pointer, place)) for place in (DATA, DIMENSIONS))
         return data, driver.load("i64", driver.into(pointer, RANK)), dimensions

@@ -20,9 +20,9 @@ from switchfit.engine.native.entries import (
     both,
     choose,
     clamp,
-    e_number,
     equal,
     is_traced,
+    known_number,
     less,
     pick,
 )
@@ -37,7 +37,7 @@ def take(graph: Graph, a: Any, starts: Sequence[Any], sizes: Sequence[int]) -> A
     """Return a window of an array: (sizes); each start is in range, an int or an `Integer`."""
     moving = [k for k, start in enumerate(starts) if isinstance(start, Integer)]
     a = a[tuple(_reach(start, size) for start, size in zip(starts, sizes, strict=True))]
-    if len(moving) > 1 and not any(is_traced(e) and e_number(e) is None for e in a.reshape(-1)):
+    if len(moving) > 1 and not any(is_traced(e) and known_number(e) is None for e in a.reshape(-1)):
         return _from_table(graph, a, [starts[k] for k in moving], moving, sizes)
     for axis in moving:
         rows = np.moveaxis(a, axis, 0)
@@ -50,12 +50,12 @@ def take(graph: Graph, a: Any, starts: Sequence[Any], sizes: Sequence[int]) -> A
 
 
 def _reach(start: Any, size: int) -> slice:
-    """All places that a window may reach."""
+    """Return the range of places that a window may reach."""
     return slice(start.low, start.high + size) if isinstance(start, Integer) else slice(start, start + size)
 
 
 def _from_table(graph: Graph, a: Any, starts: list[Integer], moving: list[int], sizes: Sequence[int]) -> Objects:
-    """A window of a known array that moves along several axes: one index into all candidates for each entry."""
+    """Take a window of a known array that moves along several axes: each entry by one index into a table."""
     multiply, add, subtract = (OF_INTEGERS[op](graph, {}, np.dtype(np.int64)) for op in ("mul", "add", "sub"))
     spans = [start.high - start.low + 1 for start in starts]
     index: Any = 0
@@ -91,13 +91,13 @@ def put(graph: Graph, a: Objects, starts: Sequence[Any], window: Any, combine: C
 
 
 def dynamic_slice(graph: Graph, equation: Any, a: Any, *starts: Any) -> Any:
-    """As `jax.lax.dynamic_slice`: a window that does not fit is moved inside."""
+    """Do what `jax.lax.dynamic_slice` does: a window that does not fit is moved inside."""
     sizes = equation.params["slice_sizes"]
     return take(graph, a, _moved_inside(graph, starts, a.shape, sizes), sizes)
 
 
 def dynamic_update_slice(graph: Graph, equation: Any, a: Any, update: Any, *starts: Any) -> Any:
-    """As `jax.lax.dynamic_update_slice`."""
+    """Do what `jax.lax.dynamic_update_slice` does."""
     result = a.astype(object)
     inside = _moved_inside(graph, starts, a.shape, update.shape)
     put(graph, result, inside, update, lambda here, old, new: choose(graph, here, new, old))
@@ -130,7 +130,7 @@ class _Window:
 def _windows(
     graph: Graph, shape: Sequence[int], indices: Any, sizes: Sequence[int], numbers: Any, inside: Any, many: int
 ) -> Iterator[_Window]:
-    """All windows of a gather or scatter; `inside`: axes in the windows, of the `many` of the array of all windows."""
+    """Yield the windows of a gather or scatter; `inside` are the axes in windows, of the `many` of their array."""
     gathers = hasattr(numbers, "start_index_map")
     axes = numbers.start_index_map if gathers else numbers.scatter_dims_to_operand_dims
     batched = dict(
@@ -157,7 +157,7 @@ def _windows(
 
 
 def gather(graph: Graph, equation: Any, a: Any, indices: Any) -> Any:
-    """As `jax.lax.gather`."""
+    """Do what `jax.lax.gather` does."""
     params, out = equation.params, equation.outvars[0].aval
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
@@ -173,7 +173,7 @@ def gather(graph: Graph, equation: Any, a: Any, indices: Any) -> Any:
 
 
 def _fill_value(given: Any, dtype: np.dtype[Any]) -> Any:
-    """What JAX takes for an index out of range: NaN, True, or the largest unsigned or smallest signed integer."""
+    """Return JAX's value for an index out of range: NaN, True, or the largest unsigned or smallest signed integer."""
     if given is not None:
         return np.asarray(given, dtype).item()
     if dtype.kind in "iu":
@@ -182,7 +182,7 @@ def _fill_value(given: Any, dtype: np.dtype[Any]) -> Any:
 
 
 def scatter(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any, combine: Combine) -> Any:
-    """As `jax.lax.scatter` and its kin."""
+    """Do what `jax.lax.scatter`, `scatter_add` and the like do."""
     params = equation.params
     numbers = params["dimension_numbers"]
     inside, dropped = numbers.update_window_dims, (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
@@ -198,7 +198,7 @@ def scatter(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any, com
     return result
 
 
-def added(graph: Graph, add: Callable[[Any, Any], Any], of_integers: bool) -> Combine:
+def add_where(graph: Graph, add: Callable[[Any, Any], Any], of_integers: bool) -> Combine:
     """Return how an update is added where a condition holds."""
 
     def combine(here: Any, old: Any, update: Any) -> Any:

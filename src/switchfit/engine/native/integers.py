@@ -68,7 +68,7 @@ def _absolute(a: tuple[int, int]) -> tuple[int, int]:
 
 
 def _quotient(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
-    """Towards zero; -1 for a division by zero."""
+    """Return the quotient towards zero; -1 for a division by zero."""
 
     def divide(one: Any, other: Any) -> Any:
         a, b = Integer.of(graph, one), Integer.of(graph, other)
@@ -87,7 +87,7 @@ def _signs(a: Integer, b: Integer, largest: int) -> tuple[int, int]:
 
 
 def _remainder(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
-    """With the sign of the dividend; the dividend itself for a division by zero."""
+    """Return the remainder, with the sign of the dividend; the dividend itself for a division by zero."""
 
     def remainder(one: Any, other: Any) -> Any:
         a, b = Integer.of(graph, one), Integer.of(graph, other)

@@ -16,7 +16,7 @@ What a straight line reads and writes it finds behind pointers. Every pointer me
                     of some constraints: (m,), (m,), their values (m,) and derivatives (m, width)
     moment          (t, first node of the cell), for the adaptive solver; its y is (x, running cost)
     entries         second derivatives at the stages of a row, (s, count)
-    check           not a number once something was not finite that had been presumed so, else 0
+    check           NaN once something presumed finite was not, else 0
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ class Kernels:
             stores.append(("J", 0, graph.load("J", 0) + cost_of_row(EXPLICIT, h, densities)))
         if checked:
             stores += graph.check()
-        self.module.straight(name, FORWARD, stores)
+        self.module.write_straight_line(name, FORWARD, stores)
 
     def backward_row(self, name: str, stage: Template, moving: bool, late: bool = False) -> list[tuple[int, int]]:
         """Write a row backward: the costate before it, its part of the gradient, second derivatives at its stages.
@@ -202,7 +202,7 @@ class Kernels:
         for j in range(STAGES if self.with_tangents else 0):
             values = [second[j][key] for key in chosen] + [graph.constant(STAGE_TIMES[j])] * moving
             stores += [("entries", j * len(values) + k, node) for k, node in enumerate(values)]
-        self.module.straight(name, BACKWARD, stores + graph.check())
+        self.module.write_straight_line(name, BACKWARD, stores + graph.check())
         return chosen
 
     def curvature(self, name: str, chosen: list[tuple[int, int]], moving: bool) -> None:
@@ -221,7 +221,7 @@ class Kernels:
                 entries = [one + c_j * (other - one) for one, other in zip(starts, ends, strict=True)]
                 of_time = start_d + c_j * (end_d - start_d), entries
             rows = self._curved(graph, rows, second, [of_time, *self._state_directions(graph, "XZ", j * n)])
-        self.module.straight(name, CURVATURE, _changed(H, rows))
+        self.module.write_straight_line(name, CURVATURE, _changed(H, rows))
 
     def length(self) -> None:
         """Write ``H += h' x V' + V' x h'``, V' being what `backward_row` stored for a row that moves."""
@@ -233,7 +233,7 @@ class Kernels:
             h_d = graph.load("closes", d) - graph.load("opens", d)
             row = graph.load("H", d, vector=True) + h_d * along + graph.load("length", d) * (end_d - start_d)
             stores.append(("H", d, row))
-        self.module.straight("length", LENGTH, stores)
+        self.module.write_straight_line("length", LENGTH, stores)
 
     # Nodes
 
@@ -250,7 +250,7 @@ class Kernels:
             stores += _stored("Z", 0, [_as_vector(graph, v) for v in self._along_p(graph, x_p)])
         if self.order == Order.COST:
             stores += graph.check()
-        self.module.straight("start", START, stores, seen=True)
+        self.module.write_straight_line("start", START, stores, exported=True)
         if self.order == Order.COST:
             return
 
@@ -265,7 +265,7 @@ class Kernels:
             for k in range(self.sizes.M):
                 row = graph.load("H", N + k, vector=True) + self._along_p(graph, g_pp[k])
                 stores.append(("H", N + k, row))
-        self.module.straight("start_back", START_BACK, stores + graph.check())
+        self.module.write_straight_line("start_back", START_BACK, stores + graph.check())
 
     def reset(self, which: int) -> None:
         """Write a reset map, forward and backward."""
@@ -283,7 +283,7 @@ class Kernels:
             stores += _stored("Z_after", 0, [_as_vector(graph, v) for v in Z_after])
         if self.order == Order.COST:
             stores += graph.check()
-        self.module.straight(f"reset_{which}", RESET, stores, seen=True)
+        self.module.write_straight_line(f"reset_{which}", RESET, stores, exported=True)
         if self.order == Order.COST:
             return
 
@@ -292,7 +292,7 @@ class Kernels:
         x, t, psi = graph.loads("x", n), graph.load("time", 0), graph.loads("psi", n)
         derivatives = template(graph, t, x, p, psi, *constants, only=range(4, 13), checked=True)
         stores = _stored("psi", 0, derivatives[1]) + self._scalar(graph, derivatives, moving=True)
-        self.module.straight(f"reset_back_{which}", RESET_BACK, stores + graph.check())
+        self.module.write_straight_line(f"reset_back_{which}", RESET_BACK, stores + graph.check())
 
     def sample(self, k: int) -> None:
         """Write the cost of a sample of the k-th Measurements: late ones move."""
@@ -302,7 +302,7 @@ class Kernels:
         p, constants = self.inputs(graph)
         given = graph.load("time", 0), graph.loads("value", q), graph.loads("weight", q), graph.loads("x", self.sizes.n)
         found = template(graph, *given, p, *constants, checked=True)
-        self.module.straight(f"sample_{k}", SAMPLE, self._cost(graph, found, moving=late) + graph.check())
+        self.module.write_straight_line(f"sample_{k}", SAMPLE, self._cost(graph, found, moving=late) + graph.check())
 
     def late_time(self, k: int) -> None:
         """Write of which moment a late sample is: the end of its row, and its derivative."""
@@ -312,12 +312,12 @@ class Kernels:
         stores = [("row", 1, t.item())]
         if self.order > Order.COST:
             stores.append(("closes", 0, _as_vector(graph, self._along_p(graph, t_p))))
-        self.module.straight(f"late_time_{k}", LATE_TIME, stores + graph.check())
+        self.module.write_straight_line(f"late_time_{k}", LATE_TIME, stores + graph.check())
 
     def end_of_late(self) -> None:
         """Write what a late sample adds to the costate at the start of the row that holds it."""
         graph, n = Graph(), self.sizes.n
-        self.module.straight(
+        self.module.write_straight_line(
             "end_of_late", END_OF_LATE, _stored("late", 0, graph.loads("late", n) + graph.loads("psi", n))
         )
 
@@ -326,7 +326,7 @@ class Kernels:
         template, graph = self.templates.end(), Graph()
         p, constants = self.inputs(graph)
         found = template(graph, graph.loads("x", self.sizes.n), p, *constants, checked=True)
-        self.module.straight("end", NODE, self._cost(graph, found, moving=False) + graph.check())
+        self.module.write_straight_line("end", NODE, self._cost(graph, found, moving=False) + graph.check())
 
     def transition(self, kind: TransitionKind, which: int) -> None:
         """Write one of the functions at transitions."""
@@ -336,11 +336,13 @@ class Kernels:
         if kind.constraint:
             weights = self._weights(graph, template, given, constants, 1)
             found = template(graph, *given, weights, *constants, checked=True)
-            self.module.straight(name, CONSTRAINT, self._constraint(graph, found, moving=True) + graph.check())
+            self.module.write_straight_line(
+                name, CONSTRAINT, self._constraint(graph, found, moving=True) + graph.check()
+            )
         else:
             none = np.full(1, graph.constant(0.0), dtype=object)
             found = template(graph, *given, none, *constants, checked=True)
-            self.module.straight(name, NODE, self._cost(graph, found, moving=True) + graph.check())
+            self.module.write_straight_line(name, NODE, self._cost(graph, found, moving=True) + graph.check())
 
     def end_constraint(self) -> None:
         """Write the terminal constraints."""
@@ -349,7 +351,9 @@ class Kernels:
         given = graph.loads("x", self.sizes.n), p
         weights = self._weights(graph, template, given, constants, self.sizes.m)
         found = template(graph, *given, weights, *constants, checked=True)
-        self.module.straight("end_constraint", CONSTRAINT, self._constraint(graph, found, moving=False) + graph.check())
+        self.module.write_straight_line(
+            "end_constraint", CONSTRAINT, self._constraint(graph, found, moving=False) + graph.check()
+        )
 
     def state(self) -> None:
         """Write a check that a state is finite, and so small that products of a few entries do not overflow.
@@ -364,7 +368,7 @@ class Kernels:
             for k in range(n):
                 for Z in graph.loads("Z", self.sizes.D, k * self.sizes.width):
                     total = total + graph.certain_product(0.0, Z)
-        self.module.straight("check_state", STATES, [(CHECKED, 0, total)])
+        self.module.write_straight_line("check_state", STATES, [(CHECKED, 0, total)])
 
     def outputs(self) -> None:
         """Write what all sensors see, with its derivatives."""
@@ -377,12 +381,12 @@ class Kernels:
             h_x, h_p = jacobians
             y_d = times_vector(h_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, h_p)
             stores += _stored("Y", 0, [_as_vector(graph, value) for value in y_d])
-        self.module.straight("outputs", OUTPUTS, stores + graph.check())
+        self.module.write_straight_line("outputs", OUTPUTS, stores + graph.check())
 
     # What they have in common
 
     def inputs(self, graph: Graph) -> tuple[Objects, list[Objects]]:
-        """p and the constants."""
+        """Load p and the constants."""
         p, offset, constants = graph.loads("p", self.sizes.M), 0, []
         for shape in self.sizes.constants:
             count = int(np.prod(shape))
@@ -391,7 +395,7 @@ class Kernels:
         return p, constants
 
     def _row(self, graph: Graph) -> Any:
-        """What the functions of a stage are given, of (t, x, w, hb); w and hb are zero if they are left out."""
+        """Return the inputs of a stage as a function of (t, x, w, hb); w and hb default to zero."""
         p, constants = self.inputs(graph)
         origin, signal = graph.load("row", 2), graph.loads("signal", 4 * self.sizes.signals)
         nothing = graph.constant(0.0)
@@ -402,18 +406,18 @@ class Kernels:
         return graph.load("opens", 0, vector=True), graph.load("closes", 0, vector=True)
 
     def _units(self, graph: Graph) -> list[Node]:
-        """Derivatives of p along theta."""
+        """Return the derivatives of p along theta."""
         return [graph.unit(self.sizes.N + k) for k in range(self.sizes.M)]
 
     def _along_p(self, graph: Graph, derivatives: Objects) -> Any:
-        """``sum_k derivatives[..., k] p_k'``: of shape (...)."""
+        """Return ``sum_k derivatives[..., k] p_k'``: of shape (...)."""
         total: Any = 0.0 if derivatives.ndim == 1 else np.zeros(derivatives.shape[:-1])
         for k, unit in enumerate(self._units(graph)):
             total = total + derivatives[..., k] * unit
         return total
 
     def _scalar(self, graph: Graph, derivatives: Sequence[Objects], moving: bool) -> list[Store]:
-        """Stores of g and H with a scalar's derivatives added, g_t, g_x, g_p and the second ones, at x, Z."""
+        """Return stores that add the derivatives of a scalar, g_t, g_x, g_p and the second ones, to g and H."""
         g_t, _, g_p, *second = derivatives
         g = graph.load("g", 0, vector=True) + self._along_p(graph, g_p)
         if moving:
@@ -430,7 +434,7 @@ class Kernels:
         return stores
 
     def _cost(self, graph: Graph, found: Sequence[Objects], moving: bool) -> list[Store]:
-        """Stores of a cost of (t, x, p) at one moment: J, g and H grow, and the costate by its derivative."""
+        """Return stores that add a cost at a node to J, g, H and the costate."""
         cost, *derivatives = found
         stores = [("J", 0, graph.load("J", 0) + cost.item())]
         if self.order == Order.COST:
@@ -441,13 +445,13 @@ class Kernels:
     def _weights(
         self, graph: Graph, template: Template, given: tuple[Any, ...], constants: list[Objects], count: int
     ) -> Objects:
-        """``multiplier + penalty c`` of some constraints, what weighs their second derivatives in a Lagrangian."""
+        """Return ``multiplier + penalty c``: the weights of the constraints in the Lagrangian."""
         none = np.full(count, graph.constant(0.0), dtype=object)
         (c,) = template(graph, *given, none, *constants, only=(0,))
         return graph.loads("multiplier", count) + graph.loads("penalty", count) * c
 
     def _constraint(self, graph: Graph, found: Sequence[Objects], moving: bool) -> list[Store]:
-        """Stores of constraints: their values and derivatives, and those of the weighted sum beside those of J."""
+        """Return stores of constraints and their tangents, and those that add ``weights . c`` to g, H and psi."""
         stores = _stored("constraint", 0, found[0])
         if self.order == Order.COST:
             return stores
@@ -461,7 +465,7 @@ class Kernels:
         return stores + self._scalar(graph, derivatives, moving)
 
     def _state_directions(self, graph: Graph, pointer: str, first: int = 0) -> Along:
-        """The derivative of each entry of x along theta."""
+        """Load the derivative of each entry of x along theta."""
         n, D, width = self.sizes.n, self.sizes.D, self.sizes.width
         return [
             (graph.load(pointer, k, vector=True), [graph.load(pointer, k * width + d) for d in range(D)])
@@ -469,7 +473,7 @@ class Kernels:
         ]
 
     def _curved(self, graph: Graph, H: list[Node], second: dict[tuple[int, int], Node], along: Along) -> list[Node]:
-        """Rows of H with ``Z' S Z`` added, S given by its lower half along (t, x, p); `along` is Z of t and x."""
+        """Add ``Z' S Z`` to the rows of H, S given by its lower half along (t, x, p); `along` is Z of t and x."""
         n, N = self.sizes.n, self.sizes.N
         vectors = [vector for vector, _ in along] + self._units(graph)
         product: dict[int, Any] = {}
@@ -488,7 +492,7 @@ class Kernels:
 
 
 def _entries(second: Sequence[Objects], with_time: bool) -> dict[tuple[int, int], Node]:
-    """The lower half of a second derivative along (t, x, p), as entries of one matrix; zeros are left out."""
+    """Return the lower half of a second derivative along (t, x, p), as entries of one matrix; zeros are left out."""
     tt, xt, xx, pt, px, pp = second
     n, M = len(xt), len(pt)
     entries = {(1 + i, 1 + j): xx[i, j] for i in range(n) for j in range(i + 1)}
@@ -505,7 +509,7 @@ def _changed(H: list[Node], rows: list[Node]) -> list[Store]:
 
 
 def _as_vector(graph: Graph, value: Any) -> Node:
-    """A vector node, also where the value turned out to be zero."""
+    """Return a vector node, also if the value turned out to be a scalar zero."""
     if isinstance(value, Node) and value.vector:
         return value
     return graph.zeros()

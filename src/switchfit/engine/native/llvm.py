@@ -1,6 +1,6 @@
 """Straight-line graphs as LLVM functions, and LLVM modules as machine code.
 
-What was compiled once is kept in the folder of `switchfit.runtime.cache` and read from there by the next process.
+Object code is cached in the folder of `switchfit.runtime.cache`; the next process loads it from there.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ BUDGET = 20_000_000
 
 
 def literal(number: float) -> str:
-    """A double, exactly."""
+    """Return a double as LLVM's hexadecimal literal, which is exact."""
     return f"0x{struct.unpack('<Q', struct.pack('<d', number))[0]:016X}"
 
 
@@ -49,7 +49,7 @@ class Module:
     Attributes
     ----------
     prefix : str
-        With which the names of all functions begin that are written from now on.
+        Start of the names of all functions that are written from now on.
     """
 
     def __init__(self, width: int) -> None:
@@ -60,13 +60,13 @@ class Module:
         self._work: dict[str, int] = {}
         self._declared: dict[str, str] = {}
 
-    def straight(
-        self, name: str, pointers: Sequence[str], stores: Sequence[tuple[str, int, Node]], seen: bool = False
+    def write_straight_line(
+        self, name: str, pointers: Sequence[str], stores: Sequence[tuple[str, int, Node]], exported: bool = False
     ) -> None:
-        """A function of pointers that loads, computes and stores: ``(pointer, offset, what)``.
+        """Write a function of pointers that loads, computes and stores: ``(pointer, offset, node)``.
 
         Everything is loaded before anything is stored. Offsets count doubles, those of vectors vectors. Only what is
-        `seen` can be called from Python.
+        `exported` can be called from Python.
         """
         writer = _Writer(self)
         nodes = needed([node for _, _, node in stores])
@@ -77,11 +77,11 @@ class Module:
             writer.store(pointer, offset, node)
         arguments = ", ".join(f"ptr %{pointer}" for pointer in pointers)
         body = "\n".join(writer.lines)
-        linkage = "" if seen else "internal "
+        linkage = "" if exported else "internal "
         self.functions.append(f"define {linkage}void @{self.prefix}{name}({arguments}) {{\n{body}\n  ret void\n}}\n")
 
     def work(self, name: str) -> int:
-        """What a function costs that was written with the prefix of now, in additions."""
+        """Return the cost of a function of the current prefix, in additions."""
         return self._work[self.prefix + name]
 
     def _effort(self, node: Node) -> int:
@@ -90,16 +90,16 @@ class Module:
         return effort * (1 + self.width // 4 if node.vector else 1)
 
     def add(self, text: str) -> None:
-        """A function written by hand, which calls none but those of the same prefix, and LLVM's."""
+        """Add a function written by hand, which calls only functions of the current prefix and LLVM's."""
         self.functions.append(re.sub(r"@(?!llvm\.)(\w+)\(", rf"@{self.prefix}\1(", text))
 
     def declare(self, name: str, signature: str) -> None:
-        """A function from elsewhere."""
+        """Declare an external function or a constant."""
         self._declared[name] = signature
 
     @property
     def text(self) -> str:
-        """The whole module."""
+        """Text of the whole module."""
         return "\n".join([*self._declared.values(), *self.functions])
 
 
@@ -111,7 +111,7 @@ def _declaration(operation: Operation) -> str:
 
 
 class _Writer:
-    """One function: a line an operation."""
+    """Emits the instructions of one function, one for each operation."""
 
     def __init__(self, module: Module) -> None:
         self.module = module
@@ -125,7 +125,7 @@ class _Writer:
         return name
 
     def value(self, node: Node) -> str:
-        """The name under which the value of a node is known, or a literal."""
+        """Return the name of the value of a node, or its literal; emit it first if needed."""
         name = self.names.get(node.index)
         if name is None:
             name = self.names[node.index] = self._written(node)
@@ -155,7 +155,7 @@ class _Writer:
         return self.emit(operation.code.format(*(self._as(a, node.vector) for a in args), type=self._type(node)))
 
     def _table(self, values: NDArray[np.float64]) -> str:
-        """The name of a constant array, which the functions of a module share."""
+        """Declare a constant array, which the functions of a module share; return its name."""
         name = f"table.{hashlib.sha256(values.tobytes()).hexdigest()[:16]}"
         entries = ", ".join(f"double {literal(value)}" for value in values.tolist())
         kind = f"[{len(values)} x double]"
@@ -178,7 +178,7 @@ class _Writer:
         return self.module.vector if node.vector else "i1" if node.truth else "double"
 
     def _as(self, node: Node, vector: bool) -> str:
-        """A value as an operand of an operation on vectors, or on scalars."""
+        """Return a value as an operand: a scalar is broadcast for an operation on vectors."""
         if not vector or node.vector or node.truth:
             return self.value(node)
         name = self.splats.get(node.index)
@@ -191,7 +191,7 @@ class _Writer:
 
 
 class Workspace:
-    """Memory that calls of a program work in, one after the other: one piece for all, which stays in the caches.
+    """Scratch space of a program: all calls share it, one at a time, so that it stays in the processor's caches.
 
     Attributes
     ----------
@@ -204,7 +204,7 @@ class Workspace:
         self.memory = np.zeros(0)
 
     def reserve(self, size: int) -> None:
-        """Make sure that it has a size; what was in it may be gone."""
+        """Allocate at least `size` doubles; the contents may be lost."""
         if len(self.memory) < size:
             self.memory = np.zeros(size)
 
@@ -225,18 +225,18 @@ class Program:
         self._functions: dict[str, Any] = {}
 
     def address(self, name: str) -> int:
-        """Where one of its functions is."""
+        """Return the address of a function."""
         return int(self._engine.get_function_address(name))
 
     def function(self, name: str, *types: Any) -> Any:
-        """One of its functions that return nothing, to be called from Python."""
+        """Return a function that returns nothing, callable from Python."""
         if name not in self._functions:
             self._functions[name] = ctypes.CFUNCTYPE(None, *types)(self.address(name))
         return self._functions[name]
 
 
-def compiled(text: str) -> Program:
-    """Machine code for this processor, from the cache if it is there."""
+def compile_module(text: str) -> Program:
+    """Compile a module for this processor, or load its code from the cache."""
     _start()
     key = hashlib.sha256("\n".join([text, llvmlite.__version__, *_processor()]).encode()).hexdigest()
     name, features = _processor()

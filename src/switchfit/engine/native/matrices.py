@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.engine.native.entries import Unsupported, both, choose, e_number, equal, pick
+from switchfit.engine.native.entries import Unsupported, both, choose, equal, known_number, pick
 from switchfit.engine.native.scalars import Graph, Objects
 
 MOST_ROWS_TO_PIVOT = 5
@@ -24,14 +24,14 @@ MOST_KNOWN_ROWS = 30
 
 
 def _for_each(function: Callable[..., tuple[Any, ...]], *arrays: Any) -> list[Any]:
-    """Results of a function of matrices, for arrays of matrices."""
+    """Map a function of matrices over arrays of matrices."""
     batch = arrays[0].shape[:-2]
     parts = [function(*(np.asarray(a[place], dtype=object) for a in arrays)) for place in np.ndindex(*batch)]
     return [np.stack(column).reshape(*batch, *np.shape(column[0])) for column in zip(*parts, strict=True)]
 
 
 def lu(graph: Graph, equation: Any, a: Any) -> list[Any]:
-    """As `jax.lax.linalg.lu`: L and U in one matrix, the row that each step exchanges, and the order of the rows."""
+    """Do what `jax.lax.linalg.lu` does: L and U in one matrix, the row that each step exchanges, the order."""
     _check_rows(max(a.shape[-2:]), MOST_ROWS_TO_PIVOT)
     return _for_each(lambda matrix: _lu(graph, matrix), a)
 
@@ -44,8 +44,8 @@ def _lu(graph: Graph, matrix: Objects) -> tuple[Any, ...]:
     for k in range(min(rows, columns)):
         pivots[k] = _largest(graph, a[:, k], k)
         if pivots[k] != k:
-            a = _exchanged(graph, a, k, pivots[k])
-            order = _exchanged(graph, order[:, None], k, pivots[k])[:, 0]
+            a = _exchange_rows(graph, a, k, pivots[k])
+            order = _exchange_rows(graph, order[:, None], k, pivots[k])[:, 0]
         pivot = a[k, k]
         # LAPACK leaves a column of zeros as it is.
         inverse = graph.apply("div", 1.0, choose(graph, graph.apply("eq", pivot, 0.0), 1.0, pivot))
@@ -58,19 +58,19 @@ def _lu(graph: Graph, matrix: Objects) -> tuple[Any, ...]:
 
 
 def _largest(graph: Graph, column: Objects, k: int) -> Any:
-    """Where the largest entry from k on is, the first of several; entries that are zero in any case are left out."""
+    """Return the index of the largest entry from k on, the first of several; entries known to be zero are skipped."""
     size, found = graph.apply("abs", column[k]), k
     for i in range(k + 1, len(column)):
         other = graph.apply("abs", column[i])
-        if e_number(other) == 0.0:
+        if known_number(other) == 0.0:
             continue
         larger = graph.apply("lt", size, other)
         size, found = graph.apply("select", larger, other, size), choose(graph, larger, i, found)
     return found
 
 
-def _exchanged(graph: Graph, a: Any, k: int, other: Any) -> Any:
-    """Rows with row k and another one from k on, which is known or an `Integer`, in each other's place."""
+def _exchange_rows(graph: Graph, a: Any, k: int, other: Any) -> Any:
+    """Exchange row k with another one from k on, whose index is known or an `Integer`."""
     result = a.copy()
     if isinstance(other, int):
         result[[k, other]] = a[[other, k]]
@@ -82,7 +82,7 @@ def _exchanged(graph: Graph, a: Any, k: int, other: Any) -> Any:
 
 
 def cholesky(graph: Graph, equation: Any, a: Any) -> list[Any]:
-    """As `jax.lax.linalg.cholesky` of a symmetric matrix; all is NaN if it is not positive definite."""
+    """Do what `jax.lax.linalg.cholesky` does for a symmetric matrix; all is NaN if it is not positive definite."""
     _check_rows(a.shape[-1], MOST_ROWS)
     return _for_each(lambda matrix: (_cholesky(graph, matrix),), a)
 
@@ -116,7 +116,7 @@ def _sum_of_products(graph: Graph, a: Any, b: Any) -> Any:
 
 
 def triangular_solve(graph: Graph, equation: Any, a: Any, b: Any) -> list[Any]:
-    """As `jax.lax.linalg.triangular_solve`."""
+    """Do what `jax.lax.linalg.triangular_solve` does."""
     params = equation.params
     _check_rows(a.shape[-1], MOST_ROWS if a.dtype == object else MOST_KNOWN_ROWS)
     lower = params["lower"] != params["transpose_a"]
@@ -124,14 +124,14 @@ def triangular_solve(graph: Graph, equation: Any, a: Any, b: Any) -> list[Any]:
     def solve(matrix: Objects, right: Objects) -> tuple[Any, ...]:
         matrix = matrix.T if params["transpose_a"] else matrix
         if params["left_side"]:
-            return (_substituted(graph, matrix, right, lower, params["unit_diagonal"]),)
+            return (_substitute(graph, matrix, right, lower, params["unit_diagonal"]),)
         # x A = b is A' x' = b'
-        return (_substituted(graph, matrix.T, right.T, not lower, params["unit_diagonal"]).T,)
+        return (_substitute(graph, matrix.T, right.T, not lower, params["unit_diagonal"]).T,)
 
     return _for_each(solve, a, b)
 
 
-def _substituted(graph: Graph, a: Objects, b: Objects, lower: bool, unit_diagonal: bool) -> Objects:
+def _substitute(graph: Graph, a: Objects, b: Objects, lower: bool, unit_diagonal: bool) -> Objects:
     x = b.copy()
     n = len(a)
     for i in range(n) if lower else reversed(range(n)):

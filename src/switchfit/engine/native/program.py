@@ -1,7 +1,7 @@
 """Machine code for a library of modes: written, compiled, kept.
 
 A program goes through the segments forward, then through samples and terminal costs, then backward. It is written for
-a library: which mode comes when is among what it is given.
+a library: which mode a segment has is read at run time.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from switchfit.discretization.nodes import AT_TRANSITIONS
 from switchfit.discretization.tableaus import EXPLICIT, get_tableau
 from switchfit.engine.native.adaptive import write_slope, write_step
 from switchfit.engine.native.driver import Driver
-from switchfit.engine.native.frame import handler
+from switchfit.engine.native.frame import write_handler
 from switchfit.engine.native.kernels import Kernels
-from switchfit.engine.native.llvm import Module, Program, compiled
+from switchfit.engine.native.llvm import Module, Program, compile_module
 from switchfit.engine.native.scalars import Graph
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.engine.native.trace import Unsupported
@@ -32,11 +32,11 @@ PREFIX = {Order.COST: "plain_", Order.GRADIENT: "first_", Order.HESSIAN: "", Ord
 
 
 def program_of(library: Structure, sizes: Sizes, order: Order) -> Program | str:
-    """Machine code for a library, with derivatives of an order; or the reason why JAX has to do its work.
+    """Return machine code for a library with derivatives of an order, or the reason why there is none.
 
-    That is so for implicit steps, and for functions that cannot be written as a straight line of scalars. A fit needs
-    simulations and second derivatives: they are one program. Whatever else goes wrong is a defect of this package: JAX
-    then does the work as well, and the reason begins with "internal: ".
+    There is none for implicit steps, and for functions that cannot be written as a straight line of scalars. A fit
+    needs simulations and second derivatives: they are one program. Any other failure is a defect of this package: the
+    caller falls back to JAX as well, and the reason begins with "internal: ".
     """
     with _one_at_a_time:
         both = (Order.COST, Order.HESSIAN)
@@ -46,7 +46,7 @@ def program_of(library: Structure, sizes: Sizes, order: Order) -> Program | str:
 @lru_cache(maxsize=64)
 def _program_of(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> Program | str:
     try:
-        return _compiled(library, sizes, orders)
+        return _compile(library, sizes, orders)
     except Unsupported as error:
         reason = str(error)
         log.info("Evaluated by JAX: %s.", reason)
@@ -56,7 +56,7 @@ def _program_of(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> 
     return reason
 
 
-def _compiled(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> Program:
+def _compile(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> Program:
     if get_tableau(library.solver) is not EXPLICIT:
         raise Unsupported(f"solver={library.solver!r} takes implicit steps")
     if sizes.D == 0:
@@ -66,11 +66,11 @@ def _compiled(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> Pr
         for order in orders:
             module.prefix = PREFIX[order]
             _write(module, library, sizes, order)
-    return compiled(module.text)
+    return compile_module(module.text)
 
 
-def forget_programs() -> None:
-    """Let go of all machine code that nothing works with."""
+def drop_programs() -> None:
+    """Drop cached programs that are not in use."""
     with _one_at_a_time:
         _program_of.cache_clear()
 
@@ -110,7 +110,7 @@ def _write(module: Module, library: Structure, sizes: Sizes, order: Order) -> No
         module.add(driver.backward_any())
     module.add(driver.whole())
     if order == Order.HESSIAN:
-        module.add(handler(driver))
+        module.add(write_handler(driver))
 
 
 def _write_mode(kernels: Kernels, driver: Driver, mode: int, late: bool) -> int:

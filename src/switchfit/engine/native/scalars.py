@@ -29,7 +29,7 @@ CHECKED = "check"
 
 
 class Table:
-    """Constant numbers in memory; equal ones are one."""
+    """Array of constants in memory; equal tables are shared."""
 
     __slots__ = ("_key", "values")
 
@@ -64,7 +64,7 @@ class Node:
 
     @property
     def number(self) -> Any:
-        """The number that a constant is; None for everything else."""
+        """Value of a constant; None for every other node."""
         return self.args[0] if self.op == "const" else None
 
     def __add__(self, other: Any) -> Any:
@@ -156,18 +156,18 @@ class Graph:
         self._finite: set[int] = set()
 
     def constant(self, number: Any) -> Node:
-        """A number, or a truth value."""
+        """Return the node of a number or a truth value."""
         if isinstance(number, np.ndarray):
             number = number.item()
         number = bool(number) if isinstance(number, bool | np.bool_) else float(number)
         return self._node("const", (number,), False, key=("const", type(number), number, math.copysign(1.0, number)))
 
     def load(self, pointer: str, offset: int, vector: bool = False) -> Node:
-        """What is found in memory."""
+        """Load pointer[offset]."""
         return self._node("load", (pointer, offset), vector)
 
     def loads(self, pointer: str, count: int, offset: int = 0, vector: bool = False) -> Objects:
-        """Neighbours in memory: (count,)."""
+        """Load `count` consecutive entries: (count,)."""
         return as_objects([self.load(pointer, offset + k, vector) for k in range(count)])
 
     def lookup(self, table: NDArray[np.float64], index: Node) -> Node:
@@ -179,19 +179,19 @@ class Graph:
         return self.apply("lookup", self._node("table", (constant,), False), index)
 
     def require(self, condition: Node) -> None:
-        """Leave an evaluation to JAX where a truth value is false, by way of what is presumed finite."""
+        """Presume that a truth value is true: if it is not, the evaluation falls back to JAX."""
         self.presume(self.apply("div", 1.0, self.apply("select", condition, 1.0, 0.0)))
 
     def unit(self, position: int) -> Node:
-        """The vector with one 1."""
+        """Return the unit vector e_position."""
         return self._node("unit", (position,), True)
 
     def zeros(self) -> Node:
-        """The vector of zeros."""
+        """Return the vector of zeros."""
         return self._node("zeros", (), True)
 
     def apply(self, op: str, *given: Any) -> Node:
-        """The node of an operation; it may be an older or a simpler one."""
+        """Return the node of an operation, which may be an existing or a simpler one."""
         args = tuple(a if isinstance(a, Node) else self.constant(a) for a in given)
         if args[0].op == "const" and all(a.op == "const" for a in args):
             with np.errstate(all="ignore"):
@@ -204,7 +204,7 @@ class Graph:
         return self._node(op, args, any(a.vector for a in args))
 
     def presume(self, node: Node) -> None:
-        """Note all that has to be finite for a node to be finite."""
+        """Record all nodes that have to be finite for a node to be finite."""
         pending = [node]
         while pending:
             each = pending.pop()
@@ -223,11 +223,11 @@ class Graph:
             pending += each.args
 
     def certain_product(self, factor: float, node: Node) -> Node:
-        """The product as it is, without simplification."""
+        """Return the product of a number with a node, without simplification."""
         return self._node("mul", (self.constant(factor), node), node.vector)
 
     def check(self) -> list[tuple[str, int, Node]]:
-        """A store that makes `CHECKED` not a number if anything presumed is not finite; none if nothing is."""
+        """Return the store that makes `CHECKED` NaN if a presumption is wrong; an empty list without presumptions."""
         total = self.load(CHECKED, 0)
         for node in self.presumed.values():
             total = total + self.certain_product(0.0, node)
@@ -325,7 +325,7 @@ class Namespace:
 
 
 def as_objects(values: Sequence[Any]) -> Objects:
-    """An array (len,) of nodes and numbers."""
+    """Return an object array (len,) of nodes and numbers."""
     array = np.empty(len(values), dtype=object)
     for k, value in enumerate(values):
         array[k] = value
@@ -333,7 +333,7 @@ def as_objects(values: Sequence[Any]) -> Objects:
 
 
 def needed(outputs: Sequence[Node]) -> list[Node]:
-    """All nodes that some outputs depend on, in order."""
+    """Return all nodes that some outputs depend on, in order."""
     if not outputs:
         return []
     graph = outputs[0].graph
@@ -367,9 +367,9 @@ class Template:
     def __call__(
         self, graph: Graph, *inputs: Any, only: Sequence[int] | None = None, checked: bool = False
     ) -> list[Objects]:
-        """The outputs (or `only` some, in the order asked for) for given inputs, arrays of nodes.
+        """Copy the function into a graph; return its outputs, or `only` some, for the given inputs.
 
-        With `checked` the graph presumes what the template does, for whichever of its outputs.
+        With `checked` the graph takes over all presumptions of the template.
         """
         chosen = tuple(range(len(self._flat)) if only is None else only)
         presumed = self.presumed if checked else []

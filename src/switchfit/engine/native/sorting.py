@@ -15,9 +15,9 @@ from switchfit.engine.native.entries import (
     Unsupported,
     both,
     choose,
-    e_number,
     equal,
     is_traced,
+    known_number,
     less,
 )
 from switchfit.engine.native.scalars import Graph, Node, as_objects
@@ -30,7 +30,7 @@ Entries = tuple[Any, ...]
 
 
 def sort(graph: Graph, equation: Any, *arrays: Any) -> list[Any]:
-    """As `jax.lax.sort`: stable, with NaN last, by the first `num_keys` arrays."""
+    """Do what `jax.lax.sort` does: stable, with NaN last, by the first `num_keys` arrays."""
     params = equation.params
     axis, keys = params["dimension"], params["num_keys"]
     kinds = [variable.aval.dtype.kind for variable in equation.invars[:keys]]
@@ -42,17 +42,17 @@ def sort(graph: Graph, equation: Any, *arrays: Any) -> list[Any]:
     rows = [np.moveaxis(a, axis, -1).reshape(-1, shape[axis]) for a in arrays]
     found = [np.empty(row.shape, dtype=object) for row in rows]
     for k in range(len(rows[0])):
-        entries = _sorted(graph, list(zip(*(row[k].tolist() for row in rows), strict=True)), behind)
+        entries = _sort_entries(graph, list(zip(*(row[k].tolist() for row in rows), strict=True)), behind)
         for to, column in zip(found, zip(*entries, strict=True), strict=True):
             to[k] = as_objects(column)
     moved = tuple(n for k, n in enumerate(shape) if k != axis)
     return [np.moveaxis(each.reshape(*moved, shape[axis]), -1, axis) for each in found]
 
 
-def _sorted(
+def _sort_entries(
     graph: Graph, entries: list[Entries], behind: Callable[[Entries, Entries], Any], first: int | None = None
 ) -> list[Entries]:
-    """Entries in order, or the first few of them: neighbours are exchanged where one is behind the other."""
+    """Sort entries, or the first few of them, by exchanging neighbours."""
     n = len(entries)
     if n > MOST_SORTED:
         raise Unsupported(f"sorts {n} numbers that depend on the state (limit: {MOST_SORTED})")
@@ -67,7 +67,7 @@ def _sorted(
 
 
 def _is_behind(graph: Graph, kinds: list[str], one: Entries, other: Entries) -> Any:
-    """Whether an entry comes after another by the first key in which they differ."""
+    """Return whether an entry comes after another by the first key in which they differ."""
     kind, a, b = kinds[0], one[0], other[0]
     if kind == "f":  # a > b, or a is NaN and b is not
         behind = graph.apply("and", graph.apply("not", graph.apply("le", a, b)), graph.apply("eq", b, b))
@@ -85,7 +85,7 @@ def _is_behind(graph: Graph, kinds: list[str], one: Entries, other: Entries) -> 
 
 
 def top_k(graph: Graph, equation: Any, a: Any) -> list[Any]:
-    """As `jax.lax.top_k`: the largest entries and where they are, NaN first, the first of several that are equal.
+    """Do what `jax.lax.top_k` does: the largest entries and their places, NaN first, the first of equal ones.
 
     Other than in a sort, 0.0 is larger than -0.0: the reciprocal of each entry, which is moved with it, tells.
     """
@@ -102,7 +102,7 @@ def top_k(graph: Graph, equation: Any, a: Any) -> list[Any]:
     values, places = np.empty((2, int(np.prod(shape[:-1])), k), dtype=object)
     for row, to, at in zip(a.reshape(-1, a.shape[-1]), values, places, strict=True):
         reciprocals = [graph.apply("div", 1.0, value) if kind == "f" else 0 for value in row]
-        found = _sorted(graph, list(zip(row.tolist(), range(len(row)), reciprocals, strict=True)), behind, k)[:k]
+        found = _sort_entries(graph, list(zip(row.tolist(), range(len(row)), reciprocals, strict=True)), behind, k)[:k]
         to[:], at[:], _ = (as_objects(column) for column in zip(*found, strict=True))
     return [values.reshape(shape), places.reshape(shape)]
 
@@ -119,8 +119,8 @@ def compare_in_order(graph: Graph, op: str, a: Any, b: Any) -> Any:
 
 
 def search(graph: Graph, table: Any, query: Any, right: bool) -> Any:
-    """As `jnp.searchsorted`: before which entry of a sorted table (K,) each number belongs, on one of two sides."""
-    entries = [e_number(e) if is_traced(e) else e for e in table.tolist()]
+    """Do what `jnp.searchsorted` does: find before which entry of a sorted table (K,) each number belongs."""
+    entries = [known_number(e) if is_traced(e) else e for e in table.tolist()]
     numbers = None if None in entries else np.array(entries, dtype=float)
     of_constants = numbers is not None and not any(a > b for a, b in pairwise(numbers)) and not np.isnan(numbers).any()
 
@@ -133,7 +133,7 @@ def search(graph: Graph, table: Any, query: Any, right: bool) -> Any:
 
 
 def _search(graph: Graph, table: list[Any], x: Any, right: bool) -> Any:
-    """By the comparisons that JAX makes, along all ways that they may take."""
+    """Search with the comparisons that JAX makes, along all branches."""
 
     if len(table) > MOST_CHOICES:
         raise Unsupported(f"searches {len(table)} numbers that depend on the state (limit: {MOST_CHOICES})")
@@ -151,7 +151,7 @@ def _search(graph: Graph, table: list[Any], x: Any, right: bool) -> Any:
 
 
 def _search_constants(graph: Graph, table: Any, x: Any, right: bool) -> Any:
-    """By halving, with the table in memory: log2 K turns, which do not depend on what they find."""
+    """Search by bisection with the table in memory: log2 K turns, whatever is found."""
     K = len(table)
     if K > MOST_ROWS_OF_TABLE:
         raise Unsupported(f"searches a table of {K} entries (limit: {MOST_ROWS_OF_TABLE})")

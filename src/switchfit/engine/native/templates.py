@@ -16,7 +16,7 @@ from switchfit.discretization.arguments import Arguments, Samples
 from switchfit.discretization.model import Model, Piece, apply_weights
 from switchfit.discretization.nodes import TransitionKind, get_end_constraints, get_end_cost, get_transition_function
 from switchfit.engine.native.scalars import Template
-from switchfit.engine.native.trace import traced
+from switchfit.engine.native.trace import trace_scalars
 from switchfit.problem.structure import Structure
 
 Shape = tuple[int, ...]
@@ -60,24 +60,24 @@ class Sizes:
 
     @classmethod
     def of(cls, structure: Structure, arguments: Arguments) -> Sizes:
-        """Those of one experiment."""
+        """Return the sizes of one experiment."""
         constants = tuple(np.shape(a) for a in constants_of(arguments))
         count = structure.terminal_constraint_count
         return cls(structure.n, structure.transitions, structure.M, arguments.signals.shape[2], count, constants)
 
     @property
     def D(self) -> int:
-        """Unknowns: all transition times, then p."""
+        """Number of unknowns: all transition times, then p."""
         return self.N + self.M
 
     @property
     def width(self) -> int:
-        """Entries of a vector: even, so that vector instructions of the processor fit."""
+        """Number of entries of a vector: even, so that vector instructions of the processor fit."""
         return self.D if self.D == 1 else self.D + self.D % 2
 
 
 def constants_of(arguments: Arguments) -> list[Any]:
-    """What functions of the model look at beside t, x, p and signals."""
+    """Return the arrays that functions of the model read beside t, x, p and signals."""
     return [*arguments.fixed, *arguments.weights, arguments.initial_state]
 
 
@@ -92,7 +92,7 @@ class Templates:
         self.library, self.sizes, self.order = library, sizes, order
 
     def model(self, constants: tuple[Any, ...]) -> Model:
-        """The model with traced constants."""
+        """Return the model with traced constants."""
         fixed = sum(not free for _, _, free in self.library.parameters)
         arguments = Arguments(
             nodes=jnp.zeros(2),
@@ -105,7 +105,7 @@ class Templates:
         return Model(self.library, arguments)
 
     def stage(self, mode: int, running: bool = True) -> Template:
-        """f, ell, their derivatives and those of ``w . f + hb ell``; `F` and what follows it say the places.
+        """Trace f, ell, their derivatives and those of ``w . f + hb ell``; `F` to `SECOND` are their places.
 
         Without `running` ell is left out.
         """
@@ -136,21 +136,21 @@ class Templates:
                 model.reference_residuals(piece) if costs else (), model.arguments.weights, strict=False
             ):
                 r_d = jax.jacfwd(residual, argnums=(0, 1, 2))(t, x, p)
-                second = _added(second, _normal_matrix(r_d, partial(_weigh, W, hb)))
+                second = _add_all(second, _normal_matrix(r_d, partial(_weigh, W, hb)))
             if costs and self.library.running:
 
                 def cost_of_state(x: Any, p: Any) -> Any:
                     return hb * sum(density(t, x, model.parameters(p)) for density in self.library.running)
 
-                second = _added(second, self._second_in_state(cost_of_state, x, p))
+                second = _add_all(second, self._second_in_state(cost_of_state, x, p))
             return [*slope, *cost, *jax.grad(cost_to_go, argnums=(0, 1, 2))(t, x, p), *second]
 
         also = " or a running cost" if running and (self.library.running or self.library.references) else ""
         name = f"mode {self.library.mode_names[mode]!r}{also}"
-        return traced(stage, (), (n,), (M,), (n,), (), (), (4, S), *self.sizes.constants, name=name)
+        return trace_scalars(stage, (), (n,), (M,), (n,), (), (), (4, S), *self.sizes.constants, name=name)
 
     def sample(self, k: int) -> Template:
-        """Cost of a sample and its derivatives."""
+        """Trace the cost of a sample and its derivatives."""
         q = self.library.measurements[k].channels
 
         def sample(time: Any, value: Any, weight: Any, x: Any, p: Any, *constants: Any) -> Any:
@@ -171,14 +171,14 @@ class Templates:
                 # Fisher's information of normal noise: 2 of log sigma, none between sigma and the rest.
                 log_sigma = lambda t, x, p: model.log_sigma(k, given(t), p)  # noqa: E731
                 s_d = jax.jacfwd(log_sigma, argnums=(0, 1, 2))(time, x, p)
-                second = _added(second, _normal_matrix(s_d, lambda A: 2.0 * A))
+                second = _add_all(second, _normal_matrix(s_d, lambda A: 2.0 * A))
             return [cost(time, x, p), *jax.grad(cost, argnums=(0, 1, 2))(time, x, p), *second]
 
         shapes = (), (q,), (q,), (self.sizes.n,), (self.sizes.M,)
-        return traced(sample, *shapes, *self.sizes.constants, name="observe of Measurements")
+        return trace_scalars(sample, *shapes, *self.sizes.constants, name="observe of Measurements")
 
     def late_time(self, k: int) -> Template:
-        """Of the k-th Measurements the moment of which a late sample is, and its derivative in p."""
+        """Trace the time at which a late sample of the k-th Measurements saw the state, and its derivative in p."""
 
         def time(t: Any, p: Any, *constants: Any) -> Any:
             model = self.model(constants)
@@ -186,10 +186,10 @@ class Templates:
             seen = lambda p: model.correct_delay(k, Samples(jnp.zeros((), int), t, nothing, nothing), p).time  # noqa: E731
             return [seen(p), jax.grad(seen)(p)]
 
-        return traced(time, (), (self.sizes.M,), *self.sizes.constants, name="delay of Measurements")
+        return trace_scalars(time, (), (self.sizes.M,), *self.sizes.constants, name="delay of Measurements")
 
     def end(self) -> Template:
-        """The terminal costs."""
+        """Trace the terminal costs."""
 
         def end(x: Any, p: Any, *constants: Any) -> Any:
             cost = get_end_cost(self.model(constants))
@@ -200,10 +200,10 @@ class Templates:
             gradient = jax.grad(cost, argnums=(0, 1, 2))(0.0, x, p)
             return [cost(0.0, x, p), *gradient, *self._second_in_state(lambda x, p: cost(0.0, x, p), x, p)]
 
-        return traced(end, (self.sizes.n,), (self.sizes.M,), *self.sizes.constants, name="a terminal cost")
+        return trace_scalars(end, (self.sizes.n,), (self.sizes.M,), *self.sizes.constants, name="a terminal cost")
 
     def transition(self, kind: TransitionKind, which: int) -> Template:
-        """One of the functions at transitions: a cost, or ``weight`` times a constraint beside its own first ones.
+        """Trace a function at transitions: a cost, or a constraint and ``weight`` times it.
 
         The outputs of a constraint are its value and first derivatives, then those of the weighted one.
         """
@@ -218,10 +218,10 @@ class Templates:
             return self._constraint(lambda t, x, p: function(t, x, p)[None], t, x, p, weight)
 
         shapes = (), (self.sizes.n,), (self.sizes.M,), (1,)
-        return traced(at, *shapes, *self.sizes.constants, name=f"one of the {kind.name}")
+        return trace_scalars(at, *shapes, *self.sizes.constants, name=f"one of the {kind.name}")
 
     def end_constraint(self) -> Template:
-        """All terminal constraints and their first derivatives, then those of the weighted sum."""
+        """Trace all terminal constraints and their first derivatives, then those of the weighted sum."""
 
         def end(x: Any, p: Any, weights: Any, *constants: Any) -> Any:
             function = get_end_constraints(self.model(constants))
@@ -230,10 +230,10 @@ class Templates:
             return self._constraint(function, jnp.zeros(()), x, p, weights)
 
         shapes = (self.sizes.n,), (self.sizes.M,), (self.sizes.m,)
-        return traced(end, *shapes, *self.sizes.constants, name="a terminal constraint")
+        return trace_scalars(end, *shapes, *self.sizes.constants, name="a terminal constraint")
 
     def reset(self, which: int) -> Template:
-        """A reset map, its Jacobians, and the derivatives of ``w . R``."""
+        """Trace a reset map, its Jacobians, and the derivatives of ``w . R``."""
 
         def reset(t: Any, x: Any, p: Any, w: Any, *constants: Any) -> Any:
             R = self.model(constants).reset(which)
@@ -243,10 +243,10 @@ class Templates:
             return [R(t, x, p), *jacobians, *self._derivatives(lambda t, x, p: w @ R(t, x, p), t, x, p)]
 
         n = self.sizes.n
-        return traced(reset, (), (n,), (self.sizes.M,), (n,), *self.sizes.constants, name="a reset map")
+        return trace_scalars(reset, (), (n,), (self.sizes.M,), (n,), *self.sizes.constants, name="a reset map")
 
     def start(self) -> Template:
-        """x(t0), its Jacobian (n, M) in p, and the derivatives of ``w . x(t0)``: (M,) and (M, M)."""
+        """Trace x(t0), its Jacobian (n, M) in p, and the derivatives of ``w . x(t0)``: (M,) and (M, M)."""
 
         def start(p: Any, w: Any, *constants: Any) -> Any:
             x0 = self.model(constants).initial_state
@@ -256,10 +256,10 @@ class Templates:
             second = jnp.zeros((p.size, p.size)) if self.order == Order.GAUSS_NEWTON else jax.jacfwd(jax.grad(value))(p)
             return [x0(p), jax.jacfwd(x0)(p), jax.grad(value)(p), second]
 
-        return traced(start, (self.sizes.M,), (self.sizes.n,), *self.sizes.constants, name="initial_state")
+        return trace_scalars(start, (self.sizes.M,), (self.sizes.n,), *self.sizes.constants, name="initial_state")
 
     def outputs(self) -> Template:
-        """What all sensors see, references first, then Measurements, and its derivatives in x and p."""
+        """Trace the outputs, of references, then of Measurements, and their derivatives in x and p."""
 
         def outputs(t: Any, x: Any, p: Any, *constants: Any) -> Any:
             model = self.model(constants)
@@ -270,16 +270,16 @@ class Templates:
 
             return [seen(x, p), *(jax.jacfwd(seen, argnums=(0, 1))(x, p) if self.order > Order.GRADIENT else ())]
 
-        return traced(outputs, (), (self.sizes.n,), (self.sizes.M,), *self.sizes.constants, name="observe")
+        return trace_scalars(outputs, (), (self.sizes.n,), (self.sizes.M,), *self.sizes.constants, name="observe")
 
     def _cost(self, value: Callable[..., Any], t: Any, x: Any, p: Any) -> list[Any]:
-        """A cost with its derivatives, as far as the order asks for them."""
+        """Return a cost with the derivatives of the order."""
         if self.order == Order.COST:
             return [value(t, x, p)]
         return [value(t, x, p), *self._derivatives(value, t, x, p)]
 
     def _constraint(self, function: Callable[..., Any], t: Any, x: Any, p: Any, weights: Any) -> list[Any]:
-        """Values (m,) with Jacobians in t, x and p, then the derivatives of ``weights . c``."""
+        """Return values (m,) with Jacobians in t, x and p, then the derivatives of ``weights . c``."""
         if self.order == Order.COST:
             return [function(t, x, p)]
         jacobians = jax.jacfwd(function, argnums=(0, 1, 2))(t, x, p)
@@ -290,7 +290,7 @@ class Templates:
         ]
 
     def _derivatives(self, value: Callable[..., Any], t: Any, x: Any, p: Any) -> list[Any]:
-        """First and second derivatives; at the order of Gauss-Newton the second ones are left out."""
+        """Return first and second derivatives; at the order of Gauss-Newton the second ones are zero."""
         if self.order != Order.GAUSS_NEWTON:
             return _first_and_second(value, t, x, p)
         return [*jax.grad(value, argnums=(0, 1, 2))(t, x, p), *self._no_second()]
@@ -300,21 +300,21 @@ class Templates:
         return [jnp.zeros(shape) for shape in ((), (n,), (n, n), (M,), (M, n), (M, M))]
 
     def _second_in_state(self, value: Callable[..., Any], x: Any, p: Any) -> list[Any]:
-        """Second derivatives of a function of (x, p), those in t being zero."""
+        """Return the second derivatives of a function of (x, p); those in t are zero."""
         (xx, _), (px, pp) = jax.jacfwd(jax.grad(value, argnums=(0, 1)), argnums=(0, 1))(x, p)
         tt, xt, _, pt, _, _ = self._no_second()
         return [tt, xt, xx, pt, px, pp]
 
 
 def _first_and_second(value: Callable[..., Any], *at: Any) -> list[Any]:
-    """First derivatives of a scalar in t, x, p, and second in tt, xt, xx, pt, px, pp."""
+    """Return the first derivatives of a scalar in t, x, p, and second in tt, xt, xx, pt, px, pp."""
     gradient = jax.grad(value, argnums=(0, 1, 2))
     (tt, _, _), (xt, xx, _), (pt, px, pp) = jax.jacfwd(gradient, argnums=(0, 1, 2))(*at)
     return [*gradient(*at), tt, xt, xx, pt, px, pp]
 
 
 def _normal_matrix(r_d: tuple[Any, Any, Any], weigh: Callable[[Any], Any]) -> list[Any]:
-    """``r_d' W r_d`` along (t, x, p) by its parts tt, xt, xx, pt, px, pp; `weigh` multiplies by W from the left."""
+    """Return ``r_d' W r_d`` along (t, x, p) by its parts tt, xt, xx, pt, px, pp; `weigh` multiplies by W."""
     t, x, p = r_d
     Wt, Wx, Wp = weigh(t[:, None])[:, 0], weigh(x), weigh(p)
     return [t @ Wt, x.T @ Wt, x.T @ Wx, p.T @ Wt, p.T @ Wx, p.T @ Wp]
@@ -324,5 +324,5 @@ def _weigh(W: Any, factor: Any, A: Any) -> Any:
     return factor * apply_weights(W, A)
 
 
-def _added(one: list[Any], other: list[Any]) -> list[Any]:
+def _add_all(one: list[Any], other: list[Any]) -> list[Any]:
     return [a + b for a, b in zip(one, other, strict=True)]

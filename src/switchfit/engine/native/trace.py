@@ -20,14 +20,14 @@ import numpy as np
 from jax._src import source_info_util
 
 from switchfit.engine.native.entries import Integer, Unsupported, choose, is_traced, less
-from switchfit.engine.native.indexing import added, dynamic_slice, dynamic_update_slice, gather, scatter
+from switchfit.engine.native.indexing import add_where, dynamic_slice, dynamic_update_slice, gather, scatter
 from switchfit.engine.native.integers import OF_INTEGERS, from_double, invert
 from switchfit.engine.native.matrices import MATRICES
 from switchfit.engine.native.operations import OPERATIONS
 from switchfit.engine.native.scalars import Graph, Node, Objects, Template, as_objects
 from switchfit.engine.native.sorting import SORTING, compare_in_order, search
 
-__all__ = ["Unsupported", "traced"]
+__all__ = ["Unsupported", "trace_scalars"]
 
 
 MOST_NODES = 10_000
@@ -37,8 +37,10 @@ MOST_TURNS = 100_000
 """Turns of a loop beyond which it is not followed."""
 
 
-def traced(function: Callable[..., Sequence[Any]], *shapes: tuple[int, ...], name: str = "the function") -> Template:
-    """A function of float64 arrays of the given shapes, which returns a flat list of arrays.
+def trace_scalars(
+    function: Callable[..., Sequence[Any]], *shapes: tuple[int, ...], name: str = "the function"
+) -> Template:
+    """Trace a function of float64 arrays of the given shapes, which returns a flat list of arrays.
 
     Raises
     ------
@@ -82,20 +84,20 @@ def _run(graph: Graph, jaxpr: Any, consts: Sequence[Any], inputs: Sequence[Any])
                 raise Unsupported(f"takes more than {MOST_NODES} operations")
             results = _apply(graph, equation, [of(a) for a in equation.invars])
         except Unsupported as error:
-            raise _located(error, equation) from None
+            raise _add_location(error, equation) from None
         for variable, value in zip(equation.outvars, results, strict=True):
             known[variable] = _as_array(value)
     return [of(a) for a in jaxpr.outvars]
 
 
 def _as_array(value: Any) -> Any:
-    """A NumPy array; keys of random numbers, which NumPy does not know, stay as they are."""
+    """Return a NumPy array; keys of random numbers, which NumPy does not know, stay as they are."""
     extended = isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended)
     return value if extended or isinstance(value, np.ndarray) else np.asarray(value)
 
 
-def _located(error: Unsupported, equation: Any) -> Unsupported:
-    """The same with the line of the user's code, and the name of JAX's function that this line calls.
+def _add_location(error: Unsupported, equation: Any) -> Unsupported:
+    """Add the line of the user's code, and the name of JAX's function that it calls.
 
     Functions of JAX such as `jnp.sort` are traced once for all their callers. What their inner operations say of where
     they stand may thus be the place of another call.
@@ -111,7 +113,7 @@ def _located(error: Unsupported, equation: Any) -> Unsupported:
 
 
 def _public_name(jaxpr: Any) -> str | None:
-    """What users call a function of JAX; None for any other function."""
+    """Return the public name of a function of JAX; None for any other function."""
     info = getattr(jaxpr, "debug_info", None)
     file, name = getattr(info, "func_filename", None), str(getattr(info, "func_name", "")).lstrip("_")
     if file is None or not file.startswith(os.path.dirname(jax.__file__) + os.sep):
@@ -142,7 +144,7 @@ def _modules() -> list[tuple[str, Any]]:
 
 
 def _line_of(equation: Any) -> str | None:
-    """File and line of the user's code from which an operation comes; None if JAX does not say."""
+    """Return file and line of the user's code from which an operation comes; None if JAX does not say."""
     try:  # not public: what JAX says where it fails may be said in another way one day
         frame = source_info_util.user_frame(equation.source_info.traceback)
         return None if frame is None else f"{os.path.basename(frame.file_name)}:{frame.start_line}"
@@ -171,7 +173,7 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
             dtype = equation.outvars[0].aval.dtype
             return [np.asarray(INDEXED[name](graph, equation, *args)).astype(dtype)]
     if known and name not in MOVES and name not in NUMPY:
-        return _evaluated(equation, args)
+        return _evaluate_known(equation, args)
     if name in LOOPS:
         return LOOPS[name](graph, equation, args)
     if name in MOVES:
@@ -180,7 +182,7 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
     if known:
         dtype = equation.outvars[0].aval.dtype
         if name == "convert_element_type" and args[0].dtype.kind == "f" and dtype.kind in "iu":
-            return _evaluated(equation, args)  # NumPy and JAX differ where a number does not fit
+            return _evaluate_known(equation, args)  # NumPy and JAX differ where a number does not fit
         return [np.asarray(NUMPY[name](params, *args)).astype(dtype).reshape(shapes[0])]
     if name in WRITTEN_OUT:
         for variable in equation.invars:
@@ -195,15 +197,15 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
     return [np.asarray(np.frompyfunc(meaning, len(args), 1)(*args), dtype=object)]
 
 
-def _evaluated(equation: Any, args: list[Any]) -> list[Any]:
-    """An operation on known numbers, by JAX."""
+def _evaluate_known(equation: Any, args: list[Any]) -> list[Any]:
+    """Evaluate an operation on known numbers by JAX."""
     with jax.ensure_compile_time_eval():
         results = equation.primitive.bind(*args, **equation.params)
     return [_as_array(a) for a in (results if equation.primitive.multiple_results else [results])]
 
 
 def _meaning(graph: Graph, name: str, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
-    """What an operation does to entries of arrays of a type."""
+    """Return what an operation does to entries of arrays of a type."""
     _check_type(dtype)
     if dtype.kind in "iu":
         if name in OF_INTEGERS:
@@ -223,7 +225,7 @@ def _check_type(dtype: np.dtype[Any]) -> None:
 
 
 def _is_search(equation: Any) -> bool:
-    """Whether JAX searches one sorted array with a loop, as `jnp.interp` does as well.
+    """Return whether JAX searches one sorted array with a loop, as `jnp.interp` does too.
 
     Behind the array and the numbers come tangents, which an index does not depend on.
     """
@@ -251,7 +253,7 @@ OTHER_NAMES = {"while": "jax.lax.while_loop", "eigh": "jnp.linalg.eigh", "eig": 
 
 
 def _scan(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
-    """A loop of known length, one turn after another."""
+    """Unroll a loop of known length."""
     params = equation.params
     fixed, carried, length = params["num_consts"], params["num_carry"], params["length"]
     consts, carry, columns = args[:fixed], args[fixed : fixed + carried], args[fixed + carried :]
@@ -269,7 +271,7 @@ def _scan(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
 
 
 def _while(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
-    """A loop whose condition never depends on the state."""
+    """Unroll a loop whose condition never depends on the state."""
     params = equation.params
     condition, body = params["cond_jaxpr"], params["body_jaxpr"]
     first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
@@ -285,7 +287,7 @@ def _while(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
 
 
 def _cond(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
-    """All branches, and a choice among their results."""
+    """Trace all branches, and choose among their results."""
     which, *operands = args
     branches = [
         (lambda branch=branch: _run(graph, branch.jaxpr, branch.consts, operands))
@@ -303,7 +305,7 @@ def _cond(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
 
 
 def _linear_solve(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
-    """A linear system, by the solver that comes with it; its derivatives have been taken before."""
+    """Trace the solver of a linear system; its derivatives have been taken before."""
     lengths, jaxprs = equation.params["const_lengths"], equation.params["jaxprs"]
     before = lengths.matvec + lengths.vecmat
     right = before + lengths.solve + (lengths.transpose_solve if jaxprs.transpose_solve is not None else 0)
@@ -349,7 +351,7 @@ def _slice(params: Any, a: Any) -> Any:
 
 
 def _pad(params: Any, a: Any, value: Any) -> Any:
-    """Entries between and around those of an array; a negative number at an end cuts entries off."""
+    """Add entries between and around those of an array; a negative number at an end cuts entries off."""
     config = params["padding_config"]
     whole = [n + max(n - 1, 0) * inner for n, (_, _, inner) in zip(a.shape, config, strict=True)]
     shape = [max(low, 0) + n + max(high, 0) for n, (low, high, _) in zip(whole, config, strict=True)]
@@ -410,11 +412,11 @@ NUMPY: dict[str, Callable[..., Any]] = {
 # Doubles
 
 
-def _simply(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
+def _apply_operation(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
     return lambda graph, params: partial(graph.apply, op)
 
 
-def _swapped(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
+def _apply_swapped(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
     return lambda graph, params: lambda a, b: graph.apply(op, b, a)
 
 
@@ -445,7 +447,7 @@ def _integer_power(graph: Graph, params: Any) -> Callable[[Any], Any]:
 
 
 def _select(graph: Graph, params: Any) -> Callable[..., Any]:
-    """Of several cases that which a truth value or an integer says."""
+    """Select one of several cases by a truth value or an integer."""
 
     def select(which: Any, *cases: Any) -> Any:
         if not isinstance(which, Node | Integer):
@@ -461,7 +463,7 @@ def _select(graph: Graph, params: Any) -> Callable[..., Any]:
 
 
 def _round(graph: Graph, params: Any) -> Callable[[Any], Any]:
-    """To the nearest integer; of two the even one, or the one farther from zero."""
+    """Round to the nearest integer; a half to the even one, or away from zero."""
     to_even = params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN
     return partial(graph.apply, "rint" if to_even else "round")
 
@@ -475,9 +477,9 @@ def _sign(graph: Graph, params: Any) -> Callable[[Any], Any]:
 
 
 MEANINGS: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
-    **{name: _simply(op) for op, operation in OPERATIONS.items() for name in operation.primitives},
-    "gt": _swapped("lt"),
-    "ge": _swapped("le"),
+    **{name: _apply_operation(op) for op, operation in OPERATIONS.items() for name in operation.primitives},
+    "gt": _apply_swapped("lt"),
+    "ge": _apply_swapped("le"),
     "convert_element_type": _convert_number,
     "integer_pow": _integer_power,
     "square": lambda graph, params: lambda a: a * a,
@@ -513,7 +515,7 @@ def _convert_truth(graph: Graph, params: Any) -> Callable[[Any], Any]:
 
 
 OF_TRUTH: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
-    **{name: _simply(op) for op, operation in OPERATIONS.items() for name in operation.of_truth},
+    **{name: _apply_operation(op) for op, operation in OPERATIONS.items() for name in operation.of_truth},
     "eq": _logic(lambda do, a, b: do("not", do("xor", a, b))),
     "lt": _logic(lambda do, a, b: do("and", do("not", a), b)),
     "le": _logic(lambda do, a, b: do("or", do("not", a), b)),
@@ -551,8 +553,8 @@ def _contract(a: Any, b: Any, axes: Any) -> Objects:
     return np.asarray(np.tensordot(a, b, axes=axes), dtype=object)
 
 
-def _reduced(name: str) -> Callable[..., Any]:
-    """One operation over some axes."""
+def _reduce(name: str) -> Callable[..., Any]:
+    """Reduce over axes by an operation."""
 
     def over(graph: Graph, equation: Any, a: Any) -> Any:
         axes, dtype = equation.params["axes"], equation.invars[0].aval.dtype
@@ -565,8 +567,8 @@ def _reduced(name: str) -> Callable[..., Any]:
     return over
 
 
-def _accumulated(name: str) -> Callable[..., Any]:
-    """One operation over all entries up to each along an axis."""
+def _accumulate(name: str) -> Callable[..., Any]:
+    """Accumulate along an axis by an operation."""
 
     def along(graph: Graph, equation: Any, a: Any) -> Any:
         axis, turned = equation.params["axis"], equation.params["reverse"]
@@ -578,8 +580,8 @@ def _accumulated(name: str) -> Callable[..., Any]:
     return along
 
 
-def _first(name: str) -> Callable[..., Any]:
-    """Where along an axis the largest (or smallest) entry is, the first of several; a NaN counts as such."""
+def _find_first(name: str) -> Callable[..., Any]:
+    """Find the largest (or smallest) entry along an axis, the first of several; a NaN counts as such."""
 
     def along(graph: Graph, equation: Any, a: Any) -> Any:
         (axis,), dtype = equation.params["axes"], equation.invars[0].aval.dtype
@@ -602,26 +604,26 @@ def _first(name: str) -> Callable[..., Any]:
 
 
 ARRAYS: dict[str, Callable[..., Any]] = {
-    "argmax": _first("gt"),
-    "argmin": _first("lt"),
+    "argmax": _find_first("gt"),
+    "argmin": _find_first("lt"),
     "dot_general": _dot,
-    "reduce_sum": _reduced("add"),
-    "reduce_prod": _reduced("mul"),
-    "reduce_max": _reduced("max"),
-    "reduce_min": _reduced("min"),
-    "reduce_and": _reduced("and"),
-    "reduce_or": _reduced("or"),
-    "reduce_xor": _reduced("xor"),
-    "cumsum": _accumulated("add"),
-    "cumprod": _accumulated("mul"),
-    "cummax": _accumulated("max"),
-    "cummin": _accumulated("min"),
+    "reduce_sum": _reduce("add"),
+    "reduce_prod": _reduce("mul"),
+    "reduce_max": _reduce("max"),
+    "reduce_min": _reduce("min"),
+    "reduce_and": _reduce("and"),
+    "reduce_or": _reduce("or"),
+    "reduce_xor": _reduce("xor"),
+    "cumsum": _accumulate("add"),
+    "cumprod": _accumulate("mul"),
+    "cummax": _accumulate("max"),
+    "cummin": _accumulate("min"),
 }
 """Operations on whole arrays."""
 
 
 def _scatter(name: str | None) -> Callable[..., Any]:
-    """A scatter that combines old entries with updates by an operation, or replaces them."""
+    """Return a scatter that combines old entries with updates by an operation, or replaces them."""
 
     def scattered(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any) -> Any:
         dtype = equation.outvars[0].aval.dtype
@@ -634,7 +636,7 @@ def _scatter(name: str | None) -> Callable[..., Any]:
         def combine(here: Any, old: Any, update: Any) -> Any:
             return choose(graph, here, update if name is None else apply(old, update), old)
 
-        how = added(graph, apply, dtype.kind in "iu") if name == "add" else combine
+        how = add_where(graph, apply, dtype.kind in "iu") if name == "add" else combine
         return scatter(graph, equation, a, indices, updates, how)
 
     return scattered

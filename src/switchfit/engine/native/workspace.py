@@ -35,13 +35,13 @@ WHOLE_OF_SAMPLES = ("cell", "segment")
 
 
 class Length(NamedTuple):
-    """A length that grows with the number of rows."""
+    """A size, in doubles, that grows with the number of rows."""
 
     fixed: int
     each_row: int = 0
 
     def at(self, rows: int) -> int:
-        """The length for a number of rows."""
+        """Return the size for a number of rows."""
         return self.fixed + self.each_row * rows
 
 
