@@ -25,7 +25,7 @@ tests of such functions are marked with `promotes`.
 for name, (strict, _) in PROMOTION.items():
     jax.config.update(name, strict)
 
-# Nearly all programs of the tests run for milliseconds. The processes that tests start have XLA's defaults, as users do.
+# Nearly all programs of the tests run for milliseconds. Processes that tests start have XLA's defaults, as users do.
 jax.config.update("jax_disable_most_optimizations", True)
 
 MOST_MAPPINGS = 20_000
