@@ -20,8 +20,9 @@ demo: $(VENV)/.installed
 	$(BIN)/switchfit fit examples/toss/problem.toml --out out/demo
 	$(BIN)/switchfit fit examples/vehicle/problem.toml --out out/demo-vehicle
 
+# One process has all of a file: its tests share programs.
 test: $(VENV)/.installed-dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
 test-slow: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) -m "slow or fuzz or not slow"

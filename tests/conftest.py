@@ -1,4 +1,6 @@
-"""Settings for all tests: the same examples in every run, strict promotion, programs dropped after each file."""
+"""Settings for all tests: the same examples in every run, strict promotion, programs that compile quickly."""
+
+from pathlib import Path
 
 import jax
 import pytest
@@ -23,6 +25,12 @@ tests of such functions are marked with `promotes`.
 for name, (strict, _) in PROMOTION.items():
     jax.config.update(name, strict)
 
+# Nearly all programs of the tests run for milliseconds. Processes that tests start have XLA's defaults, as users do.
+jax.config.update("jax_disable_most_optimizations", True)
+
+MOST_MAPPINGS = 20_000
+"""Pieces of memory that a process may map before compiled programs are dropped; the kernel allows 65,530."""
+
 
 @pytest.fixture(autouse=True)
 def _promotion(request):
@@ -38,8 +46,13 @@ def _promotion(request):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _programs_let_go():
-    """A process may map some 65,000 pieces of memory; the programs of all tests together need more, and XLA crashes."""
+def _drop_programs():
+    """Drop compiled programs where they are many: those of all tests together need more mappings, and XLA crashes.
+
+    After every file it would cost: the small programs that all files share are then compiled again and again.
+    """
     yield
-    jax.clear_caches()
-    drop_programs()
+    maps = Path("/proc/self/maps")  # on Linux, where the limit is
+    if maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPPINGS:
+        jax.clear_caches()
+        drop_programs()

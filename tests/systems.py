@@ -29,6 +29,7 @@ from switchfit.problem.experiment import Experiment, Parameter
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
+from switchfit.runtime.cache import use_compilation_cache
 
 KINDS = ("running", "reference", "samples", "terminal", "all")
 CELLS = 176
@@ -166,11 +167,11 @@ class Derivatives:
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`jax.jit` in float64, compiled quickly: these programs run for milliseconds."""
-    program = jax.jit(function, compiler_options={"xla_backend_optimization_level": 0})
+    """`jax.jit` in float64, with the programs of other processes: several files of tests differentiate the same."""
+    program = jax.jit(function)
 
     def call(arguments: Arguments, tau: Any, p: Any, side: int = 1) -> Any:
-        with use_float64():
+        with use_float64(), use_compilation_cache():
             return jax.block_until_ready(program(arguments, jnp.asarray(tau), jnp.asarray(p), jnp.asarray(side)))
 
     return call

@@ -69,8 +69,7 @@ def exact():
                 cost(theta, jax.vmap(jax.scipy.linalg.expm)),
                 jax.grad(cost)(theta, jax.vmap(jax.scipy.linalg.expm)),
                 jax.hessian(cost)(theta, jax.vmap(jax.scipy.linalg.expm)),
-            ),
-            compiler_options={"xla_backend_optimization_level": 0},
+            )
         )
         return tuple(np.asarray(value) for value in closed(jnp.asarray(THETA)))
 

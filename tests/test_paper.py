@@ -76,6 +76,7 @@ def test_magic_formula_reference_gives_values_like_the_paper_and_sixteen_coeffic
     assert values[0] < 1e-12 * values[-1]
 
 
+@pytest.mark.slow
 def test_error_grows_with_noise_and_is_largest_for_mu(tmp_path, monkeypatch):
     monkeypatch.setattr(noise, "QUICK_LEVELS", (0.0, 0.05, 0.25, 0.5))
     found = found_by(noise, tmp_path)
@@ -106,6 +107,7 @@ def test_trials_converge_in_fewer_than_fifteen_iterations_and_a_reset_explains_t
         assert trial["fits"]["reset"]["cost"] < 0.25 * trial["fits"]["continuous"]["cost"]
 
 
+@pytest.mark.slow
 def test_a_longer_horizon_is_more_accurate_but_does_not_always_widen_the_region_of_starts(tmp_path, monkeypatch):
     monkeypatch.setattr(horizon, "QUICK_ENDS", (8.0, 15.0, 26.0))
     found = found_by(horizon, tmp_path)

@@ -175,29 +175,49 @@ SEQUENCES = {
 }
 
 
+def slopes_of(evaluator, simulation):
+    """Derivatives of the states behind the rows in all of theta, (Q, n, d): 0 for unknowns that have no part."""
+    own = simulation.tangents.after
+    slopes = np.zeros((*own.shape[:2], len(evaluator.problem.initial_theta)))
+    slopes[..., evaluator.problem.places[0]] = own
+    return slopes
+
+
 @pytest.mark.parametrize("data", ["samples", "late", "reference, running", "transitions"])
 def test_sequences_of_any_length_run_in_a_program_with_room_for_them(data):
-    """Sequences with fewer transitions leave segments idle: same cost, derivatives, simulations, guards."""
+    """Sequences with fewer transitions leave segments idle: all is as in a program of their own length.
+
+    JAX takes part in the shortest case with a transition: it compiles its programs for every length.
+    """
     system = sf.HybridSystem(MODES, [0.4, 0.1], BOUNCE, guards=GUARDS)
-    counts = []
+    compiled = []
     for sequence, times in SEQUENCES.items():
-        given = problem(DATA[data], sequence, times, system, MORE, max_transitions=4)
-        native, by_jax = both(given)
-        theta = given.initial_theta
-        found, expected = native(theta), by_jax(theta)
-        np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-12)
-        np.testing.assert_allclose(found.gradient, expected.gradient, rtol=1e-10, atol=1e-10)
-        np.testing.assert_allclose(found.hessian, expected.hessian, rtol=1e-9, atol=1e-8)
-        assert native.cost(theta) == pytest.approx(expected.cost, rel=1e-12)
-        for one, other in zip(*(each.simulate(theta, tangents=True) for each in (native, by_jax)), strict=True):
-            np.testing.assert_allclose(one.after, other.after, rtol=1e-11, atol=1e-12)
-            np.testing.assert_allclose(one.tangents.after, other.tangents.after, rtol=1e-10, atol=1e-11)
-        if given.constraint_names:
-            one, other = (each.constrained(theta, 1, 0.7, 2.0) for each in (native, by_jax))
-            np.testing.assert_allclose(one.jacobian, other.jacobian, rtol=1e-10, atol=1e-11)
-            np.testing.assert_allclose(one.hessian, other.hessian, rtol=1e-9, atol=1e-8)
-        counts.append(programs())
-    assert len(set(counts)) == 1
+        own = Evaluator(problem(DATA[data], sequence, times, system, MORE, engine="native"))
+        room = replace(own.problem, max_transitions=4)
+        others = [own]
+        if sequence == ("fall", "swing"):
+            others.append(Evaluator(replace(room, engine="jax"), meshes=own.meshes))
+        before = programs()
+        native = Evaluator(room, meshes=own.meshes)
+        theta = room.initial_theta
+        found, cost, simulations = native(theta), native.cost(theta), native.simulate(theta, tangents=True)
+        constrained = native.constrained(theta, 1, 0.7, 2.0) if room.constraint_names else None
+        compiled.append(programs() - before)
+        for other in others:
+            expected = other(theta)
+            np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-12)
+            np.testing.assert_allclose(found.gradient, expected.gradient, rtol=1e-10, atol=1e-10)
+            np.testing.assert_allclose(found.hessian, expected.hessian, rtol=1e-9, atol=1e-8)
+            assert cost == pytest.approx(expected.cost, rel=1e-12)
+            for one, its in zip(simulations, other.simulate(theta, tangents=True), strict=True):
+                np.testing.assert_allclose(one.after, its.after, rtol=1e-11, atol=1e-12)
+                slopes = slopes_of(native, one), slopes_of(other, its)
+                np.testing.assert_allclose(*slopes, rtol=1e-10, atol=1e-11)
+            if constrained is not None:
+                expected = other.constrained(theta, 1, 0.7, 2.0)
+                np.testing.assert_allclose(constrained.jacobian, expected.jacobian, rtol=1e-10, atol=1e-11)
+                np.testing.assert_allclose(constrained.hessian, expected.hessian, rtol=1e-9, atol=1e-8)
+    assert not any(compiled[1:]), "a sequence needs a program of its own"
 
 
 @pytest.mark.parametrize("room", [2, 4])

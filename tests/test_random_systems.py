@@ -14,7 +14,6 @@ from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -627,14 +626,6 @@ def _constrained(
 
 
 # The tests
-
-
-@pytest.fixture(autouse=True)
-def _quickly_compiled():
-    """These programs run for milliseconds: XLA need not make them fast."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 PLAIN: dict[str, Any] = {

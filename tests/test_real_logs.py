@@ -86,23 +86,34 @@ CASES = {
 }
 
 
+COMBINED = ("cauchy, noise", "priors", "delay, noise, huber")
+"""Cases whose derivatives are checked by default: JAX compiles five programs for each."""
+
+
 @pytest.fixture(scope="module", params=CASES)
 def case(request):
     return CASES[request.param]()
 
 
-def test_taylor_remainders_have_orders_1_2_3_and_the_papers_equations_agree(case):
-    check = sf.check_derivatives(case)
+@pytest.fixture(
+    scope="module", params=[pytest.param(name, marks=[pytest.mark.slow] * (name not in COMBINED)) for name in CASES]
+)
+def differentiated(request):
+    return CASES[request.param]()
+
+
+def test_taylor_remainders_have_orders_1_2_3_and_the_papers_equations_agree(differentiated):
+    check = sf.check_derivatives(differentiated)
     np.testing.assert_allclose(check.observed_orders, [1.0, 2.0, 3.0], atol=0.1)
     assert max(check.gradient_gap, check.hessian_gap) < 1e-6
     assert check.passed
 
 
-def test_methods_agree(case):
-    expected = sf.evaluate(case, method="autodiff")
+def test_methods_agree(differentiated):
+    expected = sf.evaluate(differentiated, method="autodiff")
     assert np.abs(np.diag(expected.hessian)).min() > 1e-3, "an unknown is not tested"
     for method in ("forward", "discrete-adjoint"):
-        found = sf.evaluate(case, method=method)
+        found = sf.evaluate(differentiated, method=method)
         assert found.cost == pytest.approx(expected.cost, rel=1e-12)
         for a, b in ((found.gradient, expected.gradient), (found.hessian, expected.hessian)):
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * np.abs(b).max())

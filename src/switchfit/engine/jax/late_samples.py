@@ -20,7 +20,7 @@ from jax import lax
 
 from switchfit.discretization.arguments import Samples
 from switchfit.discretization.model import Model, Piece
-from switchfit.discretization.propagation import Path, flatten_rows, step_to_late_sample
+from switchfit.discretization.propagation import Path, find_late_rows, flatten_rows, step_to_late_sample
 
 Array = jax.Array
 
