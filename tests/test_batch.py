@@ -183,7 +183,7 @@ def test_several_experiments_each_with_its_own_noise():
 def test_lockstep_is_the_same_as_one_after_the_other():
     work = work_of(room(), TRUTH, np.array([1.7, 1.0]))
     values = np.stack([work._draw_run(k)[0, 0] for k in range(12)])
-    varying, starts = work._varying({(0, 0): values}), np.repeat(work.start[None], 12, axis=0)
+    varying, starts = work._stack_values({(0, 0): values}), np.repeat(work.start[None], 12, axis=0)
     settings = {"tolerance": 1e-7, "max_iterations": 200}
     one, other = (fit_chunk(work.problem, work.meshes, varying, starts, **settings, lockstep=m) for m in (False, True))
     np.testing.assert_allclose(one.theta, other.theta, rtol=0, atol=1e-10)
@@ -481,14 +481,14 @@ def test_a_problem_is_pickled_without_its_programs():
 
 def test_nothing_is_compiled_for_other_data_or_another_number_of_runs():
     work = work_of(room(), TRUTH, TRUTH)
-    varying = Varying(*work._varying({(0, 0): np.zeros((3, 24, 1))}))
+    varying = Varying(*work._stack_values({(0, 0): np.zeros((3, 24, 1))}))
     settings = {"tolerance": 1e-7, "max_iterations": 200}
     fit_chunk(work.problem, work.meshes, varying, np.repeat(TRUTH[None], 3, axis=0), **settings)
     before = jax.config.jax_log_compiles
     from switchfit.batch.program import _fits
 
     count = _fits._cache_size()
-    more = Varying(*work._varying({(0, 0): np.ones((7, 24, 1))}))
+    more = Varying(*work._stack_values({(0, 0): np.ones((7, 24, 1))}))
     fit_chunk(work.problem, work.meshes, more, np.repeat(TRUTH[None], 7, axis=0), **settings)
     assert _fits._cache_size() == count
     assert jax.config.jax_log_compiles is before
