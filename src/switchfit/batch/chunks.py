@@ -45,7 +45,7 @@ class Work(Protocol):
         """Arrays with one entry for each of the runs."""
         ...
 
-    def compute_fingerprint(self) -> str:
+    def fingerprint(self) -> str:
         """Return a digest that changes with everything that a result depends on."""
         ...
 
@@ -80,7 +80,7 @@ def run_chunks(
         If the folder holds the chunks of something else.
     """
     chunks = [range(first, min(first + work.size, count)) for first in range(0, count, work.size)]
-    store = None if folder is None else _Store(Path(folder), work.compute_fingerprint(), work.size)
+    store = None if folder is None else _Store(Path(folder), work.fingerprint(), work.size)
     results: dict[int, Arrays] = {}
     if store is not None:
         results = {chunk.start: found for chunk in chunks if (found := store.load(chunk)) is not None}

@@ -160,7 +160,7 @@ class _Work:
                 arrays, k, estimate(problem, tolerance=self.tolerance, max_iterations=self.max_iterations, start=theta)
             )
 
-    def compute_fingerprint(self) -> str:
+    def fingerprint(self) -> str:
         parts: list[Any] = ["logs", len(self.problems), self.tolerance, self.max_iterations]
         for problem in self.problems:
             parts += [problem.theta_names, problem.initial_theta, *problem.unknowns.priors, problem.digests]

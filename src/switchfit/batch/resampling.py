@@ -403,7 +403,7 @@ class _Runs:
                 changed[samples.weight] = weights[:, e, None, None] * np.asarray(leaves[samples.weight])[None]
         return Varying(tuple(changed), tuple(changed.values()))
 
-    def compute_fingerprint(self) -> str:
+    def fingerprint(self) -> str:
         unknowns = self.problem.unknowns
         settings = self.seed, self.tolerance, self.max_iterations, unknowns.names, self.problem.solver
         leaves = jax.tree.leaves([build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes)])

@@ -458,7 +458,7 @@ class _Work:
                     channel += q
         return Varying(tuple(changed), tuple(changed.values()))
 
-    def compute_fingerprint(self) -> str:
+    def fingerprint(self) -> str:
         unknowns = self.problem.unknowns
         data = [np.asarray(values) for items in self.clean for values in items if values is not None]
         drawn = list(self._draw_run(self.sound).values())  # stands for the noise, which may be a function

@@ -209,7 +209,7 @@ class _Work:
         found = redo_unresolved(found, lambda k: self.problem, self.meshes, **settings)
         return {**found._asdict(), "start": starts, "samples": np.full(len(runs), count_samples(self.problem))}
 
-    def compute_fingerprint(self) -> str:
+    def fingerprint(self) -> str:
         unknowns = self.problem.unknowns
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
         leaves = jax.tree.leaves([build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes)])
