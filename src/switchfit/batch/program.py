@@ -268,7 +268,7 @@ def _fits(
         def piece(theta: jax.Array) -> jax.Array:
             """The cell in which each free transition time lies; these are not scaled."""
             cells = [
-                jnp.searchsorted(a.nodes, theta[place], side="right")
+                jnp.searchsorted(a.nodes, theta[place], side="right").astype(int)
                 for a, structure, places in zip(here, layout.structures, layout.places, strict=True)
                 for place in places[: structure.N]
                 if place >= 0

@@ -335,7 +335,7 @@ def _direction(state: State, constraints: Constraints) -> tuple[Array, Array]:
 
     def absolute() -> Array:
         values, vectors = jnp.linalg.eigh(scaled)
-        return (vectors * algebra.positive_eigenvalues(values, jnp)) @ vectors.T
+        return (vectors * algebra.positive_eigenvalues(values, jnp)[None]) @ vectors.T
 
     matrix = lax.cond(definite, lambda: scaled, absolute)
     factor = jnp.linalg.cholesky(matrix)
@@ -352,7 +352,7 @@ def _direction(state: State, constraints: Constraints) -> tuple[Array, Array]:
     def constrained() -> Array:
         # In white variables e = Lᵀ D d: minimise ½‖e − e_0‖² subject to G e >= c with unit rows, by its dual.
         normals = constraints.normals
-        rows = jax.scipy.linalg.solve_triangular(factor, (normals / scaling).T, lower=True).T
+        rows = jax.scipy.linalg.solve_triangular(factor, (normals / scaling[None]).T, lower=True).T
         unit, norms = algebra.unit_rows(rows, jnp)
         gap = (normals @ newton - offsets) / norms
         allowed = jnp.isfinite(gap)
