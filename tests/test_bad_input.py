@@ -340,7 +340,7 @@ def loud(t, x, p):
     [
         (lambda t, x, p: jnp.zeros(2), ["f(t, x, p) must return an array of shape (1,); got shape (2,)"]),
         (lambda t, x, p: x.astype(jnp.float32), ["must return float64; got float32", "do not cast them"]),
-        (lambda t, x, p: x * 1j, ["must return float64; got complex128"]),
+        pytest.param(lambda t, x, p: x * 1j, ["must return float64; got complex128"], marks=pytest.mark.promotes),
         (lambda t, x, p: None, ["must return an array of numbers; got None"]),
         (lambda t, x, p: [x, [x, x]], ["must return an array of numbers; got [JitTracer"]),
         (branching, ["decides by the value of t, x or p (an `if`", "make it a mode with a transition time"]),

@@ -130,6 +130,7 @@ FUNCTIONS = {
 }
 
 
+@pytest.mark.promotes
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_functions_as_scalars(name):
     """By folding constants, and by machine code."""
