@@ -541,7 +541,7 @@ class Interrupted:
             raise KeyboardInterrupt
         return {"value": np.arange(runs.start, runs.stop)}
 
-    def compute_fingerprint(self):
+    def fingerprint(self):
         return "interrupted"
 
 

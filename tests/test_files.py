@@ -197,7 +197,7 @@ class Squares:
         k = np.asarray(runs)
         return {"square": k**2.0, "row": np.outer(k, [1.0, 2.0]), "text": np.array([f"run {i}" for i in runs])}
 
-    def compute_fingerprint(self):
+    def fingerprint(self):
         return self.name
 
 
@@ -209,7 +209,7 @@ class Heavy:
     def __call__(self, runs):
         return {"value": np.repeat(np.asarray(runs, dtype=float)[:, None], 300, axis=1)}
 
-    def compute_fingerprint(self):
+    def fingerprint(self):
         return "heavy"
 
 

@@ -208,7 +208,7 @@ class Endless:
             self.released.wait(60.0)
         return {"run": np.array(runs)}
 
-    def compute_fingerprint(self):
+    def fingerprint(self):
         return "endless"
 
 
