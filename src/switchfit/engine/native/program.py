@@ -13,13 +13,21 @@ from functools import lru_cache
 from switchfit.discretization.nodes import AT_TRANSITIONS
 from switchfit.discretization.tableaus import EXPLICIT, get_tableau
 from switchfit.engine.native.adaptive import write_slope, write_step
-from switchfit.engine.native.driver import Driver
+from switchfit.engine.native.driver import write_adaptive_solve, write_evaluation, write_outputs, write_slope_in_cell
 from switchfit.engine.native.frame import write_handler
 from switchfit.engine.native.kernels import Kernels
 from switchfit.engine.native.llvm import Module, Program, compile_module
+from switchfit.engine.native.sample_loops import write_late_samples, write_late_states, write_samples
 from switchfit.engine.native.scalars import Graph
+from switchfit.engine.native.segments import (
+    write_backward,
+    write_backward_segment,
+    write_forward,
+    write_forward_segment,
+)
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.engine.native.trace import Unsupported
+from switchfit.engine.native.writer import Writer
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
 
@@ -78,19 +86,19 @@ def drop_programs() -> None:
 def _write(module: Module, library: Structure, sizes: Sizes, order: Order) -> None:
     """Write all functions of a library with derivatives of an order."""
     kernels = Kernels(library, sizes, order, module)
-    driver = Driver(library, sizes, order, kernels, module)
+    writer = Writer(library, sizes, order, kernels, module)
     late = [k for k, sensor in enumerate(library.measurements) if sensor.delay is not None]
     if order == Order.COST:
         write_step(module, sizes)
-    late_counts = [_write_mode(kernels, driver, mode, bool(late)) for mode in range(len(library.modes))]
+    late_counts = [_write_mode(kernels, writer, mode, bool(late)) for mode in range(len(library.modes))]
     for k in range(len(library.measurements)):
         kernels.sample(k)
         if k in late:
             kernels.late_time(k)
-            module.add(driver.late_samples(k, late_counts))
-            module.add(driver.late_states(k))
+            module.add(write_late_samples(writer, k, late_counts))
+            module.add(write_late_states(writer, k))
         else:
-            module.add(driver.samples(k))
+            module.add(write_samples(writer, k))
     if library.terminal:
         kernels.end()
     if library.terminal_constraints:
@@ -104,16 +112,16 @@ def _write(module: Module, library: Structure, sizes: Sizes, order: Order) -> No
     kernels.state()
     if order != Order.GRADIENT:
         kernels.outputs()
-        module.add(driver.outputs())
-    module.add(driver.forward_any())
+        module.add(write_outputs(writer))
+    module.add(write_forward(writer))
     if order > Order.COST:
-        module.add(driver.backward_any())
-    module.add(driver.whole())
+        module.add(write_backward(writer))
+    module.add(write_evaluation(writer))
     if order == Order.HESSIAN:
-        module.add(write_handler(driver))
+        module.add(write_handler(writer))
 
 
-def _write_mode(kernels: Kernels, driver: Driver, mode: int, late: bool) -> int:
+def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> int:
     """Write the rows of a mode; return how many second derivatives a late sample has at each stage of its row."""
     module, order, library = kernels.module, kernels.order, kernels.library
     running = bool(library.running or library.references)
@@ -134,12 +142,12 @@ def _write_mode(kernels: Kernels, driver: Driver, mode: int, late: bool) -> int:
         kernels.length()
     if order > Order.COST and late and mode == 0:
         kernels.end_of_late()
-    module.add(driver.forward_segment(mode))
+    module.add(write_forward_segment(writer, mode))
     if order == Order.COST:
         graph = Graph()
         write_slope(module, f"slope_{mode}", stage, (graph, *kernels.inputs(graph)), kernels.sizes)
-        module.add(driver.slope_at(mode))
-        module.add(driver.adaptive(mode))
+        module.add(write_slope_in_cell(writer, mode))
+        module.add(write_adaptive_solve(writer, mode))
     if order > Order.COST:
-        module.add(driver.backward_segment(mode, counts["inner"], counts["end"]))
+        module.add(write_backward_segment(writer, mode, counts["inner"], counts["end"]))
     return counts.get("late", 0)
