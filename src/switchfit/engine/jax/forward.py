@@ -140,7 +140,7 @@ def running_gradient(model: Model, first: Forward) -> Array:
     def chunk(total: Array, given: Any) -> tuple[Array, None]:
         return total + jax.vmap(row)(*given).sum(0), None
 
-    hb = (layout.end - layout.start)[..., None] * b
+    hb = (layout.end - layout.start)[..., None] * b[None, None]
     of_stages = at.l, hb * at.l_t, hb[..., None] * at.l_x, hb[..., None] * at.l_p
     given = (*time_directions(model, layout), of_stages, *kept)
     return lax.scan(chunk, jnp.zeros(P.shape[1]), given)[0]

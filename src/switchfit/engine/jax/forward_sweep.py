@@ -101,13 +101,14 @@ def parameter_directions(model: Model) -> Array:
 
 def unit(D: int, i: int) -> Array:
     """Return the derivative of tau_i in theta, i from 0: (D,)."""
-    return (jnp.arange(D) == i) * 1.0
+    return (jnp.arange(D) == i).astype(float)
 
 
 def time_directions(model: Model, layout: Rows) -> tuple[Array, Array]:
     """Return the derivatives of the start and the end of each row in theta: two (Q, C, D) arrays of zeros and ones."""
-    index = jnp.arange(model.structure.N + model.structure.M)
-    return (layout.starts_at[..., None] == index) * 1.0, (layout.ends_at[..., None] == index) * 1.0
+    index = jnp.arange(model.structure.N + model.structure.M)[None, None]
+    starts_at, ends_at = layout.starts_at[..., None], layout.ends_at[..., None]
+    return (starts_at == index).astype(float), (ends_at == index).astype(float)
 
 
 def stage_jacobians(model: Model, path: Path, p: Array) -> StageJacobians:

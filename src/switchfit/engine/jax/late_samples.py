@@ -88,7 +88,7 @@ def late_gradients(
 
 def _along(model: Model, at: Anchors, x_d: Array, p: Array, e: Array) -> tuple[Array, Array, Array]:
     """Return ``(start, x, p)`` of one sample at ``theta + e``, to first order in e (D,); x_d is that of x, (n, D)."""
-    start_d = (jnp.arange(e.shape[0]) == at.starts_at) * 1.0
+    start_d = (jnp.arange(e.shape[0]) == at.starts_at).astype(float)
     return at.start + start_d @ e, at.x + x_d @ e, p + e[model.structure.N :]
 
 
