@@ -18,7 +18,9 @@ SOURCE = ROOT / "src" / "switchfit"
 
 PAPER, ROWS = "paper_adjoint.py", "discretization/rows.py"
 ALGEBRA = "optimize/algebra.py"
-KERNELS, DRIVER, TEMPLATES = (f"engine/native/{name}.py" for name in ("kernels", "driver", "templates"))
+KERNELS, SEGMENTS, SAMPLE_LOOPS, TEMPLATES = (
+    f"engine/native/{name}.py" for name in ("kernels", "segments", "sample_loops", "templates")
+)
 
 SYSTEMS = ["tests/test_random_systems.py", "-k", "machine_code or each_engine"]
 PROTOCOL = ["tests/test_protocol.py"]
@@ -103,18 +105,21 @@ IN_NATIVE: dict[str, tuple[str, Replacements]] = {
         [('+ graph.load("length", d) * (end_d - start_d)', "+ 0.0 * (end_d - start_d)")],
     ),
     "the reset map of another transition": (
-        DRIVER,
+        SEGMENTS,
         [
             (
-                '"moves": self.at(found["units"], "%segment", width),\n            "x_after"',
-                '"moves": found["units"],\n            "x_after"',
+                '"moves": writer.at(found["units"], "%segment", width),\n        "x_after"',
+                '"moves": found["units"],\n        "x_after"',
             )
         ],
     ),
-    "the sample behind a transition": (DRIVER, [("icmp sge i64 {cell}, {begin}", "icmp sgt i64 {cell}, {begin}")]),
+    "the sample behind a transition": (
+        SAMPLE_LOOPS,
+        [("icmp sge i64 {cell}, {begin}", "icmp sgt i64 {cell}, {begin}")],
+    ),
     "the costate of a late sample": (
-        DRIVER,
-        [('{"late": self.at(found["late"], row, n)})', '{"late": found["late"]})')],
+        SAMPLE_LOOPS,
+        [('{"late": writer.at(found["late"], row, n)})', '{"late": found["late"]})')],
     ),
     "W in the Gauss-Newton matrix": (TEMPLATES, [("return factor * apply_weights(W, A)", "return factor * A")]),
 }
