@@ -38,6 +38,20 @@ class Evaluation:
     cost : J
     gradient : (d,), J's derivative in theta
     hessian : (d, d)
+
+    See Also
+    --------
+    evaluate, GuardedEvaluation
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> evaluation = sf.evaluate(problem)
+    >>> evaluation.gradient.shape, evaluation.hessian.shape
+    ((2,), (2, 2))
     """
 
     cost: float
@@ -269,6 +283,20 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     -----
     The mesh is refined once, at the initial guess, so that J is one smooth function of theta. Where a transition
     time sits exactly on a sample time the derivatives are those for increasing it.
+
+    See Also
+    --------
+    check_derivatives, evaluate_on_guards
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> exact, paper = (sf.evaluate(problem, method=method) for method in ("autodiff", "adjoint"))
+    >>> bool(abs(exact.gradient - paper.gradient).max() < 1e-4 * abs(exact.gradient).max())
+    True
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     method = as_choice(method, "method", METHODS)

@@ -39,6 +39,23 @@ class GuardedEvaluation:
     hessian : (r, r)
     times : (g,), the guarded transition times
     times_slope : (g, r), their derivatives
+
+    See Also
+    --------
+    evaluate_on_guards, Evaluation
+
+    Examples
+    --------
+    >>> import jax.numpy as jnp
+    >>> import switchfit as sf
+    >>> fall = lambda t, x, p: jnp.array([x[1], -p["g"]])
+    >>> rest = lambda t, x, p: jnp.zeros(2)
+    >>> guards = {("fall", "rest"): lambda t, x, p: x[0]}
+    >>> system = sf.HybridSystem({"fall": fall, "rest": rest}, [1.0, 0.0], guards=guards)
+    >>> run = sf.Experiment(sf.TerminalCost(lambda x, p: x[1] ** 2), ("fall", "rest"), (0.4,), 0.0, 1.0)
+    >>> found = sf.evaluate_on_guards(sf.Problem(system, run, {"g": 9.81}))
+    >>> found.names, found.times.round(3)
+    (('g',), array([0.452]))
     """
 
     theta: FloatArray
@@ -70,6 +87,23 @@ def evaluate_on_guards(problem: Problem, theta: ArrayLike | None = None) -> Guar
         Without guards, or if no transition times near `theta` meet them.
     TypeError
         If an argument is of the wrong type.
+
+    See Also
+    --------
+    evaluate, HybridSystem
+
+    Examples
+    --------
+    >>> import jax.numpy as jnp
+    >>> import switchfit as sf
+    >>> fall = lambda t, x, p: jnp.array([x[1], -p["g"]])
+    >>> rest = lambda t, x, p: jnp.zeros(2)
+    >>> guards = {("fall", "rest"): lambda t, x, p: x[0]}
+    >>> system = sf.HybridSystem({"fall": fall, "rest": rest}, [1.0, 0.0], guards=guards)
+    >>> run = sf.Experiment(sf.TerminalCost(lambda x, p: x[1] ** 2), ("fall", "rest"), (0.4,), 0.0, 1.0)
+    >>> found = sf.evaluate_on_guards(sf.Problem(system, run, {"g": 9.81}))
+    >>> found.names, found.times.round(3)
+    (('g',), array([0.452]))
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     find_guarded_places(problem)  # an error where there are no guards

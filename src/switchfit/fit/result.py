@@ -282,6 +282,19 @@ class Fit:
         ValueError
             For another kind, or where the Gauss-Newton matrix is not known: the cost is not made of Measurements
             alone, or the estimate was loaded without its problem from a file that lacks it.
+
+        See Also
+        --------
+        Estimate.covariance
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.covariance_from("gauss-newton").shape
+        (2, 2)
         """
         hessian = as_choice(hessian, "hessian", ("exact", "gauss-newton"))
         matrix = self.hessian if hessian == "exact" else self.gauss_newton
@@ -304,7 +317,21 @@ class Fit:
         return correlation_of(self.covariance)
 
     def quantile(self, level: float) -> float:
-        """Return the two-sided quantile: of Student's t where sigma is unknown, of the normal distribution else."""
+        """Return the two-sided quantile: of Student's t where sigma is unknown, of the normal distribution else.
+
+        See Also
+        --------
+        Estimate.confidence_intervals
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> round(fit.quantile(0.95), 2)
+        1.96
+        """
         level = as_level(level)
         tail = 0.5 + level / 2
         freedom = max(self.freedom, 1)
@@ -323,6 +350,20 @@ class Fit:
             The quantile is of Student's t where sigma is unknown, of the normal distribution where it is known.
         hessian : {"exact", "gauss-newton"}
             As of `covariance_from`.
+
+        See Also
+        --------
+        profile, bootstrap
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.confidence_intervals(0.95).round(2)
+        array([[2.43, 2.5 ],
+               [0.38, 0.4 ]])
         """
         half = self.quantile(level) * np.sqrt(np.diag(self.covariance_from(hessian)))
         log = np.isin(self.theta_names, self.log_scaled)

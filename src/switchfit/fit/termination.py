@@ -33,6 +33,17 @@ class Kink:
         Where the kink is.
     left, right : float
         The derivatives of J on both sides of it.
+
+    See Also
+    --------
+    Estimate.kinks, Status
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> kink = sf.Kink("tau_1", value=2.0, left=-0.3, right=0.4)
+    >>> kink.left < 0 < kink.right
+    True
     """
 
     unknown: str
@@ -66,6 +77,21 @@ class Termination:
         Guards and terminal constraints that are not met, and their values.
     reason : Issue or None
         Why the line search failed, or the error with which the fit ended.
+
+    See Also
+    --------
+    Estimate.termination, Status
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> fit.termination.status.name
+    'CONVERGED'
+    >>> bool(fit.termination.optimality < 1e-7)
+    True
     """
 
     status: Status
@@ -84,7 +110,18 @@ class Termination:
 
     @classmethod
     def of_error(cls, text: str) -> Termination:
-        """Describe a fit that an error ended; `text` says which."""
+        """Describe a fit that an error ended; `text` says which.
+
+        See Also
+        --------
+        Termination
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> sf.Termination.of_error("the log is empty").status.name
+        'ERROR'
+        """
         return cls(Status.ERROR, reason=Issue("error", (text,)))
 
     def __str__(self) -> str:

@@ -35,6 +35,22 @@ class Trajectory:
     state_names, state_units : tuple of str
     time_unit : str
         That of the experiment.
+
+    See Also
+    --------
+    simulate, Comparison
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> path = sf.simulate(problem)
+    >>> path.mode_spans
+    [('on', 0.0, 2.0), ('off', 2.0, 6.0)]
+    >>> path.states[-1].round(2)
+    array([1.71])
     """
 
     times: FloatArray
@@ -69,6 +85,22 @@ class Comparison:
         The fitted output at all nodes, for plots.
     downweighted : (K, q) of bool, or None
         Where a robust loss counts a residual as an outlier, one larger than its `loss_scale`; None without such a loss.
+
+    See Also
+    --------
+    Estimate.comparisons, Trajectory
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> comparison = fit.comparisons[0][0]
+    >>> comparison.names, comparison.residuals.shape
+    (('thermometer',), (24, 1))
+    >>> comparison.rmse.round(2)
+    array([0.14])
     """
 
     kind: str
@@ -116,6 +148,20 @@ def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: in
         cannot be integrated.
     TypeError
         If an argument is of the wrong type.
+
+    See Also
+    --------
+    Trajectory, predict, evaluate
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> path = sf.simulate(problem, [2.5, 0.4])
+    >>> round(float(path.states.max()), 1)
+    15.8
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     experiment = as_index(experiment, "experiment", len(problem.experiments))

@@ -14,7 +14,23 @@ from switchfit.optimize.matrix import Curvature
 
 
 class Status(Enum):
-    """How a minimisation ended, and what that means."""
+    """How a minimisation ended, and what that means.
+
+    See Also
+    --------
+    Estimate.status, Termination
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> fit.status is sf.Status.CONVERGED
+    True
+    >>> fit.status.successful
+    True
+    """
 
     CONVERGED = "The optimality is below the tolerance, and the curvature on the free directions is positive."
     CONVERGED_PRECISION = (

@@ -1,0 +1,121 @@
+"""Emit LLVM's language line by line: names of values, addresses, loads, loops that return when a budget is spent."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from switchfit.engine.native.kernels import (
+    Kernels,
+)
+from switchfit.engine.native.llvm import Module
+from switchfit.engine.native.templates import Order, Sizes
+from switchfit.engine.native.workspace import OF_SAMPLES, constraint_rows, pointers
+from switchfit.problem.structure import Structure
+
+TABLE = "ptr %table"
+SEGMENT = f"{TABLE}, i64 %segment, i64 %first, i64 %last, double %begins, double %finishes, ptr %progress"
+WHOLE = f"{TABLE}, i64 %segment, ptr %progress"
+
+
+class Writer:
+    """Emits the lines of one function after the other for a library.
+
+    Attributes
+    ----------
+    library, sizes, order, kernels, module : as given
+    names : list of str
+        What the table of pointers holds.
+    rows : dict
+        Where the constraints stand.
+    lines : list of str
+        Of the function under way.
+    """
+
+    def __init__(self, library: Structure, sizes: Sizes, order: Order, kernels: Kernels, module: Module) -> None:
+        self.library, self.sizes, self.order, self.kernels, self.module = library, sizes, order, kernels, module
+        self.names = pointers(library, sizes, order)
+        self.rows = constraint_rows(library, sizes)
+        self.lines: list[str] = []
+        self.count = 0
+
+    def line(self, text: str) -> None:
+        """Emit a line."""
+        self.lines.append(f"  {text}")
+
+    def label(self, name: str) -> None:
+        """Emit a label: the start of a block."""
+        self.lines.append(f"{name}:")
+
+    def let(self, text: str) -> str:
+        """Emit an instruction; return the name of its value."""
+        self.count += 1
+        self.line(f"%t{self.count} = {text}")
+        return f"%t{self.count}"
+
+    def load(self, kind: str, pointer: str) -> str:
+        """Emit a load from a pointer; return the name of the value."""
+        return self.let(f"load {kind}, ptr {pointer}")
+
+    def at(self, pointer: str, *factors: Any) -> str:
+        """Emit the address of ``pointer[product of the factors]``, in doubles."""
+        offset = str(factors[0])
+        for factor in factors[1:]:
+            offset = self.let(f"mul i64 {offset}, {factor}")
+        return self.let(f"getelementptr inbounds double, ptr {pointer}, i64 {offset}")
+
+    def pointers(self) -> dict[str, str]:
+        """Load all pointers of the table."""
+        return {name: self.load("ptr", self.at("%table", k)) for k, name in enumerate(self.names)}
+
+    def samples_of(self, k: int) -> dict[str, str]:
+        """Load the pointers of the k-th Measurements."""
+        first = len(self.names) + len(OF_SAMPLES) * k
+        return {name: self.load("ptr", self.at("%table", first + m)) for m, name in enumerate(OF_SAMPLES)}
+
+    def into(self, pointer: str, offset: int) -> str:
+        """Emit an address, in bytes from a pointer."""
+        return self.let(f"getelementptr inbounds i8, ptr {pointer}, i64 {offset}")
+
+    def call(self, name: str, order: tuple[str, ...], given: dict[str, str]) -> int:
+        """Call a straight line with its pointers in order; return its cost."""
+        self.line(f"call void @{name}({', '.join(f'ptr {given[key]}' for key in order)})")
+        return self.module.work(name)
+
+    def choose(self, which: str, count: int, name: str) -> list[str]:
+        """Switch to one of `count` blocks at run time; return their labels. Each block continues at ``{name}_end``.
+
+        A choice of -1 goes there at once.
+        """
+        labels = [f"{name}_{k}" for k in range(count)]
+        cases = " ".join(f"i64 {k}, label %{label}" for k, label in enumerate(labels))
+        self.line(f"switch i64 {which}, label %{name}_end [{cases}]")
+        return labels
+
+    def load_progress(self) -> tuple[str, str]:
+        """Load from `progress` how many turns of a loop are done, and what is left of the budget."""
+        places = (self.let(f"getelementptr inbounds i64, ptr %progress, i64 {k}") for k in (1, 2))
+        turns, left = (self.load("i64", place) for place in places)
+        return turns, left
+
+    def next_turn(self, turns: str, done: str) -> None:
+        """End a turn of a loop: leave it if it is `done`, return if the budget is spent, else start the next one.
+
+        The loop has the label `loop`, this block the label `next`. `%left` is what is left after this turn.
+        """
+        self.line(f"%turns = add i64 {turns}, 1")
+        self.line("%spent = icmp sle i64 %left, 0")
+        self.line(f"%stop = or i1 {done}, %spent")
+        self.line("br i1 %stop, label %out, label %loop")
+        self.label("out")
+        self.line(f"%place = select i1 {done}, i64 0, i64 %turns")
+        for k, value in ((1, "%place"), (2, "%left")):
+            place = self.let(f"getelementptr inbounds i64, ptr %progress, i64 {k}")
+            self.line(f"store i64 {value}, ptr {place}")
+        self.line(f"ret i1 {done}")
+
+    def end_function(self, signature: str, returns: bool = True) -> str:
+        """Wrap the emitted lines into one LLVM function and reset; `returns` adds a return at its end."""
+        end = "\n  ret void" if returns else ""
+        text = f"define {signature} {{\nentry:\n" + "\n".join(self.lines) + f"{end}\n}}\n"
+        self.lines, self.count = [], 0
+        return text
