@@ -208,9 +208,39 @@ class State(NamedTuple):
     stationary: Array  # the optimality is below the tolerance and the next step negligible
 
     @property
+    def decrease(self) -> Array:
+        """The decrease of J that the slope predicts for the step that is to be judged."""
+        return -self.length * self.slope
+
+    @property
     def sides(self) -> Array:
         """The side to which each coordinate may move, +1 or -1, and 0 where a kink holds it: (d,)."""
         return _sides(self.left.gradient, self.right.gradient, self.kink)
+
+
+class Trial(NamedTuple):
+    """The point that is to be judged.
+
+    Attributes
+    ----------
+    theta, cost : (d,), ()
+    right, left : Sides
+        The same, and those of one side alone, where no coordinate is at a kink or the left is still unknown.
+    kink : (d,) bool
+    optimality : ()
+    crossed : () int
+        Breakpoints strictly between it and the point that was accepted last.
+    finite : () bool
+    """
+
+    theta: Array
+    cost: Array
+    right: Sides
+    left: Sides
+    kink: Array
+    optimality: Array
+    crossed: Array
+    finite: Array
 
 
 def minimize_traced(
@@ -238,8 +268,12 @@ def minimize_traced(
     Outcome
     """
 
+    def direct(state: State) -> State:
+        return _find_step(state, constraints, breakpoints, tolerance, max_iterations)
+
     def turn(state: State) -> State:
-        return take_turn(state, evaluate, constraints, breakpoints, tolerance, max_iterations)
+        after = take_turn(state, evaluate, constraints, breakpoints, tolerance)
+        return lax.cond(after.undirected & ~after.done, direct, lambda state: state, after)
 
     return outcome_of(lax.while_loop(lambda state: ~state.done, turn, begin(start)), constraints)
 
@@ -250,90 +284,107 @@ def take_turn(
     constraints: Constraints,
     breakpoints: Breakpoints,
     tolerance: float,
-    max_iterations: int,
 ) -> State:
     """Evaluate J once, at the point that is to be judged, and judge it; arguments as of `minimize_traced`."""
-    theta = _move(constraints, breakpoints, state.theta, state.length * state.step)
-    cost, gradient, hessian = evaluate(theta, jnp.where(state.halfway, -1.0, 1.0))
-    here = Sides(gradient, 0.5 * (hessian + hessian.T))
-    finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(hessian))
-    cost = jnp.where(state.halfway, state.cost_there, cost)
-    right = jax.tree.map(lambda known, new: jnp.where(state.halfway, known, new), state.right_there, here)
-    kink = breakpoints.on_one(theta) & (theta > constraints.lower) & (theta < constraints.upper)
-    at_kink = jnp.any(kink)
-    optimality = _kkt_residual(constraints, theta, state.scale, _steepest(here.gradient, right.gradient, kink))
-    crossed = breakpoints.count_crossed(state.theta, theta)
+    trial = _evaluate(state, evaluate, constraints, breakpoints)
     first = jnp.isinf(state.cost)
     noise = NOISE * jnp.abs(state.cost)
-    decrease = -state.length * state.slope
-    fraction = jnp.where(state.inside | (crossed == 0), ARMIJO, ARMIJO_ACROSS)
-    lower = algebra.cost_allows(cost, state.cost, state.lowest, decrease, noise, fraction)
-    lower = finite & (first | (lower & jnp.any(theta != state.theta)))
-    better = first | algebra.optimality_allows(optimality, state.optimality, cost, state.lowest, decrease, noise)
-    incomplete = at_kink & ~state.halfway
-
-    def accept(state: State) -> State:
-        below = jnp.where(first | (optimality > tolerance), 0, state.below + 1)
-        slopes = jnp.maximum(jnp.abs(right.gradient), jnp.abs(here.gradient))
-        return state._replace(
-            theta=theta,
-            cost=cost,
-            right=right,
-            left=here,
-            kink=kink,
-            optimality=optimality,
-            iterations=jnp.where(first, 0, state.iterations + 1),
-            length=jnp.ones(()),
-            trials=jnp.zeros((), int),
-            inside=jnp.zeros((), bool),
-            undirected=jnp.ones((), bool),
-            halfway=jnp.zeros((), bool),
-            below=below,
-            scale=jnp.maximum(state.scale, jnp.abs(theta)),
-            cost_scale=jnp.maximum(state.cost_scale, jnp.abs(cost)),
-            gradient_scale=jnp.maximum(state.gradient_scale, jnp.max(slopes)),
-            lowest=jnp.minimum(state.lowest, cost),
-        )
+    fraction = jnp.where(state.inside | (trial.crossed == 0), ARMIJO, ARMIJO_ACROSS)
+    lower = algebra.cost_allows(trial.cost, state.cost, state.lowest, state.decrease, noise, fraction)
+    lower = trial.finite & (first | (lower & jnp.any(trial.theta != state.theta)))
+    better = first | algebra.optimality_allows(
+        trial.optimality, state.optimality, trial.cost, state.lowest, state.decrease, noise
+    )
+    incomplete = jnp.any(trial.kink) & ~state.halfway
 
     def go_left(state: State) -> State:
-        return state._replace(halfway=jnp.ones((), bool), cost_there=cost, right_there=right)
+        return state._replace(halfway=jnp.ones((), bool), cost_there=trial.cost, right_there=trial.right)
 
-    def refuse(state: State) -> State:
-        trials, refused = state.trials + 1, state.refused + 1
-        length = state.length * jnp.where(trials <= 5, 0.5, 0.25)
-        few = breakpoints.count_crossed(state.theta, state.theta + length * state.step) < MANY_BREAKPOINTS
-        inside = ~state.inside & (crossed > 0) & few
-        hopeless = ((decrease <= noise) & ~inside) | (trials >= MAX_TRIALS)
-        # A search that finds nothing below the tolerance has met rounding: that too is the end.
-        stationary = hopeless & (state.optimality <= tolerance)
-        crawling = refused > CRAWLING[0] + CRAWLING[1] * state.iterations
-        return state._replace(
-            length=jnp.where(inside, 1.0, length),
-            trials=trials,
-            refused=refused,
-            inside=state.inside | inside,
-            undirected=inside,
-            halfway=jnp.zeros((), bool),
-            done=hopeless | crawling | first,
-            stationary=stationary,
-        )
-
-    def direct(state: State) -> State:
-        step, slope = _direction(state, constraints, breakpoints)
-        negligible = algebra.is_negligible(step, state.scale, jnp)
-        fresh = ~state.inside
-        stationary = fresh & (state.optimality <= tolerance) & (negligible | (state.below >= EXTRA_ITERATIONS))
-        done = stationary | (fresh & (state.iterations >= max_iterations))
-        none = jnp.zeros((), bool)
-        return state._replace(step=step, slope=slope, undirected=none, stationary=stationary, done=done)
-
-    after = lax.cond(
+    return lax.cond(
         lower & (incomplete | better),
-        lambda state: lax.cond(incomplete, go_left, accept, state),
-        refuse,
+        lambda state: lax.cond(incomplete, go_left, lambda state: _accept(state, trial, tolerance), state),
+        lambda state: _refuse(state, trial, breakpoints, tolerance),
         state._replace(evaluations=state.evaluations + 1),
     )
-    return lax.cond(after.undirected & ~after.done, direct, lambda state: state, after)
+
+
+def _evaluate(state: State, evaluate: TracedEvaluate, constraints: Constraints, breakpoints: Breakpoints) -> Trial:
+    """Evaluate J at the point that is to be judged, on its right; on its left if that has been done."""
+    theta = _move(constraints, breakpoints, state.theta, state.length * state.step)
+    cost, gradient, hessian = evaluate(theta, jnp.where(state.halfway, -1.0, 1.0))
+    left = Sides(gradient, 0.5 * (hessian + hessian.T))
+    finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(hessian))
+    right = jax.tree.map(lambda known, new: jnp.where(state.halfway, known, new), state.right_there, left)
+    kink = breakpoints.on_one(theta) & (theta > constraints.lower) & (theta < constraints.upper)
+    return Trial(
+        theta=theta,
+        cost=jnp.where(state.halfway, state.cost_there, cost),
+        right=right,
+        left=left,
+        kink=kink,
+        optimality=_kkt_residual(constraints, theta, state.scale, _steepest(left.gradient, right.gradient, kink)),
+        crossed=breakpoints.count_crossed(state.theta, theta),
+        finite=finite,
+    )
+
+
+def _accept(state: State, trial: Trial, tolerance: float) -> State:
+    """Return the state at a trial that decreases J; the next step is still to be found."""
+    first = jnp.isinf(state.cost)
+    slopes = jnp.maximum(jnp.abs(trial.right.gradient), jnp.abs(trial.left.gradient))
+    return state._replace(
+        theta=trial.theta,
+        cost=trial.cost,
+        right=trial.right,
+        left=trial.left,
+        kink=trial.kink,
+        optimality=trial.optimality,
+        iterations=jnp.where(first, 0, state.iterations + 1),
+        length=jnp.ones(()),
+        trials=jnp.zeros((), int),
+        inside=jnp.zeros((), bool),
+        undirected=jnp.ones((), bool),
+        halfway=jnp.zeros((), bool),
+        below=jnp.where(first | (trial.optimality > tolerance), 0, state.below + 1),
+        scale=jnp.maximum(state.scale, jnp.abs(trial.theta)),
+        cost_scale=jnp.maximum(state.cost_scale, jnp.abs(trial.cost)),
+        gradient_scale=jnp.maximum(state.gradient_scale, jnp.max(slopes)),
+        lowest=jnp.minimum(state.lowest, trial.cost),
+    )
+
+
+def _refuse(state: State, trial: Trial, breakpoints: Breakpoints, tolerance: float) -> State:
+    """Shorten the step; where it still crosses a few breakpoints, look for one inside the present smooth piece."""
+    trials, refused = state.trials + 1, state.refused + 1
+    length = state.length * jnp.where(trials <= 5, 0.5, 0.25)
+    few = breakpoints.count_crossed(state.theta, state.theta + length * state.step) < MANY_BREAKPOINTS
+    inside = ~state.inside & (trial.crossed > 0) & few
+    below_noise = (state.decrease <= NOISE * jnp.abs(state.cost)) & ~inside
+    hopeless = below_noise | (trials >= MAX_TRIALS)
+    crawling = refused > CRAWLING[0] + CRAWLING[1] * state.iterations
+    return state._replace(
+        length=jnp.where(inside, 1.0, length),
+        trials=trials,
+        refused=refused,
+        inside=state.inside | inside,
+        undirected=inside,
+        halfway=jnp.zeros((), bool),
+        done=hopeless | crawling | jnp.isinf(state.cost),
+        # A search that finds nothing below the tolerance has met rounding: that too is the end.
+        stationary=hopeless & (state.optimality <= tolerance),
+    )
+
+
+def _find_step(
+    state: State, constraints: Constraints, breakpoints: Breakpoints, tolerance: float, max_iterations: int
+) -> State:
+    """Solve the quadratic programme; a negligible step where the optimality is below the tolerance is the end."""
+    step, slope = _direction(state, constraints, breakpoints)
+    negligible = algebra.is_negligible(step, state.scale, jnp)
+    fresh = ~state.inside
+    stationary = fresh & (state.optimality <= tolerance) & (negligible | (state.below >= EXTRA_ITERATIONS))
+    done = stationary | (fresh & (state.iterations >= max_iterations))
+    return state._replace(step=step, slope=slope, undirected=jnp.zeros((), bool), stationary=stationary, done=done)
 
 
 def outcome_of(state: State, constraints: Constraints) -> Outcome:
