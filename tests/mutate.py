@@ -86,7 +86,7 @@ IN_NATIVE: dict[str, tuple[str, Replacements]] = {
         KERNELS,
         [
             (
-                '        stores += _stored("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])\n'
+                '        stores += _store("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])\n'
                 "        return stores + self._scalar(graph, derivatives, moving)\n\n    def _weights",
                 "        return stores + self._scalar(graph, derivatives, moving)\n\n    def _weights",
             )

@@ -11,7 +11,7 @@ from numpy.polynomial import Polynomial
 
 import switchfit as sf
 from switchfit.discretization.model import Piece
-from switchfit.engine.adaptive import refined_mesh
+from switchfit.engine.adaptive import refine_mesh
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.functions import use_float64
 
@@ -94,7 +94,7 @@ def test_a_held_input_is_the_same_as_modes_that_switch_at_fixed_times():
     switched = sf.HybridSystem({f"level {i}": mode(level) for i, level in enumerate(levels)}, [0.3, 0.0])
     times = [sf.Parameter(jump, fixed=True) for jump in jumps]
     second = sf.Problem(switched, sf.Experiment(cost, tuple(switched.modes), times, 0.0, 2.0), k)
-    meshes = [refined_mesh(first, 0, first.initial_theta)]
+    meshes = [refine_mesh(first, 0, first.initial_theta)]
     theta = np.array([1.3])
     a, b = Evaluator(first, meshes=meshes)(theta), Evaluator(second, meshes=meshes)(theta)
     assert a.cost == pytest.approx(b.cost, rel=1e-12)

@@ -16,6 +16,8 @@ from switchfit.engine.native.scalars import CHECKED, Graph
 from switchfit.engine.native.trace import Unsupported, trace_scalars
 from switchfit.problem.functions import use_float64
 
+pytestmark = pytest.mark.promotes
+
 OFTEN = (
     *("arithmetic: mod", "arithmetic: power of a negative", "elementary: guarded log", "rounding: round away"),
     *("decisions: where of booleans", "decisions: max of booleans", "decisions: xor", "decisions: count"),

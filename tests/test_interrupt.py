@@ -15,7 +15,7 @@ from systems import NODES, P0, case, problem_of
 
 import switchfit as sf
 from switchfit.batch.chunks import run_chunks
-from switchfit.engine.adaptive import refined_mesh
+from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.native import driver, experiment
 from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.native.program import drop_programs
@@ -113,10 +113,10 @@ def test_evaluations_row_by_row_are_the_same_bit_by_bit(tau, row_by_row):
 def test_meshes_step_by_step_are_the_same(row_by_row):
     problem = problem_of("resets")
     theta = problem.initial_theta
-    expected = refined_mesh(problem, 0, theta)
+    expected = refine_mesh(problem, 0, theta)
     cost = Evaluator(problem, meshes=[expected]).cost(theta)
     row_by_row()
-    np.testing.assert_array_equal(refined_mesh(problem, 0, theta).times, expected.times)
+    np.testing.assert_array_equal(refine_mesh(problem, 0, theta).times, expected.times)
     assert Evaluator(problem, meshes=[expected]).cost(theta) == cost
 
 

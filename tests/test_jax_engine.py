@@ -20,7 +20,7 @@ from switchfit.engine.jax.backward_sweep import backward_sweep
 from switchfit.engine.jax.constraints import constraints
 from switchfit.engine.jax.forward import forward_hessian
 from switchfit.engine.jax.forward_sweep import forward_sweep
-from switchfit.engine.jax.programs import constrained_derivatives
+from switchfit.engine.jax.programs import differentiate_constrained
 from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
 from switchfit.problem.functions import use_float64
 
@@ -63,7 +63,7 @@ def test_augmented_lagrangian_has_exact_derivatives(solver: str, relative: float
     expected = compiled(lagrangian)(arguments, TAU, P0)
 
     def differentiate(arguments, tau, p, side):
-        found = constrained_derivatives(arguments, tau, p, side, multipliers, penalty, structure=structure)
+        found = differentiate_constrained(arguments, tau, p, side, multipliers, penalty, structure=structure)
         J, slope, H, c, A = (
             found  # H is that of J + weights . c: the product of the constraints' slopes is added outside
         )

@@ -19,7 +19,7 @@ from switchfit.discretization.mesh import CHUNK, Mesh, build_rows, count_chunks,
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import compute_path_cost, propagate
 from switchfit.discretization.tableaus import ADAPTIVE
-from switchfit.engine.adaptive import _solve, _solve_natively, fixed_nodes, refined_mesh
+from switchfit.engine.adaptive import _solve, _solve_natively, list_fixed_nodes, refine_mesh
 from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.native.scalars import Graph, Namespace, as_objects
 from switchfit.fit.evaluator import Evaluator
@@ -251,7 +251,7 @@ def test_nodes_that_have_to_be_there():
     signal = sf.ReferenceSignal.from_samples([-1.0, 0.25, 0.5, 1.0, 2.0], np.zeros(5))
     inputs = sf.Input([-3.0, 0.7, 5.0], [1.0, 2.0, 3.0])
     run = sf.Experiment([samples, signal], ("a",), (), 0.0, 1.0, inputs=inputs)
-    assert fixed_nodes(run).tolist() == [0.0, 0.15, 0.25, 0.35, 0.5, 0.7, 1.0]
+    assert list_fixed_nodes(run).tolist() == [0.0, 0.15, 0.25, 0.35, 0.5, 0.7, 1.0]
 
 
 # The tolerances
@@ -297,7 +297,7 @@ def relaxation():
 def cost_of(made, **settings):
     system, run = made
     problem = sf.Problem(system, run, **settings)
-    mesh = refined_mesh(problem, 0, problem.initial_theta)
+    mesh = refine_mesh(problem, 0, problem.initial_theta)
 
     @jax.jit
     def cost(arguments, tau):
@@ -342,7 +342,7 @@ def test_both_engines_take_the_steps_of_scipy():
     data = sf.ReferenceSignal(signal.signal, observe=lambda t, x, p: x[:1])
     run = sf.Experiment(data, ("a", "b", "a"), (1.7, 2.9), 0.0, 6.0, inputs=inputs)
     problem = sf.Problem(system, run)
-    coarse = Mesh.from_times(fixed_nodes(run))
+    coarse = Mesh.from_times(list_fixed_nodes(run))
     arguments = build_arguments(problem, 0, coarse)
     native = native_experiment(problem.structures[0], arguments, coarse.times, 0)
     given = (problem, problem.structures[0], arguments.without_mesh(), arguments.signals, coarse)
@@ -435,11 +435,11 @@ def test_a_mesh_for_several_thetas_is_as_dense_as_the_densest():
     run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("fast", "slow"), (1.0,), 0.0, 10.0)
     problem = sf.Problem(system, run)
     early, late = np.array([1.0]), np.array([8.0])
-    counts = [refined_mesh(problem, 0, *thetas).cells for thetas in ((early,), (late,), (early, late), (late, early))]
+    counts = [refine_mesh(problem, 0, *thetas).cells for thetas in ((early,), (late,), (early, late), (late, early))]
     assert counts[0] < 0.3 * counts[1]
     assert counts[2] == counts[3]
     assert counts[1] <= counts[2] <= counts[1] + counts[0]
-    assert refined_mesh(problem, 0, early, finer=2.0).cells == pytest.approx(2 * counts[0], rel=0.1)
+    assert refine_mesh(problem, 0, early, finer=2.0).cells == pytest.approx(2 * counts[0], rel=0.1)
 
 
 @pytest.mark.parametrize("parts", [2, 3, 5])

@@ -14,7 +14,7 @@ from models import LATE_RAMP, decay, rest
 import switchfit as sf
 from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
-from switchfit.engine.choice import runs_natively, traced_derivatives
+from switchfit.engine.choice import derivatives_inside_program, runs_natively
 from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.native import program
 from switchfit.engine.native.experiment import places_in_library
@@ -230,7 +230,7 @@ def test_one_program_of_jax_serves_every_sequence_of_the_same_length(room):
     @partial(jax.jit, static_argnames="library")
     def run(arguments, tau, p, side, places, library):
         traces.append(library)
-        return traced_derivatives(library, arguments, tau, p, side, natively=True, places=places)
+        return derivatives_inside_program(library, arguments, tau, p, side, natively=True, places=places)
 
     at_node, mesh = TIMES[6], Mesh.from_times(np.unique([*TIMES, *np.linspace(0.0, 3.0, 50)]))
     for sequence in (("swing", "fall", "swing"), ("fall", "swing", "rest"), ("rest", "rest", "fall")):
@@ -250,7 +250,9 @@ def test_one_program_of_jax_serves_every_sequence_of_the_same_length(room):
             np.testing.assert_allclose(H, by_jax.hessian, rtol=1e-9, atol=1e-9)
     assert len(traces) == 1
     with pytest.raises(ValueError, match="programs are written for one sequence"):
-        traced_derivatives(structure, arguments, tau, p, 1.0, natively=False, places=places_in_library(structure))
+        derivatives_inside_program(
+            structure, arguments, tau, p, 1.0, natively=False, places=places_in_library(structure)
+        )
 
 
 def test_room_for_fewer_transitions_than_there_are_is_refused():

@@ -20,7 +20,7 @@ import pytest
 import reference
 
 import switchfit as sf
-from switchfit.engine.adaptive import refined_mesh
+from switchfit.engine.adaptive import refine_mesh
 from switchfit.fit.evaluator import Evaluator
 
 SYSTEMS = 200
@@ -575,7 +575,7 @@ def differences(system: System, methods: tuple[str, ...], engine: str = "auto") 
     problem = replace(system.problem, engine=engine)
     special, other = system.special_theta()
     thetas = {"guess": problem.initial_theta, special: problem.check_theta(other)}
-    meshes = [refined_mesh(problem, e, *thetas.values()) for e in range(len(problem.experiments))]
+    meshes = [refine_mesh(problem, e, *thetas.values()) for e in range(len(problem.experiments))]
     evaluator = Evaluator(problem, meshes=meshes)
     wrong: list[str] = []
     for name, theta in thetas.items():

@@ -190,7 +190,10 @@ VERBS_IN = (
 )  # fmt: skip
 """Rooms in which functions are named by imperative verbs."""
 
-NOT_PARTICIPLES = {"sliding_block": "the model of a block that slides, by its name in problem files"}
+NOT_PARTICIPLES = {
+    "sliding_block": "the model of a block that slides, by its name in problem files",
+    "constrained": "J and its constraints, beside `cost` and `derivatives`",
+}
 """Names whose first word only looks like a participle, or has to be one; and why."""
 
 

@@ -349,8 +349,16 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
         (("fit", "hessian"), [[1.0], [2.0, 3.0]], "fit.hessian is no array of float64"),
         (("fit", "theta"), {"values": []}, "fit.theta must be an array"),
         (("fit", "theta"), {"dtype": "f9", "shape": [0], "values": []}, "fit.theta has the unknown dtype 'f9'"),
-        (("fit", "theta"), {"dtype": "a", "shape": [0], "values": []}, "fit.theta has the dtype 'a', which is none"),
-        (("fit", "theta"), {"dtype": "O", "shape": [0], "values": []}, "fit.theta has the dtype 'O', which is none"),
+        (
+            ("fit", "theta"),
+            {"dtype": "a", "shape": [0], "values": []},
+            "fit.theta has the dtype 'a', which is neither",
+        ),
+        (
+            ("fit", "theta"),
+            {"dtype": "O", "shape": [0], "values": []},
+            "fit.theta has the dtype 'O', which is neither",
+        ),
         (("fit", "theta"), {"dtype": "<f8", "shape": [2], "values": []}, "has the shape (2,) but 0 values"),
         (
             ("fit", "theta"),

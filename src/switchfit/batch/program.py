@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
-from switchfit.engine.choice import runs_natively, traced_derivatives
+from switchfit.engine.choice import derivatives_inside_program, runs_natively
 from switchfit.engine.native.experiment import places_in_library
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.guards import place_on_near_guards
@@ -349,7 +349,7 @@ def _total(
             structure: Structure = structure,
         ) -> tuple[jax.Array, jax.Array, jax.Array]:
             (own, sequence), tau, p = given
-            found: tuple[jax.Array, jax.Array, jax.Array] = traced_derivatives(
+            found: tuple[jax.Array, jax.Array, jax.Array] = derivatives_inside_program(
                 structure, own, tau, p, side, natively=layout.natively, places=sequence or None
             )
             return found

@@ -18,7 +18,7 @@ from switchfit.batch.fits import Fits, check_long_run, count_samples, repeat
 from switchfit.batch.program import Varying, chunk_size, fit_chunk, with_errors
 from switchfit.discretization.arguments import build_arguments, split_by_cell
 from switchfit.discretization.mesh import Mesh
-from switchfit.engine.adaptive import refined_mesh
+from switchfit.engine.adaptive import refine_mesh
 from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, check_settings, estimate
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
@@ -314,7 +314,7 @@ def _build_meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tup
     thetas = (truth,) if np.array_equal(start, truth) else (start, truth)
     for attempt in range(REFINEMENTS + 1):
         indices = range(len(problem.experiments))
-        evaluator = Evaluator(problem, meshes=[refined_mesh(problem, e, *thetas, finer=finer) for e in indices])
+        evaluator = Evaluator(problem, meshes=[refine_mesh(problem, e, *thetas, finer=finer) for e in indices])
         fine = evaluator.divide().cost(truth)
         # Without noise J vanishes at the truth; then the error is measured against J where the fits begin.
         error = cost_error(problem, fine, evaluator(truth).cost, evaluator(start).cost)

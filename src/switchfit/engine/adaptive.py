@@ -47,7 +47,7 @@ PACE = 1000
 """Steps over which the pace of a mode is measured; a stiff one is thus refused before it has cost much."""
 
 
-def fixed_nodes(experiment: Experiment) -> FloatArray:
+def list_fixed_nodes(experiment: Experiment) -> FloatArray:
     """Return the times that must be nodes: t0, tf, and samples and knots of signals inside the horizon."""
     t0, tf = experiment.t0, experiment.tf
     times = [np.array([t0, tf])]
@@ -57,7 +57,7 @@ def fixed_nodes(experiment: Experiment) -> FloatArray:
     return nodes[(nodes >= t0) & (nodes <= tf)]
 
 
-def refined_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1.0) -> Mesh:
+def refine_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1.0) -> Mesh:
     """Return a mesh of experiment e that meets the problem's tolerances at each of the given thetas.
 
     Parameters
@@ -70,7 +70,7 @@ def refined_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1
     ValueError
         If a mode returns a value that is not finite, or the trajectory cannot be integrated to its end.
     """
-    nodes = fixed_nodes(problem.experiments[e])
+    nodes = list_fixed_nodes(problem.experiments[e])
     coarse = Mesh.from_times(nodes)
     steps = _Steps.from_solutions([_adaptive_steps(problem, e, theta, coarse) for theta in thetas])
     pieces = np.maximum(np.ceil(finer * np.diff(steps.up_to(nodes)) - 0.05).astype(int), 1)

@@ -61,7 +61,7 @@ def runs_natively(structures: Sequence[Structure], arguments: Sequence[Arguments
     return all(can_be_foreign(s) and reason_for_jax(s, a, Order.HESSIAN) is None for s, a in given)
 
 
-def traced_derivatives(
+def derivatives_inside_program(
     structure: Structure,
     arguments: Arguments,
     tau: Any,

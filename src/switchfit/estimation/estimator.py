@@ -12,7 +12,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.engine.adaptive import refined_mesh
+from switchfit.engine.adaptive import refine_mesh
 from switchfit.estimation.saved import load_fit, save_fit
 from switchfit.fit.accuracy import worst_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
@@ -571,7 +571,7 @@ def _refine(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float
     problem = fine.problem
     if excess <= 2**ORDER:
         return fine
-    return Evaluator(problem, meshes=[refined_mesh(problem, e, start, theta) for e in range(len(problem.experiments))])
+    return Evaluator(problem, meshes=[refine_mesh(problem, e, start, theta) for e in range(len(problem.experiments))])
 
 
 def _estimate(

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.discretization.arguments import Arguments, build_arguments
 from switchfit.discretization.mesh import Mesh, pad_to_common_lengths
-from switchfit.engine.adaptive import refined_mesh
+from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import engine_of, summarize
 from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.protocol import Derivatives, Engine, Matrix, Simulation
@@ -106,7 +106,7 @@ class Evaluator:
         self.problem = problem
         indices = range(len(problem.experiments))
         at = problem.initial_theta if theta is None else theta
-        given = list(meshes) if meshes is not None else [refined_mesh(problem, e, at) for e in indices]
+        given = list(meshes) if meshes is not None else [refine_mesh(problem, e, at) for e in indices]
         self.replace_arguments(
             [build_arguments(problem, e, m) for e, m in enumerate(pad_to_common_lengths(problem, given))]
         )

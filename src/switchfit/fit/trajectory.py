@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.discretization.arguments import build_arguments
-from switchfit.engine.adaptive import refined_mesh
+from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation
 from switchfit.fit.evaluator import Evaluator
@@ -166,7 +166,7 @@ def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: in
     as_instance(problem, "problem", Problem, "an sf.Problem")
     experiment = as_index(experiment, "experiment", len(problem.experiments))
     checked = problem.check_theta(theta)
-    mesh = refined_mesh(problem, experiment, checked)
+    mesh = refine_mesh(problem, experiment, checked)
     engine = engine_of(problem, experiment, build_arguments(problem, experiment, mesh), mesh)
     simulation = engine.simulate(*problem.vectors(checked, experiment), tangents=False)
     return _trajectory(problem, experiment, simulation)

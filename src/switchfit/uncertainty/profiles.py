@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq, linprog, minimize_scalar
 
-from switchfit.engine.adaptive import refined_mesh
+from switchfit.engine.adaptive import refine_mesh
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
 from switchfit.fit.solution import constraints_of, minimize_cost
@@ -705,7 +705,7 @@ def _refine_mesh(problem: Problem, trace: Trace, threshold: float) -> Evaluator 
     """
     thetas = [trace.centre.theta, *(q.theta for q in trace.edges(threshold))]
     try:
-        meshes = [refined_mesh(problem, e, *thetas, finer=2.0) for e in range(len(problem.experiments))]
+        meshes = [refine_mesh(problem, e, *thetas, finer=2.0) for e in range(len(problem.experiments))]
     except ValueError:
         return None
     return Evaluator(problem, meshes=meshes)

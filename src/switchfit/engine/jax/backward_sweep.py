@@ -14,7 +14,7 @@ from switchfit.discretization.propagation import add_point_costs, flatten_rows
 from switchfit.discretization.rows import Pull, length_factor, times_derivative
 from switchfit.discretization.steps import row_functions
 from switchfit.engine.jax.constraints import terms_at_end, terms_at_transitions
-from switchfit.engine.jax.forward_sweep import Forward, StageJacobians, running_cost, sample_gradients
+from switchfit.engine.jax.forward_sweep import Forward, StageJacobians, sample_gradients, sum_running_cost
 from switchfit.engine.jax.late_samples import anchors, late_gradients
 
 Array = jax.Array
@@ -90,7 +90,7 @@ def backward_sweep(model: Model, first: Forward, p: Array, weights: Array | None
         opened = costates.opened[layout.first_chunk]
         of_tau = of_tau + (opened * resets.t).sum(-1)[1:]
     of_p = of_p + jax.grad(lambda p: costates.start @ model.initial_state(p))(p)
-    return Backward(nodes.cost + running_cost(model, first), costates, of_tau, of_p)
+    return Backward(nodes.cost + sum_running_cost(model, first), costates, of_tau, of_p)
 
 
 class NodeGradients(NamedTuple):

@@ -9,7 +9,7 @@ import numpy as np
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
-from switchfit.engine.jax.programs import Method, constrained_derivatives, derivatives
+from switchfit.engine.jax.programs import Method, derivatives, differentiate_constrained
 from switchfit.engine.jax.simulation import simulate_by_jax
 from switchfit.engine.protocol import Constrained, Derivatives, Engine, Matrix, Simulation
 from switchfit.problem.data import FloatArray
@@ -63,7 +63,7 @@ class JaxEngine:
         """Return J and its constraints."""
         with use_float64(), use_compilation_cache():
             given = self._given(), tau, p, float(side), multipliers, penalty
-            J, slope, H, c, A = constrained_derivatives(*given, structure=self._structure)
+            J, slope, H, c, A = differentiate_constrained(*given, structure=self._structure)
         return Constrained(float(J), np.array(slope), np.array(H), np.array(c), np.array(A))
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:

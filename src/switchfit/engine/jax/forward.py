@@ -34,9 +34,9 @@ from switchfit.discretization.steps import step
 from switchfit.engine.jax.forward_sweep import (
     Forward,
     parameter_directions,
-    running_cost,
     sample_gradients,
     stages_along,
+    sum_running_cost,
     time_directions,
     unit,
 )
@@ -97,8 +97,8 @@ def forward_gradient(model: Model, first: Forward, p: Array) -> tuple[Array, Arr
     """
     P, path, X = parameter_directions(model), first.path, first.tangents
     N = model.structure.N
-    cost = running_cost(model, first) + add_point_costs(model, path, p)
-    gradient = running_gradient(model, first)
+    cost = sum_running_cost(model, first) + add_point_costs(model, path, p)
+    gradient = differentiate_running_cost(model, first)
     for k, samples in enumerate(model.arguments.samples):
         if model.structure.measurements[k].delay is None:
             values, (g_x, g_p) = sample_gradients(model, path, k, samples, p)
@@ -121,7 +121,7 @@ def forward_gradient(model: Model, first: Forward, p: Array) -> tuple[Array, Arr
     return cost, gradient
 
 
-def running_gradient(model: Model, first: Forward) -> Array:
+def differentiate_running_cost(model: Model, first: Forward) -> Array:
     """Return the gradient of the running costs, ``sum_j h b_j ell_j' + h' sum_j b_j ell_j`` over all rows: (D,)."""
     P = parameter_directions(model)
     at = first.jacobians

@@ -237,7 +237,7 @@ def recompute_tangents(
     return row_tangents(model, x_d, h, slopes, at.f_x, *direct_derivatives(model, at, start_d, end_d))
 
 
-def running_cost(model: Model, first: Forward) -> Array:
+def sum_running_cost(model: Model, first: Forward) -> Array:
     """Return the integral of the running costs over all rows: ()."""
     layout, densities = first.path.layout, first.jacobians.l
     if densities is None:

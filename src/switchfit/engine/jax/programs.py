@@ -57,7 +57,7 @@ def derivatives(
 
 
 @partial(jax.jit, static_argnames=("structure",))
-def constrained_derivatives(
+def differentiate_constrained(
     arguments: Arguments,
     tau: Array,
     p: Array,

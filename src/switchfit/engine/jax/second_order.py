@@ -57,12 +57,12 @@ def adjoint_hessian(model: Model, first: Forward, back: Backward, p: Array, weig
     P = parameter_directions(model)
     for i in model.structure.resets:
         along = unit(P.shape[1], i), X.before_transition(path.layout, i), P
-        value = _weighted(model.reset(i), psi.opened[path.layout.first_chunk[i + 1]])
+        value = _weigh(model.reset(i), psi.opened[path.layout.first_chunk[i + 1]])
         H = H + _second(value, (*path.at_transition(i), p), along)
     for k, samples in enumerate(model.arguments.samples):
         H = H + sample_curvature(model, path, X, k, samples, p, gauss_newton=False)
     if model.structure.initial_state is not None:
-        H = H + _second(_weighted(model.initial_state, psi.start), (p,), (P,))
+        H = H + _second(_weigh(model.initial_state, psi.start), (p,), (P,))
     return H
 
 
@@ -254,7 +254,7 @@ def sample_curvature(
     return block(H, jax.tree.map(lambda a: a[whole:], given))[0] if whole < K else H
 
 
-def _weighted(function: Callable[..., Array], psi: Array) -> Callable[..., Array]:
+def _weigh(function: Callable[..., Array], psi: Array) -> Callable[..., Array]:
     return lambda *z: psi @ function(*z)
 
 

@@ -91,7 +91,7 @@ def simulate_by_jax(
 
 def _cost_of_samples(structure: Structure, arguments: Arguments, seen: tuple[FloatArray, ...], p: FloatArray) -> float:
     """Return the costs of all samples from the outputs, in NumPy: a program of JAX would be compiled for each count."""
-    named, total = _named(structure, arguments, p), 0.0
+    named, total = _name_parameters(structure, arguments, p), 0.0
     for samples, sensor, y in zip(arguments.samples, structure.measurements, seen, strict=True):
         there = np.asarray(samples.weight) > 0
         u = samples.weight * np.where(there, y - samples.value, 0.0) ** 2
@@ -103,7 +103,7 @@ def _cost_of_samples(structure: Structure, arguments: Arguments, seen: tuple[Flo
     return total
 
 
-def _named(structure: Structure, arguments: Arguments, p: FloatArray) -> dict[str, Any]:
+def _name_parameters(structure: Structure, arguments: Arguments, p: FloatArray) -> dict[str, Any]:
     """Return the parameters by the model's names."""
     return dict(Model(structure, arguments).parameters(p))  # type: ignore[arg-type]  # arrays of NumPy's
 
@@ -255,7 +255,7 @@ def _late_outputs(
 ) -> FloatArray:
     """Return the outputs of all sensors at the samples of the k-th Measurements, which are late: (K, Q)."""
     sensor, samples = structure.measurements[k], whole.samples[k]
-    times = np.asarray(samples.time) - float(_named(structure, whole, p)[sensor.delay or ""])
+    times = np.asarray(samples.time) - float(_name_parameters(structure, whole, p)[sensor.delay or ""])
     row = np.minimum(np.searchsorted(simulation.end, times), len(simulation.end) - 1)
     counts = [own.stop - own.start for own in simulation.segments]
     mode, at = np.repeat(structure.mode_of_segment, counts)[row], cell[row]

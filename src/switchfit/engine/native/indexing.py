@@ -93,18 +93,18 @@ def put(graph: Graph, a: Objects, starts: Sequence[Any], window: Any, combine: C
 def dynamic_slice(graph: Graph, equation: Any, a: Any, *starts: Any) -> Any:
     """Do what `jax.lax.dynamic_slice` does: a window that does not fit is moved inside."""
     sizes = equation.params["slice_sizes"]
-    return take(graph, a, _moved_inside(graph, starts, a.shape, sizes), sizes)
+    return take(graph, a, _move_inside(graph, starts, a.shape, sizes), sizes)
 
 
 def dynamic_update_slice(graph: Graph, equation: Any, a: Any, update: Any, *starts: Any) -> Any:
     """Do what `jax.lax.dynamic_update_slice` does."""
     result = a.astype(object)
-    inside = _moved_inside(graph, starts, a.shape, update.shape)
+    inside = _move_inside(graph, starts, a.shape, update.shape)
     put(graph, result, inside, update, lambda here, old, new: choose(graph, here, new, old))
     return result
 
 
-def _moved_inside(graph: Graph, starts: Sequence[Any], shape: Sequence[int], sizes: Sequence[int]) -> list[Any]:
+def _move_inside(graph: Graph, starts: Sequence[Any], shape: Sequence[int], sizes: Sequence[int]) -> list[Any]:
     return [clamp(graph, s.item(), 0, n - size) for s, n, size in zip(starts, shape, sizes, strict=True)]
 
 

@@ -40,7 +40,7 @@ def within(graph: Graph, node: Node, low: int, high: int, dtype: np.dtype[Any]) 
 
 
 def _from_bounds(op: str, bounds: Callable[..., tuple[int, int]]) -> Meaning:
-    def meaning(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
+    def get_meaning(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
         def apply(*given: Any) -> Any:
             args = [Integer.of(graph, a) for a in given]
             low, high = bounds(*((a.low, a.high) for a in args))
@@ -49,7 +49,7 @@ def _from_bounds(op: str, bounds: Callable[..., tuple[int, int]]) -> Meaning:
 
         return apply
 
-    return meaning
+    return get_meaning
 
 
 def _without_sign_of_zero(graph: Graph, node: Node, low: int, high: int, op: str) -> Node:
@@ -134,7 +134,7 @@ def _larger(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., An
     return larger
 
 
-def _clamped(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
+def _clamp(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
     smaller, larger = _smaller(graph, params, dtype), _larger(graph, params, dtype)
     return lambda low, a, high: smaller(larger(a, low), high)
 
@@ -187,7 +187,7 @@ OF_INTEGERS: dict[str, Meaning] = {
     "sign": _sign,
     "max": _larger,
     "min": _smaller,
-    "clamp": _clamped,
+    "clamp": _clamp,
     "lt": lambda graph, params, dtype: lambda a, b: less(graph, a, b),
     "gt": lambda graph, params, dtype: lambda a, b: less(graph, b, a),
     "le": lambda graph, params, dtype: lambda a, b: invert(graph, less(graph, b, a)),

@@ -126,9 +126,9 @@ class Kernels:
         start, end = graph.load("row", 0), graph.load("row", 1)
         found, h = stages(EXPLICIT, field, start, end, x), end - start
         points = [at(*point) for point in zip(found.times, found.states, strict=True)]
-        stores = _stored("x_after", 0, end_of_row(EXPLICIT, h, x, found.slopes))
+        stores = _store("x_after", 0, end_of_row(EXPLICIT, h, x, found.slopes))
         if self.order > Order.COST:
-            stores += [store for j, X in enumerate(found.states) for store in _stored("X", j * n, X)]
+            stores += [store for j, X in enumerate(found.states) for store in _store("X", j * n, X)]
         if self.with_tangents:
             Z = graph.loads("Z", n, vector=True)
             jacobians = [stage(graph, *point, only=(F_T, F_X, F_P)) for point in points]
@@ -141,8 +141,8 @@ class Kernels:
                 forcing = [given + J[0] * t_d for given, J, t_d in zip(forcing, jacobians, times_d, strict=True)]
             along = tangent(EXPLICIT, h, found.slopes, [J[1] for J in jacobians], forcing, Z, h_d)
             for j, X_d in enumerate(along.states):
-                stores += _stored("XZ", j * n, [_as_vector(graph, value) for value in X_d])
-            stores += _stored("Z_after", 0, [_as_vector(graph, value) for value in along.after])
+                stores += _store("XZ", j * n, [_as_vector(graph, value) for value in X_d])
+            stores += _store("Z_after", 0, [_as_vector(graph, value) for value in along.after])
         if costs:
             densities = [stage(graph, *point, only=(ELL,))[0].item() for point in points]
             stores.append(("J", 0, graph.load("J", 0) + cost_of_row(EXPLICIT, h, densities)))
@@ -180,7 +180,7 @@ class Kernels:
 
         found = adjoint(EXPLICIT, h, psi, pull)
         before = found.before + graph.loads("late", n) if self.has_late and not late else found.before
-        stores = _stored("psi", 0, before)
+        stores = _store("psi", 0, before)
         g = graph.load("g", 0, vector=True) + self._along_p(graph, found.parameters)
         if moving:
             start_d, end_d = self._ends(graph)
@@ -220,8 +220,8 @@ class Kernels:
                 starts, ends = ([graph.load(name, d) for d in range(D)] for name in ("opens", "closes"))
                 entries = [one + c_j * (other - one) for one, other in zip(starts, ends, strict=True)]
                 of_time = start_d + c_j * (end_d - start_d), entries
-            rows = self._curved(graph, rows, second, [of_time, *self._state_directions(graph, "XZ", j * n)])
-        self.module.write_straight_line(name, CURVATURE, _changed(H, rows))
+            rows = self._add_curvature(graph, rows, second, [of_time, *self._state_directions(graph, "XZ", j * n)])
+        self.module.write_straight_line(name, CURVATURE, _change(H, rows))
 
     def length(self) -> None:
         """Write ``H += h' x V' + V' x h'``, V' being what `backward_row` stored for a row that moves."""
@@ -244,10 +244,10 @@ class Kernels:
         p, constants = self.inputs(graph)
         none = np.full(n, graph.constant(0.0), dtype=object)
         (x,) = template(graph, p, none, *constants, only=(0,), checked=self.order == Order.COST)
-        stores = _stored("x", 0, x)
+        stores = _store("x", 0, x)
         if self.with_tangents:
             (x_p,) = template(graph, p, none, *constants, only=(1,))
-            stores += _stored("Z", 0, [_as_vector(graph, v) for v in self._along_p(graph, x_p)])
+            stores += _store("Z", 0, [_as_vector(graph, v) for v in self._along_p(graph, x_p)])
         if self.order == Order.COST:
             stores += graph.check()
         self.module.write_straight_line("start", START, stores, exported=True)
@@ -275,12 +275,12 @@ class Kernels:
         x, t = graph.loads("x", n), graph.load("time", 0)
         none = np.full(n, graph.constant(0.0), dtype=object)
         (after,) = template(graph, t, x, p, none, *constants, only=(0,), checked=self.order == Order.COST)
-        stores = _stored("x_after", 0, after)
+        stores = _store("x_after", 0, after)
         if self.with_tangents:
             R_t, R_x, R_p = template(graph, t, x, p, none, *constants, only=(1, 2, 3))
             Z, moves = graph.loads("Z", n, vector=True), graph.load("moves", 0, vector=True)
             Z_after = times_vector(R_x, Z) + self._along_p(graph, R_p) + R_t * moves
-            stores += _stored("Z_after", 0, [_as_vector(graph, v) for v in Z_after])
+            stores += _store("Z_after", 0, [_as_vector(graph, v) for v in Z_after])
         if self.order == Order.COST:
             stores += graph.check()
         self.module.write_straight_line(f"reset_{which}", RESET, stores, exported=True)
@@ -291,7 +291,7 @@ class Kernels:
         p, constants = self.inputs(graph)
         x, t, psi = graph.loads("x", n), graph.load("time", 0), graph.loads("psi", n)
         derivatives = template(graph, t, x, p, psi, *constants, only=range(4, 13), checked=True)
-        stores = _stored("psi", 0, derivatives[1]) + self._scalar(graph, derivatives, moving=True)
+        stores = _store("psi", 0, derivatives[1]) + self._scalar(graph, derivatives, moving=True)
         self.module.write_straight_line(f"reset_back_{which}", RESET_BACK, stores + graph.check())
 
     def sample(self, k: int) -> None:
@@ -318,7 +318,7 @@ class Kernels:
         """Write what a late sample adds to the costate at the start of the row that holds it."""
         graph, n = Graph(), self.sizes.n
         self.module.write_straight_line(
-            "end_of_late", END_OF_LATE, _stored("late", 0, graph.loads("late", n) + graph.loads("psi", n))
+            "end_of_late", END_OF_LATE, _store("late", 0, graph.loads("late", n) + graph.loads("psi", n))
         )
 
     def end(self) -> None:
@@ -376,11 +376,11 @@ class Kernels:
         p, constants = self.inputs(graph)
         given = graph.load("time", 0), graph.loads("x", self.sizes.n), p
         y, *jacobians = template(graph, *given, *constants, checked=True)
-        stores = _stored("y", 0, y)
+        stores = _store("y", 0, y)
         if self.with_tangents:
             h_x, h_p = jacobians
             y_d = times_vector(h_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, h_p)
-            stores += _stored("Y", 0, [_as_vector(graph, value) for value in y_d])
+            stores += _store("Y", 0, [_as_vector(graph, value) for value in y_d])
         self.module.write_straight_line("outputs", OUTPUTS, stores + graph.check())
 
     # What they have in common
@@ -430,7 +430,7 @@ class Kernels:
                 of_time = graph.load("moves", 0, vector=True), [graph.load("moves", d) for d in range(D)]
             H = [graph.load("H", d, vector=True) for d in range(D)]
             along = [of_time, *self._state_directions(graph, "Z")]
-            stores += _changed(H, self._curved(graph, H, _entries(second, with_time=moving), along))
+            stores += _change(H, self._add_curvature(graph, H, _entries(second, with_time=moving), along))
         return stores
 
     def _cost(self, graph: Graph, found: Sequence[Objects], moving: bool) -> list[Store]:
@@ -439,7 +439,7 @@ class Kernels:
         stores = [("J", 0, graph.load("J", 0) + cost.item())]
         if self.order == Order.COST:
             return stores
-        stores += _stored("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])
+        stores += _store("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])
         return stores + self._scalar(graph, derivatives, moving)
 
     def _weights(
@@ -452,7 +452,7 @@ class Kernels:
 
     def _constraint(self, graph: Graph, found: Sequence[Objects], moving: bool) -> list[Store]:
         """Return stores of constraints and their tangents, and those that add ``weights . c`` to g, H and psi."""
-        stores = _stored("constraint", 0, found[0])
+        stores = _store("constraint", 0, found[0])
         if self.order == Order.COST:
             return stores
         _, c_t, c_x, c_p, *derivatives = found
@@ -460,8 +460,8 @@ class Kernels:
             c_d = times_vector(c_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, c_p)
             if moving:
                 c_d = c_d + c_t * graph.load("moves", 0, vector=True)
-            stores += _stored("jacobian", 0, [_as_vector(graph, value) for value in c_d])
-        stores += _stored("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])
+            stores += _store("jacobian", 0, [_as_vector(graph, value) for value in c_d])
+        stores += _store("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])
         return stores + self._scalar(graph, derivatives, moving)
 
     def _state_directions(self, graph: Graph, pointer: str, first: int = 0) -> Along:
@@ -472,7 +472,9 @@ class Kernels:
             for k in range(first, first + n)
         ]
 
-    def _curved(self, graph: Graph, H: list[Node], second: dict[tuple[int, int], Node], along: Along) -> list[Node]:
+    def _add_curvature(
+        self, graph: Graph, H: list[Node], second: dict[tuple[int, int], Node], along: Along
+    ) -> list[Node]:
         """Add ``Z' S Z`` to the rows of H, S given by its lower half along (t, x, p); `along` is Z of t and x."""
         n, N = self.sizes.n, self.sizes.N
         vectors = [vector for vector, _ in along] + self._units(graph)
@@ -504,7 +506,7 @@ def _entries(second: Sequence[Objects], with_time: bool) -> dict[tuple[int, int]
     return entries
 
 
-def _changed(H: list[Node], rows: list[Node]) -> list[Store]:
+def _change(H: list[Node], rows: list[Node]) -> list[Store]:
     return [("H", d, row) for d, (old, row) in enumerate(zip(H, rows, strict=True)) if row is not old]
 
 
@@ -515,5 +517,5 @@ def _as_vector(graph: Graph, value: Any) -> Node:
     return graph.zeros()
 
 
-def _stored(pointer: str, offset: int, values: Any) -> list[Store]:
+def _store(pointer: str, offset: int, values: Any) -> list[Store]:
     return [(pointer, offset + k, node) for k, node in enumerate(values)]

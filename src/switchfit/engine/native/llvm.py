@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.engine.native.operations import FROM_LIBM, OPERATIONS, Operation
-from switchfit.engine.native.scalars import Node, needed
+from switchfit.engine.native.scalars import Node, list_needed
 from switchfit.runtime.cache import get_usable_folder, read_code, write_code
 
 LOOKUP = 3
@@ -69,7 +69,7 @@ class Module:
         `exported` can be called from Python.
         """
         writer = _Writer(self)
-        nodes = needed([node for _, _, node in stores])
+        nodes = list_needed([node for _, _, node in stores])
         for node in nodes:
             writer.value(node)
         self._work[self.prefix + name] = sum(self._effort(node) for node in nodes)

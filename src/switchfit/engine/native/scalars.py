@@ -278,7 +278,7 @@ class Graph:
             if b.number is not None:
                 return self.constant(a.args[0].values[int(b.number)])
         elif op in COMPARISONS and (a.op == "lookup" or b.op == "lookup"):
-            return self._compared_table(op, a, b)
+            return self._compare_table(op, a, b)
         return None
 
     def _is_zero_in_any_case(self, condition: Node, yes: Node, no: Node) -> bool:
@@ -288,7 +288,7 @@ class Graph:
         table = no.args[0].args[0].values
         return condition.args[1 - condition.args.index(no)].number == 0.0 and not np.signbit(table[table == 0.0]).any()
 
-    def _compared_table(self, op: str, a: Node, b: Node) -> Node | None:
+    def _compare_table(self, op: str, a: Node, b: Node) -> Node | None:
         """Return what is true of all entries of a table: that none is NaN, or below a number."""
         if a is b or (a.op == b.op and a.args[1] is b.args[1]) or "const" in (a.op, b.op):
             sides = [node.args[0].args[0].values if node.op == "lookup" else node.number for node in (a, b)]
@@ -332,7 +332,7 @@ def as_objects(values: Sequence[Any]) -> Objects:
     return array
 
 
-def needed(outputs: Sequence[Node]) -> list[Node]:
+def list_needed(outputs: Sequence[Node]) -> list[Node]:
     """Return all nodes that some outputs depend on, in order."""
     if not outputs:
         return []
@@ -376,7 +376,7 @@ class Template:
         key = (*chosen, -1) if checked else chosen
         if key not in self._needed:
             wanted = [v for k in chosen for v in self._flat[k] if isinstance(v, Node)]
-            self._needed[key] = needed([*wanted, *presumed])
+            self._needed[key] = list_needed([*wanted, *presumed])
         given = [np.asarray(a, dtype=object).reshape(-1) for a in inputs]
         made: dict[int, Node] = {}
         for node in self._needed[key]:

@@ -52,6 +52,7 @@ def row_pointers(writer: Writer, found: dict[str, str], cell: str) -> dict[str, 
 
 
 def pointers_at_row(writer: Writer, found: dict[str, str], row: str) -> dict[str, str]:
+    """Emit the addresses of what is kept of a row."""
     n, width = writer.sizes.n, writer.sizes.width
     return {
         "X": writer.at(found["stages"], row, STAGES * n),

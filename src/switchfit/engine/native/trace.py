@@ -193,7 +193,7 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
         return [np.asarray(INDEXED[name](graph, equation, *args), dtype=object)]
     if name in ARRAYS:
         return [np.asarray(ARRAYS[name](graph, equation, *args), dtype=object)]
-    meaning = _meaning(graph, name, params, equation.invars[-1].aval.dtype)
+    meaning = _get_meaning(graph, name, params, equation.invars[-1].aval.dtype)
     return [np.asarray(np.frompyfunc(meaning, len(args), 1)(*args), dtype=object)]
 
 
@@ -204,7 +204,7 @@ def _evaluate_known(equation: Any, args: list[Any]) -> list[Any]:
     return [_as_array(a) for a in (results if equation.primitive.multiple_results else [results])]
 
 
-def _meaning(graph: Graph, name: str, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
+def _get_meaning(graph: Graph, name: str, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
     """Return what an operation does to entries of arrays of a type."""
     _check_type(dtype)
     if dtype.kind in "iu":
@@ -558,7 +558,7 @@ def _reduce(name: str) -> Callable[..., Any]:
 
     def over(graph: Graph, equation: Any, a: Any) -> Any:
         axes, dtype = equation.params["axes"], equation.invars[0].aval.dtype
-        combine = _meaning(graph, name, {}, dtype)
+        combine = _get_meaning(graph, name, {}, dtype)
         last = np.moveaxis(a, axes, range(a.ndim - len(axes), a.ndim))
         kept, count = last.shape[: a.ndim - len(axes)], [a.shape[axis] for axis in axes]
         rows = last.reshape(int(np.prod(kept)), int(np.prod(count)))
@@ -572,7 +572,7 @@ def _accumulate(name: str) -> Callable[..., Any]:
 
     def along(graph: Graph, equation: Any, a: Any) -> Any:
         axis, turned = equation.params["axis"], equation.params["reverse"]
-        combine = np.frompyfunc(_meaning(graph, name, {}, equation.invars[0].aval.dtype), 2, 1)
+        combine = np.frompyfunc(_get_meaning(graph, name, {}, equation.invars[0].aval.dtype), 2, 1)
         ordered = np.flip(a, axis) if turned else a
         result = combine.accumulate(ordered, axis=axis, dtype=object)
         return np.flip(result, axis) if turned else result
@@ -585,7 +585,7 @@ def _find_first(name: str) -> Callable[..., Any]:
 
     def along(graph: Graph, equation: Any, a: Any) -> Any:
         (axis,), dtype = equation.params["axes"], equation.invars[0].aval.dtype
-        beyond = _meaning(graph, name, {}, dtype)
+        beyond = _get_meaning(graph, name, {}, dtype)
 
         def first(row: Any) -> Any:
             best, found = row[0], 0
@@ -625,13 +625,13 @@ ARRAYS: dict[str, Callable[..., Any]] = {
 def _scatter(name: str | None) -> Callable[..., Any]:
     """Return a scatter that combines old entries with updates by an operation, or replaces them."""
 
-    def scattered(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any) -> Any:
+    def scatter_entries(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any) -> Any:
         dtype = equation.outvars[0].aval.dtype
 
         def apply(old: Any, update: Any) -> Any:
             if name == "add" and not is_traced(old) and not is_traced(update):
                 return old + update
-            return _meaning(graph, str(name), {}, dtype)(old, update)
+            return _get_meaning(graph, str(name), {}, dtype)(old, update)
 
         def combine(here: Any, old: Any, update: Any) -> Any:
             return choose(graph, here, update if name is None else apply(old, update), old)
@@ -639,7 +639,7 @@ def _scatter(name: str | None) -> Callable[..., Any]:
         how = add_where(graph, apply, dtype.kind in "iu") if name == "add" else combine
         return scatter(graph, equation, a, indices, updates, how)
 
-    return scattered
+    return scatter_entries
 
 
 INDEXED: dict[str, Callable[..., Any]] = {
