@@ -136,7 +136,7 @@ def test_gauss_newton_from_the_residual_jacobian() -> None:
         theta = jnp.concatenate([tau, p])
         h = residuals(theta)[2]
         at_samples, continuous, _ = jax.jacfwd(residuals)(theta)
-        weight = h[..., None] * jnp.asarray(model.tableau.b)[None, None] * arguments.weights[0][0]
+        weight = h[..., None] * model.tableau.b[None, None] * arguments.weights[0][0]
         return jnp.einsum("kqd,kq,kqe->de", at_samples, arguments.samples[0].weight, at_samples) + jnp.einsum(
             "qcsd,qcs,qcse->de", continuous, weight, continuous
         )
