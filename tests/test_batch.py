@@ -570,6 +570,20 @@ def test_nothing_is_compiled_for_other_data_or_another_number_of_runs():
     assert _fits._cache_size() == count
 
 
+def test_fits_are_settled_inside_the_program_at_kinks_too(monkeypatch):
+    """What goes wrong inside it is finished by `minimize`, and would be seen by the time it takes alone."""
+    from switchfit.batch import program
+
+    left = []
+    original = program.minimize_cost
+    monkeypatch.setattr(program, "minimize_cost", lambda *given, **rest: left.append(1) or original(*given, **rest))
+    study = sf.monte_carlo(room(), 64, theta=[2.0, 0.8], seed=2)  # the truth is on a sample
+    assert study.success.all()
+    assert np.sum(study.status == "CONVERGED_AT_KINK") > 5
+    assert study.free[study.status == "CONVERGED_AT_KINK"].tolist() == [1] * np.sum(study.status == "CONVERGED_AT_KINK")
+    assert not left
+
+
 def test_another_sequence_of_the_same_length_compiles_nothing():
     """What comes when is read at run time; the answers are those of fits by themselves.
 
