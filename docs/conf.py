@@ -33,3 +33,4 @@ autodoc_default_options = {"members": True}
 napoleon_google_docstring = False
 napoleon_use_ivar = True
 myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 3  # links to headings, as README pages on the web have them
