@@ -492,7 +492,7 @@ def estimate(
         history += records[1:] if history else records
         evaluations += result.evaluations
         theta = result.theta
-        fine = evaluator.divide()
+        fine = evaluator.halved
         simulation = SimulatedProblem(fine, theta)
         error, output = worst_error(
             simulation,

@@ -157,7 +157,7 @@ def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, seed:
     table = build_taylor_table(evaluator, problem.check_theta(theta), seed=seed)
     at = table.theta
     gaps = measure_derivative_gap(evaluator, at)
-    halved = measure_derivative_gap(evaluator.divide(), at)
+    halved = measure_derivative_gap(evaluator.halved, at)
     return DerivativeCheck(table.steps, table.remainders, table.orders, *gaps, *halved, at, problem.solver == "stiff")
 
 

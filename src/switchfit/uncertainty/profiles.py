@@ -436,7 +436,7 @@ class Trace:
         """Return the largest error of zeta^2 by the integration where it crosses the threshold, by
         halving all steps.
         """
-        fine = self.evaluator.divide()
+        fine = self.evaluator.halved
         base = fine.cost(self.centre.theta) - self.centre.cost
         ends = self.edges(threshold)
         return max(abs(fine.cost(q.theta) - q.cost - base) * 2 / self.scale for q in ends)
