@@ -417,7 +417,7 @@ class Estimate(Fit):
 def estimate(
     problem: Problem,
     *,
-    hessian: HessianKind = "exact",
+    hessian: HessianKind = "auto",
     tolerance: float = 1e-7,
     max_iterations: int = 200,
     callback: Callable[[IterationRecord], object] | None = None,

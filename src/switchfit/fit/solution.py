@@ -16,7 +16,7 @@ from switchfit.fit.termination import linear_constraints_of
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize, minimize_constrained
 from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.diagnosis import Finding
-from switchfit.optimize.problem import HessianKind
+from switchfit.optimize.problem import REACH, HessianKind
 from switchfit.problem.data import FloatArray, Measurements, TerminalConstraint
 from switchfit.problem.problem import Problem
 from switchfit.problem.variables import Variables
@@ -24,6 +24,9 @@ from switchfit.problem.variables import Variables
 MANY_RUNS = 16
 """Experiments from which on the Hessian's shape of an arrow is made use of; with fewer, the algebra of full matrices
 takes no longer (the runs part of the benchmarks)."""
+
+TIME_REACH = 0.01
+"""Part of the horizon by which a transition time may move in the first step inside a trust region."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +84,14 @@ def minimize_cost(
             refuse_hidden_switches(evaluator, theta, here.gradient)
         return here if identity else _to_variables(variables, theta, here)
 
+    def gauss_newton(z: Any, side: int) -> Any:
+        theta = z if identity else _to_theta(variables, constraints, z)
+        here = evaluator.arrow(theta, side, "gauss-newton") if by_blocks else evaluator(theta, side, matrix="gauss-newton")
+        if identity:
+            return here.hessian
+        flat = replace(here, gradient=np.zeros(len(theta)))  # the curvature of the variables is not part of the matrix
+        return _to_variables(variables, theta, flat).hessian
+
     def idle(z: FloatArray, everything: bool) -> NDArray[np.bool_]:
         return idle_unknowns(evaluator, z if identity else _to_theta(variables, constraints, z), everything)
 
@@ -99,6 +110,8 @@ def minimize_cost(
         callback=told,
         size=problem.sizes if identity else variables.sizes_inward(problem.sizes),
         idle=idle,
+        reach=_reach_of(problem),
+        gauss_newton=gauss_newton,
     )
     if result.status is Status.LINE_SEARCH_FAILED:
         refuse_jumps(evaluator, result.theta if identity else _to_theta(variables, constraints, result.theta))
@@ -132,6 +145,21 @@ def minimize_with_constraints(
     )
     values, multipliers = found.constraints.tolist(), found.multipliers.tolist()
     return found.result, tuple(zip(names, values, multipliers, strict=True))
+
+
+def _reach_of(problem: Problem) -> FloatArray:
+    """Return how far each variable may move in the first step inside the optimiser's trust region: (d,).
+
+    A transition time a part of the horizon, any other unknown a part of its first guess, or of the way between its
+    bounds where that is zero.
+    """
+    unknowns = problem.unknowns
+    width = unknowns.upper - unknowns.lower
+    guess = np.abs(unknowns.initial)
+    reach = REACH * np.where(guess > 0, guess, np.where(np.isfinite(width) & (width > 0), width, 1.0))
+    for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
+        reach[where[where >= 0]] = TIME_REACH * (experiment.tf - experiment.t0)
+    return np.where(unknowns.variables.log, REACH, reach / unknowns.variables.size)
 
 
 def _to_theta(variables: Variables, constraints: LinearConstraints, z: FloatArray) -> FloatArray:

@@ -1,7 +1,8 @@
 """The direction of an iteration: a convex quadratic programme in the step.
 
 Its matrix is the exact Hessian, made positive definite only in the subspace where it has to be (Newton), its blocks,
-Gauss-Newton's matrix, or a multiple of the identity (steepest descent). It starts from the sides of the steepest
+Gauss-Newton's matrix, or a multiple of the identity (steepest descent); by default the exact Hessian where it is
+positive definite, and Gauss-Newton's matrix inside a trust region where it is not. It starts from the sides of the steepest
 descent, so that its step descends wherever the optimality is positive.
 """
 
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.optimize.algebra import FloatArray
+from switchfit.optimize.box import FIRST_RADIUS, keep_in_box
 from switchfit.optimize.constraints import NONE
 from switchfit.optimize.dense import Dense
 from switchfit.optimize.kinks import release
@@ -24,13 +26,15 @@ from switchfit.optimize.state import State
 class Direction(NamedTuple):
     """Step d (d,) of the quadratic programme with its slope gᵀd and its predicted reduction −(gᵀd + ½dᵀBd).
 
-    `regular`: no constraint is active, no coordinate is held or at a kink, and H is positive definite.
+    `regular`: no constraint is active, no coordinate is held or at a kink, and H is positive definite. `radius` is that
+    of the trust region that it was found in.
     """
 
     step: FloatArray
     slope: float
     reduction: float
     regular: bool
+    radius: float = np.inf
 
 
 def find_direction(problem: Problem, state: State, piece: tuple[FloatArray, FloatArray] | None = None) -> Direction:
@@ -74,16 +78,21 @@ def _solve_on_sides(
     """
     point, constraints = state.point, problem.constraints
     gradient, hessian = point.derivatives(sides)
+    radius = state.radius
     room = _room(problem, state, sides, piece)
     matrix, floor = _model(problem, state, hessian, room.free)
     pressing = (point.multipliers > 0.0).nonzero()[0] if point.active.size else NONE
-    found = matrix.minimize_model(gradient, room, constraints.rows(pressing), floor)
+    found = matrix.minimize_model(gradient, keep_in_box(problem, room, radius), constraints.rows(pressing), floor)
+    if problem.has_box and not found.definite:
+        radius = FIRST_RADIUS if radius == np.inf else radius
+        matrix = matrix if state.careful or point.gauss_newton is None else point.gauss_newton
+        found = matrix.minimize_model(gradient, keep_in_box(problem, room, radius), constraints.rows(pressing), floor)
     regular = found.definite and matrix is hessian and room.free is None and point.is_interior
     slope = float(gradient @ found.step)
     force = -found.product
     if found.multipliers is not None:
         force = constraints.A.T @ found.multipliers[: constraints.b.size] - found.product
-    return Direction(found.step, slope, -(slope + 0.5 * float(found.step @ found.product)), regular), force
+    return Direction(found.step, slope, -(slope + 0.5 * float(found.step @ found.product)), regular, radius), force
 
 
 def _room(problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[FloatArray, FloatArray] | None) -> Room:

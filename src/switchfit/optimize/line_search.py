@@ -12,8 +12,11 @@ References
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from switchfit.optimize import box
 from switchfit.optimize.algebra import ARMIJO, ARMIJO_ACROSS, NOISE, cost_allows, optimality_allows
 from switchfit.optimize.direction import Direction, find_direction
 from switchfit.optimize.feasibility import move
@@ -29,6 +32,8 @@ def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | Non
     """Return a step that decreases J: across breakpoints if that works, otherwise inside the present smooth piece."""
     problem, theta = oracle.problem, state.point.theta
     breakpoints, constraints = problem.breakpoints, problem.constraints
+    if problem.has_box:
+        return _search_in_box(oracle, state, direction)
     alpha = 1.0
     crossed = breakpoints.count_crossed(theta, direction.step)
     while crossed > 0:
@@ -42,6 +47,33 @@ def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | Non
             direction = find_direction(problem, state, piece)
             break
     return _backtrack(oracle, state, direction)
+
+
+def _search_in_box(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
+    """Shrink the trust region until the step of the programme in it decreases J."""
+    problem, point = oracle.problem, state.point
+    breakpoints, constraints = problem.breakpoints, problem.constraints
+    whole = box.measure(problem, direction.step)
+    piece = None
+    for k in range(MAX_BACKTRACKS):
+        crossed = breakpoints.count_crossed(point.theta, direction.step)
+        accepted = _attempt(oracle, state, direction, 1.0, ARMIJO_ACROSS if crossed else ARMIJO)
+        length = box.measure(problem, direction.step)
+        if accepted is not None:
+            trial = accepted.point
+            radius = box.next_radius(
+                problem, direction.radius, direction.step, direction.reduction, point.cost, trial.cost
+            )
+            return Accepted(trial, length / whole if k else 1.0, radius)
+        if k > 5 and -direction.slope < 0.01 * NOISE * abs(point.cost):
+            break
+        if 0 < crossed < MANY_BREAKPOINTS and piece is None:
+            piece = breakpoints.piece(point.theta, constraints.lower, constraints.upper)
+            radius = direction.radius
+        else:
+            radius = box.SHRINK * length
+        direction = find_direction(problem, replace(state, radius=radius), piece)
+    return _blind_step(oracle, state, direction)
 
 
 def _backtrack(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
@@ -95,4 +127,4 @@ def _blind_step(oracle: Oracle, state: State, direction: Direction) -> Accepted 
     trial = oracle.point(there, state.scale)
     if trial is None or trial.cost > state.lowest_cost + noise or trial.optimality > 0.5 * state.point.optimality:
         return None
-    return Accepted(trial, 1.0)
+    return Accepted(trial, 1.0, state.radius)

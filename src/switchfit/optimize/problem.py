@@ -15,7 +15,11 @@ from switchfit.optimize.algebra import EPS, FloatArray
 from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.constraints import LinearConstraints
 
-HessianKind = Literal["exact", "descent-first", "block-diagonal", "gauss-newton", "none"]
+HessianKind = Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"]
+
+
+REACH = 0.1
+"""Part of an unknown's size by which it may move in the first step inside a trust region."""
 
 
 class Evaluation(Protocol):
@@ -31,6 +35,8 @@ class Evaluation(Protocol):
 
 Evaluate = Callable[[FloatArray, int], Evaluation]
 """``evaluate(theta, side)``, see `switchfit.optimize.minimize`."""
+GaussNewton = Callable[[FloatArray, int], FloatArray | Arrow]
+"""``gauss_newton(theta, side)``, see `switchfit.optimize.minimize`."""
 Idle = Callable[[FloatArray, bool], NDArray[np.bool_]]
 """``idle(theta, everything)``, see `switchfit.optimize.minimize`."""
 
@@ -51,6 +57,9 @@ class Problem:
     size : array, shape (d,)
         Typical size of each coordinate, zero where only its values tell.
     idle : callable or None
+    reach : array, shape (d,)
+        How far each coordinate may go at first in a step that the exact Hessian is no guide for.
+    gauss_newton : callable or None
     """
 
     evaluate: Evaluate
@@ -62,6 +71,8 @@ class Problem:
     max_iterations: int
     size: FloatArray
     idle: Idle | None
+    reach: FloatArray
+    gauss_newton: GaussNewton | None
 
     @classmethod
     def of(
@@ -76,6 +87,8 @@ class Problem:
         max_iterations: int,
         size: ArrayLike | None,
         idle: Idle | None,
+        reach: ArrayLike | None = None,
+        gauss_newton: GaussNewton | None = None,
     ) -> Problem:
         """The arguments of `switchfit.optimize.minimize`, checked."""
         d = constraints.size
@@ -97,6 +110,8 @@ class Problem:
             max_iterations=max_iterations,
             size=np.zeros(d) if size is None else np.broadcast_to(np.asarray(size, dtype=float), (d,)),
             idle=idle,
+            reach=typical_reach(theta) if reach is None else np.broadcast_to(np.asarray(reach, dtype=float), (d,)),
+            gauss_newton=gauss_newton,
         )
 
     @cached_property
@@ -118,6 +133,11 @@ class Problem:
     def rounding(self) -> FloatArray:
         """Rounding error of each coordinate, if it is of its typical size: (d,)."""
         return np.asarray(8 * EPS * self.size)
+
+    @property
+    def has_box(self) -> bool:
+        """Whether steps are kept inside a trust region where the exact Hessian is no guide."""
+        return self.hessian == "auto"
 
     @property
     def uses_hessian(self) -> bool:
@@ -222,6 +242,12 @@ def _next(points: list[float], x: float, step: float) -> float:
     """Return the fraction of a step of one coordinate up to the next breakpoint; infinite if it meets none."""
     k = bisect_right(points, x) if step > 0.0 else bisect_left(points, x) - 1
     return (points[k] - x) / step if step != 0.0 and 0 <= k < len(points) else np.inf
+
+
+def typical_reach(theta: FloatArray) -> FloatArray:
+    """Return how far unknowns may go in a first step where nothing else is known: a part of their sizes, (d,)."""
+    size = np.abs(theta)
+    return REACH * np.where(size > 0.0, size, 1.0)
 
 
 def _labels(hessian: HessianKind, blocks: ArrayLike | None, d: int) -> FloatArray | None:

@@ -36,6 +36,8 @@ class State:
         Largest ``|J|`` and largest derivative seen.
     lowest_cost : float
     restarts : int
+    radius : float
+        Half-width of the trust region, in units of `Problem.reach`; infinite where there is none.
     careful : bool
         The next step is taken with the diagonal of the Hessian alone.
     status : Status or None
@@ -53,6 +55,7 @@ class State:
     gradient_scale: float = 0.0
     lowest_cost: float = np.inf
     restarts: int = 0
+    radius: float = np.inf
     careful: bool = False
     status: Status | None = None
     reason: Finding | None = None
@@ -83,6 +86,7 @@ class State:
             gradient_scale=max(self.gradient_scale, point.largest_derivative),
             lowest_cost=min(self.lowest_cost, point.cost),
             restarts=self.restarts,
+            radius=accepted.radius,
         )
 
     @property
@@ -107,10 +111,11 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Accepted:
-    """The point of a step that was accepted, and the fraction of the proposed step that it took."""
+    """The point of a step that was accepted, the fraction of the proposed step that it took, and the next radius."""
 
     point: Point
     step_length: float
+    radius: float = np.inf
 
 
 def curvature_at(problem: Problem, state: State, rows: NDArray[np.intp]) -> Curvature:

@@ -1,0 +1,54 @@
+"""The trust region: a box around the point, in which the model of the cost is believed.
+
+Far from the solution the exact Hessian of a sum of squares is often indefinite, and made positive definite it leads
+astray. There Gauss-Newton's matrix stands in its place, and no unknown moves further than a radius times its `reach`.
+The radius follows from how well the model predicted the last step ([1]_, algorithm 4.1); a box, because then the
+region adds nothing but bounds to the quadratic programme. Where the Hessian is positive definite and its steps succeed,
+there is no box.
+
+References
+----------
+.. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapter 4.
+.. [2] J. E. Dennis, D. M. Gay, R. E. Welsch, An adaptive nonlinear least-squares algorithm, ACM Trans. Math. Softw. 7
+   (1981) 348-368 (Gauss-Newton's matrix and the exact Hessian in turn).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from switchfit.optimize.algebra import NOISE, FloatArray
+from switchfit.optimize.matrix import Room
+from switchfit.optimize.problem import Problem
+
+#: Radius of the first box.
+FIRST_RADIUS = 1.0
+#: Factors by which the radius falls after a step that the model misjudged, and grows after one that it judged well.
+SHRINK, GROW = 0.25, 2.0
+#: Ratios of the actual to the predicted reduction below and above which it does so.
+POOR, GOOD = 0.25, 0.75
+
+
+def keep_in_box(problem: Problem, room: Room, radius: float) -> Room:
+    """Return the room of a step, narrowed to the box with this radius."""
+    if radius == np.inf:
+        return room
+    m, d = room.constraints.b.size, room.constraints.size
+    offsets = room.offsets.copy()
+    offsets[m:] = np.maximum(offsets[m:], -radius * np.concatenate([problem.reach, problem.reach]))
+    return Room(room.constraints, offsets, room.free)
+
+
+def measure(problem: Problem, step: FloatArray) -> float:
+    """Return the radius of the smallest box that holds a step (d,)."""
+    return float(np.max(np.abs(step) / problem.reach))
+
+
+def next_radius(problem: Problem, radius: float, step: FloatArray, predicted: float, before: float, after: float) -> float:
+    """Return the radius that follows a step (d,) from the cost `before` to the cost `after`, if it was accepted."""
+    if predicted <= NOISE * abs(before):
+        return radius
+    ratio, length = (before - after) / predicted, measure(problem, step)
+    if ratio < POOR:
+        return min(radius, SHRINK * length)
+    return radius * GROW if ratio > GOOD and length > 0.9 * radius else radius
