@@ -84,14 +84,6 @@ def minimize_cost(
             refuse_hidden_switches(evaluator, theta, here.gradient)
         return here if identity else _to_variables(variables, theta, here)
 
-    def gauss_newton(z: Any, side: int) -> Any:
-        theta = z if identity else _to_theta(variables, constraints, z)
-        here = evaluator.arrow(theta, side, "gauss-newton") if by_blocks else evaluator(theta, side, matrix="gauss-newton")
-        if identity:
-            return here.hessian
-        flat = replace(here, gradient=np.zeros(len(theta)))  # the curvature of the variables is not part of the matrix
-        return _to_variables(variables, theta, flat).hessian
-
     def idle(z: FloatArray, everything: bool) -> NDArray[np.bool_]:
         return idle_unknowns(evaluator, z if identity else _to_theta(variables, constraints, z), everything)
 
@@ -111,7 +103,6 @@ def minimize_cost(
         size=problem.sizes if identity else variables.sizes_inward(problem.sizes),
         idle=idle,
         reach=_reach_of(problem),
-        gauss_newton=gauss_newton,
     )
     if result.status is Status.LINE_SEARCH_FAILED:
         refuse_jumps(evaluator, result.theta if identity else _to_theta(variables, constraints, result.theta))

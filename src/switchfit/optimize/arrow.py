@@ -205,7 +205,12 @@ class Arrow:
         return ArrowFactor.of(self if free is None else self.held(free)) is not None
 
     def minimize_model(
-        self, gradient: FloatArray, room: Room, pressed: FloatArray, floor: FloatArray | None
+        self,
+        gradient: FloatArray,
+        room: Room,
+        pressed: FloatArray,
+        floor: FloatArray | None,
+        reach: FloatArray | None = None,
     ) -> ModelStep:
         """Minimise ``gᵀd + ½ dᵀBd`` inside `room`; see `switchfit.optimize.matrix.SymmetricMatrix`.
 

@@ -7,6 +7,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -24,6 +25,9 @@ from switchfit.optimize.algebra import (
 from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.matrix import Curvature, ModelStep, Room, Spectrum, diagonal_scaling
 from switchfit.optimize.qp import CholeskyFactor, is_definite, newton_step, solve_whitened
+
+RAISED = 1.01
+"""Multiple of the smallest eigenvalue by which an indefinite matrix is shifted inside a trust region."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,11 +95,16 @@ class Dense:
         return bool(np.all(np.linalg.eigvalsh(part) > 0.0))
 
     def minimize_model(
-        self, gradient: FloatArray, room: Room, pressed: FloatArray, floor: FloatArray | None
+        self,
+        gradient: FloatArray,
+        room: Room,
+        pressed: FloatArray,
+        floor: FloatArray | None,
+        reach: FloatArray | None = None,
     ) -> ModelStep:
         """Minimise ``gᵀd + ½ dᵀBd`` inside `room`; see `switchfit.optimize.matrix.SymmetricMatrix`."""
         if room.free is None:
-            return _minimize(self.array, gradient, room.constraints.normals, room.offsets, pressed, floor)
+            return _minimize(self.array, gradient, room.constraints.normals, room.offsets, pressed, floor, reach)
         part = np.flatnonzero(room.free)
         d, m = len(self.array), room.constraints.b.size
         step = np.zeros(d)
@@ -105,7 +114,8 @@ class Dense:
         kept = np.concatenate([np.arange(m), m + part, m + d + part])
         normals = room.constraints.normals[kept][:, part]
         block, rest = self.array[np.ix_(part, part)], None if floor is None else floor[part]
-        found = _minimize(block, gradient[part], normals, room.offsets[kept], pressed[:, part], rest)
+        far = None if reach is None else reach[part]
+        found = _minimize(block, gradient[part], normals, room.offsets[kept], pressed[:, part], rest, far)
         step[part] = found.step
         product = self.array[:, part] @ found.step
         product[part] = found.product
@@ -170,9 +180,10 @@ def _minimize(
     offsets: FloatArray,
     pressed: FloatArray,
     floor: FloatArray | None,
+    reach: FloatArray | None,
 ) -> ModelStep:
     """Solve the programme of `Dense.minimize_model` in unknowns that are all free."""
-    convex, factor = convexify_and_factor(hessian, pressed, floor)
+    convex, factor = convexify_and_factor(hessian, pressed, floor, reach)
     step = newton_step(gradient, convex, factor)
     if (normals @ step >= offsets).all():
         return ModelStep(step, convex @ step, None, convex is hessian)
@@ -226,9 +237,12 @@ def convexify(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None
 
 
 def convexify_and_factor(
-    hessian: FloatArray, normals: FloatArray, floor: FloatArray | None
+    hessian: FloatArray, normals: FloatArray, floor: FloatArray | None, reach: FloatArray | None = None
 ) -> tuple[FloatArray, CholeskyFactor]:
-    """Return the matrix B of `convexify` and its factorisation; d > 0."""
+    """Return the matrix B of `convexify` and its factorisation; d > 0.
+
+    Inside a trust region with the half-widths `reach` (d,) eigenvalues are shifted instead of replaced.
+    """
     square = hessian.diagonal() if floor is None else np.maximum(hessian.diagonal(), floor)
     if square.min() > 0.0:
         # A positive definite matrix needs no more than Jacobi's scaling.
@@ -237,7 +251,7 @@ def convexify_and_factor(
         factor = CholeskyFactor.of_scaled(scaled, scaling) if is_definite(_shift(scaled)) else None
         if factor is not None:
             return hessian, factor
-    convex = _convex(hessian, normals, floor)
+    convex = _convex(hessian, normals, floor, reach)
     return convex, CholeskyFactor.of(convex)
 
 
@@ -248,27 +262,49 @@ def _shift(matrix: FloatArray) -> FloatArray:
     return shifted
 
 
-def _convex(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None) -> FloatArray:
+def _convex(
+    hessian: FloatArray, normals: FloatArray, floor: FloatArray | None, reach: FloatArray | None
+) -> FloatArray:
     """Return B for a matrix that is not positive definite, or was not found to be with Jacobi's scaling."""
     scaling = diagonal_scaling(Dense(hessian), floor)
     weight = scaling[:, None] * scaling
     scaled = hessian / weight
     if is_definite(_shift(scaled)):
         return hessian
-    free, blocked = split_space(normals / scaling)
+    if reach is None:
+        return _convex_on_face(scaled, normals / scaling, _absolute) * weight
+    weight = 1.0 / (reach[:, None] * reach)
+    return _convex_on_face(hessian / weight, normals * reach, _raise) * weight
+
+
+def _convex_on_face(
+    scaled: FloatArray, normals: FloatArray, make_definite: Callable[[FloatArray], FloatArray]
+) -> FloatArray:
+    """Return a positive definite matrix that differs from a scaled one across the normals alone if that is enough."""
+    free, blocked = split_space(normals)
     if blocked.shape[1] == 0 or free.shape[1] == 0:
-        return _absolute(scaled) * weight
-    top = _absolute(free.T @ scaled @ free)
+        return make_definite(scaled)
+    top = make_definite(free.T @ scaled @ free)
     cross = free.T @ scaled @ blocked
     tie = cross.T @ np.linalg.solve(top, cross)
-    bottom = _absolute(blocked.T @ scaled @ blocked - tie) + tie
+    bottom = make_definite(blocked.T @ scaled @ blocked - tie) + tie
     basis = np.hstack([free, blocked])
     convex = basis @ np.block([[top, cross], [cross.T, bottom]]) @ basis.T
     values = np.linalg.eigvalsh(convex)
     # A nearly singular Z'HZ makes the tie huge, and the smallest eigenvalue rounding.
     if values[0] < max(0.1 * EIGENVALUE_FLOOR, 64 * EPS * values[-1]):
-        return _absolute(scaled) * weight
-    return 0.5 * (convex + convex.T) * weight
+        return make_definite(scaled)
+    return np.asarray(0.5 * (convex + convex.T))
+
+
+def _raise(matrix: FloatArray) -> FloatArray:
+    """Return the matrix with all eigenvalues raised until the smallest is positive; itself if it is."""
+    symmetric = 0.5 * (matrix + matrix.T)
+    values = np.linalg.eigvalsh(symmetric)
+    margin = EIGENVALUE_FLOOR * float(np.max(np.abs(values), initial=0.0))
+    if values.size == 0 or values[0] > margin:
+        return symmetric
+    return np.asarray(symmetric + (margin - RAISED * values[0]) * np.eye(len(values)))
 
 
 def _absolute(matrix: FloatArray) -> FloatArray:

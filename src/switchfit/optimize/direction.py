@@ -1,8 +1,8 @@
 """The direction of an iteration: a convex quadratic programme in the step.
 
 Its matrix is the exact Hessian, made positive definite only in the subspace where it has to be (Newton), its blocks,
-Gauss-Newton's matrix, or a multiple of the identity (steepest descent); by default the exact Hessian where it is
-positive definite, and Gauss-Newton's matrix inside a trust region where it is not. It starts from the sides of the steepest
+Gauss-Newton's matrix, or a multiple of the identity (steepest descent); by default the exact Hessian,
+and where it is not positive definite the Hessian shifted until it is, inside a trust region. It starts from the sides of the steepest
 descent, so that its step descends wherever the optimality is positive.
 """
 
@@ -82,11 +82,12 @@ def _solve_on_sides(
     room = _room(problem, state, sides, piece)
     matrix, floor = _model(problem, state, hessian, room.free)
     pressing = (point.multipliers > 0.0).nonzero()[0] if point.active.size else NONE
-    found = matrix.minimize_model(gradient, keep_in_box(problem, room, radius), constraints.rows(pressing), floor)
-    if problem.has_box and not found.definite:
-        radius = FIRST_RADIUS if radius == np.inf else radius
-        matrix = matrix if state.careful or point.gauss_newton is None else point.gauss_newton
-        found = matrix.minimize_model(gradient, keep_in_box(problem, room, radius), constraints.rows(pressing), floor)
+    pressed = constraints.rows(pressing)
+    metric = problem.reach if problem.has_box else None
+    found = matrix.minimize_model(gradient, keep_in_box(problem, room, radius), pressed, floor, metric)
+    if problem.has_box and not found.definite and radius == np.inf:
+        radius = FIRST_RADIUS
+        found = matrix.minimize_model(gradient, keep_in_box(problem, room, radius), pressed, floor, metric)
     regular = found.definite and matrix is hessian and room.free is None and point.is_interior
     slope = float(gradient @ found.step)
     force = -found.product

@@ -154,7 +154,13 @@ class SymmetricMatrix(Protocol):
         ...
 
     def minimize_model(
-        self, gradient: FloatArray, room: Room, pressed: FloatArray, floor: FloatArray | None, /
+        self,
+        gradient: FloatArray,
+        room: Room,
+        pressed: FloatArray,
+        floor: FloatArray | None,
+        reach: FloatArray | None = None,
+        /,
     ) -> ModelStep:
         """Minimise ``gᵀd + ½ dᵀBd`` inside `room`, where B is H made positive definite on the free unknowns.
 
@@ -166,6 +172,8 @@ class SymmetricMatrix(Protocol):
             Normals of the constraints expected to be active: on their face B is H wherever it can be.
         floor : array, shape (d,), or None
             Curvature of each unknown that counts as none.
+        reach : array, shape (d,), or None
+            Half-widths of a trust region, in whose metric an indefinite H is shifted to make B.
         """
         ...
 

@@ -7,9 +7,8 @@ when no feasible v has J'(v) < 0, and the steepest descent −J'(v) over ‖v‖
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,8 +55,6 @@ class Point:
         Like side, and for each kink the side to descend to, 0 to hold it.
     idle : array of bool, shape (d,), or None
         Coordinates that are held because J does not depend on them; None if there are none.
-    find_gauss_newton : callable
-        Evaluates Gauss-Newton's matrix; None where there is none.
     curvatures : dict
         Curvatures found already, by the constraints' places.
     """
@@ -73,7 +70,6 @@ class Point:
     multipliers: FloatArray
     downhill: NDArray[np.int_]
     idle: NDArray[np.bool_] | None
-    find_gauss_newton: Callable[[], SymmetricMatrix | None]
     curvatures: dict[bytes, Curvature] = field(default_factory=dict)
 
     @property
@@ -96,11 +92,6 @@ class Point:
         """Larger of the two one-sided derivatives of each unknown, in size: (d,)."""
         right = np.abs(self.plus.gradient)
         return right if self.plus is self.minus else np.maximum(right, np.abs(self.minus.gradient))
-
-    @cached_property
-    def gauss_newton(self) -> SymmetricMatrix | None:
-        """Gauss-Newton's matrix, evaluated when it is asked for; None where there is none or it is not finite."""
-        return self.find_gauss_newton()
 
     @property
     def reported_sides(self) -> NDArray[np.int_]:
@@ -178,24 +169,12 @@ class Oracle:
             optimality, values, downhill = steepest_descent(left, right, kink, side, normals, idle)
             multipliers = np.zeros(len(constraints.names))
             multipliers[active] = values
-        gauss_newton = partial(self._gauss_newton, theta, -1 if plus is minus and (side < 0).any() else 1)
-        return Point(
-            theta, plus, minus, kink, side, slack, active, optimality, multipliers, downhill, idle, gauss_newton
-        )
+        return Point(theta, plus, minus, kink, side, slack, active, optimality, multipliers, downhill, idle)
 
     def point(self, trial: Trial, scale: FloatArray) -> Point | None:
         """Return the point at a trial, evaluated; None if J is not finite there."""
         first = self.first(trial)
         return None if first is None else self.complete(trial, first, scale)
-
-    def _gauss_newton(self, theta: FloatArray, side: int) -> SymmetricMatrix | None:
-        """Return Gauss-Newton's matrix at theta; None if the caller has none, or it is not finite."""
-        if self.problem.gauss_newton is None:
-            return None
-        self.evaluations += 1
-        given = self.problem.gauss_newton(theta.copy(), side)
-        found: SymmetricMatrix = given if isinstance(given, Arrow) else Dense.of(given, theta.size)
-        return found if found.finite else None
 
     def _idle(self, theta: FloatArray, active: NDArray[np.intp]) -> NDArray[np.bool_] | None:
         """Return the coordinates on which J does not depend while active rows stay so: (d,) of bool, or None."""

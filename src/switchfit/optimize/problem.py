@@ -35,8 +35,6 @@ class Evaluation(Protocol):
 
 Evaluate = Callable[[FloatArray, int], Evaluation]
 """``evaluate(theta, side)``, see `switchfit.optimize.minimize`."""
-GaussNewton = Callable[[FloatArray, int], FloatArray | Arrow]
-"""``gauss_newton(theta, side)``, see `switchfit.optimize.minimize`."""
 Idle = Callable[[FloatArray, bool], NDArray[np.bool_]]
 """``idle(theta, everything)``, see `switchfit.optimize.minimize`."""
 
@@ -58,8 +56,7 @@ class Problem:
         Typical size of each coordinate, zero where only its values tell.
     idle : callable or None
     reach : array, shape (d,)
-        How far each coordinate may go at first in a step that the exact Hessian is no guide for.
-    gauss_newton : callable or None
+        How far each coordinate may go in the first step inside a trust region.
     """
 
     evaluate: Evaluate
@@ -72,7 +69,6 @@ class Problem:
     size: FloatArray
     idle: Idle | None
     reach: FloatArray
-    gauss_newton: GaussNewton | None
 
     @classmethod
     def of(
@@ -88,7 +84,6 @@ class Problem:
         size: ArrayLike | None,
         idle: Idle | None,
         reach: ArrayLike | None = None,
-        gauss_newton: GaussNewton | None = None,
     ) -> Problem:
         """The arguments of `switchfit.optimize.minimize`, checked."""
         d = constraints.size
@@ -111,7 +106,6 @@ class Problem:
             size=np.zeros(d) if size is None else np.broadcast_to(np.asarray(size, dtype=float), (d,)),
             idle=idle,
             reach=typical_reach(theta) if reach is None else np.broadcast_to(np.asarray(reach, dtype=float), (d,)),
-            gauss_newton=gauss_newton,
         )
 
     @cached_property
@@ -136,7 +130,7 @@ class Problem:
 
     @property
     def has_box(self) -> bool:
-        """Whether steps are kept inside a trust region where the exact Hessian is no guide."""
+        """Whether steps are kept inside a trust region where the Hessian is indefinite or misjudges them."""
         return self.hessian == "auto"
 
     @property

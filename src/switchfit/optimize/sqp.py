@@ -36,7 +36,7 @@ from switchfit.optimize.feasibility import Trial, feasible_start
 from switchfit.optimize.line_search import search
 from switchfit.optimize.matrix import Curvature, Spectrum
 from switchfit.optimize.point import Oracle
-from switchfit.optimize.problem import Evaluate, GaussNewton, HessianKind, Idle, Problem
+from switchfit.optimize.problem import Evaluate, HessianKind, Idle, Problem
 from switchfit.optimize.saddles import NEGATIVE_CURVATURE, close_gaps, escape
 from switchfit.optimize.state import State, curvature_at, idle_coordinates
 from switchfit.optimize.status import Callback, IterationRecord, Result, Status
@@ -59,7 +59,6 @@ def minimize(
     size: ArrayLike | None = None,
     idle: Idle | None = None,
     reach: ArrayLike | None = None,
-    gauss_newton: GaussNewton | None = None,
 ) -> Result:
     """Minimise a piecewise smooth cost under linear constraints; every iterate is feasible.
 
@@ -77,8 +76,8 @@ def minimize(
     breakpoints : sequence of d arrays, optional
         Sorted values of each coordinate where the derivatives of J may jump. None: J is smooth.
     hessian : {"auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"}
-        What stands in the quadratic programme: the Hessian where it is positive definite, else Gauss-Newton's matrix
-        inside a trust region (`box`); the Hessian as evaluated, made positive definite where needed; the
+        What stands in the quadratic programme: the Hessian inside a trust region (`box`); the Hessian, made positive
+        definite where needed, with a line search; the
         Hessian where it is positive definite and steepest descent until then (the paper's scheme, Section II-A); the
         first without the entries between different `blocks`; the same again, for a caller whose `evaluate` returns
         Gauss-Newton's matrix; or nothing (steepest descent in the metric of theta, as in the paper).
@@ -100,8 +99,6 @@ def minimize(
     reach : array, shape (d,), optional
         How far each unknown may move in the first step inside a trust region ("auto"); a tenth of its value if left
         out.
-    gauss_newton : callable, optional
-        ``gauss_newton(theta, side)`` returns Gauss-Newton's matrix, in the shape of the Hessian, for "auto".
 
     Returns
     -------
@@ -131,7 +128,6 @@ def minimize(
         size,
         idle,
         reach,
-        gauss_newton,
     )
     trial = feasible_start(problem, start)
     oracle = Oracle(problem)
