@@ -358,7 +358,7 @@ def test_examples_load(path):
         ("sigma = 0.1", 'kind = "samples"', r"kind' must be 'measurements' or 'reference'; got 'samples'"),
         ("[options]", "[option]", r"unknown key 'option'; did you mean 'options'\?"),
         ("rtol = 1e-7", "rtol = -1.0", r"'options\.rtol' must be greater than 0; got -1\.0"),
-        ("rtol = 1e-7", 'hessian = "newton"', r"'options\.hessian' must be 'exact', 'descent-first', 'block-diagonal'"),
+        ("rtol = 1e-7", 'hessian = "newton"', r"'options\.hessian' must be 'auto', 'exact', 'descent-first'"),
         ("min_duration = 0.5", "min_duration = 4.0", r"min_duration is 4\.0 s, but the guess gives mode 1"),
         ("[parameters]", "[parameters", r"is not valid TOML: .*line 4"),
         ('model = "room.py:room"', "", r"the key 'model' is missing; name one of skid_steer, sliding_block, magic"),

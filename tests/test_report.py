@@ -140,7 +140,7 @@ def test_report_of_a_good_fit():
     text = report(made())
     assert line_with(text, "experiment") == "experiment stick -> slip -> stick, 0 to 10 s"
     assert line_with(text, "X, h") == "X, h: 30 samples, 1 of 60 values missing"
-    assert line_with(text, "method") == "method SQP with the exact Hessian"
+    assert line_with(text, "method") == "method SQP with the exact Hessian and a line search"
     assert line_with(text, "effort") == "effort 2 iterations, 4 evaluations, 1.25 s"
     assert line_with(text, "status") == "status Converged: the optimality 2.0e-09 is below the tolerance 1.0e-07."
     assert line_with(text, "cost J") == "cost J 28 (first guess: 900)"

@@ -843,7 +843,7 @@ def test_bad_input_is_named():
         minimize(evaluate, [np.nan, 0.0], constraints=free(2))
     with pytest.raises(ValueError, match=r"row 0 \(by 1\); start at a feasible"):
         minimize(evaluate, [1.0, 0.0], constraints=rows([[-1.0, 1.0]], [0.0]))
-    with pytest.raises(ValueError, match="choose one of exact"):
+    with pytest.raises(ValueError, match="choose one of auto, exact"):
         minimize(evaluate, [1.0, 0.0], constraints=free(2), hessian="bfgs")
     with pytest.raises(ValueError, match="must not be negative"):
         minimize(evaluate, [1.0, 0.0], constraints=free(2), tolerance=-1.0)

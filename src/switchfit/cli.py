@@ -69,8 +69,8 @@ def fit(
         Path | None, typer.Option(help="Folder for report.txt, estimate.json and fit.png.", show_default=False)
     ] = None,
     hessian: Annotated[
-        Literal["exact", "descent-first", "block-diagonal", "gauss-newton", "none"] | None,
-        typer.Option(help="Quadratic term of the optimiser.", show_default="exact"),
+        Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"] | None,
+        typer.Option(help="Quadratic term of the optimiser.", show_default="auto"),
     ] = None,
     tolerance: Annotated[
         float | None, typer.Option(min=0.0, help="Optimality at which to stop.", show_default="the library's")

@@ -428,10 +428,12 @@ def estimate(
     Parameters
     ----------
     problem : Problem
-    hessian : {"exact", "descent-first", "block-diagonal", "gauss-newton", "none"}
-        Quadratic term of the sequential quadratic programme: equation (3), made positive definite where it is not;
-        steepest descent until it is positive definite, then equation (3), as the paper does it (Section II-A);
-        equation (4); the Gauss-Newton matrix; or none (steepest descent).
+    hessian : {"auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"}
+        Quadratic term of the sequential quadratic programme: equation (3), shifted inside a trust region where it is
+        not positive definite; equation (3), its eigenvalues made positive where they are not, with a line search, which
+        guards and 16 experiments or more have in any case; steepest descent until it is positive definite, then
+        equation (3), as the paper does it (Section II-A); equation (4); the Gauss-Newton matrix; or none (steepest
+        descent).
     tolerance : float
         On the KKT residual, the norm of the gradient where no constraint is active. An unknown on a logarithmic scale
         counts by its logarithm, one whose first guess is below 1e-3 or above 1e3 in units of (about) that guess.
@@ -478,8 +480,8 @@ def estimate(
     tolerance, max_iterations = check_settings(tolerance, max_iterations)
     if callback is not None:
         as_callable(callback, "callback", "a function callback(record)", arguments=1)
-    if problem.constraint_names and hessian != "exact":
-        raise ValueError(f"with guards or terminal constraints hessian must be 'exact'; got {hessian!r}.")
+    if problem.constraint_names and hessian not in ("auto", "exact"):
+        raise ValueError(f"with guards or terminal constraints hessian must be 'auto' or 'exact'; got {hessian!r}.")
     began = time.perf_counter()
     theta, evaluator = _prepare_start(problem, start)
     history: list[IterationRecord] = []

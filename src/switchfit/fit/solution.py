@@ -95,7 +95,7 @@ def minimize_cost(
         theta if identity else variables.inward(np.asarray(theta)),
         constraints=constraints if identity else _convert_constraints(variables, constraints),
         breakpoints=evaluator.breakpoints(),
-        hessian=hessian,
+        hessian="exact" if by_blocks and hessian == "auto" else hessian,  # one radius for many runs would serve none
         blocks=unknowns.is_time.astype(int),
         tolerance=tolerance,
         max_iterations=max_iterations,

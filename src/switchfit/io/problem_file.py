@@ -31,7 +31,7 @@ from switchfit.problem.system import HybridSystem
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import is_device
 
-HessianKind = Literal["exact", "descent-first", "block-diagonal", "gauss-newton", "none"]
+HessianKind = Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"]
 
 
 @dataclass(frozen=True)

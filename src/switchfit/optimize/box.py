@@ -1,16 +1,15 @@
-"""The trust region: a box around the point, in which the model of the cost is believed.
+"""The trust region: a box around the point, in which the quadratic model of the cost is believed.
 
-Far from the solution the exact Hessian of a sum of squares is often indefinite, and made positive definite it leads
-astray. There Gauss-Newton's matrix stands in its place, and no unknown moves further than a radius times its `reach`.
-The radius follows from how well the model predicted the last step ([1]_, algorithm 4.1); a box, because then the
-region adds nothing but bounds to the quadratic programme. Where the Hessian is positive definite and its steps succeed,
-there is no box.
+Far from the solution the Hessian is often indefinite. Where eigenvalues are replaced by their absolute values, a line
+search along the step goes far in directions in which the model says nothing. Inside a trust region the Hessian is
+shifted instead, in the metric of the region, until it is positive definite ([1]_, section 4.3), and no unknown moves
+further than a radius times its `reach`. The radius follows from how well the model predicted the last step ([1]_,
+algorithm 4.1). The region is a box, for then it adds nothing but bounds to the quadratic programme. As long as the
+Hessian is positive definite and its steps succeed, there is no box.
 
 References
 ----------
 .. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapter 4.
-.. [2] J. E. Dennis, D. M. Gay, R. E. Welsch, An adaptive nonlinear least-squares algorithm, ACM Trans. Math. Softw. 7
-   (1981) 348-368 (Gauss-Newton's matrix and the exact Hessian in turn).
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ def keep_in_box(problem: Problem, room: Room, radius: float) -> Room:
     """Return the room of a step, narrowed to the box with this radius."""
     if radius == np.inf:
         return room
-    m, d = room.constraints.b.size, room.constraints.size
+    m = room.constraints.b.size
     offsets = room.offsets.copy()
     offsets[m:] = np.maximum(offsets[m:], -radius * np.concatenate([problem.reach, problem.reach]))
     return Room(room.constraints, offsets, room.free)
@@ -44,8 +43,10 @@ def measure(problem: Problem, step: FloatArray) -> float:
     return float(np.max(np.abs(step) / problem.reach))
 
 
-def next_radius(problem: Problem, radius: float, step: FloatArray, predicted: float, before: float, after: float) -> float:
-    """Return the radius that follows a step (d,) from the cost `before` to the cost `after`, if it was accepted."""
+def next_radius(
+    problem: Problem, radius: float, step: FloatArray, predicted: float, before: float, after: float
+) -> float:
+    """Return the radius that follows an accepted step (d,) from the cost `before` to the cost `after`."""
     if predicted <= NOISE * abs(before):
         return radius
     ratio, length = (before - after) / predicted, measure(problem, step)

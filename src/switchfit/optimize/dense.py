@@ -26,7 +26,7 @@ from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.matrix import Curvature, ModelStep, Room, Spectrum, diagonal_scaling
 from switchfit.optimize.qp import CholeskyFactor, is_definite, newton_step, solve_whitened
 
-RAISED = 1.01
+RAISED = 2.0
 """Multiple of the smallest eigenvalue by which an indefinite matrix is shifted inside a trust region."""
 
 
@@ -262,9 +262,7 @@ def _shift(matrix: FloatArray) -> FloatArray:
     return shifted
 
 
-def _convex(
-    hessian: FloatArray, normals: FloatArray, floor: FloatArray | None, reach: FloatArray | None
-) -> FloatArray:
+def _convex(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None, reach: FloatArray | None) -> FloatArray:
     """Return B for a matrix that is not positive definite, or was not found to be with Jacobi's scaling."""
     scaling = diagonal_scaling(Dense(hessian), floor)
     weight = scaling[:, None] * scaling

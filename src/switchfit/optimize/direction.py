@@ -1,9 +1,9 @@
 """The direction of an iteration: a convex quadratic programme in the step.
 
 Its matrix is the exact Hessian, made positive definite only in the subspace where it has to be (Newton), its blocks,
-Gauss-Newton's matrix, or a multiple of the identity (steepest descent); by default the exact Hessian,
-and where it is not positive definite the Hessian shifted until it is, inside a trust region. It starts from the sides of the steepest
-descent, so that its step descends wherever the optimality is positive.
+Gauss-Newton's matrix, or a multiple of the identity (steepest descent). By default the step stays inside a trust region
+where the Hessian is not positive definite (`box`). It starts from the sides of the steepest descent, so that its step
+descends wherever the optimality is positive.
 """
 
 from __future__ import annotations

@@ -50,7 +50,10 @@ def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | Non
 
 
 def _search_in_box(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
-    """Shrink the trust region until the step of the programme in it decreases J."""
+    """Shrink the trust region until the step of the programme in it decreases J.
+
+    A step that failed across few breakpoints is tried in the present smooth piece before the region shrinks.
+    """
     problem, point = oracle.problem, state.point
     breakpoints, constraints = problem.breakpoints, problem.constraints
     whole = box.measure(problem, direction.step)

@@ -9,7 +9,7 @@ One iteration, `_step`, maps a state (`state`) at a point (`point`) to the next 
 
 1. *direction* (`direction`): a convex quadratic programme (`qp`, with the matrices of `dense` or `arrow`);
 2. *line search* (`line_search`): the full step first, even across breakpoints, then inside the present smooth piece;
-   every trial is made feasible (`feasibility`);
+   by default in a trust region that shrinks (`box`); every trial is made feasible (`feasibility`);
 3. *kinks* (`kinks`): coordinates that sit on a breakpoint are held, or released to one side.
 
 At a stationary point the curvature tells a minimum from a saddle, which is left along negative curvature (`saddles`);

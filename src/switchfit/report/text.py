@@ -28,7 +28,8 @@ LISTED_EXPERIMENTS = 10
 SMALL_CORRELATION = 0.1
 """Correlations below this in size are not listed."""
 METHODS = {
-    "exact": "SQP with the exact Hessian",
+    "auto": "SQP with the exact Hessian in a trust region",
+    "exact": "SQP with the exact Hessian and a line search",
     "descent-first": "steepest descent until the Hessian is positive definite, then SQP with it",
     "block-diagonal": "SQP with the block-diagonal Hessian",
     "gauss-newton": "SQP with the Gauss-Newton matrix",
