@@ -1,0 +1,132 @@
+"""Removal and re-insertion of modes: what local minima in switching times are made of is undone.
+
+A mode that is not where it should be often cannot get there: on its way it would have to pass other modes, or to vanish
+and to appear elsewhere. So the mode whose removal costs least is taken out, and put in where the cost falls fastest with
+the length of a mode of no length, which is its derivative in the later of two equal transition times ([1]_). A fit
+follows, and all this is repeated as long as the cost falls.
+
+References
+----------
+.. [1] M. Egerstedt, Y. Wardi, H. Axelsson, Transition-time optimization for switched-mode dynamical systems, IEEE Trans.
+   Automat. Contr. 51 (2006) 110-115 (the derivative in a transition time).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from switchfit.fit.evaluator import Evaluator
+from switchfit.problem.data import FloatArray
+from switchfit.problem.problem import Problem
+from switchfit.strategy.quick import End, fit_briefly
+
+PLACES = 60
+"""Places along the horizon at which an insertion is tried."""
+
+LENGTHS = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8)
+"""Lengths that are tried, as parts of what the mode has room for."""
+
+REMOVALS = 3
+"""Modes that are taken out in turn, those first whose removal costs least."""
+
+LOWER = 1e-6
+"""A cost has to fall by this part of itself for the search to go on."""
+
+ROUNDS = 20
+
+
+def can_reinsert(problem: Problem) -> bool:
+    """Return whether a mode can be taken out and put in elsewhere with the same sequence: it stands between two equal
+    ones, of which there are more pairs."""
+    return any(next(_list_moves(run.mode_sequence), None) is not None for run in problem.experiments)
+
+
+def reinsert_modes(problem: Problem, theta: FloatArray) -> End:
+    """Return where removals and insertions end that begin at the end of a fit, theta (d,)."""
+    current = fit_briefly(problem, theta)
+    evaluations = current.evaluations
+    for _ in range(ROUNDS):
+        better = None
+        for candidate, tried in _list_candidates(problem, current.theta):
+            end = fit_briefly(problem, candidate)
+            evaluations += tried + end.evaluations
+            if end.cost < current.cost - LOWER * abs(current.cost):
+                better = end
+                break
+        if better is None:
+            break
+        current = better
+    return current._replace(evaluations=evaluations)
+
+
+def _list_moves(sequence: tuple[str, ...]) -> Iterator[tuple[int, int]]:
+    """Find which segment may be taken out, and behind which of the others it may be put in: the sequence stays the
+    same."""
+    for i in range(len(sequence) - 2):
+        if sequence[i] == sequence[i + 2]:
+            rest = sequence[: i + 1] + sequence[i + 3 :]
+            for j in range(len(rest)):
+                whole = (*rest[: j + 1], sequence[j + 1] if j + 1 < len(sequence) else "", rest[j], *rest[j + 1 :])
+                if whole == sequence and len(rest) > 1:
+                    yield i, j
+
+
+def _list_candidates(problem: Problem, theta: FloatArray) -> Iterator[tuple[FloatArray, int]]:
+    """Find thetas from which a fit may end at a lower cost, with the evaluations that each took."""
+    evaluator = Evaluator(problem, theta)
+    for run, where in zip(problem.experiments, problem.unknowns.times, strict=True):
+        moves: dict[int, list[int]] = {}
+        for i, j in _list_moves(run.mode_sequence):
+            if np.all(where[i : i + 2] >= 0):
+                moves.setdefault(i, []).append(j)
+        closed = {}
+        for i in moves:
+            without = theta.copy()
+            without[where[i : i + 2]] = theta[where[i : i + 2]].mean()
+            closed[i] = _cost(evaluator, without)
+        for i in sorted(closed, key=closed.__getitem__)[:REMOVALS]:
+            found = _insert(evaluator, theta, where, i, moves[i], run.t0, run.tf)
+            if found is not None:
+                yield found[0], found[1] + len(closed)
+
+
+def _insert(
+    evaluator: Evaluator, theta: FloatArray, where: FloatArray, i: int, behind: list[int], t0: float, tf: float
+) -> tuple[FloatArray, int] | None:
+    """Put the pair of transitions i and i + 1 in where the cost falls fastest; None if it falls nowhere."""
+    times = theta[where]
+    others = np.delete(times, [i, i + 1])
+    knots = np.concatenate([[t0], others, [tf]])
+    best, tried = (0.0, np.nan, 0), 0
+    for place in np.linspace(t0, tf, PLACES + 2)[1:-1]:
+        j = int(np.searchsorted(others, place, "right"))
+        if j not in behind:
+            continue
+        there = _with_pair(theta, where, others, j, place, place)
+        slope = evaluator(there).gradient[where[j + 1]]
+        tried += 1
+        if slope < best[0]:
+            best = (float(slope), float(place), j)
+    slope, place, j = best
+    if slope == 0.0:
+        return None
+    room = knots[j + 1] - place
+    candidates = [_with_pair(theta, where, others, j, place, place + part * room) for part in LENGTHS]
+    costs = [_cost(evaluator, candidate) for candidate in candidates]
+    return candidates[int(np.argmin(costs))], tried + len(costs)
+
+
+def _with_pair(
+    theta: FloatArray, where: FloatArray, others: FloatArray, j: int, begin: float, end: float
+) -> FloatArray:
+    """Return theta with the transition times `others` and a pair behind the j-th of them."""
+    moved = theta.copy()
+    moved[where] = np.insert(others, [j, j], [begin, end])
+    return moved
+
+
+def _cost(evaluator: Evaluator, theta: FloatArray) -> float:
+    cost = evaluator.cost(theta)
+    return cost if np.isfinite(cost) else np.inf
