@@ -19,6 +19,9 @@ TOLERANCE = 1e-6
 PERFECT = 1e-6
 """Part of J at the problem's guess below which the optimum is a perfect fit: excesses are then parts of that J."""
 
+NOISE = 2.0
+"""Of noisy data, ends whose J (half of chi²) is higher by this much are as good as the best."""
+
 MET = 1e-6
 """Largest value of a guard or a terminal constraint that counts as met."""
 
@@ -35,8 +38,9 @@ class Case:
     starts : (S, d)
         In the order of ``problem.theta_names``.
     noisy : bool
-        Whether the data are simulated at `near` with noise. A fit that is no worse than the true values is right then:
-        with kinks at the samples there are many minima about the truth, and the noise decides which is the lowest.
+        Whether the data are simulated at `near` with noise of known size. An end is right then if it fits no worse
+        than the true values and its J is at most `NOISE` above the best: with kinks at the samples there are many
+        minima about the truth, and the noise decides which is the lowest.
     """
 
     problem: sf.Problem
@@ -64,14 +68,20 @@ class Case:
         return bool(violation <= MET and self.excess(cost, best) <= TOLERANCE)
 
     def is_right(self, cost: float, best: float, violation: float = 0.0) -> bool:
-        """Return whether an end is right: the best known cost, or, of noisy data, at most the cost of the truth."""
+        """Return whether an end is right: the best known cost, or, of noisy data, in the basin of the truth."""
         if self.is_best(cost, best, violation):
             return True
-        return bool(self.noisy and violation <= MET and cost <= self.cost_near)
+        return bool(self.noisy and violation <= MET and cost <= min(self.cost_near, best + NOISE))
+
+    @cached_property
+    def identity(self) -> str:
+        """A digest of the problem that stays the same from version to version: `near`, and J at the guess."""
+        return hashlib.sha256(self.near.tobytes() + f"{self.cost_of_guess:.6g}".encode()).hexdigest()[:12]
 
     def digest(self, start: int) -> str:
-        """Return a digest of one start, which tells whether an outcome on file belongs to it."""
-        return hashlib.sha256(np.ascontiguousarray(self.starts[start]).tobytes()).hexdigest()[:12]
+        """Return a digest of the problem and one start: an outcome on file belongs to them if its digest is this."""
+        own = np.ascontiguousarray(self.starts[start]).tobytes()
+        return hashlib.sha256(self.identity.encode() + own).hexdigest()[:12]
 
 
 def draw_anywhere(problem: sf.Problem, count: int, seed: int) -> np.ndarray:

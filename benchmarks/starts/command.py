@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from benchmarks.report import RESULTS
-from benchmarks.starts.methods import list_methods, why_not
+from benchmarks.starts.methods import list_methods
 from benchmarks.starts.problems import PROBLEMS
 from benchmarks.starts.study import Outcomes, digest_source, list_jobs, run_jobs
 from benchmarks.starts.table import write_table
@@ -24,15 +24,11 @@ def main(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     problems = options.problems.split(",") if options.problems else list(PROBLEMS)
     methods = options.methods.split(",") if options.methods else list(list_methods())
-    unknown = [name for name in problems if name not in PROBLEMS]
-    if unknown:
-        parser.error(f"no such problem: {', '.join(unknown)}; there are {', '.join(PROBLEMS)}")
+    for what, given, there in (("problem", problems, PROBLEMS), ("method", methods, list_methods())):
+        if unknown := [name for name in given if name not in there]:
+            parser.error(f"no such {what}: {', '.join(unknown)}; there are {', '.join(there)}")
     if (options.starts is not None and options.starts < 1) or options.processes < 1:
         parser.error("--starts and --processes must be 1 or more")
-    for name in methods:
-        if name not in list_methods():
-            print(f"{name} is left out: {why_not(name)}.")
-    methods = [name for name in methods if name in list_methods()]
     outcomes = Outcomes(options.folder / f"starts-{digest_source()}.jsonl", options.fresh)
     run_jobs(list_jobs(problems, methods, options.starts), outcomes, options.processes)
     lines = write_table(outcomes, problems, methods, options.starts)

@@ -4,41 +4,13 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 import switchfit as sf
-
-
-@dataclass(frozen=True)
-class End:
-    """Where a fit ended and what it said of it.
-
-    Attributes
-    ----------
-    theta : list of d floats
-    cost : float
-    violation : float
-        Largest absolute value of a guard or terminal constraint; 0 without any.
-    claims : bool
-        Whether the fit says that it succeeded: its verdict is "good", or it has no verdict and success is true.
-    verdict : str
-        "good", "doubtful" or "bad"; empty where a fit gives none.
-    status : str
-    evaluations, iterations : int
-    """
-
-    theta: list[float]
-    cost: float
-    violation: float
-    claims: bool
-    verdict: str
-    status: str
-    evaluations: int
-    iterations: int
-
+from benchmarks.starts.end import End
+from benchmarks.starts.peers import fit_with_least_squares, fit_with_slsqp, why_no_least_squares
 
 Method = Callable[[sf.Problem, np.ndarray], End]
 
@@ -82,12 +54,14 @@ def list_methods() -> dict[str, Method]:
         "default": fit_with(),
     }
     if has_strategies():
-        methods |= {"auto": fit_with(strategy="auto"), "thorough": fit_with(strategy="thorough")}
-    return methods
+        methods |= {name: fit_with(strategy=name) for name in STRATEGIES}
+    return methods | PEERS
 
 
-def why_not(name: str) -> str:
-    """Return why a method is missing."""
-    if name in ("auto", "thorough"):
-        return "this version of sf.estimate has no strategies"
-    return f"there is no method {name!r}; there are {', '.join(list_methods())}"
+PEERS: dict[str, Method] = {"scipy-least-squares": fit_with_least_squares, "scipy-slsqp": fit_with_slsqp}
+STRATEGIES = ("auto", "thorough")
+
+
+def why_not(name: str, problem: sf.Problem) -> str:
+    """Return why a method does not apply to a problem; empty where it does."""
+    return why_no_least_squares(problem) if name == "scipy-least-squares" else ""

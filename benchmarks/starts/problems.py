@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
-from benchmarks.starts import logs, switching, vehicles
+from benchmarks.starts import bounces, logs, switching, vehicles
 from benchmarks.starts.case import Case, Make
 
 PROBLEMS: dict[str, Make] = {
@@ -16,7 +16,13 @@ PROBLEMS: dict[str, Make] = {
     "fishing": switching.fishing,
     "linear": switching.linear,
     "oscillator": switching.oscillator,
+    "tosses": logs.ten_tosses,
+    "ball-guards": bounces.ball_on_guards,
+    "ball": bounces.ball_without_guards,
     "thermostat": logs.thermostat,
+    "epidemic": logs.epidemic,
+    "runs": logs.many_runs,
+    "enzyme": logs.enzyme,
 }
 
 

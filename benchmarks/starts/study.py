@@ -16,14 +16,15 @@ from pathlib import Path
 from typing import Any
 
 import switchfit as sf
-from benchmarks.starts.methods import End, list_methods
+from benchmarks.starts.end import End
+from benchmarks.starts.methods import list_methods, why_not
 from benchmarks.starts.problems import build_case
 
 REFERENCE = "from the truth"
 """Name of the method that fits from where the best known answer is; start -1."""
 
 Outcome = dict[str, Any]
-"""problem, method, start, digest of the start, seconds, and either error or the fields of `methods.End`."""
+"""problem and case (its identity), method, start and its digest, seconds, and an error or the fields of `End`."""
 
 
 @dataclass(frozen=True)
@@ -88,16 +89,18 @@ def list_jobs(problems: Iterable[str], methods: Iterable[str], count: int | None
     jobs = []
     for problem in problems:
         case = build_case(problem, count)
-        jobs.append(Job(problem, REFERENCE, -1, "near"))
+        jobs.append(Job(problem, REFERENCE, -1, case.identity))
         for method in methods:
-            jobs += [Job(problem, method, k, case.digest(k)) for k in range(len(case.starts))]
+            if not why_not(method, case.problem):
+                jobs += [Job(problem, method, k, case.digest(k)) for k in range(len(case.starts))]
     return jobs
 
 
 def run_job(job: Job) -> Outcome:
     """Fit one start; an error is an outcome like any other."""
     case = build_case(job.problem)
-    known: dict[str, Any] = {"problem": job.problem, "method": job.method, "start": job.start, "digest": job.digest}
+    known: Outcome = {"problem": job.problem, "case": case.identity, "method": job.method}
+    known |= {"start": job.start, "digest": job.digest}
     reference = job.method == REFERENCE
     fit = list_methods()["exact" if reference else job.method]
     start = case.near if reference else case.starts[job.start]

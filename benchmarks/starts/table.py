@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from benchmarks.starts.case import MET, Case
+from benchmarks.starts.methods import why_not
 from benchmarks.starts.problems import build_case
 from benchmarks.starts.study import REFERENCE, Outcome, Outcomes, read_outcomes
 
@@ -17,7 +18,7 @@ HEADER = (
     "right",
     "of these the best",
     "wrong, claims success",
-    "right, doubtful or bad",
+    "right, does not claim it",
     "errors",
     "evaluations, median",
     "evaluations, all",
@@ -26,13 +27,15 @@ HEADER = (
 )
 
 
-def find_best(problem: str, files: Iterable[Path]) -> float:
-    """Return the least cost that any method of any version of switchfit has found with all constraints met."""
+def find_best(problem: str, case: Case, files: Iterable[Path]) -> float:
+    """Return the least cost that any method and version of switchfit has found with all constraints met."""
     costs = [
         outcome["cost"]
         for path in files
         for outcome in read_outcomes(path)
-        if outcome["problem"] == problem and "error" not in outcome and outcome["violation"] <= MET
+        if (outcome["problem"], outcome["case"]) == (problem, case.identity)
+        and "error" not in outcome
+        and outcome["violation"] <= MET
     ]
     return min((cost for cost in costs if cost == cost), default=float("nan"))
 
@@ -43,15 +46,13 @@ def count(case: Case, best: float, outcomes: list[Outcome]) -> tuple[str, ...]:
     right = [end for end in ends if case.is_right(end["cost"], best, end["violation"])]
     wrong = [end for end in ends if not case.is_right(end["cost"], best, end["violation"])]
     exact = [end for end in right if case.is_best(end["cost"], best, end["violation"])]
-    doubted = [end for end in right if end["verdict"] in ("doubtful", "bad")]
-    has_verdict = any(end["verdict"] for end in ends)
     evaluations = [end["evaluations"] for end in ends]
     seconds = [outcome["seconds"] for outcome in outcomes]
     return (
         f"{len(right)} of {len(outcomes)}",
         str(len(exact)),
         f"{sum(end['claims'] for end in wrong)} of {len(wrong)}",
-        str(len(doubted)) if has_verdict else "no verdicts",
+        str(sum(not end["claims"] for end in right)),
         str(len(outcomes) - len(ends)),
         f"{statistics.median(evaluations):.0f}" if ends else "",
         str(sum(evaluations)),
@@ -67,10 +68,13 @@ def write_table(outcomes: Outcomes, problems: list[str], methods: list[str], num
     notes = []
     for problem in problems:
         case = build_case(problem, number)
-        best = find_best(problem, files)
-        reference = outcomes.found.get((problem, REFERENCE, -1, "near"))
+        best = find_best(problem, case, files)
+        reference = outcomes.found.get((problem, REFERENCE, -1, case.identity))
         notes.append(describe(problem, case, best, reference))
         for method in methods:
+            if why := why_not(method, case.problem):
+                notes.append(f"- {problem}, {method} is left out: {why}")
+                continue
             keys = [(problem, method, k, case.digest(k)) for k in range(len(case.starts))]
             found = [outcomes.found[key] for key in keys if key in outcomes.found]
             if found:

@@ -1,0 +1,149 @@
+"""SciPy's optimisers with switchfit's own costs and exact first derivatives: what differs is the way to the optimum.
+
+Each works on one mesh, chosen at its start, as a user would have it; where it ends J is evaluated on a mesh chosen
+there.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.optimize
+
+import switchfit as sf
+from benchmarks.starts.end import End
+from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.solution import is_plain_least_squares
+from switchfit.uncertainty.sensitivity import collect_sample_derivatives, get_sensitivity_program
+
+MOST_CALLS = 300
+FTOL = 1e-15
+
+
+def fit_with_least_squares(problem: sf.Problem, start: np.ndarray) -> End:
+    """Fit with `least_squares` (trust region reflective) in the modes' durations, which keeps the times in order."""
+    evaluator = Evaluator(problem, start)
+    back = build_durations(problem)
+    forth = np.linalg.solve(back, start)
+    lower, upper = (np.array(bound, dtype=float) for bound in (problem.unknowns.lower, problem.unknowns.upper))
+    for run, where in zip(problem.experiments, problem.unknowns.times, strict=True):
+        # The first is a time, the others are durations; that the last is before tf is left to `residuals`.
+        lower[where[:1]], upper[where[:1]] = np.maximum(lower[where[:1]], run.t0), np.minimum(upper[where[:1]], run.tf)
+        lower[where[1:]], upper[where[1:]] = 0.0, run.tf - run.t0
+    found: dict[bytes, Any] = {}
+
+    def samples(z: np.ndarray) -> Any:
+        key = z.tobytes()
+        if key not in found:
+            found.clear()
+            theta = back @ z
+            simulations = enumerate(evaluator.simulate(theta, tangents=True))
+            runs = [get_sensitivity_program(problem, e, simulation) for e, simulation in simulations]
+            found[key] = collect_sample_derivatives(problem, runs)
+        return found[key]
+
+    shape = len(samples(forth).residual)
+
+    def residuals(z: np.ndarray) -> np.ndarray:
+        if not is_in_order(problem, back @ z):
+            return np.full(shape, np.inf)
+        here = samples(z)
+        return np.sqrt(here.weight) * here.residual
+
+    def jacobian(z: np.ndarray) -> np.ndarray:
+        here = samples(z)
+        return np.sqrt(here.weight)[:, None] * here.derivative @ back
+
+    result = scipy.optimize.least_squares(
+        residuals,
+        np.clip(forth, lower, upper),
+        jac=jacobian,
+        bounds=(lower, upper),
+        x_scale="jac",
+        ftol=1e-12,
+        xtol=1e-10,
+        gtol=1e-10,
+        max_nfev=MOST_CALLS,
+    )
+    return _read(problem, back @ result.x, result.success, str(result.status), result.nfev, result.njev)
+
+
+def fit_with_slsqp(problem: sf.Problem, start: np.ndarray) -> End:
+    """Fit with SLSQP from J and its exact gradient; guards and terminal constraints are its equalities.
+
+    It is sensitive to scales: J counts in units of J at the start, parameters in units of theirs there.
+    """
+    evaluator = Evaluator(problem, start)
+    unknowns = problem.unknowns
+    unit = np.where(unknowns.is_time | (start == 0), 1.0, np.abs(start))
+    first = max(abs(evaluator.cost(start)), np.finfo(float).tiny)
+
+    def cost(z: np.ndarray) -> tuple[float, np.ndarray]:
+        here = evaluator(unit * z, matrix="none")
+        return here.cost / first, unit * here.gradient / first
+
+    constraints: list[dict[str, Any]] = []
+    if len(unknowns.b):
+        order = {"fun": lambda z: unknowns.A @ (unit * z) - unknowns.b, "jac": lambda z: unknowns.A * unit}
+        constraints.append({"type": "ineq", **order})
+    if problem.constraint_names:
+        held = {
+            "fun": lambda z: evaluator.constrained(unit * z).constraints,
+            "jac": lambda z: evaluator.constrained(unit * z).jacobian * unit,
+        }
+        constraints.append({"type": "eq", **held})
+    result = scipy.optimize.minimize(
+        cost,
+        start / unit,
+        jac=True,
+        method="SLSQP",
+        bounds=scipy.optimize.Bounds(unknowns.lower / unit, unknowns.upper / unit),
+        constraints=constraints,
+        options={"ftol": FTOL, "maxiter": MOST_CALLS},
+    )
+    return _read(problem, unit * result.x, result.success, str(result.status), result.nfev, result.nit)
+
+
+def why_no_least_squares(problem: sf.Problem) -> str:
+    """Return why `least_squares` does not apply; empty where it does."""
+    if problem.constraint_names:
+        return "it knows no guards and no terminal constraints"
+    samples_alone = all(isinstance(item, sf.Measurements) for run in problem.experiments for item in run.data)
+    return "" if samples_alone and is_plain_least_squares(problem) else "its cost is no sum of squares over samples"
+
+
+def build_durations(problem: sf.Problem) -> np.ndarray:
+    """Return the matrix (d, d) that takes the first time and the durations after it to the times of each run."""
+    matrix = np.eye(len(problem.theta_names))
+    for where in problem.unknowns.times:
+        matrix[np.ix_(where, where)] = np.tril(np.ones((len(where), len(where))))
+    return matrix
+
+
+def is_in_order(problem: sf.Problem, theta: np.ndarray) -> bool:
+    """Return whether theta satisfies the order of the times and all bounds, but for rounding."""
+    unknowns = problem.unknowns
+    inside = np.all(theta >= unknowns.lower - 1e-12) and np.all(theta <= unknowns.upper + 1e-12)
+    return bool(inside and np.all(unknowns.A @ theta - unknowns.b >= -1e-12))
+
+
+def _read(problem: sf.Problem, theta: np.ndarray, success: bool, status: str, calls: int, iterations: int) -> End:
+    """Return where an optimiser of SciPy's ended, judged by J on a mesh chosen there."""
+    theta = np.clip(theta, problem.unknowns.lower, problem.unknowns.upper)
+    for run, where in zip(problem.experiments, problem.unknowns.times, strict=True):
+        theta[where] = np.clip(np.maximum.accumulate(theta[where]), run.t0, run.tf)
+    evaluator = Evaluator(problem, problem.check_theta(theta))
+    violation = 0.0
+    if problem.constraint_names:
+        violation = float(np.max(np.abs(evaluator.constrained(theta).constraints)))
+    return End(
+        theta=theta.tolist(),
+        cost=float(evaluator.cost(theta)),
+        violation=violation,
+        claims=bool(success),
+        verdict="",
+        status=status,
+        evaluations=int(calls),
+        iterations=int(iterations),
+    )
