@@ -18,7 +18,7 @@ from switchfit.fit.solution import is_plain_least_squares
 from switchfit.uncertainty.sensitivity import collect_sample_derivatives, get_sensitivity_program
 
 MOST_CALLS = 300
-FTOL = 1e-15
+FTOL = 1e-12
 
 
 def fit_with_least_squares(problem: sf.Problem, start: np.ndarray) -> End:
