@@ -12,6 +12,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 
 import switchfit as sf
 from benchmarks.starts import command, methods, peers, study, table
+from benchmarks.starts.end import judge
 from benchmarks.starts.problems import PROBLEMS, build_case
 from benchmarks.starts.study import REFERENCE, Job, Outcomes
 from switchfit.fit.evaluator import Evaluator
@@ -32,13 +33,16 @@ def test_starts_are_feasible_and_differ(name):
 def test_the_truth_is_right_and_a_bad_start_is_not(name):
     case = build_case(name)
     fit = methods.fit_with()(case.problem, case.near)
-    assert case.is_best(fit.cost, fit.cost, fit.violation)
-    assert case.is_right(fit.cost, fit.cost, fit.violation)
-    # From a start nothing is right yet.
-    assert not any(case.is_right(Evaluator(case.problem, s).cost(s), fit.cost) for s in case.starts[:3])
+    found = judge(case.problem, fit.theta)
+    best = found["cost"]
+    assert case.excess(fit.said, best) == pytest.approx(0.0, abs=1e-6)
+    assert case.is_best(**found, best=best)
+    assert case.is_right(**found, best=best)
+    # At a start nothing is right yet.
+    assert not any(case.is_right(judge(case.problem, start.tolist())["cost"], best) for start in case.starts[:3])
     if case.noisy:
-        assert fit.cost < case.cost_near
-        assert not case.is_right(fit.cost + 2.5, fit.cost)
+        assert best < case.cost_near
+        assert not case.is_right(best + 2.5, best)
 
 
 def test_two_turns_is_the_problem_that_it_was():
@@ -51,6 +55,17 @@ def test_two_turns_is_the_problem_that_it_was():
     eigenvalues = np.linalg.eigvalsh(sf.evaluate(clean).hessian)
     assert eigenvalues[0] == pytest.approx(-3.6e8, rel=0.02)
     assert eigenvalues[-1] == pytest.approx(1.8e7, rel=0.03)
+
+
+def test_an_end_is_judged_on_a_mesh_of_its_own():
+    """Far from where its mesh was chosen, J of explicit steps is wrong, and a fit may descend into its error."""
+    case = build_case("two-turns")
+    end = np.array([0.0, 11.469, 21.7949, 24.0, 3.0, 1.5775, 5.0])
+    there = Evaluator(case.problem, case.starts[1]).cost(end)
+    judged = judge(case.problem, end.tolist())["cost"]
+    assert judged > 10 * there
+    assert case.is_misjudged(there, judged)
+    assert not case.is_misjudged(judged * (1 + 1e-6), judged)
 
 
 def test_a_violated_guard_is_not_right():
@@ -69,9 +84,12 @@ def test_residuals_and_jacobian_of_peers_are_those_of_the_cost():
     case = build_case("thermostat")
     fit = peers.fit_with_least_squares(case.problem, case.near)
     assert fit.claims
-    assert case.is_right(fit.cost, methods.fit_with()(case.problem, case.near).cost)
-    slsqp = peers.fit_with_slsqp(build_case("ball-guards").problem, build_case("ball-guards").starts[1])
-    assert slsqp.violation < 1e-6
+    best = methods.fit_with()(case.problem, case.near).said
+    assert fit.said == pytest.approx(best, rel=1e-6)
+    assert peers.fit_with_slsqp(case.problem, case.near).said == pytest.approx(best, rel=1e-6)
+    ball = build_case("ball-guards")
+    guarded = peers.fit_with_slsqp(ball.problem, ball.starts[1])
+    assert judge(ball.problem, guarded.theta)["violation"] < 1e-6
     assert "guards" in peers.why_no_least_squares(build_case("ball-guards").problem)
     assert "no sum of squares" in peers.why_no_least_squares(build_case("fishing").problem)
 

@@ -19,6 +19,9 @@ TOLERANCE = 1e-6
 PERFECT = 1e-6
 """Part of J at the problem's guess below which the optimum is a perfect fit: excesses are then parts of that J."""
 
+MISJUDGED = 1e-3
+"""Part of J by which what a fit reports may be off before it counts."""
+
 NOISE = 2.0
 """Of noisy data, ends whose J (half of chi²) is higher by this much are as good as the best."""
 
@@ -62,6 +65,10 @@ class Case:
         """Return how far a cost is above the best known, as a part of it (of J at the guess for a perfect fit)."""
         scale = abs(best) if abs(best) > PERFECT * abs(self.cost_of_guess) else abs(self.cost_of_guess)
         return (cost - best) / scale
+
+    def is_misjudged(self, said: float, cost: float) -> bool:
+        """Return whether the J that a fit reports is not the J of where it ended."""
+        return not abs(said - cost) <= MISJUDGED * max(abs(cost), PERFECT * abs(self.cost_of_guess))
 
     def is_best(self, cost: float, best: float, violation: float = 0.0) -> bool:
         """Return whether a cost is the best known, with all constraints met."""

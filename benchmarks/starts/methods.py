@@ -30,8 +30,7 @@ def read_estimate(estimate: Any) -> End:
     level = "" if verdict is None else str(getattr(verdict, "level", verdict))
     return End(
         theta=np.asarray(estimate.theta).tolist(),
-        cost=float(estimate.cost),
-        violation=max((abs(value) for _, value, _ in estimate.constraints), default=0.0),
+        said=float(estimate.cost),
         claims=level == "good" if level else bool(estimate.success),
         verdict=level,
         status=estimate.status.name,

@@ -1,7 +1,6 @@
 """SciPy's optimisers with switchfit's own costs and exact first derivatives: what differs is the way to the optimum.
 
-Each works on one mesh, chosen at its start, as a user would have it; where it ends J is evaluated on a mesh chosen
-there.
+Each works on one mesh, chosen at its start.
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ def fit_with_least_squares(problem: sf.Problem, start: np.ndarray) -> End:
         gtol=1e-10,
         max_nfev=MOST_CALLS,
     )
-    return _read(problem, back @ result.x, result.success, str(result.status), result.nfev, result.njev)
+    return _read(problem, back @ result.x, result.cost, result.success, str(result.status), result.nfev, result.njev)
 
 
 def fit_with_slsqp(problem: sf.Problem, start: np.ndarray) -> End:
@@ -102,7 +101,8 @@ def fit_with_slsqp(problem: sf.Problem, start: np.ndarray) -> End:
         constraints=constraints,
         options={"ftol": FTOL, "maxiter": MOST_CALLS},
     )
-    return _read(problem, unit * result.x, result.success, str(result.status), result.nfev, result.nit)
+    cost_there = float(result.fun) * first
+    return _read(problem, unit * result.x, cost_there, result.success, str(result.status), result.nfev, result.nit)
 
 
 def why_no_least_squares(problem: sf.Problem) -> str:
@@ -128,22 +128,11 @@ def is_in_order(problem: sf.Problem, theta: np.ndarray) -> bool:
     return bool(inside and np.all(unknowns.A @ theta - unknowns.b >= -1e-12))
 
 
-def _read(problem: sf.Problem, theta: np.ndarray, success: bool, status: str, calls: int, iterations: int) -> End:
-    """Return where an optimiser of SciPy's ended, judged by J on a mesh chosen there."""
+def _read(
+    problem: sf.Problem, theta: np.ndarray, cost: float, success: bool, status: str, calls: int, iterations: int
+) -> End:
+    """Return where an optimiser of SciPy's ended, with violations by rounding taken away."""
     theta = np.clip(theta, problem.unknowns.lower, problem.unknowns.upper)
     for run, where in zip(problem.experiments, problem.unknowns.times, strict=True):
         theta[where] = np.clip(np.maximum.accumulate(theta[where]), run.t0, run.tf)
-    evaluator = Evaluator(problem, problem.check_theta(theta))
-    violation = 0.0
-    if problem.constraint_names:
-        violation = float(np.max(np.abs(evaluator.constrained(theta).constraints)))
-    return End(
-        theta=theta.tolist(),
-        cost=float(evaluator.cost(theta)),
-        violation=violation,
-        claims=bool(success),
-        verdict="",
-        status=status,
-        evaluations=int(calls),
-        iterations=int(iterations),
-    )
+    return End(theta.tolist(), cost, bool(success), "", status, int(calls), int(iterations))

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import switchfit as sf
-from benchmarks.starts.end import End
+from benchmarks.starts.end import judge
 from benchmarks.starts.methods import list_methods, why_not
 from benchmarks.starts.problems import build_case
 
@@ -24,7 +24,7 @@ REFERENCE = "from the truth"
 """Name of the method that fits from where the best known answer is; start -1."""
 
 Outcome = dict[str, Any]
-"""problem and case (its identity), method, start and its digest, seconds, and an error or the fields of `End`."""
+"""problem and case (its identity), method, start and its digest, seconds; an error, or what `End` and `judge` have."""
 
 
 @dataclass(frozen=True)
@@ -106,11 +106,11 @@ def run_job(job: Job) -> Outcome:
     start = case.near if reference else case.starts[job.start]
     began = time.perf_counter()
     try:
-        end: End = fit(case.problem, start)
+        end = fit(case.problem, start)
+        seconds = time.perf_counter() - began
+        return {**known, "seconds": seconds, **asdict(end), **judge(case.problem, end.theta)}
     except Exception as error:
         return {**known, "seconds": time.perf_counter() - began, "error": f"{type(error).__name__}: {error}"}
-    seconds = time.perf_counter() - began
-    return {**known, "seconds": seconds, **asdict(end)}
 
 
 def run_jobs(jobs: list[Job], outcomes: Outcomes, processes: int = 1) -> None:
