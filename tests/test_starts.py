@@ -32,7 +32,7 @@ def test_starts_are_feasible_and_differ(name):
 @pytest.mark.parametrize("name", sorted(PROBLEMS))
 def test_the_truth_is_right_and_a_bad_start_is_not(name):
     case = build_case(name)
-    fit = methods.fit_with()(case.problem, case.near)
+    fit = methods.fit_with()(case, case.near)
     found = judge(case.problem, fit.theta)
     best = found["cost"]
     assert case.excess(fit.said, best) == pytest.approx(0.0, abs=1e-6)
@@ -82,16 +82,16 @@ def test_a_perfect_fit_is_measured_by_the_cost_at_the_guess():
 
 def test_residuals_and_jacobian_of_peers_are_those_of_the_cost():
     case = build_case("thermostat")
-    fit = peers.fit_with_least_squares(case.problem, case.near)
+    fit = peers.fit_with_least_squares(case, case.near)
     assert fit.claims
-    best = methods.fit_with()(case.problem, case.near).said
+    best = methods.fit_with()(case, case.near).said
     assert fit.said == pytest.approx(best, rel=1e-6)
-    assert peers.fit_with_slsqp(case.problem, case.near).said == pytest.approx(best, rel=1e-6)
+    assert peers.fit_with_slsqp(case, case.near).said == pytest.approx(best, rel=1e-6)
     ball = build_case("ball-guards")
-    guarded = peers.fit_with_slsqp(ball.problem, ball.starts[1])
+    guarded = peers.fit_with_slsqp(ball, ball.starts[1])
     assert judge(ball.problem, guarded.theta)["violation"] < 1e-6
-    assert "guards" in peers.why_no_least_squares(build_case("ball-guards").problem)
-    assert "no sum of squares" in peers.why_no_least_squares(build_case("fishing").problem)
+    assert "guards" in peers.why_no_least_squares(ball)
+    assert "no sum of squares" in peers.why_no_least_squares(build_case("fishing"))
 
 
 @pytest.fixture
@@ -128,10 +128,10 @@ def test_study_runs_and_goes_on(run):
 
 
 def test_an_error_is_counted_and_ends_nothing(monkeypatch, run):
-    def fail(problem, start):
-        if start[0] == build_case("two-turns").starts[1][0]:
+    def fail(case, start):
+        if start[0] == case.starts[1][0]:
             raise FloatingPointError("made to fail")
-        return methods.fit_with(max_iterations=1)(problem, start)
+        return methods.fit_with(max_iterations=1)(case, start)
 
     monkeypatch.setattr(study, "list_methods", lambda: {"exact": fail})
     out, _, path = run("--methods", "exact")
@@ -157,6 +157,15 @@ def test_outcomes_of_another_problem_or_start_do_not_count(tmp_path):
     outcomes.add({**base, "problem": "ball-guards", "cost": 1.0})
     outcomes.add({**base, "problem": "ball", "error": "x", "start": 2})
     assert table.find_best("ball", case, [outcomes.path]) == 5.0
+
+
+def test_ipopt_finds_the_same_answer():
+    pytest.importorskip("casadi")
+    case = build_case("paper-reference")
+    end = peers.fit_with_ipopt(case, case.problem.initial_theta)
+    assert end.claims
+    assert case.is_right(judge(case.problem, end.theta)["cost"], judge(case.problem, case.near.tolist())["cost"])
+    assert peers.why_no_ipopt(build_case("ball"))
 
 
 def test_verdicts_count_where_there_are_any():

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.stats import qmc
 
 import switchfit as sf
+from benchmarks.models import Model
 from switchfit.fit.evaluator import Evaluator
 
 TOLERANCE = 1e-6
@@ -20,13 +21,32 @@ PERFECT = 1e-6
 """Part of J at the problem's guess below which the optimum is a perfect fit: excesses are then parts of that J."""
 
 MISJUDGED = 1e-3
-"""Part of J by which what a fit reports may be off before it counts."""
+"""Part of J (of the same part of J at the guess where that is more) by which the J that a fit reports may be off."""
 
 NOISE = 2.0
 """Of noisy data, ends whose J (half of chi²) is higher by this much are as good as the best."""
 
 MET = 1e-6
 """Largest value of a guard or a terminal constraint that counts as met."""
+
+MET_BY_BEST = 1e-8
+"""The same for an end whose J may become the best known: a violated constraint can make J lower."""
+
+
+@dataclass(frozen=True, eq=False)
+class Collocated:
+    """What `benchmarks.peers.casadi_collocation` makes a program of.
+
+    Attributes
+    ----------
+    model : Model
+    bounds : lower and upper bounds of the parameters, (M,) each
+    reference : knots (K,) and values (K, n) of the reference signal, if there is one
+    """
+
+    model: Model
+    bounds: tuple[np.ndarray, np.ndarray]
+    reference: tuple[np.ndarray, np.ndarray] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +64,15 @@ class Case:
         Whether the data are simulated at `near` with noise of known size. An end is right then if it fits no worse
         than the true values and its J is at most `NOISE` above the best: with kinks at the samples there are many
         minima about the truth, and the noise decides which is the lowest.
+    collocation : Collocated, optional
+        The same problem as IPOPT gets it.
     """
 
     problem: sf.Problem
     near: np.ndarray
     starts: np.ndarray
     noisy: bool = False
+    collocation: Collocated | None = None
 
     @cached_property
     def cost_near(self) -> float:
@@ -68,7 +91,7 @@ class Case:
 
     def is_misjudged(self, said: float, cost: float) -> bool:
         """Return whether the J that a fit reports is not the J of where it ended."""
-        return not abs(said - cost) <= MISJUDGED * max(abs(cost), PERFECT * abs(self.cost_of_guess))
+        return not abs(said - cost) <= MISJUDGED * max(abs(cost), MISJUDGED * abs(self.cost_of_guess))
 
     def is_best(self, cost: float, best: float, violation: float = 0.0) -> bool:
         """Return whether a cost is the best known, with all constraints met."""

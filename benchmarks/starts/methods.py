@@ -1,4 +1,4 @@
-"""What fits a problem from a start: switchfit's ways and its peers, each ``(problem, start) -> End``."""
+"""What fits a problem from a start: switchfit's ways and its peers, each ``(case, start) -> End``."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from typing import Any
 import numpy as np
 
 import switchfit as sf
+from benchmarks.starts import peers
+from benchmarks.starts.case import Case
 from benchmarks.starts.end import End
-from benchmarks.starts.peers import fit_with_least_squares, fit_with_slsqp, why_no_least_squares
 
-Method = Callable[[sf.Problem, np.ndarray], End]
+Method = Callable[[Case, np.ndarray], End]
 
 
 def fit_with(**settings: Any) -> Method:
     """Return the method that calls `sf.estimate` with these settings."""
 
-    def fit(problem: sf.Problem, start: np.ndarray) -> End:
-        return read_estimate(sf.estimate(problem, start=start, **settings))
+    def fit(case: Case, start: np.ndarray) -> End:
+        return read_estimate(sf.estimate(case.problem, start=start, **settings))
 
     return fit
 
@@ -57,10 +58,15 @@ def list_methods() -> dict[str, Method]:
     return methods | PEERS
 
 
-PEERS: dict[str, Method] = {"scipy-least-squares": fit_with_least_squares, "scipy-slsqp": fit_with_slsqp}
+PEERS: dict[str, Method] = {
+    "scipy-least-squares": peers.fit_with_least_squares,
+    "scipy-slsqp": peers.fit_with_slsqp,
+    "ipopt": peers.fit_with_ipopt,
+}
 STRATEGIES = ("auto", "thorough")
 
 
-def why_not(name: str, problem: sf.Problem) -> str:
+def why_not(name: str, case: Case) -> str:
     """Return why a method does not apply to a problem; empty where it does."""
-    return why_no_least_squares(problem) if name == "scipy-least-squares" else ""
+    reasons = {"scipy-least-squares": peers.why_no_least_squares, "ipopt": peers.why_no_ipopt}
+    return reasons[name](case) if name in reasons else ""

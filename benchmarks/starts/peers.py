@@ -1,16 +1,19 @@
-"""SciPy's optimisers with switchfit's own costs and exact first derivatives: what differs is the way to the optimum.
+"""SciPy's optimisers with switchfit's own costs and exact first derivatives; IPOPT on a collocation.
 
-Each works on one mesh, chosen at its start.
+SciPy's work on one mesh, chosen at their start: what differs from switchfit is the way to the optimum.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 import scipy.optimize
 
 import switchfit as sf
+from benchmarks.starts.case import Case
 from benchmarks.starts.end import End
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import is_plain_least_squares
@@ -20,8 +23,9 @@ MOST_CALLS = 300
 FTOL = 1e-12
 
 
-def fit_with_least_squares(problem: sf.Problem, start: np.ndarray) -> End:
+def fit_with_least_squares(case: Case, start: np.ndarray) -> End:
     """Fit with `least_squares` (trust region reflective) in the modes' durations, which keeps the times in order."""
+    problem = case.problem
     evaluator = Evaluator(problem, start)
     back = build_durations(problem)
     forth = np.linalg.solve(back, start)
@@ -68,13 +72,13 @@ def fit_with_least_squares(problem: sf.Problem, start: np.ndarray) -> End:
     return _read(problem, back @ result.x, result.cost, result.success, str(result.status), result.nfev, result.njev)
 
 
-def fit_with_slsqp(problem: sf.Problem, start: np.ndarray) -> End:
+def fit_with_slsqp(case: Case, start: np.ndarray) -> End:
     """Fit with SLSQP from J and its exact gradient; guards and terminal constraints are its equalities.
 
     It is sensitive to scales: J counts in units of J at the start, parameters in units of theirs there.
     """
-    evaluator = Evaluator(problem, start)
-    unknowns = problem.unknowns
+    problem = case.problem
+    evaluator, unknowns = Evaluator(problem, start), problem.unknowns
     unit = np.where(unknowns.is_time | (start == 0), 1.0, np.abs(start))
     first = max(abs(evaluator.cost(start)), np.finfo(float).tiny)
 
@@ -105,8 +109,39 @@ def fit_with_slsqp(problem: sf.Problem, start: np.ndarray) -> End:
     return _read(problem, unit * result.x, cost_there, result.success, str(result.status), result.nfev, result.nit)
 
 
-def why_no_least_squares(problem: sf.Problem) -> str:
+ELEMENTS = 16
+"""Elements of the collocation in each mode."""
+
+
+def fit_with_ipopt(case: Case, start: np.ndarray) -> End:
+    """Fit with IPOPT by collocation, the states simulated at the start as first guess."""
+    found = _collocate(case)(start)
+    status = "success" if found.success else "failure"
+    # IPOPT does not say how often it evaluated; it has one Hessian an iteration.
+    return _read(case.problem, found.theta, found.cost, found.success, status, found.iterations, found.iterations)
+
+
+@lru_cache(maxsize=4)
+def _collocate(case: Case) -> Any:
+    """Return the program of a case, built once."""
+    from benchmarks.peers.casadi_collocation import Collocation  # CasADi need not be there
+
+    given = case.collocation
+    if given is None:
+        raise ValueError("this case has no model for a collocation.")
+    return Collocation(given.model, ELEMENTS, given.bounds, given.reference)
+
+
+def why_no_ipopt(case: Case) -> str:
+    """Return why IPOPT does not apply; empty where it does."""
+    if case.collocation is None:
+        return "the problem is not written for collocation"
+    return "" if find_spec("casadi") else "CasADi is not installed"
+
+
+def why_no_least_squares(case: Case) -> str:
     """Return why `least_squares` does not apply; empty where it does."""
+    problem = case.problem
     if problem.constraint_names:
         return "it knows no guards and no terminal constraints"
     samples_alone = all(isinstance(item, sf.Measurements) for run in problem.experiments for item in run.data)
@@ -131,7 +166,7 @@ def is_in_order(problem: sf.Problem, theta: np.ndarray) -> bool:
 def _read(
     problem: sf.Problem, theta: np.ndarray, cost: float, success: bool, status: str, calls: int, iterations: int
 ) -> End:
-    """Return where an optimiser of SciPy's ended, with violations by rounding taken away."""
+    """Return where a peer ended, with violations by rounding taken away."""
     theta = np.clip(theta, problem.unknowns.lower, problem.unknowns.upper)
     for run, where in zip(problem.experiments, problem.unknowns.times, strict=True):
         theta[where] = np.clip(np.maximum.accumulate(theta[where]), run.t0, run.tf)

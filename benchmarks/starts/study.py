@@ -91,7 +91,7 @@ def list_jobs(problems: Iterable[str], methods: Iterable[str], count: int | None
         case = build_case(problem, count)
         jobs.append(Job(problem, REFERENCE, -1, case.identity))
         for method in methods:
-            if not why_not(method, case.problem):
+            if not why_not(method, case):
                 jobs += [Job(problem, method, k, case.digest(k)) for k in range(len(case.starts))]
     return jobs
 
@@ -106,7 +106,7 @@ def run_job(job: Job) -> Outcome:
     start = case.near if reference else case.starts[job.start]
     began = time.perf_counter()
     try:
-        end = fit(case.problem, start)
+        end = fit(case, start)
         seconds = time.perf_counter() - began
         return {**known, "seconds": seconds, **asdict(end), **judge(case.problem, end.theta)}
     except Exception as error:

@@ -6,7 +6,7 @@ import numpy as np
 
 import switchfit as sf
 from benchmarks import models, problems
-from benchmarks.starts.case import Case, draw_anywhere
+from benchmarks.starts.case import Case, Collocated, draw_anywhere
 from switchfit.paper import lti
 
 FIVE_SWITCHES = np.array([0.10021709786456, 0.29739223936426, 0.43294465994443, 0.64175816832317, 0.76662528600859])
@@ -18,7 +18,8 @@ LINEAR = sf.HybridSystem({"A1": lambda t, x, p: A1 @ x, "A2": lambda t, x, p: A2
 def fishing(count: int = 100) -> Case:
     """Lotka-Volterra fishing, eight switches anywhere in order."""
     problem = problems.case("fishing").problem()
-    return Case(problem, np.array(models.FISHING_BEST), draw_anywhere(problem, count, seed=0))
+    collocated = Collocated(models.FISHING, (np.zeros(0), np.zeros(0)))
+    return Case(problem, np.array(models.FISHING_BEST), draw_anywhere(problem, count, seed=0), collocation=collocated)
 
 
 def linear(count: int = 64) -> Case:

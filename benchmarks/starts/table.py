@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
-from benchmarks.starts.case import MET, Case
+from benchmarks.starts.case import MET_BY_BEST, Case
 from benchmarks.starts.methods import why_not
 from benchmarks.starts.problems import build_case
 from benchmarks.starts.study import REFERENCE, Outcome, Outcomes, read_outcomes
@@ -36,7 +36,7 @@ def find_best(problem: str, case: Case, files: Iterable[Path]) -> float:
         for outcome in read_outcomes(path)
         if (outcome["problem"], outcome["case"]) == (problem, case.identity)
         and "error" not in outcome
-        and outcome["violation"] <= MET
+        and outcome["violation"] <= MET_BY_BEST
     ]
     return min((cost for cost in costs if cost == cost), default=float("nan"))
 
@@ -74,7 +74,7 @@ def write_table(outcomes: Outcomes, problems: list[str], methods: list[str], num
         reference = outcomes.found.get((problem, REFERENCE, -1, case.identity))
         notes.append(describe(problem, case, best, reference))
         for method in methods:
-            if why := why_not(method, case.problem):
+            if why := why_not(method, case):
                 notes.append(f"- {problem}, {method} is left out: {why}")
                 continue
             keys = [(problem, method, k, case.digest(k)) for k in range(len(case.starts))]

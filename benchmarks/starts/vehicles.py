@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import switchfit as sf
-from benchmarks import many, vehicle
-from benchmarks.starts.case import Case, draw_anywhere, sample_states
+from benchmarks import many, models, vehicle
+from benchmarks.starts.case import Case, Collocated, draw_anywhere, sample_states
 from switchfit.models import skid_steer
 
 LENGTH, WIDTH, GRAVITY, MASS = 0.25, 0.23, 9.81, 80.0
@@ -122,7 +122,10 @@ PAPER = np.array([*vehicle.TRUTH, vehicle.MU_TRUTH])
 def paper_reference(count: int = 64) -> Case:
     """The paper's vehicle with its reference signal, over all that bounds and order allow."""
     problem = vehicle.with_reference()
-    return Case(problem, PAPER, draw_anywhere(problem, count, seed=6))
+    signal = problem.experiments[0].data[0].signal
+    bounds = problem.unknowns.lower[2:], problem.unknowns.upper[2:]
+    collocated = Collocated(models.VEHICLE, bounds, (signal.knots, signal(signal.knots)))
+    return Case(problem, PAPER, draw_anywhere(problem, count, seed=6), collocation=collocated)
 
 
 def paper_positions(count: int = 64) -> Case:
