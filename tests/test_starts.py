@@ -156,6 +156,7 @@ def test_outcomes_of_another_problem_or_start_do_not_count(tmp_path):
     outcomes.add({**base, "problem": "ball", "cost": 3.0, "violation": 0.1, "start": 1})
     outcomes.add({**base, "problem": "ball-guards", "cost": 1.0})
     outcomes.add({**base, "problem": "ball", "error": "x", "start": 2})
+    outcomes.add({**base, "problem": "ball", "cost": 2.0, "case": "the data were others", "digest": "-"})
     assert table.find_best("ball", case, [outcomes.path]) == 5.0
 
 
