@@ -44,11 +44,12 @@ class Job:
 
 @cache
 def digest_source() -> str:
-    """Return a digest of switchfit's source files: outcomes of another version do not count."""
-    folder = Path(sf.__file__).parent
+    """Return a digest of the sources of switchfit and of the methods: outcomes of other versions do not count."""
+    folder, here = Path(sf.__file__).parent, Path(__file__).parent
     found = hashlib.sha256()
-    for path in sorted(folder.rglob("*.py")):
-        found.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    for path in [*sorted(folder.rglob("*.py")), *(here / name for name in ("end.py", "methods.py", "peers.py"))]:
+        name = path.relative_to(folder) if path.is_relative_to(folder) else path.name
+        found.update(str(name).encode() + b"\0" + path.read_bytes() + b"\0")
     return found.hexdigest()[:10]
 
 
