@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: help demo test test-slow fuzz coverage check format bench speed paper docs clean
+.PHONY: help demo test test-slow fuzz coverage check format bench starts speed paper docs clean
 
 help:
 	@echo "make demo       fit a measured toss and the paper's simulated vehicle: reports, figures in out/"
@@ -13,6 +13,7 @@ help:
 	@echo "make coverage   how often intervals contain the truth (minutes)"
 	@echo "make check      ruff and mypy;  make format: put the code into form"
 	@echo "make bench      measure speed;  make speed: and put the figures into the documentation"
+	@echo "make starts     from which starts the right answer is found, for many problems and methods (an hour; goes on)"
 	@echo "make paper      every experiment and figure of the paper, into out/paper and the documentation (ten minutes)"
 	@echo "make docs       build the documentation;  make clean: remove what was built"
 
@@ -44,6 +45,9 @@ format: $(VENV)/.installed-dev
 
 bench: $(VENV)/.installed-bench
 	$(BIN)/python -m benchmarks
+
+starts: $(VENV)/.installed-bench
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks starts --processes $(JOBS)
 
 speed: bench
 	cp benchmarks/results/full.md docs/speed-results.md

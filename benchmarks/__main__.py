@@ -1,6 +1,7 @@
 """Run all benchmarks, print Markdown tables and write them to benchmarks/results: ``python -m benchmarks``.
 
-``python -m benchmarks sizes REVISION...`` measures nothing but how large the code is (`benchmarks.sizes`).
+``python -m benchmarks sizes REVISION...`` measures nothing but how large the code is (`benchmarks.sizes`);
+``python -m benchmarks starts`` counts from which starts the right answer is found (`benchmarks.starts`).
 """
 
 from __future__ import annotations
@@ -18,6 +19,11 @@ def main() -> None:
     """Parse the command line and run the parts asked for."""
     if sys.argv[1:2] == ["sizes"]:
         sizes.main(sys.argv[2:])
+        return
+    if sys.argv[1:2] == ["starts"]:
+        from benchmarks.starts import command
+
+        command.main(sys.argv[2:])
         return
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__.partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="fewer cases and repetitions; some minutes")

@@ -257,6 +257,17 @@ def tosses_task(count: int, quick: bool) -> Task:
         "switchfit": lambda theta: sf.estimate(problems.tosses(theta)).theta,
         "SciPy least_squares": lambda theta: by_scipy(theta).x,
     }
+
+    def judge(theta: np.ndarray) -> float:
+        return evaluator(theta, matrix="none").cost
+
+    return Task("Ten tosses jointly, 51 unknowns", start, tosses_starts(count), judge, sides, float("nan"))
+
+
+def tosses_starts(count: int) -> list[np.ndarray]:
+    """Perturbed starts of the tosses: the times anywhere in the later half of each, velocities and friction near."""
+    measured = problems.read_tosses()
+    start = problems.tosses_theta(measured)
     random = np.random.default_rng(0)
     K = len(measured)
     ends = np.array([toss.times[-1] for toss in measured])
@@ -269,8 +280,4 @@ def tosses_task(count: int, quick: bool) -> Task:
         states[:, :2] += 0.002 * random.standard_normal((K, 2))
         states[:, 2:] *= 1 + 0.1 * random.standard_normal((K, 2))
         starts.append(theta)
-
-    def judge(theta: np.ndarray) -> float:
-        return evaluator(theta, matrix="none").cost
-
-    return Task("Ten tosses jointly, 51 unknowns", start, starts, judge, sides, float("nan"))
+    return starts

@@ -1,0 +1,5 @@
+"""From which starts is the right answer found? ``python -m benchmarks starts``: problems, methods, seeded starts.
+
+`case` says what a problem is, `vehicles`, `switching`, `logs` and `shapes` hold the problems, `methods` what fits them,
+`study` runs all starts and writes their outcomes, `table` counts.
+"""

@@ -1,0 +1,195 @@
+"""SciPy's optimisers with switchfit's own costs and exact first derivatives; IPOPT on a collocation.
+
+SciPy's work on a mesh chosen at their start, and again from where they end, as often as `sf.estimate` would refine its
+own: what differs from switchfit is the way to the optimum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import scipy.optimize
+
+import switchfit as sf
+from benchmarks.starts.case import PERFECT, Case
+from benchmarks.starts.end import End, judge
+from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, REFINEMENTS
+from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.solution import is_plain_least_squares
+from switchfit.uncertainty.sensitivity import collect_sample_derivatives, get_sensitivity_program
+
+MOST_CALLS = 300
+FTOL = 1e-12
+
+
+def resume(fit: Callable[[Case, np.ndarray], End]) -> Callable[[Case, np.ndarray], End]:
+    """Return the method that fits again, on a mesh chosen at the end, while J differs between the meshes."""
+
+    def fit_again(case: Case, start: np.ndarray) -> End:
+        calls = iterations = 0
+        for _ in range(REFINEMENTS + 1):
+            end = fit(case, start)
+            calls, iterations, start = calls + end.evaluations, iterations + end.iterations, np.array(end.theta)
+            there = judge(case.problem, end.theta)["cost"]
+            if abs(end.said - there) <= LARGEST_INTEGRATION_ERROR * max(abs(there), PERFECT * abs(case.cost_of_guess)):
+                break
+        return replace(end, evaluations=calls, iterations=iterations)
+
+    return fit_again
+
+
+@resume
+def fit_with_least_squares(case: Case, start: np.ndarray) -> End:
+    """Fit with `least_squares` (trust region reflective) in the modes' durations, which keeps the times in order."""
+    problem = case.problem
+    evaluator = Evaluator(problem, start)
+    back = build_durations(problem)
+    forth = np.linalg.solve(back, start)
+    lower, upper = (np.array(bound, dtype=float) for bound in (problem.unknowns.lower, problem.unknowns.upper))
+    for run, where in zip(problem.experiments, problem.unknowns.times, strict=True):
+        # The first is a time, the others are durations; that the last is before tf is left to `residuals`.
+        lower[where[:1]], upper[where[:1]] = np.maximum(lower[where[:1]], run.t0), np.minimum(upper[where[:1]], run.tf)
+        lower[where[1:]], upper[where[1:]] = 0.0, run.tf - run.t0
+    found: dict[bytes, Any] = {}
+
+    def samples(z: np.ndarray) -> Any:
+        key = z.tobytes()
+        if key not in found:
+            found.clear()
+            theta = back @ z
+            simulations = enumerate(evaluator.simulate(theta, tangents=True))
+            runs = [get_sensitivity_program(problem, e, simulation) for e, simulation in simulations]
+            found[key] = collect_sample_derivatives(problem, runs)
+        return found[key]
+
+    shape = len(samples(forth).residual)
+
+    def residuals(z: np.ndarray) -> np.ndarray:
+        if not is_in_order(problem, back @ z):
+            return np.full(shape, np.inf)
+        here = samples(z)
+        return np.sqrt(here.weight) * here.residual
+
+    def jacobian(z: np.ndarray) -> np.ndarray:
+        here = samples(z)
+        return np.sqrt(here.weight)[:, None] * here.derivative @ back
+
+    result = scipy.optimize.least_squares(
+        residuals,
+        np.clip(forth, lower, upper),
+        jac=jacobian,
+        bounds=(lower, upper),
+        x_scale="jac",
+        ftol=1e-12,
+        xtol=1e-10,
+        gtol=1e-10,
+        max_nfev=MOST_CALLS,
+    )
+    return _read(problem, back @ result.x, result.cost, result.success, str(result.status), result.nfev, result.njev)
+
+
+@resume
+def fit_with_slsqp(case: Case, start: np.ndarray) -> End:
+    """Fit with SLSQP from J and its exact gradient; guards and terminal constraints are its equalities.
+
+    It is sensitive to scales: J counts in units of J at the start, parameters in units of theirs there.
+    """
+    problem = case.problem
+    evaluator, unknowns = Evaluator(problem, start), problem.unknowns
+    unit = np.where(unknowns.is_time | (start == 0), 1.0, np.abs(start))
+    first = max(abs(evaluator.cost(start)), np.finfo(float).tiny)
+
+    def cost(z: np.ndarray) -> tuple[float, np.ndarray]:
+        here = evaluator(unit * z, matrix="none")
+        return here.cost / first, unit * here.gradient / first
+
+    constraints: list[dict[str, Any]] = []
+    if len(unknowns.b):
+        order = {"fun": lambda z: unknowns.A @ (unit * z) - unknowns.b, "jac": lambda z: unknowns.A * unit}
+        constraints.append({"type": "ineq", **order})
+    if problem.constraint_names:
+        held = {
+            "fun": lambda z: evaluator.constrained(unit * z).constraints,
+            "jac": lambda z: evaluator.constrained(unit * z).jacobian * unit,
+        }
+        constraints.append({"type": "eq", **held})
+    result = scipy.optimize.minimize(
+        cost,
+        start / unit,
+        jac=True,
+        method="SLSQP",
+        bounds=scipy.optimize.Bounds(unknowns.lower / unit, unknowns.upper / unit),
+        constraints=constraints,
+        options={"ftol": FTOL, "maxiter": MOST_CALLS},
+    )
+    cost_there = float(result.fun) * first
+    return _read(problem, unit * result.x, cost_there, result.success, str(result.status), result.nfev, result.nit)
+
+
+ELEMENTS = 16
+"""Elements of the collocation in each mode."""
+
+
+def fit_with_ipopt(case: Case, start: np.ndarray) -> End:
+    """Fit with IPOPT by collocation, the states simulated at the start as first guess."""
+    found = _collocate(case)(start)
+    status = "success" if found.success else "failure"
+    # IPOPT does not say how often it evaluated; it has one Hessian an iteration.
+    return _read(case.problem, found.theta, found.cost, found.success, status, found.iterations, found.iterations)
+
+
+@lru_cache(maxsize=4)
+def _collocate(case: Case) -> Any:
+    """Return the program of a case, built once."""
+    from benchmarks.peers.casadi_collocation import Collocation  # CasADi need not be there
+
+    given = case.collocation
+    if given is None:
+        raise ValueError("this case has no model for a collocation.")
+    return Collocation(given.model, ELEMENTS, given.bounds, given.reference)
+
+
+def why_no_ipopt(case: Case) -> str:
+    """Return why IPOPT does not apply; empty where it does."""
+    if case.collocation is None:
+        return "the problem is not written for collocation"
+    return "" if find_spec("casadi") else "CasADi is not installed"
+
+
+def why_no_least_squares(case: Case) -> str:
+    """Return why `least_squares` does not apply; empty where it does."""
+    problem = case.problem
+    if problem.constraint_names:
+        return "it knows no guards and no terminal constraints"
+    samples_alone = all(isinstance(item, sf.Measurements) for run in problem.experiments for item in run.data)
+    return "" if samples_alone and is_plain_least_squares(problem) else "its cost is no sum of squares over samples"
+
+
+def build_durations(problem: sf.Problem) -> np.ndarray:
+    """Return the matrix (d, d) that takes the first time and the durations after it to the times of each run."""
+    matrix = np.eye(len(problem.theta_names))
+    for where in problem.unknowns.times:
+        matrix[np.ix_(where, where)] = np.tril(np.ones((len(where), len(where))))
+    return matrix
+
+
+def is_in_order(problem: sf.Problem, theta: np.ndarray) -> bool:
+    """Return whether theta satisfies the order of the times and all bounds, but for rounding."""
+    unknowns = problem.unknowns
+    inside = np.all(theta >= unknowns.lower - 1e-12) and np.all(theta <= unknowns.upper + 1e-12)
+    return bool(inside and np.all(unknowns.A @ theta - unknowns.b >= -1e-12))
+
+
+def _read(
+    problem: sf.Problem, theta: np.ndarray, cost: float, success: bool, status: str, calls: int, iterations: int
+) -> End:
+    """Return where a peer ended, with violations by rounding taken away."""
+    theta = np.clip(theta, problem.unknowns.lower, problem.unknowns.upper)
+    for run, where in zip(problem.experiments, problem.unknowns.times, strict=True):
+        theta[where] = np.clip(np.maximum.accumulate(theta[where]), run.t0, run.tf)
+    return End(theta.tolist(), cost, bool(success), "", status, int(calls), int(iterations))

@@ -1,0 +1,40 @@
+"""All problems of the study, by name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+from benchmarks.starts import bounces, logs, switching, vehicles
+from benchmarks.starts.case import Case, Make
+
+PROBLEMS: dict[str, Make] = {
+    "two-turns": vehicles.two_turns,
+    "two-turns-anywhere": vehicles.two_turns_anywhere,
+    "paper-reference": vehicles.paper_reference,
+    "paper-positions": vehicles.paper_positions,
+    "fishing": switching.fishing,
+    "linear": switching.linear,
+    "oscillator": switching.oscillator,
+    "tosses": logs.ten_tosses,
+    "ball-guards": bounces.ball_on_guards,
+    "ball": bounces.ball_without_guards,
+    "thermostat": logs.thermostat,
+    "epidemic": logs.epidemic,
+    "runs": logs.many_runs,
+    "enzyme": logs.enzyme,
+}
+
+
+@cache
+def _build(name: str) -> Case:
+    return PROBLEMS[name]()
+
+
+def build_case(name: str, count: int | None = None) -> Case:
+    """Return a problem of the study with its own number of starts, or with the first `count` of them.
+
+    It is built once in a process and kept with its compiled programs.
+    """
+    case = _build(name)
+    return case if count is None else replace(case, starts=case.starts[:count])

@@ -1,0 +1,199 @@
+"""`python -m benchmarks starts`: problems whose truth is right, outcomes that are kept, errors that are counted."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
+import switchfit as sf
+from benchmarks.starts import command, methods, peers, study, table
+from benchmarks.starts.end import judge
+from benchmarks.starts.problems import PROBLEMS, build_case
+from benchmarks.starts.study import REFERENCE, Job, Outcomes
+from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.solution import constraints_of
+
+
+@pytest.mark.parametrize("name", sorted(PROBLEMS))
+def test_starts_are_feasible_and_differ(name):
+    case = build_case(name)
+    constraints = constraints_of(case.problem)
+    assert case.starts.shape[1] == len(case.near) == len(case.problem.theta_names)
+    for start in case.starts:
+        assert constraints.slack(case.problem.check_theta(start)).min() >= -1e-12
+    assert len({start.tobytes() for start in case.starts}) == len(case.starts)
+
+
+@pytest.mark.parametrize("name", sorted(PROBLEMS))
+def test_the_truth_is_right_and_a_bad_start_is_not(name):
+    case = build_case(name)
+    fit = methods.fit_with()(case, case.near)
+    found = judge(case.problem, fit.theta)
+    best = found["cost"]
+    assert case.excess(fit.said, best) == pytest.approx(0.0, abs=1e-6)
+    assert case.is_best(**found, best=best)
+    assert case.is_right(**found, best=best)
+    # At a start nothing is right yet.
+    assert not any(case.is_right(judge(case.problem, start.tolist())["cost"], best) for start in case.starts[:3])
+    if case.noisy:
+        assert best < case.cost_near
+        assert not case.is_right(best + 2.5, best)
+
+
+def test_two_turns_is_the_problem_that_it_was():
+    """Without noise: a perfect fit at the truth, and an indefinite Hessian at the guess, which makes it hard."""
+    from benchmarks.starts import vehicles
+
+    clean = vehicles.two_turns_problem(noise=None)
+    at_truth = Evaluator(clean, vehicles.TWO_TURNS).cost(vehicles.TWO_TURNS)
+    assert at_truth < 1e-8
+    eigenvalues = np.linalg.eigvalsh(sf.evaluate(clean).hessian)
+    assert eigenvalues[0] == pytest.approx(-3.6e8, rel=0.02)
+    assert eigenvalues[-1] == pytest.approx(1.8e7, rel=0.03)
+
+
+def test_an_end_is_judged_on_a_mesh_of_its_own():
+    """Far from where its mesh was chosen, J of explicit steps is wrong, and a fit may descend into its error."""
+    case = build_case("two-turns")
+    end = np.array([0.0, 11.469, 21.7949, 24.0, 3.0, 1.5775, 5.0])
+    there = Evaluator(case.problem, case.starts[1]).cost(end)
+    judged = judge(case.problem, end.tolist())["cost"]
+    assert judged > 10 * there
+    assert case.is_misjudged(there, judged)
+    assert not case.is_misjudged(judged * (1 + 1e-6), judged)
+
+
+def test_a_violated_guard_is_not_right():
+    case = build_case("ball-guards")
+    assert case.is_right(60.0, 60.0, violation=1e-9)
+    assert not case.is_right(60.0, 60.0, violation=1e-3)
+
+
+def test_a_perfect_fit_is_measured_by_the_cost_at_the_guess():
+    case = build_case("oscillator")
+    assert case.is_right(1e-8 * case.cost_of_guess, 1e-16)
+    assert not case.is_right(1e-4 * case.cost_of_guess, 1e-16)
+
+
+def test_residuals_and_jacobian_of_peers_are_those_of_the_cost():
+    case = build_case("thermostat")
+    fit = peers.fit_with_least_squares(case, case.near)
+    assert fit.claims
+    best = methods.fit_with()(case, case.near).said
+    assert fit.said == pytest.approx(best, rel=1e-6)
+    assert peers.fit_with_slsqp(case, case.near).said == pytest.approx(best, rel=1e-6)
+    ball = build_case("ball-guards")
+    guarded = peers.fit_with_slsqp(ball, ball.starts[1])
+    assert judge(ball.problem, guarded.theta)["violation"] < 1e-6
+    assert "guards" in peers.why_no_least_squares(ball)
+    assert "no sum of squares" in peers.why_no_least_squares(build_case("fishing"))
+
+
+@pytest.fixture
+def run(tmp_path, capsys):
+    """The command on three starts of the two turns; returns what it printed and the file of outcomes."""
+
+    def call(*arguments):
+        command.main(["--folder", str(tmp_path), "--problems", "two-turns", "--starts", "3", *arguments])
+        (path,) = tmp_path.glob("starts-*.jsonl")
+        printed = capsys.readouterr()
+        return printed.out, printed.err, path
+
+    return call
+
+
+def test_study_runs_and_goes_on(run):
+    out, err, path = run("--methods", "exact")
+    assert "| two-turns | exact |" in out
+    assert "4 of 4 starts" in err  # the truth, and three
+    lines = path.read_text().splitlines()
+    assert len(lines) == 4
+    assert "| two-turns | exact |" in path.with_suffix(".md").read_text()
+    # Killed in the middle of the last line: the start of this line is run again, and no other.
+    path.write_text("\n".join(lines[:3]) + "\n" + lines[3][:20])
+    again, err, _ = run("--methods", "exact")
+    assert "1 of 1 starts" in err
+    kept = path.read_text().splitlines()
+    assert kept[:3] == lines[:3]
+    assert len(kept) == 4
+    assert {**json.loads(kept[3]), "seconds": 0} == {**json.loads(lines[3]), "seconds": 0}
+    assert again.splitlines()[2].split("|")[3:8] == out.splitlines()[2].split("|")[3:8]
+    _, err, _ = run("--methods", "exact", "--fresh")
+    assert "4 of 4 starts" in err
+
+
+def test_an_error_is_counted_and_ends_nothing(monkeypatch, run):
+    def fail(case, start):
+        if start[0] == case.starts[1][0]:
+            raise FloatingPointError("made to fail")
+        return methods.fit_with(max_iterations=1)(case, start)
+
+    monkeypatch.setattr(study, "list_methods", lambda: {"exact": fail})
+    out, _, path = run("--methods", "exact")
+    outcomes = [json.loads(line) for line in path.read_text().splitlines()]
+    assert [outcome.get("error") for outcome in outcomes] == [None, None, "FloatingPointError: made to fail", None]
+    row = dict(zip(table.HEADER, [cell.strip() for cell in out.splitlines()[2].split("|")[1:-1]], strict=True))
+    assert row["right"] == "0 of 3"
+    assert row["errors"] == "1"
+    assert row["wrong, claims success"] == "0 of 2"
+    assert "1 times FloatingPointError: made to fail" in out
+
+
+def test_outcomes_of_another_problem_or_start_do_not_count(tmp_path):
+    case = build_case("ball")
+    moved = replace(case, starts=case.starts + 1e-6)
+    assert case.identity == moved.identity
+    assert case.digest(0) != moved.digest(0)
+    assert replace(case, near=case.near + 1e-6).digest(0) != case.digest(0)
+    outcomes = Outcomes(tmp_path / "starts-x.jsonl")
+    base = {"case": case.identity, "method": "exact", "start": 0, "digest": "", "violation": 0.0}
+    outcomes.add({**base, "problem": "ball", "cost": 5.0})
+    outcomes.add({**base, "problem": "ball", "cost": 3.0, "violation": 0.1, "start": 1})
+    outcomes.add({**base, "problem": "ball-guards", "cost": 1.0})
+    outcomes.add({**base, "problem": "ball", "error": "x", "start": 2})
+    outcomes.add({**base, "problem": "ball", "cost": 2.0, "case": "the data were others", "digest": "-"})
+    assert table.find_best("ball", case, [outcomes.path]) == 5.0
+
+
+def test_ipopt_finds_the_same_answer():
+    pytest.importorskip("casadi")
+    case = build_case("paper-reference")
+    end = peers.fit_with_ipopt(case, case.problem.initial_theta)
+    assert end.claims
+    assert case.is_right(judge(case.problem, end.theta)["cost"], judge(case.problem, case.near.tolist())["cost"])
+    assert peers.why_no_ipopt(build_case("ball"))
+
+
+def test_verdicts_count_where_there_are_any():
+    class Verdict:
+        level = "doubtful"
+
+    fit = sf.estimate(build_case("linear").problem)
+    assert methods.read_estimate(fit).claims
+    object.__setattr__(fit, "verdict", Verdict())
+    end = methods.read_estimate(fit)
+    assert (end.verdict, end.claims) == ("doubtful", False)
+
+
+def test_processes_give_the_same_outcomes(tmp_path):
+    jobs = [Job("linear", "exact", k, build_case("linear").digest(k)) for k in range(2)]
+    jobs.append(Job("linear", REFERENCE, -1, build_case("linear").identity))
+    outcomes = Outcomes(tmp_path / "starts-x.jsonl")
+    study.run_jobs(jobs, outcomes, processes=2)
+    for job in jobs:
+        here = study.run_job(job)
+        assert outcomes.found[job.key]["theta"] == pytest.approx(here["theta"], rel=1e-9)
+
+
+def test_names_are_checked(capsys):
+    with pytest.raises(SystemExit):
+        command.main(["--problems", "no-such"])
+    assert "no such problem: no-such" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        command.main(["--methods", "no-such"])
+    assert "no such method: no-such" in capsys.readouterr().err
