@@ -59,7 +59,7 @@ def is_resolved(problem: Problem, meshes: Sequence[Mesh], theta: Any, cost: floa
     """
     evaluator = Evaluator(problem, meshes=meshes)
     here = evaluator.cost(theta) if cost is None else cost
-    fine = evaluator.halved.cost(theta)
+    fine = evaluator.halve_rows(theta).cost(theta)
     return cost_error(problem, fine, here, 0.0) <= max(LARGEST_INTEGRATION_ERROR, problem.rtol)
 
 

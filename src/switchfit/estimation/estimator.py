@@ -494,14 +494,9 @@ def estimate(
         history += records[1:] if history else records
         evaluations += result.evaluations
         theta = result.theta
-        fine = evaluator.halved
-        simulation = SimulatedProblem(fine, theta)
-        error, output = worst_error(
-            simulation,
-            cost=result.cost,
-            first_cost=history[0].cost if history else 0.0,
-            constraints=[value for _, value, _ in held],
-        )
+        values = [value for _, value, _ in held]
+        first_cost = history[0].cost if history else 0.0
+        fine, simulation, error, output = _judge_meshes(evaluator, result, first_cost, values, first=not attempt)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
         if result.status in STOPPED or attempt == REFINEMENTS or not excess > 1:
             break
@@ -562,6 +557,23 @@ def _minimize(
         return minimize_with_constraints(evaluator, theta, tolerance, max_iterations, report)
     constraints = constraints_of(problem)
     return minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, report, constraints), ()
+
+
+def _judge_meshes(
+    evaluator: Evaluator, result: Result, first_cost: float, constraints: list[float], *, first: bool
+) -> tuple[Evaluator, SimulatedProblem, float, str]:
+    """Return the problem with its steps halved, its simulation there, and the largest integration error and of what.
+
+    The first meshes are mostly too coarse, as the evaluator with halved cells tells as well, which is kept for the next
+    fit of the same problem.
+    """
+    for halve in (lambda: evaluator.halved, lambda: evaluator.halve_rows(result.theta))[not first :]:
+        fine = halve()
+        simulation = SimulatedProblem(fine, result.theta)
+        error, output = worst_error(simulation, cost=result.cost, first_cost=first_cost, constraints=constraints)
+        if error > max(LARGEST_INTEGRATION_ERROR, evaluator.problem.rtol):
+            break
+    return fine, simulation, error, output
 
 
 def _refine(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:
