@@ -24,8 +24,14 @@ def write_verdict(verdict: Verdict) -> str:
     ----------
     verdict : Verdict
     """
-    reasons = [write_reason(reason) for reason in verdict.reasons[:LISTED_REASONS]]
-    more = len(verdict.reasons) - len(reasons)
+    collapsed = [reason for reason in verdict.reasons if reason.kind == "a mode collapsed"]
+    reasons = [
+        write_reason(reason) if len(collapsed) < 2 or reason not in collapsed else _count_modes(collapsed)
+        for reason in verdict.reasons
+        if reason not in collapsed[1:]
+    ]
+    more = len(reasons) - LISTED_REASONS
+    reasons = reasons[:LISTED_REASONS]
     if more > 0:
         reasons.append("and another reason" if more == 1 else f"and {more} more reasons")
     steps = ", or ".join(write_step(step) for step in verdict.next_steps[:LISTED_STEPS])
@@ -106,6 +112,11 @@ def _name_mode(issue: Issue) -> str:
     return f"mode {mode!r}" + (f" of {run}" if run else "")
 
 
+def _count_modes(collapsed: list[Issue]) -> str:
+    names = tuple(_name_mode(issue).removeprefix("mode ") for issue in collapsed)
+    return f"{len(names)} modes collapsed ({_name(names)})"
+
+
 _ENDINGS: Mapping[str, str] = {
     Status.MAX_ITERATIONS.name: "not converged: stopped after {iterations:.0f} iterations",
     Status.LINE_SEARCH_FAILED.name: "not converged: the line search failed (optimality {optimality:.1e})",
@@ -135,7 +146,9 @@ _REASONS: dict[str, Callable[[Issue], str]] = {
     "slightly wrong": lambda issue: (
         f"slightly wrong at high precision: {_explain_worst(issue)}, but the residuals are more than sigma"
     ),
-    "sigma too small": lambda issue: f"sigma looks too small: {_explain_worst(issue)}, and what is left looks like noise",
+    "sigma too small": lambda issue: (
+        f"sigma looks too small: {_explain_worst(issue)}, and what is left looks like noise"
+    ),
     "little explained": _explain,
     "too few samples": lambda issue: (
         f"{_figure(issue, 'samples'):.0f} values for {_figure(issue, 'unknowns'):.0f} unknowns leave nothing to check "

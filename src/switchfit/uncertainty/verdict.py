@@ -34,8 +34,8 @@ UNLIKELY = 1e-3
 fits. Shared among the channels where each is tested by itself."""
 
 CLEARLY_OFF = 0.1
-"""How far the reduced chi-square must be from 1 as well: with 10,000 samples chi-square rejects a sigma that is 2 % off,
-which no instrument is known to."""
+"""How far the reduced chi-square must be from 1 as well: with 10,000 samples chi-square rejects a sigma that is 2 %
+off, which no instrument is known to."""
 
 WHITE = 0.05
 """Probability of the residuals' correlation above which they count as noise of another size: then it is sigma that is
@@ -142,22 +142,21 @@ def judge(fit: Fit, certificate: Certificate | None = None) -> Verdict:
         What it found about the derivatives counts; left out, nothing is said of them.
     """
     quality = measure_quality(fit) if fit.status.successful and np.isfinite(fit.cost) else None
-    found = list(_find_ending(fit))
-    misfit = False
-    if quality is not None:
-        fitting = list(_judge_quality(fit, quality))
-        misfit = any(f.reason.kind in MISFITS for f in fitting)
-        found += fitting
-    else:
-        fitting = []
-    wrong = misfit and quality is not None and _worst(quality.channels) < NEARLY_ALL
-    found += _find_collapsed(fit, wrong=wrong)
+    fitting = [] if quality is None else list(_judge_quality(fit, quality))
+    collapsed = list(_find_collapsed(fit))
+    if collapsed and quality is not None and _worst(quality.channels) < NEARLY_ALL:
+        fitting = [_condemn(f) if f.reason.kind in MISFITS else f for f in fitting]
+    if any(f.level == "bad" for f in fitting):
+        collapsed = [f._replace(level="bad") for f in collapsed]
+    correlated = [f for f in fitting if f.reason.kind == "correlated residuals"]
+    found = [*_find_ending(fit), *(f for f in fitting if f not in correlated), *collapsed]
     found += _judge_starts(fit, confirmed=quality is not None and quality.has_chi_square and not fitting)
     if quality is not None:
         found += _find_undetermined(fit)
         found += _find_bounds(fit)
         found += _check_integration(fit)
         found += _check_derivatives(certificate)
+        found += correlated
     found.sort(key=lambda f: -LEVELS.index(f.level))  # stable: in the order of weight on each level
     if not found:
         return Verdict("good", tuple(_praise(fit, quality)))
@@ -277,9 +276,15 @@ def _find_correlation(quality: Quality) -> Iterator[Finding]:
             yield Finding("doubtful", issue, ("corrected errors", "look at the residuals"))
 
 
-def _find_collapsed(fit: Fit, *, wrong: bool) -> Iterator[Finding]:
-    """Find modes that have collapsed, or are at their minimum duration; bad beside a poor fit."""
-    level: Level = "bad" if wrong else "doubtful"
+def _condemn(finding: Finding) -> Finding:
+    """Return a misfit as it counts beside a collapsed mode: as one that the model cannot explain."""
+    reason = finding.reason
+    kind = "unexplained" if reason.kind == "slightly wrong" else reason.kind
+    return Finding("bad", Issue(kind, reason.subjects, reason.figures), ("more starts", "look at the residuals"))
+
+
+def _find_collapsed(fit: Fit) -> Iterator[Finding]:
+    """Find modes that have collapsed, or are at their minimum duration."""
     collapsed = False
     for constraint in fit.active:
         if constraint.position is None:
@@ -288,12 +293,12 @@ def _find_collapsed(fit: Fit, *, wrong: bool) -> Iterator[Finding]:
         if constraint.kind == "collapsed":
             collapsed = True
             reason = Issue("a mode collapsed", (constraint.mode, constraint.run), figures)
-            yield Finding(level, reason, ("more starts", "leave the mode out"))
+            yield Finding("doubtful", reason, ("more starts", "leave the mode out"))
         else:
             reason = Issue("a mode is short", (constraint.mode, constraint.run), figures)
             yield Finding("doubtful", reason, ("lower min_duration",))
     if fit.status is Status.COLLAPSED and not collapsed:
-        yield Finding(level, Issue("idle", fit.idle), ("more starts", "leave the mode out"))
+        yield Finding("doubtful", Issue("idle", fit.idle), ("more starts", "leave the mode out"))
 
 
 def _judge_starts(fit: Fit, *, confirmed: bool) -> Iterator[Finding]:
