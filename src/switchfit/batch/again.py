@@ -48,7 +48,7 @@ def redo_unresolved(
             again = estimate(problem, start=arrays["theta"][k], tolerance=tolerance, max_iterations=max_iterations)
         except Exception:  # this end allows no fit of its own: what was found stays, and is listed
             continue
-        if again.success:
+        if again.status.successful:
             adopt(arrays, k, again)
     return Chunk(**arrays | {name: arrays[name].astype(str) for name in ("status", "message")})
 

@@ -34,20 +34,21 @@ from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_callable, as_choice, as_count, as_instance, as_path, as_positive
+from switchfit.problem.validation import as_callable, as_choice, as_count, as_flag, as_instance, as_path, as_positive
 from switchfit.runtime.presentation import draw_figure, format_text
 from switchfit.runtime.progress import Progress
 from switchfit.uncertainty.certificate import Certificate, certify
 from switchfit.uncertainty.identification import Identifiability, identifiability
 from switchfit.uncertainty.prediction import Prediction, predict
 from switchfit.uncertainty.profiles import Profile, profile
-from switchfit.uncertainty.residuals import ResidualDiagnostics, diagnose
+from switchfit.uncertainty.residuals import ResidualDiagnostics, correct_errors, diagnose
 from switchfit.uncertainty.sensitivity import (
     Sensitivity,
     build_gauss_newton,
     collect_sample_derivatives,
     compute_sensitivity,
 )
+from switchfit.uncertainty.verdict import Verdict, judge
 
 HESSIANS = get_args(HessianKind)
 
@@ -140,6 +141,58 @@ class Estimate(Fit):
         if self.saved_certificate is not None:
             return self.saved_certificate
         return certify(self, None if self.problem is None else Evaluator(self.problem, theta=self.theta))
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether to believe the numbers: good, doubtful or bad, why, and what to do next. Print it for one line.
+
+        The derivatives count where the certificate has been asked for, or was loaded.
+        """
+        known = self.known_certificate
+        held = self.__dict__.get("_verdict")
+        if held is None or held[0] is not known:
+            held = self.__dict__["_verdict"] = known, judge(self, known)
+        return held[1]
+
+    @property
+    def success(self) -> bool:
+        """Whether the fit converged and its verdict is not bad; ``status.successful`` says whether it converged."""
+        return self.status.successful and self.verdict.level != "bad"
+
+    @property
+    def corrected_standard_errors(self) -> FloatArray:
+        """Standard errors that allow for correlated residuals: (d,); `standard_errors` where there are none.
+
+        These times sqrt((1 + r) / (1 - r)), r being the correlation of neighbouring residuals, and where sigma is known
+        times the residuals' root mean square in sigmas. Of a transition time by the channels of its own run, of any
+        other unknown by all; the largest factor counts.
+        """
+        return correct_errors(self)
+
+    def report(self, *, full: bool = False) -> str:
+        """Return the report that `print` shows: the verdict and one screen of numbers.
+
+        Parameters
+        ----------
+        full : bool
+            All experiments, channels, unknowns, correlations, weak directions and warnings, however many.
+
+        See Also
+        --------
+        Estimate.verdict, Estimate.plot
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.report().splitlines()[0]
+        'Good: the model explains 99.85 % of the variance (chi² 12.1 for 22 degrees of freedom).'
+        >>> len(fit.report(full=True)) > len(fit.report())
+        True
+        """
+        return format_text(self, full=True) if as_flag(full, "full") else format_text(self)
 
     @property
     def known_certificate(self) -> Certificate | None:
@@ -337,7 +390,7 @@ class Estimate(Fit):
         >>> with TemporaryDirectory() as folder:
         ...     fit.save(Path(folder) / "fit.json")
         ...     (Path(folder) / "fit.json").read_text().splitlines()[1]
-        '  "format": "switchfit fit",'
+        '  "verdict": {'
         """
         file = as_path(path, "path")
         save_fit(self.complete(), self.certificate, file)
@@ -449,7 +502,7 @@ def estimate(
     Returns
     -------
     Estimate
-        Also when it did not converge: see ``.success`` and ``.message``.
+        Also when it did not converge, or is far from the data: see ``.success`` and ``.verdict``.
 
     Raises
     ------

@@ -122,6 +122,9 @@ class Fit:
         Guards and terminal constraints that are not met, and their values.
     reason : Issue or None
         Why the line search failed, or the error with which the fit ended.
+    starts : (tried, better, agreeing) or None
+        How many other starts were fitted, how many of them ended lower, and how many in the same minimum; None where
+        none were.
     """
 
     theta_names: tuple[str, ...]
@@ -167,15 +170,7 @@ class Fit:
     flat_direction: tuple[tuple[str, float], ...] = ()
     violated: tuple[tuple[str, float], ...] = ()
     reason: Issue | None = None
-
-    @property
-    def success(self) -> bool:
-        """Whether the fit converged, which is `Status.successful`: it found a point near which nothing decreases J.
-
-        With `Status.SINGULAR` J is flat in some direction from there, with `Status.COLLAPSED` in nothing but what a
-        mode of no duration leaves undetermined; ``status.is_strict_minimum`` is False with these two.
-        """
-        return self.status.successful
+    starts: tuple[int, int, int] | None = None
 
     @property
     def termination(self) -> Termination:
