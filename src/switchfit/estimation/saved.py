@@ -373,6 +373,7 @@ def _upgrade(content: dict[str, Any], version: int) -> None:
             _upgrade_fit(content["fit"])
             _upgrade_certificate(content["certificate"], content["fit"])
         content["fit"].setdefault("starts", None)
+        content["fit"].setdefault("steps", [])
         for comparison in (comparison for run in content["fit"]["comparisons"] for comparison in run):
             comparison.setdefault("weights", None)
     except (LookupError, TypeError, AttributeError) as error:
