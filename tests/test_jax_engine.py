@@ -38,7 +38,9 @@ def assert_close(found, expected, relative: float) -> None:
         np.testing.assert_allclose(a, b, rtol=0.0, atol=relative * np.abs(b).max())
 
 
-@pytest.mark.parametrize(("solver", "relative"), [("explicit", 1e-12), ("stiff", 1e-9)])
+@pytest.mark.parametrize(
+    ("solver", "relative"), [("explicit", 1e-12), pytest.param("stiff", 1e-9, marks=pytest.mark.slow)]
+)
 def test_augmented_lagrangian_has_exact_derivatives(solver: str, relative: float) -> None:
     structure, arguments = program_inputs(constrained(TAU, solver=solver))
     multipliers, penalty = np.array([0.3, -1.1, 0.7, 0.4]), np.array([1.3, 0.6, 0.8, 1.9])
@@ -138,21 +140,26 @@ def test_costs_at_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(added, expected, rtol=0.0, atol=1e-11 * np.abs(expected).max())
 
 
+def differentiate(method: str, matrix: str):
+    """J, g and H of `constrained`, traced anew."""
+    structure, arguments = program_inputs(constrained(TAU))
+    with use_float64():
+        return jax.jit(
+            lambda *at: programs.derivatives.__wrapped__(*at, structure=structure, method=method, matrix=matrix)
+        )(arguments, TAU, P0, np.ones(()))
+
+
+@pytest.fixture(scope="module")
+def by_the_adjoint():
+    return differentiate("discrete-adjoint", "exact")
+
+
 @pytest.mark.parametrize(
     ("method", "matrix"), [("forward", "exact"), ("forward", "none"), ("discrete-adjoint", "gauss-newton")]
 )
-def test_forward_mode_takes_nothing_from_the_adjoint(method, matrix, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_forward_mode_takes_nothing_from_the_adjoint(method, matrix, by_the_adjoint, monkeypatch) -> None:
     """So that a mistake in one is not repeated in the other; the Gauss-Newton matrix does without it to be fast."""
-    structure, arguments = program_inputs(constrained(TAU))
-    given = arguments, TAU, P0, np.ones(())
-
-    def differentiate(method, matrix):
-        with use_float64():
-            return jax.jit(
-                lambda *at: programs.derivatives.__wrapped__(*at, structure=structure, method=method, matrix=matrix)
-            )(*given)
-
-    expected = differentiate("discrete-adjoint", "exact")
+    expected = by_the_adjoint
 
     def fails(*_):
         raise AssertionError("the backward sweep is not forward")
