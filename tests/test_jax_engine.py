@@ -38,9 +38,8 @@ def assert_close(found, expected, relative: float) -> None:
         np.testing.assert_allclose(a, b, rtol=0.0, atol=relative * np.abs(b).max())
 
 
-@pytest.mark.parametrize(
-    ("solver", "relative"), [("explicit", 1e-12), pytest.param("stiff", 1e-9, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow  # short forms: in test_guards.py, and of JAX in test_random_systems.py
+@pytest.mark.parametrize(("solver", "relative"), [("explicit", 1e-12), ("stiff", 1e-9)])
 def test_augmented_lagrangian_has_exact_derivatives(solver: str, relative: float) -> None:
     structure, arguments = program_inputs(constrained(TAU, solver=solver))
     multipliers, penalty = np.array([0.3, -1.1, 0.7, 0.4]), np.array([1.3, 0.6, 0.8, 1.9])
