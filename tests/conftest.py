@@ -4,9 +4,11 @@ import os
 from pathlib import Path
 
 import jax
+import llvmlite.binding
 import pytest
 from hypothesis import settings
 
+from switchfit.engine.native import llvm, program
 from switchfit.engine.native.program import drop_programs
 
 settings.register_profile("switchfit", derandomize=True, deadline=None)
@@ -36,6 +38,25 @@ jax.config.update("jax_disable_most_optimizations", True)
 os.environ["XLA_FLAGS"] = QUICK_FLAGS
 jax.jit(lambda: 0)()
 os.environ["XLA_FLAGS"] = DEFAULT_FLAGS
+
+
+def pytest_configure(config):
+    """Make machine code without optimisation too, unless slow or long random tests are asked for.
+
+    The cache must not hand it to others: a comment in the text of a program gives it a key of its own.
+    """
+    if config.getoption("markexpr") != "not slow and not fuzz":
+        return
+    create, compile_module = llvmlite.binding.Target.create_target_machine, llvm.compile_module
+
+    def create_quickly(self, **settings):
+        return create(self, **(settings | {"opt": 0}))
+
+    def compile_quickly(text):
+        return compile_module(f"{text}\n; without optimisation\n")
+
+    llvmlite.binding.Target.create_target_machine = create_quickly
+    llvm.compile_module = program.compile_module = compile_quickly
 
 
 @pytest.fixture
