@@ -75,6 +75,7 @@ def test_augmented_lagrangian_has_exact_derivatives(solver: str, relative: float
     assert_close(found, expected, relative)
 
 
+@pytest.mark.slow  # in closed form, and in both engines, in test_protocol.py
 def test_costs_at_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
     """A kind of node at transitions that is a cost: here the guards, taken for one."""
     structure, arguments = program_inputs(constrained(TAU))
