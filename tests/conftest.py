@@ -40,6 +40,9 @@ jax.jit(lambda: 0)()
 os.environ["XLA_FLAGS"] = DEFAULT_FLAGS
 
 
+AS_USERS = llvmlite.binding.Target.create_target_machine, llvm.compile_module
+
+
 def pytest_configure(config):
     """Make machine code without optimisation too, unless slow or long random tests are asked for.
 
@@ -47,7 +50,7 @@ def pytest_configure(config):
     """
     if config.getoption("markexpr") != "not slow and not fuzz":
         return
-    create, compile_module = llvmlite.binding.Target.create_target_machine, llvm.compile_module
+    create, compile_module = AS_USERS
 
     def create_quickly(self, **settings):
         return create(self, **(settings | {"opt": 0}))
@@ -57,6 +60,18 @@ def pytest_configure(config):
 
     llvmlite.binding.Target.create_target_machine = create_quickly
     llvm.compile_module = program.compile_module = compile_quickly
+
+
+@pytest.fixture(scope="module")
+def optimised_machine_code():
+    """Machine code as users have it, to the last bit."""
+    drop_programs()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(llvmlite.binding.Target, "create_target_machine", AS_USERS[0])
+        for module in (llvm, program):
+            patch.setattr(module, "compile_module", AS_USERS[1])
+        yield
+    drop_programs()
 
 
 @pytest.fixture
