@@ -51,6 +51,7 @@ EVERYTHING = Limits(*[sys.maxsize] * len(SCREEN))
 
 SMALL_CORRELATION = 0.1
 """Correlations below this in size are not listed."""
+CORRELATIONS = f"Correlations above {SMALL_CORRELATION:g}"
 METHODS = {
     "auto": "SQP with the exact Hessian in a trust region",
     "exact": "SQP with the exact Hessian and a line search",
@@ -92,21 +93,19 @@ def report(
     """
     verdict = judge(fit, certificate) if verdict is None else verdict
     limits = EVERYTHING if full else SCREEN
+    weak = analyse_solution(fit, None) if found is None else found
     sections = [
         _wrap(str(verdict), "", "  "),
         _format_section(
-            "Fit", [*_format_experiments(fit, limits.experiments, full=full), *_format_course(fit, full=full)]
+            "Fit", _format_experiments(fit, limits.experiments, full=full) + _format_course(fit, full=full)
         ),
-        _format_section("Quality of the fit", [*_format_quality(fit), *_format_channels(fit, limits.channels)]),
+        _format_section(
+            "Quality of the fit", [*_format_quality(fit, full=full), *_format_channels(fit, limits.channels)]
+        ),
         _format_section("Unknowns", _format_unknowns(fit, limits.unknowns)),
         _format_section("Held fixed", _format_fixed(fit, limits.fixed)),
-        _format_section(
-            f"Correlations above {SMALL_CORRELATION:g}", _format_correlations(fit, limits.correlations, full=full)
-        ),
-        _format_section(
-            "Determined worst by the data",
-            _describe_weak(fit, analyse_solution(fit, None) if found is None else found, limits.directions),
-        ),
+        _format_section(CORRELATIONS, _format_correlations(fit, limits.correlations, full=full)),
+        _format_section("Determined worst by the data", _describe_weak(fit, weak, limits.directions)),
         _format_section("Warnings", _format_warnings(fit, verdict, limits.warnings, full=full)),
     ]
     shown = "\n\n".join("\n".join(section) for section in sections if section)
@@ -131,8 +130,9 @@ def write_estimate(estimate: Estimate, *, full: bool = False) -> str:
 # --- sections ---------------------------------------------------------------------------------------------------------
 
 
-def _format_experiments(fit: Fit, most: int, *, full: bool) -> Iterator[str]:
+def _format_experiments(fit: Fit, most: int, *, full: bool) -> list[str]:
     """Return each experiment's modes, its horizon and its data; on one screen of several a line each."""
+    lines: list[str] = []
     single = len(fit.trajectories) == 1
     names = ["experiment"] if single else fit.run_names
     for name, trajectory, run in list(zip(names, fit.trajectories, fit.comparisons, strict=True))[:most]:
@@ -140,13 +140,14 @@ def _format_experiments(fit: Fit, most: int, *, full: bool) -> Iterator[str]:
         horizon = f"{trajectory.times[0]:.6g} to {trajectory.times[-1]:.6g}{unit_suffix(trajectory.time_unit)}"
         data = [_format_data(comparison) for comparison in run] or ["no data: a cost of the trajectory"]
         if full or single:
-            yield from _format_row(name, f"{sequence}, {horizon}")
-            for line in data:
-                yield from _format_row("", line)
+            lines += _format_row(name, f"{sequence}, {horizon}")
+            for text in data:
+                lines += _format_row("", text)
         else:
-            yield from _format_row(name, "; ".join([f"{sequence}, {horizon}", *data]))
+            lines += _format_row(name, "; ".join([f"{sequence}, {horizon}", *data]))
     if len(names) > most:
-        yield from _format_row("", f"and {len(names) - most} more experiments")
+        lines += _format_row("", f"and {len(names) - most} more experiments")
+    return lines
 
 
 def _format_data(comparison: Comparison) -> str:
@@ -161,14 +162,15 @@ def _format_data(comparison: Comparison) -> str:
     return f"{names}: {_count(len(comparison.times), 'sample')}{note}"
 
 
-def _format_course(fit: Fit, *, full: bool) -> Iterator[str]:
+def _format_course(fit: Fit, *, full: bool) -> list[str]:
     """Return method, effort, and how it ended."""
-    yield from _format_row("method", METHODS.get(fit.hessian_kind, fit.hessian_kind))
+    lines = _format_row("method", METHODS.get(fit.hessian_kind, fit.hessian_kind))
     effort = f"{_count(fit.iterations, 'iteration')}, {_count(fit.evaluations, 'evaluation')}, {fit.seconds:.3g} s"
-    yield from _format_row("effort", effort if fit.engine is None or full else f"{effort}. {fit.engine}")
+    lines += _format_row("effort", effort if fit.engine is None or full else f"{effort}. {fit.engine}")
     if fit.engine is not None and full:
-        yield from _format_row("", str(fit.engine))
-    yield from _format_row("status", fit.message if full or not fit.status.successful else _shorten_status(fit))
+        lines += _format_row("", str(fit.engine))
+    lines += _format_row("status", fit.message if full or not fit.status.successful else _shorten_status(fit))
+    return lines
 
 
 def _shorten_status(fit: Fit) -> str:
@@ -182,11 +184,12 @@ def _shorten_status(fit: Fit) -> str:
     return f"{where}: the optimality {fit.optimality:.1e} is {side} the tolerance {fit.tolerance:.1e}."
 
 
-def _format_quality(fit: Fit) -> Iterator[str]:
-    """Return cost, optimality, residual variance, integration error."""
+def _format_quality(fit: Fit, *, full: bool) -> Iterator[str]:
+    """Return cost, optimality (which the status says as well), residual variance, integration error."""
     start = f"   (first guess: {fit.history[0].cost:.8g})" if fit.history else ""
     yield from _format_row("cost J", f"{fit.cost:.8g}{start}")
-    yield from _format_row("KKT residual", f"{fit.optimality:.1e}   (tolerance: {fit.tolerance:.1e})")
+    if full:
+        yield from _format_row("KKT residual", f"{fit.optimality:.1e}   (tolerance: {fit.tolerance:.1e})")
     for name, value, multiplier in fit.constraints:
         yield from _format_row(name, f"{value:.1e}   (multiplier {multiplier:.6g})")
     variance, unknowns = fit.residual_variance, _count(fit.free_basis.shape[1], "free unknown")
@@ -266,8 +269,8 @@ def _format_unknowns(fit: Fit, most: int) -> list[str]:
         return table
     if corrected:
         allowed = "Standard errors allow for the correlation of the residuals; naive: as if these were independent."
-        return [*table, "", f"  {allowed}"]
-    return [*table, "", f"  Standard errors from the exact Hessian{_compare_covariances(fit)}."]
+        return [*table, f"  {allowed}"]
+    return [*table, f"  Standard errors from the exact Hessian{_compare_covariances(fit)}."]
 
 
 def _select_unknowns(fit: Fit, most: int) -> list[int]:
