@@ -38,11 +38,11 @@ MOST_DRAWN = 2**30
 ENDS_TRIED = 10
 """Ends from which a full estimate is tried, the lowest first."""
 
-SAME_COST = 1e-6
-"""Two ends are one minimum if their costs differ by less than this part of them, and ..."""
-
 CLEARLY_LOWER = 1e-4
 """Part of the best cost by which another end is better: on the mesh that all starts share costs are less accurate."""
+
+SAME_COST = 1e-6
+"""Two ends are one minimum if their costs differ by less than this part of them, and ..."""
 
 SAME_PLACE = 1e-3
 """... each parameter by less than this part of the spread of the starts, or of its size where they do not differ in it,
