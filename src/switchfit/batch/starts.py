@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 
 ENDS_TRIED = 10
 """Ends from which a full estimate is tried, the lowest first."""
+
+CLEARLY_LOWER = 1e-4
+"""Part of the best cost by which another end is better: on the mesh that all starts share costs are less accurate."""
 
 SAME_COST = 1e-6
 """Two ends are one minimum if their costs differ by less than this part of them, and ..."""
@@ -163,7 +166,17 @@ def multistart(
         for k, error in errors.items():
             status[k], message[k] = Status.ERROR.name, error_message(error)
         found |= {"status": status.astype(str), "message": message.astype(str)}
-    return Multistart(**found, clusters=_find_clusters(problem, Fits(**found)), best=best)
+    clusters = _find_clusters(problem, Fits(**found))
+    if best is not None:
+        best = replace(best, starts=_count_starts(Fits(**found), clusters, best.cost))
+    return Multistart(**found, clusters=clusters, best=best)
+
+
+def _count_starts(fits: Fits, clusters: NDArray[np.int64], best: float) -> tuple[int, int, int]:
+    """Return how many starts there were beside the one that ended in the best, how many ended lower, how many there."""
+    costs = fits.cost[fits.success]
+    better = int(np.sum(costs < best - CLEARLY_LOWER * abs(best)))
+    return len(fits) - 1, better, max(int(np.sum(clusters == 0)) - 1, 0)
 
 
 def _find_best(

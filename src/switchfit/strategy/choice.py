@@ -14,7 +14,7 @@ from switchfit.estimation.estimator import Estimate, fit_locally
 from switchfit.fit.result import Step
 from switchfit.optimize import IterationRecord, Status
 from switchfit.optimize.problem import HessianKind
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_positive
 from switchfit.runtime.errors import NotIntegrableError
@@ -23,9 +23,20 @@ from switchfit.strategy.quick import End
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
 from switchfit.strategy.scan import can_scan, scan_intervals
 from switchfit.strategy.starts import try_starts
+from switchfit.uncertainty.quality import measure_quality
 
 Strategy = Literal["local", "auto", "thorough"]
 STRATEGIES = get_args(Strategy)
+
+MORE_STARTS = "next: more starts"
+"""Step that a verdict advises where the fit may be better elsewhere."""
+
+CONFIRMING = ("growing horizon", "removal and re-insertion", "many starts")
+"""Strategies that look everywhere."""
+
+PERFECT = 0.9999
+"""Share of the variance of a reference that must be explained for a fit not to need confirmation: wrong ends of the
+benchmarks reach 0.9989."""
 
 LOWER = 1e-7
 """Part of the cost by which an end has to be lower to replace the best so far."""
@@ -129,18 +140,22 @@ def estimate(
     return search.finish()
 
 
-def _is_enough(fit: Estimate) -> bool:
-    """Return whether nothing more has to be tried: the verdict is good, and there is a quality of fit to judge by."""
-    if fit.status in (Status.INTERRUPTED, Status.ERROR):
+def _is_enough(fit: Estimate, confirmed: bool = False) -> bool:
+    """Return whether nothing more has to be tried: nothing that the verdict doubts could be better elsewhere.
+
+    Without noise to measure the residuals by, a quality of fit that is not perfect has to be `confirmed` by a strategy
+    that does not depend on the guess.
+    """
+    if fit.status is Status.INTERRUPTED:
         return True
-    return _has_data(fit) and fit.verdict.level == "good"
+    if not fit.status.successful or any(step.kind == MORE_STARTS for step in fit.verdict.next_steps):
+        return False
+    return confirmed or _shows_noise(fit) or measure_quality(fit).explained >= PERFECT
 
 
-def _has_data(fit: Estimate) -> bool:
-    assert fit.problem is not None
-    return all(
-        any(isinstance(item, Measurements | ReferenceSignal) for item in run.data) for run in fit.problem.experiments
-    )
+def _shows_noise(fit: Estimate) -> bool:
+    """Return whether each run has measurements, whose residuals tell a right end from a wrong one."""
+    return all(any(comparison.kind == "measurements" for comparison in run) for run in fit.comparisons)
 
 
 class Search:
@@ -175,7 +190,7 @@ class Search:
                 if self.late:
                     break
                 self._try(name, find)
-                if self.strategy == "auto" and self.best is not None and _is_enough(self.best):
+                if self.strategy == "auto" and self.best is not None and _is_enough(self.best, name in CONFIRMING):
                     break
                 if self.best is not None and self.best.status is Status.INTERRUPTED:
                     break
