@@ -19,7 +19,7 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_positive
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.strategy.horizon import can_grow, grow_horizon
-from switchfit.strategy.quick import End
+from switchfit.strategy.quick import End, fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
 from switchfit.strategy.scan import can_scan, scan_intervals
 from switchfit.strategy.starts import try_starts
@@ -37,6 +37,9 @@ CONFIRMING = ("growing horizon", "removal and re-insertion", "many starts")
 PERFECT = 0.9999
 """Share of the variance of a reference that must be explained for a fit not to need confirmation: wrong ends of the
 benchmarks reach 0.9989."""
+
+MORE_ITERATIONS = 2000
+"""Iterations of a fit that goes on where the first has not converged within those that it was allowed."""
 
 LOWER = 1e-7
 """Part of the cost by which an end has to be lower to replace the best so far."""
@@ -217,8 +220,10 @@ class Search:
         """Find what applies to the problem, the cheapest first."""
         problem = self.problem
         found: list[tuple[str, Callable[[FloatArray], End]]] = []
+        if self.best is not None and self.best.status is Status.MAX_ITERATIONS:
+            found.append(("more iterations", lambda theta: fit_briefly(problem, theta, MORE_ITERATIONS)))
         if problem.constraint_names:
-            return [("many starts", self._try_starts)]
+            return [*found, ("many starts", self._try_starts)]
         if can_scan(problem):
             found.append(("scan over sample intervals", lambda theta: scan_intervals(problem, theta)))
         if can_grow(problem):

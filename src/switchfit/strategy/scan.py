@@ -87,7 +87,8 @@ class Scan:
 
     def __init__(self, problem: Problem, theta: FloatArray, *, everywhere: bool) -> None:
         self.problem, self.theta = problem, theta
-        self.reach, self.settled = (np.inf, SETTLED[0]) if everywhere else (NEAR, SETTLED[1])
+        self.reach: float = np.inf if everywhere else NEAR
+        self.settled = SETTLED[0] if everywhere else SETTLED[1]
         self.evaluator = Evaluator(problem, theta)
         self.evaluations = 0
         touched = np.array([self._touched(e) for e in range(len(problem.experiments))])
@@ -207,10 +208,11 @@ class Scan:
                 break
             theta = theta.copy()
             theta[own] = np.clip(theta[own] + move, lower, upper)
-        return None if best is None else self._option(*best, o)
+        return None if best is None else self._option(best, o)
 
-    def _option(self, theta: FloatArray, J: float, g: FloatArray, H: FloatArray, moving: FloatArray, o: int) -> Option:
+    def _option(self, best: tuple[Any, ...], o: int) -> Option:
         """Return an option with the slope and curvature that are left where the moving unknowns follow the shared."""
+        theta, J, g, H, moving = best
         s = len(self.shared)
         follows = np.zeros((o, s))
         if not 0 < s <= MOST_SHARED:
