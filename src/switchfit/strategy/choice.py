@@ -15,7 +15,7 @@ from switchfit.fit.result import Step
 from switchfit.optimize import IterationRecord, Status
 from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray
-from switchfit.problem.problem import Problem
+from switchfit.problem.problem import GIVEN, Problem
 from switchfit.problem.validation import as_choice, as_positive
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.strategy.horizon import can_grow, grow_horizon
@@ -161,6 +161,12 @@ def _shows_noise(fit: Estimate) -> bool:
     return all(any(comparison.kind == "measurements" for comparison in run) for run in fit.comparisons)
 
 
+def without_guards(problem: Problem) -> Problem:
+    """Return the same problem with transitions that may happen anywhere, guards or not."""
+    given = {name: getattr(problem, name) for name in GIVEN}
+    return Problem(**given | {"system": replace(problem.system, guards={})})
+
+
 class Search:
     """The strategies in turn, the best fit so far, and what each brought."""
 
@@ -223,6 +229,8 @@ class Search:
         if self.best is not None and self.best.status is Status.MAX_ITERATIONS:
             found.append(("more iterations", lambda theta: fit_briefly(problem, theta, MORE_ITERATIONS)))
         if problem.constraint_names:
+            if any(structure.guarded for structure in problem.structures):
+                found.append(("transitions free of their guards", self._free_transitions))
             return [*found, ("many starts", self._try_starts)]
         if can_scan(problem):
             found.append(("scan over sample intervals", lambda theta: scan_intervals(problem, theta)))
@@ -231,6 +239,17 @@ class Search:
         if can_reinsert(problem):
             found.append(("removal and re-insertion", lambda theta: reinsert_modes(problem, theta)))
         return [*found, ("many starts", self._try_starts)]
+
+    def _free_transitions(self, theta: FloatArray) -> End:
+        """Fit with transitions that may happen anywhere, and from there with their guards."""
+        free = estimate(without_guards(self.problem), start=self.theta, time_budget=self._time_left)
+        end = fit_briefly(self.problem, free.theta)
+        return end._replace(evaluations=end.evaluations + free.evaluations)
+
+    @property
+    def _time_left(self) -> float | None:
+        left = self.budget - (time.perf_counter() - self.began)
+        return None if left == np.inf else max(left, 1e-3)
 
     def _try_starts(self, theta: FloatArray) -> End:
         found = try_starts(self.problem, theta, stop=lambda: self.late)
