@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import Any, Literal, get_args
 
@@ -21,6 +21,7 @@ from switchfit.runtime.errors import NotIntegrableError
 from switchfit.strategy.horizon import can_grow, grow_horizon
 from switchfit.strategy.quick import End, fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
+from switchfit.strategy.runs import fit_runs_alone, has_runs
 from switchfit.strategy.scan import can_scan, scan_intervals
 from switchfit.strategy.starts import try_starts
 from switchfit.uncertainty.quality import measure_quality
@@ -31,7 +32,15 @@ STRATEGIES = get_args(Strategy)
 MORE_STARTS = "next: more starts"
 """Step that a verdict advises where the fit may be better elsewhere."""
 
-CONFIRMING = ("growing horizon", "removal and re-insertion", "many starts")
+SCAN, GROW, REINSERT, STARTS = (
+    "scan over sample intervals",
+    "growing horizon",
+    "removal and re-insertion",
+    "many starts",
+)
+"""Names of strategies."""
+
+EVERYWHERE = frozenset({GROW, REINSERT, STARTS})
 """Strategies that look everywhere."""
 
 PERFECT = 0.9999
@@ -143,22 +152,28 @@ def estimate(
     return search.finish()
 
 
-def _is_enough(fit: Estimate, confirmed: bool = False) -> bool:
+def _is_enough(fit: Estimate, tried: Collection[str] = ()) -> bool:
     """Return whether nothing more has to be tried: nothing that the verdict doubts could be better elsewhere.
 
-    Without noise to measure the residuals by, a quality of fit that is not perfect has to be `confirmed` by a strategy
-    that does not depend on the guess.
+    Where the size of the noise is not known, the residuals of a minimum near the lowest look as good as its own: the
+    intervals between samples have to have been `tried`. Where there is no noise at all, and the quality of the fit is
+    not perfect, a strategy that looks everywhere.
     """
     if fit.status is Status.INTERRUPTED:
         return True
-    if not fit.status.successful or any(step.kind == MORE_STARTS for step in fit.verdict.next_steps):
+    if is_doubted(fit):
         return False
-    return confirmed or _shows_noise(fit) or measure_quality(fit).explained >= PERFECT
+    assert fit.problem is not None
+    if fit.sigma_known is True or not any(run.transition_times for run in fit.problem.experiments):
+        return True
+    if all(any(comparison.kind == "measurements" for comparison in run) for run in fit.comparisons):
+        return SCAN in tried
+    return not EVERYWHERE.isdisjoint(tried) or measure_quality(fit).explained >= PERFECT
 
 
-def _shows_noise(fit: Estimate) -> bool:
-    """Return whether each run has measurements, whose residuals tell a right end from a wrong one."""
-    return all(any(comparison.kind == "measurements" for comparison in run) for run in fit.comparisons)
+def is_doubted(fit: Estimate) -> bool:
+    """Return whether a better end may be elsewhere, by what the verdict says."""
+    return not fit.status.successful or any(step.kind == MORE_STARTS for step in fit.verdict.next_steps)
 
 
 def without_guards(problem: Problem) -> Problem:
@@ -194,12 +209,14 @@ class Search:
 
     def run(self) -> None:
         """Try one strategy after the other until the verdict is good; Ctrl-C ends it with the best so far."""
+        tried: set[str] = set()
         try:
             for name, find in self._list_strategies():
                 if self.late:
                     break
                 self._try(name, find)
-                if self.strategy == "auto" and self.best is not None and _is_enough(self.best, name in CONFIRMING):
+                tried.add(name)
+                if self.strategy == "auto" and self.best is not None and _is_enough(self.best, tried):
                     break
                 if self.best is not None and self.best.status is Status.INTERRUPTED:
                     break
@@ -231,20 +248,31 @@ class Search:
         if problem.constraint_names:
             if any(structure.guarded for structure in problem.structures):
                 found.append(("transitions free of their guards", self._free_transitions))
-            return [*found, ("many starts", self._try_starts)]
+            return [*found, (STARTS, self._try_starts)]
+        if has_runs(problem) and (self.best is None or is_doubted(self.best) or self.strategy == "thorough"):
+            found.append(("each run alone", self._fit_runs_alone))
         if can_scan(problem):
-            found.append(("scan over sample intervals", lambda theta: scan_intervals(problem, theta)))
+            found.append((SCAN, lambda theta: scan_intervals(problem, theta)))
         if can_grow(problem):
-            found.append(("growing horizon", lambda theta: grow_horizon(problem, theta)))
+            found.append((GROW, lambda theta: grow_horizon(problem, theta)))
         if can_reinsert(problem):
-            found.append(("removal and re-insertion", lambda theta: reinsert_modes(problem, theta)))
-        return [*found, ("many starts", self._try_starts)]
+            found.append((REINSERT, lambda theta: reinsert_modes(problem, theta)))
+        return [*found, (STARTS, self._try_starts)]
 
     def _free_transitions(self, theta: FloatArray) -> End:
         """Fit with transitions that may happen anywhere, and from there with their guards."""
         free = estimate(without_guards(self.problem), start=self.theta, time_budget=self._time_left)
         end = fit_briefly(self.problem, free.theta)
         return end._replace(evaluations=end.evaluations + free.evaluations)
+
+    def _fit_runs_alone(self, theta: FloatArray) -> End:
+        """Fit each run by itself, then all together."""
+
+        def fit(part: Problem, start: FloatArray) -> tuple[FloatArray, FloatArray, int]:
+            found = estimate(part, start=start, time_budget=self._time_left)
+            return found.theta, found.hessian, found.evaluations
+
+        return fit_runs_alone(self.problem, self.theta, fit)
 
     @property
     def _time_left(self) -> float | None:

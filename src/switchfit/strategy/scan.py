@@ -29,6 +29,9 @@ STEPS = 3
 SETTLED = (1e-2, 1e-8)
 """Part of the cost below which a predicted fall ends the steps in an interval: in the first scan, in later ones."""
 
+MOST_INTERVALS = 60
+"""Intervals of a transition in the first scan: where there are more samples, several are joined to one."""
+
 NEAR = 2
 """Intervals on either side that later scans look at."""
 
@@ -162,7 +165,9 @@ class Scan:
             latest = self.theta[where[i + 1]] if i + 1 < len(where) and where[i + 1] >= 0 else run.tf
             earliest = max(earliest, float(self.problem.unknowns.lower[place]))
             latest = min(latest, float(self.problem.unknowns.upper[place]))
-            edges = np.concatenate([[earliest], samples[(samples > earliest) & (samples < latest)], [latest]])
+            inside = samples[(samples > earliest) & (samples < latest)]
+            stride = -(-len(inside) // MOST_INTERVALS) if self.reach == np.inf and len(inside) else 1
+            edges = np.concatenate([[earliest], inside[::stride], [latest]])
             here = int(np.clip(np.searchsorted(edges, self.theta[place], "right") - 1, 0, len(edges) - 2))
             first, last = max(here - self.reach, 0), min(here + self.reach, len(edges) - 2)
             for way in (range(here, int(last) + 1), range(here - 1, int(first) - 1, -1)):
