@@ -1,8 +1,9 @@
 """Each run alone first: runs that begin badly are found, and put right, one by one before all are fitted together.
 
-A joint fit from a start at which a few runs are far off is led astray by them: the shared unknowns follow the worst. So
-each run is fitted by itself, with shared unknowns of its own. Their weighted median is what most runs agree on, whatever
-a few say; each run's own unknowns follow to it by the Schur complement of its Hessian, and the fit of all begins there.
+A joint fit from a start at which a few runs are far off is led astray by them: the shared unknowns follow the worst.
+So each run is fitted by itself, with shared unknowns of its own. Their weighted median is what most runs agree on,
+whatever a few say; each run's own unknowns follow to it by the Schur complement of its Hessian, and the fit of all
+begins there.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.problem.data import FloatArray
@@ -62,21 +64,20 @@ def fit_runs_alone(problem: Problem, theta: FloatArray, fit: FitAlone) -> End:
     return end._replace(evaluations=end.evaluations + evaluations // len(problem.experiments))
 
 
-def isolate_run(problem: Problem, e: int) -> tuple[Problem, FloatArray]:
+def isolate_run(problem: Problem, e: int) -> tuple[Problem, NDArray[np.intp]]:
     """Return the problem of one run, and where its unknowns stand in theta."""
     run, structure = problem.experiments[e], problem.structures[e]
     names = [run.parameter_map.get(name, name) for name, _, _ in structure.parameters]
     parameters = {name: problem.parameters[name] for name in problem.parameters if name in set(names)}
     given = {name: getattr(problem, name) for name in GIVEN}
     part = Problem(**given | {"experiments": run, "parameters": parameters})
-    spans = [
-        np.arange(s.start, s.stop) for n, s in problem.unknowns.parameters.items() if n in part.unknowns.parameters
-    ]
+    own = part.unknowns.parameters
+    spans = [np.arange(span.start, span.stop) for name, span in problem.unknowns.parameters.items() if name in own]
     times, states = problem.unknowns.times[e], problem.unknowns.initial_states[e]
     return part, np.concatenate([times[times >= 0], *spans, states[states >= 0]]).astype(np.intp)
 
 
-def _reduce(hessian: FloatArray, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _reduce(hessian: FloatArray, shared: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
     """Return the curvature in the shared unknowns where the others follow, and how they follow: (s, s), (o, s)."""
     own = ~shared
     follows = -np.linalg.pinv(hessian[np.ix_(own, own)], hermitian=True) @ hessian[np.ix_(own, shared)]
