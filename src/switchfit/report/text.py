@@ -357,6 +357,7 @@ _SAID = {
     "too few samples": {"no errors: too few samples"},
     "unexplained": {"sigma too small", "correlated residuals"},
     "slightly wrong": {"sigma too small"},
+    "mostly outliers": {"residuals not normal", "correlated residuals"},
     "sigma too small": {"sigma too small"},
     "correlated residuals": {"correlated residuals"},
     "integration error": {"large integration error"},

@@ -24,7 +24,7 @@ from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR, Certificate
 from switchfit.uncertainty.issues import BARELY_DETERMINED
-from switchfit.uncertainty.quality import ChannelQuality, Quality, measure_quality
+from switchfit.uncertainty.quality import MOST_OUTLIERS, ChannelQuality, Quality, measure_quality
 
 Level = Literal["good", "doubtful", "bad"]
 LEVELS: tuple[Level, ...] = ("good", "doubtful", "bad")
@@ -168,7 +168,7 @@ def judge(fit: Fit, certificate: Certificate | None = None) -> Verdict:
     return Verdict(found[0].level, tuple(f.reason for f in found), tuple(Issue(f"next: {step}") for step in steps))
 
 
-MISFITS = ("unexplained", "slightly wrong", "reference not followed")
+MISFITS = ("unexplained", "mostly outliers", "slightly wrong", "reference not followed")
 """Kinds of reasons that say that the model does not fit, other than by the size of the noise."""
 
 
@@ -199,6 +199,11 @@ def _judge_quality(fit: Fit, quality: Quality) -> Iterator[Finding]:
     if fit.freedom <= 0 and fit.sigma_known is not None:
         figures = {"samples": float(fit.samples), "unknowns": float(fit.free_basis.shape[1])}
         yield Finding("doubtful", Issue("too few samples", figures=figures), ("more data",))
+        return
+    lost = max(samples, key=lambda c: c.outliers)
+    if lost.outliers > MOST_OUTLIERS:
+        reason = Issue("mostly outliers", (lost.label,), {"share": lost.outliers})
+        yield Finding("bad", reason, ("more starts", "look at the residuals"))
         return
     too_small = quality.has_chi_square and quality.probability_below < UNLIKELY and quality.ratio < 1 - CLEARLY_OFF
     if quality.has_chi_square and not too_small:
