@@ -77,7 +77,7 @@ def report(
     ----------
     fit : Fit
     certificate : Certificate, optional
-        What it found about the derivatives counts in the verdict.
+        What failed counts in the verdict; left out, what can be checked without the model is checked.
     found : Identifiability, optional
         Left out, what the Hessian alone tells.
     verdict : Verdict, optional

@@ -47,6 +47,8 @@ class ChannelQuality:
         Sum of the squared residuals over sigma; NaN where sigma is unknown.
     whiteness : float
         Probability of the residuals' correlation if they are white; NaN for fewer than 20, and for a reference signal.
+    correlated : bool
+        Whether neighbouring residuals are alike, see `ResidualDiagnostics.correlated`.
     outliers : float
         Share of the values that a robust loss counts as outliers; 0 without such a loss.
     """
@@ -57,7 +59,8 @@ class ChannelQuality:
     explained: float
     chi_square: float
     whiteness: float
-    outliers: float = 0.0
+    correlated: bool
+    outliers: float
 
     @property
     def probability(self) -> float:
@@ -117,7 +120,7 @@ def measure_quality(fit: Fit) -> Quality:
     fit : Fit
     """
     residuals = diagnose(fit)
-    tests = iter(residuals.channels)
+    tests = iter(zip(residuals.channels, residuals.correlated, strict=True))
     single = len(fit.comparisons) == 1
     channels: list[ChannelQuality] = []
     left = total = 0.0
@@ -128,7 +131,10 @@ def measure_quality(fit: Fit) -> Quality:
                     continue
                 if comparison.weights is not None and comparison.weights[k] == 0:
                     continue
-                whiteness = next(tests).whiteness if comparison.kind == "measurements" else np.nan
+                whiteness, correlated = np.nan, False
+                if comparison.kind == "measurements":
+                    tested, correlated = next(tests)
+                    whiteness = tested.whiteness
                 squares, spread, size = _sum_squares(comparison, k)
                 if not np.isfinite(squares):
                     continue
@@ -142,6 +148,7 @@ def measure_quality(fit: Fit) -> Quality:
                         explained=1 - squares / spread if spread > 0 else np.nan,
                         chi_square=_chi_square(comparison, k),
                         whiteness=whiteness,
+                        correlated=correlated,
                         outliers=_share_outliers(comparison, k),
                     )
                 )
