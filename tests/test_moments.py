@@ -118,7 +118,7 @@ def test_a_switch_hidden_in_a_mode_is_refused():
 
 
 def test_a_hidden_switch_that_is_fixed_is_none_of_ours():
-    assert sf.estimate(hidden_problem(t_on=sf.Parameter(1.7, fixed=True))).success
+    assert sf.estimate(hidden_problem(t_on=sf.Parameter(1.7, fixed=True))).status.successful
 
 
 def smooth(t, x, p):

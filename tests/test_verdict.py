@@ -171,7 +171,10 @@ def test_few_samples_cannot_show_that_what_is_left_is_noise():
 def test_nothing_is_read_from_residuals_that_are_rounding():
     fit = straight(2.0 + 0.5 * TIMES)
     assert str(fit.verdict) == "Good: the model explains all of the variance."
+    assert replace(fit, integration_error=1.0).verdict.level == "good"
+    assert replace(fit, starts=(40, 3, 0)).verdict.level == "good"
     wave = straight(2.0 + 0.5 * TIMES + 1e-4 * np.sin(2 * TIMES))
+    assert replace(wave, integration_error=1.0).verdict.level == "bad"
     assert kinds(wave) == ["correlated residuals"]
 
 

@@ -150,13 +150,14 @@ def judge(fit: Fit, certificate: Certificate | None = None) -> Verdict:
         collapsed = [f._replace(level="bad") for f in collapsed]
     correlated = [f for f in fitting if f.reason.kind == "correlated residuals"]
     found = [*_find_ending(fit), *(f for f in fitting if f not in correlated), *collapsed]
-    exact = quality is not None and 1 - quality.explained < NO_RESIDUALS  # there is no better minimum than 0
+    # There is no better minimum than 0, and the integration error is all of a cost that is rounding.
+    exact = quality is not None and 1 - quality.explained < NO_RESIDUALS
     if not exact:
         found += _judge_starts(fit, confirmed=quality is not None and quality.has_chi_square and not fitting)
     if quality is not None:
         found += _find_undetermined(fit)
         found += _find_bounds(fit)
-        found += _check_integration(fit)
+        found += [] if exact and fit.integration_error_of == "J" else _check_integration(fit)
         found += _check_certificate(certify(fit, None) if certificate is None else certificate)
         found += correlated
     found.sort(key=lambda f: -LEVELS.index(f.level))  # stable: in the order of weight on each level
