@@ -475,8 +475,11 @@ def fit_locally(
     max_iterations: int = 200,
     callback: Callable[[IterationRecord], object] | None = None,
     start: ArrayLike | None = None,
+    first_cost: float = 0.0,
 ) -> Estimate:
     """Fit a problem once from one start: what `estimate` does with ``strategy="local"``, with the same arguments.
+
+    `first_cost` is J where a search began that this fit ends: the integration error is measured by J where it is large.
 
     Raises
     ------
@@ -505,8 +508,8 @@ def fit_locally(
         evaluations += result.evaluations
         theta = result.theta
         values = [value for _, value, _ in held]
-        first_cost = history[0].cost if history else 0.0
-        fine, simulation, error, output = _judge_meshes(evaluator, result, first_cost, values, first=not attempt)
+        scale = max(first_cost, history[0].cost if history else 0.0)
+        fine, simulation, error, output = _judge_meshes(evaluator, result, scale, values, first=not attempt)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
         if result.status in STOPPED or attempt == REFINEMENTS or not excess > 1:
             break

@@ -29,8 +29,8 @@ from switchfit.uncertainty.quality import measure_quality
 Strategy = Literal["local", "auto", "thorough"]
 STRATEGIES = get_args(Strategy)
 
-MORE_STARTS = "next: more starts"
-"""Step that a verdict advises where the fit may be better elsewhere."""
+MORE_STARTS, SMALLER_RTOL = "next: more starts", "next: smaller rtol"
+"""Steps that a verdict advises where the fit may be better elsewhere, and where the integration error is too large."""
 
 SCAN, GROW, REINSERT, STARTS = (
     "scan over sample intervals",
@@ -39,6 +39,8 @@ SCAN, GROW, REINSERT, STARTS = (
     "many starts",
 )
 """Names of strategies."""
+
+REMESH = "new meshes"
 
 EVERYWHERE = frozenset({GROW, REINSERT, STARTS})
 """Strategies that look everywhere."""
@@ -161,7 +163,7 @@ def _is_enough(fit: Estimate, tried: Collection[str] = ()) -> bool:
     """
     if fit.status is Status.INTERRUPTED:
         return True
-    if is_doubted(fit):
+    if is_doubted(fit) or (_is_coarse(fit) and REMESH not in tried):
         return False
     assert fit.problem is not None
     if any(run.is_guess_proposed for run in fit.problem.experiments) and fit.sigma_known is not True:
@@ -171,6 +173,11 @@ def _is_enough(fit: Estimate, tried: Collection[str] = ()) -> bool:
     if all(any(comparison.kind == "measurements" for comparison in run) for run in fit.comparisons):
         return SCAN in tried
     return not EVERYWHERE.isdisjoint(tried) or measure_quality(fit).explained >= PERFECT
+
+
+def _is_coarse(fit: Estimate) -> bool:
+    """Return whether the integration error is too large: mostly, since the meshes were made for where the fit began."""
+    return any(step.kind == SMALLER_RTOL for step in fit.verdict.next_steps)
 
 
 def is_doubted(fit: Estimate) -> bool:
@@ -204,6 +211,7 @@ class Search:
         proposed = any(run.is_guess_proposed for run in problem.experiments)
         name = "local, from evenly spaced times" if proposed else "local"
         self.steps = [Step(name, cost, self.evaluations, time.perf_counter() - began)]
+        self.first_cost = best.history[0].cost if best is not None and best.history else 0.0
         self.starts: tuple[int, int, int] | None = None
 
     @property
@@ -215,6 +223,11 @@ class Search:
         """Try one strategy after the other until the verdict is good; Ctrl-C ends it with the best so far."""
         tried: set[str] = set()
         try:
+            if self.best is not None and _is_coarse(self.best):
+                self._fit_on_new_meshes(self.best)
+                tried.add(REMESH)
+                if self.strategy == "auto" and _is_enough(self.best, tried):
+                    return
             for name, find in self._list_strategies():
                 if self.late:
                     break
@@ -291,16 +304,26 @@ class Search:
         self.starts = found.tried, 0, found.agreeing
         return found.end
 
+    def _fit_on_new_meshes(self, fit: Estimate) -> None:
+        """Fit again from where the best fit ended, on meshes made for it."""
+        began = time.perf_counter()
+        again = fit_locally(self.problem, start=fit.theta, first_cost=self.first_cost, **self.settings)
+        if again.integration_error < fit.integration_error:
+            self.best = again
+        self.evaluations += again.evaluations
+        assert self.best is not None
+        self.steps.append(Step(REMESH, self.best.cost, again.evaluations, time.perf_counter() - began))
+
     def _try(self, name: str, find: Callable[[FloatArray], End]) -> None:
         """Run one strategy; a full fit follows where its end is lower than the best so far."""
         began = time.perf_counter()
         end = find(self.theta if self.best is None else self.best.theta)
         evaluations = end.evaluations
-        before = np.inf if self.best is None else self.best.cost
-        if end.cost < before - LOWER * abs(before) or (self.best is None and not end.failed):
-            fit = fit_locally(self.problem, start=end.theta, **self.settings)
+        before = np.inf if self.best is None or self.best.violated else self.best.cost
+        if not end.failed and (before == np.inf or end.cost < before - LOWER * abs(before)):
+            fit = fit_locally(self.problem, start=end.theta, first_cost=self.first_cost, **self.settings)
             evaluations += fit.evaluations
-            if self.best is None or fit.cost < before:
+            if self.best is None or (fit.cost < before and not fit.violated) or self.best.violated:
                 self.best = fit
         self.evaluations += evaluations
         cost = np.inf if self.best is None else self.best.cost
