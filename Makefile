@@ -47,7 +47,8 @@ bench: $(VENV)/.installed-bench
 	$(BIN)/python -m benchmarks
 
 starts: $(VENV)/.installed-bench
-	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks starts --processes $(JOBS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks starts --methods exact,local,auto --processes $(JOBS)
+	cp $$(ls -t benchmarks/results/starts-*.md | head -1) docs/starts-results.md
 
 speed: bench
 	cp benchmarks/results/full.md docs/speed-results.md

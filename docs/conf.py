@@ -9,10 +9,19 @@ import covid_figures  # these stand beside this file
 import heaters_figures
 import paper_figures
 import speed_figures
+import starts_figures
 import tosses_figures
 import uncertainty_figures
 
-DRAWN_HERE = (covid_figures, heaters_figures, paper_figures, speed_figures, tosses_figures, uncertainty_figures)
+DRAWN_HERE = (
+    covid_figures,
+    heaters_figures,
+    paper_figures,
+    speed_figures,
+    starts_figures,
+    tosses_figures,
+    uncertainty_figures,
+)
 for pictures in DRAWN_HERE:
     pictures.draw(Path(__file__).parent / "_figures")
 

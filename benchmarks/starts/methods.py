@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -27,12 +26,11 @@ def fit_with(**settings: Any) -> Method:
 
 def read_estimate(estimate: Any) -> End:
     """Return what counts of an `sf.Estimate`."""
-    verdict = getattr(estimate, "verdict", None)
-    level = "" if verdict is None else str(getattr(verdict, "level", verdict))
+    level = estimate.verdict.level
     return End(
         theta=np.asarray(estimate.theta).tolist(),
         said=float(estimate.cost),
-        claims=level == "good" if level else bool(estimate.success),
+        claims=level == "good",
         verdict=level,
         status=estimate.status.name,
         evaluations=int(estimate.evaluations),
@@ -40,22 +38,14 @@ def read_estimate(estimate: Any) -> End:
     )
 
 
-def has_strategies() -> bool:
-    """Return whether this version of `sf.estimate` has strategies."""
-    return "strategy" in inspect.signature(sf.estimate).parameters
-
-
 def list_methods() -> dict[str, Method]:
-    """Return all methods that this version of switchfit has, by name."""
-    one_fit = {"strategy": "local"} if has_strategies() else {}
-    methods = {
-        "exact": fit_with(hessian="exact", **one_fit),
-        "gauss-newton": fit_with(hessian="gauss-newton", **one_fit),
-        "default": fit_with(),
+    """Return all methods, by name: single fits with a line search and in a trust region, strategies, peers."""
+    return {
+        "exact": fit_with(strategy="local", hessian="exact"),
+        "gauss-newton": fit_with(strategy="local", hessian="gauss-newton"),
+        **{name: fit_with(strategy=name) for name in ("local", "auto", "thorough")},
+        **PEERS,
     }
-    if has_strategies():
-        methods |= {name: fit_with(strategy=name) for name in STRATEGIES}
-    return methods | PEERS
 
 
 PEERS: dict[str, Method] = {
@@ -63,7 +53,6 @@ PEERS: dict[str, Method] = {
     "scipy-slsqp": peers.fit_with_slsqp,
     "ipopt": peers.fit_with_ipopt,
 }
-STRATEGIES = ("auto", "thorough")
 
 
 def why_not(name: str, case: Case) -> str:
