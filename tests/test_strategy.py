@@ -363,3 +363,20 @@ def test_rows_beside_transitions_are_halved_too():
         before = tau - coarse[coarse < tau][-1]
         assert fine[fine > tau][0] - tau <= 0.5 * behind * (1 + 1e-12)
         assert tau - fine[fine < tau][-1] <= 0.5 * before * (1 + 1e-12)
+
+
+def test_a_run_that_is_not_determined_leaves_the_others_their_errors():
+    """The second room has no sample after its heater goes off, so that its time is unknown, and nothing else is."""
+    problem = two_runs()
+    whole = sf.estimate(problem, strategy="local")
+    runs = list(problem.experiments)
+    data = runs[1].data[0]
+    early = data.times < 3.9
+    cut = sf.Measurements(data.times[early], data.values[early], sigma=0.02)
+    runs[1] = sf.Experiment(cut, ("on", "off"), (5.0,), 0.0, 6.0, parameter_map={"power": "power_1"}, name="room1")
+    found = sf.estimate(sf.Problem(HEATER, runs, problem.parameters), strategy="local")
+    errors = dict(zip(found.theta_names, found.standard_errors.tolist(), strict=True))
+    assert np.isnan(errors["room1.tau_1"])
+    for name in ("room0.tau_1", "k", "power_0", "power_1"):
+        assert np.isfinite(errors[name])
+    assert errors["room0.tau_1"] == pytest.approx(whole.standard_errors[0], rel=0.2)

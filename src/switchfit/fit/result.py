@@ -292,7 +292,8 @@ class Fit:
         the posterior (Laplace's approximation); with a robust loss, that of noise whose negative log-likelihood the
         loss is; a sigma that is a parameter is an unknown like others. An unknown held by a bound, a
         collapsed mode or a kink has variance 0 here. NaN where the cost has no noise model (anything but
-        `Measurements`), the Hessian is not positive definite, or there are too few samples.
+        `Measurements`) or there are too few samples, and for the unknowns that have a part in a direction along which
+        the Hessian is not positive; the others keep their variances.
         """
         return self.covariance_from("exact")
 
@@ -457,8 +458,19 @@ def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_]) -> Flo
     return np.stack([np.where(log, theta / factor, theta - half), np.where(log, theta * factor, theta + half)], axis=-1)
 
 
+UNDETERMINED = 1e-14
+"""Eigenvalue of the Hessian, scaled to a diagonal of one, up to which a direction is not determined."""
+
+PART = 1e-6
+"""Part of an unknown in such a direction from which it has no standard error."""
+
+
 def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:
-    """Return ``Z (Z' H Z)^-1 Z'``: (d, d); NaN where H is not finite, or not positive definite on Z (d, k)."""
+    """Return ``Z (Z' H Z)^-1 Z'``: (d, d); NaN where H is not finite, or not positive definite on Z (d, k).
+
+    Where it is not, in some directions, only the unknowns that have a part in these are NaN: of the others the
+    pseudo-inverse says what there is to say, as of the other runs where one of many is not determined.
+    """
     nothing = np.full(hessian.shape, np.nan)
     if not np.isfinite(hessian).all():
         return nothing
@@ -469,10 +481,16 @@ def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:
     if not np.isfinite(scaled).all():  # numbers near the limits of float64
         return nothing
     values, vectors = np.linalg.eigh(scaled)
-    if len(values) and values[0] <= 1e-14:
-        return nothing
-    root = Z @ (size[:, None] * vectors / np.sqrt(values))
-    return np.asarray(root @ root.T)
+    kept = values > UNDETERMINED
+    directions = Z @ (size[:, None] * vectors)
+    root = directions[:, kept] / np.sqrt(values[kept])
+    inverse = root @ root.T
+    if not kept.all():
+        part = np.abs(directions[:, ~kept]).max(axis=1) / np.maximum(np.linalg.norm(Z * size, axis=1), 1e-300)
+        unknown = part > PART
+        inverse[unknown] = np.nan
+        inverse[:, unknown] = np.nan
+    return np.asarray(inverse)
 
 
 class FreeCurvature(NamedTuple):
