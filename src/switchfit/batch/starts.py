@@ -266,7 +266,7 @@ def _draw_starts(problem: Problem, starts: Any, seed: int) -> FloatArray:
 
 def _list_stretches(experiment: Any, where: NDArray[np.intp]) -> list[tuple[float, float, NDArray[np.intp]]]:
     """Return groups of free transition times with the fixed times (or ends of the horizon) that enclose them."""
-    knots = np.concatenate([[experiment.t0], experiment.initial_times, [experiment.tf]])
+    knots = np.concatenate([[experiment.t0], experiment.initial_times, [experiment.end]])
     fixed = [0, *(np.flatnonzero(where < 0) + 1).tolist(), len(knots) - 1]
     return [(float(knots[a]), float(knots[b]), where[a : b - 1]) for a, b in pairwise(fixed) if b - a > 1]
 
@@ -316,15 +316,15 @@ def _find_clusters(problem: Problem, fits: Fits) -> NDArray[np.int64]:
 def _build_schedule(problem: Problem, theta: FloatArray) -> list[Any]:
     """Return each experiment's modes without the collapsed ones, and when they switch as parts of the horizon."""
     schedules = []
-    for experiment, times in zip(problem.experiments, problem.split(theta)[0], strict=True):
-        knots = np.concatenate([[experiment.t0], times, [experiment.tf]])
-        knots = (knots - experiment.t0) / (experiment.tf - experiment.t0)
+    for experiment, ends in zip(problem.experiments, problem.ends_of_modes(theta), strict=True):
+        knots = (ends - experiment.t0) / experiment.initial_length
         modes: list[str] = []
         switches: list[float] = []
         for mode, begin, end in zip(experiment.mode_sequence, knots[:-1], knots[1:], strict=True):
             if end - begin > SAME_PLACE and (not modes or modes[-1] != mode):
                 modes.append(mode)
                 switches.append(float(begin))
+        switches.append(float(knots[-1]))
         schedules.append((modes, np.array(switches)))
     return schedules
 

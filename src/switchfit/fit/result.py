@@ -122,6 +122,10 @@ class Fit:
         Guards and terminal constraints that are not met, and their values.
     reason : Issue or None
         Why the line search failed, or the error with which the fit ended.
+    final_times : tuple of float, one an experiment
+        tf, estimated or given. Empty in a fit that was loaded from a file of an earlier version.
+    final_places : tuple of int, one an experiment
+        Where in theta each tf stands; -1 where it is fixed.
     """
 
     theta_names: tuple[str, ...]
@@ -167,6 +171,8 @@ class Fit:
     flat_direction: tuple[tuple[str, float], ...] = ()
     violated: tuple[tuple[str, float], ...] = ()
     reason: Issue | None = None
+    final_times: tuple[float, ...] = ()
+    final_places: tuple[int, ...] = ()
 
     @property
     def success(self) -> bool:
@@ -189,9 +195,9 @@ class Fit:
 
     @property
     def is_time(self) -> NDArray[np.bool_]:
-        """Which of the unknowns are transition times: (d,)."""
+        """Which of the unknowns are transition times or a free tf: (d,)."""
         found = np.zeros(len(self.theta_names), dtype=bool)
-        for places in self.transition_places:
+        for places in (*self.transition_places, np.array(self.final_places, dtype=np.intp)):
             found[places[places >= 0]] = True
         return found
 

@@ -119,7 +119,7 @@ def _number_as_table(given: Any) -> Any:
 
 
 def _known_as_table(given: Any) -> Any:
-    """Return ``{ value = 0.5, fixed = true }`` for ``0.5``: a state at t0 that is given as a number is known."""
+    """Return ``{ value = 0.5, fixed = true }`` for ``0.5``: a state at t0, or a tf, that is a number is known."""
     return {"value": given, "fixed": True} if isinstance(given, (int, float)) and not isinstance(given, bool) else given
 
 
@@ -159,7 +159,7 @@ class ParameterTable(_Table):
 
 
 class TransitionTable(_Table):
-    """First guess of a transition time, with bounds of its own."""
+    """First guess of a transition time, or of tf, with bounds of its own."""
 
     value: float = Field(description="first guess of the transition time, in the experiment's time_unit")
     lower: float = Field(default=-np.inf, description="earliest time")
@@ -259,7 +259,11 @@ class ExperimentTable(_Table):
         min_length=1, description="what the model is compared with; several tables add up"
     )
     t0: float | None = Field(default=None, description="start of the horizon; left out, the first sample")
-    tf: float | None = Field(default=None, description="end of the horizon; left out, the last sample")
+    tf: Annotated[TransitionTable | None, pydantic.BeforeValidator(_known_as_table)] = Field(
+        default=None,
+        description="end of the horizon; left out, the last sample. A number, or a table with value, lower and upper "
+        "where it is to be estimated",
+    )
     initial_state: list[Annotated[StateTable, pydantic.BeforeValidator(_known_as_table)]] | None = Field(
         default=None,
         description="state at t0, instead of the model's: a number, or a table where it is to be estimated",
@@ -547,7 +551,7 @@ def _build_experiment(
         mode_sequence=tuple(table.mode_sequence),
         transition_times=tuple(_build_parameter(tau) for tau in table.transition_times),
         t0=min(span[0] for span in spans) if table.t0 is None else table.t0,
-        tf=max(span[-1] for span in spans) if table.tf is None else table.tf,
+        tf=max(span[-1] for span in spans) if table.tf is None else _build_parameter(table.tf),
         inputs=None if table.inputs is None else _build_at(f"{where}.inputs", _build_input, folder, table.inputs),
         initial_state=_build_initial_state(table),
         parameter_map=table.parameter_map,
