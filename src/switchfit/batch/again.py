@@ -48,7 +48,7 @@ def redo_unresolved(
             again = estimate(problem, start=arrays["theta"][k], tolerance=tolerance, max_iterations=max_iterations)
         except Exception:  # this end allows no fit of its own: what was found stays, and is listed
             continue
-        if again.success:
+        if again.status.successful:
             adopt(arrays, k, again)
     return Chunk(**arrays | {name: arrays[name].astype(str) for name in ("status", "message")})
 
@@ -59,7 +59,7 @@ def is_resolved(problem: Problem, meshes: Sequence[Mesh], theta: Any, cost: floa
     """
     evaluator = Evaluator(problem, meshes=meshes)
     here = evaluator.cost(theta) if cost is None else cost
-    fine = evaluator.halved.cost(theta)
+    fine = evaluator.halve_rows(theta).cost(theta)
     return cost_error(problem, fine, here, 0.0) <= max(LARGEST_INTEGRATION_ERROR, problem.rtol)
 
 

@@ -102,7 +102,7 @@ class Fits:
 
     @cached_property
     def success(self) -> NDArray[np.bool_]:
-        """Which of them converged: (R,)."""
+        """Which of them converged, by `Status.successful`: (R,). Many fits have no verdict, an `Estimate` has."""
         good = [status.name for status in Status if status.successful]
         return np.isin(self.status, good)
 

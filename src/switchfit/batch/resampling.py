@@ -237,7 +237,7 @@ def bootstrap(
     runs, seed = as_count(runs, "runs", at_least=1), as_seed(seed)
     tolerance, max_iterations = check_settings(tolerance, max_iterations)
     check_long_run(client, folder, callback)
-    if not estimate.success:
+    if not estimate.status.successful:
         raise ValueError(f"a bootstrap begins at a minimum, and this fit has not found one: {estimate.message}")
     problem = estimate.evaluator_at_solution().problem
     _check_data(problem)

@@ -316,7 +316,7 @@ def _build_meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tup
     for attempt in range(REFINEMENTS + 1):
         indices = range(len(problem.experiments))
         evaluator = Evaluator(problem, meshes=[refine_mesh(problem, e, *thetas, finer=finer) for e in indices])
-        fine = evaluator.halved.cost(truth)
+        fine = evaluator.halve_rows(truth).cost(truth)
         # Without noise J vanishes at the truth; then the error is measured against J where the fits begin.
         error = cost_error(problem, fine, evaluator(truth).cost, evaluator(start).cost)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)

@@ -73,6 +73,14 @@ class Mesh:
         # Equal parts of a cell as short as rounding may coincide.
         return Mesh.pad(divided) if (divided[1:] > divided[:-1]).all() else Mesh.from_times(divided)
 
+    def halve_rows(self, transition_times: FloatArray) -> Mesh:
+        """Return the mesh with every row cut in two: every cell, or its parts where transitions (N,) cut it.
+
+        A transition in the second half of a cell has behind it a row that a cut through the cell would leave as it is.
+        """
+        cuts = np.unique(np.concatenate([self.times, transition_times]))
+        return Mesh.from_times(np.concatenate([self.times, 0.5 * (cuts[:-1] + cuts[1:])]))
+
     def cell_ending_at(self, times: FloatArray) -> NDArray[np.intp]:
         """Return the index of the cell that ends at each of `times`, which must be nodes; -1 for t0."""
         return np.searchsorted(self.times, times) - 1

@@ -34,20 +34,21 @@ from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_callable, as_choice, as_count, as_instance, as_path, as_positive
+from switchfit.problem.validation import as_callable, as_choice, as_count, as_flag, as_instance, as_path, as_positive
 from switchfit.runtime.presentation import draw_figure, format_text
 from switchfit.runtime.progress import Progress
 from switchfit.uncertainty.certificate import Certificate, certify
 from switchfit.uncertainty.identification import Identifiability, identifiability
 from switchfit.uncertainty.prediction import Prediction, predict
 from switchfit.uncertainty.profiles import Profile, profile
-from switchfit.uncertainty.residuals import ResidualDiagnostics, diagnose
+from switchfit.uncertainty.residuals import ResidualDiagnostics, correct_errors, diagnose
 from switchfit.uncertainty.sensitivity import (
     Sensitivity,
     build_gauss_newton,
     collect_sample_derivatives,
     compute_sensitivity,
 )
+from switchfit.uncertainty.verdict import Verdict, judge
 
 HESSIANS = get_args(HessianKind)
 
@@ -140,6 +141,58 @@ class Estimate(Fit):
         if self.saved_certificate is not None:
             return self.saved_certificate
         return certify(self, None if self.problem is None else Evaluator(self.problem, theta=self.theta))
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether to believe the numbers: good, doubtful or bad, why, and what to do next. Print it for one line.
+
+        The derivatives count where the certificate has been asked for, or was loaded.
+        """
+        known = self.known_certificate
+        held = self.__dict__.get("_verdict")
+        if held is None or held[0] is not known:
+            held = self.__dict__["_verdict"] = known, judge(self, known)
+        return held[1]
+
+    @property
+    def success(self) -> bool:
+        """Whether the fit converged and its verdict is not bad; ``status.successful`` says whether it converged."""
+        return self.status.successful and self.verdict.level != "bad"
+
+    @property
+    def corrected_standard_errors(self) -> FloatArray:
+        """Standard errors that allow for correlated residuals: (d,); `standard_errors` where there are none.
+
+        These times sqrt((1 + r) / (1 - r)), r being the correlation of neighbouring residuals, and where sigma is known
+        times the residuals' root mean square in sigmas. Of a transition time by the channels of its own run, of any
+        other unknown by all; the largest factor counts.
+        """
+        return correct_errors(self)
+
+    def report(self, *, full: bool = False) -> str:
+        """Return the report that `print` shows: the verdict and one screen of numbers.
+
+        Parameters
+        ----------
+        full : bool
+            All experiments, channels, unknowns, correlations, weak directions and warnings, however many.
+
+        See Also
+        --------
+        Estimate.verdict, Estimate.plot
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.report().splitlines()[0]
+        'Good: the model explains 99.85 % of the variance (chi² 12.1 for 22 degrees of freedom).'
+        >>> len(fit.report(full=True)) > len(fit.report())
+        True
+        """
+        return format_text(self, full=True) if as_flag(full, "full") else format_text(self)
 
     @property
     def known_certificate(self) -> Certificate | None:
@@ -337,7 +390,7 @@ class Estimate(Fit):
         >>> with TemporaryDirectory() as folder:
         ...     fit.save(Path(folder) / "fit.json")
         ...     (Path(folder) / "fit.json").read_text().splitlines()[1]
-        '  "format": "switchfit fit",'
+        '  "verdict": {'
         """
         file = as_path(path, "path")
         save_fit(self.complete(), self.certificate, file)
@@ -449,7 +502,7 @@ def estimate(
     Returns
     -------
     Estimate
-        Also when it did not converge: see ``.success`` and ``.message``.
+        Also when it did not converge, or is far from the data: see ``.success`` and ``.verdict``.
 
     Raises
     ------
@@ -494,14 +547,9 @@ def estimate(
         history += records[1:] if history else records
         evaluations += result.evaluations
         theta = result.theta
-        fine = evaluator.halved
-        simulation = SimulatedProblem(fine, theta)
-        error, output = worst_error(
-            simulation,
-            cost=result.cost,
-            first_cost=history[0].cost if history else 0.0,
-            constraints=[value for _, value, _ in held],
-        )
+        values = [value for _, value, _ in held]
+        first_cost = history[0].cost if history else 0.0
+        fine, simulation, error, output = _judge_meshes(evaluator, result, first_cost, values, first=not attempt)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
         if result.status in STOPPED or attempt == REFINEMENTS or not excess > 1:
             break
@@ -562,6 +610,23 @@ def _minimize(
         return minimize_with_constraints(evaluator, theta, tolerance, max_iterations, report)
     constraints = constraints_of(problem)
     return minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, report, constraints), ()
+
+
+def _judge_meshes(
+    evaluator: Evaluator, result: Result, first_cost: float, constraints: list[float], *, first: bool
+) -> tuple[Evaluator, SimulatedProblem, float, str]:
+    """Return the problem with its steps halved, its simulation there, and the largest integration error and of what.
+
+    The first meshes are mostly too coarse, as the evaluator with halved cells tells as well, which is kept for the next
+    fit of the same problem.
+    """
+    for halve in (lambda: evaluator.halved, lambda: evaluator.halve_rows(result.theta))[not first :]:
+        fine = halve()
+        simulation = SimulatedProblem(fine, result.theta)
+        error, output = worst_error(simulation, cost=result.cost, first_cost=first_cost, constraints=constraints)
+        if error > max(LARGEST_INTEGRATION_ERROR, evaluator.problem.rtol):
+            break
+    return fine, simulation, error, output
 
 
 def _refine(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:

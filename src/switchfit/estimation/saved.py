@@ -1,7 +1,8 @@
 """Fits as JSON files that can be read without switchfit, and back again without losing a bit.
 
-A file holds ``{"format": "switchfit fit", "version": 4, "fit": {...}, "certificate": {...}}`` with the fields of
-`Fit` and `Certificate` under their own names:
+A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 5, "fit": {...}, "certificate": {...}}`` with the
+fields of `Verdict`, `Fit` and `Certificate` under their own names; the verdict, and its line of text, are for readers of
+the file, and are judged again from the rest where it is loaded:
 
 - numbers are written with as many digits as it takes to read the same float64; JSON has no NaN and no infinities, so
   they are the strings ``"NaN"``, ``"Infinity"`` and ``"-Infinity"``;
@@ -11,7 +12,8 @@ A file holds ``{"format": "switchfit fit", "version": 4, "fit": {...}, "certific
 
 What is read is checked by pydantic against the types that the fields of the dataclasses declare, and then all sizes and
 names against one another (`_check_fit`): what was loaded can be printed and plotted, and has intervals. Files of
-versions 2 and 3, which held sentences in place of data, are brought to version 4 before that (`_upgrade`).
+versions 2 and 3, which held sentences in place of data, and of version 4 are brought to version 5 before that
+(`_upgrade`).
 """
 
 from __future__ import annotations
@@ -37,10 +39,14 @@ from switchfit.runtime.errors import get_first_line
 from switchfit.runtime.files import write_atomically
 from switchfit.uncertainty.certificate import Certificate
 from switchfit.uncertainty.identification import analyse_solution
+from switchfit.uncertainty.verdict import Verdict, judge
 
 FORMAT = "switchfit fit"
-VERSION = 4
-READABLE = (2, 3, 4)
+VERSION = 5
+READABLE = (2, 3, 4, 5)
+
+DATA = 4
+"""The first version that holds data in place of sentences."""
 
 NUMBERS = ("NaN", "Infinity", "-Infinity", "nan", "inf", "-inf")
 """Strings that stand for numbers; the latter three in files before version 4."""
@@ -66,7 +72,9 @@ def save_fit(fit: Fit, certificate: Certificate, path: Path) -> None:
     OSError
         If the file cannot be written; an existing one is then left as it was.
     """
+    verdict = judge(fit, certificate)
     content = {
+        "verdict": {"level": verdict.level, "text": str(verdict)} | _to_json(verdict, Verdict),
         "format": FORMAT,
         "version": VERSION,
         "fit": _to_json(fit, Fit),
@@ -111,11 +119,11 @@ def load_fit(path: Path) -> tuple[Fit, Certificate]:
         )
     try:
         if version < VERSION:
-            _upgrade(content)
+            _upgrade(content, version)
         fit = _from_json(Fit, content.get("fit"), "fit")
         certificate = _from_json(Certificate, content.get("certificate"), "certificate")
         _check_fit(fit)
-        if version < VERSION:
+        if version < DATA:
             directions = analyse_solution(fit, None).directions
             certificate = replace(certificate, worst_unknowns=directions[0].names if directions else ())
         return fit, certificate
@@ -358,11 +366,17 @@ def _describe_place(loc: Iterable[Any], content: Any, top: str) -> str:
 # --- files of earlier versions ----------------------------------------------------------------------------------------
 
 
-def _upgrade(content: dict[str, Any]) -> None:
-    """Bring the content of a file of version 2 or 3 to version 4, in place."""
+def _upgrade(content: dict[str, Any], version: int) -> None:
+    """Bring the content of a file of an earlier version to version 5, in place."""
     try:
-        _upgrade_fit(content["fit"])
-        _upgrade_certificate(content["certificate"], content["fit"])
+        if version < DATA:
+            _upgrade_fit(content["fit"])
+            _upgrade_certificate(content["certificate"], content["fit"])
+        content["fit"].setdefault("starts", None)
+        content["fit"]["final_times"] = [run["times"][-1] for run in content["fit"]["trajectories"]]
+        content["fit"]["final_places"] = [-1] * len(content["fit"]["trajectories"])
+        for comparison in (comparison for run in content["fit"]["comparisons"] for comparison in run):
+            comparison.setdefault("weights", None)
     except (LookupError, TypeError, AttributeError) as error:
         raise ValueError(f"it is not what version {content['version']} holds ({get_first_line(error)})") from error
 
@@ -469,6 +483,10 @@ def _check_fit(fit: Fit) -> None:
     _check_size("fit.run_names", fit.run_names, (experiments,), runs)
     _check_size("fit.transition_places", fit.transition_places, (experiments,), runs)
     _check_size("fit.transition_times", fit.transition_times, (experiments,), runs)
+    _check_size("fit.final_times", fit.final_times, (experiments,), runs)
+    _check_size("fit.final_places", fit.final_places, (experiments,), runs)
+    if not all(-1 <= place < d for place in fit.final_places):
+        raise ValueError(f"fit.final_places must lie between -1 and {d - 1}; got {list(fit.final_places)}")
     _check_size("fit.comparisons", fit.comparisons, (experiments,), runs)
     for e, (trajectory, times) in enumerate(zip(fit.trajectories, fit.transition_times, strict=True)):
         _check_trajectory(trajectory, times, e)
@@ -506,6 +524,8 @@ def _check_comparison(comparison: Comparison, where: str) -> None:
     for name in ("measured", "fitted", "sigma", "downweighted"):
         if getattr(comparison, name) is not None:
             _check_size(f"{where}.{name}", getattr(comparison, name), (K, q), sizes)
+    if comparison.weights is not None:
+        _check_size(f"{where}.weights", comparison.weights, (q,), f"since its names has {q} entries")
     _check_size(f"{where}.curve", comparison.curve, (L, q), f"since its curve_times has {L} entries and its names {q}")
 
 

@@ -1,6 +1,6 @@
 """Integration error of a fit: what halving all steps changes in J, in the guards and in the terminal constraints.
 
-Each output is compared at the same theta on the meshes of the fit and on meshes with every cell halved, and the change
+Each output is compared at the same theta on the meshes of the fit and on meshes with every step halved, and the change
 is put in relation to a size of that output:
 
 - J: to J itself, or to 1e-3 of its first value where that is more (a cost that vanishes has no relative error).
@@ -66,7 +66,7 @@ def worst_error(
     Parameters
     ----------
     fine : SimulatedProblem
-        At theta, on the meshes of the fit with every cell halved.
+        At theta, on the meshes of the fit with every step halved.
     cost, first_cost : float
         J on the meshes of the fit, at theta and at the first guess.
     constraints : (m,)

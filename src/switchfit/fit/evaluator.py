@@ -118,8 +118,14 @@ class Evaluator:
 
     @cached_property
     def halved(self) -> Evaluator:
-        """The same problem with every cell of its meshes cut in two, by which its integration error is judged."""
+        """The same problem with every cell of its meshes cut in two."""
         return self.divide(2)
+
+    def halve_rows(self, theta: FloatArray) -> Evaluator:
+        """Return the same problem with every step cut in two that it takes at theta, to judge the integration error."""
+        times = [self.problem.vectors(theta, e)[0] for e in range(len(self.meshes))]
+        meshes = [mesh.halve_rows(tau) for mesh, tau in zip(self.meshes, times, strict=True)]
+        return Evaluator(self.problem, meshes=meshes)
 
     def __call__(
         self, theta: FloatArray, side: int = 1, method: Method = "auto", matrix: Matrix = "exact"

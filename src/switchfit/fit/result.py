@@ -122,8 +122,11 @@ class Fit:
         Guards and terminal constraints that are not met, and their values.
     reason : Issue or None
         Why the line search failed, or the error with which the fit ended.
+    starts : (tried, better, agreeing) or None
+        How many other starts were fitted, how many of them ended lower, and how many in the same minimum; None where
+        none were.
     final_times : tuple of float, one an experiment
-        tf, estimated or given. Empty in a fit that was loaded from a file of an earlier version.
+        tf, estimated or given.
     final_places : tuple of int, one an experiment
         Where in theta each tf stands; -1 where it is fixed.
     """
@@ -171,17 +174,9 @@ class Fit:
     flat_direction: tuple[tuple[str, float], ...] = ()
     violated: tuple[tuple[str, float], ...] = ()
     reason: Issue | None = None
+    starts: tuple[int, int, int] | None = None
     final_times: tuple[float, ...] = ()
     final_places: tuple[int, ...] = ()
-
-    @property
-    def success(self) -> bool:
-        """Whether the fit converged, which is `Status.successful`: it found a point near which nothing decreases J.
-
-        With `Status.SINGULAR` J is flat in some direction from there, with `Status.COLLAPSED` in nothing but what a
-        mode of no duration leaves undetermined; ``status.is_strict_minimum`` is False with these two.
-        """
-        return self.status.successful
 
     @property
     def termination(self) -> Termination:

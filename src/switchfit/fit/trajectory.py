@@ -85,6 +85,8 @@ class Comparison:
         The fitted output at all nodes, for plots.
     downweighted : (K, q) of bool, or None
         Where a robust loss counts a residual as an outlier, one larger than its `loss_scale`; None without such a loss.
+    weights : (q,) or None
+        Of the channels of a reference signal, the diagonal of its weight matrix; None for measurements.
 
     See Also
     --------
@@ -112,6 +114,7 @@ class Comparison:
     curve_times: FloatArray
     curve: FloatArray
     downweighted: NDArray[np.bool_] | None = None
+    weights: FloatArray | None = None
 
     @property
     def residuals(self) -> FloatArray:
@@ -233,7 +236,7 @@ def _trajectory(problem: Problem, e: int, simulation: Simulation) -> Trajectory:
     structure, system = problem.structures[e], problem.system
     moving = simulation.end > simulation.start
     counts = [1 + int(moving[rows].sum()) for rows in simulation.segments]
-    modes = np.repeat([structure.mode_names[mode] for mode in structure.mode_of_segment], counts)
+    modes = np.repeat(problem.experiments[e].mode_sequence, counts)
     names = system.state_names or tuple(f"x{k + 1}" for k in range(structure.n))
     units = system.state_units or ("",) * structure.n
     return Trajectory(
@@ -264,7 +267,8 @@ def _comparisons(
         default = trajectory.state_names if item.observe is None else tuple(f"y{k + 1}" for k in range(q))
         label = item.names or default
         if isinstance(item, ReferenceSignal):
-            here = Comparison("reference", label, times, item.signal(times), curve, None, times, curve)
+            weights = np.diag(item.weights).copy()
+            here = Comparison("reference", label, times, item.signal(times), curve, None, times, curve, None, weights)
         else:
             named = problem.name_parameters(theta, e)
             fitted = simulation.seen[measured][: len(item.times)]

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from switchfit.optimize.algebra import EIGENVALUE_FLOOR, FloatArray, positive_eigenvalues, press_on_bounds
 from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.dense import Dense, convexify, split_space
-from switchfit.optimize.matrix import Curvature, ModelStep, Room, Spectrum, diagonal_scaling
+from switchfit.optimize.matrix import Box, Curvature, ModelStep, Room, Spectrum, diagonal_scaling
 from switchfit.optimize.qp import QPSolution, newton_step, solve_whitened
 
 IntArray = NDArray[np.intp]
@@ -210,7 +210,7 @@ class Arrow:
         room: Room,
         pressed: FloatArray,
         floor: FloatArray | None,
-        reach: FloatArray | None = None,
+        box: Box | None = None,
     ) -> ModelStep:
         """Minimise ``gᵀd + ½ dᵀBd`` inside `room`; see `switchfit.optimize.matrix.SymmetricMatrix`.
 

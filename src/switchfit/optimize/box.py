@@ -17,7 +17,6 @@ from __future__ import annotations
 import numpy as np
 
 from switchfit.optimize.algebra import NOISE, FloatArray
-from switchfit.optimize.matrix import Room
 from switchfit.optimize.problem import Problem
 
 #: Radius of the first box.
@@ -26,16 +25,6 @@ FIRST_RADIUS = 1.0
 SHRINK, GROW = 0.25, 2.0
 #: Ratios of the actual to the predicted reduction below and above which it does so.
 POOR, GOOD = 0.25, 0.75
-
-
-def keep_in_box(problem: Problem, room: Room, radius: float) -> Room:
-    """Return the room of a step, narrowed to the box with this radius."""
-    if radius == np.inf:
-        return room
-    m = room.constraints.b.size
-    offsets = room.offsets.copy()
-    offsets[m:] = np.maximum(offsets[m:], -radius * np.concatenate([problem.reach, problem.reach]))
-    return Room(room.constraints, offsets, room.free)
 
 
 def measure(problem: Problem, step: FloatArray) -> float:

@@ -23,7 +23,7 @@ from switchfit.optimize.algebra import (
     press_on_bounds,
 )
 from switchfit.optimize.constraints import LinearConstraints
-from switchfit.optimize.matrix import Curvature, ModelStep, Room, Spectrum, diagonal_scaling
+from switchfit.optimize.matrix import Box, Curvature, ModelStep, Room, Spectrum, diagonal_scaling
 from switchfit.optimize.qp import CholeskyFactor, is_definite, newton_step, solve_whitened
 
 RAISED = 2.0
@@ -100,11 +100,11 @@ class Dense:
         room: Room,
         pressed: FloatArray,
         floor: FloatArray | None,
-        reach: FloatArray | None = None,
+        box: Box | None = None,
     ) -> ModelStep:
         """Minimise ``gᵀd + ½ dᵀBd`` inside `room`; see `switchfit.optimize.matrix.SymmetricMatrix`."""
         if room.free is None:
-            return _minimize(self.array, gradient, room.constraints.normals, room.offsets, pressed, floor, reach)
+            return _minimize(self.array, gradient, room.constraints.normals, room.offsets, pressed, floor, box)
         part = np.flatnonzero(room.free)
         d, m = len(self.array), room.constraints.b.size
         step = np.zeros(d)
@@ -114,8 +114,8 @@ class Dense:
         kept = np.concatenate([np.arange(m), m + part, m + d + part])
         normals = room.constraints.normals[kept][:, part]
         block, rest = self.array[np.ix_(part, part)], None if floor is None else floor[part]
-        far = None if reach is None else reach[part]
-        found = _minimize(block, gradient[part], normals, room.offsets[kept], pressed[:, part], rest, far)
+        own_box = None if box is None else box.of(part)
+        found = _minimize(block, gradient[part], normals, room.offsets[kept], pressed[:, part], rest, own_box)
         step[part] = found.step
         product = self.array[:, part] @ found.step
         product[part] = found.product
@@ -180,10 +180,12 @@ def _minimize(
     offsets: FloatArray,
     pressed: FloatArray,
     floor: FloatArray | None,
-    reach: FloatArray | None,
+    box: Box | None,
 ) -> ModelStep:
     """Solve the programme of `Dense.minimize_model` in unknowns that are all free."""
-    convex, factor = convexify_and_factor(hessian, pressed, floor, reach)
+    convex, factor = convexify_and_factor(hessian, pressed, floor, None if box is None else box.reach)
+    if box is not None:
+        offsets = box.narrow(offsets, convex is hessian)
     step = newton_step(gradient, convex, factor)
     if (normals @ step >= offsets).all():
         return ModelStep(step, convex @ step, None, convex is hessian)

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.optimize.algebra import FloatArray
-from switchfit.optimize.box import FIRST_RADIUS, keep_in_box
+from switchfit.optimize.box import FIRST_RADIUS
 from switchfit.optimize.constraints import NONE
 from switchfit.optimize.dense import Dense
 from switchfit.optimize.kinks import release
-from switchfit.optimize.matrix import Room, SymmetricMatrix
+from switchfit.optimize.matrix import Box, Room, SymmetricMatrix
 from switchfit.optimize.problem import Problem
 from switchfit.optimize.state import State
 
@@ -78,21 +78,18 @@ def _solve_on_sides(
     """
     point, constraints = state.point, problem.constraints
     gradient, hessian = point.derivatives(sides)
-    radius = state.radius
     room = _room(problem, state, sides, piece)
     matrix, floor = _model(problem, state, hessian, room.free)
     pressing = (point.multipliers > 0.0).nonzero()[0] if point.active.size else NONE
     pressed = constraints.rows(pressing)
-    metric = problem.reach if problem.has_box else None
-    found = matrix.minimize_model(gradient, keep_in_box(problem, room, radius), pressed, floor, metric)
-    if problem.has_box and not found.definite and radius == np.inf:
-        radius = FIRST_RADIUS
-        found = matrix.minimize_model(gradient, keep_in_box(problem, room, radius), pressed, floor, metric)
+    box = Box(problem.reach, state.radius, FIRST_RADIUS) if problem.has_box else None
+    found = matrix.minimize_model(gradient, room, pressed, floor, box)
     regular = found.definite and matrix is hessian and room.free is None and point.is_interior
     slope = float(gradient @ found.step)
     force = -found.product
     if found.multipliers is not None:
         force = constraints.A.T @ found.multipliers[: constraints.b.size] - found.product
+    radius = np.inf if box is None else box.radius_for(found.definite)
     return Direction(found.step, slope, -(slope + 0.5 * float(found.step @ found.product)), regular, radius), force
 
 

@@ -41,6 +41,42 @@ class Room(NamedTuple):
         return self.offsets[-2 * d : -d], -self.offsets[-d:]
 
 
+class Box(NamedTuple):
+    """A trust region about a point: no unknown moves by more than ``radius * reach``.
+
+    Attributes
+    ----------
+    reach : array, shape (d,)
+        Half-widths at radius 1, in whose metric an indefinite Hessian is shifted.
+    radius : float
+        Infinite where there has been no box yet; an indefinite Hessian then gets one of radius `first`.
+    first : float
+    """
+
+    reach: FloatArray
+    radius: float
+    first: float
+
+    def radius_for(self, definite: bool) -> float:
+        """Return the radius for a Hessian that is positive definite, or is not."""
+        return self.first if self.radius == np.inf and not definite else self.radius
+
+    def narrow(self, offsets: FloatArray, definite: bool) -> FloatArray:
+        """Return the offsets of a `Room`, (m + 2 d,), with its bounds narrowed to the box."""
+        radius = self.radius_for(definite)
+        if radius == np.inf:
+            return offsets
+        narrowed = offsets.copy()
+        d = len(self.reach)
+        narrowed[-2 * d : -d] = np.maximum(narrowed[-2 * d : -d], -radius * self.reach)
+        narrowed[-d:] = np.maximum(narrowed[-d:], -radius * self.reach)
+        return narrowed
+
+    def of(self, part: NDArray[np.intp]) -> Box:
+        """Return the box of some of the unknowns."""
+        return Box(self.reach[part], self.radius, self.first)
+
+
 class ModelStep(NamedTuple):
     """Solution of the quadratic programme of an iteration.
 
@@ -159,7 +195,7 @@ class SymmetricMatrix(Protocol):
         room: Room,
         pressed: FloatArray,
         floor: FloatArray | None,
-        reach: FloatArray | None = None,
+        box: Box | None = None,
         /,
     ) -> ModelStep:
         """Minimise ``gᵀd + ½ dᵀBd`` inside `room`, where B is H made positive definite on the free unknowns.
@@ -172,8 +208,8 @@ class SymmetricMatrix(Protocol):
             Normals of the constraints expected to be active: on their face B is H wherever it can be.
         floor : array, shape (d,), or None
             Curvature of each unknown that counts as none.
-        reach : array, shape (d,), or None
-            Half-widths of a trust region, in whose metric an indefinite H is shifted to make B.
+        box : Box, or None
+            The trust region, in whose metric an indefinite H is shifted to make B.
         """
         ...
 

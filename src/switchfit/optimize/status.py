@@ -57,7 +57,9 @@ class Status(Enum):
 
     @property
     def successful(self) -> bool:
-        """Whether it converged, to a point near which nothing decreases the cost; `Estimate.success` is the same.
+        """Whether it converged, to a point near which nothing decreases the cost.
+
+        It says nothing about how well the model fits: `Estimate.success` asks that the verdict is not bad as well.
 
         Also where that point is not the only one: where the cost is flat in some direction (`SINGULAR`), or a mode has
         collapsed (`COLLAPSED`). `is_strict_minimum` leaves these out.

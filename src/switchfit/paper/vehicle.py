@@ -155,5 +155,5 @@ def summary(fit: Estimate) -> dict[str, Any]:
         "status": fit.status.name,
         "smallest_eigenvalue": curvature.smallest,
         "scaled_eigenvalues": curvature.scaled.tolist(),
-        "sufficient": bool(fit.success and curvature.smallest > 0),
+        "sufficient": bool(fit.status.successful and curvature.smallest > 0),
     }

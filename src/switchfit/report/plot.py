@@ -427,11 +427,11 @@ def _draw_head(fit: Fit, figure: Figure, shown: int, colours: Mapping[str, str])
         handles[mode] = Patch(facecolor=colours[mode], edgecolor=TRANSITION, linewidth=0.5)
     ncols = min(len(handles), max(3, int(figure.get_figwidth() / 2.0)))
     figure.legend(handles.values(), handles.keys(), loc="outside upper right", ncols=ncols, frameon=False)
-    notes = [] if fit.success else [f"Not a minimum: {fit.status.name.lower().replace('_', ' ')}"]
+    notes = [] if fit.status.successful else [f"Not a minimum: {fit.status.name.lower().replace('_', ' ')}"]
     if shown < len(fit.trajectories):
         notes.append(f"{shown} of {len(fit.trajectories)} experiments")
     if notes:
-        colour = "black" if fit.success else FIT
+        colour = "black" if fit.status.successful else FIT
         figure.suptitle("; ".join(notes), x=0.01, ha="left", fontweight="bold", fontsize="medium", color=colour)
 
 

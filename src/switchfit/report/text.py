@@ -269,7 +269,7 @@ def _format_correlations(fit: Fit) -> list[str]:
 
 def _describe_weak(fit: Fit, found: Identifiability) -> list[str]:
     """Return the combinations of unknowns that the data hardly see, if there are any."""
-    weak = [d for d in found.directions if d.eigenvalue < WEAK] if fit.success else []
+    weak = [d for d in found.directions if d.eigenvalue < WEAK] if fit.status.successful else []
     return [line for direction in weak for line in _wrap(write_direction(found, direction), "  - ", "    ")]
 
 

@@ -12,13 +12,15 @@ from typing import Any
 
 
 @singledispatch
-def format_text(result: Any) -> str:
+def format_text(result: Any, **settings: Any) -> str:
     """Return a result as plain text, one line or several without a newline at the end.
 
     Parameters
     ----------
     result : object
         Of a kind that a module of `switchfit.report` has registered.
+    settings
+        What that kind of text can be given.
     """
     raise TypeError(f"no module of switchfit.report writes a {type(result).__name__}; register one with text_of.")
 

@@ -56,7 +56,7 @@ def can_grow(problem: Problem) -> bool:
     run = problem.experiments[0]
     if len(problem.experiments) != 1 or not run.transition_times or run.has_free_tf:
         return False
-    return len(_sample_times(run)) > FEWEST_WINDOWS
+    return len(list_sample_times(run)) > FEWEST_WINDOWS
 
 
 def grow_horizon(problem: Problem, theta: FloatArray) -> End:
@@ -102,7 +102,7 @@ class Beginning(NamedTuple):
     rest: FloatArray
 
 
-def _sample_times(run: Experiment) -> FloatArray:
+def list_sample_times(run: Experiment) -> FloatArray:
     """Return the times at which something is measured: (K,), ascending."""
     times = [
         item.seen_times[np.any(np.isfinite(item.values), axis=1)] for item in run.data if isinstance(item, Measurements)
@@ -114,7 +114,7 @@ def _sample_times(run: Experiment) -> FloatArray:
 
 def _choose_windows(run: Experiment) -> FloatArray:
     """Return the ends of the windows: about as many samples come in with each."""
-    times = _sample_times(run)
+    times = list_sample_times(run)
     count = min(max(FEWEST_WINDOWS, WINDOWS_EACH * len(run.mode_sequence)), len(times))
     ends = times[np.linspace(0, len(times) - 1, count + 1).round().astype(int)[1:-1]]
     return np.append(np.unique(ends[(ends > run.t0) & (ends < run.end)]), run.end)

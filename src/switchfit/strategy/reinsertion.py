@@ -1,14 +1,14 @@
 """Removal and re-insertion of modes: what local minima in switching times are made of is undone.
 
-A mode that is not where it should be often cannot get there: on its way it would have to pass other modes, or to vanish
-and to appear elsewhere. So the mode whose removal costs least is taken out, and put in where the cost falls fastest with
-the length of a mode of no length, which is its derivative in the later of two equal transition times ([1]_). A fit
-follows, and all this is repeated as long as the cost falls.
+A mode that is not where it should be often cannot get there: on its way it would have to pass other modes, or to
+vanish and to appear elsewhere. So the mode whose removal costs least is taken out, and put in where the cost falls
+fastest with the length of a mode of no length, which is its derivative in the later of two equal transition times
+([1]_). A fit follows, and all this is repeated as long as the cost falls.
 
 References
 ----------
-.. [1] M. Egerstedt, Y. Wardi, H. Axelsson, Transition-time optimization for switched-mode dynamical systems, IEEE Trans.
-   Automat. Contr. 51 (2006) 110-115 (the derivative in a transition time).
+.. [1] M. Egerstedt, Y. Wardi, H. Axelsson, Transition-time optimization for switched-mode dynamical systems, IEEE
+   Trans. Automat. Contr. 51 (2006) 110-115 (the derivative in a transition time).
 """
 
 from __future__ import annotations
@@ -81,9 +81,10 @@ def _list_candidates(problem: Problem, theta: FloatArray) -> Iterator[tuple[Floa
         if run.has_free_tf:
             continue
         moves: dict[int, list[int]] = {}
+        if np.any(where < 0):  # a fixed transition stays where it is, and with it the others' order
+            continue
         for i, j in _list_moves(run.mode_sequence):
-            if np.all(where[i : i + 2] >= 0):
-                moves.setdefault(i, []).append(j)
+            moves.setdefault(i, []).append(j)
         closed = {}
         for i in moves:
             without = theta.copy()

@@ -99,7 +99,7 @@ def _find_missing_errors(fit: Fit) -> Iterator[Issue]:
 def _check_noise(fit: Fit) -> Iterator[Issue]:
     """Find out whether a known sigma contradicts the residuals: 2 J should be chi-square distributed."""
     variance = fit.residual_variance
-    if not (fit.success and fit.sigma_known and np.isfinite(variance)):
+    if not (fit.status.successful and fit.sigma_known and np.isfinite(variance)):
         return
     freedom = fit.freedom
     below, above = scipy.special.chdtr(freedom, 2 * fit.cost), scipy.special.chdtrc(freedom, 2 * fit.cost)
@@ -110,13 +110,13 @@ def _check_noise(fit: Fit) -> Iterator[Issue]:
 
 def _check_residuals(fit: Fit) -> Iterator[Issue]:
     """Find residuals that are not white, normal noise."""
-    if fit.success and fit.sigma_known is not None:
+    if fit.status.successful and fit.sigma_known is not None:
         yield from diagnose(fit).issues
 
 
 def _compare_covariances(fit: Fit) -> Iterator[Issue]:
     """Find out whether the exact Hessian and the Gauss-Newton matrix give different standard errors."""
-    found = disagreement(fit) if fit.success else None
+    found = disagreement(fit) if fit.status.successful else None
     if found is not None and found.factor > DIFFERENT:
         kind = "known to second order" if found.factor > UNSEEN else "covariances differ"
         figures = {"factor": found.factor, "exact": found.exact, "Gauss-Newton": found.gauss_newton}

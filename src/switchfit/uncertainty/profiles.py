@@ -717,7 +717,7 @@ def _wrap_callback(report: Progress, trace: Trace) -> bool:
 
 
 def _check(fit: Fit) -> None:
-    if not fit.success:
+    if not fit.status.successful:
         raise ValueError(f"a profile begins at a minimum, and this fit has not found one: {fit.message}")
     if fit.sigma_known is None:
         raise ValueError("a profile needs a noise model: a cost made of Measurements alone, with sigma or without.")

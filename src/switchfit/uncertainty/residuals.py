@@ -32,7 +32,8 @@ from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text
 
 UNLIKELY = 1e-3
-"""Probability below which a test counts as failed: with ten channels one false alarm in fifty fits."""
+"""Probability below which a test counts as failed: with ten channels one false alarm in fifty fits. Where it decides on
+the verdict it is shared among the channels: of 200 right runs, one in five fits would have a false alarm otherwise."""
 
 SERIOUS = 1.2
 """Factor by which correlated residuals make standard errors too small from which the report speaks of it: a 95 %
@@ -124,6 +125,14 @@ class ChannelResiduals:
         """Factor by which standard errors that take the residuals as independent are too small."""
         return float(np.sqrt(len(self.values) / self.effective))
 
+    @property
+    def widening(self) -> float:
+        """Factor that corrects standard errors for correlated residuals, and where these are larger than sigma for that
+        too; at least 1.
+        """
+        size = self.rms if self.sigma_known else 1.0
+        return max(1.0, size * self.narrowing)
+
 
 @dataclass(frozen=True, eq=False)
 class ResidualDiagnostics:
@@ -158,17 +167,27 @@ class ResidualDiagnostics:
         return all(channel.white and channel.normal for channel in self.channels)
 
     @property
+    def correlated(self) -> tuple[bool, ...]:
+        """Of which channels neighbouring residuals are alike, more than chance explains and by so much that it matters.
+
+        The chance is shared among the channels.
+        """
+        shared = UNLIKELY / max(len(self.channels), 1)
+        return tuple(c.whiteness < shared and c.correlation > 0 and c.narrowing > SERIOUS for c in self.channels)
+
+    @property
     def issues(self) -> list[Issue]:
         """What fails: channels whose residuals are correlated, and channels whose residuals are not normal."""
         found = []
         named = list(zip(self.labels, self.channels, strict=True))
-        alike = [(label, c) for label, c in named if not c.white and c.correlation > 0 and c.narrowing > SERIOUS]
+        tested = zip(named, self.correlated, strict=True)
+        alike = [(label, c) for (label, c), correlated in tested if correlated and c.widening > SERIOUS]
         if alike:
             figures: dict[str, float | tuple[float, ...]] = {
                 "correlation": tuple(c.correlation for _, c in alike),
                 "values": float(sum(len(c.values) for _, c in alike)),
                 "effective": float(sum(c.effective for _, c in alike)),
-                "narrowing": max(c.narrowing for _, c in alike),
+                "narrowing": max(c.widening for _, c in alike),
             }
             found.append(Issue("correlated residuals", tuple(label for label, _ in alike), figures))
         heavy = [(label, c) for label, c in named if not c.normal and c.white]
@@ -202,6 +221,29 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
                     channels.append(diagnose_channel(comparison, k, e, fit.trajectories[e].time_unit))
                     names.append(name if single else f"{fit.run_names[e]} {name}")
     return ResidualDiagnostics(tuple(channels), tuple(names))
+
+
+def correct_errors(fit: Fit) -> FloatArray:
+    """Return the standard errors of a fit, widened where residuals are correlated: (d,).
+
+    Those of a transition time by the channels of its own run, of any other unknown by all; the largest factor counts.
+
+    Parameters
+    ----------
+    fit : Fit
+    """
+    errors = fit.standard_errors
+    if fit.sigma_known is None or not fit.status.successful:
+        return errors
+    found = diagnose(fit)
+    factors = np.ones(len(fit.comparisons))
+    for channel, correlated in zip(found.channels, found.correlated, strict=True):
+        if correlated and channel.widening > SERIOUS:
+            factors[channel.experiment] = max(factors[channel.experiment], channel.widening)
+    each = np.full(len(errors), factors.max(initial=1.0))
+    for factor, places in zip(factors, fit.transition_places, strict=True):
+        each[places[places >= 0]] = factor
+    return np.asarray(each * errors)
 
 
 def diagnose_channel(comparison: Comparison, k: int, experiment: int = 0, time_unit: str = "s") -> ChannelResiduals:

@@ -1,0 +1,193 @@
+"""The line of a verdict: its level, the reasons in order of weight, and what to do next."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from switchfit.optimize import Status
+from switchfit.report.sentences import join_words
+from switchfit.runtime.issue import Issue
+from switchfit.runtime.presentation import format_text
+from switchfit.uncertainty.verdict import Verdict
+
+LISTED_REASONS, LISTED_STEPS, LISTED_NAMES = 4, 2, 3
+"""Reasons, steps and names in the line; all are in the data."""
+
+
+@format_text.register(Verdict)
+def write_verdict(verdict: Verdict) -> str:
+    """Return the verdict in one line.
+
+    Parameters
+    ----------
+    verdict : Verdict
+    """
+    collapsed = [reason for reason in verdict.reasons if reason.kind == "a mode collapsed"]
+    reasons = [
+        write_reason(reason) if len(collapsed) < 2 or reason not in collapsed else _count_modes(collapsed)
+        for reason in verdict.reasons
+        if reason not in collapsed[1:]
+    ]
+    more = len(reasons) - LISTED_REASONS
+    reasons = reasons[:LISTED_REASONS]
+    if more > 0:
+        reasons.append("and another reason" if more == 1 else f"and {more} more reasons")
+    steps = ", or ".join(write_step(step) for step in verdict.next_steps[:LISTED_STEPS])
+    return f"{verdict.level.capitalize()}: {'; '.join(reasons)}{f': {steps}' if steps else ''}."
+
+
+def write_reason(reason: Issue) -> str:
+    """Return a reason as a part of a sentence.
+
+    Parameters
+    ----------
+    reason : Issue
+    """
+    return _REASONS[reason.kind](reason) if reason.kind in _REASONS else str(reason)
+
+
+def write_step(step: Issue) -> str:
+    """Return what to do as a part of a sentence.
+
+    Parameters
+    ----------
+    step : Issue
+    """
+    return _STEPS.get(step.kind.removeprefix("next: "), step.kind)
+
+
+def _figure(issue: Issue, name: str) -> float:
+    value = issue.figures.get(name, np.nan)
+    return np.nan if isinstance(value, tuple) else float(value)
+
+
+def format_share(share: float) -> str:
+    """Return a share in per cent, with as many nines as it has and one digit more.
+
+    Parameters
+    ----------
+    share : float
+        At most 1.
+    """
+    if share <= 0:
+        return "none"
+    if 1 - share < 1e-6:
+        return "all but 1e-6" if share < 1 - 1e-12 else "all"
+    digits = 0 if share < 0.9 else max(int(np.ceil(-np.log10(1 - share))) - 1, 1)
+    return f"{np.floor(share * 10 ** (digits + 2)) / 10**digits:.{digits}f} %"
+
+
+def _explain(issue: Issue) -> str:
+    """Return how much of the variance is explained, and chi-square where there is one."""
+    return f"the model explains {format_share(_figure(issue, 'explained'))} of the variance{_chi_square(issue)}"
+
+
+def _chi_square(issue: Issue) -> str:
+    chi_square, freedom = _figure(issue, "chi-square"), _figure(issue, "freedom")
+    if not np.isfinite(chi_square):
+        return ""
+    return f" (chi² {chi_square:.3g} for {freedom:.0f} degrees of freedom)".replace("e+0", "e").replace("e+", "e")
+
+
+def _explain_worst(issue: Issue) -> str:
+    """Return how much is explained of all, and of the worst channel where that is clearly less."""
+    explained, worst = _figure(issue, "explained"), _figure(issue, "worst")
+    text = _explain(issue)
+    if issue.subjects and 1 - worst > 1.5 * (1 - explained):
+        text += f", {format_share(worst)} of {issue.subjects[0]}"
+    return text
+
+
+def _name(names: tuple[str, ...]) -> str:
+    """Return the first names, and how many more there are."""
+    if len(names) <= LISTED_NAMES:
+        return join_words(names) if names else "the unknowns"
+    return f"{', '.join(names[:LISTED_NAMES])} and {len(names) - LISTED_NAMES} more"
+
+
+def _name_mode(issue: Issue) -> str:
+    mode, run = (*issue.subjects, "", "")[:2]
+    return f"mode {mode!r}" + (f" of {run}" if run else "")
+
+
+def _count_modes(collapsed: list[Issue]) -> str:
+    names = tuple(_name_mode(issue).removeprefix("mode ") for issue in collapsed)
+    return f"{len(names)} modes collapsed ({_name(names)})"
+
+
+_ENDINGS: Mapping[str, str] = {
+    Status.MAX_ITERATIONS.name: "not converged: stopped after {iterations:.0f} iterations",
+    Status.LINE_SEARCH_FAILED.name: "not converged: the line search failed (optimality {optimality:.1e})",
+    Status.INTERRUPTED.name: "not converged: interrupted after {iterations:.0f} iterations",
+    Status.NONFINITE_START.name: "not started: the cost is not finite at the first guess",
+    Status.SADDLE.name: "not a minimum but a saddle point",
+    Status.INFEASIBLE.name: "a guard or terminal constraint is not met",
+    Status.ERROR.name: "the fit ended with an error",
+}
+
+
+def _write_ending(issue: Issue) -> str:
+    figures = {name: _figure(issue, name) for name in ("iterations", "optimality", "tolerance")}
+    return _ENDINGS.get(issue.subjects[0], "not converged").format(**figures)
+
+
+_REASONS: dict[str, Callable[[Issue], str]] = {
+    "fits": _explain,
+    "a minimum": lambda issue: f"a minimum (KKT residual {_figure(issue, 'optimality'):.1e})",
+    "starts agree": lambda issue: (
+        f"{_figure(issue, 'agreeing'):.0f} of {_figure(issue, 'tried'):.0f} other starts agree, none is better"
+    ),
+    "at kinks": lambda issue: f"{_name(issue.subjects)} at a kink of the cost",
+    "not converged": _write_ending,
+    "unexplained": _explain_worst,
+    "reference not followed": _explain_worst,
+    "slightly wrong": lambda issue: (
+        f"slightly wrong at high precision: {_explain_worst(issue)}, but the residuals are more than sigma"
+    ),
+    "sigma too small": lambda issue: (
+        f"sigma looks too small: {_explain_worst(issue)}, and what is left looks like noise"
+    ),
+    "little explained": _explain,
+    "too few samples": lambda issue: (
+        f"{_figure(issue, 'samples'):.0f} values for {_figure(issue, 'unknowns'):.0f} unknowns leave nothing to check "
+        "the fit with"
+    ),
+    "correlated residuals": lambda issue: (
+        f"neighbouring residuals are correlated in {_name(issue.subjects)} (standard errors too small by a factor of "
+        f"{_figure(issue, 'narrowing'):.2g})"
+    ),
+    "a mode collapsed": lambda issue: f"{_name_mode(issue)} collapsed",
+    "a mode is short": lambda issue: f"{_name_mode(issue)} is at its minimum duration",
+    "idle": lambda issue: f"the cost does not depend on {_name(issue.subjects)}",
+    "other starts are better": lambda issue: (
+        f"{_figure(issue, 'better'):.0f} of {_figure(issue, 'tried'):.0f} other starts are better"
+    ),
+    "few starts agree": lambda issue: (
+        f"only {_figure(issue, 'agreeing'):.0f} of {_figure(issue, 'tried'):.0f} other starts agree, none is better"
+    ),
+    "not determined": lambda issue: f"the data hardly determine {_name(issue.subjects)}",
+    "at bounds": lambda issue: f"{_name(issue.subjects)} at a bound",
+    "integration error": lambda issue: (
+        f"the integration error of {_name(issue.subjects)} is {_figure(issue, 'error'):.1e}, relative"
+    ),
+}
+
+_STEPS = {
+    "more starts": "strategy='thorough'",
+    "look at the residuals": "look at estimate.plot_residuals()",
+    "check sigma": "check sigma",
+    "corrected errors": "take the corrected standard errors",
+    "leave the mode out": "leave the mode out of mode_sequence",
+    "lower min_duration": "lower min_duration or leave the mode out",
+    "move the bound": "move the bound if it is not a physical one",
+    "fix or add data": "fix one of them or add data",
+    "more data": "add data",
+    "smaller rtol": "give the Problem a smaller rtol",
+    "raise max_iterations": "raise max_iterations",
+    "continue": "continue with start=estimate.theta",
+    "start elsewhere": "start elsewhere, or check the model there",
+    "start nearer": "start nearer to a point that meets it",
+    "check derivatives": "run sf.check_derivatives(problem)",
+}

@@ -1,0 +1,249 @@
+"""Scan over sample intervals: for each run, each transition is tried in every interval between two samples.
+
+Between two samples the cost is smooth in a transition time, and at each it has a kink, so that minima lie in several
+intervals. Given the unknowns that runs share, the other unknowns of a run are few: Newton's method with the transition
+confined to an interval, begun at the end of the interval beside it, gives the least cost of each interval and, by the
+Schur complement of its Hessian, how that changes with the shared unknowns, as a parabola. The shared unknowns then
+minimise the sum over the runs of the lowest parabolas, a fit of all runs follows, and this is repeated as long as the
+cost falls.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.fit.evaluator import Evaluator
+from switchfit.problem.data import FloatArray
+from switchfit.problem.problem import Problem
+from switchfit.strategy.horizon import list_sample_times
+from switchfit.strategy.quick import End, fit_briefly
+
+ROUNDS = 8
+
+STEPS = 3
+"""Newton steps in an interval."""
+
+SETTLED = (1e-2, 1e-8)
+"""Part of the cost below which a predicted fall ends the steps in an interval: in the first scan, in later ones."""
+
+NEAR = 2
+"""Intervals on either side that later scans look at."""
+
+RISES = 4
+"""Intervals in turn in which the cost is far above the lowest, after which the scan turns round."""
+
+FAR = 3.0
+"""Multiple of the lowest cost of a run that counts as far above it."""
+
+LOWER = 1e-6
+"""A cost has to fall by this part of itself for the scan to be repeated."""
+
+SMALLEST_EIGENVALUE = 1e-8
+"""Eigenvalues of a matrix, scaled to a diagonal of one, below which they are replaced."""
+
+EPS = float(np.finfo(float).eps)
+
+MOST_SHARED = 8
+"""Shared unknowns up to which their curvature in a run says where they will go."""
+
+
+class Option(NamedTuple):
+    """The best of one run in one interval: theta, J, its slope and curvature in the shared unknowns (s,), (s, s), and
+    the derivative of the run's own unknowns (o,) in them, (o, s)."""
+
+    theta: FloatArray
+    cost: float
+    slope: FloatArray
+    curvature: FloatArray
+    follows: FloatArray
+
+
+def can_scan(problem: Problem) -> bool:
+    """Return whether there are samples with intervals between them, and transitions."""
+    return any(run.transition_times and len(list_sample_times(run)) > 1 for run in problem.experiments)
+
+
+def scan_intervals(problem: Problem, theta: FloatArray) -> End:
+    """Return where scans end that begin at the end of a fit, theta (d,)."""
+    current = fit_briefly(problem, theta)
+    evaluations = current.evaluations
+    for repeated in range(ROUNDS if not current.failed else 0):
+        scan = Scan(problem, current.theta, everywhere=not repeated)
+        start = scan.choose()
+        end = fit_briefly(problem, start)
+        evaluations += end.evaluations + -(-scan.evaluations // len(problem.experiments))
+        lower = end.cost < current.cost - LOWER * abs(current.cost)
+        current = min(current, end, key=lambda one: one.cost)
+        if repeated and not lower:
+            break
+    return current._replace(evaluations=evaluations)
+
+
+class Scan:
+    """One scan of all runs about theta (d,): of all intervals, or, more accurately, of those near by."""
+
+    def __init__(self, problem: Problem, theta: FloatArray, *, everywhere: bool) -> None:
+        self.problem, self.theta = problem, theta
+        self.reach, self.settled = (np.inf, SETTLED[0]) if everywhere else (NEAR, SETTLED[1])
+        self.evaluator = Evaluator(problem, theta)
+        self.evaluations = 0
+        touched = np.array([self._touched(e) for e in range(len(problem.experiments))])
+        several = len(touched) > 1
+        self.shared = np.flatnonzero(touched.sum(0) > 1) if several else np.zeros(0, dtype=np.intp)
+        self.own = [np.setdiff1d(np.flatnonzero(which), self.shared) for which in touched]
+        self._sums = [self._sum_over(e) for e in range(len(touched))]
+
+    def _sum_over(self, e: int) -> FloatArray:
+        """Return the matrix (o + s, k) that adds up a run's own vector for its own unknowns and the shared ones."""
+        own, mine = self.problem.own_places[e]
+        count = len(self._derivatives(self.theta, e, 1)[1])
+        sums = np.zeros((len(self.own[e]) + len(self.shared), count))
+        for row, place in enumerate([*self.own[e], *self.shared]):
+            sums[row, own[mine == place]] = 1.0
+        return sums
+
+    def choose(self) -> FloatArray:
+        """Return the theta that is the best of all combinations of intervals, as far as parabolas tell."""
+        options = [self._scan_run(e) for e in range(len(self.problem.experiments))]
+        move = np.zeros(len(self.shared))
+        for _ in range(20):
+            best = [min(own, key=lambda option: self._predict(option, move)) for own in options]
+            slope = sum((option.slope for option in best), np.zeros(len(move)))
+            curvature = sum((option.curvature for option in best), np.zeros((len(move), len(move))))
+            before, move = move, -_solve_convex(curvature, slope) if len(move) else move
+            if np.array_equal(before, move):
+                break
+        theta = self.theta.copy()
+        theta[self.shared] += move
+        for own, option in zip(self.own, best, strict=True):
+            theta[own] = option.theta[own] + option.follows @ move
+        unknowns = self.problem.unknowns
+        theta = np.clip(theta, unknowns.lower, unknowns.upper)
+        return self._in_order(theta)
+
+    def _in_order(self, theta: FloatArray) -> FloatArray:
+        """Return theta with the transition times of each run inside its horizon and in order."""
+        for run, where in zip(self.problem.experiments, self.problem.unknowns.times, strict=True):
+            free = where[where >= 0]
+            theta[free] = np.maximum.accumulate(np.clip(theta[free], run.t0, run.end))
+        return theta
+
+    @staticmethod
+    def _predict(option: Option, move: FloatArray) -> float:
+        return float(option.cost + option.slope @ move + 0.5 * move @ option.curvature @ move)
+
+    def _touched(self, e: int) -> NDArray[np.bool_]:
+        """Return which unknowns the cost of a run depends on: (d,)."""
+        own, mine = self.problem.own_places[e]
+        found = self._derivatives(self.theta, e, 1)
+        touched = np.zeros(len(self.theta), dtype=bool)
+        np.logical_or.at(touched, mine, (found[1][own] != 0) | np.any(found[2][own] != 0, axis=1))
+        return touched
+
+    def _derivatives(self, theta: FloatArray, e: int, side: int) -> tuple[float, FloatArray, FloatArray]:
+        self.evaluations += 1
+        found = self.evaluator.engines[e].derivatives(*self.problem.vectors(theta, e), side, "exact")
+        return float(found.cost), found.gradient, found.hessian
+
+    def _scan_run(self, e: int) -> list[Option]:
+        """Return the best of each interval for each transition of a run, the others left to follow."""
+        where, run = self.problem.unknowns.times[e], self.problem.experiments[e]
+        samples = list_sample_times(run)
+        stay = self._fit_inside(self.theta, e, -1, -np.inf, np.inf)
+        options = [] if stay is None else [stay]
+        for i, place in enumerate(where.tolist()):
+            if place < 0:
+                continue
+            earliest = self.theta[where[i - 1]] if i and where[i - 1] >= 0 else run.t0
+            latest = self.theta[where[i + 1]] if i + 1 < len(where) and where[i + 1] >= 0 else run.end
+            earliest = max(earliest, float(self.problem.unknowns.lower[place]))
+            latest = min(latest, float(self.problem.unknowns.upper[place]))
+            edges = np.concatenate([[earliest], samples[(samples > earliest) & (samples < latest)], [latest]])
+            here = int(np.clip(np.searchsorted(edges, self.theta[place], "right") - 1, 0, len(edges) - 2))
+            first, last = max(here - self.reach, 0), min(here + self.reach, len(edges) - 2)
+            for way in (range(here, int(last) + 1), range(here - 1, int(first) - 1, -1)):
+                options += self._scan_one_way(e, place, edges, way, stay)
+        return options or [Option(self.theta, np.inf, *(np.zeros(0),) * 3)]
+
+    def _scan_one_way(self, e: int, place: int, edges: FloatArray, way: range, stay: Option | None) -> list[Option]:
+        """Return the best of each interval, from one to the next, until the cost stays far above the lowest."""
+        found, rises = [], 0
+        theta, lowest = self.theta, np.inf if stay is None else stay.cost
+        for k in way:
+            start = theta.copy()
+            start[place] = np.clip(start[place], edges[k], edges[k + 1])
+            option = self._fit_inside(start, e, place, edges[k], edges[k + 1])
+            if option is None:
+                break
+            found.append(option)
+            theta = option.theta
+            lowest = min(lowest, option.cost)
+            rises = rises + 1 if option.cost > FAR * lowest else 0
+            if rises == RISES:
+                break
+        return found
+
+    def _fit_inside(self, theta: FloatArray, e: int, place: int, low: float, high: float) -> Option | None:
+        """Return the run's best with the unknown at `place` between two values; None if J cannot be evaluated."""
+        own, sums = self.own[e], self._sums[e]
+        lower, upper = self.problem.unknowns.lower[own].copy(), self.problem.unknowns.upper[own].copy()
+        lower[own == place], upper[own == place] = low, high
+        best: tuple[Any, ...] | None = None
+        o = len(own)
+        for step in range(STEPS + 1):
+            side = -1 if place >= 0 and theta[place] >= high else 1
+            J, g, H = self._derivatives(theta, e, side)
+            g, H = sums @ g, sums @ H @ sums.T
+            if not (np.isfinite(J) and np.isfinite(g).all() and np.isfinite(H).all()):
+                break
+            if best is not None and best[1] < J:
+                break
+            move, held = _newton_in_bounds(g[:o], H[:o, :o], lower - theta[own], upper - theta[own])
+            best = theta, J, g, H, np.flatnonzero(~held)
+            if step == STEPS or -(g[:o] @ move) <= self.settled * abs(J):
+                break
+            theta = theta.copy()
+            theta[own] = np.clip(theta[own] + move, lower, upper)
+        return None if best is None else self._option(*best, o)
+
+    def _option(self, theta: FloatArray, J: float, g: FloatArray, H: FloatArray, moving: FloatArray, o: int) -> Option:
+        """Return an option with the slope and curvature that are left where the moving unknowns follow the shared."""
+        s = len(self.shared)
+        follows = np.zeros((o, s))
+        if not 0 < s <= MOST_SHARED:
+            return Option(theta, J, np.zeros(s), np.zeros((s, s)), follows)
+        across = H[moving, o:]
+        if len(moving):
+            follows[moving] = -_solve_convex(H[np.ix_(moving, moving)], across)
+        return Option(theta, J, g[o:] + follows[moving].T @ g[moving], H[o:, o:] + across.T @ follows[moving], follows)
+
+
+def _solve_convex(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the solution of a linear system whose matrix is made positive definite if it is not."""
+    size = np.abs(matrix.diagonal())
+    scale = np.sqrt(np.where(size > EPS**2 * size.max(initial=0.0), size, 1.0))  # what J does not depend on stays
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    values = np.maximum(np.abs(values), SMALLEST_EIGENVALUE)
+    scaled = (right.T / scale).T
+    return np.asarray((vectors @ ((vectors.T @ scaled).T / values).T).T / scale).T
+
+
+def _newton_in_bounds(
+    g: FloatArray, H: FloatArray, lower: FloatArray, upper: FloatArray
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return Newton's step with entries that would leave their bounds put onto them, and which these are."""
+    step, held = np.zeros(len(g)), np.zeros(len(g), dtype=bool)
+    for _ in range(3):
+        moving = ~held
+        if moving.any():
+            rest = g[moving] + H[np.ix_(moving, held)] @ step[held]
+            step[moving] = -_solve_convex(H[np.ix_(moving, moving)], rest)
+        out = moving & ((step < lower) | (step > upper))
+        if not out.any():
+            break
+        step[out] = np.clip(step[out], lower[out], upper[out])
+        held |= out
+    return np.clip(step, lower, upper), held

@@ -1,0 +1,193 @@
+"""How well a fit explains its data: shares of the variance channel by channel, and chi-square where sigma is known.
+
+- explained share (R²) of a channel: ``1 - sum r² / sum (y - mean)²`` over its samples that are not missing; for a
+  reference signal the sums are integrals over time, and channels of no weight are left out. Where measurements do not
+  vary, the sum in the denominator is that of y² itself, so that ``1 - share`` is the square of the relative root mean
+  square of the residuals (NRMSE); of a reference that is constant there is nothing to explain.
+- samples that a robust loss counts as outliers are left out, unless they are more than a third: then it is the fit
+  that is far from the samples, not the samples that are outliers.
+- chi-square: 2 J where all sigmas are known numbers, with `Fit.freedom` degrees of freedom.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.special
+
+from switchfit.fit.result import Fit
+from switchfit.fit.trajectory import Comparison
+from switchfit.problem.data import FloatArray
+from switchfit.uncertainty.residuals import ResidualDiagnostics, diagnose
+
+NO_VARIATION = 1e-9
+"""Standard deviation of a channel, as a part of its largest value, below which it counts as constant: rounding."""
+
+MOST_OUTLIERS = 1 / 3
+"""Share of outliers from which they are no outliers: with the usual scales of 1.3 to 3 sigma normal noise has at most a
+fifth beyond."""
+
+
+@dataclass(frozen=True)
+class ChannelQuality:
+    """How well one channel is explained.
+
+    Attributes
+    ----------
+    label : str
+        Its name, with that of the experiment where there are several.
+    kind : "measurements" or "reference"
+    count : int
+        Values that are not missing.
+    explained : float
+        Share of the variance that the model explains, at most 1; negative if a constant would fit better. NaN for a
+        channel that is 0 throughout, and for a constant reference.
+    chi_square : float
+        Sum of the squared residuals over sigma; NaN where sigma is unknown.
+    whiteness : float
+        Probability of the residuals' correlation if they are white; NaN for fewer than 20, and for a reference signal.
+    """
+
+    label: str
+    kind: str
+    count: int
+    explained: float
+    chi_square: float
+    whiteness: float
+
+    @property
+    def probability(self) -> float:
+        """Probability of its chi-square, or a larger one, with as many degrees of freedom as values; NaN without."""
+        return float(scipy.special.chdtrc(self.count, self.chi_square))
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How well a fit explains its data.
+
+    Attributes
+    ----------
+    channels : tuple of ChannelQuality
+        Those with values.
+    explained : float
+        Of all of them together: ``1 - sum (r / sigma)² / sum ((y - mean) / sigma)²``, sigma being 1 where it is
+        unknown. NaN without data.
+    chi_square : float
+        2 J; NaN where sigma is not known as a number for all samples, or a loss is robust.
+    freedom : int
+    residuals : ResidualDiagnostics
+    """
+
+    channels: tuple[ChannelQuality, ...]
+    explained: float
+    chi_square: float
+    freedom: int
+    residuals: ResidualDiagnostics
+
+    @property
+    def has_chi_square(self) -> bool:
+        """Whether there is a chi-square, with degrees of freedom left."""
+        return bool(np.isfinite(self.chi_square))
+
+    @property
+    def probability(self) -> float:
+        """Probability of chi-square, or of a larger one, if the model and sigma are right; NaN without."""
+        return float(scipy.special.chdtrc(self.freedom, self.chi_square)) if self.has_chi_square else np.nan
+
+    @property
+    def probability_below(self) -> float:
+        """Probability of chi-square, or of a smaller one; NaN without."""
+        return float(scipy.special.chdtr(self.freedom, self.chi_square)) if self.has_chi_square else np.nan
+
+    @property
+    def ratio(self) -> float:
+        """Reduced chi-square, near 1 where model and sigma are right; NaN without."""
+        return self.chi_square / self.freedom if self.has_chi_square else np.nan
+
+
+def measure_quality(fit: Fit) -> Quality:
+    """Return how well a fit explains its data.
+
+    Parameters
+    ----------
+    fit : Fit
+    """
+    residuals = diagnose(fit)
+    tests = iter(residuals.channels)
+    single = len(fit.comparisons) == 1
+    channels: list[ChannelQuality] = []
+    left = total = 0.0
+    for e, run in enumerate(fit.comparisons):
+        for comparison in run:
+            for k, name in enumerate(comparison.names):
+                if not np.isfinite(comparison.measured[:, k]).any():
+                    continue
+                if comparison.weights is not None and comparison.weights[k] == 0:
+                    continue
+                whiteness = next(tests).whiteness if comparison.kind == "measurements" else np.nan
+                squares, spread, size = _sum_squares(comparison, k)
+                if not np.isfinite(squares):
+                    continue
+                left, total = left + squares / size, total + spread / size
+                channels.append(
+                    ChannelQuality(
+                        label=name if single else f"{fit.run_names[e]} {name}",
+                        kind=comparison.kind,
+                        count=int(np.isfinite(comparison.measured[:, k]).sum()),
+                        explained=1 - squares / spread if spread > 0 else np.nan,
+                        chi_square=_chi_square(comparison, k),
+                        whiteness=whiteness,
+                    )
+                )
+    judged = fit.sigma_known is True and np.isfinite(fit.residual_variance)
+    return Quality(
+        channels=tuple(channels),
+        explained=1 - left / total if total > 0 else np.nan,
+        chi_square=2 * fit.cost if judged else np.nan,
+        freedom=fit.freedom,
+        residuals=residuals,
+    )
+
+
+def _sum_squares(comparison: Comparison, k: int) -> tuple[float, float, float]:
+    """Return the sums of squares of the residuals of a channel and of its values about their mean, and what both are
+    divided by where channels are added; NaN if the channel has no values.
+    """
+    y, residual = comparison.measured[:, k], comparison.residuals[:, k]
+    there = np.isfinite(residual)
+    if comparison.downweighted is not None and there.any():
+        beyond = comparison.downweighted[:, k]
+        if beyond[there].mean() <= MOST_OUTLIERS:
+            there &= ~beyond
+    if not there.any():
+        return np.nan, np.nan, 1.0
+    weight = _weights(comparison)[there]
+    y, residual = y[there], residual[there]
+    size = 1.0
+    if comparison.sigma is not None:
+        size = float(np.mean(comparison.sigma[there, k] ** 2))
+    elif comparison.weights is not None:
+        size = 1.0 / float(comparison.weights[k])
+    mean = float(weight @ y / weight.sum()) if weight.sum() > 0 else 0.0
+    spread, about_zero = float(weight @ (y - mean) ** 2), float(weight @ y**2)
+    if spread <= NO_VARIATION**2 * about_zero:
+        spread = about_zero if comparison.kind == "measurements" else 0.0
+    return float(weight @ residual**2), spread, size if size > 0 else 1.0
+
+
+def _weights(comparison: Comparison) -> FloatArray:
+    """Return what each row counts: 1 for a sample, the trapezoidal rule's weight for a node of a reference signal."""
+    if comparison.kind == "measurements":
+        return np.ones(len(comparison.times))
+    steps = np.diff(comparison.times)
+    return 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
+
+
+def _chi_square(comparison: Comparison, k: int) -> float:
+    """Return the sum of the squared residuals over sigma; NaN where sigma is unknown or a loss is robust."""
+    if comparison.sigma is None or comparison.downweighted is not None:
+        return np.nan
+    residual = comparison.residuals[:, k]
+    there = np.isfinite(residual)
+    return float(np.sum((residual[there] / comparison.sigma[there, k]) ** 2))

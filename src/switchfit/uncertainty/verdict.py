@@ -1,0 +1,378 @@
+"""The verdict on a fit: good, doubtful or bad, why, and what to do next, as data; the report makes the sentence of it.
+
+A wrong answer that is called good is the worst defect of such a rule, a right one that is called bad the second. What
+tells a wrong end from a right one is whether the residuals look like noise *and* how much of the data is explained:
+
+- sigma known: chi-square says whether the residuals are noise. If it says no but nearly everything is explained, the
+  model is slightly wrong at high precision, as with most real logs: doubtful. If much is left, bad.
+- sigma unknown: correlated residuals take the place of chi-square. Uncorrelated ones are noise, however large.
+- reference signals: the share that is explained decides alone; noise in them cannot be told from a misfit.
+- costs without data (switching-time optimisation) have no quality of fit: what is judged is the minimum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from switchfit.fit.result import Fit, free_curvature
+from switchfit.optimize import Status
+from switchfit.runtime.issue import Issue
+from switchfit.runtime.presentation import format_text
+from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR, Certificate
+from switchfit.uncertainty.issues import BARELY_DETERMINED
+from switchfit.uncertainty.quality import ChannelQuality, Quality, measure_quality
+
+Level = Literal["good", "doubtful", "bad"]
+LEVELS: tuple[Level, ...] = ("good", "doubtful", "bad")
+
+UNLIKELY = 1e-3
+"""Probability of chi-square below which the residuals are not the noise that sigma says: one false alarm in a thousand
+fits. Shared among the channels where each is tested by itself."""
+
+CLEARLY_OFF = 0.1
+"""How far the reduced chi-square must be from 1 as well: with 10,000 samples chi-square rejects a sigma that is 2 %
+off, which no instrument is known to."""
+
+WHITE = 0.05
+"""Probability of the residuals' correlation above which they count as noise of another size: then it is sigma that is
+wrong and not the model."""
+
+EXPLAINED = 0.99
+"""Share of a channel's variance that must be explained where sigma is known and chi-square too large: below it what
+is left is a tenth of the signal, which is to be seen in a figure."""
+
+EXPLAINED_UNKNOWN = 0.95
+"""The same where sigma is unknown and the residuals are correlated: there is no noise level to compare with, and right
+fits to real logs have been seen down to 0.96."""
+
+NEARLY_ALL = 0.999
+"""Share from which a model is no more than slightly wrong, whatever else is said against it: residuals of 3 % of the
+signal. Below it, a collapsed mode or residuals of ten sigma beside a chi-square that is too large make a fit bad."""
+
+FAR_OFF = 100.0
+"""Reduced chi-square of residuals of ten sigma. Real logs with a model that is slightly wrong have 2 to 50."""
+
+REFERENCE_LOST = 0.98
+"""Share of all reference signals below which a fit is bad. Noise in a reference stays in it: right ends of the paper's
+vehicle keep 0.999 with noise of 0.3 m, wrong ends have 0.84 to 0.991."""
+
+REFERENCE_FOLLOWED = 0.995
+"""The same below which it is doubtful."""
+
+REFERENCE_CHANNEL = 0.95
+"""Share of a single channel of a reference below which a fit is doubtful; no more than that, since it may be noise."""
+
+HALF = 0.5
+"""Share of all data below which a fit is doubtful even where what is left looks like noise: it says more of the
+unknowns than of the data. Bad where there are too few samples to tell whether it is noise."""
+
+MOSTLY = 0.9
+"""Share of all data below which a fit to fewer samples than the tests of residuals need is doubtful."""
+
+NO_RESIDUALS = 1e-10
+"""Unexplained share of the variance that is rounding and tolerance: nothing is read from residuals of that size."""
+
+WRONG_INTEGRATION = 1e-2
+"""Integration error from which a fit is bad: the minimum may be that of the discretisation."""
+
+AGREEING = 0.1
+"""Share of other starts that end in the same minimum below which it is doubtful that there is no better one, unless
+chi-square confirms the fit."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether to believe a fit; print it for one line that says so.
+
+    Attributes
+    ----------
+    level : {"good", "doubtful", "bad"}
+        Bad: not converged, or far from the data, or known not to be the best. Doubtful: read the reasons before using
+        the numbers.
+    reasons : tuple of Issue
+        What speaks against the fit, in order of weight; for a good one what speaks for it.
+    next_steps : tuple of Issue
+        What to do, the most promising first; empty for a good fit.
+
+    See Also
+    --------
+    Estimate.verdict, Estimate.success
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> fit.verdict.level
+    'good'
+    >>> [reason.kind for reason in fit.verdict.reasons]
+    ['fits']
+    >>> print(fit.verdict)
+    Good: the model explains 99.85 % of the variance (chi² 12.1 for 22 degrees of freedom).
+    """
+
+    level: Level
+    reasons: tuple[Issue, ...]
+    next_steps: tuple[Issue, ...] = ()
+
+    def __str__(self) -> str:
+        return format_text(self)
+
+
+class Finding(NamedTuple):
+    """One thing that speaks against a fit, and what to do about it."""
+
+    level: Level
+    reason: Issue
+    steps: tuple[str, ...] = ()
+
+
+def judge(fit: Fit, certificate: Certificate | None = None) -> Verdict:
+    """Return the verdict on a fit.
+
+    Parameters
+    ----------
+    fit : Fit
+    certificate : Certificate, optional
+        What it found about the derivatives counts; left out, nothing is said of them.
+    """
+    quality = measure_quality(fit) if fit.status.successful and np.isfinite(fit.cost) else None
+    fitting = [] if quality is None else list(_judge_quality(fit, quality))
+    collapsed = list(_find_collapsed(fit))
+    if collapsed and quality is not None and _worst(quality.channels) < NEARLY_ALL:
+        fitting = [_condemn(f) if f.reason.kind in MISFITS else f for f in fitting]
+    if any(f.level == "bad" for f in fitting):
+        collapsed = [f._replace(level="bad") for f in collapsed]
+    correlated = [f for f in fitting if f.reason.kind == "correlated residuals"]
+    found = [*_find_ending(fit), *(f for f in fitting if f not in correlated), *collapsed]
+    found += _judge_starts(fit, confirmed=quality is not None and quality.has_chi_square and not fitting)
+    if quality is not None:
+        found += _find_undetermined(fit)
+        found += _find_bounds(fit)
+        found += _check_integration(fit)
+        found += _check_derivatives(certificate)
+        found += correlated
+    found.sort(key=lambda f: -LEVELS.index(f.level))  # stable: in the order of weight on each level
+    if not found:
+        return Verdict("good", tuple(_praise(fit, quality)))
+    steps = dict.fromkeys(step for f in found for step in f.steps)
+    if fit.starts is not None and fit.starts[1] == 0:  # other starts were tried: they are no remedy any more
+        steps.pop("more starts", None)
+    return Verdict(found[0].level, tuple(f.reason for f in found), tuple(Issue(f"next: {step}") for step in steps))
+
+
+MISFITS = ("unexplained", "slightly wrong", "reference not followed")
+"""Kinds of reasons that say that the model does not fit, other than by the size of the noise."""
+
+
+def _find_ending(fit: Fit) -> Iterator[Finding]:
+    """Find out whether the fit converged."""
+    if fit.status.successful:
+        return
+    figures = {"optimality": fit.optimality, "tolerance": fit.tolerance, "iterations": float(fit.iterations)}
+    steps = {
+        Status.MAX_ITERATIONS: ("raise max_iterations", "more starts"),
+        Status.INTERRUPTED: ("continue",),
+        Status.NONFINITE_START: ("start elsewhere",),
+        Status.INFEASIBLE: ("start nearer",),
+    }.get(fit.status, ("more starts",))
+    yield Finding("bad", Issue("not converged", (fit.status.name,), figures), steps)
+
+
+def _judge_quality(fit: Fit, quality: Quality) -> Iterator[Finding]:
+    """Judge how well the fit explains its data."""
+    if not quality.channels:
+        return
+    references = tuple(c for c in quality.channels if c.kind == "reference")
+    samples = tuple(c for c in quality.channels if c.kind != "reference")
+    if references:
+        yield from _judge_reference(quality, references)
+    if not samples:
+        return
+    if fit.freedom <= 0 and fit.sigma_known is not None:
+        figures = {"samples": float(fit.samples), "unknowns": float(fit.free_basis.shape[1])}
+        yield Finding("doubtful", Issue("too few samples", figures=figures), ("more data",))
+        return
+    too_small = quality.has_chi_square and quality.probability_below < UNLIKELY and quality.ratio < 1 - CLEARLY_OFF
+    if quality.has_chi_square and not too_small:
+        yield from _judge_chi_square(quality, samples)
+    else:
+        yield from _judge_residuals(quality, samples, sigma_too_large=too_small)
+
+
+def _judge_chi_square(quality: Quality, samples: tuple[ChannelQuality, ...]) -> Iterator[Finding]:
+    """Judge a fit by chi-square, of all data and of each channel."""
+    large = quality.probability < UNLIKELY and quality.ratio > 1 + CLEARLY_OFF
+    shared = UNLIKELY / len(samples)
+    poor = [c for c in samples if c.probability < shared and c.chi_square > (1 + CLEARLY_OFF) * c.count]
+    if not large and not poor:
+        yield from _find_correlation(quality)
+        return
+    suspects = tuple(poor) or samples
+    worst = min(suspects, key=lambda c: _share(c.explained))
+    share = _share(worst.explained)
+    ratio = max([quality.ratio, *(c.chi_square / c.count for c in poor)])
+    figures = _describe_fit(quality) | {"worst": share}
+    if all(c.whiteness > WHITE for c in suspects) and ratio < FAR_OFF:
+        yield Finding("doubtful", Issue("sigma too small", (worst.label,), figures), ("check sigma", "more starts"))
+    elif share < EXPLAINED or (share < NEARLY_ALL and ratio > FAR_OFF):
+        yield Finding("bad", Issue("unexplained", (worst.label,), figures), ("more starts", "look at the residuals"))
+    else:
+        steps = ("look at the residuals", "more starts")
+        yield Finding("doubtful", Issue("slightly wrong", (worst.label,), figures), steps)
+        yield from _find_correlation(quality)
+
+
+def _judge_residuals(
+    quality: Quality, samples: tuple[ChannelQuality, ...], *, sigma_too_large: bool
+) -> Iterator[Finding]:
+    """Judge a fit whose sigma is unknown, or far too large, by the correlation of its residuals."""
+    correlated = [
+        (c.explained, c.label)
+        for c, alike in zip(samples, quality.residuals.correlated, strict=True)
+        if alike and 1 - c.explained >= NO_RESIDUALS
+    ]
+    if correlated:
+        share, label = min((_share(explained), label) for explained, label in correlated)
+        figures = _describe_fit(quality) | {"worst": share}
+        if share < EXPLAINED_UNKNOWN:
+            yield Finding("bad", Issue("unexplained", (label,), figures), ("more starts", "look at the residuals"))
+        elif not sigma_too_large:
+            yield from _find_correlation(quality)
+        return
+    if sigma_too_large:
+        return
+    untested = all(np.isnan(c.whiteness) for c in samples)
+    figures = _describe_fit(quality) | {"worst": quality.explained}
+    if untested and quality.explained < HALF:
+        yield Finding("bad", Issue("unexplained", (), figures), ("more starts", "look at the residuals"))
+    elif quality.explained < (MOSTLY if untested else HALF):
+        yield Finding("doubtful", Issue("little explained", (), figures), ("more starts", "more data"))
+
+
+def _judge_reference(quality: Quality, references: tuple[ChannelQuality, ...]) -> Iterator[Finding]:
+    """Judge how well reference signals are followed."""
+    varying = [c for c in references if np.isfinite(c.explained)]
+    if not varying:
+        return
+    worst = min(varying, key=lambda c: c.explained)
+    if quality.explained < REFERENCE_FOLLOWED or worst.explained < REFERENCE_CHANNEL:
+        level: Level = "bad" if quality.explained < REFERENCE_LOST else "doubtful"
+        figures = _describe_fit(quality) | {"worst": worst.explained}
+        steps = ("more starts", "look at the residuals")
+        yield Finding(level, Issue("reference not followed", (worst.label,), figures), steps)
+
+
+def _find_correlation(quality: Quality) -> Iterator[Finding]:
+    """Find residuals whose correlation makes the standard errors too small."""
+    for issue in quality.residuals.issues:
+        negligible = 1 - quality.explained < NO_RESIDUALS
+        if issue.kind == "correlated residuals" and not negligible:
+            yield Finding("doubtful", issue, ("corrected errors", "look at the residuals"))
+
+
+def _condemn(finding: Finding) -> Finding:
+    """Return a misfit as it counts beside a collapsed mode: as one that the model cannot explain."""
+    reason = finding.reason
+    kind = "unexplained" if reason.kind == "slightly wrong" else reason.kind
+    return Finding("bad", Issue(kind, reason.subjects, reason.figures), ("more starts", "look at the residuals"))
+
+
+def _find_collapsed(fit: Fit) -> Iterator[Finding]:
+    """Find modes that have collapsed, or are at their minimum duration."""
+    collapsed = False
+    for constraint in fit.active:
+        if constraint.position is None:
+            continue
+        figures = {"position": float(constraint.position)}
+        if constraint.kind == "collapsed":
+            collapsed = True
+            reason = Issue("a mode collapsed", (constraint.mode, constraint.run), figures)
+            yield Finding("doubtful", reason, ("more starts", "leave the mode out"))
+        else:
+            reason = Issue("a mode is short", (constraint.mode, constraint.run), figures)
+            yield Finding("doubtful", reason, ("lower min_duration",))
+    if fit.status is Status.COLLAPSED and not collapsed:
+        yield Finding("doubtful", Issue("idle", fit.idle), ("more starts", "leave the mode out"))
+
+
+def _judge_starts(fit: Fit, *, confirmed: bool) -> Iterator[Finding]:
+    """Find out whether other starts ended lower, or elsewhere."""
+    if fit.starts is None:
+        return
+    tried, better, agreeing = fit.starts
+    figures = {"tried": float(tried), "better": float(better), "agreeing": float(agreeing)}
+    if better > 0:
+        yield Finding("bad", Issue("other starts are better", figures=figures), ("more starts",))
+    elif tried > 0 and agreeing < AGREEING * tried and not confirmed:
+        yield Finding("doubtful", Issue("few starts agree", figures=figures), ("more starts",))
+
+
+def _find_undetermined(fit: Fit) -> Iterator[Finding]:
+    """Find a direction along which the data determine hardly anything."""
+    curvature = free_curvature(fit)
+    smallest = float(curvature.scaled[0]) if len(curvature.scaled) else np.inf
+    if fit.status is Status.SINGULAR or smallest < BARELY_DETERMINED:
+        names = curvature.weakest or tuple(name for name, _ in fit.flat_direction)
+        reason = Issue("not determined", names, {"eigenvalue": smallest})
+        yield Finding("doubtful", reason, ("fix or add data",))
+
+
+def _find_bounds(fit: Fit) -> Iterator[Finding]:
+    """Find unknowns at bounds that the user gave. A cost without data may have its minimum there."""
+    names = [c.unknown for c in fit.active if c.position is None and c.unknown not in fit.idle]
+    if names and any(fit.comparisons):
+        yield Finding("doubtful", Issue("at bounds", tuple(names)), ("move the bound",))
+
+
+def _check_integration(fit: Fit) -> Iterator[Finding]:
+    """Find out whether the integration is accurate enough."""
+    error = fit.integration_error
+    if not error <= LARGE_INTEGRATION_ERROR:
+        level: Level = "doubtful" if error <= WRONG_INTEGRATION else "bad"
+        reason = Issue("integration error", (fit.integration_error_of,), {"error": error})
+        yield Finding(level, reason, ("smaller rtol",))
+
+
+def _check_derivatives(certificate: Certificate | None) -> Iterator[Finding]:
+    """Find out whether derivatives that were checked are wrong."""
+    for failure in certificate.failures if certificate is not None else ():
+        if failure.kind in ("derivative gap", "Taylor orders", "negative curvature"):
+            yield Finding("doubtful", failure, ("check derivatives",))
+
+
+def _praise(fit: Fit, quality: Quality | None) -> Iterator[Issue]:
+    """Return what speaks for a fit against which nothing speaks."""
+    if quality is not None and quality.channels:
+        yield Issue("fits", figures=_describe_fit(quality))
+    else:
+        yield Issue("a minimum", figures={"optimality": fit.optimality})
+    if fit.starts is not None and fit.starts[0] > 0:
+        tried, better, agreeing = map(float, fit.starts)
+        yield Issue("starts agree", figures={"tried": tried, "better": better, "agreeing": agreeing})
+    if fit.kinks:
+        yield Issue("at kinks", tuple(kink.unknown for kink in fit.kinks))
+
+
+def _describe_fit(quality: Quality) -> dict[str, float | tuple[float, ...]]:
+    """Return the figures of a sentence about how well the data are explained."""
+    return {
+        "explained": quality.explained,
+        "chi-square": quality.chi_square,
+        "freedom": float(quality.freedom),
+        "probability": quality.probability,
+    }
+
+
+def _worst(channels: tuple[ChannelQuality, ...]) -> float:
+    return min((c.explained for c in channels if np.isfinite(c.explained)), default=1.0)
+
+
+def _share(explained: float) -> float:
+    """Return an explained share; 0 for a channel that is 0 throughout."""
+    return 0.0 if np.isnan(explained) else explained
