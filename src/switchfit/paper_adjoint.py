@@ -39,8 +39,8 @@ printed once f_{i-1} is read as F_{i-1}. Through the map itself
     D_p x+ = D_x R D_p x- + D_p R,      psi- = psi+ D_x R,      Omega- = D_x R' Omega+ D_x R + psi+ . D_x^2 R,
     Omega_p- = D_x R' Omega_p+ + psi+ . [D_x^2 R D_p x- + D_p D_x R],      and (9) gains psi+ D_p R.
 
-**A free tf** is the transition to a mode with f = 0 and ell = 0, so that x stays x(tf) until the end of the mesh. All of
-the above holds for it, with Lambda = ell(tf, x, p) and X = f_N: D_tf J = ell + psi f_N, psi being D phi there.
+**A free tf** is the transition to a mode with f = 0 and ell = 0, so that x stays x(tf) until the end of the mesh. All
+of the above holds for it, with Lambda = ell(tf, x, p) and X = f_N: D_tf J = ell + psi f_N, psi being D phi there.
 
 **Integration.** Forward and backward with the same Runge-Kutta method over the same rows of the mesh. In the backward
 sweep x(t) comes from quintic Hermite interpolation, since integrating x backward would blow up stiff modes.

@@ -106,7 +106,9 @@ class Experiment:
         if not (np.isfinite(t0) and np.isfinite(last) and t0 < last):
             raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got ({t0}, {last}).")
         if isinstance(tf, Parameter) and np.isfinite(tf.lower) and tf.lower <= t0:
-            raise ValueError(f"The lower bound of tf must lie after t0 = {t0}; got {tf.lower}. Leave it out, or raise it.")
+            raise ValueError(
+                f"The lower bound of tf must lie after t0 = {t0}; got {tf.lower}. Leave it out, or raise it."
+            )
         modes = as_sequence(self.mode_sequence, "mode_sequence", "a sequence of mode names")
         sequence = tuple(as_name(mode, "each of mode_sequence", "the name of a mode") for mode in modes)
         if not sequence:
@@ -149,7 +151,7 @@ class Experiment:
     @property
     def times(self) -> tuple[Parameter, ...]:
         """What programs take as their times: all transition times, then tf where it is free."""
-        return (*self.transition_times, self.tf) if self.has_free_tf else self.transition_times
+        return (*self.transition_times, self.tf) if isinstance(self.tf, Parameter) else self.transition_times
 
     @property
     def initial_times(self) -> FloatArray:
@@ -169,12 +171,12 @@ class Experiment:
         unit = as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'")
         for i, tau in enumerate(self.times, start=1):
             if tau.unit not in ("", unit):
-                what = f"transition time {i}" if i <= len(self.transition_times) else "tf"
+                is_tf = i > len(self.transition_times)
                 raise ValueError(
-                    f"{what} has the unit {tau.unit!r}, but time_unit of the experiment is {unit!r}, and "
-                    f"times are not converted. If all times of the experiment are in {tau.unit}, give it "
-                    f"time_unit={tau.unit!r}; otherwise give {what if i > len(self.transition_times) else 'the transition time'} "
-                    f"in {unit}."
+                    f"{'tf' if is_tf else f'transition time {i}'} has the unit {tau.unit!r}, but time_unit of the "
+                    f"experiment is {unit!r}, and times are not converted. If all times of the experiment are in "
+                    f"{tau.unit}, give it time_unit={tau.unit!r}; otherwise give "
+                    f"{'tf' if is_tf else 'the transition time'} in {unit}."
                 )
 
     def _check_times(self) -> None:

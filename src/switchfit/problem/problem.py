@@ -301,8 +301,8 @@ class Problem:
                     raise ValueError(
                         f"the delay {item.delay!r} may lie in [{least}, {most}]{unit} (its bounds, if it is not "
                         f"fixed), but only from {low:.6g} to {high:.6g}{unit} are all samples of moments inside "
-                        f"(t0, tf) = ({experiment.t0}, {experiment.earliest_end}): give it narrower bounds, move t0 or tf, or "
-                        "leave out samples at the ends."
+                        f"(t0, tf) = ({experiment.t0}, {experiment.earliest_end}): give it narrower bounds, move t0 "
+                        "or tf, or leave out samples at the ends."
                     )
 
     def _check_delay_unit(self, experiment: Experiment, delay: str) -> None:

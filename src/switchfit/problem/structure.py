@@ -29,7 +29,6 @@ from switchfit.problem.functions import Function, Shape, trace_function
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.system import HybridSystem
 
-
 REST = ""
 """Name of the mode after a free tf, which nobody is shown; no mode of a system can have it."""
 

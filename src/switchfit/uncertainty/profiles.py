@@ -722,8 +722,8 @@ def _check(fit: Fit) -> None:
         raise ValueError(f"a profile begins at a minimum, and this fit has not found one: {fit.message}")
     if fit.constraints:
         raise ValueError(
-            "a profile knows no guards and no terminal constraints, without which its intervals would be too wide: take "
-            "confidence_intervals, sf.bootstrap or sf.monte_carlo."
+            "a profile knows no guards and no terminal constraints, without which its intervals would be too wide: "
+            "take confidence_intervals, sf.bootstrap or sf.monte_carlo."
         )
     if fit.sigma_known is None:
         raise ValueError("a profile needs a noise model: a cost made of Measurements alone, with sigma or without.")

@@ -209,7 +209,6 @@ def stage_gauss_newton(model: Model, first: Forward, p: Array) -> Array:
     kept, along_row = stages_along(model, first)
     operands = (layout.start, layout.end, path.pieces, path.stages, *time_directions(model, layout), *kept)
 
-
     def of_mode(mode: int) -> Callable[..., Array]:
         return lambda *rows: jax.vmap(partial(row, mode))(*rows).sum(0)
 
