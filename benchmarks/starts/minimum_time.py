@@ -1,9 +1,9 @@
 """Minimum time between two states with a bounded control, which jumps between its bounds: tf is an unknown.
 
-rest-to-rest  x'' = u, |u| <= 1, over 1 m: Pontryagin et al., The Mathematical Theory of Optimal Processes, 1962, section
-              5, example 1; Bryson and Ho, Applied Optimal Control, 1975, section 3.9.
-pendulum      x'' + x = u, |u| <= 1, to rest at 0: Pontryagin et al., the same, example 2. All arcs between the first and
-              the last take pi.
+rest-to-rest  x'' = u, |u| <= 1, over 1 m: Pontryagin et al., The Mathematical Theory of Optimal Processes, 1962,
+              section 5, example 1; Bryson and Ho, Applied Optimal Control, 1975, section 3.9.
+pendulum      x'' + x = u, |u| <= 1, to rest at 0: Pontryagin et al., the same, example 2. All arcs between the first
+              and the last take pi.
 van-der-pol   x'' = -x - (x² - 1) x' + u, |u| <= 1: Maurer and Osmolovskii, Second order sufficient conditions for
               time-optimal bang-bang control, SIAM J. Control Optim. 42 (2004), 2239-2263.
 """

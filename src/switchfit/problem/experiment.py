@@ -159,7 +159,20 @@ class Experiment:
         return np.array([tau.value for tau in self.times], dtype=np.float64)
 
     def ends_of_modes(self, times: FloatArray) -> FloatArray:
-        """Return where each mode begins and the last one ends, one more than modes, for values of `times`."""
+        """Return where each mode begins and the last one ends, one more than modes, for values of `times`.
+
+        See Also
+        --------
+        Problem.ends_of_modes : of all experiments, at a theta.
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> cost = sf.RunningCost(lambda t, x, p: x[0])
+        >>> run = sf.Experiment(cost, ("on", "off"), (1.0,), 0.0, sf.Parameter(2.5, upper=5.0))
+        >>> run.ends_of_modes(run.initial_times)
+        array([0. , 1. , 2.5])
+        """
         return np.concatenate([[self.t0], times, [] if self.has_free_tf else [self.end]])
 
     @property
