@@ -1,11 +1,14 @@
 """Settings for all tests: the same examples in every run, strict promotion, programs that compile quickly."""
 
+import os
 from pathlib import Path
 
 import jax
+import llvmlite.binding
 import pytest
 from hypothesis import settings
 
+from switchfit.engine.native import llvm, program
 from switchfit.engine.native.program import drop_programs
 
 settings.register_profile("switchfit", derandomize=True, deadline=None)
@@ -25,8 +28,58 @@ tests of such functions are marked with `promotes`.
 for name, (strict, _) in PROMOTION.items():
     jax.config.update(name, strict)
 
-# Nearly all programs of the tests run for milliseconds. Processes that tests start have XLA's defaults, as users do.
+# Nearly all programs of the tests run for milliseconds, and compiling them is most of what the tests take: without the
+# emitters of fusions by way of MLIR it takes half the time. XLA reads its flags once, when it compiles first. Processes
+# that tests start have XLA's defaults, as users do, unless they ask for `quick_processes`.
+DEFAULT_FLAGS = os.environ.get("XLA_FLAGS", "")
+QUICK_FLAGS = f"{DEFAULT_FLAGS} --xla_cpu_use_fusion_emitters=false"
+
 jax.config.update("jax_disable_most_optimizations", True)
+os.environ["XLA_FLAGS"] = QUICK_FLAGS
+jax.jit(lambda: 0)()
+os.environ["XLA_FLAGS"] = DEFAULT_FLAGS
+
+
+AS_USERS = llvmlite.binding.Target.create_target_machine, llvm.compile_module
+
+
+def pytest_configure(config):
+    """Make machine code without optimisation too, unless slow or long random tests are asked for.
+
+    The cache must not hand it to others: a comment in the text of a program gives it a key of its own.
+    """
+    if config.getoption("markexpr") != "not slow and not fuzz":
+        return
+    create, compile_module = AS_USERS
+
+    def create_quickly(self, **settings):
+        return create(self, **(settings | {"opt": 0}))
+
+    def compile_quickly(text):
+        return compile_module(f"{text}\n; without optimisation\n")
+
+    llvmlite.binding.Target.create_target_machine = create_quickly
+    llvm.compile_module = program.compile_module = compile_quickly
+
+
+@pytest.fixture(scope="module")
+def optimised_machine_code():
+    """Machine code as users have it, to the last bit."""
+    drop_programs()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(llvmlite.binding.Target, "create_target_machine", AS_USERS[0])
+        for module in (llvm, program):
+            patch.setattr(module, "compile_module", AS_USERS[1])
+        yield
+    drop_programs()
+
+
+@pytest.fixture
+def quick_processes(monkeypatch):
+    """Processes that the test starts compile as this one does, so that they find its programs in the cache."""
+    monkeypatch.setenv("XLA_FLAGS", QUICK_FLAGS)
+    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+
 
 MOST_MAPPINGS = 20_000
 """Pieces of memory that a process may map before compiled programs are dropped; the kernel allows 65,530."""

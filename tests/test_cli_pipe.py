@@ -11,7 +11,7 @@ PROGRAM = "from switchfit.cli import main; main()"
 
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])
-def test_a_reader_that_is_gone_ends_nothing(stream, tmp_path):
+def test_a_reader_that_is_gone_ends_nothing(stream, tmp_path, quick_processes):
     """As `switchfit ... | head`: no traceback, all files, and the exit code as without the pipe."""
     command = [sys.executable, "-c", PROGRAM, "fit", str(TOSS), "--out", str(tmp_path), "--no-figures"]
     other = "stderr" if stream == "stdout" else "stdout"
@@ -25,7 +25,7 @@ def test_a_reader_that_is_gone_ends_nothing(stream, tmp_path):
     assert ("written to" in said) == (other == "stderr")
 
 
-def test_a_check_of_which_one_line_is_read():
+def test_a_check_of_which_one_line_is_read(quick_processes):
     """Several things are printed one after the other; the reader leaves after the first line."""
     command = [sys.executable, "-c", PROGRAM, "check", str(TOSS)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:

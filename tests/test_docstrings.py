@@ -59,7 +59,7 @@ def test_there_are_examples_and_references(name):
 
 
 @pytest.mark.parametrize("name", [name for name, item in PUBLIC.items() if section(item, "Examples")])
-def test_examples_run_and_print_what_they_say(name):
+def test_examples_run_and_print_what_they_say(name, optimised_machine_code):
     """Each by itself: what it needs, it imports."""
     (examples,) = doctest.DocTestFinder(recurse=False).find(PUBLIC[name], name, globs={})
     report = []

@@ -38,6 +38,7 @@ def assert_close(found, expected, relative: float) -> None:
         np.testing.assert_allclose(a, b, rtol=0.0, atol=relative * np.abs(b).max())
 
 
+@pytest.mark.slow  # short forms: in test_guards.py, and of JAX in test_random_systems.py
 @pytest.mark.parametrize(("solver", "relative"), [("explicit", 1e-12), ("stiff", 1e-9)])
 def test_augmented_lagrangian_has_exact_derivatives(solver: str, relative: float) -> None:
     structure, arguments = program_inputs(constrained(TAU, solver=solver))
@@ -74,6 +75,7 @@ def test_augmented_lagrangian_has_exact_derivatives(solver: str, relative: float
     assert_close(found, expected, relative)
 
 
+@pytest.mark.slow  # in closed form, and in both engines, in test_protocol.py
 def test_costs_at_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
     """A kind of node at transitions that is a cost: here the guards, taken for one."""
     structure, arguments = program_inputs(constrained(TAU))
@@ -138,21 +140,26 @@ def test_costs_at_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(added, expected, rtol=0.0, atol=1e-11 * np.abs(expected).max())
 
 
+def differentiate(method: str, matrix: str):
+    """J, g and H of `constrained`, traced anew."""
+    structure, arguments = program_inputs(constrained(TAU))
+    with use_float64():
+        return jax.jit(
+            lambda *at: programs.derivatives.__wrapped__(*at, structure=structure, method=method, matrix=matrix)
+        )(arguments, TAU, P0, np.ones(()))
+
+
+@pytest.fixture(scope="module")
+def by_the_adjoint():
+    return differentiate("discrete-adjoint", "exact")
+
+
 @pytest.mark.parametrize(
     ("method", "matrix"), [("forward", "exact"), ("forward", "none"), ("discrete-adjoint", "gauss-newton")]
 )
-def test_forward_mode_takes_nothing_from_the_adjoint(method, matrix, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_forward_mode_takes_nothing_from_the_adjoint(method, matrix, by_the_adjoint, monkeypatch) -> None:
     """So that a mistake in one is not repeated in the other; the Gauss-Newton matrix does without it to be fast."""
-    structure, arguments = program_inputs(constrained(TAU))
-    given = arguments, TAU, P0, np.ones(())
-
-    def differentiate(method, matrix):
-        with use_float64():
-            return jax.jit(
-                lambda *at: programs.derivatives.__wrapped__(*at, structure=structure, method=method, matrix=matrix)
-            )(*given)
-
-    expected = differentiate("discrete-adjoint", "exact")
+    expected = by_the_adjoint
 
     def fails(*_):
         raise AssertionError("the backward sweep is not forward")

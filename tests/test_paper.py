@@ -3,6 +3,7 @@
 import contextlib
 import json
 import types
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,10 @@ from switchfit.cli import app
 from switchfit.paper import PARTS, convergence, horizon, lti, magic, noise, run, trials
 from switchfit.paper.part import Row
 from switchfit.paper.runner import table
-from switchfit.paper.vehicle import NAMES, TRUTH
+from switchfit.paper.vehicle import NAMES, TRUTH, wheel_speeds
+
+COEFFICIENTS = ("eigenvalues", "scaled_eigenvalues", "undetermined", "worst")
+"""What is found of the Hessian in the 16 coefficients of the Magic Formula."""
 
 
 def found_by(part, folder):
@@ -61,7 +65,11 @@ def test_exact_sqp_is_quadratic_and_the_block_diagonal_hessian_linear(tmp_path):
     assert fits["exact"]["sufficient"]
 
 
-def test_magic_formula_reference_gives_values_like_the_paper_and_sixteen_coefficients_do_not_work(tmp_path):
+def test_magic_formula_reference_gives_values_like_the_paper(tmp_path, monkeypatch):
+    """What is found of the 16 coefficients, which takes long, is that of the documentation."""
+    results = json.loads((Path(__file__).parent.parent / "docs" / "paper-results.json").read_text())
+    kept = results["magic-formula"]["found"]
+    monkeypatch.setattr(magic, "_coefficients", lambda speeds, say: {name: kept[name] for name in COEFFICIENTS})
     found = found_by(magic, tmp_path)
     literal, reset = found["fits"]["continuous"], found["fits"]["reset"]
     for fit in (literal, reset):
@@ -70,6 +78,12 @@ def test_magic_formula_reference_gives_values_like_the_paper_and_sixteen_coeffic
         assert 10.0 < fit["theta"]["tau_2"] < 12.0
         assert 0.6 < fit["theta"]["mu"] < 0.85
     assert reset["rms_position_error"] < 0.2 * literal["rms_position_error"]
+
+
+@pytest.mark.slow
+def test_sixteen_coefficients_do_not_work():
+    found = magic._coefficients(wheel_speeds(), lambda text: None)
+    assert found.keys() == set(COEFFICIENTS)
     values = np.array(found["eigenvalues"])
     assert found["undetermined"] > 6
     assert len(found["scaled_eigenvalues"]) == 16

@@ -59,9 +59,21 @@ DATA = {
         sf.RunningCost(lambda t, x, p: x[0] ** 2 * x[1] ** 2 + p["k"] * t * x[0]),
         sf.Measurements(TIMES[2:], VALUES[2:], sigma=0.5, delay="d"),
     ],
-    "transitions": [samples(), sf.TransitionCost(lambda t, x, p: p["k"] * x[0] ** 2 * x[1] + (t - 1.2) ** 2 * x[1])],
-    "end": [samples(), sf.TerminalCost(lambda x, p: p["k"] * x[0] ** 2 * x[1])],
+    "transitions, end": [
+        samples(),
+        sf.TransitionCost(lambda t, x, p: p["k"] * x[0] ** 2 * x[1] + (t - 1.2) ** 2 * x[1]),
+        sf.TerminalCost(lambda x, p: p["k"] * x[0] ** 2 * x[1]),
+    ],
 }
+RICH = ("late, robust", "reference, running", "transitions, end")
+"""Kinds of data that have all that the others have, too: these are compared by default."""
+
+
+def kinds_of(names, default):
+    """Kinds of data, as parameters of a test; those that are not among the default ones are slow."""
+    return [pytest.param(name, marks=[] if name in default else pytest.mark.slow) for name in names]
+
+
 MORE = {"s": sf.Parameter(0.7, lower=0.1), "d": sf.Parameter(0.13, lower=0.0, upper=0.25)}
 
 
@@ -72,7 +84,7 @@ def both(given):
 
 
 @pytest.mark.parametrize("matrix", ["exact", "gauss-newton", "none"])
-@pytest.mark.parametrize("name", DATA)
+@pytest.mark.parametrize("name", kinds_of(DATA, RICH))
 def test_derivatives_are_the_same(name, matrix):
     given = problem(DATA[name], parameters=MORE)
     native, by_jax = both(given)
@@ -126,7 +138,7 @@ def test_the_cost_of_transitions_in_closed_form():
 
 
 def test_what_the_papers_equations_do_not_know_is_not_compared_with_them():
-    given = problem(DATA["transitions"])
+    given = problem(DATA["transitions, end"])
     with pytest.raises(ValueError, match="the paper's equations know no TransitionCost: take another method"):
         sf.evaluate(given, method="adjoint")
     check = sf.check_derivatives(given)
@@ -183,7 +195,7 @@ def slopes_of(evaluator, simulation):
     return slopes
 
 
-@pytest.mark.parametrize("data", ["samples", "late", "reference, running", "transitions"])
+@pytest.mark.parametrize("data", kinds_of(("samples", "late", "reference, running", "transitions, end"), RICH))
 def test_sequences_of_any_length_run_in_a_program_with_room_for_them(data):
     """Sequences with fewer transitions leave segments idle: all is as in a program of their own length.
 
@@ -220,11 +232,11 @@ def test_sequences_of_any_length_run_in_a_program_with_room_for_them(data):
     assert not any(compiled[1:]), "a sequence needs a program of its own"
 
 
-@pytest.mark.parametrize("room", [2, 4])
+@pytest.mark.parametrize("room", [pytest.param(2, marks=pytest.mark.slow), 4])
 def test_one_program_of_jax_serves_every_sequence_of_the_same_length(room):
     """Machine code inside it is told which mode a segment has; segments that are not needed stay idle."""
     system = sf.HybridSystem(MODES, [0.4, 0.1], BOUNCE)
-    data = [*DATA["reference, running"][:2], *DATA["transitions"]]
+    data = [*DATA["reference, running"][:2], *DATA["transitions, end"]]
     traces = []
 
     @partial(jax.jit, static_argnames="library")

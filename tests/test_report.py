@@ -32,7 +32,7 @@ from switchfit.report.plot import (
     plot_residuals,
     plot_transitions,
 )
-from switchfit.report.text import report
+from switchfit.report.text import report as write_report
 from switchfit.runtime.issue import Issue
 from switchfit.uncertainty.issues import find_issues
 
@@ -126,6 +126,11 @@ def several(count: int, names=None) -> Fit:
     )
 
 
+def report(fit: Fit) -> str:
+    """All of it; `test_verdict.py` has tests of the report of one screen."""
+    return write_report(fit, full=True)
+
+
 def line_with(text: str, start: str) -> str:
     """The only line that begins with `start`, spaces aside, with single spaces."""
     found = [line for line in text.splitlines() if line.strip().startswith(start)]
@@ -145,9 +150,9 @@ def test_report_of_a_good_fit():
     assert line_with(text, "status") == "status Converged: the optimality 2.0e-09 is below the tolerance 1.0e-07."
     assert line_with(text, "cost J") == "cost J 28 (first guess: 900)"
     assert line_with(text, "reduced chi-square").startswith("reduced chi-square 1 (2 J / (59 values - 3 free unknowns)")
-    assert line_with(text, "X  ") == "X 29 0.1 m 1"
-    assert line_with(text, "h  ") == "h 30 0.1 1"  # no state is called h: no unit
-    assert text.splitlines()[0] == "Fit"
+    assert line_with(text, "X  ") == "X 29 0.1 m 1 99.12 %"
+    assert line_with(text, "h  ") == "h 30 0.1 1 98.1 %"  # no state is called h: no unit
+    assert text.splitlines()[0].startswith("Good: the model explains ")
     assert "Warnings" not in text
     assert all(len(line) <= 100 and line == line.rstrip() for line in text.splitlines())
 
@@ -193,19 +198,20 @@ def test_rounding_loses_less_than_a_tenth_of_the_error(value, error):
 
 def test_what_failed_is_said_first():
     statuses = {
-        Status.MAX_ITERATIONS: "NOT CONVERGED",
-        Status.LINE_SEARCH_FAILED: "NOT CONVERGED",
-        Status.INTERRUPTED: "NOT CONVERGED: interrupted",
-        Status.NONFINITE_START: "NOT STARTED",
-        Status.SADDLE: "NOT A MINIMUM",
-        Status.SINGULAR: "NOT UNIQUE",
-        Status.COLLAPSED: "A MODE HAS COLLAPSED",
-        Status.ERROR: "NOT CONVERGED",
-        Status.INFEASIBLE: "CONSTRAINTS NOT MET",
+        Status.MAX_ITERATIONS: "Bad: not converged: stopped after 2 iterations: raise max_iterations, or strategy=",
+        Status.LINE_SEARCH_FAILED: "Bad: not converged: the line search failed (optimality 2.0e-09): strategy=",
+        Status.INTERRUPTED: "Bad: not converged: interrupted after 2 iterations: continue with start=estimate.theta.",
+        Status.NONFINITE_START: "Bad: not started: the cost is not finite at the first guess: start elsewhere, or",
+        Status.SADDLE: "Bad: not a minimum but a saddle point: strategy=",
+        Status.SINGULAR: "Doubtful: the data hardly determine tau_2 and mu: fix one of them or add data.",
+        Status.COLLAPSED: "Doubtful: the cost does not depend on tau_2: strategy='thorough', or leave the mode out",
+        Status.ERROR: "Bad: the fit ended with an error: strategy=",
+        Status.INFEASIBLE: "Bad: a guard or terminal constraint is not met: start nearer to a point that meets it.",
     }
     for status in Status:
-        first = report(made(status=status)).splitlines()[0]
-        assert first.startswith(f"*** {statuses[status]}") if status in statuses else first == "Fit"
+        idle = ("tau_2",) if status is Status.COLLAPSED else ()
+        first = report(made(status=status, idle=idle)).splitlines()[0]
+        assert first.startswith(statuses.get(status, "Good: ")), first
 
 
 MESSAGES = [
@@ -280,11 +286,10 @@ def test_every_status_has_a_message():
         assert len(str(Termination(status))) > 40
 
 
-def test_success_is_that_of_the_status():
-    """It has one meaning: also where other numbers fit as well, and where a mode has collapsed."""
-    for status in Status:
-        assert made(status=status).success == status.successful
+def test_what_is_successful_has_converged():
+    """Also where other numbers fit as well, and where a mode has collapsed; how well it fits is the verdict's."""
     assert Status.SINGULAR.successful
+    assert Status.COLLAPSED.successful
     assert not Status.SINGULAR.is_strict_minimum
     assert not Status.SADDLE.successful
 
@@ -309,7 +314,7 @@ def test_reference_signals_have_no_errors_and_say_why():
     fit = made(sigma_known=None, comparisons=((comparison_of(trajectory, kind="reference", sigma=None),),))
     text = report(fit)
     assert line_with(text, "X, h") == "X, h: reference signal"
-    assert line_with(text, "X  ") == "X signal 0.1 m"
+    assert line_with(text, "X  ") == "X signal 0.1 m 99.12 %"
     assert line_with(text, "tau_1  ") == "tau_1 4 s 3 stick -> slip"
     assert "std. error" not in text
     assert "Correlations" not in text
@@ -393,8 +398,17 @@ def test_a_parameter_is_no_transition_time_whatever_it_is_called():
 
 def test_warning_of_a_kink():
     fit = made(kinks=(Kink("tau_1", 4.0, -3.0, 5.0),), free_basis=np.eye(3)[:, 1:], cost=28.5)
-    assert only_warning(fit).startswith("tau_1 is at a kink of the cost, where its derivative jumps from -3.0e+00 to")
+    assert only_warning(fit).startswith(
+        "tau_1 is at a kink of the cost, as where a transition meets a sample. It has no"
+    )
     assert line_with(report(fit), "tau_1  ") == "tau_1 4 held s 3 stick -> slip, AT A KINK"
+
+
+def test_kinks_have_one_warning_together():
+    fit = made(
+        kinks=(Kink("tau_1", 4.0, -3.0, 5.0), Kink("tau_2", 7.0, -1.0, 1.0)), free_basis=np.eye(3)[:, 2:], cost=29
+    )
+    assert only_warning(fit).startswith("tau_1, tau_2 are at kinks of the cost, as where a transition meets a sample.")
 
 
 def test_warning_of_a_hessian_that_is_not_positive_definite():
@@ -491,7 +505,7 @@ def test_transitions_have_their_places_in_theta():
     text = report(fit)
     assert line_with(text, "dry  ") == "dry stick -> slip -> stick, 0 to 10 s"
     assert line_with(text, "wet.tau_2") == "wet.tau_2 7 s slip -> stick"
-    assert line_with(text, "wet dX") == "wet dX 30 0.1 m/s 1"
+    assert line_with(text, "wet dX") == "wet dX 30 0.1 m/s 1 98.1 %"
 
 
 def test_transitions_of_one_experiment_with_the_first_fixed():
@@ -502,15 +516,25 @@ def test_transitions_of_one_experiment_with_the_first_fixed():
     assert [(t.name, t.index) for t in fit.transitions] == [("tau_1", None), ("tau_2", 0)]
 
 
-def test_many_experiments_are_cut_short():
-    text = report(several(14))
-    assert "and 4 more experiments" in text
-    assert "run10 " in text
-    assert "run11  " not in text
-    assert "run14.tau_1" in text
+def test_many_experiments_are_cut_short_unless_all_is_asked_for():
+    fit = several(14)
+    text = write_report(fit)
+    assert "and 11 more experiments" in text
+    assert (
+        line_with(text, "run3  ") == "run3 stick -> slip -> stick, 0 to 10 s; X, dX: 30 samples, 1 of 60 values missing"
+    )
+    assert "run4  " not in text
+    assert line_with(text, "mu  ").startswith("mu 0.8")  # what the runs share
+    assert "and 7 more unknowns" in text
+    assert "and 24 more channels" in text
+    assert "run14.tau_1" not in text
+    whole = report(fit)
+    assert all(f"run{e + 1}  " in whole for e in range(14))
+    assert "run14.tau_1" in whole
+    assert "more" not in whole
 
 
-def test_correlations_are_the_largest_first_and_at_most_ten():
+def test_correlations_are_the_largest_first():
     d = 8
     rng = np.random.default_rng(0)
     factor = rng.standard_normal((d, d))
@@ -521,10 +545,14 @@ def test_correlations_are_the_largest_first_and_at_most_ten():
         parameters={name: np.array(1.0) for name in names}, fixed=(), transition_places=(np.array([-1, -1]),),
     )  # fmt: skip
     section = report(fit).split("Correlations above 0.1\n")[1].split("\n\n")[0].splitlines()
-    sizes = [abs(float(line.split()[-1])) for line in section[:10]]
+    sizes = [abs(float(line.split()[-1])) for line in section]
     expected = np.sort(np.abs(fit.correlation[np.tril_indices(d, -1)]))[::-1]
-    assert sizes == pytest.approx(expected[:10], abs=6e-4)
-    assert section[10].strip() == f"and {np.sum(expected > 0.1) - 10} more"
+    expected = expected[expected > 0.1]
+    assert sizes == pytest.approx(expected, abs=6e-4)
+    (line,) = write_report(fit).split("Correlations above 0.1\n")[1].split("\n\n")[0].splitlines()
+    *shown, rest = line.split("; ")
+    assert [abs(float(part.split()[-1])) for part in shown] == pytest.approx(expected[:3], abs=6e-4)
+    assert rest == f"and {len(expected) - 3} more"
 
 
 def test_array_parameters_that_are_fixed_are_abbreviated():

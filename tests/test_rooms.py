@@ -23,6 +23,7 @@ LAYERS = (
     "fit",
     "uncertainty",
     "estimation",
+    "strategy",
     "batch",
     "report",
     "io",

@@ -162,11 +162,12 @@ def test_runs_add_up_to_runs_written_by_hand():
     assert np.count_nonzero(H[9]) > 3  # the initial state tells on the transition time and the parameters of its run
 
 
-def test_all_methods_agree():
+@pytest.mark.parametrize("methods", [("auto", "discrete-adjoint"), pytest.param(METHODS, marks=pytest.mark.slow)])
+def test_methods_agree(methods):
     """With an initial state of which one entry is known, and parameters under other names."""
     start = [0.9, UNKNOWN[0]]
     problem = sf.Problem(SWING, run(initial_state=start, parameter_map={"k": "k_2", "b": "b_2"}), GUESS)
-    found = {method: sf.evaluate(problem, method=method) for method in METHODS}
+    found = {method: sf.evaluate(problem, method=method) for method in methods}
     base = found["auto"]
     for other in found.values():
         assert other.cost == pytest.approx(base.cost, rel=1e-12)

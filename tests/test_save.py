@@ -185,7 +185,7 @@ def test_a_real_fit_comes_back(tmp_path):
 # --- files of earlier versions ----------------------------------------------------------------------------------------
 
 EARLIER = Path(__file__).parent / "saved" / "version_3.json"
-"""A fit of two runs that ended at a bound and at a kink, as version 3 wrote it, beside the report that was printed."""
+"""A fit of two runs that ended at a bound and at a kink, as version 3 wrote it, beside its whole report."""
 
 
 def earlier(tmp_path, version=3, **changes) -> Path:
@@ -203,9 +203,11 @@ def earlier(tmp_path, version=3, **changes) -> Path:
     return tmp_path / "earlier.json"
 
 
-def test_a_file_of_version_3_prints_the_report_that_it_printed_then():
+def test_a_file_of_version_3_prints_the_same_report_as_ever():
     loaded = sf.Estimate.load(EARLIER)
-    assert f"{loaded}\n\n{loaded.certificate}\n" == EARLIER.with_suffix(".txt").read_text(encoding="utf-8")
+    assert f"{loaded.report(full=True)}\n\n{loaded.certificate}\n" == EARLIER.with_suffix(".txt").read_text(
+        encoding="utf-8"
+    )
 
 
 def test_sentences_of_version_3_become_data(tmp_path):
@@ -232,6 +234,19 @@ def test_a_file_of_version_2_lacks_what_came_with_version_3(tmp_path):
     assert {trajectory.time_unit for trajectory in fit.trajectories} == {"s"}
     assert (fit.engine, fit.idle, fit.integration_error_of, certificate.integration_error_of) == (None, (), "J", "J")
     assert fit.message.startswith("Converged, but the cost is flat to second order along -0.73 wet.tau_2 -0.69 wet")
+
+
+def test_a_file_of_version_4_lacks_what_came_with_version_5(tmp_path):
+    save_fit(replace(made(), starts=(40, 0, 12)), CERTIFICATE, tmp_path / "fit.json")
+    content = json.loads((tmp_path / "fit.json").read_text(encoding="utf-8"))
+    assert content["fit"].pop("starts") == [40, 0, 12]
+    for comparison in content["fit"]["comparisons"][0]:
+        assert comparison.pop("weights") is None
+    del content["verdict"]
+    (tmp_path / "fit.json").write_text(json.dumps(content | {"version": 4}), encoding="utf-8")
+    fit, certificate = load_fit(tmp_path / "fit.json")
+    assert_same(made(), fit)
+    assert_same(CERTIFICATE, certificate)
 
 
 def test_a_file_of_an_earlier_version_is_saved_as_one_of_this(tmp_path):
@@ -322,9 +337,9 @@ def test_a_missing_file(tmp_path):
         (b'{"format": "switchfit fit", "version": 2, "version": 2}', "it has the entry 'version' twice"),
         (b"[1, 2]", 'no entry "format": "switchfit fit"'),
         (b'{"theta": [1.0]}', 'no entry "format": "switchfit fit"'),
-        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads the versions 2, 3 and 4"),
-        (b'{"format": "switchfit fit", "version": 1}', "of version 1; this switchfit reads the versions 2, 3 and 4"),
-        (b'{"format": "switchfit fit", "version": 4}', "is damaged: fit must be an object; got null"),
+        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads the versions 2, 3, 4 and 5"),
+        (b'{"format": "switchfit fit", "version": 1}', "of version 1; this switchfit reads the versions 2, 3, 4 and 5"),
+        (b'{"format": "switchfit fit", "version": 5}', "is damaged: fit must be an object; got null"),
         (b'{"format": "switchfit fit", "version": 3}', "is damaged: it is not what version 3 holds .KeyError: 'fit'"),
         (b'{"format": "switchfit fit", "version": 3, "fit": [], "certificate": {}}', "is not what version 3 holds"),
         (b'{"format": "switchfit fit", "version": true}', "of version True; this switchfit reads"),

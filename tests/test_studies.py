@@ -42,15 +42,19 @@ def no_failure(study):
     assert study.failures == [], study.failures[:3]
 
 
-# Short forms
+# Short forms: of each kind one by default
 
 
-@pytest.mark.parametrize("name", MULTISTART)
+def with_slow(default, *others):
+    return [default, *(pytest.param(name, marks=pytest.mark.slow) for name in others)]
+
+
+@pytest.mark.parametrize("name", with_slow("fishing", *sorted(MULTISTART.keys() - {"fishing"})))
 def test_starts(name):
     no_failure(start_anywhere(name, 40, seed=1))
 
 
-@pytest.mark.parametrize("name", ["thermostat", "ramps"])
+@pytest.mark.parametrize("name", with_slow("thermostat", "ramps"))
 def test_refits(name):
     study = fit_again(name, 150, seed=1, from_guess=True)
     no_failure(study)

@@ -5,9 +5,10 @@ from switchfit.batch.logs import estimate_many
 from switchfit.batch.resampling import Bootstrap, bootstrap
 from switchfit.batch.simulated import MonteCarlo, monte_carlo
 from switchfit.batch.starts import Multistart, multistart
-from switchfit.estimation.estimator import Estimate, estimate
+from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluation, evaluate
 from switchfit.fit.guards import GuardedEvaluation, evaluate_on_guards
+from switchfit.fit.result import Step
 from switchfit.fit.termination import Kink, Termination
 from switchfit.fit.trajectory import Comparison, Trajectory, simulate
 from switchfit.optimize import Status
@@ -27,6 +28,7 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.xla import compile_small_loops_whole
+from switchfit.strategy.choice import estimate
 from switchfit.uncertainty.certificate import Certificate
 from switchfit.uncertainty.derivative_check import DerivativeCheck, check_derivatives
 from switchfit.uncertainty.identification import Direction, Identifiability, identifiability
@@ -73,6 +75,7 @@ __all__ = [
     "ResidualDiagnostics",
     "RunningCost",
     "Status",
+    "Step",
     "TerminalConstraint",
     "TerminalCost",
     "Termination",

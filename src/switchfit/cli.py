@@ -82,13 +82,16 @@ def fit(
     certificate: Annotated[
         bool, typer.Option("--certificate", help="Check with the paper's equations too, and print how.")
     ] = False,
+    full: Annotated[
+        bool, typer.Option("--full", help="Report all runs, channels, unknowns and warnings, not one screen.")
+    ] = False,
     debug: Debug = False,
 ) -> None:
     """Estimate transition times and parameters; report on the terminal, report and figure in --out.
 
     Options given here win over those in the problem file. Ctrl-C stops after the iteration that is under way and
-    reports what was found. Exit code 0: converged; 1: not converged, what was found is still written; 2: something
-    is wrong with what was given.
+    reports what was found. Exit code 0: converged, the verdict is good or doubtful; 1: not converged or bad, what was
+    found is still written; 2: something is wrong with what was given.
     """
     given = {"hessian": hessian, "tolerance": tolerance, "max_iterations": max_iterations}
     with _report_errors(debug):
@@ -99,7 +102,7 @@ def fit(
             _make_folder(out)
         estimate = _estimate(loaded, options, prepare_figures=figures)
         checked = f"\n\nCertificate\n{estimate.certificate}" if certificate else ""
-        report = str(estimate) + checked  # after the certificate, which it begins with where that fails
+        report = estimate.report(full=full) + checked  # after the certificate, which counts in the verdict
         _print(report)
         if out is not None:
             _write(out / "report.txt", report + "\n")
@@ -111,7 +114,8 @@ def fit(
                 _write(out / "fit.png", figure.getvalue())
             _print(f"written to {out}", err=True)
     if not estimate.success:
-        _print(f"switchfit: not converged. {estimate.message}", err=True)
+        reason = "" if estimate.status.successful else f"not converged. {estimate.message}"
+        _print(f"switchfit: {reason or 'the fit is bad; the first line of the report says why.'}", err=True)
         raise typer.Exit(NOT_CONVERGED)
 
 

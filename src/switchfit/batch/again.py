@@ -9,7 +9,7 @@ import numpy as np
 
 from switchfit.batch.program import Chunk
 from switchfit.discretization.mesh import Mesh
-from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, Estimate, estimate
+from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, Estimate, fit_locally
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import inverse_on
@@ -45,7 +45,7 @@ def redo_unresolved(
             problem = problem_of(k)
             if is_resolved(problem, meshes, arrays["theta"][k]):
                 continue
-            again = estimate(problem, start=arrays["theta"][k], tolerance=tolerance, max_iterations=max_iterations)
+            again = fit_locally(problem, start=arrays["theta"][k], tolerance=tolerance, max_iterations=max_iterations)
         except Exception:  # this end allows no fit of its own: what was found stays, and is listed
             continue
         if again.status.successful:

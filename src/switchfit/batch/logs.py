@@ -15,7 +15,7 @@ from switchfit.batch.again import adopt, is_resolved
 from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import Fits, check_long_run, count_samples, repeat
 from switchfit.batch.program import Varying, chunk_size, error_message, fit_chunk, make_failed_chunk
-from switchfit.estimation.estimator import check_settings, estimate
+from switchfit.estimation.estimator import check_settings, fit_locally
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import is_sigma_known
 from switchfit.optimize import Status
@@ -157,7 +157,9 @@ class _Work:
         theta, cost = arrays["theta"][k], float(arrays["cost"][k])
         if not is_resolved(problem, evaluator_of(problem).meshes, theta, cost):
             adopt(
-                arrays, k, estimate(problem, tolerance=self.tolerance, max_iterations=self.max_iterations, start=theta)
+                arrays,
+                k,
+                fit_locally(problem, tolerance=self.tolerance, max_iterations=self.max_iterations, start=theta),
             )
 
     def fingerprint(self) -> str:

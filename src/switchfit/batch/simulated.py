@@ -19,7 +19,7 @@ from switchfit.batch.program import Varying, chunk_size, fit_chunk, with_errors
 from switchfit.discretization.arguments import build_arguments, split_by_cell
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh
-from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, check_settings, estimate
+from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, check_settings, fit_locally
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.guards import place_on_near_guards
@@ -202,7 +202,7 @@ def monte_carlo(
     began = time.perf_counter()
     given = None if theta is None else problem.check_theta(theta)
     begin = None if start is None else problem.check_theta(start, "start")
-    truth = estimate(problem).theta if given is None else place_on_near_guards(evaluator_of(problem), given)
+    truth = fit_locally(problem).theta if given is None else place_on_near_guards(evaluator_of(problem), given)
     begin = truth if begin is None else begin
     found, error = fit_simulated(
         problem,

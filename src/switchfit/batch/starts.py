@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,24 +18,24 @@ from switchfit.batch.fits import Fits, check_long_run, count_samples, repeat
 from switchfit.batch.program import Varying, chunk_size, error_message, fit_chunk
 from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
-from switchfit.estimation.estimator import Estimate, check_settings, estimate
+from switchfit.estimation.estimator import Estimate, check_settings, fit_locally
 from switchfit.fit.evaluator import evaluator_of
+from switchfit.fit.random_starts import MOST_DRAWN, draw_starts
 from switchfit.fit.solution import constraints_of
 from switchfit.optimize import Status
-from switchfit.optimize.qp import solve_qp
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_array, as_count, as_instance, as_seed, join_names
+from switchfit.problem.validation import as_array, as_count, as_instance, as_seed
 from switchfit.runtime.presentation import draw_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MOST_DRAWN = 2**30
-"""Points that SciPy's Sobol sequences have."""
-
 ENDS_TRIED = 10
 """Ends from which a full estimate is tried, the lowest first."""
+
+CLEARLY_LOWER = 1e-4
+"""Part of the best cost by which another end is better: on the mesh that all starts share costs are less accurate."""
 
 SAME_COST = 1e-6
 """Two ends are one minimum if their costs differ by less than this part of them, and ..."""
@@ -155,7 +154,10 @@ def multistart(
     check_long_run(client, folder, callback)
     began = time.perf_counter()
     several = hasattr(type(starts), "__len__")
-    points = _check_starts(problem, starts) if several else _draw_starts(problem, starts, seed)
+    if several:
+        points = _check_starts(problem, starts)
+    else:
+        points = draw_starts(problem, as_count(starts, "starts", at_least=1, at_most=MOST_DRAWN), seed)
     work = _Work(problem, list(evaluator_of(problem).meshes), points, tolerance, max_iterations)
     found = repeat(problem, work, len(points), "Multistart", began, client=client, folder=folder, callback=callback)
     best, errors = _find_best(problem, Fits(**found), tolerance, max_iterations)
@@ -164,7 +166,17 @@ def multistart(
         for k, error in errors.items():
             status[k], message[k] = Status.ERROR.name, error_message(error)
         found |= {"status": status.astype(str), "message": message.astype(str)}
-    return Multistart(**found, clusters=_find_clusters(problem, Fits(**found)), best=best)
+    clusters = _find_clusters(problem, Fits(**found))
+    if best is not None:
+        best = replace(best, starts=_count_starts(Fits(**found), clusters, best.cost))
+    return Multistart(**found, clusters=clusters, best=best)
+
+
+def _count_starts(fits: Fits, clusters: NDArray[np.int64], best: float) -> tuple[int, int, int]:
+    """Return how many starts there were beside the one that ended in the best, how many ended lower, how many there."""
+    costs = fits.cost[fits.success]
+    better = int(np.sum(costs < best - CLEARLY_LOWER * abs(best)))
+    return len(fits) - 1, better, max(int(np.sum(clusters == 0)) - 1, 0)
 
 
 def _find_best(
@@ -175,7 +187,7 @@ def _find_best(
     for k in np.lexsort((np.nan_to_num(fits.cost, nan=np.inf), ~fits.success))[:ENDS_TRIED].tolist():
         start = fits.theta[k] if np.isfinite(fits.theta[k]).all() else fits.start[k]
         try:
-            return estimate(problem, start=start, tolerance=tolerance, max_iterations=max_iterations), errors
+            return fit_locally(problem, start=start, tolerance=tolerance, max_iterations=max_iterations), errors
         except Exception as error:  # of this end alone: listed
             errors[k] = error
     return None, errors
@@ -229,59 +241,6 @@ def _check_starts(problem: Problem, starts: Any) -> FloatArray:
         if np.any(slack < -1e-12 * (1 + np.max(np.abs(point)))):
             raise ValueError(f"start {k} violates: {constraints.names[int(np.argmin(slack))]}.")
     return points
-
-
-def _draw_starts(problem: Problem, starts: Any, seed: int) -> FloatArray:
-    """Return starts from a Sobol sequence: (S, d)."""
-    from scipy.stats import qmc  # here, since importing it takes longer than most fits
-
-    count = as_count(starts, "starts", at_least=1, at_most=MOST_DRAWN)
-    unknowns = problem.unknowns
-    is_time = np.zeros(len(unknowns.names), dtype=bool)
-    for where in unknowns.times:
-        is_time[where[where >= 0]] = True
-    unbounded = ~is_time & ~(np.isfinite(unknowns.lower) & np.isfinite(unknowns.upper))
-    unbounded |= unknowns.log & (unknowns.lower <= 0)
-    if unbounded.any():
-        names = join_names(np.array(unknowns.names)[unbounded])
-        raise ValueError(
-            f"multistart draws starts between bounds, but there are none for {names}: give sf.Parameter(..., "
-            "lower=..., upper=...), or the starts themselves."
-        )
-    sobol = qmc.Sobol(len(unknowns.names), seed=seed)
-    cube = sobol.random(1 << max(count - 1, 0).bit_length())[:count]
-    low, high = np.where(is_time, 0.0, unknowns.lower), np.where(is_time, 1.0, unknowns.upper)
-    points = low + cube * (high - low)
-    log = unknowns.log
-    points[:, log] = low[log] * (high[log] / low[log]) ** cube[:, log]
-    for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
-        for begin, end, group in _list_stretches(experiment, where):
-            # Sorted uniform numbers are uniform over all ordered times; the room that minimum durations take is added.
-            room = end - begin - (len(group) + 1) * problem.min_duration
-            ordered = np.sort(cube[:, group], axis=1)
-            points[:, group] = begin + max(room, 0.0) * ordered + problem.min_duration * np.arange(1, len(group) + 1)
-    points[0] = unknowns.initial
-    return np.array([_find_nearest_feasible(problem, point) for point in points])
-
-
-def _list_stretches(experiment: Any, where: NDArray[np.intp]) -> list[tuple[float, float, NDArray[np.intp]]]:
-    """Return groups of free transition times with the fixed times (or ends of the horizon) that enclose them."""
-    knots = np.concatenate([[experiment.t0], experiment.initial_times, [experiment.end]])
-    fixed = [0, *(np.flatnonzero(where < 0) + 1).tolist(), len(knots) - 1]
-    return [(float(knots[a]), float(knots[b]), where[a : b - 1]) for a, b in pairwise(fixed) if b - a > 1]
-
-
-def _find_nearest_feasible(problem: Problem, point: FloatArray) -> FloatArray:
-    """Return the feasible point nearest to `point`, each unknown measured by its own range."""
-    constraints = constraints_of(problem)
-    inside = problem.initial_theta
-    if np.all(constraints.slack(point) >= 0):
-        return point
-    size = np.maximum(np.abs(point - inside), 1e-9 * (1 + np.abs(inside)))
-    matrix = np.diag(1 / size**2)
-    offsets = -np.maximum(constraints.slack(inside), 0.0)
-    step = solve_qp(-(point - inside) / size**2, matrix, constraints.normals, offsets).step
-    return np.clip(inside + step, constraints.lower, constraints.upper)
 
 
 def _find_clusters(problem: Problem, fits: Fits) -> NDArray[np.int64]:

@@ -37,6 +37,7 @@ from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
 from switchfit.runtime.cache import use_compilation_cache
+from switchfit.runtime.errors import NotIntegrableError
 
 T = TypeVar("T")
 
@@ -186,7 +187,7 @@ def _solve(
             what = (
                 f"a running cost in mode {name!r} returned {density}" if finite else f"mode {name!r} returned {slope}"
             )
-            raise ValueError(
+            raise NotIntegrableError(
                 f"{what} at t = {t:.6g}{unit}, x = {y[:-1].tolist()}: the guess leads to where the model is not "
                 "defined or grows without bound; use a better guess, or change the model there."
             )
@@ -204,7 +205,7 @@ def _solve(
         if solver.status == "failed" or _has_too_many_steps(accepted, end):
             remedy = "use solver='stiff', or a better guess" if problem.solver == "explicit" else "use a better guess"
             reason = message or f"it needs more than {MAX_STEPS} steps"
-            raise ValueError(
+            raise NotIntegrableError(
                 f"mode {name!r} cannot be integrated at the guess beyond t = {solver.t:.6g}{unit}, where x = "
                 f"{solver.y[:-1].tolist()} ({reason}): {remedy}."
             )
@@ -283,7 +284,7 @@ def _has_too_many_steps(accepted: Sequence[float] | FloatArray, end: float) -> b
 def _require_finite(value: jax.Array | FloatArray, what: str) -> FloatArray:
     state = np.asarray(value)
     if not np.isfinite(state).all():
-        raise ValueError(f"{what} returned {state.tolist()}, which is not finite: use a better guess.")
+        raise NotIntegrableError(f"{what} returned {state.tolist()}, which is not finite: use a better guess.")
     return state
 
 

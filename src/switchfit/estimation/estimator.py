@@ -467,7 +467,7 @@ class Estimate(Fit):
         return cls(**own, saved_certificate=certificate, problem=problem)
 
 
-def estimate(
+def fit_locally(
     problem: Problem,
     *,
     hessian: HessianKind = "auto",
@@ -476,57 +476,14 @@ def estimate(
     callback: Callable[[IterationRecord], object] | None = None,
     start: ArrayLike | None = None,
 ) -> Estimate:
-    """Estimate all transition times and parameters of a problem together.
-
-    Parameters
-    ----------
-    problem : Problem
-    hessian : {"auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"}
-        Quadratic term of the sequential quadratic programme: equation (3), shifted inside a trust region where it is
-        not positive definite; equation (3), its eigenvalues made positive where they are not, with a line search, which
-        guards and 16 experiments or more have in any case; steepest descent until it is positive definite, then
-        equation (3), as the paper does it (Section II-A); equation (4); the Gauss-Newton matrix; or none (steepest
-        descent).
-    tolerance : float
-        On the KKT residual, the norm of the gradient where no constraint is active. An unknown on a logarithmic scale
-        counts by its logarithm, one whose first guess is below 1e-3 or above 1e3 in units of (about) that guess.
-    max_iterations : int
-        Most iterations on one mesh. Where a fit has converged but the integration error asks for a finer mesh, at most
-        twice, it is resumed there with as many again; ``iterations`` counts all of them.
-    callback : callable, optional
-        Called with each `IterationRecord`; a true return value stops the fit. Ctrl-C does as well; both
-        return the best point so far.
-    start : (d,) array_like, optional
-        Where to begin, in the order of ``problem.theta_names``; the problem's initial guess if left out.
-
-    Returns
-    -------
-    Estimate
-        Also when it did not converge, or is far from the data: see ``.success`` and ``.verdict``.
+    """Fit a problem once from one start: what `estimate` does with ``strategy="local"``, with the same arguments.
 
     Raises
     ------
+    NotIntegrableError
+        For a guess at which the model cannot be integrated.
     ValueError
-        For a bad setting, or a guess at which the model cannot be integrated.
-    TypeError
-        If an argument is of the wrong type.
-
-    See Also
-    --------
-    estimate_many, multistart : many fits.
-    Estimate : what it returns.
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
-    >>> problem = heater_problem()
-
-    >>> fit = sf.estimate(problem)
-    >>> fit.success
-    True
-    >>> fit.transition_times[0].round(2), round(float(fit.parameters["k"]), 2)
-    (array([2.46]), 0.39)
+        For a bad setting, or a model whose cost jumps.
     """
     as_instance(problem, "problem", Problem, "an sf.Problem; several are what sf.estimate_many takes")
     hessian = as_choice(hessian, "hessian", HESSIANS)

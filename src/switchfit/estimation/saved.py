@@ -1,8 +1,8 @@
 """Fits as JSON files that can be read without switchfit, and back again without losing a bit.
 
-A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 5, "fit": {...}, "certificate": {...}}`` with the
-fields of `Verdict`, `Fit` and `Certificate` under their own names; the verdict, and its line of text, are for readers of
-the file, and are judged again from the rest where it is loaded:
+A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 5, "fit": {...}, "certificate": {...}}`` with
+the fields of `Verdict`, `Fit` and `Certificate` under their own names. The verdict, with its line of text, is there for
+readers of the file; where it is loaded it is judged again from the rest:
 
 - numbers are written with as many digits as it takes to read the same float64; JSON has no NaN and no infinities, so
   they are the strings ``"NaN"``, ``"Infinity"`` and ``"-Infinity"``;
@@ -375,6 +375,7 @@ def _upgrade(content: dict[str, Any], version: int) -> None:
         content["fit"].setdefault("starts", None)
         content["fit"]["final_times"] = [run["times"][-1] for run in content["fit"]["trajectories"]]
         content["fit"]["final_places"] = [-1] * len(content["fit"]["trajectories"])
+        content["fit"].setdefault("steps", [])
         for comparison in (comparison for run in content["fit"]["comparisons"] for comparison in run):
             comparison.setdefault("weights", None)
     except (LookupError, TypeError, AttributeError) as error:

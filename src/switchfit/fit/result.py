@@ -53,6 +53,37 @@ class Transition:
     index: int | None
 
 
+@dataclass(frozen=True)
+class Step:
+    """One strategy of a fit: what it brought and what it cost.
+
+    Attributes
+    ----------
+    strategy : str
+        "local", the fit from the first guess, or the name of another; "interrupted".
+    cost : float
+        The lowest J after it.
+    evaluations : int
+    seconds : float
+
+    See Also
+    --------
+    estimate, Estimate.steps
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> [step.strategy for step in sf.estimate(heater_problem(), strategy="thorough").steps][0]
+    'local'
+    """
+
+    strategy: str
+    cost: float
+    evaluations: int
+    seconds: float
+
+
 @dataclass(frozen=True, eq=False)
 class Fit:
     """What an estimation found; d unknowns in the order of `theta_names`.
@@ -129,6 +160,8 @@ class Fit:
         tf, estimated or given.
     final_places : tuple of int, one an experiment
         Where in theta each tf stands; -1 where it is fixed.
+    steps : tuple of Step
+        The strategies that were tried, in their order; empty where the first fit was enough.
     """
 
     theta_names: tuple[str, ...]
@@ -177,6 +210,7 @@ class Fit:
     starts: tuple[int, int, int] | None = None
     final_times: tuple[float, ...] = ()
     final_places: tuple[int, ...] = ()
+    steps: tuple[Step, ...] = ()
 
     @property
     def termination(self) -> Termination:

@@ -8,6 +8,8 @@ References
 .. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapter 3.
 .. [2] W. W. Hager, H. Zhang, A new conjugate gradient method with guaranteed descent and an efficient line search,
    SIAM J. Optim. 16 (2005) 170-192 (line searches below the rounding error of the cost).
+.. [3] R. M. Chamberlain, M. J. D. Powell, C. Lemarechal, H. C. Pedersen, The watchdog technique for forcing convergence
+   in algorithms for constrained optimization, Math. Program. Study 16 (1982) 1-17.
 """
 
 from __future__ import annotations
@@ -26,6 +28,8 @@ from switchfit.optimize.state import Accepted, State
 #: Shortened steps across breakpoints are tried while they still cross this many.
 MANY_BREAKPOINTS = 3
 MAX_BACKTRACKS = 60
+#: Iterations after which a step that fails in a trust region is followed by one more before the region shrinks.
+PATIENCE = 15
 
 
 def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
@@ -68,6 +72,9 @@ def _search_in_box(oracle: Oracle, state: State, direction: Direction) -> Accept
                 problem, direction.radius, direction.step, direction.reduction, point.cost, trial.cost
             )
             return Accepted(trial, length / whole if k else 1.0, radius)
+        corrected = _step_back(oracle, state, direction) if k == 0 and state.iteration >= PATIENCE else None
+        if corrected is not None:
+            return corrected
         if k > 5 and -direction.slope < 0.01 * NOISE * abs(point.cost):
             break
         if 0 < crossed < MANY_BREAKPOINTS and piece is None:
@@ -77,6 +84,28 @@ def _search_in_box(oracle: Oracle, state: State, direction: Direction) -> Accept
             radius = box.SHRINK * length
         direction = find_direction(problem, replace(state, radius=radius), piece)
     return _blind_step(oracle, state, direction)
+
+
+def _step_back(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
+    """Take one more step from where a step has failed: in a curved valley it leads back to the valley's floor ([3]_).
+
+    The point of the failed step is evaluated once more, for the line search keeps none that it refuses.
+    """
+    problem, point = oracle.problem, state.point
+    trial = oracle.point(move(problem, point.theta, direction.step, state.scale), state.scale)
+    if trial is None:
+        return None
+    radius = min(direction.radius, box.measure(problem, direction.step))
+    second = find_direction(problem, replace(state, point=trial, radius=radius))
+    back = move(problem, trial.theta, second.step, state.scale)
+    first = oracle.first(back)
+    noise = NOISE * abs(point.cost)
+    if first is None or not cost_allows(
+        first.cost, point.cost, state.lowest_cost, -direction.slope, noise, ARMIJO_ACROSS
+    ):
+        return None
+    end = oracle.complete(back, first, state.scale)
+    return None if end is None else Accepted(end, 1.0, direction.radius)
 
 
 def _backtrack(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from switchfit.estimation.estimator import Estimate, HessianKind, estimate
+from switchfit.estimation.estimator import Estimate, HessianKind, fit_locally
 from switchfit.fit.evaluator import evaluate
 from switchfit.paper.part import BLUE, COLUMN, DARK, LIGHT, RED, Found, Row, Say, conditions, new_figure, tidy
 from switchfit.paper.vehicle import TRUTH, build_simulated_problem, summary
@@ -46,9 +46,9 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
     }
     for kind in KINDS:
         say(kind)
-        fit = estimate(problem, hessian=kind, max_iterations=20000)
+        fit = fit_locally(problem, hessian=kind, max_iterations=20000)
         found["fits"][kind] = {**summary(fit), "history": thin(fit)}
-    first = estimate(problem, hessian="descent-first")
+    first = fit_locally(problem, hessian="descent-first")
     positive = [np.linalg.eigvalsh(evaluate(problem, record.theta).hessian)[0] > 0 for record in first.history]
     found["descents"] = positive.index(True)
     return found

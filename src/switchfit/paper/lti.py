@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import expm
 
-from switchfit.estimation.estimator import HessianKind, estimate
+from switchfit.estimation.estimator import HessianKind, fit_locally
 from switchfit.fit.evaluator import evaluate
 from switchfit.fit.trajectory import simulate
 from switchfit.paper.convergence import convergence_figure, thin
@@ -125,7 +125,7 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
     }
     for kind in KINDS:
         say(kind)
-        fit = estimate(here, hessian=kind, max_iterations=20000)
+        fit = fit_locally(here, hessian=kind, max_iterations=20000)
         found["fits"][kind] = {**summary(fit), "history": thin(fit)}
     exact_fit = found["fits"]["exact"]["theta"]
     found["error"] = float(np.max(np.abs(np.array(list(exact_fit.values())) - TRUTH)))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from switchfit.estimation.estimator import estimate
+from switchfit.estimation.estimator import fit_locally
 from switchfit.fit.evaluator import evaluate
 from switchfit.models.magic_formula import MAGIC_FORMULA
 from switchfit.paper.part import BLUE, DARK, LIGHT, PAGE, RED, Found, Row, Say, conditions, new_figure, tidy
@@ -55,7 +55,7 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
     }
     for restick in ("continuous", "reset"):
         say(f"fitting stick-slip, {restick} at re-stick")
-        fit = estimate(stick_slip(gps_reference(SECONDS, positions), START, restick=restick))
+        fit = fit_locally(stick_slip(gps_reference(SECONDS, positions), START, restick=restick))
         fitted = states_at(fit.trajectory, SECONDS)[:, [0, 2]]
         found["fits"][restick] = {
             **summary(fit),

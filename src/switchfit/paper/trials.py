@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from switchfit.estimation.estimator import estimate
+from switchfit.estimation.estimator import fit_locally
 from switchfit.fit.trajectory import simulate
 from switchfit.paper.part import COLUMN, DARK, LIGHT, RED, Found, Row, Say, new_figure, tidy
 from switchfit.paper.vehicle import curve, gps_reference, log_on_tyres, states_at, stick_slip, summary, wheel_speeds
@@ -51,7 +51,7 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
         }
         for restick in ("continuous", "reset"):
             problem = stick_slip(reference, START, stick_force=force, restick=restick)
-            fit = estimate(problem)
+            fit = fit_locally(problem)
             fitted = states_at(fit.trajectory, SECONDS)[:, [0, 2]]
             trial["fits"][restick] = {
                 **summary(fit),

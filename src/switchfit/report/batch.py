@@ -92,7 +92,7 @@ def write_bootstrap(study: Bootstrap) -> str:
 
 @format_text.register(Multistart)
 def write_multistart(study: Multistart) -> str:
-    """Return how the fits ended, and a line for each of the ten lowest minima.
+    """Return the verdict on the best, how the fits ended, and a line for each of the ten lowest minima.
 
     Parameters
     ----------
@@ -105,7 +105,8 @@ def write_multistart(study: Multistart) -> str:
         columns = zip(study.theta_names, study.theta[here[0]], study.theta_units, strict=True)
         place = ", ".join(f"{name} = {value:.6g}{unit_suffix(unit)}" for name, value, unit in columns)
         rows.append((f"J = {study.cost[here].min():.9g}", f"{len(here)} starts", place))
-    return "\n".join([*summarise(study), "", f"{minima} minima:", *format_table(rows, "<><")])
+    best = [] if study.best is None else [str(study.best.verdict)]
+    return "\n".join([*best, *summarise(study), "", f"{minima} minima:", *format_table(rows, "<><")])
 
 
 def tabulate_monte_carlo(study: MonteCarlo) -> list[str]:

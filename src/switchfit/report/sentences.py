@@ -181,6 +181,19 @@ def _describe_held_by_bound(issue: Issue) -> str:
     )
 
 
+def _describe_kinks(issue: Issue) -> str:
+    names = _shorten_list(list(issue.subjects))
+    if len(issue.subjects) == 1:
+        return (
+            f"{names} is at a kink of the cost, as where a transition meets a sample. It has no standard error, and "
+            "those of the others take it as known; its profile gives an interval."
+        )
+    return (
+        f"{names} are at kinks of the cost, as where a transition meets a sample. They have no standard errors, and "
+        "those of the others take them as known; their profiles give intervals."
+    )
+
+
 def _describe_hardly_determined(issue: Issue) -> str:
     *others, last = issue.subjects or ("the unknowns",)
     what = f"{', '.join(others)} and {last} apart from one another" if others else last
@@ -312,11 +325,7 @@ _ISSUES: dict[str, Callable[[Issue], str]] = {
         f"{_join(issue)}: acts only in modes that have collapsed. The data say nothing about it, and its value "
         "above is where the fit left it, not an estimate."
     ),
-    "at a kink": lambda issue: (
-        f"{_join(issue)} is at a kink of the cost, where its derivative jumps from {_get(issue, 'left'):.1e} to "
-        f"{_get(issue, 'right'):.1e}; a transition time that meets a sample is one. It has no standard error, and "
-        "those of the others take it as known."
-    ),
+    "at a kink": _describe_kinks,
     "hardly determined": _describe_hardly_determined,
     "no errors: not finite": lambda issue: "No standard errors: the cost or its derivatives are not finite.",
     "no errors: no noise model": lambda issue: (

@@ -2,31 +2,56 @@
 
 from __future__ import annotations
 
+import sys
 import textwrap
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.fit.result import Fit, disagreement
+from switchfit.fit.result import Fit, disagreement, interval
 from switchfit.fit.trajectory import Comparison
 from switchfit.optimize import Status
+from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report.numbers import format_rounded, format_unit, get_unit
 from switchfit.report.tables import format_table
 from switchfit.report.uncertainty import write_direction
+from switchfit.report.verdict import format_share
 from switchfit.runtime.presentation import format_text
-from switchfit.uncertainty.certificate import Certificate, certify
+from switchfit.uncertainty.certificate import Certificate
 from switchfit.uncertainty.identification import WEAK, Identifiability, analyse_solution
 from switchfit.uncertainty.issues import DIFFERENT, find_issues
+from switchfit.uncertainty.quality import explain_channel
+from switchfit.uncertainty.residuals import correct_errors
+from switchfit.uncertainty.verdict import Verdict, judge
 
 WIDTH = 100
 LABEL = 18
 """Columns of the labels at the left."""
-LISTED_CORRELATIONS = 10
-LISTED_EXPERIMENTS = 10
+
+
+class Limits(NamedTuple):
+    """How much of each section is shown; what is left out is counted."""
+
+    experiments: int
+    channels: int
+    unknowns: int
+    fixed: int
+    correlations: int
+    directions: int
+    warnings: int
+
+
+SCREEN = Limits(experiments=3, channels=6, unknowns=10, fixed=4, correlations=3, directions=1, warnings=3)
+"""About 40 lines for most fits."""
+
+EVERYTHING = Limits(*[sys.maxsize] * len(SCREEN))
+
 SMALL_CORRELATION = 0.1
 """Correlations below this in size are not listed."""
+CORRELATIONS = f"Correlations above {SMALL_CORRELATION:g}"
 METHODS = {
     "auto": "SQP with the exact Hessian in a trust region",
     "exact": "SQP with the exact Hessian and a line search",
@@ -37,91 +62,92 @@ METHODS = {
 }
 
 
-def report(fit: Fit, certificate: Certificate | None = None, found: Identifiability | None = None) -> str:
-    """Return what was fitted, how it ended, how well it fits, the unknowns with their errors, and what to be wary of.
+def report(
+    fit: Fit,
+    certificate: Certificate | None = None,
+    found: Identifiability | None = None,
+    *,
+    verdict: Verdict | None = None,
+    full: bool = False,
+) -> str:
+    """Return the verdict, what was fitted, how it ended, how well it fits, the unknowns with their errors, and what to
+    be wary of.
 
     Parameters
     ----------
     fit : Fit
     certificate : Certificate, optional
-        Left out, what can be checked without the model is checked.
+        What it found about the derivatives counts in the verdict.
     found : Identifiability, optional
         Left out, what the Hessian alone tells.
+    verdict : Verdict, optional
+        Of this fit; judged here if left out.
+    full : bool
+        All experiments, channels, unknowns, correlations and directions, and all warnings in full; otherwise a screen,
+        without the warnings that the verdict gives already.
 
     Returns
     -------
     str
-        Several lines without a newline at the end.
+        Several lines without a newline at the end; the verdict first.
     """
+    verdict = judge(fit, certificate) if verdict is None else verdict
+    limits = EVERYTHING if full else SCREEN
+    weak = analyse_solution(fit, None) if found is None else found
     sections = [
-        _format_failure(fit, certify(fit, None) if certificate is None else certificate),
-        _format_section("Fit", [*_format_experiments(fit), *_format_course(fit)]),
-        _format_section("Quality of the fit", [*_format_quality(fit), *_format_channels(fit)]),
-        _format_section("Unknowns", _format_unknowns(fit)),
-        _format_section("Held fixed", _format_fixed(fit)),
-        _format_section(f"Correlations above {SMALL_CORRELATION:g}", _format_correlations(fit)),
+        _wrap(str(verdict), "", "  "),
         _format_section(
-            "Determined worst by the data", _describe_weak(fit, analyse_solution(fit, None) if found is None else found)
+            "Fit", _format_experiments(fit, limits.experiments, full=full) + _format_course(fit, full=full)
         ),
-        _format_section("Warnings", [line for issue in find_issues(fit) for line in _wrap(str(issue), "  - ", "    ")]),
+        _format_section(
+            "Quality of the fit", [*_format_quality(fit, full=full), *_format_channels(fit, limits.channels)]
+        ),
+        _format_section("Unknowns", _format_unknowns(fit, limits.unknowns)),
+        _format_section("Held fixed", _format_fixed(fit, limits.fixed)),
+        _format_section(CORRELATIONS, _format_correlations(fit, limits.correlations, full=full)),
+        _format_section("Determined worst by the data", _describe_weak(fit, weak, limits.directions)),
+        _format_section("Warnings", _format_warnings(fit, verdict, limits.warnings, full=full)),
     ]
-    return "\n\n".join("\n".join(section) for section in sections if section)
+    shown = "\n\n".join("\n".join(section) for section in sections if section)
+    return shown if full else f"{shown}\n\nMore: estimate.report(full=True), switchfit fit --full."
 
 
 @format_text.register(Fit)
-def write_fit(fit: Fit) -> str:
+def write_fit(fit: Fit, *, full: bool = False) -> str:
     """Return the report of a fit, with what can be checked without its model."""
-    return report(fit)
+    return report(fit, full=full)
 
 
 @format_text.register(Estimate)
-def write_estimate(estimate: Estimate) -> str:
+def write_estimate(estimate: Estimate, *, full: bool = False) -> str:
     """Return the report of an estimate, with its certificate if that is known already, and J evaluated where it is
     weak.
     """
-    return report(estimate, estimate.known_certificate, estimate.identifiability)
+    verdict = estimate.verdict
+    return report(estimate, estimate.known_certificate, estimate.identifiability, verdict=verdict, full=full)
 
 
 # --- sections ---------------------------------------------------------------------------------------------------------
 
 
-def _format_failure(fit: Fit, certificate: Certificate) -> list[str]:
-    """Return lines in capitals, unless a minimum was found, it is the only one nearby, and nothing that was checked
-    failed.
-    """
-    if not fit.status.is_strict_minimum:
-        return [f"*** {_FAILURES.get(fit.status, 'NOT CONVERGED: the numbers below are not a minimum')}. ***"]
-    if certificate.passed:
-        return []
-    return _wrap(f"*** CERTIFICATE FAILED: {'; '.join(map(str, certificate.failures))}. ***", "", "    ")
-
-
-_FAILURES = {
-    Status.NONFINITE_START: "NOT STARTED: the numbers below are the first guess",
-    Status.INTERRUPTED: "NOT CONVERGED: interrupted; the numbers below are the best so far",
-    Status.SADDLE: "NOT A MINIMUM: the numbers below are a saddle point of the cost",
-    Status.INFEASIBLE: "CONSTRAINTS NOT MET: the numbers below break a guard or a terminal constraint",
-    Status.SINGULAR: "NOT UNIQUE: other numbers than those below fit the data as well",
-    Status.COLLAPSED: (
-        "A MODE HAS COLLAPSED: it lasts no time at the solution, and what acts in it alone is not determined"
-    ),
-}
-
-
-def _format_experiments(fit: Fit) -> Iterator[str]:
-    """Return each experiment's modes, its horizon and its data."""
+def _format_experiments(fit: Fit, most: int, *, full: bool) -> list[str]:
+    """Return each experiment's modes, its horizon and its data; on one screen of several a line each."""
+    lines: list[str] = []
     single = len(fit.trajectories) == 1
     names = ["experiment"] if single else fit.run_names
-    for name, trajectory, run in list(zip(names, fit.trajectories, fit.comparisons, strict=True))[:LISTED_EXPERIMENTS]:
+    for name, trajectory, run in list(zip(names, fit.trajectories, fit.comparisons, strict=True))[:most]:
         sequence = " -> ".join(mode for mode, _, _ in trajectory.mode_spans)
         horizon = f"{trajectory.times[0]:.6g} to {trajectory.times[-1]:.6g}{unit_suffix(trajectory.time_unit)}"
-        yield from _format_row(name, f"{sequence}, {horizon}")
-        for comparison in run:
-            yield from _format_row("", _format_data(comparison))
-        if not run:
-            yield from _format_row("", "no data: a cost of the trajectory")
-    if len(names) > LISTED_EXPERIMENTS:
-        yield from _format_row("", f"and {len(names) - LISTED_EXPERIMENTS} more experiments")
+        data = [_format_data(comparison) for comparison in run] or ["no data: a cost of the trajectory"]
+        if full or single:
+            lines += _format_row(name, f"{sequence}, {horizon}")
+            for text in data:
+                lines += _format_row("", text)
+        else:
+            lines += _format_row(name, "; ".join([f"{sequence}, {horizon}", *data]))
+    if len(names) > most:
+        lines += _format_row("", f"and {len(names) - most} more experiments")
+    return lines
 
 
 def _format_data(comparison: Comparison) -> str:
@@ -136,21 +162,34 @@ def _format_data(comparison: Comparison) -> str:
     return f"{names}: {_count(len(comparison.times), 'sample')}{note}"
 
 
-def _format_course(fit: Fit) -> Iterator[str]:
+def _format_course(fit: Fit, *, full: bool) -> list[str]:
     """Return method, effort, and how it ended."""
-    yield from _format_row("method", METHODS.get(fit.hessian_kind, fit.hessian_kind))
+    lines = _format_row("method", METHODS.get(fit.hessian_kind, fit.hessian_kind))
     effort = f"{_count(fit.iterations, 'iteration')}, {_count(fit.evaluations, 'evaluation')}, {fit.seconds:.3g} s"
-    yield from _format_row("effort", effort)
-    if fit.engine is not None:
-        yield from _format_row("", str(fit.engine))
-    yield from _format_row("status", fit.message)
+    lines += _format_row("effort", effort if fit.engine is None or full else f"{effort}. {fit.engine}")
+    if fit.engine is not None and full:
+        lines += _format_row("", str(fit.engine))
+    lines += _format_row("status", fit.message if full or not fit.status.successful else _shorten_status(fit))
+    return lines
 
 
-def _format_quality(fit: Fit) -> Iterator[str]:
-    """Return cost, optimality, residual variance, integration error."""
+def _shorten_status(fit: Fit) -> str:
+    """Return how a fit converged; what the verdict, the table of unknowns and the warnings say is left out."""
+    below = fit.optimality <= fit.tolerance
+    where = {
+        Status.CONVERGED_AT_KINK: "Converged at a kink of the cost",
+        Status.CONVERGED_PRECISION: "Converged to the limit of double precision",
+    }.get(fit.status, "Converged")
+    side = "below" if below else "above"
+    return f"{where}: the optimality {fit.optimality:.1e} is {side} the tolerance {fit.tolerance:.1e}."
+
+
+def _format_quality(fit: Fit, *, full: bool) -> Iterator[str]:
+    """Return cost, optimality (which the status says as well), residual variance, integration error."""
     start = f"   (first guess: {fit.history[0].cost:.8g})" if fit.history else ""
     yield from _format_row("cost J", f"{fit.cost:.8g}{start}")
-    yield from _format_row("KKT residual", f"{fit.optimality:.1e}   (tolerance: {fit.tolerance:.1e})")
+    if full:
+        yield from _format_row("KKT residual", f"{fit.optimality:.1e}   (tolerance: {fit.tolerance:.1e})")
     for name, value, multiplier in fit.constraints:
         yield from _format_row(name, f"{value:.1e}   (multiplier {multiplier:.6g})")
     variance, unknowns = fit.residual_variance, _count(fit.free_basis.shape[1], "free unknown")
@@ -168,22 +207,29 @@ def _format_quality(fit: Fit) -> Iterator[str]:
     )
 
 
-def _format_channels(fit: Fit) -> list[str]:
-    """Return a table of the channels: root mean square of the residuals, in units and in sigmas."""
+def _format_channels(fit: Fit, most: int) -> list[str]:
+    """Return a table of the channels: root mean square of the residuals, in units and in sigmas, and the share of the
+    variance that is explained; of more than `most` those that are explained worst.
+    """
     single = len(fit.trajectories) == 1
-    rows = []
+    rows, shares = [], []
     for name, trajectory, run in zip(fit.run_names, fit.trajectories, fit.comparisons, strict=True):
         for comparison in run:
             for k, channel in enumerate(comparison.names):
                 count, rmse, scaled = _format_residuals(comparison, k)
+                share = explain_channel(comparison, k)
                 label = channel if single else f"{name} {channel}"
-                rows.append([label, count, rmse, get_unit(channel, trajectory), scaled])
+                explained = "" if np.isnan(share) else format_share(share)
+                rows.append([label, count, rmse, get_unit(channel, trajectory), scaled, explained])
+                shares.append(np.inf if np.isnan(share) else share)
     if not rows:
         return []
-    most = 4 * LISTED_EXPERIMENTS
-    in_sigmas = "rmse/sigma" if any(row[-1] for row in rows) else ""
-    table = format_table([["channel", "values", "rmse", "", in_sigmas], *rows[:most]], "<>><>")
-    return ["", *table] + ([f"  and {len(rows) - most} more channels"] if len(rows) > most else [])
+    kept = sorted(np.argsort(shares, kind="stable")[: _count_shown(len(rows), most)].tolist())
+    in_sigmas = "rmse/sigma" if any(row[4] for row in rows) else ""
+    header = ["channel", "values", "rmse", "", in_sigmas, "explained"]
+    table = format_table([header, *(rows[k] for k in kept)], "<>><>>")
+    more = len(rows) - len(kept)
+    return ["", *table] + ([f"  and {more} more channels, of which more is explained"] if more else [])
 
 
 def _format_residuals(comparison: Comparison, k: int) -> tuple[str, str, str]:
@@ -198,24 +244,42 @@ def _format_residuals(comparison: Comparison, k: int) -> tuple[str, str, str]:
     return count, f"{rmse:.4g}", "" if isinstance(scaled, str) else f"{np.sqrt(np.mean(scaled**2)):.3g}"
 
 
-def _format_unknowns(fit: Fit) -> list[str]:
-    """Return the table of the unknowns."""
-    errors = fit.standard_errors
+def _format_unknowns(fit: Fit, most: int) -> list[str]:
+    """Return the table of the unknowns; standard errors that are corrected have the naive ones beside them."""
+    naive, errors = fit.standard_errors, correct_errors(fit)
     known = bool(np.isfinite(errors).any())
+    corrected = known and not np.array_equal(naive, errors, equal_nan=True)
     joins = {t.index: f"{t.before} -> {t.after}" for t in fit.transitions}
-    rows = [["", "value", "std. error", "", "", "first guess", ""]]
-    for i, name in enumerate(fit.theta_names):
+    rows = [["", "value", "std. error", "", "naive", "", "first guess", ""]]
+    shown = _select_unknowns(fit, most)
+    for i in shown:
+        name = fit.theta_names[i]
         value, error, relative = format_rounded(fit.theta[i], np.nan if name in fit.idle else errors[i])
+        plain = format_rounded(fit.theta[i], np.nan if name in fit.idle else naive[i])[1]
         prior = f"prior: {fit.priors[name]}" if name in fit.priors else ""
-        notes = [joins.get(i, ""), prior, _format_log_scale(fit, i), _mark_unknown(fit, name)]
+        notes = [joins.get(i, ""), prior, _format_log_scale(fit, i, errors), _mark_unknown(fit, name)]
         note = ", ".join(note for note in notes if note)
-        rows.append(
-            [name, value, error, relative, format_unit(fit.theta_units[i]), f"{fit.initial_theta[i]:.6g}", note]
-        )
+        unit = format_unit(fit.theta_units[i])
+        rows.append([name, value, error, relative, plain, unit, f"{fit.initial_theta[i]:.6g}", note])
+    columns = [k for k in range(8) if (known or k not in (2, 3, 4)) and (corrected or k != 4)]
+    table = format_table([[row[k] for k in columns] for row in rows], "".join("<><><<><"[k] for k in columns))
+    more = len(fit.theta) - len(shown)
+    table += [f"  and {more} more unknowns"] if more else []
     if not known:
-        rows = [row[:2] + row[4:] for row in rows]
-        return format_table(rows, "<><><")
-    return [*format_table(rows, "<><><><"), "", f"  Standard errors from the exact Hessian{_compare_covariances(fit)}."]
+        return table
+    if corrected:
+        allowed = "Standard errors allow for the correlation of the residuals; naive: as if these were independent."
+        return [*table, f"  {allowed}"]
+    return [*table, f"  Standard errors from the exact Hessian{_compare_covariances(fit)}."]
+
+
+def _select_unknowns(fit: Fit, most: int) -> list[int]:
+    """Return which unknowns are listed: of more than `most` first those at a bound, a kink or of a collapsed mode, then
+    parameters, then transition times; in the order of theta.
+    """
+    marked = [bool(_mark_unknown(fit, name)) for name in fit.theta_names] if len(fit.theta) > most else []
+    order = sorted(range(len(fit.theta)), key=lambda i: (not marked[i], bool(fit.is_time[i]))) if marked else None
+    return list(range(len(fit.theta))) if order is None else sorted(order[: _count_shown(len(order), most)])
 
 
 def _compare_covariances(fit: Fit) -> str:
@@ -226,11 +290,14 @@ def _compare_covariances(fit: Fit) -> str:
     return f"; Gauss-Newton's are within {100 * (found.factor - 1):.2g} % of them" if found.factor < DIFFERENT else ""
 
 
-def _format_log_scale(fit: Fit, i: int) -> str:
+def _format_log_scale(fit: Fit, i: int, errors: FloatArray) -> str:
     """Return the interval of an unknown on a logarithmic scale, which its standard error does not say."""
     if fit.theta_names[i] not in fit.log_scaled:
         return ""
     low, high = fit.confidence_intervals()[i]
+    if low < high and errors[i] > fit.standard_errors[i]:
+        ends = interval(fit.theta[i : i + 1], fit.quantile(0.95) * errors[i : i + 1], np.ones(1, dtype=bool))[0]
+        low, high = np.clip(ends, fit.lower[i], fit.upper[i])
     return f"95 % in [{low:.4g}, {high:.4g}]" if low < high else ""
 
 
@@ -244,36 +311,74 @@ def _mark_unknown(fit: Fit, name: str) -> str:
     return "AT A KINK" if name in [kink.unknown for kink in fit.kinks] else ""
 
 
-def _format_fixed(fit: Fit) -> list[str]:
+def _format_fixed(fit: Fit, most: int) -> list[str]:
     """Return transition times and parameters that were not estimated."""
     fixed = [t for t in fit.transitions if t.index is None]
     rows = [[t.name, f"{t.time:.8g}", format_unit(t.unit), f"{t.before} -> {t.after}"] for t in fixed]
     for name in fit.fixed:
         text = np.array2string(fit.parameters[name], precision=8, threshold=6, edgeitems=2, separator=", ")
         rows.append([name, " ".join(text.split()), format_unit(fit.parameter_units[name]), ""])
-    return format_table(rows, "<<<<")
+    more = len(rows) - len(rows[:most])
+    return format_table(rows[:most], "<<<<") + ([f"  and {more} more"] if more else [])
 
 
-def _format_correlations(fit: Fit) -> list[str]:
-    """Return the largest correlations."""
+def _format_correlations(fit: Fit, most: int, *, full: bool) -> list[str]:
+    """Return the largest correlations, in one line or all of them."""
     if not np.isfinite(fit.standard_errors).any():
         return []
     correlation = np.nan_to_num(np.tril(fit.correlation, -1))
     above = np.argwhere(np.abs(correlation) > SMALL_CORRELATION)
     above = above[np.argsort(-np.abs(correlation[tuple(above.T)]), kind="stable")]
     names = fit.theta_names
-    rows = [[f"{names[j]}, {names[i]}", f"{correlation[i, j]:+.3f}"] for i, j in above[:LISTED_CORRELATIONS]]
+    rows = [[f"{names[j]}, {names[i]}", f"{correlation[i, j]:+.3f}"] for i, j in above[:most]]
+    if full or not rows:
+        return format_table(rows, "<>")
     more = len(above) - len(rows)
-    return format_table(rows, "<>") + ([f"  and {more} more"] if more > 0 else [])
+    listed = [f"{pair} {value}" for pair, value in rows] + ([f"and {more} more"] if more > 0 else [])
+    return _wrap("; ".join(listed), "  ", "    ")
 
 
-def _describe_weak(fit: Fit, found: Identifiability) -> list[str]:
+def _describe_weak(fit: Fit, found: Identifiability, most: int) -> list[str]:
     """Return the combinations of unknowns that the data hardly see, if there are any."""
     weak = [d for d in found.directions if d.eigenvalue < WEAK] if fit.status.successful else []
-    return [line for direction in weak for line in _wrap(write_direction(found, direction), "  - ", "    ")]
+    lines = [line for direction in weak[:most] for line in _wrap(write_direction(found, direction), "  - ", "    ")]
+    more = len(weak) - len(weak[:most])
+    return lines + ([f"  and {_count(more, 'direction')} more"] if more else [])
+
+
+_SAID = {
+    "a mode collapsed": {"mode collapsed", "idle times", "idle parameters"},
+    "idle": {"idle times", "idle parameters"},
+    "a mode is short": {"minimum duration"},
+    "at bounds": {"lower bound", "upper bound"},
+    "at kinks": {"at a kink"},
+    "not determined": {"hardly determined", "no errors: not positive definite"},
+    "not converged": {"no errors: not positive definite", "no errors: not finite"},
+    "too few samples": {"no errors: too few samples"},
+    "unexplained": {"sigma too small", "correlated residuals"},
+    "slightly wrong": {"sigma too small"},
+    "sigma too small": {"sigma too small"},
+    "correlated residuals": {"correlated residuals"},
+    "integration error": {"large integration error"},
+}
+"""Kinds of warnings that a reason of the verdict says already."""
+
+
+def _format_warnings(fit: Fit, verdict: Verdict, most: int, *, full: bool) -> list[str]:
+    """Return what to be wary of; on one screen without what the verdict has said."""
+    said = set() if full else set().union(*(_SAID.get(reason.kind, set()) for reason in verdict.reasons))
+    issues = [issue for issue in find_issues(fit) if issue.kind not in said]
+    lines = [line for issue in issues[:most] for line in _wrap(str(issue), "  - ", "    ")]
+    more = len(issues) - len(issues[:most])
+    return lines + ([f"  and {_count(more, 'warning')} more"] if more else [])
 
 
 # --- layout -----------------------------------------------------------------------------------------------------------
+
+
+def _count_shown(count: int, most: int) -> int:
+    """Return how many rows are shown of a table that has room for `most`: fewer where the rest is to be counted."""
+    return count if count <= most else most - 2
 
 
 def _format_section(title: str, lines: Sequence[str]) -> list[str]:

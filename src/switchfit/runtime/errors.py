@@ -1,10 +1,14 @@
-"""The error for everything that is wrong with a file somebody wrote."""
+"""Errors that callers tell from others: a file that somebody wrote is wrong, a model cannot be integrated."""
 
 from __future__ import annotations
 
 
 class InputError(ValueError):
     """Something given is wrong; the message names the file and the key or line, what was given, and what to do."""
+
+
+class NotIntegrableError(ValueError):
+    """The model cannot be integrated at a theta: it is undefined, grows without bound or takes too many steps."""
 
 
 def get_first_line(error: BaseException) -> str:

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray
@@ -97,7 +98,7 @@ def _list_candidates(problem: Problem, theta: FloatArray) -> Iterator[tuple[Floa
 
 
 def _insert(
-    evaluator: Evaluator, theta: FloatArray, where: FloatArray, i: int, behind: list[int], t0: float, tf: float
+    evaluator: Evaluator, theta: FloatArray, where: NDArray[np.intp], i: int, behind: list[int], t0: float, tf: float
 ) -> tuple[FloatArray, int] | None:
     """Put the pair of transitions i and i + 1 in where the cost falls fastest; None if it falls nowhere."""
     times = theta[where]
@@ -123,7 +124,7 @@ def _insert(
 
 
 def _with_pair(
-    theta: FloatArray, where: FloatArray, others: FloatArray, j: int, begin: float, end: float
+    theta: FloatArray, where: NDArray[np.intp], others: FloatArray, j: int, begin: float, end: float
 ) -> FloatArray:
     """Return theta with the transition times `others` and a pair behind the j-th of them."""
     moved = theta.copy()

@@ -29,6 +29,9 @@ STEPS = 3
 SETTLED = (1e-2, 1e-8)
 """Part of the cost below which a predicted fall ends the steps in an interval: in the first scan, in later ones."""
 
+MOST_INTERVALS = 60
+"""Intervals of a transition in the first scan: where there are more samples, several are joined to one."""
+
 NEAR = 2
 """Intervals on either side that later scans look at."""
 
@@ -87,7 +90,8 @@ class Scan:
 
     def __init__(self, problem: Problem, theta: FloatArray, *, everywhere: bool) -> None:
         self.problem, self.theta = problem, theta
-        self.reach, self.settled = (np.inf, SETTLED[0]) if everywhere else (NEAR, SETTLED[1])
+        self.reach: float = np.inf if everywhere else NEAR
+        self.settled = SETTLED[0] if everywhere else SETTLED[1]
         self.evaluator = Evaluator(problem, theta)
         self.evaluations = 0
         touched = np.array([self._touched(e) for e in range(len(problem.experiments))])
@@ -161,7 +165,9 @@ class Scan:
             latest = self.theta[where[i + 1]] if i + 1 < len(where) and where[i + 1] >= 0 else run.end
             earliest = max(earliest, float(self.problem.unknowns.lower[place]))
             latest = min(latest, float(self.problem.unknowns.upper[place]))
-            edges = np.concatenate([[earliest], samples[(samples > earliest) & (samples < latest)], [latest]])
+            inside = samples[(samples > earliest) & (samples < latest)]
+            stride = -(-len(inside) // MOST_INTERVALS) if self.reach == np.inf and len(inside) else 1
+            edges = np.concatenate([[earliest], inside[::stride], [latest]])
             here = int(np.clip(np.searchsorted(edges, self.theta[place], "right") - 1, 0, len(edges) - 2))
             first, last = max(here - self.reach, 0), min(here + self.reach, len(edges) - 2)
             for way in (range(here, int(last) + 1), range(here - 1, int(first) - 1, -1)):
@@ -207,10 +213,11 @@ class Scan:
                 break
             theta = theta.copy()
             theta[own] = np.clip(theta[own] + move, lower, upper)
-        return None if best is None else self._option(*best, o)
+        return None if best is None else self._option(best, o)
 
-    def _option(self, theta: FloatArray, J: float, g: FloatArray, H: FloatArray, moving: FloatArray, o: int) -> Option:
+    def _option(self, best: tuple[Any, ...], o: int) -> Option:
         """Return an option with the slope and curvature that are left where the moving unknowns follow the shared."""
+        theta, J, g, H, moving = best
         s = len(self.shared)
         follows = np.zeros((o, s))
         if not 0 < s <= MOST_SHARED:

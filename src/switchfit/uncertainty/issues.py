@@ -69,8 +69,9 @@ def _find_idle(fit: Fit) -> Iterator[Issue]:
 
 def _find_kinks(fit: Fit) -> Iterator[Issue]:
     """Find unknowns at which the derivative jumps through zero."""
-    for kink in fit.kinks:
-        yield Issue("at a kink", (kink.unknown,), {"left": kink.left, "right": kink.right})
+    if fit.kinks:
+        figures = {"left": tuple(k.left for k in fit.kinks), "right": tuple(k.right for k in fit.kinks)}
+        yield Issue("at a kink", tuple(kink.unknown for kink in fit.kinks), figures)
 
 
 def _find_undetermined(fit: Fit) -> Iterator[Issue]:
@@ -88,6 +89,8 @@ def _find_missing_errors(fit: Fit) -> Iterator[Issue]:
     if not np.isfinite(fit.hessian).all():
         yield Issue("no errors: not finite")
     elif fit.sigma_known is None:
+        if not any(fit.comparisons):  # a cost of the trajectory: there is nothing to be done
+            return
         yield Issue("no errors: no noise model")
     elif fit.sigma_known is False and fit.samples <= k:
         yield Issue("no errors: too few samples", figures={"samples": float(fit.samples), "unknowns": float(k)})

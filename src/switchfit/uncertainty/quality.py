@@ -150,6 +150,21 @@ def measure_quality(fit: Fit) -> Quality:
     )
 
 
+def explain_channel(comparison: Comparison, k: int) -> float:
+    """Return the share of the variance of channel k that is explained; NaN where there is none.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    k : int
+        Which channel, from 0.
+    """
+    if comparison.weights is not None and comparison.weights[k] == 0:
+        return np.nan
+    squares, spread, _ = _sum_squares(comparison, k)
+    return 1 - squares / spread if spread > 0 else np.nan
+
+
 def _sum_squares(comparison: Comparison, k: int) -> tuple[float, float, float]:
     """Return the sums of squares of the residuals of a channel and of its values about their mean, and what both are
     divided by where channels are added; NaN if the channel has no values.

@@ -150,7 +150,9 @@ def judge(fit: Fit, certificate: Certificate | None = None) -> Verdict:
         collapsed = [f._replace(level="bad") for f in collapsed]
     correlated = [f for f in fitting if f.reason.kind == "correlated residuals"]
     found = [*_find_ending(fit), *(f for f in fitting if f not in correlated), *collapsed]
-    found += _judge_starts(fit, confirmed=quality is not None and quality.has_chi_square and not fitting)
+    exact = quality is not None and 1 - quality.explained < NO_RESIDUALS  # there is no better minimum than 0
+    if not exact:
+        found += _judge_starts(fit, confirmed=quality is not None and quality.has_chi_square and not fitting)
     if quality is not None:
         found += _find_undetermined(fit)
         found += _find_bounds(fit)

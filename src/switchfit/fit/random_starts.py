@@ -1,0 +1,84 @@
+"""Starts all over what bounds, order and minimum durations allow."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.fit.solution import constraints_of
+from switchfit.optimize.qp import solve_qp
+from switchfit.problem.data import FloatArray
+from switchfit.problem.problem import Problem
+
+MOST_DRAWN = 2**30
+"""Points that SciPy's Sobol sequences have."""
+
+FACTOR = 10.0
+"""Where a bound is missing: an unknown with a positive guess is drawn between the guess divided and multiplied by this,
+and on a logarithmic scale; any other within its guess, plus or minus so many times its size."""
+
+
+def draw_starts(problem: Problem, count: int, seed: int) -> FloatArray:
+    """Return starts from a scrambled Sobol sequence: (S, d); the first is the problem's initial guess.
+
+    Parameters
+    ----------
+    problem : Problem
+        Unknowns without bounds are drawn around their guesses (`FACTOR`).
+    count, seed : int
+    """
+    from scipy.stats import qmc  # here, since importing it takes longer than most fits
+
+    unknowns = problem.unknowns
+    sobol = qmc.Sobol(len(unknowns.names), seed=seed)
+    cube = sobol.random(1 << max(count - 1, 0).bit_length())[:count]
+    low, high, log = _ranges(problem)
+    points = low + cube * (high - low)
+    points[:, log] = low[log] * (high[log] / low[log]) ** cube[:, log]
+    for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
+        for begin, end, group in _list_stretches(experiment, where):
+            # Sorted uniform numbers are uniform over all ordered times; the room that minimum durations take is added.
+            room = end - begin - (len(group) + 1) * problem.min_duration
+            ordered = np.sort(cube[:, group], axis=1)
+            points[:, group] = begin + max(room, 0.0) * ordered + problem.min_duration * np.arange(1, len(group) + 1)
+    points[0] = unknowns.initial
+    return np.array([find_nearest_feasible(problem, point) for point in points])
+
+
+def _ranges(problem: Problem) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Return between what each unknown is drawn, (d,) and (d,), and whether on a logarithmic scale, (d,)."""
+    unknowns = problem.unknowns
+    guess, is_time = unknowns.initial, unknowns.is_time
+    size = np.where(guess != 0, np.abs(guess), 1.0)
+    open_low = ~np.isfinite(unknowns.lower) | (unknowns.log & (unknowns.lower <= 0))
+    open_high = ~np.isfinite(unknowns.upper)
+    ratio = (guess > 0) & (open_low | open_high) & (unknowns.lower >= 0) | unknowns.log
+    low = np.where(ratio, size / FACTOR, guess - FACTOR * size)
+    high = np.where(ratio, size * FACTOR, guess + FACTOR * size)
+    low = np.where(open_low | ratio & (unknowns.lower <= 0), np.maximum(low, unknowns.lower), unknowns.lower)
+    high = np.where(open_high, np.maximum(high, low), unknowns.upper)
+    ratio &= ~is_time & (low > 0)
+    return np.where(is_time, 0.0, low), np.where(is_time, 1.0, high), ratio
+
+
+def _list_stretches(experiment: Any, where: NDArray[np.intp]) -> list[tuple[float, float, NDArray[np.intp]]]:
+    """Return groups of free transition times with the fixed times (or ends of the horizon) that enclose them."""
+    knots = np.concatenate([[experiment.t0], experiment.initial_times, [experiment.end]])
+    fixed = [0, *(np.flatnonzero(where < 0) + 1).tolist(), len(knots) - 1]
+    return [(float(knots[a]), float(knots[b]), where[a : b - 1]) for a, b in pairwise(fixed) if b - a > 1]
+
+
+def find_nearest_feasible(problem: Problem, point: FloatArray) -> FloatArray:
+    """Return the feasible point nearest to `point`, each unknown measured by its own range."""
+    constraints = constraints_of(problem)
+    inside = problem.initial_theta
+    if np.all(constraints.slack(point) >= 0):
+        return point
+    size = np.maximum(np.abs(point - inside), 1e-9 * (1 + np.abs(inside)))
+    matrix = np.diag(1 / size**2)
+    offsets = -np.maximum(constraints.slack(inside), 0.0)
+    step = solve_qp(-(point - inside) / size**2, matrix, constraints.normals, offsets).step
+    return np.clip(inside + step, constraints.lower, constraints.upper)

@@ -1,0 +1,300 @@
+"""`estimate`: one fit, and where its verdict is not good, strategies that do not depend on the first guess."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection
+from dataclasses import replace
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from switchfit.estimation.estimator import Estimate, fit_locally
+from switchfit.fit.result import Step
+from switchfit.optimize import IterationRecord, Status
+from switchfit.optimize.problem import HessianKind
+from switchfit.problem.data import FloatArray
+from switchfit.problem.problem import GIVEN, Problem
+from switchfit.problem.validation import as_choice, as_positive
+from switchfit.runtime.errors import NotIntegrableError
+from switchfit.strategy.horizon import can_grow, grow_horizon
+from switchfit.strategy.quick import End, fit_briefly
+from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
+from switchfit.strategy.runs import fit_runs_alone, has_runs
+from switchfit.strategy.scan import can_scan, scan_intervals
+from switchfit.strategy.starts import try_starts
+from switchfit.uncertainty.quality import measure_quality
+
+Strategy = Literal["local", "auto", "thorough"]
+STRATEGIES = get_args(Strategy)
+
+MORE_STARTS = "next: more starts"
+"""Step that a verdict advises where the fit may be better elsewhere."""
+
+SCAN, GROW, REINSERT, STARTS = (
+    "scan over sample intervals",
+    "growing horizon",
+    "removal and re-insertion",
+    "many starts",
+)
+"""Names of strategies."""
+
+EVERYWHERE = frozenset({GROW, REINSERT, STARTS})
+"""Strategies that look everywhere."""
+
+PERFECT = 0.9999
+"""Share of the variance of a reference that must be explained for a fit not to need confirmation: wrong ends of the
+benchmarks reach 0.9989."""
+
+MORE_ITERATIONS = 2000
+"""Iterations of a fit that goes on where the first has not converged within those that it was allowed."""
+
+LOWER = 1e-7
+"""Part of the cost by which an end has to be lower to replace the best so far."""
+
+
+def estimate(
+    problem: Problem,
+    *,
+    strategy: Strategy = "auto",
+    hessian: HessianKind = "auto",
+    tolerance: float = 1e-7,
+    max_iterations: int = 200,
+    callback: Callable[[IterationRecord], object] | None = None,
+    start: ArrayLike | None = None,
+    time_budget: float | None = None,
+) -> Estimate:
+    """Estimate all transition times and parameters of a problem together.
+
+    Parameters
+    ----------
+    problem : Problem
+    strategy : {"auto", "local", "thorough"}
+        "local": one fit from the first guess. "auto": more where the verdict on it is not good, and for costs without
+        data, whose verdict knows no quality of fit: transitions free of their guards first, a scan over the sample
+        intervals, a growing horizon, removal and re-insertion of modes, many starts, in this order and as far as they
+        apply, until the verdict is good. "thorough": all of them, whatever the verdict.
+    hessian : {"auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"}
+        Quadratic term of the sequential quadratic programme: equation (3), shifted inside a trust region where it is
+        not positive definite; equation (3), its eigenvalues made positive where they are not, with a line search, which
+        guards and 16 experiments or more have in any case; steepest descent until it is positive definite, then
+        equation (3), as the paper does it (Section II-A); equation (4); the Gauss-Newton matrix; or none (steepest
+        descent). With another than "auto" the strategy is "local" unless "thorough" is asked for.
+    tolerance : float
+        On the KKT residual, the norm of the gradient where no constraint is active. An unknown on a logarithmic scale
+        counts by its logarithm, one whose first guess is below 1e-3 or above 1e3 in units of (about) that guess.
+    max_iterations : int
+        Most iterations on one mesh. Where a fit has converged but the integration error asks for a finer mesh, at most
+        twice, it is resumed there with as many again; ``iterations`` counts all of them.
+    callback : callable, optional
+        Called with each `IterationRecord` of the first fit and of those that end a strategy; a true return value stops.
+        Ctrl-C does as well; both return the best point so far.
+    start : (d,) array_like, optional
+        Where to begin, in the order of ``problem.theta_names``; the problem's initial guess if left out.
+    time_budget : float, optional
+        Seconds after which no further strategy begins, and the many starts end.
+
+    Returns
+    -------
+    Estimate
+        The lowest end that was found, also when it did not converge, or is far from the data: see ``.success`` and
+        ``.verdict``. ``.steps`` says what was tried and what it brought.
+
+    Raises
+    ------
+    ValueError
+        For a bad setting, or where neither the guess nor any other start can be integrated.
+    TypeError
+        If an argument is of the wrong type.
+
+    See Also
+    --------
+    estimate_many, multistart : many fits.
+    Estimate : what it returns.
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> fit = sf.estimate(problem)
+    >>> fit.success
+    True
+    >>> fit.transition_times[0].round(2), round(float(fit.parameters["k"]), 2)
+    (array([2.46]), 0.39)
+    """
+    strategy = as_choice(strategy, "strategy", STRATEGIES)
+    budget = np.inf if time_budget is None else as_positive(time_budget, "time_budget")
+    settings: dict[str, Any] = {"tolerance": tolerance, "max_iterations": max_iterations, "callback": callback}
+    settings["hessian"] = hessian
+    began = time.perf_counter()
+    best: Estimate | None = None
+    try:
+        best = fit_locally(problem, start=start, **settings)
+    except NotIntegrableError:
+        if strategy == "local":
+            raise
+        failure = True
+    else:
+        failure = False
+    if strategy == "local" or (strategy == "auto" and best is not None and _is_enough(best)):
+        assert best is not None
+        return best
+    if strategy == "auto" and hessian != "auto" and best is not None:
+        return best
+    search = Search(problem, best, problem.check_theta(start), strategy, settings, began, budget)
+    search.run()
+    if search.best is None:
+        assert failure
+        return fit_locally(problem, start=start, **settings)  # raises what is wrong with the guess
+    return search.finish()
+
+
+def _is_enough(fit: Estimate, tried: Collection[str] = ()) -> bool:
+    """Return whether nothing more has to be tried: nothing that the verdict doubts could be better elsewhere.
+
+    Where the size of the noise is not known, the residuals of a minimum near the lowest look as good as its own: the
+    intervals between samples have to have been `tried`. Where there is no noise at all, and the quality of the fit is
+    not perfect, a strategy that looks everywhere.
+    """
+    if fit.status is Status.INTERRUPTED:
+        return True
+    if is_doubted(fit):
+        return False
+    assert fit.problem is not None
+    if fit.sigma_known is True or not any(run.transition_times for run in fit.problem.experiments):
+        return True
+    if all(any(comparison.kind == "measurements" for comparison in run) for run in fit.comparisons):
+        return SCAN in tried
+    return not EVERYWHERE.isdisjoint(tried) or measure_quality(fit).explained >= PERFECT
+
+
+def is_doubted(fit: Estimate) -> bool:
+    """Return whether a better end may be elsewhere, by what the verdict says."""
+    return not fit.status.successful or any(step.kind == MORE_STARTS for step in fit.verdict.next_steps)
+
+
+def without_guards(problem: Problem) -> Problem:
+    """Return the same problem with transitions that may happen anywhere, guards or not."""
+    given = {name: getattr(problem, name) for name in GIVEN}
+    return Problem(**given | {"system": replace(problem.system, guards={})})
+
+
+class Search:
+    """The strategies in turn, the best fit so far, and what each brought."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        best: Estimate | None,
+        theta: FloatArray,
+        strategy: Strategy,
+        settings: dict[str, Any],
+        began: float,
+        budget: float,
+    ) -> None:
+        self.problem, self.best, self.theta = problem, best, theta
+        self.strategy, self.settings, self.began, self.budget = strategy, settings, began, budget
+        self.evaluations = 0 if best is None else best.evaluations
+        cost = np.inf if best is None else best.cost
+        self.steps = [Step("local", cost, self.evaluations, time.perf_counter() - began)]
+        self.starts: tuple[int, int, int] | None = None
+
+    @property
+    def late(self) -> bool:
+        """Whether the time budget is spent."""
+        return time.perf_counter() - self.began > self.budget
+
+    def run(self) -> None:
+        """Try one strategy after the other until the verdict is good; Ctrl-C ends it with the best so far."""
+        tried: set[str] = set()
+        try:
+            for name, find in self._list_strategies():
+                if self.late:
+                    break
+                self._try(name, find)
+                tried.add(name)
+                if self.strategy == "auto" and self.best is not None and _is_enough(self.best, tried):
+                    break
+                if self.best is not None and self.best.status is Status.INTERRUPTED:
+                    break
+        except KeyboardInterrupt:
+            if self.best is None:
+                raise
+            self.steps.append(Step("interrupted", self.best.cost, 0, 0.0))
+
+    def finish(self) -> Estimate:
+        """Return the best fit with all that was done."""
+        assert self.best is not None
+        seconds = time.perf_counter() - self.began
+        starts = self.starts
+        return replace(
+            self.best,
+            initial_theta=self.theta,
+            steps=tuple(self.steps),
+            starts=starts,
+            evaluations=self.evaluations,
+            seconds=seconds,
+        )
+
+    def _list_strategies(self) -> list[tuple[str, Callable[[FloatArray], End]]]:
+        """Find what applies to the problem, the cheapest first."""
+        problem = self.problem
+        found: list[tuple[str, Callable[[FloatArray], End]]] = []
+        if self.best is not None and self.best.status is Status.MAX_ITERATIONS:
+            found.append(("more iterations", lambda theta: fit_briefly(problem, theta, MORE_ITERATIONS)))
+        if problem.constraint_names:
+            if any(structure.guarded for structure in problem.structures):
+                found.append(("transitions free of their guards", self._free_transitions))
+            return [*found, (STARTS, self._try_starts)]
+        if has_runs(problem) and (self.best is None or is_doubted(self.best) or self.strategy == "thorough"):
+            found.append(("each run alone", self._fit_runs_alone))
+        if can_scan(problem):
+            found.append((SCAN, lambda theta: scan_intervals(problem, theta)))
+        if can_grow(problem):
+            found.append((GROW, lambda theta: grow_horizon(problem, theta)))
+        if can_reinsert(problem):
+            found.append((REINSERT, lambda theta: reinsert_modes(problem, theta)))
+        return [*found, (STARTS, self._try_starts)]
+
+    def _free_transitions(self, theta: FloatArray) -> End:
+        """Fit with transitions that may happen anywhere, and from there with their guards."""
+        free = estimate(without_guards(self.problem), start=self.theta, time_budget=self._time_left)
+        end = fit_briefly(self.problem, free.theta)
+        return end._replace(evaluations=end.evaluations + free.evaluations)
+
+    def _fit_runs_alone(self, theta: FloatArray) -> End:
+        """Fit each run by itself, then all together."""
+
+        def fit(part: Problem, start: FloatArray) -> tuple[FloatArray, FloatArray, int]:
+            found = estimate(part, start=start, time_budget=self._time_left)
+            return found.theta, found.hessian, found.evaluations
+
+        return fit_runs_alone(self.problem, self.theta, fit)
+
+    @property
+    def _time_left(self) -> float | None:
+        left = self.budget - (time.perf_counter() - self.began)
+        return None if left == np.inf else max(left, 1e-3)
+
+    def _try_starts(self, theta: FloatArray) -> End:
+        found = try_starts(self.problem, theta, stop=lambda: self.late)
+        self.starts = found.tried, 0, found.agreeing
+        return found.end
+
+    def _try(self, name: str, find: Callable[[FloatArray], End]) -> None:
+        """Run one strategy; a full fit follows where its end is lower than the best so far."""
+        began = time.perf_counter()
+        end = find(self.theta if self.best is None else self.best.theta)
+        evaluations = end.evaluations
+        before = np.inf if self.best is None else self.best.cost
+        if end.cost < before - LOWER * abs(before) or (self.best is None and not end.failed):
+            fit = fit_locally(self.problem, start=end.theta, **self.settings)
+            evaluations += fit.evaluations
+            if self.best is None or fit.cost < before:
+                self.best = fit
+        self.evaluations += evaluations
+        cost = np.inf if self.best is None else self.best.cost
+        self.steps.append(Step(name, cost, evaluations, time.perf_counter() - began))

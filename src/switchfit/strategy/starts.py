@@ -1,0 +1,81 @@
+"""Many starts: short fits from points all over the room, until it is unlikely that a minimum has been missed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from switchfit.fit.random_starts import draw_starts
+from switchfit.problem.data import FloatArray
+from switchfit.problem.problem import Problem
+from switchfit.strategy.quick import End, fit_briefly
+
+MOST = 128
+"""Starts at most; a study of more is what `multistart` is for."""
+
+AGREE = 3
+"""Ends at the lowest cost after which the search may stop."""
+
+SAME_COST = 1e-6
+"""Part of the cost by which two ends of one minimum differ at most."""
+
+
+class Starts(NamedTuple):
+    """The lowest end, and how many starts were tried, ended lower than where the search began, and at the lowest."""
+
+    end: End
+    tried: int
+    better: int
+    agreeing: int
+
+
+def try_starts(
+    problem: Problem, theta: FloatArray, *, seed: int = 0, most: int = MOST, stop: Callable[[], bool] = lambda: False
+) -> Starts:
+    """Return the lowest end of short fits from random starts, theta (d,) among them.
+
+    They stop where, after n fits that ended in w different minima, no more than half a minimum is expected to be
+    missing ([1]_), and the lowest has been found `AGREE` times.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : (d,)
+        Where the best fit so far ended.
+    seed : int
+    most : int
+        Starts at most.
+    stop : callable
+        Asked after each fit; true ends the search.
+
+    References
+    ----------
+    .. [1] C. G. E. Boender, A. H. G. Rinnooy Kan, Bayesian stopping rules for multistart global optimization methods,
+       Math. Program. 37 (1987) 59-80.
+    """
+    first = fit_briefly(problem, theta)
+    ends, evaluations = [first], first.evaluations
+    for start in draw_starts(problem, most, seed)[1:]:
+        end = fit_briefly(problem, start)
+        evaluations += end.evaluations
+        ends.append(end)
+        if stop() or _is_enough(np.array([one.cost for one in ends if not one.failed])):
+            break
+    best = min(ends, key=lambda one: one.cost)
+    costs = np.array([one.cost for one in ends[1:]])
+    margin = SAME_COST * abs(best.cost)
+    better = int(np.sum(costs < first.cost - SAME_COST * abs(first.cost)))
+    return Starts(best._replace(evaluations=evaluations), len(costs), better, int(np.sum(costs <= best.cost + margin)))
+
+
+def _is_enough(costs: FloatArray) -> bool:
+    """Return whether the minima with these costs (n,) are likely to be all, and the lowest is no chance find."""
+    n = len(costs)
+    if n == 0:
+        return False
+    ascending = np.sort(costs)
+    w = 1 + int(np.sum(np.diff(ascending) > SAME_COST * np.abs(ascending[1:])))
+    found = int(np.sum(ascending <= ascending[0] + SAME_COST * abs(ascending[0])))
+    return found > AGREE and n > w + 2 and w * (n - 1) / (n - w - 2) < w + 0.5
