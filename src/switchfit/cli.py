@@ -68,6 +68,13 @@ def fit(
     out: Annotated[
         Path | None, typer.Option(help="Folder for report.txt, estimate.json and fit.png.", show_default=False)
     ] = None,
+    strategy: Annotated[
+        Literal["local", "auto", "thorough"] | None,
+        typer.Option(help="One fit, more where its verdict is not good, or all.", show_default="auto"),
+    ] = None,
+    time_budget: Annotated[
+        float | None, typer.Option(min=0.0, help="Seconds after which no further strategy begins.", show_default="none")
+    ] = None,
     hessian: Annotated[
         Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"] | None,
         typer.Option(help="Quadratic term of the optimiser.", show_default="auto"),
@@ -93,7 +100,13 @@ def fit(
     reports what was found. Exit code 0: converged, the verdict is good or doubtful; 1: not converged or bad, what was
     found is still written; 2: something is wrong with what was given.
     """
-    given = {"hessian": hessian, "tolerance": tolerance, "max_iterations": max_iterations}
+    given = {
+        "strategy": strategy,
+        "time_budget": time_budget,
+        "hessian": hessian,
+        "tolerance": tolerance,
+        "max_iterations": max_iterations,
+    }
     with _report_errors(debug):
         loaded = _load(problem)
         options = loaded.options | {key: value for key, value in given.items() if value is not None}

@@ -31,6 +31,9 @@ from switchfit.problem.system import HybridSystem
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import is_device
 
+OPTIONS = {"strategy", "time_budget", "hessian", "tolerance", "max_iterations"}
+"""Options of `estimate`."""
+
 HessianKind = Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"]
 
 
@@ -71,7 +74,7 @@ def load_problem(path: str | Path) -> ProblemFile:
     """
     path = Path(path)
     contents = _validate(path, _parse(path))
-    options = contents.options.model_dump(include={"hessian", "tolerance", "max_iterations"}, exclude_none=True)
+    options = contents.options.model_dump(include=OPTIONS, exclude_none=True)
     build = _build_from_tables if contents.problem is None else _load_from_python
     return ProblemFile(path, build(path, contents), options)
 
@@ -249,8 +252,10 @@ class ExperimentTable(_Table):
     """One run."""
 
     mode_sequence: list[str] = Field(min_length=1, description="names of the modes in the order of their activity")
-    transition_times: list[Annotated[TransitionTable, pydantic.BeforeValidator(_number_as_table)]] = Field(
-        description="first guess of each transition time, in time_unit, one fewer than modes"
+    transition_times: list[Annotated[TransitionTable, pydantic.BeforeValidator(_number_as_table)]] | None = Field(
+        default=None,
+        description="first guess of each transition time, in time_unit, one fewer than modes; left out, they are "
+        "looked for all over the log",
     )
     time_unit: str = Field(
         default="s", min_length=1, description="unit of all times of the run, for the report; nothing is converted"
@@ -292,6 +297,10 @@ class OptionsTable(_Table):
     solver: Literal["explicit", "stiff"] | None = Field(default=None, description="integrator")
     rtol: float | None = Field(default=None, gt=0, description="relative tolerance of the integrator")
     atol: float | None = Field(default=None, gt=0, description="absolute tolerance of the integrator")
+    strategy: Literal["local", "auto", "thorough"] | None = Field(
+        default=None, description="one fit, more where its verdict is not good, or all that can be tried"
+    )
+    time_budget: float | None = Field(default=None, gt=0, description="seconds after which no further strategy begins")
     hessian: HessianKind | None = Field(default=None, description="quadratic term of the optimiser")
     tolerance: float | None = Field(default=None, gt=0, description="optimality at which to stop")
     max_iterations: int | None = Field(default=None, ge=0, description="most iterations")
@@ -545,11 +554,12 @@ def _build_experiment(
         _build_at(place, _build_data, folder, item, system, place, parameters)
         for place, item in zip(places, table.data, strict=True)
     ]
+    times = table.transition_times
     spans = [item.seen_times if isinstance(item, Measurements) else item.signal.knots for item in data]
     return Experiment(
         data=data,
         mode_sequence=tuple(table.mode_sequence),
-        transition_times=tuple(_build_parameter(tau) for tau in table.transition_times),
+        transition_times=None if times is None else tuple(map(_build_parameter, times)),  # type: ignore[arg-type]
         t0=min(span[0] for span in spans) if table.t0 is None else table.t0,
         tf=max(span[-1] for span in spans) if table.tf is None else _build_parameter(table.tf),
         inputs=None if table.inputs is None else _build_at(f"{where}.inputs", _build_input, folder, table.inputs),

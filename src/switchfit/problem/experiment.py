@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -37,9 +37,10 @@ class Experiment:
         `TerminalConstraint` beside them has to hold.
     mode_sequence : sequence of str
         Names of the modes in the order in which they are active; a mode may return.
-    transition_times : sequence of float or Parameter
+    transition_times : sequence of float or Parameter, or None
         First guess of each transition, in the experiment's time unit, one fewer than modes, strictly increasing inside
         ``(t0, tf)``; an entry may be a `Parameter` with bounds, or fixed. Its unit, where given, must be `time_unit`.
+        None: `estimate` looks for them all over the horizon; the guess is evenly spaced.
     t0 : float
         Start of the horizon, in the experiment's time unit.
     tf : float or Parameter
@@ -99,6 +100,7 @@ class Experiment:
     name: str | None = None
     parameter_map: Any = None
     time_unit: str = "s"
+    is_guess_proposed: bool = field(init=False, default=False)
 
     def __post_init__(self) -> None:
         t0, tf = as_number(self.t0, "t0"), _check_final_time(self.tf)
@@ -113,7 +115,10 @@ class Experiment:
         sequence = tuple(as_name(mode, "each of mode_sequence", "the name of a mode") for mode in modes)
         if not sequence:
             raise ValueError("mode_sequence is empty; name at least one mode.")
+        object.__setattr__(self, "is_guess_proposed", self.transition_times is None and len(sequence) > 1)
         given = self.transition_times
+        if given is None:
+            given = np.linspace(t0, last, len(sequence) + 1)[1:-1].tolist()
         several = isinstance(given, Iterable) and getattr(given, "ndim", 1) > 0
         given = as_sequence(given, "transition_times", "a sequence of numbers or sf.Parameter") if several else (given,)
         if len(given) != len(sequence) - 1:
@@ -128,8 +133,8 @@ class Experiment:
             object.__setattr__(self, "name", as_name(self.name, "name of an experiment"))
         if self.initial_state is not None and not callable(self.initial_state):
             object.__setattr__(self, "initial_state", as_state(self.initial_state, "initial_state"))
-        for field, value in (("t0", t0), ("tf", tf), ("mode_sequence", sequence), ("transition_times", times)):
-            object.__setattr__(self, field, value)
+        for name, value in (("t0", t0), ("tf", tf), ("mode_sequence", sequence), ("transition_times", times)):
+            object.__setattr__(self, name, value)
         object.__setattr__(self, "data", _check_data(self.data))
         object.__setattr__(self, "parameter_map", _check_map(self.parameter_map))
         self._check_time_unit()

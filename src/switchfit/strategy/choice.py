@@ -164,6 +164,8 @@ def _is_enough(fit: Estimate, tried: Collection[str] = ()) -> bool:
     if is_doubted(fit):
         return False
     assert fit.problem is not None
+    if any(run.is_guess_proposed for run in fit.problem.experiments) and fit.sigma_known is not True:
+        return not EVERYWHERE.isdisjoint(tried)
     if fit.sigma_known is True or not any(run.transition_times for run in fit.problem.experiments):
         return True
     if all(any(comparison.kind == "measurements" for comparison in run) for run in fit.comparisons):
@@ -199,7 +201,9 @@ class Search:
         self.strategy, self.settings, self.began, self.budget = strategy, settings, began, budget
         self.evaluations = 0 if best is None else best.evaluations
         cost = np.inf if best is None else best.cost
-        self.steps = [Step("local", cost, self.evaluations, time.perf_counter() - began)]
+        proposed = any(run.is_guess_proposed for run in problem.experiments)
+        name = "local, from evenly spaced times" if proposed else "local"
+        self.steps = [Step(name, cost, self.evaluations, time.perf_counter() - began)]
         self.starts: tuple[int, int, int] | None = None
 
     @property
@@ -241,20 +245,23 @@ class Search:
 
     def _list_strategies(self) -> list[tuple[str, Callable[[FloatArray], End]]]:
         """Find what applies to the problem, the cheapest first."""
-        problem = self.problem
+        problem, best = self.problem, self.best
         found: list[tuple[str, Callable[[FloatArray], End]]] = []
-        if self.best is not None and self.best.status is Status.MAX_ITERATIONS:
-            found.append(("more iterations", lambda theta: fit_briefly(problem, theta, MORE_ITERATIONS)))
+        doubted = best is None or is_doubted(best)
         if problem.constraint_names:
             if any(structure.guarded for structure in problem.structures):
                 found.append(("transitions free of their guards", self._free_transitions))
             return [*found, (STARTS, self._try_starts)]
-        if has_runs(problem) and (self.best is None or is_doubted(self.best) or self.strategy == "thorough"):
+        if best is not None and best.status is Status.MAX_ITERATIONS and not can_grow(problem):
+            found.append(("more iterations", lambda theta: fit_briefly(problem, theta, MORE_ITERATIONS)))
+        if has_runs(problem) and (doubted or self.strategy == "thorough"):
             found.append(("each run alone", self._fit_runs_alone))
         if can_scan(problem):
             found.append((SCAN, lambda theta: scan_intervals(problem, theta)))
         if can_grow(problem):
-            found.append((GROW, lambda theta: grow_horizon(problem, theta)))
+            # Far from the data the intervals near by are hopeless.
+            place = 0 if best is None or best.verdict.level == "bad" else len(found)
+            found.insert(place, (GROW, lambda theta: grow_horizon(problem, theta)))
         if can_reinsert(problem):
             found.append((REINSERT, lambda theta: reinsert_modes(problem, theta)))
         return [*found, (STARTS, self._try_starts)]
@@ -289,11 +296,12 @@ class Search:
         began = time.perf_counter()
         end = find(self.theta if self.best is None else self.best.theta)
         evaluations = end.evaluations
-        before = np.inf if self.best is None else self.best.cost
+        # The cost of a fit whose constraints are not met says nothing: any that meets them is better.
+        before = np.inf if self.best is None or self.best.violated else self.best.cost
         if end.cost < before - LOWER * abs(before) or (self.best is None and not end.failed):
             fit = fit_locally(self.problem, start=end.theta, **self.settings)
             evaluations += fit.evaluations
-            if self.best is None or fit.cost < before:
+            if self.best is None or (fit.cost < before and not fit.violated):
                 self.best = fit
         self.evaluations += evaluations
         cost = np.inf if self.best is None else self.best.cost

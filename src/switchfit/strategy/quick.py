@@ -27,12 +27,14 @@ class End(NamedTuple):
 
     @property
     def failed(self) -> bool:
-        """Whether the model could not be evaluated."""
+        """Whether the model could not be evaluated, or a constraint is not met."""
         return not np.isfinite(self.cost)
 
 
 def fit_briefly(problem: Problem, theta: FloatArray, iterations: int = ITERATIONS) -> End:
-    """Return where a short fit from theta (d,) ends; with an infinite cost where it cannot begin."""
+    """Return where a short fit from theta (d,) ends; with an infinite cost where it cannot begin, or where guards or
+    terminal constraints are not met: their violation may make the cost as low as it likes.
+    """
     failed = End(theta, np.inf, 0)
     try:
         evaluator = Evaluator(problem, theta)
@@ -42,4 +44,5 @@ def fit_briefly(problem: Problem, theta: FloatArray, iterations: int = ITERATION
             result = minimize_cost(evaluator, theta, "auto", TOLERANCE, iterations)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return failed
-    return End(result.theta, result.cost, result.evaluations) if np.isfinite(result.cost) else failed
+    usable = np.isfinite(result.cost) and not result.violated
+    return End(result.theta, result.cost if usable else np.inf, result.evaluations)

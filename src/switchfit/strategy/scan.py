@@ -202,7 +202,8 @@ class Scan:
         for step in range(STEPS + 1):
             side = -1 if place >= 0 and theta[place] >= high else 1
             J, g, H = self._derivatives(theta, e, side)
-            g, H = sums @ g, sums @ H @ sums.T
+            with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is looked at below
+                g, H = sums @ g, sums @ H @ sums.T
             if not (np.isfinite(J) and np.isfinite(g).all() and np.isfinite(H).all()):
                 break
             if best is not None and best[1] < J:

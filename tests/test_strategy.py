@@ -1,0 +1,365 @@
+"""From a poor guess to the right answer: each strategy by itself, and how `estimate` chooses among them."""
+
+from itertools import pairwise
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from models import decay
+
+import switchfit as sf
+from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.random_starts import draw_starts
+from switchfit.strategy.choice import without_guards
+from switchfit.strategy.horizon import can_grow, grow_horizon
+from switchfit.strategy.quick import fit_briefly
+from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
+from switchfit.strategy.runs import fit_runs_alone, isolate_run
+from switchfit.strategy.scan import Scan, scan_intervals
+from switchfit.strategy.starts import try_starts
+
+HEATER = sf.HybridSystem({"on": lambda t, x, p: p["power"] - p["k"] * x, "off": lambda t, x, p: -p["k"] * x}, [0.2])
+TRUTH = np.array([1.83, 3.4, 5.32, 6.7, 8.1, 1.0, 0.8])
+TIMES = np.linspace(0.25, 10.0, 40)
+
+
+def temperatures(times, switches, power, k):
+    """Closed form of x' = P(t) - k x with the power on, off, on, ..., from 0.2."""
+    edges = np.concatenate([[0.0], switches, [np.inf]])
+    found, x = np.zeros(len(times)), 0.2
+    for i, (begin, end) in enumerate(pairwise(edges.tolist())):
+        level = power / k if i % 2 == 0 else 0.0
+        inside = (times >= begin) & (times < end)
+        found[inside] = level + (x - level) * np.exp(-k * (times[inside] - begin))
+        x = level + (x - level) * np.exp(-k * (end - begin))
+    return found
+
+
+def thermostat(guess=None, sigma=0.02, modes=("on", "off") * 3):
+    values = temperatures(TIMES, TRUTH[:5], *TRUTH[5:]) + np.random.default_rng(1).normal(0.0, 0.02, len(TIMES))
+    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=sigma), modes, guess, 0.0, 10.0)
+    parameters = {"power": sf.Parameter(1.2, lower=0.2, upper=5.0), "k": sf.Parameter(0.6, lower=0.05, upper=3.0)}
+    return sf.Problem(HEATER, run, parameters)
+
+
+FAR = (0.5, 1.0, 1.5, 2.0, 9.0)
+
+
+@pytest.fixture(scope="module")
+def right():
+    return sf.estimate(thermostat(tuple(TRUTH[:5])), strategy="local")
+
+
+@pytest.fixture(scope="module")
+def far_fit():
+    """A fit from a far guess, by default."""
+    return sf.estimate(thermostat(FAR))
+
+
+def test_one_fit_from_a_far_guess_is_wrong_and_its_verdict_says_so():
+    alone = sf.estimate(thermostat(FAR), strategy="local")
+    assert alone.steps == ()
+    assert alone.verdict.level == "bad"
+    assert not alone.success
+
+
+def test_by_default_the_right_answer_is_found(right, far_fit):
+    assert far_fit.verdict.level == "good"
+    assert far_fit.cost == pytest.approx(right.cost, rel=1e-6)
+    np.testing.assert_allclose(far_fit.theta, right.theta, rtol=1e-5)
+    np.testing.assert_array_equal(far_fit.initial_theta[:5], FAR)
+
+
+def test_what_each_step_brought_is_told(far_fit):
+    assert far_fit.steps[0].strategy == "local"
+    costs = [step.cost for step in far_fit.steps]
+    assert costs == sorted(costs, reverse=True)
+    assert costs[-1] == far_fit.cost < 0.02 * costs[0]
+    assert sum(step.evaluations for step in far_fit.steps) == far_fit.evaluations
+    assert far_fit.seconds >= sum(step.seconds for step in far_fit.steps) > 0
+
+
+def test_a_good_fit_tries_nothing_else(right):
+    again = sf.estimate(thermostat(tuple(TRUTH[:5])))
+    assert again.steps == ()
+    assert again.cost == right.cost
+
+
+def test_transition_times_need_not_be_given(right):
+    problem = thermostat(None)
+    np.testing.assert_allclose(problem.experiments[0].initial_times, np.arange(1, 6) * 10 / 6)
+    assert problem.experiments[0].is_guess_proposed
+    assert not thermostat(FAR).experiments[0].is_guess_proposed
+    found = sf.estimate(problem)
+    assert found.cost == pytest.approx(right.cost, rel=1e-6)
+    # Without a known noise it is not the residuals of the nearest minimum that decide.
+    unknown = sf.estimate(thermostat(None, sigma=None))
+    assert "growing horizon" in [step.strategy for step in unknown.steps]
+    assert unknown.steps[0].strategy == "local, from evenly spaced times"
+    np.testing.assert_allclose(unknown.theta, right.theta, rtol=1e-4)
+
+
+def test_growing_horizon_does_not_depend_on_the_guess(right):
+    ends = [
+        grow_horizon(thermostat(guess), thermostat(guess).initial_theta) for guess in (FAR, (8.0, 8.5, 9.0, 9.3, 9.6))
+    ]
+    for end in ends:
+        assert end.cost == pytest.approx(right.cost, rel=1e-6)
+
+
+def test_growing_horizon_keeps_what_is_fixed_and_bounded(right):
+    guess = (sf.Parameter(1.83, fixed=True), 2.0, 4.0, sf.Parameter(6.0, lower=5.5, upper=6.9), 9.0)
+    problem = thermostat(guess)
+    end = grow_horizon(problem, problem.initial_theta)
+    assert len(end.theta) == 6
+    assert 5.5 <= end.theta[2] <= 6.9
+    near = np.array([3.4, 5.32, 6.7, 8.1, 1.0, 0.8])
+    assert end.cost == pytest.approx(sf.estimate(problem, strategy="local", start=near).cost, rel=1e-6)
+    assert end.cost > right.cost
+
+
+def test_growing_horizon_wants_one_run_with_data():
+    assert can_grow(thermostat(FAR))
+    cost = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("on", "off"), (1.0,), 0.0, 2.0)
+    assert not can_grow(sf.Problem(HEATER, cost, {"power": 1.0, "k": 1.0}))
+    assert not can_grow(sf.Problem(HEATER, thermostat(FAR).experiments * 2, {"power": 1.0, "k": 1.0}))
+
+
+def test_scan_finds_the_lowest_of_all_sample_intervals():
+    """One transition, all else known: the least cost of each interval by a fine grid."""
+    values = temperatures(TIMES, [4.1], 1.0, 0.8) + np.random.default_rng(5).normal(0.0, 0.3, len(TIMES))
+    run = sf.Experiment(sf.Measurements(TIMES, values), ("on", "off"), (9.0,), 0.0, 10.0)
+    problem = sf.Problem(HEATER, run, {"power": sf.Parameter(1.0, fixed=True), "k": sf.Parameter(0.8, fixed=True)})
+    grid = np.linspace(0.01, 9.99, 4000)
+    costs = [0.5 * np.sum((temperatures(TIMES, [tau], 1.0, 0.8) - values) ** 2) for tau in grid]
+    best = grid[int(np.argmin(costs))]
+    end = scan_intervals(problem, np.array([9.0]))
+    assert end.theta[0] == pytest.approx(best, abs=3e-3)
+    assert end.cost <= min(costs) * (1 + 1e-9)
+    assert end.cost < fit_briefly(problem, np.array([9.0])).cost
+
+
+def test_parabolas_of_a_scan_are_those_of_the_cost():
+    """Slope and curvature in the shared unknown, by differences of fits with it held at either side."""
+    problem = two_runs()
+    theta = sf.estimate(problem, strategy="local").theta
+    scan = Scan(problem, theta, everywhere=False)
+    assert [problem.theta_names[k] for k in scan.shared] == ["k"]
+    option = scan._fit_inside(theta, 0, -1, -np.inf, np.inf)
+    assert option is not None
+
+    def least(k):
+        part, places = isolate_run(problem, 0)
+        held = sf.Problem(
+            HEATER, part.experiments[0], {"k": sf.Parameter(k, fixed=True), "power_0": part.parameters["power_0"]}
+        )
+        return sf.estimate(held, strategy="local", start=np.delete(theta[places], 1)).cost
+
+    k, h = theta[scan.shared[0]], 1e-3
+    low, middle, high = least(k - h), least(k), least(k + h)
+    assert option.slope[0] == pytest.approx((high - low) / (2 * h), rel=1e-3)
+    assert option.curvature[0, 0] == pytest.approx((high - 2 * middle + low) / h**2, rel=1e-3)
+
+
+def two_runs(guess=(3.0, 3.0), k=0.5):
+    times = np.linspace(0.25, 6.0, 24)
+    truth, random = ((2.2, 1.0), (4.1, 1.3)), np.random.default_rng(2)
+    runs = []
+    for e, (tau, power) in enumerate(truth):
+        values = temperatures(times, [tau], power, 0.5) + random.normal(0.0, 0.02, len(times))
+        data = sf.Measurements(times, values, sigma=0.02)
+        mapped = {"power": f"power_{e}"}
+        runs.append(sf.Experiment(data, ("on", "off"), (guess[e],), 0.0, 6.0, parameter_map=mapped, name=f"room{e}"))
+    powers = {f"power_{e}": sf.Parameter(1.0, lower=0.01, upper=50.0) for e in range(2)}
+    return sf.Problem(HEATER, runs, {"k": sf.Parameter(k, lower=0.01, upper=5.0), **powers})
+
+
+def test_runs_are_fitted_alone_before_they_are_fitted_together():
+    problem = two_runs()
+    best = sf.estimate(problem, strategy="local")
+    start = problem.initial_theta.copy()
+    start[problem.theta_names.index("room1.tau_1")] = 0.05
+    start[problem.theta_names.index("power_1")] = 40.0
+    alone = sf.estimate(problem, strategy="local", start=start)
+    assert alone.verdict.level == "bad"
+    found = sf.estimate(problem, start=start)
+    assert found.cost == pytest.approx(best.cost, rel=1e-6)
+    assert [step.strategy for step in found.steps] == ["local", "each run alone"]
+
+
+def test_a_run_that_cannot_be_fitted_does_not_end_the_others():
+    problem = two_runs()
+    tried = []
+
+    def fit(part, start):
+        tried.append(part.experiments[0].name)
+        if part.experiments[0].name == "room0":
+            raise ValueError("no")
+        found = sf.estimate(part, start=start, strategy="local")
+        return found.theta, found.hessian, found.evaluations
+
+    end = fit_runs_alone(problem, problem.initial_theta, fit)
+    assert tried == ["room0", "room1"]
+    assert np.isfinite(end.cost)
+
+
+def test_an_isolated_run_has_its_own_unknowns():
+    problem = two_runs()
+    part, places = isolate_run(problem, 1)
+    assert part.theta_names == ("tau_1", "k", "power_1")
+    assert [problem.theta_names[k] for k in places] == ["room1.tau_1", "k", "power_1"]
+
+
+def fishing(guess):
+    """Lotka-Volterra fishing with a bang-bang control of four switches."""
+
+    def field(w):
+        def f(t, x, p):
+            return jnp.stack([x[0] - x[0] * x[1] - 0.4 * w * x[0], -x[1] + x[0] * x[1] - 0.2 * w * x[1]])
+
+        return f
+
+    system = sf.HybridSystem({"rest": field(0.0), "fish": field(1.0)}, [0.5, 0.7])
+    cost = sf.RunningCost(lambda t, x, p: (x[0] - 1.0) ** 2 + (x[1] - 1.0) ** 2)
+    return sf.Problem(system, sf.Experiment(cost, ("rest", "fish") * 2 + ("rest",), guess, 0.0, 12.0))
+
+
+def test_modes_are_removed_and_put_in_elsewhere():
+    best = sf.estimate(fishing((2.4, 4.2, 4.6, 5.0)), strategy="local").cost
+    problem = fishing((8.0, 9.0, 10.0, 11.0))
+    alone = sf.estimate(problem, strategy="local")
+    assert alone.cost > 1.001 * best
+    end = reinsert_modes(problem, alone.theta)
+    assert end.cost < alone.cost
+    assert sf.estimate(problem).cost <= end.cost * (1 + 1e-7)
+    assert end.cost == pytest.approx(best, rel=1e-6)
+
+
+def test_a_mode_is_only_moved_where_the_sequence_stays_the_same():
+    assert can_reinsert(thermostat(FAR))
+    three = sf.HybridSystem(dict.fromkeys("ABC", decay), [1.0])
+    cost = sf.RunningCost(lambda t, x, p: x[0] ** 2)
+    assert not can_reinsert(sf.Problem(three, sf.Experiment(cost, tuple("ABC"), (1.0, 2.0), 0.0, 3.0), {"k": 1.0}))
+
+
+def test_many_starts_stop_when_nothing_new_is_found(right):
+    problem = two_runs()
+    found = try_starts(problem, problem.initial_theta)
+    assert found.tried < 127
+    assert found.agreeing >= 2
+    assert found.end.cost == pytest.approx(sf.estimate(problem, strategy="local").cost, rel=1e-6)
+    few = try_starts(problem, problem.initial_theta, stop=lambda: True)
+    assert few.tried == 1
+
+
+def test_starts_of_unknowns_without_bounds_are_drawn_around_the_guess():
+    run = sf.Experiment(sf.Measurements([1.0, 2.0], [0.5, 0.4]), ("on", "off"), (1.5,), 0.0, 2.0)
+    parameters = {"power": sf.Parameter(2.0, lower=0.0), "k": -0.5}
+    points = draw_starts(sf.Problem(HEATER, run, parameters), 64, seed=0)
+    assert points[:, 1].min() >= 0.2
+    assert points[:, 1].max() <= 20.0
+    assert points[:, 2].min() >= -5.5
+    assert points[:, 2].max() <= 4.5
+    assert np.ptp(np.log(points[:, 1])) > 3
+    assert np.ptp(points[:, 2]) > 7
+    assert ((points[:, 0] > 0) & (points[:, 0] < 2)).all()
+
+
+def test_guards_keep_the_guess():
+    """A ball whose bounces are on a guard: transitions free first, then on it."""
+
+    def fall(t, x, p):
+        return jnp.stack([x[1], -9.81 + 0.0 * x[1]])
+
+    def bounce(t, x, p):
+        return jnp.stack([x[0], -p["e"] * x[1]])
+
+    system = sf.HybridSystem(
+        {"fall": fall},
+        lambda p: jnp.stack([p["z0"], 0.0 * p["z0"]]),
+        reset_maps={("fall", "fall"): bounce},
+        guards={("fall", "fall"): lambda t, x, p: x[0]},
+    )
+    e, z0, impacts, speed, t = 0.8, 1.0, [], np.sqrt(2 * 9.81), np.sqrt(2 / 9.81)
+    for _ in range(3):
+        impacts.append(t)
+        speed *= e
+        t += 2 * speed / 9.81
+    times = np.arange(0.02, 2.0, 0.02)
+
+    def height(time):
+        before = [s for s in impacts if s <= time]
+        if not before:
+            return z0 - 4.905 * time**2
+        v = np.sqrt(2 * 9.81) * e ** len(before)
+        return v * (time - before[-1]) - 4.905 * (time - before[-1]) ** 2
+
+    values = np.array([height(s) for s in times]) + np.random.default_rng(0).normal(0.0, 0.005, len(times))
+    data = sf.Measurements(times, values, observe=lambda t, x, p: x[:1], sigma=0.005)
+    guess = tuple(np.add(impacts, [0.03, -0.03, 0.03]).tolist())
+    run = sf.Experiment(data, ("fall",) * 4, guess, 0.0, 2.0)
+    problem = sf.Problem(system, run, {"e": sf.Parameter(0.7, lower=0.3, upper=1.0), "z0": 1.1})
+    free = without_guards(problem)
+    assert not free.constraint_names
+    assert free.theta_names == problem.theta_names
+    found = sf.estimate(problem)
+    assert found.verdict.level == "good"
+    assert float(found.parameters["e"]) == pytest.approx(e, abs=0.005)
+    assert max(abs(value) for _, value, _ in found.constraints) < 1e-8
+
+
+def test_a_guess_that_cannot_be_integrated_is_a_bad_start():
+    def grow(t, x, p):
+        return p["a"] * x**2
+
+    system = sf.HybridSystem({"grow": grow, "rest": lambda t, x, p: -x}, [1.0])
+    times = np.linspace(0.1, 3.0, 30)
+    before = times < 1.0
+    values = np.where(before, 1 / (1 - 0.5 * np.minimum(times, 1.0)), 2.0 * np.exp(-(times - 1.0)))
+    data = sf.Measurements(times, values + np.random.default_rng(0).normal(0, 0.01, 30), sigma=0.01)
+    run = sf.Experiment(data, ("grow", "rest"), (2.0,), 0.0, 3.0)
+    problem = sf.Problem(system, run, {"a": sf.Parameter(2.0, lower=0.0, upper=4.0)})
+    with pytest.raises(ValueError, match=r"cannot be integrated|grows without bound"):
+        sf.estimate(problem, strategy="local")
+    found = sf.estimate(problem)
+    assert found.verdict.level == "good"
+    np.testing.assert_allclose(found.theta, [1.0, 0.5], atol=0.02)
+
+
+def test_a_budget_of_time_ends_the_search():
+    found = sf.estimate(thermostat(FAR), time_budget=1e-6)
+    assert [step.strategy for step in found.steps] == ["local"]
+    with pytest.raises(ValueError, match="time_budget must be positive"):
+        sf.estimate(thermostat(FAR), time_budget=0.0)
+    with pytest.raises(ValueError, match="strategy must be 'local', 'auto' or 'thorough'; got 'magic'"):
+        sf.estimate(thermostat(FAR), strategy="magic")
+
+
+def test_an_interrupted_search_keeps_the_best(monkeypatch):
+    from switchfit.strategy import choice
+
+    def interrupted(problem, theta):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(choice, "grow_horizon", interrupted)
+    found = sf.estimate(thermostat(FAR))
+    assert found.steps[-1].strategy == "interrupted"
+    assert np.isfinite(found.cost)
+
+
+def test_steps_are_saved(tmp_path, far_fit):
+    far_fit.save(tmp_path / "fit.json")
+    assert sf.Estimate.load(tmp_path / "fit.json").steps == far_fit.steps
+
+
+def test_rows_beside_transitions_are_halved_too():
+    """A transition in the second half of a cell leaves the row behind it as it is where cells are halved."""
+    evaluator = Evaluator(thermostat(FAR))
+    theta = np.array([0.4375, 1.9, 3.4, 6.7, 8.1, 1.0, 0.8])
+    fine = evaluator.halve_rows(theta).meshes[0].times
+    for tau in theta[:5]:
+        coarse = evaluator.meshes[0].times
+        behind = coarse[coarse > tau][0] - tau
+        before = tau - coarse[coarse < tau][-1]
+        assert fine[fine > tau][0] - tau <= 0.5 * behind * (1 + 1e-12)
+        assert tau - fine[fine < tau][-1] <= 0.5 * before * (1 + 1e-12)
