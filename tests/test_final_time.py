@@ -288,13 +288,22 @@ def minimum_time(tf=None, **settings):
 
 @pytest.mark.parametrize("upper", [2.6, 5.0, 8.0, 50.0])
 def test_minimum_time_does_not_depend_on_the_upper_bound(upper):
-    fit = sf.estimate(minimum_time(sf.Parameter(2.5, upper=upper)))
+    fit = sf.estimate(minimum_time(sf.Parameter(2.5, upper=upper)), strategy="local")
     assert fit.success
     np.testing.assert_allclose(fit.theta, [1.0, 2.0], rtol=0, atol=1e-9)
     assert fit.cost == pytest.approx(2.0, abs=1e-9)
     # T = 2 sqrt(q): 1 m more takes dT/dq = 1 s/m longer, which is what the multiplier says.
     assert fit.constraints[0][2] == pytest.approx(-1.0, abs=1e-7)
     assert [name for name, _, _ in fit.constraints] == ["terminal constraint 1", "terminal constraint 2"]
+
+
+def test_a_fit_that_ends_where_constraints_are_not_met_is_not_taken_for_a_better_one():
+    """From there both modes collapse: J = 0 is less than 2, and 1 m short of the goal."""
+    problem, start = minimum_time(), [1.929, 2.284]
+    alone = sf.estimate(problem, start=start, strategy="local")
+    assert alone.status.name == "INFEASIBLE"
+    assert alone.cost == pytest.approx(0.0, abs=1e-6)
+    np.testing.assert_allclose(sf.estimate(problem, start=start).theta, [1.0, 2.0], rtol=0, atol=1e-8)
 
 
 def straight(target=1.0, min_duration=0.0, **bounds):

@@ -298,7 +298,7 @@ class Search:
         evaluations = end.evaluations
         # The cost of a fit whose constraints are not met says nothing: any that meets them is better.
         before = np.inf if self.best is None or self.best.violated else self.best.cost
-        if end.cost < before - LOWER * abs(before) or (self.best is None and not end.failed):
+        if end.cost < before - LOWER * abs(before) if np.isfinite(before) else not end.failed:
             fit = fit_locally(self.problem, start=end.theta, **self.settings)
             evaluations += fit.evaluations
             if self.best is None or (fit.cost < before and not fit.violated):
