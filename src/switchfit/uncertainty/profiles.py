@@ -723,7 +723,7 @@ def _check(fit: Fit) -> None:
     if fit.constraints:
         raise ValueError(
             "a profile knows no guards and no terminal constraints, without which its intervals would be too wide: "
-            "take confidence_intervals, sf.bootstrap or sf.monte_carlo."
+            "take confidence_intervals or sf.monte_carlo."
         )
     if fit.sigma_known is None:
         raise ValueError("a profile needs a noise model: a cost made of Measurements alone, with sigma or without.")
