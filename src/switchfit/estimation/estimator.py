@@ -623,11 +623,6 @@ def _estimate(
         run_names=tuple(name_runs(problem.experiments)),
         transition_times=tuple(times),
         transition_places=tuple(where[: len(tau)] for where, tau in zip(unknowns.times, times, strict=True)),
-        final_times=tuple(float(ends[-1]) for ends in problem.ends_of_modes(result.theta)),
-        final_places=tuple(
-            int(where[-1]) if run.has_free_tf else -1
-            for run, where in zip(problem.experiments, unknowns.times, strict=True)
-        ),
         parameters={name: np.array(value) for name, value in parameters.items()},
         parameter_units={name: parameter.unit for name, parameter in problem.parameters.items()},
         fixed=tuple(name for name, parameter in problem.parameters.items() if parameter.fixed),

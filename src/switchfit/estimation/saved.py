@@ -373,8 +373,6 @@ def _upgrade(content: dict[str, Any], version: int) -> None:
             _upgrade_fit(content["fit"])
             _upgrade_certificate(content["certificate"], content["fit"])
         content["fit"].setdefault("starts", None)
-        content["fit"]["final_times"] = [run["times"][-1] for run in content["fit"]["trajectories"]]
-        content["fit"]["final_places"] = [-1] * len(content["fit"]["trajectories"])
         content["fit"].setdefault("steps", [])
         for comparison in (comparison for run in content["fit"]["comparisons"] for comparison in run):
             comparison.setdefault("weights", None)
@@ -484,10 +482,6 @@ def _check_fit(fit: Fit) -> None:
     _check_size("fit.run_names", fit.run_names, (experiments,), runs)
     _check_size("fit.transition_places", fit.transition_places, (experiments,), runs)
     _check_size("fit.transition_times", fit.transition_times, (experiments,), runs)
-    _check_size("fit.final_times", fit.final_times, (experiments,), runs)
-    _check_size("fit.final_places", fit.final_places, (experiments,), runs)
-    if not all(-1 <= place < d for place in fit.final_places):
-        raise ValueError(f"fit.final_places must lie between -1 and {d - 1}; got {list(fit.final_places)}")
     _check_size("fit.comparisons", fit.comparisons, (experiments,), runs)
     for e, (trajectory, times) in enumerate(zip(fit.trajectories, fit.transition_times, strict=True)):
         _check_trajectory(trajectory, times, e)

@@ -156,10 +156,6 @@ class Fit:
     starts : (tried, better, agreeing) or None
         How many other starts were fitted, how many of them ended lower, and how many in the same minimum; None where
         none were.
-    final_times : tuple of float, one an experiment
-        tf, estimated or given.
-    final_places : tuple of int, one an experiment
-        Where in theta each tf stands; -1 where it is fixed.
     steps : tuple of Step
         The strategies that were tried, in their order; empty where the first fit was enough.
     """
@@ -208,8 +204,6 @@ class Fit:
     violated: tuple[tuple[str, float], ...] = ()
     reason: Issue | None = None
     starts: tuple[int, int, int] | None = None
-    final_times: tuple[float, ...] = ()
-    final_places: tuple[int, ...] = ()
     steps: tuple[Step, ...] = ()
 
     @property
@@ -221,6 +215,18 @@ class Fit:
     def message(self) -> str:
         """How the fit ended as a sentence or two, with what to do."""
         return str(self.termination)
+
+    @property
+    def final_times(self) -> tuple[float, ...]:
+        """tf of each experiment, estimated or given."""
+        return tuple(float(trajectory.times[-1]) for trajectory in self.trajectories)
+
+    @property
+    def final_places(self) -> tuple[int, ...]:
+        """Where in theta the tf of each experiment stands; -1 where it is fixed."""
+        names = ["tf"] if len(self.run_names) == 1 else [f"{run}.tf" for run in self.run_names]
+        free = [name in self.theta_names and name not in self.parameters for name in names]  # a parameter may be "tf"
+        return tuple(self.theta_names.index(name) if own else -1 for name, own in zip(names, free, strict=True))
 
     @property
     def is_time(self) -> NDArray[np.bool_]:

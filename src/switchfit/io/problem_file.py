@@ -122,7 +122,7 @@ def _number_as_table(given: Any) -> Any:
 
 
 def _known_as_table(given: Any) -> Any:
-    """Return ``{ value = 0.5, fixed = true }`` for ``0.5``: a state at t0, or a tf, that is a number is known."""
+    """Return ``{ value = 0.5, fixed = true }`` for ``0.5``: a state at t0 that is given as a number is known."""
     return {"value": given, "fixed": True} if isinstance(given, (int, float)) and not isinstance(given, bool) else given
 
 
@@ -264,7 +264,10 @@ class ExperimentTable(_Table):
         min_length=1, description="what the model is compared with; several tables add up"
     )
     t0: float | None = Field(default=None, description="start of the horizon; left out, the first sample")
-    tf: Annotated[TransitionTable | None, pydantic.BeforeValidator(_known_as_table)] = Field(
+    tf: Annotated[
+        Annotated[float | None, pydantic.Tag("number")] | Annotated[TransitionTable, pydantic.Tag("table")],
+        pydantic.Discriminator(lambda given: "table" if isinstance(given, dict) else "number"),
+    ] = Field(
         default=None,
         description="end of the horizon; left out, the last sample. A number, or a table with value, lower and upper "
         "where it is to be estimated",
@@ -561,13 +564,20 @@ def _build_experiment(
         mode_sequence=tuple(table.mode_sequence),
         transition_times=None if times is None else tuple(map(_build_parameter, times)),  # type: ignore[arg-type]
         t0=min(span[0] for span in spans) if table.t0 is None else table.t0,
-        tf=max(span[-1] for span in spans) if table.tf is None else _build_parameter(table.tf),
+        tf=_build_final_time(table, spans),
         inputs=None if table.inputs is None else _build_at(f"{where}.inputs", _build_input, folder, table.inputs),
         initial_state=_build_initial_state(table),
         parameter_map=table.parameter_map,
         name=table.name,
         time_unit=table.time_unit,
     )
+
+
+def _build_final_time(table: ExperimentTable, spans: list[Any]) -> float | Parameter:
+    """Return tf, of which a table makes an unknown; left out, it is where the data end."""
+    if isinstance(table.tf, TransitionTable):
+        return _build_parameter(table.tf)
+    return float(max(span[-1] for span in spans)) if table.tf is None else table.tf
 
 
 def _build_initial_state(table: ExperimentTable) -> list[Parameter] | list[float] | None:
