@@ -19,6 +19,7 @@ from typing import Annotated, Any, Literal, get_args
 import numpy as np
 import pydantic
 from pydantic import Field
+from pydantic_core import PydanticCustomError
 
 from switchfit.io.csv import read_columns
 from switchfit.io.python_file import call, describe_error, find_object, find_user_place, load_object
@@ -124,6 +125,13 @@ def _number_as_table(given: Any) -> Any:
 def _known_as_table(given: Any) -> Any:
     """Return ``{ value = 0.5, fixed = true }`` for ``0.5``: a state at t0 that is given as a number is known."""
     return {"value": given, "fixed": True} if isinstance(given, (int, float)) and not isinstance(given, bool) else given
+
+
+def _end_as_table(given: Any) -> Any:
+    """Return ``{ value = 6.0, fixed = true }`` for ``6.0``: a tf that is given as a number is known."""
+    if given is not None and not isinstance(given, dict) and _known_as_table(given) is given:
+        raise PydanticCustomError("float_type", "Input should be a valid number")
+    return _known_as_table(given)
 
 
 def _name_as_table(given: Any) -> Any:
@@ -264,10 +272,7 @@ class ExperimentTable(_Table):
         min_length=1, description="what the model is compared with; several tables add up"
     )
     t0: float | None = Field(default=None, description="start of the horizon; left out, the first sample")
-    tf: Annotated[
-        Annotated[float | None, pydantic.Tag("number")] | Annotated[TransitionTable, pydantic.Tag("table")],
-        pydantic.Discriminator(lambda given: "table" if isinstance(given, dict) else "number"),
-    ] = Field(
+    tf: Annotated[TransitionTable | None, pydantic.BeforeValidator(_end_as_table)] = Field(
         default=None,
         description="end of the horizon; left out, the last sample. A number, or a table with value, lower and upper "
         "where it is to be estimated",
@@ -575,9 +580,7 @@ def _build_experiment(
 
 def _build_final_time(table: ExperimentTable, spans: list[Any]) -> float | Parameter:
     """Return tf, of which a table makes an unknown; left out, it is where the data end."""
-    if isinstance(table.tf, TransitionTable):
-        return _build_parameter(table.tf)
-    return float(max(span[-1] for span in spans)) if table.tf is None else table.tf
+    return float(max(span[-1] for span in spans)) if table.tf is None else _build_parameter(table.tf)
 
 
 def _build_initial_state(table: ExperimentTable) -> list[Parameter] | list[float] | None:
