@@ -121,7 +121,7 @@ def test_what_is_fixed_stays_and_is_not_in_theta():
 def test_a_bound_that_is_reached_is_named():
     """The truth is 2: a rate of 1.6 at most is at its bound, has no error of its own and presses against it."""
     found = sf.estimate(capacitor(voltage(TIMES), k=sf.Parameter(GUESS[1:], upper=[1.6, 5.0])))
-    assert found.success
+    assert found.status.successful
     assert found.parameters["k"][0] == 1.6
     (active,) = found.active
     assert (active.kind, active.unknown, active.value) == ("upper bound", "k[0]", 1.6)
@@ -137,14 +137,14 @@ def test_a_bound_that_is_reached_is_named():
 
 def test_a_bound_on_a_transition_time():
     found = sf.estimate(capacitor(voltage(TIMES), tau=sf.Parameter(0.8, lower=0.7, upper=1.0)))
-    assert found.success
+    assert found.status.successful
     assert found.transition_times[0][0] == 0.7
     assert list(map(str, found.active)) == ["tau_1 at its lower bound 0.7"]
 
 
 def test_a_minimum_duration_that_is_reached_is_named():
     found = sf.estimate(capacitor(voltage(TIMES), min_duration=0.75))
-    assert found.success
+    assert found.status.successful
     assert found.transition_times[0][0] == pytest.approx(0.75, abs=1e-12)
     (active,) = found.active
     assert (active.kind, active.mode, active.position, active.value) == ("minimum duration", "charge", 0, 0.75)
@@ -390,9 +390,11 @@ def test_a_mode_that_collapses_between_two_of_the_same_is_reported_as_such():
     known = [found.theta_names.index(name) for name in plain.theta_names]
     np.testing.assert_allclose(found.theta[known], plain.theta, rtol=1e-6)
     np.testing.assert_allclose(found.standard_errors[known], plain.standard_errors, rtol=1e-4)
-    text = str(found)
+    assert str(found).startswith("Doubtful: mode 'drain' collapsed: strategy='thorough', or leave the mode out")
+    assert "MODE COLLAPSED" in str(found)
+    text = found.report(full=True)
     for said in (
-        "A MODE HAS COLLAPSED",
+        "cost depends neither on where it would stand nor on what acts in it alone",
         "Leave it out of mode_sequence",
         "give min_duration",
         "leak: acts only in modes",

@@ -118,7 +118,7 @@ def test_a_switch_hidden_in_a_mode_is_refused():
 
 
 def test_a_hidden_switch_that_is_fixed_is_none_of_ours():
-    assert sf.estimate(hidden_problem(t_on=sf.Parameter(1.7, fixed=True))).success
+    assert sf.estimate(hidden_problem(t_on=sf.Parameter(1.7, fixed=True)), strategy="local").status.successful
 
 
 def smooth(t, x, p):
@@ -132,7 +132,7 @@ def idle(t, x, p):
 
 @pytest.mark.parametrize("mode", [smooth, idle])
 def test_a_derivative_that_is_zero_for_another_reason_is_no_hidden_switch(mode):
-    assert sf.estimate(hidden_problem(mode)).status is sf.Status.SINGULAR
+    assert sf.estimate(hidden_problem(mode), strategy="local").status is sf.Status.SINGULAR
 
 
 def test_a_hidden_switch_at_zero_is_found_between_its_bounds():

@@ -248,7 +248,11 @@ def squeezed(text):
 def test_where_a_time_is_printed_its_unit_is(in_seconds):
     """The test above would pass if no unit was printed at all."""
     for name, pieces in {
-        "report": ["on -> off, 0 to 120 s\n", "%)  s                30  on -> off", "known.tau_1  46  s"],
+        "report": [
+            "on -> off, 0 to 120 s; T: 30 samples\n",
+            "%)  s                30  on -> off",
+            "known.tau_1  46  s",
+        ],
         "identifiability before": ["s later"],
         "profile": ["± 0.10 s\n", "] s   (likelihood ratio"],
         "bootstrap": ["run1.tau_1 (s)"],
@@ -297,7 +301,7 @@ def test_times_without_a_unit():
     """The unit "1" is that of pure numbers, and not shown: as of parameters."""
     problem = sf.Problem(room(), run(time_unit="1"), RATES)
     fit = sf.estimate(problem)
-    assert "on -> off, 0 to 120\n" in str(fit)
+    assert "on -> off, 0 to 120\n" in fit.report(full=True)
     assert [ax.get_xlabel() for ax in fit.plot().axes] == ["", "time"]
     assert "on [0, 120], at 30\n" in describe(problem)
 
@@ -342,8 +346,8 @@ def test_each_experiment_has_its_own_unit(tmp_path):
     fit = sf.estimate(whole)
     assert fit.success
     text = str(fit)
-    assert re.search(r"first +on -> off, 0 to 120 min\n", text)
-    assert re.search(r"later +on -> off, 0 to 2 h\n", text)
+    assert re.search(r"first +on -> off, 0 to 120 min; ", text)
+    assert re.search(r"later +on -> off, 0 to 2 h; ", text)
     assert re.search(r"later\.tau_1 +0\.76666667 +h +on -> off", text)
     labels = [ax.get_xlabel() for ax in fit.plot().axes]
     assert labels == ["", "time (min)", "", "time (h)", "", "time (h)"]

@@ -1,4 +1,4 @@
-"""The verdict on fits: every rule with a fit that it is about and one just beside it, and known right and wrong ends."""
+"""The verdict on fits: every rule with a fit that it is about and one just beside it, and known ends."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def straight(values, *, sigma=None, times=TIMES, a=1.0, b=1.0, **settings) -> sf
     return sf.estimate(curve(line, times, np.asarray(values)[:, None], parameters, tf=float(times[-1]), sigma=sigma))
 
 
-def noise(size=1.0, count=len(TIMES), seed=0) -> np.ndarray:
+def noise(size=1.0, count=100, seed=0) -> np.ndarray:
     return size * np.random.default_rng(seed).standard_normal(count)
 
 
@@ -133,8 +133,8 @@ def test_one_wrong_run_of_many_is_found_and_named():
         return sf.Problem(heated_room(), runs, {"power": 2.0, "k": 0.5})
 
     assert sf.estimate(problem(0.0)).verdict.level == "good"
-    fit = sf.estimate(problem(1.0))
-    assert fit.residual_variance < 1.1
+    fit = sf.estimate(problem(1.5))
+    assert fit.residual_variance < 1.15
     assert fit.verdict.level == "bad"
     assert fit.verdict.reasons[0].subjects == ("room7 T",)
     assert " of room7 T" in str(fit.verdict)
@@ -162,7 +162,7 @@ def test_white_noise_is_noise_however_much_it_is():
 def test_few_samples_cannot_show_that_what_is_left_is_noise():
     times = np.linspace(0.0, 10.0, 12)
     shares = {}
-    for wave in (0.05, 0.7, 4.0):
+    for wave in (0.05, 1.0, 4.0):
         fit = straight(0.5 * times + wave * np.sin(2 * times), times=times)
         shares[fit.verdict.level] = fit.verdict.reasons[0].figures["explained"]
     assert shares["good"] > 0.9 > shares["doubtful"] > 0.5 > shares["bad"]
@@ -171,7 +171,10 @@ def test_few_samples_cannot_show_that_what_is_left_is_noise():
 def test_nothing_is_read_from_residuals_that_are_rounding():
     fit = straight(2.0 + 0.5 * TIMES)
     assert str(fit.verdict) == "Good: the model explains all of the variance."
+    assert replace(fit, integration_error=1.0).verdict.level == "good"
+    assert replace(fit, starts=(40, 3, 0)).verdict.level == "good"
     wave = straight(2.0 + 0.5 * TIMES + 1e-4 * np.sin(2 * TIMES))
+    assert replace(wave, integration_error=1.0).verdict.level == "bad"
     assert kinds(wave) == ["correlated residuals"]
 
 
@@ -197,7 +200,7 @@ def test_outliers_that_a_robust_loss_weighs_down_are_not_missed():
     assert right.verdict.level == "good"
     assert right.verdict.reasons[0].figures["explained"] > 0.99
     wrong = fit(sf.Parameter(-0.2, fixed=True))  # nearly all samples are beyond the scale
-    assert wrong.verdict.level == "bad"
+    assert (wrong.verdict.level, kinds(wrong)) == ("bad", ["mostly outliers"])
 
 
 # --- corrected standard errors ----------------------------------------------------------------------------------------
@@ -608,7 +611,7 @@ def test_the_verdict_costs_nothing_until_it_is_asked_for():
 @pytest.mark.parametrize(
     ("share", "text"),
     [
-        (1.0, "all"), (0.9999999, "all but 1e-6"), (0.99985, "99.98 %"), (0.9949, "99.4 %"), (0.61, "61 %"),
+        (1.0, "all"), (0.9999999, "all but 1e-6"), (0.99985999, "99.985 %"), (0.99499, "99.49 %"), (0.61, "61 %"),
         (0.0, "none"), (-3.0, "none"), (0.95, "95.0 %"),
     ],
 )  # fmt: skip
@@ -648,7 +651,7 @@ transition_times = []
 [[experiments.data]]
 file = "log.csv"
 time = "t"
-channels = ["y"]
+columns = ["y"]
 sigma = 0.1
 """
 
@@ -667,7 +670,7 @@ sigma = 0.1
 def test_exit_codes(tmp_path, wave, arguments, code, first):
     (tmp_path / "model.py").write_text(MODEL)
     (tmp_path / "problem.toml").write_text(FILE)
-    values = 2.0 * TIMES + wave * np.sin(2 * TIMES) + noise(0.1)
+    values = 2.0 * (TIMES - TIMES[0]) + wave * np.sin(2 * TIMES) + noise(0.1)
     rows = "".join(f"{t!r},{y!r}\n" for t, y in zip(TIMES.tolist(), values.tolist(), strict=True))
     (tmp_path / "log.csv").write_text("t,y\n" + rows)
     result = CliRunner().invoke(cli.app, ["fit", str(tmp_path / "problem.toml"), *arguments])

@@ -35,6 +35,7 @@ from switchfit.uncertainty.identification import Direction, Identifiability, ide
 from switchfit.uncertainty.prediction import Prediction, predict
 from switchfit.uncertainty.profiles import Profile, profile
 from switchfit.uncertainty.residuals import ChannelResiduals, ResidualDiagnostics
+from switchfit.uncertainty.verdict import Verdict
 
 compile_small_loops_whole()
 
@@ -81,6 +82,7 @@ __all__ = [
     "Termination",
     "Trajectory",
     "TransitionCost",
+    "Verdict",
     "bootstrap",
     "check_derivatives",
     "estimate",

@@ -25,6 +25,9 @@ MANY_RUNS = 16
 """Experiments from which on the Hessian's shape of an arrow is made use of; with fewer, the algebra of full matrices
 takes no longer (the runs part of the benchmarks)."""
 
+PERFECT_RESIDUAL = 1e-8
+"""Part of the samples that a residual is where a fit is perfect."""
+
 TIME_REACH = 0.01
 """Part of the horizon by which a transition time may move in the first step inside a trust region."""
 
@@ -212,10 +215,15 @@ def _convert_reason(variables: Variables, z: FloatArray, slopes: FloatArray, fou
 def smallest_cost(problem: Problem) -> float:
     """Return a cost below which an error is not measured against it.
 
-    The negative logarithm of a likelihood may be anything, 0 too; its parts are of the size of half the samples.
+    Half a sum of squares: that of residuals of 1e-8 of the samples. The negative logarithm of a likelihood may be
+    anything, 0 too; its parts are of the size of half the samples.
     """
     items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
-    return 1e-300 if is_least_squares(problem) else 0.5 * sum(item.count for item in items)
+    if not is_least_squares(problem):
+        return 0.5 * sum(item.count for item in items)
+    return max(
+        0.5 * PERFECT_RESIDUAL**2 * sum(float(np.nansum(item.weights * item.values**2)) for item in items), 1e-300
+    )
 
 
 def is_least_squares(problem: Problem) -> bool:

@@ -77,7 +77,7 @@ def report(
     ----------
     fit : Fit
     certificate : Certificate, optional
-        What it found about the derivatives counts in the verdict.
+        What failed counts in the verdict; left out, what can be checked without the model is checked.
     found : Identifiability, optional
         Left out, what the Hessian alone tells.
     verdict : Verdict, optional
@@ -357,6 +357,7 @@ _SAID = {
     "too few samples": {"no errors: too few samples"},
     "unexplained": {"sigma too small", "correlated residuals"},
     "slightly wrong": {"sigma too small"},
+    "mostly outliers": {"residuals not normal", "correlated residuals"},
     "sigma too small": {"sigma too small"},
     "correlated residuals": {"correlated residuals"},
     "integration error": {"large integration error"},

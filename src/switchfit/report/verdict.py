@@ -150,6 +150,9 @@ _REASONS: dict[str, Callable[[Issue], str]] = {
         f"sigma looks too small: {_explain_worst(issue)}, and what is left looks like noise"
     ),
     "little explained": _explain,
+    "mostly outliers": lambda issue: (
+        f"the robust loss counts {100 * _figure(issue, 'share'):.0f} % of {_name(issue.subjects)} as outliers"
+    ),
     "too few samples": lambda issue: (
         f"{_figure(issue, 'samples'):.0f} values for {_figure(issue, 'unknowns'):.0f} unknowns leave nothing to check "
         "the fit with"

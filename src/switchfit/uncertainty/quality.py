@@ -4,7 +4,7 @@
   reference signal the sums are integrals over time, and channels of no weight are left out. Where measurements do not
   vary, the sum in the denominator is that of y² itself, so that ``1 - share`` is the square of the relative root mean
   square of the residuals (NRMSE); of a reference that is constant there is nothing to explain.
-- samples that a robust loss counts as outliers are left out, unless they are more than a third: then it is the fit
+- samples that a robust loss counts as outliers are left out, unless they are more than half: then it is the fit
   that is far from the samples, not the samples that are outliers.
 - chi-square: 2 J where all sigmas are known numbers, with `Fit.freedom` degrees of freedom.
 """
@@ -24,9 +24,9 @@ from switchfit.uncertainty.residuals import ResidualDiagnostics, diagnose
 NO_VARIATION = 1e-9
 """Standard deviation of a channel, as a part of its largest value, below which it counts as constant: rounding."""
 
-MOST_OUTLIERS = 1 / 3
-"""Share of outliers from which they are no outliers: with the usual scales of 1.3 to 3 sigma normal noise has at most a
-fifth beyond."""
+MOST_OUTLIERS = 0.5
+"""Share of outliers from which they are no outliers: with the usual scales of 1.3 to 3 sigma normal noise has up to a
+fifth beyond, and logs with a tenth of real outliers have been seen to have a third."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,10 @@ class ChannelQuality:
         Sum of the squared residuals over sigma; NaN where sigma is unknown.
     whiteness : float
         Probability of the residuals' correlation if they are white; NaN for fewer than 20, and for a reference signal.
+    correlated : bool
+        Whether neighbouring residuals are alike, see `ResidualDiagnostics.correlated`.
+    outliers : float
+        Share of the values that a robust loss counts as outliers; 0 without such a loss.
     """
 
     label: str
@@ -55,6 +59,8 @@ class ChannelQuality:
     explained: float
     chi_square: float
     whiteness: float
+    correlated: bool
+    outliers: float
 
     @property
     def probability(self) -> float:
@@ -114,7 +120,7 @@ def measure_quality(fit: Fit) -> Quality:
     fit : Fit
     """
     residuals = diagnose(fit)
-    tests = iter(residuals.channels)
+    tests = iter(zip(residuals.channels, residuals.correlated, strict=True))
     single = len(fit.comparisons) == 1
     channels: list[ChannelQuality] = []
     left = total = 0.0
@@ -125,11 +131,15 @@ def measure_quality(fit: Fit) -> Quality:
                     continue
                 if comparison.weights is not None and comparison.weights[k] == 0:
                     continue
-                whiteness = next(tests).whiteness if comparison.kind == "measurements" else np.nan
+                whiteness, correlated = np.nan, False
+                if comparison.kind == "measurements":
+                    tested, correlated = next(tests)
+                    whiteness = tested.whiteness
                 squares, spread, size = _sum_squares(comparison, k)
                 if not np.isfinite(squares):
                     continue
-                left, total = left + squares / size, total + spread / size
+                if spread > 0:
+                    left, total = left + squares / size, total + spread / size
                 channels.append(
                     ChannelQuality(
                         label=name if single else f"{fit.run_names[e]} {name}",
@@ -138,6 +148,8 @@ def measure_quality(fit: Fit) -> Quality:
                         explained=1 - squares / spread if spread > 0 else np.nan,
                         chi_square=_chi_square(comparison, k),
                         whiteness=whiteness,
+                        correlated=correlated,
+                        outliers=_share_outliers(comparison, k),
                     )
                 )
     judged = fit.sigma_known is True and np.isfinite(fit.residual_variance)
@@ -171,10 +183,8 @@ def _sum_squares(comparison: Comparison, k: int) -> tuple[float, float, float]:
     """
     y, residual = comparison.measured[:, k], comparison.residuals[:, k]
     there = np.isfinite(residual)
-    if comparison.downweighted is not None and there.any():
-        beyond = comparison.downweighted[:, k]
-        if beyond[there].mean() <= MOST_OUTLIERS:
-            there &= ~beyond
+    if comparison.downweighted is not None and _share_outliers(comparison, k) <= MOST_OUTLIERS:
+        there &= ~comparison.downweighted[:, k]
     if not there.any():
         return np.nan, np.nan, 1.0
     weight = _weights(comparison)[there]
@@ -189,6 +199,14 @@ def _sum_squares(comparison: Comparison, k: int) -> tuple[float, float, float]:
     if spread <= NO_VARIATION**2 * about_zero:
         spread = about_zero if comparison.kind == "measurements" else 0.0
     return float(weight @ residual**2), spread, size if size > 0 else 1.0
+
+
+def _share_outliers(comparison: Comparison, k: int) -> float:
+    """Return the share of a channel's values that a robust loss counts as outliers."""
+    there = np.isfinite(comparison.residuals[:, k])
+    if comparison.downweighted is None or not there.any():
+        return 0.0
+    return float(comparison.downweighted[there, k].mean())
 
 
 def _weights(comparison: Comparison) -> FloatArray:

@@ -190,7 +190,8 @@ class ResidualDiagnostics:
                 "narrowing": max(c.widening for _, c in alike),
             }
             found.append(Issue("correlated residuals", tuple(label for label, _ in alike), figures))
-        heavy = [(label, c) for label, c in named if not c.normal and c.white]
+        shared = UNLIKELY / max(len(named), 1)
+        heavy = [(label, c) for label, c in named if c.normality < shared and c.white]
         if heavy:
             figures = {
                 "kurtosis": tuple(c.kurtosis for _, c in heavy),

@@ -22,9 +22,9 @@ from switchfit.fit.result import Fit, free_curvature
 from switchfit.optimize import Status
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text
-from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR, Certificate
+from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR, Certificate, certify
 from switchfit.uncertainty.issues import BARELY_DETERMINED
-from switchfit.uncertainty.quality import ChannelQuality, Quality, measure_quality
+from switchfit.uncertainty.quality import MOST_OUTLIERS, ChannelQuality, Quality, measure_quality
 
 Level = Literal["good", "doubtful", "bad"]
 LEVELS: tuple[Level, ...] = ("good", "doubtful", "bad")
@@ -139,7 +139,7 @@ def judge(fit: Fit, certificate: Certificate | None = None) -> Verdict:
     ----------
     fit : Fit
     certificate : Certificate, optional
-        What it found about the derivatives counts; left out, nothing is said of them.
+        Left out, what can be checked without the model is checked.
     """
     quality = measure_quality(fit) if fit.status.successful and np.isfinite(fit.cost) else None
     fitting = [] if quality is None else list(_judge_quality(fit, quality))
@@ -150,14 +150,15 @@ def judge(fit: Fit, certificate: Certificate | None = None) -> Verdict:
         collapsed = [f._replace(level="bad") for f in collapsed]
     correlated = [f for f in fitting if f.reason.kind == "correlated residuals"]
     found = [*_find_ending(fit), *(f for f in fitting if f not in correlated), *collapsed]
-    exact = quality is not None and 1 - quality.explained < NO_RESIDUALS  # there is no better minimum than 0
+    # There is no better minimum than 0, and the integration error is all of a cost that is rounding.
+    exact = quality is not None and 1 - quality.explained < NO_RESIDUALS
     if not exact:
         found += _judge_starts(fit, confirmed=quality is not None and quality.has_chi_square and not fitting)
     if quality is not None:
         found += _find_undetermined(fit)
         found += _find_bounds(fit)
-        found += _check_integration(fit)
-        found += _check_derivatives(certificate)
+        found += [] if exact and fit.integration_error_of == "J" else _check_integration(fit)
+        found += _check_certificate(certify(fit, None) if certificate is None else certificate)
         found += correlated
     found.sort(key=lambda f: -LEVELS.index(f.level))  # stable: in the order of weight on each level
     if not found:
@@ -168,7 +169,10 @@ def judge(fit: Fit, certificate: Certificate | None = None) -> Verdict:
     return Verdict(found[0].level, tuple(f.reason for f in found), tuple(Issue(f"next: {step}") for step in steps))
 
 
-MISFITS = ("unexplained", "slightly wrong", "reference not followed")
+ELSEWHERE = ("more starts", "look at the residuals")
+"""What to do about a model that does not fit: the minimum may be a local one, or the model wrong."""
+
+MISFITS = ("unexplained", "mostly outliers", "slightly wrong", "reference not followed")
 """Kinds of reasons that say that the model does not fit, other than by the size of the noise."""
 
 
@@ -200,6 +204,11 @@ def _judge_quality(fit: Fit, quality: Quality) -> Iterator[Finding]:
         figures = {"samples": float(fit.samples), "unknowns": float(fit.free_basis.shape[1])}
         yield Finding("doubtful", Issue("too few samples", figures=figures), ("more data",))
         return
+    lost = max(samples, key=lambda c: c.outliers)
+    if lost.outliers > MOST_OUTLIERS:
+        reason = Issue("mostly outliers", (lost.label,), {"share": lost.outliers})
+        yield Finding("bad", reason, ELSEWHERE)
+        return
     too_small = quality.has_chi_square and quality.probability_below < UNLIKELY and quality.ratio < 1 - CLEARLY_OFF
     if quality.has_chi_square and not too_small:
         yield from _judge_chi_square(quality, samples)
@@ -223,7 +232,7 @@ def _judge_chi_square(quality: Quality, samples: tuple[ChannelQuality, ...]) -> 
     if all(c.whiteness > WHITE for c in suspects) and ratio < FAR_OFF:
         yield Finding("doubtful", Issue("sigma too small", (worst.label,), figures), ("check sigma", "more starts"))
     elif share < EXPLAINED or (share < NEARLY_ALL and ratio > FAR_OFF):
-        yield Finding("bad", Issue("unexplained", (worst.label,), figures), ("more starts", "look at the residuals"))
+        yield Finding("bad", Issue("unexplained", (worst.label,), figures), ELSEWHERE)
     else:
         steps = ("look at the residuals", "more starts")
         yield Finding("doubtful", Issue("slightly wrong", (worst.label,), figures), steps)
@@ -234,16 +243,12 @@ def _judge_residuals(
     quality: Quality, samples: tuple[ChannelQuality, ...], *, sigma_too_large: bool
 ) -> Iterator[Finding]:
     """Judge a fit whose sigma is unknown, or far too large, by the correlation of its residuals."""
-    correlated = [
-        (c.explained, c.label)
-        for c, alike in zip(samples, quality.residuals.correlated, strict=True)
-        if alike and 1 - c.explained >= NO_RESIDUALS
-    ]
+    correlated = [c for c in samples if c.correlated and 1 - c.explained >= NO_RESIDUALS]
     if correlated:
-        share, label = min((_share(explained), label) for explained, label in correlated)
-        figures = _describe_fit(quality) | {"worst": share}
-        if share < EXPLAINED_UNKNOWN:
-            yield Finding("bad", Issue("unexplained", (label,), figures), ("more starts", "look at the residuals"))
+        worst = min(correlated, key=lambda c: c.explained)
+        figures = _describe_fit(quality) | {"worst": worst.explained}
+        if worst.explained < EXPLAINED_UNKNOWN:
+            yield Finding("bad", Issue("unexplained", (worst.label,), figures), ELSEWHERE)
         elif not sigma_too_large:
             yield from _find_correlation(quality)
         return
@@ -252,7 +257,7 @@ def _judge_residuals(
     untested = all(np.isnan(c.whiteness) for c in samples)
     figures = _describe_fit(quality) | {"worst": quality.explained}
     if untested and quality.explained < HALF:
-        yield Finding("bad", Issue("unexplained", (), figures), ("more starts", "look at the residuals"))
+        yield Finding("bad", Issue("unexplained", (), figures), ELSEWHERE)
     elif quality.explained < (MOSTLY if untested else HALF):
         yield Finding("doubtful", Issue("little explained", (), figures), ("more starts", "more data"))
 
@@ -266,8 +271,7 @@ def _judge_reference(quality: Quality, references: tuple[ChannelQuality, ...]) -
     if quality.explained < REFERENCE_FOLLOWED or worst.explained < REFERENCE_CHANNEL:
         level: Level = "bad" if quality.explained < REFERENCE_LOST else "doubtful"
         figures = _describe_fit(quality) | {"worst": worst.explained}
-        steps = ("more starts", "look at the residuals")
-        yield Finding(level, Issue("reference not followed", (worst.label,), figures), steps)
+        yield Finding(level, Issue("reference not followed", (worst.label,), figures), ELSEWHERE)
 
 
 def _find_correlation(quality: Quality) -> Iterator[Finding]:
@@ -282,7 +286,7 @@ def _condemn(finding: Finding) -> Finding:
     """Return a misfit as it counts beside a collapsed mode: as one that the model cannot explain."""
     reason = finding.reason
     kind = "unexplained" if reason.kind == "slightly wrong" else reason.kind
-    return Finding("bad", Issue(kind, reason.subjects, reason.figures), ("more starts", "look at the residuals"))
+    return Finding("bad", Issue(kind, reason.subjects, reason.figures), ELSEWHERE)
 
 
 def _find_collapsed(fit: Fit) -> Iterator[Finding]:
@@ -341,10 +345,10 @@ def _check_integration(fit: Fit) -> Iterator[Finding]:
         yield Finding(level, reason, ("smaller rtol",))
 
 
-def _check_derivatives(certificate: Certificate | None) -> Iterator[Finding]:
-    """Find out whether derivatives that were checked are wrong."""
-    for failure in certificate.failures if certificate is not None else ():
-        if failure.kind in ("derivative gap", "Taylor orders", "negative curvature"):
+def _check_certificate(certificate: Certificate) -> Iterator[Finding]:
+    """Find checks that failed; the integration error is judged by its size."""
+    for failure in certificate.failures:
+        if failure.kind != "integration error":
             yield Finding("doubtful", failure, ("check derivatives",))
 
 
