@@ -18,6 +18,7 @@ SOURCE = ROOT / "src" / "switchfit"
 
 PAPER, ROWS = "paper_adjoint.py", "discretization/rows.py"
 ALGEBRA = "optimize/algebra.py"
+MODEL, STRUCTURE = "discretization/model.py", "problem/structure.py"
 KERNELS, SEGMENTS, SAMPLE_LOOPS, TEMPLATES = (
     f"engine/native/{name}.py" for name in ("kernels", "segments", "sample_loops", "templates")
 )
@@ -29,6 +30,7 @@ TESTS = {
     "rows": [SYSTEMS],
     "native": [SYSTEMS, PROTOCOL],
     "sqp": [["tests/test_sqp.py", "tests/test_qp.py"]],
+    "final time": [["tests/test_final_time.py", "-k", "closed_form or engines or every_check"]],
 }
 """What must notice the mistakes of each part, one after the other until something does."""
 
@@ -140,12 +142,23 @@ IN_SQP: dict[str, tuple[str, Replacements]] = {
     ),
 }
 
+IN_FINAL_TIME: dict[str, tuple[str, Replacements]] = {
+    "the running cost at tf": (MODEL, [("if self.structure.is_rest(mode):", "if False:")]),
+    "rest after tf": (STRUCTURE, [("return jnp.zeros_like(x)", "return 0.1 * x")]),
+    "ell(tf) in (6)": (
+        PAPER,
+        [("ell_before(t, x, p) - ell_after(t, R(t, x, p), p)", "ell_before(t, x, p) - ell_before(t, R(t, x, p), p)")],
+    ),
+    "D ell behind tf in (11)": (PAPER, [("jax.grad(ell_after, argnums=1)", "jax.grad(ell_before, argnums=1)")]),
+}
+
 
 MISTAKES: dict[tuple[str, str], tuple[str, Replacements]] = {
     **{("paper", name): (PAPER, replacements) for name, replacements in IN_PAPER.items()},
     **{("rows", name): (ROWS, replacements) for name, replacements in IN_ROWS.items()},
     **{("native", name): mistake for name, mistake in IN_NATIVE.items()},
     **{("sqp", name): mistake for name, mistake in IN_SQP.items()},
+    **{("final time", name): mistake for name, mistake in IN_FINAL_TIME.items()},
 }
 """All mistakes by part and name: the file, and what is replaced in it."""
 

@@ -98,31 +98,6 @@ def test_events_of_amici_to_twelve_digits():
     np.testing.assert_allclose(found.hessian, hessian, rtol=0, atol=1e-10)
 
 
-def test_minimum_time_needs_no_more_than_a_last_mode_at_rest():
-    """From rest to rest over 1 m with at most 1 m/s²: one switch half way, 2 s."""
-    one = jnp.ones
-
-    system = sf.HybridSystem(
-        {
-            "push": lambda t, x, p: jnp.stack([x[1], one(()), one(())]),
-            "brake": lambda t, x, p: jnp.stack([x[1], -one(()), one(())]),
-            "done": lambda t, x, p: jnp.zeros(3),
-        },
-        [0.0, 0.0, 0.0],
-    )
-    costs = [
-        sf.TerminalCost(lambda x, p: x[2]),
-        sf.TerminalConstraint(lambda x, p: x[0] - 1.0),
-        sf.TerminalConstraint(lambda x, p: x[1:2]),
-    ]
-    fit = sf.estimate(sf.Problem(system, sf.Experiment(costs, ("push", "brake", "done"), (0.7, 2.5), 0.0, 5.0)))
-    assert fit.success
-    np.testing.assert_allclose(fit.theta, [1.0, 2.0], rtol=0, atol=1e-9)
-    # T = 2 sqrt(q): 1 m more takes dT/dq = 1 s/m longer, which is what the multiplier says.
-    assert fit.constraints[0][2] == pytest.approx(-1.0, abs=1e-8)
-    assert [name for name, _, _ in fit.constraints] == ["terminal constraint 1", "terminal constraint 2"]
-
-
 def tank_fills(t, x, p):
     return jnp.stack([p["inflow"] - 0.1 * x[0]])
 

@@ -39,10 +39,20 @@ def test_the_truth_is_right_and_a_bad_start_is_not(name):
     assert case.is_best(**found, best=best)
     assert case.is_right(**found, best=best)
     # At a start nothing is right yet.
-    assert not any(case.is_right(judge(case.problem, start.tolist())["cost"], best) for start in case.starts[:3])
+    for start in case.starts[:3]:
+        there = judge(case.problem, start.tolist())
+        assert not case.is_right(there["cost"], best, there["violation"])
     if case.noisy:
         assert best < case.cost_near
         assert not case.is_right(best + 2.5, best)
+
+
+@pytest.mark.parametrize("name", ["rest-to-rest", "pendulum", "van-der-pol"])
+def test_answers_of_minimum_time_reach_their_goals(name):
+    case = build_case(name)
+    found = judge(replace(case.problem, rtol=1e-12, atol=1e-14), case.near.tolist())
+    assert found["cost"] == pytest.approx(case.near[-1], rel=1e-9)
+    assert found["violation"] < 1e-10
 
 
 def test_two_turns_is_the_problem_that_it_was():

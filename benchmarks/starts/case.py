@@ -121,7 +121,7 @@ def draw_anywhere(problem: sf.Problem, count: int, seed: int) -> np.ndarray:
     low, high = np.where(unknowns.is_time, 0.0, unknowns.lower), np.where(unknowns.is_time, 1.0, unknowns.upper)
     points = low + cube * (high - low)
     for run, where in zip(problem.experiments, unknowns.times, strict=True):
-        points[:, where] = run.t0 + (run.tf - run.t0) * np.sort(points[:, where], axis=1)
+        points[:, where] = run.t0 + (run.end - run.t0) * np.sort(points[:, where], axis=1)
     return points
 
 

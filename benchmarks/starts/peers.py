@@ -53,8 +53,8 @@ def fit_with_least_squares(case: Case, start: np.ndarray) -> End:
     lower, upper = (np.array(bound, dtype=float) for bound in (problem.unknowns.lower, problem.unknowns.upper))
     for run, where in zip(problem.experiments, problem.unknowns.times, strict=True):
         # The first is a time, the others are durations; that the last is before tf is left to `residuals`.
-        lower[where[:1]], upper[where[:1]] = np.maximum(lower[where[:1]], run.t0), np.minimum(upper[where[:1]], run.tf)
-        lower[where[1:]], upper[where[1:]] = 0.0, run.tf - run.t0
+        lower[where[:1]], upper[where[:1]] = np.maximum(lower[where[:1]], run.t0), np.minimum(upper[where[:1]], run.end)
+        lower[where[1:]], upper[where[1:]] = 0.0, run.end - run.t0
     found: dict[bytes, Any] = {}
 
     def samples(z: np.ndarray) -> Any:
@@ -191,5 +191,5 @@ def _read(
     """Return where a peer ended, with violations by rounding taken away."""
     theta = np.clip(theta, problem.unknowns.lower, problem.unknowns.upper)
     for run, where in zip(problem.experiments, problem.unknowns.times, strict=True):
-        theta[where] = np.clip(np.maximum.accumulate(theta[where]), run.t0, run.tf)
+        theta[where] = np.clip(np.maximum.accumulate(theta[where]), run.t0, run.end)
     return End(theta.tolist(), cost, bool(success), "", status, int(calls), int(iterations))

@@ -39,6 +39,9 @@ printed once f_{i-1} is read as F_{i-1}. Through the map itself
     D_p x+ = D_x R D_p x- + D_p R,      psi- = psi+ D_x R,      Omega- = D_x R' Omega+ D_x R + psi+ . D_x^2 R,
     Omega_p- = D_x R' Omega_p+ + psi+ . [D_x^2 R D_p x- + D_p D_x R],      and (9) gains psi+ D_p R.
 
+**A free tf** is the transition to a mode with f = 0 and ell = 0, so that x stays x(tf) until the end of the mesh. All
+of the above holds for it, with Lambda = ell(tf, x, p) and X = f_N: D_tf J = ell + psi f_N, psi being D phi there.
+
 **Integration.** Forward and backward with the same Runge-Kutta method over the same rows of the mesh. In the backward
 sweep x(t) comes from quintic Hermite interpolation, since integrating x backward would blow up stiff modes.
 The result differs from the derivatives of the discretised cost (`switchfit.engine.jax.second_order`), which the
@@ -256,7 +259,8 @@ def evaluate_transition(model: Model, path: Path, i: int, tau_i: Array, p: Array
     opening = path.layout.first_chunk[i + 1]
     piece: Piece = pick(path.pieces, opening, 0)
     modes = model.structure.mode_of_segment
-    f_before, f_after, ell = model.field(modes[i], piece), model.field(modes[i + 1], piece), model.density(piece)
+    f_before, f_after = model.field(modes[i], piece), model.field(modes[i + 1], piece)
+    ell_before, ell_after = model.density(modes[i], piece), model.density(modes[i + 1], piece)
     R = model.reset(i) if i in model.structure.resets else lambda t, x, p: x
 
     def carry_over(t: Array, x: Array, p: Array) -> Array:
@@ -265,7 +269,7 @@ def evaluate_transition(model: Model, path: Path, i: int, tau_i: Array, p: Array
         return jax.jvp(R, (t, x, p), direction)[1]
 
     def Lambda(t: Array, x: Array, p: Array) -> Array:
-        return ell(t, x, p) - ell(t, R(t, x, p), p)
+        return ell_before(t, x, p) - ell_after(t, R(t, x, p), p)
 
     x_minus, x_plus = path.before_transition(i), path.before[opening, 0]
     minus, plus = (tau_i, x_minus, p), (tau_i, x_plus, p)
@@ -290,7 +294,7 @@ def evaluate_transition(model: Model, path: Path, i: int, tau_i: Array, p: Array
         D1Lambda,
         D2Lambda,
         DpLambda,
-        jax.grad(ell, argnums=1)(*plus),
+        jax.grad(ell_after, argnums=1)(*plus),
         D1R,
         DpR,
         *second,
@@ -434,12 +438,17 @@ def differentiate_along_rows(
 
         return jax.vmap(row)
 
-    def of_ell(start: Array, end: Array, piece: Piece, x: Array) -> tuple[Array, ...]:
-        times = start + fractions * (end - start)
-        return jax.vmap(lambda t, x: differentiate_twice(model.density(piece), t, x, p))(times, x)
+    def of_ell(mode: int) -> Callable[..., tuple[Array, ...]]:
+        def row(start: Array, end: Array, piece: Piece, x: Array) -> tuple[Array, ...]:
+            times = start + fractions * (end - start)
+            return jax.vmap(lambda t, x: differentiate_twice(model.density(mode, piece), t, x, p))(times, x)
+
+        return jax.vmap(row)
 
     x, Dp_x, *of_f = switch_mode(model, segment, of_mode, start, end, pieces, *values)
-    return Along(Dp_x, *of_f, *jax.vmap(of_ell)(start, end, pieces, x))
+    if not model.structure.has_free_tf:  # the same in all modes
+        return Along(Dp_x, *of_f, *of_ell(0)(start, end, pieces, x))
+    return Along(Dp_x, *of_f, *switch_mode(model, segment, of_ell, start, end, pieces, x))
 
 
 def interpolate(f: Field, s: Array, start: Array, end: Array, x_k: Array, x_k1: Array, p: Array) -> Array:

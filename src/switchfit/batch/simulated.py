@@ -280,9 +280,10 @@ def _simulate_clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray
                 times, values = item.samples
                 if np.any(np.diff(times) == 0):
                     raise ValueError("A ReferenceSignal that was broken by a time given twice cannot be simulated.")
-                inside = (times >= experiment.t0) & (times <= experiment.tf)
+                inside = (times >= experiment.t0) & (times <= experiment.earliest_end)
                 if not inside.all():
-                    raise ValueError("A ReferenceSignal with samples outside the horizon cannot be simulated.")
+                    after = ", or after the lower bound of a free tf," if experiment.has_free_tf else ""
+                    raise ValueError(f"A ReferenceSignal with samples outside the horizon{after} cannot be simulated.")
                 items.append(Measurements(times, np.nan_to_num(values), item.observe, sigma=1.0))
             else:
                 continue

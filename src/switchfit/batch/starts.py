@@ -275,15 +275,15 @@ def _find_clusters(problem: Problem, fits: Fits) -> NDArray[np.int64]:
 def _build_schedule(problem: Problem, theta: FloatArray) -> list[Any]:
     """Return each experiment's modes without the collapsed ones, and when they switch as parts of the horizon."""
     schedules = []
-    for experiment, times in zip(problem.experiments, problem.split(theta)[0], strict=True):
-        knots = np.concatenate([[experiment.t0], times, [experiment.tf]])
-        knots = (knots - experiment.t0) / (experiment.tf - experiment.t0)
+    for experiment, ends in zip(problem.experiments, problem.ends_of_modes(theta), strict=True):
+        knots = (ends - experiment.t0) / experiment.initial_length
         modes: list[str] = []
         switches: list[float] = []
         for mode, begin, end in zip(experiment.mode_sequence, knots[:-1], knots[1:], strict=True):
             if end - begin > SAME_PLACE and (not modes or modes[-1] != mode):
                 modes.append(mode)
                 switches.append(float(begin))
+        switches.append(float(knots[-1]))
         schedules.append((modes, np.array(switches)))
     return schedules
 

@@ -103,8 +103,12 @@ class Model:
         """Whether anything is integrated along the trajectory."""
         return bool(self.structure.running or self.structure.references)
 
-    def density(self, piece: Piece) -> Density:
-        """Return the sum of all running costs inside one cell, reference signals included."""
+    def density(self, mode: int, piece: Piece) -> Density:
+        """Return the sum of all running costs in a mode inside one cell, reference signals included; 0 after a free
+        tf.
+        """
+        if self.structure.is_rest(mode):
+            return lambda t, x, p: jnp.zeros(())
 
         def ell(t: Array, x: Array, p: Array) -> Array:
             total = jnp.zeros(())

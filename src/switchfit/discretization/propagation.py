@@ -127,12 +127,18 @@ def integrate_running_cost(model: Model, path: Path, p: Array) -> Array:
     if not model.has_running_cost:
         return jnp.zeros(layout.start.shape)
 
-    def row(start: Array, end: Array, piece: Piece, X: Array) -> Array:
-        times = start + model.tableau.c * (end - start)
-        densities = jax.vmap(model.density(piece), in_axes=(0, 0, None))(times, X, p)
-        return cost_of_row(model.tableau, end - start, list(densities))
+    def of_mode(mode: int) -> Callable[..., Array]:
+        def row(start: Array, end: Array, piece: Piece, X: Array) -> Array:
+            times = start + model.tableau.c * (end - start)
+            densities = jax.vmap(model.density(mode, piece), in_axes=(0, 0, None))(times, X, p)
+            return cost_of_row(model.tableau, end - start, list(densities))
 
-    return jax.vmap(jax.vmap(row))(layout.start, layout.end, path.pieces, path.stages)
+        return jax.vmap(row)
+
+    rows = layout.start, layout.end, path.pieces, path.stages
+    if not model.structure.has_free_tf:  # the same in all modes
+        return jax.vmap(of_mode(0))(*rows)
+    return lax.map(lambda given: switch_mode(model, given[0], of_mode, *given[1]), (layout.segment, rows))
 
 
 def add_point_costs(model: Model, path: Path, p: Array) -> Array:

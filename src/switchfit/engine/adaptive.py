@@ -49,8 +49,11 @@ PACE = 1000
 
 
 def list_fixed_nodes(experiment: Experiment) -> FloatArray:
-    """Return the times that must be nodes: t0, tf, and samples and knots of signals inside the horizon."""
-    t0, tf = experiment.t0, experiment.tf
+    """Return the times that must be nodes: t0, tf, and samples and knots of signals inside the horizon.
+
+    Of a free tf it is the upper bound that is a node.
+    """
+    t0, tf = experiment.t0, experiment.end
     times = [np.array([t0, tf])]
     times += [item.seen_times for item in experiment.data if isinstance(item, Measurements)]
     times += [signal.knots for signal in list_signals(experiment)]
@@ -118,7 +121,7 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
     arguments, signals = whole.without_mesh(), np.asarray(whole.signals)
     tau, p = problem.vectors(theta, e)
     unit = unit_suffix(experiment.time_unit)
-    ends = np.concatenate([[experiment.t0], tau, [experiment.tf]])
+    ends = np.concatenate([[experiment.t0], tau, [experiment.end]])
     inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
     steps = [np.array([experiment.t0])]
     native = native_experiment(structure, whole, coarse.times, order=Order.COST)
@@ -304,7 +307,7 @@ def _field_and_density(
 ) -> jax.Array:
     model = Model(structure, arguments)
     piece = Piece(origin, coefficients)
-    cost = model.density(piece)(t, x, p) if model.has_running_cost else jnp.zeros(())
+    cost = model.density(mode, piece)(t, x, p) if model.has_running_cost else jnp.zeros(())
     return jnp.append(model.field(mode, piece)(t, x, p), cost)
 
 

@@ -69,7 +69,7 @@ class Constrained(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """One experiment row by row, R = cells + N rows in the order of time.
+    """One experiment row by row, R = cells + N rows in the order of time; where tf is free, those up to tf.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class Simulation:
     nodes : (G + 1,)
         Of the mesh.
     first_cell : (N + 1,) int
-        The cell in which each segment begins.
+        The cell in which each segment begins; (N,) where tf is free.
     start, end : (R,)
     before, after : (R, n)
         States at the start and at the end of each row.
@@ -148,6 +148,25 @@ def add_samples(
         seen.append(y[:, first : first + sensor.channels])
         first += sensor.channels
     return replace(simulation, seen=tuple(seen))
+
+
+def cut_at_tf(simulation: Simulation, structure: Structure) -> Simulation:
+    """Return the simulation without the rest after a free tf; the simulation itself where tf is fixed."""
+    if not structure.has_free_tf:
+        return simulation
+    rows = slice(0, simulation.segments[-1].start)
+    tangents = simulation.tangents
+    return replace(
+        simulation,
+        first_cell=simulation.first_cell[:-1],
+        start=simulation.start[rows],
+        end=simulation.end[rows],
+        before=simulation.before[rows],
+        after=simulation.after[rows],
+        y_before=simulation.y_before[rows],
+        y_after=simulation.y_after[rows],
+        tangents=None if tangents is None else Tangents(*(values[rows] for values in tangents)),
+    )
 
 
 class ExperimentEngine(Protocol):

@@ -625,7 +625,7 @@ def _estimate(
         upper=unknowns.upper,
         run_names=tuple(name_runs(problem.experiments)),
         transition_times=tuple(times),
-        transition_places=unknowns.times,
+        transition_places=tuple(where[: len(tau)] for where, tau in zip(unknowns.times, times, strict=True)),
         parameters={name: np.array(value) for name, value in parameters.items()},
         parameter_units={name: parameter.unit for name, parameter in problem.parameters.items()},
         fixed=tuple(name for name, parameter in problem.parameters.items() if parameter.fixed),

@@ -89,8 +89,8 @@ def _open_modes(problem: Problem, theta: FloatArray) -> FloatArray:
         times, short = problem.vectors(theta, e)[0], _lengths(problem, theta, e)[0]
         if not short.any():
             continue
-        gap = OPENED * (experiment.tf - experiment.t0) * short
-        knots = np.concatenate([[experiment.t0], times, [experiment.tf]])
+        gap = OPENED * experiment.initial_length * short
+        knots = np.concatenate([[experiment.t0], times, [experiment.end]])
         for i in range(1, len(times) + 1):
             knots[i] = max(knots[i], knots[i - 1] + gap[i - 1])
         for i in range(len(times), 0, -1):
@@ -100,17 +100,21 @@ def _open_modes(problem: Problem, theta: FloatArray) -> FloatArray:
 
 
 def _lengths(problem: Problem, theta: FloatArray, e: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which modes of experiment e have no duration (N + 1,), and which transitions are at an end of it (N,)."""
+    """Return which modes of experiment e have no duration (N + 1,), and which transitions are at an end of it (N,).
+
+    A free tf counts as a transition at the end, to a mode that lasts.
+    """
     experiment = problem.experiments[e]
     times, rounding = problem.vectors(theta, e)[0], _estimate_rounding(experiment)
-    knots = np.concatenate([[experiment.t0], times, [experiment.tf]])
-    at_end = (times - experiment.t0 <= rounding) | (experiment.tf - times <= rounding)
-    return np.diff(knots) <= rounding, at_end
+    knots = experiment.ends_of_modes(times)
+    at_end = (times - experiment.t0 <= rounding) | (knots[-1] - times <= rounding)
+    short = np.diff(knots) <= rounding
+    return np.append(short, [False] * (len(times) + 1 - len(short))), at_end
 
 
 def _estimate_rounding(experiment: Experiment) -> float:
     """Return the rounding error of the difference of two times of an experiment."""
-    return 32 * EPS * max(experiment.tf - experiment.t0, abs(experiment.t0), abs(experiment.tf))
+    return 32 * EPS * max(experiment.end - experiment.t0, abs(experiment.t0), abs(experiment.end))
 
 
 def _parameters(problem: Problem) -> list[int]:

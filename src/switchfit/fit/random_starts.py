@@ -66,7 +66,7 @@ def _ranges(problem: Problem) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]
 
 def _list_stretches(experiment: Any, where: NDArray[np.intp]) -> list[tuple[float, float, NDArray[np.intp]]]:
     """Return groups of free transition times with the fixed times (or ends of the horizon) that enclose them."""
-    knots = np.concatenate([[experiment.t0], experiment.initial_times, [experiment.tf]])
+    knots = np.concatenate([[experiment.t0], experiment.initial_times, [experiment.end]])
     fixed = [0, *(np.flatnonzero(where < 0) + 1).tolist(), len(knots) - 1]
     return [(float(knots[a]), float(knots[b]), where[a : b - 1]) for a, b in pairwise(fixed) if b - a > 1]
 

@@ -217,10 +217,22 @@ class Fit:
         return str(self.termination)
 
     @property
+    def final_times(self) -> tuple[float, ...]:
+        """tf of each experiment, estimated or given."""
+        return tuple(float(trajectory.times[-1]) for trajectory in self.trajectories)
+
+    @property
+    def final_places(self) -> tuple[int, ...]:
+        """Where in theta the tf of each experiment stands; -1 where it is fixed."""
+        names = ["tf"] if len(self.run_names) == 1 else [f"{run}.tf" for run in self.run_names]
+        free = [name in self.theta_names and name not in self.parameters for name in names]  # a parameter may be "tf"
+        return tuple(self.theta_names.index(name) if own else -1 for name, own in zip(names, free, strict=True))
+
+    @property
     def is_time(self) -> NDArray[np.bool_]:
-        """Which of the unknowns are transition times: (d,)."""
+        """Which of the unknowns are transition times or a free tf: (d,)."""
         found = np.zeros(len(self.theta_names), dtype=bool)
-        for places in self.transition_places:
+        for places in (*self.transition_places, np.array(self.final_places, dtype=np.intp)):
             found[places[places >= 0]] = True
         return found
 

@@ -152,7 +152,7 @@ def _reach_of(problem: Problem) -> FloatArray:
     guess = np.abs(unknowns.initial)
     reach = REACH * np.where(guess > 0, guess, np.where(np.isfinite(width) & (width > 0), width, 1.0))
     for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
-        reach[where[where >= 0]] = TIME_REACH * (experiment.tf - experiment.t0)
+        reach[where[where >= 0]] = TIME_REACH * experiment.initial_length
     return np.where(unknowns.variables.log, REACH, reach / unknowns.variables.size)
 
 

@@ -236,7 +236,7 @@ def _trajectory(problem: Problem, e: int, simulation: Simulation) -> Trajectory:
     structure, system = problem.structures[e], problem.system
     moving = simulation.end > simulation.start
     counts = [1 + int(moving[rows].sum()) for rows in simulation.segments]
-    modes = np.repeat([structure.mode_names[mode] for mode in structure.mode_of_segment], counts)
+    modes = np.repeat(problem.experiments[e].mode_sequence, counts)
     names = system.state_names or tuple(f"x{k + 1}" for k in range(structure.n))
     units = system.state_units or ("",) * structure.n
     return Trajectory(

@@ -19,6 +19,7 @@ from typing import Annotated, Any, Literal, get_args
 import numpy as np
 import pydantic
 from pydantic import Field
+from pydantic_core import PydanticCustomError
 
 from switchfit.io.csv import read_columns
 from switchfit.io.python_file import call, describe_error, find_object, find_user_place, load_object
@@ -126,6 +127,13 @@ def _known_as_table(given: Any) -> Any:
     return {"value": given, "fixed": True} if isinstance(given, (int, float)) and not isinstance(given, bool) else given
 
 
+def _end_as_table(given: Any) -> Any:
+    """Return ``{ value = 6.0, fixed = true }`` for ``6.0``: a tf that is given as a number is known."""
+    if given is not None and not isinstance(given, dict) and _known_as_table(given) is given:
+        raise PydanticCustomError("float_type", "Input should be a valid number")
+    return _known_as_table(given)
+
+
 def _name_as_table(given: Any) -> Any:
     """Return ``{ name = "skid_steer" }`` for ``"skid_steer"``, a model without arguments."""
     return {"name": given} if isinstance(given, str) else given
@@ -162,7 +170,7 @@ class ParameterTable(_Table):
 
 
 class TransitionTable(_Table):
-    """First guess of a transition time, with bounds of its own."""
+    """First guess of a transition time, or of tf, with bounds of its own."""
 
     value: float = Field(description="first guess of the transition time, in the experiment's time_unit")
     lower: float = Field(default=-np.inf, description="earliest time")
@@ -264,7 +272,11 @@ class ExperimentTable(_Table):
         min_length=1, description="what the model is compared with; several tables add up"
     )
     t0: float | None = Field(default=None, description="start of the horizon; left out, the first sample")
-    tf: float | None = Field(default=None, description="end of the horizon; left out, the last sample")
+    tf: Annotated[TransitionTable | None, pydantic.BeforeValidator(_end_as_table)] = Field(
+        default=None,
+        description="end of the horizon; left out, the last sample. A number, or a table with value, lower and upper "
+        "where it is to be estimated",
+    )
     initial_state: list[Annotated[StateTable, pydantic.BeforeValidator(_known_as_table)]] | None = Field(
         default=None,
         description="state at t0, instead of the model's: a number, or a table where it is to be estimated",
@@ -557,13 +569,18 @@ def _build_experiment(
         mode_sequence=tuple(table.mode_sequence),
         transition_times=None if times is None else tuple(map(_build_parameter, times)),  # type: ignore[arg-type]
         t0=min(span[0] for span in spans) if table.t0 is None else table.t0,
-        tf=max(span[-1] for span in spans) if table.tf is None else table.tf,
+        tf=_build_final_time(table, spans),
         inputs=None if table.inputs is None else _build_at(f"{where}.inputs", _build_input, folder, table.inputs),
         initial_state=_build_initial_state(table),
         parameter_map=table.parameter_map,
         name=table.name,
         time_unit=table.time_unit,
     )
+
+
+def _build_final_time(table: ExperimentTable, spans: list[Any]) -> float | Parameter:
+    """Return tf, of which a table makes an unknown; left out, it is where the data end."""
+    return float(max(span[-1] for span in spans)) if table.tf is None else _build_parameter(table.tf)
 
 
 def _build_initial_state(table: ExperimentTable) -> list[Parameter] | list[float] | None:

@@ -48,8 +48,11 @@ def describe_experiments(experiments: Sequence[Experiment]) -> str:
 
 def _describe_experiment(experiment: Experiment) -> list[str]:
     unit = unit_suffix(experiment.time_unit)
-    times = ", ".join(f"{t:.6g}" for t in experiment.initial_times)
-    sequence, horizon = " -> ".join(experiment.mode_sequence), f"[{experiment.t0:.6g}, {experiment.tf:.6g}]{unit}"
+    ends = experiment.ends_of_modes(experiment.initial_times)
+    times = ", ".join(f"{t:.6g}" for t in ends[1:-1])
+    sequence, horizon = " -> ".join(experiment.mode_sequence), f"[{ends[0]:.6g}, {ends[-1]:.6g}]{unit}"
+    if experiment.has_free_tf:
+        horizon += " (tf is estimated)"
     lines = [f"{sequence} on {horizon}, at {times}{unit}" if times else f"{sequence} on {horizon}"]
     for item in experiment.data:
         if isinstance(item, Measurements):

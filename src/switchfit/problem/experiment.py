@@ -41,8 +41,12 @@ class Experiment:
         First guess of each transition, in the experiment's time unit, one fewer than modes, strictly increasing inside
         ``(t0, tf)``; an entry may be a `Parameter` with bounds, or fixed. Its unit, where given, must be `time_unit`.
         None: `estimate` looks for them all over the horizon; the guess is evenly spaced.
-    t0, tf : float
-        Horizon, in the experiment's time unit.
+    t0 : float
+        Start of the horizon, in the experiment's time unit.
+    tf : float or Parameter
+        End of the horizon. A `Parameter` that is not fixed is estimated, and called "tf" among the unknowns: give it a
+        finite upper bound, up to which inputs and reference signals must be known, and a lower bound where there are
+        samples, none of which may lie after it.
     inputs : Input, optional
         Known input; modes are then called as ``f(t, x, p, u)``.
     initial_state : (n,) array_like or callable ``p -> (n,)``, optional
@@ -61,7 +65,7 @@ class Experiment:
     ------
     ValueError
         If lengths do not match, times are unordered or outside the horizon, data lies outside it, `time_unit` is empty,
-        or a transition time has another unit.
+        a transition time or tf has another unit, or a free tf has bounds that do not fit.
     TypeError
         If an argument is of the wrong type: times that are not numbers (dates among them), mode names that are no
         strings, data of another kind than those above.
@@ -90,7 +94,7 @@ class Experiment:
     mode_sequence: tuple[str, ...]
     transition_times: tuple[Any, ...]
     t0: float
-    tf: float
+    tf: float | Parameter
     inputs: Input | None = None
     initial_state: Any = None
     name: str | None = None
@@ -99,9 +103,14 @@ class Experiment:
     is_guess_proposed: bool = field(init=False, default=False)
 
     def __post_init__(self) -> None:
-        t0, tf = as_number(self.t0, "t0"), as_number(self.tf, "tf")
-        if not (np.isfinite(t0) and np.isfinite(tf) and t0 < tf):
-            raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got ({t0}, {tf}).")
+        t0, tf = as_number(self.t0, "t0"), _check_final_time(self.tf)
+        last = float(tf.value) if isinstance(tf, Parameter) else tf
+        if not (np.isfinite(t0) and np.isfinite(last) and t0 < last):
+            raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got ({t0}, {last}).")
+        if isinstance(tf, Parameter) and np.isfinite(tf.lower) and tf.lower <= t0:
+            raise ValueError(
+                f"The lower bound of tf must lie after t0 = {t0}; got {tf.lower}. Leave it out, or raise it."
+            )
         modes = as_sequence(self.mode_sequence, "mode_sequence", "a sequence of mode names")
         sequence = tuple(as_name(mode, "each of mode_sequence", "the name of a mode") for mode in modes)
         if not sequence:
@@ -109,7 +118,7 @@ class Experiment:
         object.__setattr__(self, "is_guess_proposed", self.transition_times is None and len(sequence) > 1)
         given = self.transition_times
         if given is None:
-            given = np.linspace(t0, tf, len(sequence) + 1)[1:-1].tolist()
+            given = np.linspace(t0, last, len(sequence) + 1)[1:-1].tolist()
         several = isinstance(given, Iterable) and getattr(given, "ndim", 1) > 0
         given = as_sequence(given, "transition_times", "a sequence of numbers or sf.Parameter") if several else (given,)
         if len(given) != len(sequence) - 1:
@@ -132,21 +141,60 @@ class Experiment:
         self._check_times()
         self._check_data_inside()
         if self.inputs is not None:
-            self.inputs.signal(t0, tf)
+            self.inputs.signal(t0, self.end)
+
+    @property
+    def has_free_tf(self) -> bool:
+        """Whether tf is estimated."""
+        return isinstance(self.tf, Parameter)
+
+    @property
+    def end(self) -> float:
+        """Time to which the mesh reaches: tf, or the upper bound of a free tf."""
+        return float(self.tf.upper) if isinstance(self.tf, Parameter) else self.tf
+
+    @property
+    def times(self) -> tuple[Parameter, ...]:
+        """What programs take as their times: all transition times, then tf where it is free."""
+        return (*self.transition_times, self.tf) if isinstance(self.tf, Parameter) else self.transition_times
 
     @property
     def initial_times(self) -> FloatArray:
-        """Guess of all transition times, fixed ones included: an ``(N,)`` array."""
-        return np.array([tau.value for tau in self.transition_times], dtype=np.float64)
+        """Guess of all of `times`, fixed ones included: an ``(N,)`` array."""
+        return np.array([tau.value for tau in self.times], dtype=np.float64)
+
+    def ends_of_modes(self, times: FloatArray) -> FloatArray:
+        """Return where each mode begins and the last one ends, one more than modes, for values of `times`.
+
+        See Also
+        --------
+        Problem.ends_of_modes : of all experiments, at a theta.
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> cost = sf.RunningCost(lambda t, x, p: x[0])
+        >>> run = sf.Experiment(cost, ("on", "off"), (1.0,), 0.0, sf.Parameter(2.5, upper=5.0))
+        >>> run.ends_of_modes(run.initial_times)
+        array([0. , 1. , 2.5])
+        """
+        return np.concatenate([[self.t0], times, [] if self.has_free_tf else [self.end]])
+
+    @property
+    def initial_length(self) -> float:
+        """Length of the horizon at the guess."""
+        return float(self.ends_of_modes(self.initial_times)[-1]) - self.t0
 
     def _check_time_unit(self) -> None:
         unit = as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'")
-        for i, tau in enumerate(self.transition_times, start=1):
+        for i, tau in enumerate(self.times, start=1):
             if tau.unit not in ("", unit):
+                is_tf = i > len(self.transition_times)
                 raise ValueError(
-                    f"transition time {i} has the unit {tau.unit!r}, but time_unit of the experiment is {unit!r}, and "
-                    f"times are not converted. If all times of the experiment are in {tau.unit}, give it "
-                    f"time_unit={tau.unit!r}; otherwise give the transition time in {unit}."
+                    f"{'tf' if is_tf else f'transition time {i}'} has the unit {tau.unit!r}, but time_unit of the "
+                    f"experiment is {unit!r}, and times are not converted. If all times of the experiment are in "
+                    f"{tau.unit}, give it time_unit={tau.unit!r}; otherwise give "
+                    f"{'tf' if is_tf else 'the transition time'} in {unit}."
                 )
 
     def _check_times(self) -> None:
@@ -157,11 +205,11 @@ class Experiment:
             raise ValueError(
                 f"transition_times must be single numbers or Parameters of one; got the shapes {shorten(shapes)}."
             )
-        knots = np.concatenate([[self.t0], self.initial_times, [self.tf]])
+        knots = self.ends_of_modes(self.initial_times)
         if np.any(np.diff(knots) <= 0):
             raise ValueError(
-                f"transition_times must increase strictly inside (t0, tf) = ({self.t0}, {self.tf}); "
-                f"got {shorten(self.initial_times)}."
+                f"transition_times must increase strictly inside (t0, tf) = ({self.t0}, {knots[-1]}); "
+                f"got {shorten(knots[1:-1])}."
             )
 
     def _check_data_inside(self) -> None:
@@ -169,14 +217,34 @@ class Experiment:
             if isinstance(item, Measurements):
                 if not isinstance(item.delay, str):  # otherwise its bounds decide, which the Problem knows
                     late = f" less the delay of {item.delay:g}" if item.delay else ""
-                    _require_inside(item.seen_times, self.t0, self.tf, f"Measurements times{late}")
+                    self._require_inside(item.seen_times, f"Measurements times{late}")
             elif isinstance(item, ReferenceSignal):
                 first, last = item.signal.knots[[0, -1]]
-                if first > self.t0 or last < self.tf:
+                if first > self.t0 or last < self.end:
+                    bound = ", whose end is the upper bound of tf" if self.has_free_tf else ""
                     raise ValueError(
-                        f"A ReferenceSignal must reach over (t0, tf) = ({self.t0}, {self.tf}); "
+                        f"A ReferenceSignal must reach over (t0, tf) = ({self.t0}, {self.end}){bound}; "
                         f"this one is known from {first} to {last}."
                     )
+
+    def _require_inside(self, times: FloatArray, what: str) -> None:
+        """Raise ValueError for times of samples before t0, or after any tf that there may be."""
+        last = self.earliest_end
+        outside = (times < self.t0) | (times > last)
+        if not outside.any():
+            return
+        count = f"{outside.sum()} of {len(times)} do not, the first is {times[outside][0]}."
+        if self.has_free_tf and not np.any(times < self.t0):
+            raise ValueError(
+                f"{what} must not lie after a free tf, at its earliest {last}; {count} Give tf a lower bound of "
+                f"{times.max()} or more, or leave out later samples."
+            )
+        raise ValueError(f"{what} must lie inside [t0, tf] = [{self.t0}, {last}]; {count}")
+
+    @property
+    def earliest_end(self) -> float:
+        """The earliest tf that there may be: tf, or the lower bound of a free tf, t0 where it has none."""
+        return max(float(self.tf.lower), self.t0) if isinstance(self.tf, Parameter) else self.tf
 
 
 def initial_state_of(system: HybridSystem, experiment: Experiment) -> Any:
@@ -188,7 +256,7 @@ def list_signals(experiment: Experiment) -> tuple[PiecewisePolynomial, ...]:
     """Return reference signals in the order of the data, then the input: all that varies in time beside the modes."""
     signals = [item.signal for item in experiment.data if isinstance(item, ReferenceSignal)]
     if experiment.inputs is not None:
-        signals.append(experiment.inputs.signal(experiment.t0, experiment.tf))
+        signals.append(experiment.inputs.signal(experiment.t0, experiment.end))
     return tuple(signals)
 
 
@@ -223,10 +291,19 @@ def _check_data(data: Any) -> tuple[Data, ...]:
     return items
 
 
-def _require_inside(times: FloatArray, t0: float, tf: float, what: str) -> None:
-    outside = (times < t0) | (times > tf)
-    if outside.any():
+def _check_final_time(given: Any) -> float | Parameter:
+    """Return tf as a number, or as a `Parameter` where it is free."""
+    if not isinstance(given, Parameter):
+        return as_number(given, "tf")
+    if given.shape != ():
+        raise ValueError(f"tf must be a single number or a Parameter of one; got the shape {given.shape}.")
+    if given.fixed:
+        return float(given.value)
+    if given.scale != "linear":
+        raise ValueError("tf is estimated as it is; leave out scale='log'.")
+    if not np.isfinite(given.upper):
         raise ValueError(
-            f"{what} must lie inside [t0, tf] = [{t0}, {tf}]; {outside.sum()} of {len(times)} do not, "
-            f"the first is {times[outside][0]}."
+            "A free tf needs a finite upper bound, such as sf.Parameter(2.0, upper=5.0): the latest time to which the "
+            f"model may be integrated; got the upper bound {given.upper}."
         )
+    return given

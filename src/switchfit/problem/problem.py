@@ -1,6 +1,7 @@
 """What is estimated: parameters, experiments, and the flat vector theta of all unknowns with its constraints.
 
-``theta`` holds the free transition times of the first experiment, of the second, ..., then the free parameters
+``theta`` holds the free transition times of the first experiment and its tf where it is free, of the second, ..., then
+the free parameters
 in the order given, then the unknown entries of the initial states, again experiment by experiment. Everything that
 is fixed stays out of it.
 """
@@ -50,11 +51,13 @@ ROUNDING = 1e-12
 class Unknowns:
     """Where each unknown stands in theta, and the linear constraints on theta.
 
+    A free tf stands behind the transition times of its experiment, and counts as one of them.
+
     Attributes
     ----------
     names, units : tuple of str, length d
     initial, lower, upper : (d,) arrays
-    times : for each experiment the positions in theta of its transition times, -1 where fixed: (N,) int arrays
+    times : for each experiment the positions in theta of its `Experiment.times`, -1 where fixed: (N,) int arrays
     parameters : dict of name -> slice into theta of the free parameters
     initial_states : for each experiment the positions in theta of the entries of its initial state, -1 where it is not
         estimated: (n,) int arrays; (0,) where it is a function
@@ -80,7 +83,7 @@ class Unknowns:
 
     @cached_property
     def is_time(self) -> NDArray[np.bool_]:
-        """Which of the unknowns are transition times: (d,)."""
+        """Which of the unknowns are transition times or a free tf: (d,)."""
         found = np.zeros(len(self.names), dtype=bool)
         for where in self.times:
             found[where[where >= 0]] = True
@@ -292,14 +295,14 @@ class Problem:
                     )
                 self._check_delay_unit(experiment, item.delay)
                 unit = unit_suffix(experiment.time_unit)
-                low, high = item.times[-1] - experiment.tf, item.times[0] - experiment.t0
+                low, high = item.times[-1] - experiment.earliest_end, item.times[0] - experiment.t0
                 least, most = (parameter.value,) * 2 if parameter.fixed else (parameter.lower, parameter.upper)
                 if not low <= least <= most <= high:
                     raise ValueError(
                         f"the delay {item.delay!r} may lie in [{least}, {most}]{unit} (its bounds, if it is not "
                         f"fixed), but only from {low:.6g} to {high:.6g}{unit} are all samples of moments inside "
-                        f"(t0, tf) = ({experiment.t0}, {experiment.tf}): give it narrower bounds, move t0 or tf, or "
-                        "leave out samples at the ends."
+                        f"(t0, tf) = ({experiment.t0}, {experiment.earliest_end}): give it narrower bounds, move t0 "
+                        "or tf, or leave out samples at the ends."
                     )
 
     def _check_delay_unit(self, experiment: Experiment, delay: str) -> None:
@@ -336,7 +339,7 @@ class Problem:
 
     @property
     def theta_names(self) -> tuple[str, ...]:
-        """Name of each entry of theta, transition times first."""
+        """Name of each entry of theta, transition times first, "tf" behind them where it is free."""
         return self.unknowns.names
 
     @cached_property
@@ -418,7 +421,7 @@ class Problem:
         return counted
 
     def vectors(self, theta: FloatArray, e: int) -> tuple[FloatArray, FloatArray]:
-        """Return what the compiled programs of experiment e take: its transition times (N,) and its p (M,).
+        """Return what the compiled programs of experiment e take: its times (N,), a free tf last, and its p (M,).
 
         See Also
         --------
@@ -535,15 +538,16 @@ class Problem:
         for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
             times = experiment.initial_times
             times[where >= 0] = checked[where[where >= 0]]
-            knots = np.concatenate([[experiment.t0], times, [experiment.tf]])
+            knots = np.concatenate([[experiment.t0], times, [experiment.end]])
             if np.any(np.diff(knots) < -ROUNDING * _clock(experiment)):
+                last = ", with the upper bound of tf for its end" if experiment.has_free_tf else ""
                 raise ValueError(
                     f"The transition times in {what} must not decrease inside (t0, tf) = ({experiment.t0}, "
-                    f"{experiment.tf}); got {shorten(times)}."
+                    f"{experiment.end}){last}; got {shorten(times)}."
                 )
             if np.any(np.diff(knots) < 0):  # by rounding: put in order, round the times that are fixed
                 low = np.maximum.accumulate(np.append(experiment.t0, np.where(where < 0, times, -np.inf)))[1:]
-                high = np.minimum.accumulate(np.append(np.where(where < 0, times, np.inf), experiment.tf)[::-1])[::-1]
+                high = np.minimum.accumulate(np.append(np.where(where < 0, times, np.inf), experiment.end)[::-1])[::-1]
                 ordered = np.maximum.accumulate(np.clip(times, low, high[:-1]))
                 checked[where[where >= 0]] = ordered[where >= 0]
         self._check_delays_inside(checked, what)
@@ -552,11 +556,35 @@ class Problem:
     def _check_delays_inside(self, theta: FloatArray, what: str) -> None:
         for e, experiment in enumerate(self.experiments):
             seen = self.late_times(theta, e)
-            if seen.size and (seen.min() < experiment.t0 or seen.max() > experiment.tf):
+            if seen.size and (seen.min() < experiment.t0 or seen.max() > experiment.earliest_end):
                 raise ValueError(
                     f"{what} has delays with which samples are of moments from {seen.min():.6g} to {seen.max():.6g}"
-                    f"{unit_suffix(experiment.time_unit)}, outside (t0, tf) = ({experiment.t0}, {experiment.tf})."
+                    f"{unit_suffix(experiment.time_unit)}, outside (t0, tf) = ({experiment.t0}, "
+                    f"{experiment.earliest_end})."
                 )
+
+    def ends_of_modes(self, theta: FloatArray) -> list[FloatArray]:
+        """Return when each mode begins and the last one ends, at tf: one array an experiment, one more than its modes.
+
+        See Also
+        --------
+        Problem.split
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> problem.ends_of_modes(problem.initial_theta)
+        [array([0., 2., 6.])]
+        """
+        found = []
+        for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
+            times = experiment.initial_times
+            times[where >= 0] = theta[where[where >= 0]]
+            found.append(experiment.ends_of_modes(times))
+        return found
 
     def split(self, theta: FloatArray) -> tuple[list[FloatArray], dict[str, FloatArray]]:
         """Return all transition times, one ``(N,)`` array an experiment, and all parameters by name, fixed ones
@@ -576,11 +604,7 @@ class Problem:
         >>> times, float(parameters["k"])
         ([array([2.])], 0.5)
         """
-        times = []
-        for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
-            tau = experiment.initial_times
-            tau[where >= 0] = theta[where[where >= 0]]
-            times.append(tau)
+        times = [ends[1:-1] for ends in self.ends_of_modes(theta)]
         parameters = {}
         for name, parameter in self.parameters.items():
             span = self.unknowns.parameters.get(name)
@@ -592,7 +616,8 @@ def _clock(experiment: Experiment) -> float:
     """Return the size of the times of an experiment, of which rounding is a part: the horizon, or the clock's reading
     if more.
     """
-    return max(experiment.tf - experiment.t0, abs(experiment.t0), abs(experiment.tf))
+    last = experiment.t0 + experiment.initial_length
+    return max(experiment.initial_length, abs(experiment.t0), abs(last))
 
 
 def _check_parameters(parameters: Any) -> dict[str, Parameter]:
@@ -612,11 +637,11 @@ def _list_unknowns(
     where: list[NDArray[np.intp]] = []
     prefixes = [""] if len(experiments) == 1 else [f"{name}." for name in name_runs(experiments)]
     for prefix, experiment in zip(prefixes, experiments, strict=True):
-        positions = np.full(len(experiment.transition_times), -1, dtype=np.intp)
-        for i, tau in enumerate(experiment.transition_times):
+        positions = np.full(len(experiment.times), -1, dtype=np.intp)
+        for i, tau in enumerate(experiment.times):
             if not tau.fixed:
                 positions[i] = len(names)
-                names.append(f"{prefix}tau_{i + 1}")
+                names.append(f"{prefix}{f'tau_{i + 1}' if i < len(experiment.transition_times) else 'tf'}")
                 units.append(experiment.time_unit)
                 pieces.append(tau)
         where.append(positions)
@@ -684,8 +709,8 @@ def _build_ordering(
         _require_one_time_unit(units, "min_duration", "leave it out and bound the transition times of each")
     for e, (experiment, positions) in enumerate(zip(experiments, where, strict=True)):
         run = "" if len(experiments) == 1 else f" of {labels[e]}"
-        knots = np.concatenate([[experiment.t0], experiment.initial_times, [experiment.tf]])
-        ends = np.concatenate([[-1], positions, [-1]])
+        knots = experiment.ends_of_modes(experiment.initial_times)
+        ends = np.concatenate([[-1], positions, [] if experiment.has_free_tf else [-1]]).astype(np.intp)
         unit = unit_suffix(experiment.time_unit)
         for i, mode in enumerate(experiment.mode_sequence):
             length = knots[i + 1] - knots[i]

@@ -12,6 +12,7 @@ from functools import cached_property, partial
 from itertools import pairwise, product
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from switchfit.problem.data import (
@@ -27,6 +28,14 @@ from switchfit.problem.experiment import Experiment, initial_state_of
 from switchfit.problem.functions import Function, Shape, trace_function
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.system import HybridSystem
+
+REST = ""
+"""Name of the mode after a free tf, which nobody is shown; no mode of a system can have it."""
+
+
+def stay_at_rest(t: Any, x: Any, p: Any, u: Any = None) -> Any:
+    """Return the vector field after a free tf: 0, so that x stays x(tf)."""
+    return jnp.zeros_like(x)
 
 
 class Sensor(NamedTuple):
@@ -76,6 +85,8 @@ class Structure:
     guard_library: tuple[Function, ...]
     transition_costs: tuple[Function | None, ...] = ()
     transition_cost_library: tuple[Function, ...] = ()
+    has_free_tf: bool = False
+    """Whether the last of `modes` is rest: after a free tf nothing moves and nothing costs."""
 
     @property
     def outputs(self) -> tuple[tuple[Function | None, int], ...]:
@@ -84,8 +95,12 @@ class Structure:
 
     @property
     def N(self) -> int:
-        """Number of transitions."""
+        """Number of transitions, a free tf among them: it is the transition to rest."""
         return len(self.reset_maps)
+
+    def is_rest(self, mode: int) -> bool:
+        """Return whether a mode is the rest after a free tf."""
+        return self.has_free_tf and mode == len(self.modes) - 1
 
     @cached_property
     def M(self) -> int:
@@ -257,6 +272,11 @@ def trace_structure(
         return tuple(traced.get(pair) for pair in own), tuple(dict.fromkeys(traced.values()))
 
     modes = tuple(trace(system.modes[name], in_mode, (n,), f"mode {name!r}", form, input_names) for name in names)
+    sequence = tuple(names.index(mode) for mode in experiment.mode_sequence)
+    end: tuple[None, ...] = ()
+    if experiment.has_free_tf:  # a free tf is the transition to one more mode, which has no functions beside
+        modes += (trace(stay_at_rest, in_mode, (n,), "the rest after tf", form, input_names),)
+        names, sequence, end = (*names, REST), (*sequence, len(names)), (None,)
     references = ((item, item.signal.channels) for item in items(ReferenceSignal))
     measurements = ((item, item.values.shape[1]) for item in items(Measurements))
     reset_maps, reset_library = at_transitions(system.reset_maps, (n,), "reset map", "R(t, x, p)")
@@ -266,8 +286,8 @@ def trace_structure(
     structure = Structure(
         mode_names=names,
         modes=modes,
-        mode_of_segment=tuple(names.index(mode) for mode in experiment.mode_sequence),
-        reset_maps=reset_maps,
+        mode_of_segment=sequence,
+        reset_maps=(*reset_maps, *end),
         initial_state=x0,
         n=n,
         unknown_states=unknown,
@@ -276,15 +296,16 @@ def trace_structure(
         references=tuple((_trace_observe(trace, item, q, n), q) for item, q in references),
         measurements=tuple(Sensor.of(item, _trace_observe(trace, item, q, n)) for item, q in measurements),
         terminal=tuple(trace(item.phi, at[1:], (), "TerminalCost", "phi(x, p)") for item in items(TerminalCost)),
-        guards=guards,
+        guards=(*guards, *end),
         terminal_constraints=tuple(_trace_terminal_constraint(trace, item, n) for item in items(TerminalConstraint)),
         input_shape=inputs,
         solver=solver,
-        transitions=len(reset_maps) if transitions is None else transitions,
+        transitions=(len(reset_maps) if transitions is None else transitions) + len(end),
         reset_library=reset_library,
         guard_library=guard_library,
-        transition_costs=transition_costs,
+        transition_costs=(*transition_costs, *end),
         transition_cost_library=transition_cost_library,
+        has_free_tf=experiment.has_free_tf,
     )
     return replace(structure, parameters=_select_parameters(trace, structure))
 

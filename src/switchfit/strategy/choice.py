@@ -319,6 +319,7 @@ class Search:
         began = time.perf_counter()
         end = find(self.theta if self.best is None else self.best.theta)
         evaluations = end.evaluations
+        # The cost of a fit whose constraints are not met says nothing: any that meets them is better.
         before = np.inf if self.best is None or self.best.violated else self.best.cost
         if not end.failed and (before == np.inf or end.cost < before - LOWER * abs(before)):
             fit = fit_locally(self.problem, start=end.theta, first_cost=self.first_cost, **self.settings)

@@ -52,9 +52,9 @@ the guess, or of the way between its bounds. The last fit is without them."""
 
 
 def can_grow(problem: Problem) -> bool:
-    """Return whether a problem is one run with transitions and with data all along it."""
+    """Return whether a problem is one run with transitions, with a tf that is known and data all along it."""
     run = problem.experiments[0]
-    if len(problem.experiments) != 1 or not run.transition_times:
+    if len(problem.experiments) != 1 or not run.transition_times or run.has_free_tf:
         return False
     return len(list_sample_times(run)) > FEWEST_WINDOWS
 
@@ -108,7 +108,7 @@ def list_sample_times(run: Experiment) -> FloatArray:
         item.seen_times[np.any(np.isfinite(item.values), axis=1)] for item in run.data if isinstance(item, Measurements)
     ]
     if any(isinstance(item, ReferenceSignal) for item in run.data):
-        times.append(np.linspace(run.t0, run.tf, REFERENCE_POINTS))
+        times.append(np.linspace(run.t0, run.end, REFERENCE_POINTS))
     return np.unique(np.concatenate([np.zeros(0), *times]))
 
 
@@ -117,7 +117,7 @@ def _choose_windows(run: Experiment) -> FloatArray:
     times = list_sample_times(run)
     count = min(max(FEWEST_WINDOWS, WINDOWS_EACH * len(run.mode_sequence)), len(times))
     ends = times[np.linspace(0, len(times) - 1, count + 1).round().astype(int)[1:-1]]
-    return np.append(np.unique(ends[(ends > run.t0) & (ends < run.tf)]), run.tf)
+    return np.append(np.unique(ends[(ends > run.t0) & (ends < run.end)]), run.end)
 
 
 def _list_starts(
@@ -160,7 +160,7 @@ def _truncate(problem: Problem, end: float, k: int, *, loose: bool) -> Problem |
         taken = [replace(tau, value=value) for tau, value in zip(run.transition_times, times, strict=False)]
         part = replace(
             run,
-            data=[cut for item in run.data if (cut := _cut(item, end, run.tf)) is not None],
+            data=[cut for item in run.data if (cut := _cut(item, end, run.end)) is not None],
             mode_sequence=run.mode_sequence[: k + 1],
             transition_times=tuple(taken),
             tf=end,

@@ -18,10 +18,6 @@ TOLERANCE = 1e-5
 """On the KKT residual of a short fit; the fit that ends a strategy has that of `estimate`."""
 
 
-MET = 1e-5
-"""Value of a guard or terminal constraint, in its own unit, up to which a short fit counts as having met it."""
-
-
 class End(NamedTuple):
     """Where a short fit ended: theta (d,), the cost there, and the evaluations that it took."""
 
@@ -31,22 +27,23 @@ class End(NamedTuple):
 
     @property
     def failed(self) -> bool:
-        """Whether the model could not be evaluated."""
+        """Whether the model could not be evaluated, or a constraint is not met."""
         return not np.isfinite(self.cost)
 
 
 def fit_briefly(problem: Problem, theta: FloatArray, iterations: int = ITERATIONS) -> End:
-    """Return where a short fit from theta (d,) ends; its cost is infinite where it cannot begin, or violates guards."""
+    """Return where a short fit from theta (d,) ends; with an infinite cost where it cannot begin, or where guards or
+    terminal constraints are not met: their violation may make the cost as low as it likes.
+    """
     failed = End(theta, np.inf, 0)
     try:
         with np.errstate(all="ignore"):  # far from the data numbers may overflow
             evaluator = Evaluator(problem, theta)
             if problem.constraint_names:
-                result, held = minimize_with_constraints(evaluator, theta, TOLERANCE, iterations)
-                if any(not abs(value) <= MET for _, value, _ in held):
-                    return failed._replace(evaluations=result.evaluations)
+                result, _ = minimize_with_constraints(evaluator, theta, TOLERANCE, iterations)
             else:
                 result = minimize_cost(evaluator, theta, "auto", TOLERANCE, iterations)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return failed
-    return End(result.theta, result.cost, result.evaluations) if np.isfinite(result.cost) else failed
+    usable = np.isfinite(result.cost) and not result.violated
+    return End(result.theta, result.cost if usable else np.inf, result.evaluations)

@@ -40,8 +40,9 @@ ROUNDS = 20
 
 def can_reinsert(problem: Problem) -> bool:
     """Return whether a mode can be taken out and put in elsewhere with the same sequence: it stands between two equal
-    ones, of which there are more pairs."""
-    return any(next(_list_moves(run.mode_sequence), None) is not None for run in problem.experiments)
+    ones, of which there are more pairs. Not where tf is free: its place among the times is the last."""
+    known = [run.mode_sequence for run in problem.experiments if not run.has_free_tf]
+    return any(next(_list_moves(sequence), None) is not None for sequence in known)
 
 
 def reinsert_modes(problem: Problem, theta: FloatArray) -> End:
@@ -78,6 +79,8 @@ def _list_candidates(problem: Problem, theta: FloatArray) -> Iterator[tuple[Floa
     """Find thetas from which a fit may end at a lower cost, with the evaluations that each took."""
     evaluator = Evaluator(problem, theta)
     for run, where in zip(problem.experiments, problem.unknowns.times, strict=True):
+        if run.has_free_tf:
+            continue
         moves: dict[int, list[int]] = {}
         if np.any(where < 0):  # a fixed transition stays where it is, and with it the others' order
             continue
@@ -89,7 +92,7 @@ def _list_candidates(problem: Problem, theta: FloatArray) -> Iterator[tuple[Floa
             without[where[i : i + 2]] = theta[where[i : i + 2]].mean()
             closed[i] = _cost(evaluator, without)
         for i in sorted(closed, key=closed.__getitem__)[:REMOVALS]:
-            found = _insert(evaluator, theta, where, i, moves[i], run.t0, run.tf)
+            found = _insert(evaluator, theta, where, i, moves[i], run.t0, run.end)
             if found is not None:
                 yield found[0], found[1] + len(closed)
 

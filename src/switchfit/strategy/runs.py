@@ -105,5 +105,5 @@ def _make_feasible(problem: Problem, theta: FloatArray) -> FloatArray:
     theta = np.clip(theta, problem.unknowns.lower, problem.unknowns.upper)
     for run, where in zip(problem.experiments, problem.unknowns.times, strict=True):
         free = where[where >= 0]
-        theta[free] = np.maximum.accumulate(np.clip(theta[free], run.t0, run.tf))
+        theta[free] = np.maximum.accumulate(np.clip(theta[free], run.t0, run.end))
     return theta

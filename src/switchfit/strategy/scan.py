@@ -132,7 +132,7 @@ class Scan:
         """Return theta with the transition times of each run inside its horizon and in order."""
         for run, where in zip(self.problem.experiments, self.problem.unknowns.times, strict=True):
             free = where[where >= 0]
-            theta[free] = np.maximum.accumulate(np.clip(theta[free], run.t0, run.tf))
+            theta[free] = np.maximum.accumulate(np.clip(theta[free], run.t0, run.end))
         return theta
 
     @staticmethod
@@ -162,7 +162,7 @@ class Scan:
             if place < 0:
                 continue
             earliest = self.theta[where[i - 1]] if i and where[i - 1] >= 0 else run.t0
-            latest = self.theta[where[i + 1]] if i + 1 < len(where) and where[i + 1] >= 0 else run.tf
+            latest = self.theta[where[i + 1]] if i + 1 < len(where) and where[i + 1] >= 0 else run.end
             earliest = max(earliest, float(self.problem.unknowns.lower[place]))
             latest = min(latest, float(self.problem.unknowns.upper[place]))
             inside = samples[(samples > earliest) & (samples < latest)]

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.discretization.mesh import Mesh
 from switchfit.fit.result import Fit
+from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
@@ -199,7 +200,7 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
     if times is None:
         points = estimate.sensitivities[experiment].nodes
     else:
-        asked = _check_times(times, problem, experiment)
+        asked = _check_times(times, problem, experiment, fit.trajectories[experiment])
         mesh = Mesh.from_times(np.concatenate([evaluator.meshes[experiment].times, asked]))
         found: Sensitivity = compute_sensitivity(problem, experiment, fit.theta, mesh)
         points = found.at(asked)
@@ -261,9 +262,9 @@ def _is_near_transition(fit: Fit, problem: Problem, e: int, times: FloatArray) -
     return np.asarray((np.abs(times[:, None] - fit.theta[free][None]) <= reach[None]).any(1))
 
 
-def _check_times(times: ArrayLike, problem: Problem, e: int) -> FloatArray:
+def _check_times(times: ArrayLike, problem: Problem, e: int, trajectory: Trajectory) -> FloatArray:
     asked = np.atleast_1d(as_array(times, "times"))
-    t0, tf = problem.experiments[e].t0, problem.experiments[e].tf
+    t0, tf = trajectory.times[[0, -1]].tolist()
     if asked.ndim != 1 or asked.size == 0 or not np.isfinite(asked).all():
         raise ValueError(f"times must be finite numbers of shape (K,); got shape {asked.shape}.")
     outside = (asked < t0) | (asked > tf)

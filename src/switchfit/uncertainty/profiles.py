@@ -642,7 +642,8 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     TypeError
         If this is no estimate, or an argument is of the wrong type.
     ValueError
-        For an unknown that is not in theta, an estimate that has no problem, did not converge or has no noise model.
+        For an unknown that is not in theta, an estimate that has no problem, did not converge or has no noise model,
+        and for a problem with guards or terminal constraints.
 
     Notes
     -----
@@ -719,6 +720,11 @@ def _wrap_callback(report: Progress, trace: Trace) -> bool:
 def _check(fit: Fit) -> None:
     if not fit.status.successful:
         raise ValueError(f"a profile begins at a minimum, and this fit has not found one: {fit.message}")
+    if fit.constraints:
+        raise ValueError(
+            "a profile knows no guards and no terminal constraints, without which its intervals would be too wide: "
+            "take confidence_intervals or sf.monte_carlo."
+        )
     if fit.sigma_known is None:
         raise ValueError("a profile needs a noise model: a cost made of Measurements alone, with sigma or without.")
     if fit.sigma_known is False and fit.freedom < 1:

@@ -152,7 +152,7 @@ def second_tangents(model: Model, first: Forward, p: Array) -> tuple[Array, Seco
 
     def of_mode(mode: int) -> Callable[..., tuple[Array, ...]]:
         def row(start: Array, end: Array, piece: Piece, x: Array, *directions: Array) -> tuple[Array, ...]:
-            f, ell = model.field(mode, piece), model.density(piece)
+            f, ell = model.field(mode, piece), model.density(mode, piece)
 
             def function(start: Array, end: Array, x: Array, p: Array) -> tuple[Array, Array]:
                 return step(model.tableau, f, ell if model.has_running_cost else None, start, end, x, p)

@@ -122,7 +122,7 @@ def stage_jacobians(model: Model, path: Path, p: Array) -> StageJacobians:
             if not model.has_running_cost:
                 return StageJacobians(f_t, f_x, f_p)
             # A scalar: backward is cheaper.
-            l, gradient = jax.value_and_grad(model.density(piece), argnums=(0, 1, 2))(t, x, p)  # noqa: E741
+            l, gradient = jax.value_and_grad(model.density(mode, piece), argnums=(0, 1, 2))(t, x, p)  # noqa: E741
             return StageJacobians(f_t, f_x, f_p, l, *gradient)
 
         def row(start: Array, end: Array, piece: Piece, X: Array) -> StageJacobians:

@@ -107,7 +107,7 @@ def stage_curvature(model: Model, first: Forward, psi: Costates, p: Array) -> Ar
 
     def of_mode(mode: int) -> Callable[..., Array]:
         def at_stage(piece: Piece, t: Array, x: Array, w: Array, hb: Array, t_d: Array, x_d: Array) -> Array:
-            f, ell = model.field(mode, piece), model.density(piece)
+            f, ell = model.field(mode, piece), model.density(mode, piece)
 
             def value(t: Array, x: Array, p: Array) -> Array:
                 return w @ f(t, x, p) + (hb * ell(t, x, p) if model.has_running_cost else 0.0)
@@ -174,8 +174,10 @@ def stage_gauss_newton(model: Model, first: Forward, p: Array) -> Array:
     if not model.has_running_cost:
         return jnp.zeros((P.shape[1], P.shape[1]))
 
-    def at_stage(piece: Piece, t: Array, x: Array, t_d: Array, x_d: Array) -> Array:
+    def at_stage(mode: int, piece: Piece, t: Array, x: Array, t_d: Array, x_d: Array) -> Array:
         H = jnp.zeros((P.shape[1], P.shape[1]))
+        if model.structure.is_rest(mode):
+            return H
         for residual, W in zip(model.reference_residuals(piece), model.arguments.weights, strict=True):
             r_d = _columns(residual, (t, x, p), (t_d, x_d, P))
             H = H + r_d.T @ apply_weights(W, r_d)
@@ -188,6 +190,7 @@ def stage_gauss_newton(model: Model, first: Forward, p: Array) -> Array:
         return H
 
     def row(
+        mode: int,
         start: Array,
         end: Array,
         piece: Piece,
@@ -198,13 +201,18 @@ def stage_gauss_newton(model: Model, first: Forward, p: Array) -> Array:
     ) -> Array:
         h = end - start
         times, times_d = start + model.tableau.c * h, jnp.stack(times_derivative(model.tableau, s_d, e_d))
-        parts = jax.vmap(at_stage, in_axes=(None, 0, 0, 0, 0))(piece, times, states, times_d, along_row(*at_stages))
+        over_stages = jax.vmap(partial(at_stage, mode), in_axes=(None, 0, 0, 0, 0))
+        parts = over_stages(piece, times, states, times_d, along_row(*at_stages))
         return h * jnp.tensordot(jnp.asarray(model.tableau.b), parts, axes=1)
 
     layout = path.layout
     kept, along_row = stages_along(model, first)
     operands = (layout.start, layout.end, path.pieces, path.stages, *time_directions(model, layout), *kept)
-    return _sum_over_chunks(model, lambda _: lambda *rows: jax.vmap(row)(*rows).sum(0), layout.segment, operands)
+
+    def of_mode(mode: int) -> Callable[..., Array]:
+        return lambda *rows: jax.vmap(partial(row, mode))(*rows).sum(0)
+
+    return _sum_over_chunks(model, of_mode, layout.segment, operands)
 
 
 def _sum_over_chunks(

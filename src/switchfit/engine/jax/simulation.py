@@ -23,7 +23,7 @@ from switchfit.discretization.mesh import CHUNK, Mesh, build_rows
 from switchfit.discretization.model import Model, Piece
 from switchfit.discretization.nodes import list_costs_at_transitions
 from switchfit.discretization.steps import step
-from switchfit.engine.protocol import Simulation, Tangents, add_samples
+from switchfit.engine.protocol import Simulation, Tangents, add_samples, cut_at_tf
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.losses import robust
@@ -86,7 +86,7 @@ def simulate_by_jax(
         if sensor.delay is not None
     }
     found = add_samples(simulation, structure, whole, late)
-    return replace(found, cost=cost + _cost_of_samples(structure, whole, found.seen, p))
+    return cut_at_tf(replace(found, cost=cost + _cost_of_samples(structure, whole, found.seen, p)), structure)
 
 
 def _cost_of_samples(structure: Structure, arguments: Arguments, seen: tuple[FloatArray, ...], p: FloatArray) -> float:
@@ -193,7 +193,7 @@ def _block(
         def row(carried: tuple[jax.Array, jax.Array], given: tuple[Any, ...]) -> tuple[Any, Any]:
             x, X = carried
             start, end, start_d, end_d, piece = given
-            f, ell = model.field(mode, piece), model.density(piece) if model.has_running_cost else None
+            f, ell = model.field(mode, piece), model.density(mode, piece) if model.has_running_cost else None
             after, cost = step(model.tableau, f, ell, start, end, x, p)
             if not tangents:
                 return (after, X), (cost, x, after)

@@ -19,6 +19,7 @@ from switchfit.engine.protocol import (
     Simulation,
     Tangents,
     add_samples,
+    cut_at_tf,
 )
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
@@ -142,4 +143,5 @@ def _simulation(
     late = {k: native.outputs(times, states, p) for k, (times, states) in found.late.items()}
     if None in late.values():
         return None
-    return add_samples(simulation, structure, arguments, {k: y[0] for k, y in late.items() if y is not None})
+    found_all = add_samples(simulation, structure, arguments, {k: y[0] for k, y in late.items() if y is not None})
+    return cut_at_tf(found_all, structure)

@@ -124,8 +124,8 @@ def _write(module: Module, library: Structure, sizes: Sizes, order: Order) -> No
 def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> int:
     """Write the rows of a mode; return how many second derivatives a late sample has at each stage of its row."""
     module, order, library = kernels.module, kernels.order, kernels.library
-    running = bool(library.running or library.references)
-    stage = kernels.templates.stage(mode)
+    running = bool(library.running or library.references) and not library.is_rest(mode)
+    stage = kernels.templates.stage(mode, running=running)
     kinds = [("inner", stage, False, running, False), ("end", stage, True, running, False)]
     if late:
         kinds.append(("late", kernels.templates.stage(mode, running=False) if running else stage, True, False, True))

@@ -114,7 +114,7 @@ class Templates:
         def stage(t: Any, x: Any, p: Any, w: Any, hb: Any, origin: Any, coefficients: Any, *constants: Any) -> Any:
             model = self.model(constants)
             piece = Piece(origin, coefficients)
-            f, ell = model.field(mode, piece), model.density(piece)
+            f, ell = model.field(mode, piece), model.density(mode, piece)
             costs = running and model.has_running_cost
             zero = jnp.zeros(())
             if self.order == Order.COST:

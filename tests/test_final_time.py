@@ -1,0 +1,473 @@
+"""A free final time: closed forms, all methods and both engines, what is printed, drawn and saved, what is refused."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import switchfit as sf
+from switchfit.discretization.model import Model
+from switchfit.fit.evaluator import Evaluator
+from switchfit.io.problem_file import load_problem
+from switchfit.problem.functions import use_float64
+
+METHODS = ("auto", "forward", "autodiff", "adjoint")
+
+
+def grow(t, x, p):
+    return jnp.stack([p["a"] + 0 * t])
+
+
+def decay(t, x, p):
+    return -p["k"] * x
+
+
+def closed_problem(**settings):
+    """x' = a until tau, then x' = -k x until tf; J is the integral of x^2 + t, plus (x(tf) - 1/2)^2."""
+    system = sf.HybridSystem({"grow": grow, "decay": decay}, [0.1])
+    costs = [
+        sf.RunningCost(lambda t, x, p: x[0] ** 2 + t),
+        sf.TerminalCost(lambda x, p: (x[0] - 0.5) ** 2),
+    ]
+    run = sf.Experiment(costs, ("grow", "decay"), (0.9,), 0.0, sf.Parameter(2.3, lower=0.5, upper=6.0))
+    return sf.Problem(system, run, {"a": 1.2, "k": 0.7}, rtol=1e-12, atol=1e-14, **settings)
+
+
+def closed_cost(theta):
+    tau, tf, a, k = theta
+    grown = ((0.1 + a * tau) ** 3 - 0.1**3) / (3 * a)
+    top, rest = 0.1 + a * tau, tf - tau
+    return grown + top**2 * (1 - jnp.exp(-2 * k * rest)) / (2 * k) + tf**2 / 2 + (top * jnp.exp(-k * rest) - 0.5) ** 2
+
+
+@pytest.mark.parametrize("engine", ["native", "jax"])
+@pytest.mark.parametrize("method", METHODS)
+def test_cost_gradient_and_hessian_are_those_of_the_closed_form(method, engine):
+    problem = closed_problem(engine=engine)
+    assert problem.theta_names == ("tau_1", "tf", "a", "k")
+    with use_float64():
+        theta = jnp.array(problem.initial_theta)
+        expected = closed_cost(theta), jax.grad(closed_cost)(theta), jax.hessian(closed_cost)(theta)
+    found = sf.evaluate(problem, method=method)
+    assert found.cost == pytest.approx(float(expected[0]), rel=1e-11)
+    np.testing.assert_allclose(found.gradient, expected[1], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found.hessian, expected[2], rtol=0, atol=1e-8)
+
+
+def swing(t, x, p, u):
+    return jnp.stack([x[1], -jnp.sin(x[0]) * (1 + 0.3 * jnp.sin(t)) - p["c"] * x[1] + u])
+
+
+def drift(t, x, p, u):
+    return jnp.stack([x[1] * jnp.cos(t * x[0]), p["q"] * x[0] * x[1] - u * t])
+
+
+def kick(t, x, p):
+    return jnp.stack([x[0] + 0.1 * p["q"] * t, 0.5 * x[1] * x[0]])
+
+
+def hard_problem(tf=2.4, **settings):
+    """Two transitions, one with a reset map and one with a guard, an input, a reference signal, samples and costs of
+    every kind, all of them nonlinear and dependent on time."""
+    times = np.linspace(0.0, 4.0, 33)
+    rng = np.random.default_rng(3)
+    signal = sf.ReferenceSignal.from_samples(times, rng.normal(size=(33, 1)), observe=lambda t, x, p: x[:1] * x[1] ** 2)
+    samples = sf.Measurements(times[1:12], rng.normal(size=(11, 1)), lambda t, x, p: x[1:] + p["c"] * t, sigma=0.7)
+    costs = [
+        samples,
+        signal,
+        sf.RunningCost(lambda t, x, p: jnp.cos(x[0] * t) * p["c"] + x[1] ** 3),
+        sf.TransitionCost(lambda t, x, p: t * x[0] ** 2, before="drift", after="swing"),
+        sf.TerminalCost(lambda x, p: jnp.exp(0.3 * x[0]) * p["q"] * x[1]),
+        sf.TerminalConstraint(lambda x, p: jnp.stack([x[0] * x[1] - p["c"], x[1] ** 2])),
+    ]
+    system = sf.HybridSystem(
+        {"swing": swing, "drift": drift},
+        lambda p: jnp.stack([0.4 + 0 * p["c"], p["c"]]),
+        reset_maps={("swing", "drift"): kick},
+        guards={("drift", "swing"): lambda t, x, p: x[0] ** 2 - 0.3 * t * p["q"]},
+    )
+    run = sf.Experiment(
+        costs,
+        ("swing", "drift", "swing"),
+        (0.83, 1.57),
+        0.0,
+        sf.Parameter(tf, lower=1.6, upper=4.0),
+        inputs=sf.Input(times, np.sin(2 * times), kind="cubic"),
+    )
+    return sf.Problem(system, run, {"c": 0.3, "q": -0.4}, **settings)
+
+
+@pytest.mark.parametrize("tf", [2.4, 2.375])  # 2.375 is a node of the mesh
+def test_both_engines_agree(tf):
+    native, jax_ = (Evaluator(hard_problem(tf, engine=engine)) for engine in ("native", "jax"))
+    theta = native.problem.initial_theta
+    for matrix in ("exact", "gauss-newton", "none"):
+        one, other = native(theta, matrix=matrix), jax_(theta, matrix=matrix)
+        assert one.cost == pytest.approx(other.cost, rel=1e-12)
+        np.testing.assert_allclose(one.gradient, other.gradient, rtol=1e-11, atol=1e-12)
+        if matrix != "none":
+            np.testing.assert_allclose(one.hessian, other.hessian, rtol=1e-10, atol=1e-11)
+    multipliers = np.array([0.7, -1.3, 0.4])
+    one, other = (e.constrained(theta, 1, multipliers, 2.0) for e in (native, jax_))
+    np.testing.assert_allclose(one.constraints, other.constraints, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(one.jacobian, other.jacobian, rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(one.hessian, other.hessian, rtol=1e-10, atol=1e-10)
+
+
+def test_derivatives_pass_every_check():
+    found = sf.check_derivatives(hard_problem())
+    assert found.passed, str(found)
+
+
+def test_forward_and_automatic_derivatives_are_those_of_the_backward_sweep():
+    problem = replace(
+        hard_problem(), experiments=replace(hard_problem().experiments[0], data=hard_problem().experiments[0].data[:3])
+    )
+    exact = sf.evaluate(problem)
+    for method in ("forward", "autodiff"):
+        found = sf.evaluate(problem, method=method)
+        np.testing.assert_allclose(found.gradient, exact.gradient, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(found.hessian, exact.hessian, rtol=0, atol=1e-9)
+
+
+# --- fits -------------------------------------------------------------------------------------------------------------
+
+RATE, LEVEL = 0.4, 0.2
+TIMES = np.linspace(0.1, 2.0, 20)
+
+
+def cooling_run(seed=0, start=1.0, name=None, tf=None, more=()):
+    """A log of x' = -k x up to 2 s; when does x reach the level?"""
+    values = start * np.exp(-RATE * TIMES) + 0.01 * np.random.default_rng(seed).normal(size=20)
+    data = [sf.Measurements(TIMES, values, sigma=0.01), sf.TerminalConstraint(lambda x, p: x[0] - LEVEL), *more]
+    tf = sf.Parameter(5.0, lower=2.0, upper=9.0) if tf is None else tf
+    return sf.Experiment(data, ("cools",), (), 0.0, tf, initial_state=[start], name=name)
+
+
+def cooling(*runs):
+    system = sf.HybridSystem({"cools": decay}, [1.0])
+    return sf.Problem(system, list(runs) or cooling_run(), {"k": sf.Parameter(0.6, lower=0.05, upper=3.0)})
+
+
+@pytest.fixture(scope="module")
+def cooled():
+    return sf.estimate(cooling())
+
+
+def test_the_time_to_a_level_and_its_standard_error_follow_from_the_rate(cooled):
+    """tf = ln(1 / level) / k, which the samples up to 2 s determine through k."""
+    fit = cooled
+    assert fit.success
+    assert fit.theta_names == ("tf", "k")
+    tf, k = fit.theta
+    assert tf == pytest.approx(np.log(1 / LEVEL) / k, rel=1e-8)
+    assert fit.final_times == (tf,)
+    assert [len(times) for times in fit.transition_times] == [0]
+    assert fit.standard_errors[0] == pytest.approx(tf / k * fit.standard_errors[1], rel=1e-7)
+    residual = fit.problem.experiments[0].data[0].values[:, 0] - np.exp(-k * TIMES)
+    slope = -TIMES * np.exp(-k * TIMES)
+    assert residual @ slope == pytest.approx(0.0, abs=1e-6)
+    curvature = (slope @ slope - residual @ (TIMES**2 * np.exp(-k * TIMES))) / 0.01**2
+    assert fit.standard_errors[1] == pytest.approx(curvature**-0.5, rel=1e-5)
+
+
+def test_what_is_printed_drawn_predicted_and_saved_ends_at_tf(cooled, tmp_path):
+    fit = cooled
+    tf = fit.final_times[0]
+    assert fit.trajectory.times[-1] == tf
+    assert fit.trajectory.mode_spans == [("cools", 0.0, tf)]
+    assert "cools, 0 to 3.98557 s" in str(fit)
+    assert "  tf   3.986  ± 0.033" in str(fit)
+    figure = fit.plot(bands=True)
+    assert {ax.get_xlim() for ax in figure.axes} == {(0.0, tf)}
+    plt.close(figure)
+    assert fit.predict().times[-1] == tf
+    at_end = fit.predict([1.0, tf])
+    assert at_end.outputs[1, 0] == pytest.approx(LEVEL, rel=1e-9)
+    # At a fixed time: x(t) = exp(-k t), whatever tf is.
+    np.testing.assert_allclose(
+        at_end.output_errors[:, 0], at_end.times * at_end.outputs[:, 0] * fit.standard_errors[1], rtol=1e-6
+    )
+    with pytest.raises(ValueError, match=r"times must lie inside \[t0, tf\] = \[0.0, 3.98557"):
+        fit.predict([tf + 1e-3])
+    fit.save(tmp_path / "fit.json")
+    loaded = sf.Estimate.load(tmp_path / "fit.json")
+    assert str(loaded) == str(fit)
+    assert (loaded.final_times, loaded.final_places) == ((tf,), (0,))
+    assert loaded.is_time.tolist() == [True, False]
+
+
+def test_simulation_ends_at_the_given_tf():
+    path = sf.simulate(cooling(), [3.3, 0.5])
+    assert (path.times[0], path.times[-1]) == (0.0, 3.3)
+    assert set(path.modes) == {"cools"}
+    assert path.states[-1, 0] == pytest.approx(np.exp(-0.5 * 3.3), rel=1e-8)
+    at_bound = sf.simulate(cooling(), [9.0, 0.5])
+    assert at_bound.times[-1] == 9.0
+    assert at_bound.states[-1, 0] == pytest.approx(np.exp(-0.5 * 9.0), rel=1e-8)
+
+
+def test_each_of_several_runs_has_its_own_tf_beside_runs_without():
+    known = cooling_run(2, start=0.7, tf=2.5)
+    known = replace(known, data=known.data[:1])
+    problem = cooling(cooling_run(0, name="hot"), known, cooling_run(1, start=0.6, name="warm"))
+    assert problem.theta_names == ("hot.tf", "warm.tf", "k")
+    assert sf.check_derivatives(problem).passed
+    fit = sf.estimate(problem)
+    assert fit.success
+    k = fit.parameters["k"]
+    np.testing.assert_allclose(fit.final_times, [np.log(1 / LEVEL) / k, 2.5, np.log(0.6 / LEVEL) / k], rtol=1e-8)
+    assert [path.times[-1] for path in fit.trajectories] == list(fit.final_times)
+    assert fit.final_places == (0, -1, 1)
+
+
+def test_multistart_draws_tf_between_its_bounds_and_monte_carlo_varies_it():
+    problem = cooling()
+    starts = sf.multistart(problem, starts=16, seed=2)
+    drawn = starts.start[1:, 0]
+    assert drawn.min() >= 2.0
+    assert drawn.max() <= 9.0
+    assert np.ptp(drawn) > 4.0
+    found = starts.theta[starts.success]
+    assert len(found) >= 12
+    np.testing.assert_allclose(found, np.broadcast_to(found[0], found.shape), rtol=1e-6)
+    fits = sf.monte_carlo(problem, runs=12, seed=3, theta=[np.log(1 / LEVEL) / RATE, RATE])
+    assert fits.success.all()
+    np.testing.assert_allclose(fits.theta[:, 0], np.log(1 / LEVEL) / fits.theta[:, 1], rtol=1e-7)
+    assert np.ptp(fits.theta[:, 0]) > 0.02
+
+
+def test_batches_without_constraints_take_a_free_tf_in_their_compiled_program():
+    """A prior on tf and a cost of x(tf): the program that all fits share, and one fit alone, end in the same place."""
+    system = sf.HybridSystem({"cools": decay}, [1.0])
+    data = [
+        sf.Measurements(TIMES, np.exp(-RATE * TIMES), sigma=0.01),
+        sf.TerminalCost(lambda x, p: 9 * (x[0] - 0.3) ** 2),
+    ]
+    tf = sf.Parameter(4.0, lower=2.0, upper=9.0, prior=sf.Normal(3.5, 0.5))
+    problem = sf.Problem(system, sf.Experiment(data, ("cools",), (), 0.0, tf), {"k": sf.Parameter(0.5, lower=0.1)})
+    truth = np.array([3.2, RATE])
+    alone = sf.estimate(problem)
+    assert alone.success
+    by_hand = lambda tf: 9 * (np.exp(-alone.theta[1] * tf) - 0.3) ** 2 + 0.5 * (tf - 3.5) ** 2 / 0.25  # noqa: E731
+    for step in (1e-4, -1e-4):
+        assert by_hand(alone.theta[0] + step) > by_hand(alone.theta[0])
+    fits = sf.monte_carlo(problem, runs=6, seed=5, theta=truth)
+    assert fits.success.all()
+    again = [
+        sf.estimate(replace(problem, experiments=replace(problem.experiments[0], tf=replace(tf, value=t))))
+        for t in (2.5, 6.0)
+    ]
+    for fit in again:
+        np.testing.assert_allclose(fit.theta, alone.theta, rtol=1e-6)
+    several = sf.estimate_many([fit.problem for fit in again])
+    np.testing.assert_allclose(several.theta, [alone.theta] * 2, rtol=1e-6)
+
+
+def minimum_time(tf=None, **settings):
+    """From rest to rest over 1 m with at most 1 m/s^2: one switch half way, 2 s."""
+    system = sf.HybridSystem(
+        {
+            "push": lambda t, x, p: jnp.stack([x[1], jnp.ones(())]),
+            "brake": lambda t, x, p: jnp.stack([x[1], -jnp.ones(())]),
+        },
+        [0.0, 0.0],
+    )
+    costs = [
+        sf.RunningCost(lambda t, x, p: jnp.ones(())),
+        sf.TerminalConstraint(lambda x, p: x[0] - 1.0),
+        sf.TerminalConstraint(lambda x, p: x[1:2]),
+    ]
+    tf = sf.Parameter(2.5, upper=5.0) if tf is None else tf
+    return sf.Problem(system, sf.Experiment(costs, ("push", "brake"), (0.7,), 0.0, tf), **settings)
+
+
+@pytest.mark.parametrize("upper", [2.6, 5.0, 8.0, 50.0])
+def test_minimum_time_does_not_depend_on_the_upper_bound(upper):
+    fit = sf.estimate(minimum_time(sf.Parameter(2.5, upper=upper)), strategy="local")
+    assert fit.success
+    np.testing.assert_allclose(fit.theta, [1.0, 2.0], rtol=0, atol=1e-9)
+    assert fit.cost == pytest.approx(2.0, abs=1e-9)
+    # T = 2 sqrt(q): 1 m more takes dT/dq = 1 s/m longer, which is what the multiplier says.
+    assert fit.constraints[0][2] == pytest.approx(-1.0, abs=1e-7)
+    assert [name for name, _, _ in fit.constraints] == ["terminal constraint 1", "terminal constraint 2"]
+
+
+def test_a_fit_that_ends_where_constraints_are_not_met_is_not_taken_for_a_better_one():
+    """From there both modes collapse: J = 0 is less than 2, and 1 m short of the goal."""
+    problem, start = minimum_time(), [1.929, 2.284]
+    alone = sf.estimate(problem, start=start, strategy="local")
+    assert alone.status.name == "INFEASIBLE"
+    assert alone.cost == pytest.approx(0.0, abs=1e-6)
+    np.testing.assert_allclose(sf.estimate(problem, start=start).theta, [1.0, 2.0], rtol=0, atol=1e-8)
+
+
+def straight(target=1.0, min_duration=0.0, **bounds):
+    """x' = 1, and a cost of how far x(tf) is from a target."""
+    system = sf.HybridSystem({"goes": lambda t, x, p: jnp.ones(1)}, [0.0])
+    cost = sf.TerminalCost(lambda x, p: (x[0] - target) ** 2)
+    run = sf.Experiment(cost, ("goes",), (), 0.0, sf.Parameter(**({"value": 2.0, "upper": 4.0} | bounds)))
+    return sf.Problem(system, run, min_duration=min_duration)
+
+
+def test_bounds_and_minimum_duration_hold_tf():
+    assert sf.estimate(straight()).theta == pytest.approx([1.0], abs=1e-8)
+    late = sf.estimate(straight(target=7.0))
+    assert (late.theta.tolist(), [str(c) for c in late.active]) == ([4.0], ["tf at its upper bound 4"])
+    early = sf.estimate(straight(lower=1.5))
+    assert (early.theta.tolist(), [str(c) for c in early.active]) == ([1.5], ["tf at its lower bound 1.5"])
+    long = sf.estimate(straight(min_duration=1.25))
+    assert long.theta == pytest.approx([1.25], abs=1e-12)
+    assert [c.kind for c in long.active] == ["minimum duration"]
+
+
+def test_a_last_mode_that_vanishes_is_reported_as_collapsed():
+    """x rises at 1, then at 1/2: the way to 1 is short in the first mode, which then takes all of the time."""
+    system = sf.HybridSystem({"fast": lambda t, x, p: jnp.ones(1), "slow": lambda t, x, p: 0.5 * jnp.ones(1)}, [0.0])
+    costs = [sf.RunningCost(lambda t, x, p: jnp.ones(())), sf.TerminalConstraint(lambda x, p: x - 1.0)]
+    run = sf.Experiment(costs, ("fast", "slow"), (0.5,), 0.0, sf.Parameter(1.5, upper=4.0))
+    fit = sf.estimate(sf.Problem(system, run))
+    np.testing.assert_allclose(fit.theta, [1.0, 1.0], rtol=0, atol=1e-8)
+    assert [(c.kind, c.mode, c.position) for c in fit.active] == [("collapsed", "slow", 1)]
+
+
+def test_a_guard_before_a_free_tf():
+    """A ball falls from 1 m, bounces with e = 1/2 and rises until it stands still: both times are known."""
+    g = 9.81
+    fall = lambda t, x, p: jnp.stack([x[1], -g * jnp.ones(())])  # noqa: E731
+    system = sf.HybridSystem(
+        {"falls": fall, "rises": fall},
+        [1.0, 0.0],
+        reset_maps={("falls", "rises"): lambda t, x, p: jnp.stack([x[0], -0.5 * x[1]])},
+        guards={("falls", "rises"): lambda t, x, p: x[0]},
+    )
+    costs = [sf.TerminalCost(lambda x, p: 0.0 * x[0]), sf.TerminalConstraint(lambda x, p: x[1])]
+    problem = sf.Problem(system, sf.Experiment(costs, ("falls", "rises"), (0.4,), 0.0, sf.Parameter(0.7, upper=2.0)))
+    fit = sf.estimate(problem)
+    hits = np.sqrt(2 / g)
+    np.testing.assert_allclose(fit.theta, [hits, 1.5 * hits], rtol=1e-8)
+    assert fit.trajectory.states[-1, 0] == pytest.approx(0.25, rel=1e-8)
+
+
+# --- problem files and errors -----------------------------------------------------------------------------------------
+
+
+def test_a_problem_file_has_a_free_tf(tmp_path):
+    from typer.testing import CliRunner
+
+    from switchfit import cli
+
+    (tmp_path / "room.py").write_text(
+        "import switchfit as sf\nroom = sf.HybridSystem({'cools': lambda t, x, p: -p['k'] * x}, [1.0])\n"
+    )
+    rows = "".join(f"{t},{v}\n" for t, v in zip(TIMES.tolist(), np.exp(-RATE * TIMES).tolist(), strict=True))
+    (tmp_path / "log.csv").write_text("t,x\n" + rows)
+    (tmp_path / "problem.toml").write_text(
+        'model = "room.py:room"\n[parameters]\nk = 0.6\n[[experiments]]\nmode_sequence = ["cools"]\n'
+        "transition_times = []\nt0 = 0.0\n"
+        "tf = { value = 3.0, lower = 2.0, upper = 9.0, prior = { mean = 3.5, sd = 0.5 } }\n"
+        '[[experiments.data]]\nfile = "log.csv"\ntime = "t"\ncolumns = ["x"]\nsigma = 0.01\n'
+    )
+    loaded = load_problem(tmp_path / "problem.toml").problem
+    tf = loaded.experiments[0].tf
+    assert (float(tf.value), float(tf.lower), float(tf.upper)) == (3.0, 2.0, 9.0)
+    fit = sf.estimate(loaded)
+    assert fit.theta == pytest.approx([3.5, RATE], rel=1e-6)
+    assert fit.standard_errors[0] == pytest.approx(0.5, rel=1e-6)
+    out = tmp_path / "path.csv"
+    found = CliRunner().invoke(cli.app, ["simulate", str(tmp_path / "problem.toml"), "--out", str(out)])
+    assert found.exit_code == 0, found.output
+    assert out.read_text().splitlines()[-1].split(",")[1] == "3.0"
+
+
+def test_a_fixed_parameter_is_a_number():
+    run = cooling_run(tf=sf.Parameter(3.0, fixed=True))
+    assert (run.tf, run.has_free_tf) == (3.0, False)
+    assert cooling(run).theta_names == ("k",)
+
+
+@pytest.mark.parametrize(
+    ("tf", "message"),
+    [
+        (sf.Parameter(5.0, lower=2.0), r"A free tf needs a finite upper bound, .*; got the upper bound inf"),
+        (sf.Parameter(5.0, lower=-1.0, upper=9.0), r"The lower bound of tf must lie after t0 = 0.0; got -1.0"),
+        (sf.Parameter(5.0, lower=0.0, upper=9.0), r"The lower bound of tf must lie after t0 = 0.0; got 0.0"),
+        (sf.Parameter(-1.0, upper=9.0), r"a finite horizon with t0 < tf; got \(0.0, -1.0\)"),
+        (sf.Parameter([5.0, 6.0], upper=9.0), r"tf must be a single number .* the shape \(2,\)"),
+        (sf.Parameter(5.0, upper=9.0, scale="log"), r"tf is estimated as it is; leave out scale='log'"),
+        (sf.Parameter(5.0, lower=2.0, upper=9.0, unit="h"), r"tf has the unit 'h', but time_unit of .* is 's'"),
+        (
+            sf.Parameter(5.0, lower=1.5, upper=9.0),
+            r"must not lie after a free tf, at its earliest 1.5; 5 of 20 do not, .* a lower bound of 2.0 or more",
+        ),
+        (sf.Parameter(5.0, upper=9.0), r"must not lie after a free tf, at its earliest 0.0; 20 of 20"),
+    ],
+)
+def test_a_tf_that_makes_no_sense_is_refused(tf, message):
+    with pytest.raises(ValueError, match=message):
+        cooling_run(tf=tf)
+
+
+def test_signals_must_reach_to_the_upper_bound_of_tf():
+    times = np.linspace(0.0, 4.0, 9)
+    tf = sf.Parameter(3.0, lower=2.0, upper=5.0)
+    signal = sf.ReferenceSignal.from_samples(times, times[:, None])
+    with pytest.raises(ValueError, match=r"over \(t0, tf\) = \(0.0, 5.0\), whose end is the upper bound of tf"):
+        sf.Experiment(signal, ("cools",), (), 0.0, tf)
+    with pytest.raises(ValueError, match=r"Input must be known over \(t0, tf\) = \(0.0, 5.0\)"):
+        sf.Experiment(
+            sf.RunningCost(lambda t, x, p: x[0]), ("cools",), (), 0.0, tf, inputs=sf.Input(times, times, kind="linear")
+        )
+
+
+def test_transitions_must_lie_before_tf():
+    cost = sf.TerminalCost(lambda x, p: x[0])
+    with pytest.raises(ValueError, match=r"strictly inside \(t0, tf\) = \(0.0, 2.0\); got \[3.0\]"):
+        sf.Experiment(cost, ("a", "b"), (3.0,), 0.0, sf.Parameter(2.0, upper=5.0))
+    problem = minimum_time()
+    with pytest.raises(
+        ValueError, match=r"must not decrease inside \(t0, tf\) = \(0.0, 5.0\), with the upper bound of tf"
+    ):
+        sf.simulate(problem, [1.0, 5.5])
+    with pytest.raises(ValueError, match="must not decrease"):
+        sf.simulate(problem, [2.0, 1.5])
+
+
+def test_a_delay_must_leave_all_samples_before_the_lower_bound_of_tf():
+    data = sf.Measurements(TIMES + 1.0, np.exp(-RATE * TIMES), sigma=0.01, delay="lag")
+    run = sf.Experiment(data, ("cools",), (), 0.0, sf.Parameter(3.0, lower=2.5, upper=5.0))
+    system = sf.HybridSystem({"cools": decay}, [1.0])
+    parameters = {"k": 0.5, "lag": sf.Parameter(0.6, lower=0.5, upper=1.05)}
+    assert sf.check_derivatives(sf.Problem(system, run, parameters)).passed
+    with pytest.raises(ValueError, match=r"only from 0.5 to 1.1 s are all samples .* = \(0.0, 2.5\)"):
+        sf.Problem(system, run, parameters | {"lag": sf.Parameter(0.6, lower=0.4, upper=1.05)})
+
+
+def test_a_reference_signal_that_outlasts_a_free_tf_cannot_be_simulated():
+    times = np.linspace(0.0, 5.0, 21)
+    signal = sf.ReferenceSignal.from_samples(times, np.exp(-RATE * times)[:, None])
+    system = sf.HybridSystem({"cools": decay}, [1.0])
+    problem = sf.Problem(
+        system, sf.Experiment(signal, ("cools",), (), 0.0, sf.Parameter(3.0, lower=2.0, upper=5.0)), {"k": 0.5}
+    )
+    with pytest.raises(ValueError, match="or after the lower bound of a free tf, cannot be simulated"):
+        sf.monte_carlo(problem, runs=2)
+
+
+def test_a_profile_with_constraints_is_refused(cooled):
+    with pytest.raises(ValueError, match="a profile knows no guards and no terminal constraints"):
+        cooled.profile("tf")
+
+
+def test_nothing_is_left_of_the_running_cost_after_tf_in_the_functions_of_the_model():
+    problem = closed_problem()
+    structure = problem.structures[0]
+    assert [structure.is_rest(mode) for mode in range(3)] == [False, False, True]
+    model = Model(structure, Evaluator(problem).arguments[0])
+    with use_float64():
+        at = 1.0, jnp.array([2.0]), jnp.array([1.2, 0.7])
+        assert [float(model.density(mode, None)(*at)) for mode in range(3)] == [5.0, 5.0, 0.0]
