@@ -132,12 +132,12 @@ def test_another_number_of_transitions_compiles_one_program_another_number_of_sa
         modes = [("on", "off")[k % 2] for k in range(transitions + 1)]
         return sf.Problem(ROOM, sf.Experiment(data, modes, knots, 0.0, 3.0), {"k": sf.Parameter(1.0, 0.5, 2.0)})
 
-    sf.estimate(room())
+    sf.estimate(room(), strategy="local")
     size = pad_length(evaluator_of(room()).meshes[0].cells)
     if "samples" in change:
         assert pad_length(evaluator_of(room(**change)).meshes[0].cells) > size
     fits = []
-    counts = compiled_by(lambda: fits.append(sf.estimate(room(**change))))
+    counts = compiled_by(lambda: fits.append(sf.estimate(room(**change), strategy="local")))
     assert fits[0].integration_error < 1e-8, "the mesh has not been refined after the fit"
     assert counts == [1 if "transitions" in change else 0, 0, 0, 0, 0]
 

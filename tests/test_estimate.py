@@ -306,7 +306,7 @@ def test_trajectories_are_simulated_when_they_are_asked_for(monkeypatch):
 
 
 def test_too_few_iterations():
-    found = sf.estimate(capacitor(voltage(TIMES) + noise(0)), max_iterations=1)
+    found = sf.estimate(capacitor(voltage(TIMES) + noise(0)), max_iterations=1, strategy="local")
     assert found.status is sf.Status.MAX_ITERATIONS
     assert not found.success
     assert found.iterations == 1

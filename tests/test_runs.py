@@ -482,8 +482,6 @@ def test_batches(fitted):
     study = sf.monte_carlo(problem, 40, theta=fitted.theta, seed=1)
     assert study.success.all()
     np.testing.assert_allclose(study.standard_deviation, fitted.standard_errors, rtol=0.5)
-    with pytest.raises(ValueError, match=r"there are none for k, c: give sf.Parameter"):
-        sf.multistart(problem, 4)
     bounded = {"k": sf.Parameter(1.0, lower=0.5, upper=2.0), "c": sf.Parameter(0.2, lower=0.0, upper=0.5)}
     several = sf.multistart(sf.Problem(TANK, problem.experiments, dict(problem.parameters) | bounded), 8)
     assert several.best.cost == pytest.approx(fitted.cost, rel=1e-8)

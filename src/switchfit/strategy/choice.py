@@ -8,23 +8,26 @@ from dataclasses import replace
 from typing import Any, Literal, get_args
 
 import numpy as np
+import scipy.special
 from numpy.typing import ArrayLike
 
 from switchfit.estimation.estimator import Estimate, fit_locally
 from switchfit.fit.result import Step
+from switchfit.fit.solution import is_least_squares, is_sigma_known
 from switchfit.optimize import IterationRecord, Status
 from switchfit.optimize.problem import HessianKind
-from switchfit.problem.data import FloatArray
+from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.problem import GIVEN, Problem
 from switchfit.problem.validation import as_choice, as_positive
 from switchfit.runtime.errors import NotIntegrableError
-from switchfit.strategy.horizon import can_grow, grow_horizon
+from switchfit.strategy.horizon import REFERENCE_POINTS, can_grow, grow_horizon
 from switchfit.strategy.quick import End, fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
 from switchfit.strategy.runs import fit_runs_alone, has_runs
 from switchfit.strategy.scan import can_scan, scan_intervals
 from switchfit.strategy.starts import try_starts
 from switchfit.uncertainty.quality import measure_quality
+from switchfit.uncertainty.verdict import UNLIKELY
 
 Strategy = Literal["local", "auto", "thorough"]
 STRATEGIES = get_args(Strategy)
@@ -132,29 +135,24 @@ def estimate(
     settings: dict[str, Any] = {"tolerance": tolerance, "max_iterations": max_iterations, "callback": callback}
     settings["hessian"] = hessian
     began = time.perf_counter()
-    best: Estimate | None = None
     try:
         best = fit_locally(problem, start=start, **settings)
     except NotIntegrableError:
         if strategy == "local":
             raise
-        failure = True
-    else:
-        failure = False
-    if strategy == "local" or (strategy == "auto" and best is not None and _is_enough(best)):
-        assert best is not None
-        return best
-    if strategy == "auto" and hessian != "auto" and best is not None:
+        search = Search(problem, None, problem.check_theta(start), strategy, settings, began, budget)
+        search.run()
+        if search.best is None:
+            raise
+        return search.finish(search.best)
+    if strategy == "local" or (strategy == "auto" and (hessian != "auto" or _is_enough(problem, best))):
         return best
     search = Search(problem, best, problem.check_theta(start), strategy, settings, began, budget)
     search.run()
-    if search.best is None:
-        assert failure
-        return fit_locally(problem, start=start, **settings)  # raises what is wrong with the guess
-    return search.finish()
+    return search.finish(search.best or best)
 
 
-def _is_enough(fit: Estimate, tried: Collection[str] = ()) -> bool:
+def _is_enough(problem: Problem, fit: Estimate, tried: Collection[str] = ()) -> bool:
     """Return whether nothing more has to be tried: nothing that the verdict doubts could be better elsewhere.
 
     Where the size of the noise is not known, the residuals of a minimum near the lowest look as good as its own: the
@@ -163,16 +161,49 @@ def _is_enough(fit: Estimate, tried: Collection[str] = ()) -> bool:
     """
     if fit.status is Status.INTERRUPTED:
         return True
+    if _is_confirmed(problem, fit):
+        return True
     if is_doubted(fit) or (_is_coarse(fit) and REMESH not in tried):
         return False
-    assert fit.problem is not None
-    if any(run.is_guess_proposed for run in fit.problem.experiments) and fit.sigma_known is not True:
+    if any(run.is_guess_proposed for run in problem.experiments) and fit.sigma_known is not True:
         return not EVERYWHERE.isdisjoint(tried)
-    if fit.sigma_known is True or not any(run.transition_times for run in fit.problem.experiments):
+    if fit.sigma_known is True or not any(run.transition_times for run in problem.experiments):
         return True
     if all(any(comparison.kind == "measurements" for comparison in run) for run in fit.comparisons):
         return SCAN in tried
     return not EVERYWHERE.isdisjoint(tried) or measure_quality(fit).explained >= PERFECT
+
+
+def _is_confirmed(problem: Problem, fit: Estimate) -> bool:
+    """Return whether J alone says that nothing is in doubt, without a simulation of what was fitted.
+
+    Where sigma is known, the residuals are the noise by chi²; where references are followed, nearly all is explained.
+    """
+    if fit.status is not Status.CONVERGED or fit.active or fit.idle or fit.integration_error > problem.rtol:
+        return False
+    items = [item for run in problem.experiments for item in run.data]
+    if all(isinstance(item, ReferenceSignal) for item in items):
+        return fit.cost <= (1 - PERFECT) * _cost_of_means(problem)
+    if not (is_sigma_known(problem) and is_least_squares(problem)):
+        return False
+    count = sum(item.count for item in items if isinstance(item, Measurements))
+    freedom = count + len(fit.priors) - fit.free_basis.shape[1]
+    return freedom > 0 and bool(scipy.special.chdtrc(freedom, 2 * fit.cost) >= UNLIKELY)
+
+
+def _cost_of_means(problem: Problem) -> float:
+    """Return J of references that are met by their means, kept with the problem."""
+    if "cost_of_means" not in problem.__dict__:
+        total = 0.0
+        for run in problem.experiments:
+            for item in run.data:
+                times = np.linspace(run.t0, run.end, REFERENCE_POINTS)
+                deviation = item.signal(times) - item.signal(times).mean(axis=0)
+                total += (
+                    0.5 * float(np.einsum("ki,ij,kj->", deviation, item.weights, deviation)) * (times[1] - times[0])
+                )
+        object.__setattr__(problem, "cost_of_means", total)
+    return float(problem.__dict__["cost_of_means"])
 
 
 def _is_coarse(fit: Estimate) -> bool:
@@ -226,14 +257,14 @@ class Search:
             if self.best is not None and _is_coarse(self.best):
                 self._fit_on_new_meshes(self.best)
                 tried.add(REMESH)
-                if self.strategy == "auto" and _is_enough(self.best, tried):
+                if self.strategy == "auto" and _is_enough(self.problem, self.best, tried):
                     return
             for name, find in self._list_strategies():
                 if self.late:
                     break
                 self._try(name, find)
                 tried.add(name)
-                if self.strategy == "auto" and self.best is not None and _is_enough(self.best, tried):
+                if self.strategy == "auto" and self.best is not None and _is_enough(self.problem, self.best, tried):
                     break
                 if self.best is not None and self.best.status is Status.INTERRUPTED:
                     break
@@ -242,13 +273,12 @@ class Search:
                 raise
             self.steps.append(Step("interrupted", self.best.cost, 0, 0.0))
 
-    def finish(self) -> Estimate:
+    def finish(self, best: Estimate) -> Estimate:
         """Return the best fit with all that was done."""
-        assert self.best is not None
         seconds = time.perf_counter() - self.began
         starts = self.starts
         return replace(
-            self.best,
+            best,
             initial_theta=self.theta,
             steps=tuple(self.steps),
             starts=starts,
@@ -308,10 +338,8 @@ class Search:
         """Fit again from where the best fit ended, on meshes made for it."""
         began = time.perf_counter()
         again = fit_locally(self.problem, start=fit.theta, first_cost=self.first_cost, **self.settings)
-        if again.integration_error < fit.integration_error:
-            self.best = again
+        self.best = again if again.integration_error < fit.integration_error else fit
         self.evaluations += again.evaluations
-        assert self.best is not None
         self.steps.append(Step(REMESH, self.best.cost, again.evaluations, time.perf_counter() - began))
 
     def _try(self, name: str, find: Callable[[FloatArray], End]) -> None:
