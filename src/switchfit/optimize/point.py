@@ -83,6 +83,12 @@ class Point:
         return self.active.size == 0 and self.kink is None
 
     @property
+    def held(self) -> NDArray[np.bool_]:
+        """Coordinates at a kink from which the steepest descent does not move them: (d,)."""
+        nothing = np.zeros(self.theta.size, dtype=bool)
+        return nothing if self.kink is None else np.asarray(self.kink & (self.downhill == 0))
+
+    @property
     def largest_derivative(self) -> float:
         """Largest one-sided derivative of all unknowns, in size."""
         return float(self.largest_slopes.max())
