@@ -153,7 +153,7 @@ def _descend(oracle: Oracle, state: State, direction: Direction) -> Accepted | N
         length = 1.0 if accepted is None else 2.0 * alpha
         nearer = find_direction(problem, replace(state, metric=length * state.metric), piece)
         stop = _attempt(oracle, state, nearer, 1.0, ARMIJO_ACROSS)
-        if stop is not None and (accepted is None or (stop.point.held & ~point.held).any()):
+        if stop is not None and (accepted is None or stop.point.jumps):
             return Accepted(stop.point, alpha)
     return _blind_step(oracle, state, direction) if accepted is None else Accepted(accepted.point, alpha)
 

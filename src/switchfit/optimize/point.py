@@ -22,6 +22,9 @@ from switchfit.optimize.kinks import steepest_descent
 from switchfit.optimize.matrix import Curvature, SymmetricMatrix
 from switchfit.optimize.problem import Problem
 
+#: Jumps of a derivative above this part of the largest derivative are no errors of the integration.
+LARGE_JUMP = 1e-6
+
 
 @dataclass(frozen=True, eq=False)
 class Sample:
@@ -83,10 +86,10 @@ class Point:
         return self.active.size == 0 and self.kink is None
 
     @property
-    def held(self) -> NDArray[np.bool_]:
-        """Coordinates at a kink from which the steepest descent does not move them: (d,)."""
-        nothing = np.zeros(self.theta.size, dtype=bool)
-        return nothing if self.kink is None else np.asarray(self.kink & (self.downhill == 0))
+    def jumps(self) -> bool:
+        """Whether a derivative jumps upwards at a breakpoint here, by more than an integrator's error explains."""
+        jump = self.plus.gradient - self.minus.gradient
+        return self.kink is not None and bool((jump[self.kink] > LARGE_JUMP * self.largest_derivative).any())
 
     @property
     def largest_derivative(self) -> float:
