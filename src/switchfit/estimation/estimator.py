@@ -274,7 +274,8 @@ class Estimate(Fit):
         relative standard error). Of a transition time that is at a kink, or with sample times inside that interval,
         where 2 (J − J_min) of a piecewise quadratic profile stays below the squared quantile: slope and curvature of
         the cost jump at every sample time, and the interval is not symmetric then. An estimate that was loaded without
-        its model knows ``theta +- quantile x standard error`` only, and so do many fits at once (`Fits`).
+        its model, one of more than 15 experiments or with guards or terminal constraints knows ``theta +- quantile x
+        standard error`` only, and so do many fits at once (`Fits`).
         NaN for an unknown that is held by a bound, a collapsed mode or, without its model, a kink.
 
         Parameters

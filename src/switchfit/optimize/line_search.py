@@ -133,7 +133,7 @@ def _backtrack(oracle: Oracle, state: State, direction: Direction) -> Accepted |
 
 
 def _descend(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
-    """Halve the step of the steepest descent until Armijo's rule holds ([1]_, algorithm 3.1), each inside the constraints.
+    """Halve the step of the steepest descent until Armijo's rule holds ([1]_, algorithm 3.1), inside the constraints.
 
     A large fraction of the predicted decrease keeps the steps across the narrow direction of a valley short of its
     other side. Derivatives need not jump at a breakpoint: the step ends there only where J is lowest there.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from switchfit.models.skid_steer import skid_steer
 from switchfit.paper.part import BLUE, COLUMN, DARK, LIGHT, RED, Found, Row, Say, new_figure
@@ -56,8 +56,17 @@ def draw_vehicle(ax: Axes, found: Found) -> Axes:
         ax.arrow(x, y, 0.0, -friction if x > 0 else friction, color=BLUE, **arrow)
         below = 0.1 if y < 0 else -0.09
         label = rf"$F_{number}$ = {force:g} N"
-        ax.text(x + (0.05 if x > 0 else -0.05), y - below, label, fontsize=6.5, ha="center", va="center", transform=turn, rotation=HEADING)
-    dash = {"color": DARK, "linewidth": 0.6, "linestyle": "--"}
+        ax.text(
+            x + (0.05 if x > 0 else -0.05),
+            y - below,
+            label,
+            fontsize=6.5,
+            ha="center",
+            va="center",
+            transform=turn,
+            rotation=HEADING,
+        )
+    dash: dict[str, Any] = {"color": DARK, "linewidth": 0.6, "linestyle": "--"}
     ax.plot([0.0, 0.75], [0, 0], transform=turn, **dash)
     ax.plot([0, 0.7], [0, 0], **dash)
     ax.text(0.47, 0.08, r"$\theta$", fontsize=9)

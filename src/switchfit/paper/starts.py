@@ -112,4 +112,4 @@ def _name(end: Found) -> str:
 
 def _rest(ends: list[Found]) -> str:
     text = "tau uniform in 0 to 15 s, mu in its bounds; (tau_1, tau_2, mu)"
-    return text + (f"; {sum(end['count'] for end in ends)} at {len(ends)} other ends" if ends else "")
+    return text + (f"; {sum(end['count'] for end in ends)} elsewhere" if ends else "")

@@ -26,6 +26,9 @@ from switchfit.problem.problem import Problem
 MOST_PIECES = 60
 """Sample times that are passed in one direction; with more of them in an interval the kinks average out."""
 
+MOST_RUNS = 15
+"""Problems of more experiments, whose evaluations take long, keep the intervals of one parabola."""
+
 AT_SAMPLE = 1e-9
 """A transition time nearer to a sample time than this part of the horizon is at it."""
 
@@ -36,7 +39,7 @@ def replace_intervals(
     """Return intervals (d, 2) with those of transition times with samples inside, or at a kink, from their pieces."""
     found = intervals.copy()
     threshold = _threshold(fit, level)
-    if threshold is None:
+    if threshold is None or len(problem.experiments) > MOST_RUNS:
         return found
     others = _movable(fit)
     for e, k in _transitions(problem):
