@@ -54,7 +54,7 @@ def draw_vehicle(ax: Axes, found: Found) -> Axes:
             ax.arrow(x, y, LONGEST * force / largest, 0.0, color=RED, **arrow)
         friction = 0.07 if x > 0 else 0.14  # the centre of mass slides outwards: more at the rear
         ax.arrow(x, y, 0.0, -friction if x > 0 else friction, color=BLUE, **arrow)
-        below = 0.1 if y < 0 else -0.09
+        below = -0.09 if x > 0 and y > 0 else 0.1
         label = rf"$F_{number}$ = {force:g} N"
         ax.text(
             x + (0.05 if x > 0 else -0.05),
@@ -71,14 +71,14 @@ def draw_vehicle(ax: Axes, found: Found) -> Axes:
     ax.plot([0, 0.7], [0, 0], **dash)
     ax.text(0.47, 0.08, r"$\theta$", fontsize=9)
     ax.plot(0, 0, "o", color=DARK, markersize=3)
-    ax.text(-0.03, 0.03, "(X, Y)", fontsize=7, ha="right")
+    ax.text(-0.03, -0.05, "(X, Y)", fontsize=7, ha="right")
     ax.plot([0, a], [0, 0], color=DARK, linewidth=1.5, transform=turn)
     ax.plot([a, a], [0, b], color=DARK, linewidth=1.5, transform=turn)
-    ax.text(a / 2, -0.06, f"a = {a:g} m", fontsize=6.5, ha="center", transform=turn, rotation=HEADING)
-    ax.text(0.0, b / 2, f"b = {b:g} m", fontsize=6.5, va="center", transform=turn, rotation=HEADING)
+    ax.text(a / 2 - 0.02, 0.02, f"{a:g} m", fontsize=6.5, ha="center", transform=turn, rotation=HEADING)
+    ax.text(a + 0.04, 0.55 * b, f"{b:g} m", fontsize=6.5, va="center", transform=turn, rotation=HEADING)
     ax.plot([], [], color=RED, label="drive forces in slip")
     ax.plot([], [], color=BLUE, label="friction against a turn to the left (slip)")
-    ax.set(xlim=(-0.7, 0.85), ylim=(-0.85, 0.62), xlabel="X (m)", ylabel="Y (m)")
+    ax.set(xlim=(-0.7, 0.85), ylim=(-0.75, 0.62), xlabel="X (m)", ylabel="Y (m)")
     ax.set_aspect("equal")
     ax.tick_params(labelsize=7)
     ax.legend(frameon=False, fontsize=6.5, loc="lower right")
