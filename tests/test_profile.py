@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
+import sys
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +15,7 @@ from models import curve, rest
 from scipy.optimize import brentq
 
 import switchfit as sf
+from switchfit.fit.result import Fit
 
 SIGMA = 0.2
 TIMES = np.linspace(0.0, 4.0, 21)[1:]
@@ -294,3 +298,60 @@ def test_figure_of_a_profile():
     figure.draw_without_rendering()
     unknown = ramp(np.minimum(TIMES, 2.05) + noise(3), sigma=None).profile("v").plot()
     assert unknown.axes[0].get_ylabel() == "2 (J - J min) / s²"
+
+
+# Intervals across kinks
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("tau", [2.0, 2.05, 2.1])
+def test_intervals_across_samples_are_those_of_the_profile(seed, tau):
+    """v known: J is a parabola between samples, so the pieces are exact."""
+    sigma = 0.3
+    times = np.arange(1, 41) / 10
+    values = np.minimum(times, tau) + sigma * np.random.default_rng(seed).standard_normal(40)
+    data = sf.Measurements(times, values[:, None], sigma=sigma)
+    run = sf.Experiment(data, ("up", "rest"), (tau,), 0.0, 4.0)
+    fit = sf.estimate(sf.Problem(RAMP, run, {"v": sf.Parameter(1.0, fixed=True)}))
+    for level in (0.68, 0.95):
+        found = fit.confidence_intervals(level)[0]
+        np.testing.assert_allclose(found, fit.profile("tau_1", level=level).interval(level), rtol=0, atol=1e-4)
+    plain = Fit.confidence_intervals(fit)[0]
+    assert fit.kinks or np.max(np.abs(fit.confidence_intervals()[0] - plain)) > 1e-4
+
+
+def test_interval_at_a_kink_is_not_symmetric_and_holds_the_profile():
+    benchmark = load_coverage()
+    kinks = 0
+    for seed in range(20):
+        values = np.where(benchmark.TIMES > 2.0, 1 - np.exp(-8.0 * (benchmark.TIMES - 2.0)), 0.0)
+        values = values + 0.05 * np.random.default_rng(seed).standard_normal(40)
+        fit = sf.estimate(benchmark.build_problem(values[:, None], 2.0, rate_known=True), strategy="local")
+        if not fit.kinks:
+            continue
+        kinks += 1
+        assert np.isnan(Fit.confidence_intervals(fit)).all()
+        low, high = fit.confidence_intervals()[0]
+        assert low < fit.theta[0] < high
+        np.testing.assert_allclose([low, high], fit.profile("tau_1").interval(), rtol=0, atol=0.005)
+        text = f"95 % in [{low:.4g}, {high:.4g}], not symmetric: samples make kinks"
+        assert text in " ".join(str(fit).split())
+    assert kinks
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tau", [2.0, 2.01, 2.05])
+def test_intervals_cover_a_transition_on_beside_and_between_samples(tau):
+    found = load_coverage().measure_coverage(tau, 2000, rate_known=True)
+    assert abs(found.piecewise - 0.95) < 0.02
+    if tau < 2.02:
+        assert found.quadratic < 0.85
+
+
+def load_coverage():
+    path = Path(__file__).parent.parent / "benchmarks" / "coverage.py"
+    spec = importlib.util.spec_from_file_location("coverage_benchmark", path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["coverage_benchmark"] = module
+    spec.loader.exec_module(module)
+    return module

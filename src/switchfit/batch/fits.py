@@ -118,7 +118,10 @@ class Fits:
             return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
     def confidence_intervals(self, level: float = 0.95) -> FloatArray:
-        """Return intervals of each fit: (R, d, 2); see `Estimate.confidence_intervals`.
+        """Return intervals theta +- quantile x standard error of each fit: (R, d, 2).
+
+        They take the cost for one parabola: of a transition time with samples within its interval, and at a kink,
+        where they are NaN, those of a single `Estimate.confidence_intervals` are better.
 
         See Also
         --------

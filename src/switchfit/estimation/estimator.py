@@ -18,7 +18,7 @@ from switchfit.fit.accuracy import worst_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.guards import place_on_near_guards
 from switchfit.fit.hidden import refuse_jumps
-from switchfit.fit.result import Fit
+from switchfit.fit.result import CovarianceKind, Fit
 from switchfit.fit.solution import (
     constraints_of,
     is_least_squares,
@@ -39,6 +39,7 @@ from switchfit.runtime.presentation import draw_figure, format_text
 from switchfit.runtime.progress import Progress
 from switchfit.uncertainty.certificate import Certificate, certify
 from switchfit.uncertainty.identification import Identifiability, identifiability
+from switchfit.uncertainty.piecewise import replace_intervals
 from switchfit.uncertainty.prediction import Prediction, predict
 from switchfit.uncertainty.profiles import Profile, profile
 from switchfit.uncertainty.residuals import ResidualDiagnostics, correct_errors, diagnose
@@ -265,6 +266,43 @@ class Estimate(Fit):
                 "This estimate was loaded without its model: load it with Estimate.load(path, problem=problem)."
             )
         return self.evaluator or Evaluator(self.problem, theta=self.theta)
+
+    def confidence_intervals(self, level: float = 0.95, *, hessian: CovarianceKind = "exact") -> FloatArray:
+        """Return intervals of all unknowns, cut off at the bounds: (d, 2).
+
+        ``theta +- quantile x standard error``; of unknowns on a logarithmic scale theta times or by exp(quantile x
+        relative standard error). Of a transition time that is at a kink, or with sample times inside that interval,
+        where 2 (J − J_min) of a piecewise quadratic profile stays below the squared quantile: slope and curvature of
+        the cost jump at every sample time, and the interval is not symmetric then. An estimate that was loaded without
+        its model, one of more than 15 experiments or with guards or terminal constraints knows ``theta +- quantile x
+        standard error`` only, and so do many fits at once (`Fits`).
+        NaN for an unknown that is held by a bound, a collapsed mode or, without its model, a kink.
+
+        Parameters
+        ----------
+        level : float, between 0 and 1
+            The quantile is of Student's t where sigma is unknown, of the normal distribution where it is known.
+        hessian : {"exact", "gauss-newton"}
+            As of `covariance_from`. With "gauss-newton" kinks are not looked at.
+
+        See Also
+        --------
+        profile, bootstrap
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.confidence_intervals(0.95).round(2)
+        array([[2.43, 2.5 ],
+               [0.38, 0.4 ]])
+        """
+        intervals = super().confidence_intervals(level, hessian=hessian)
+        if hessian != "exact" or self.problem is None or self.constraints:
+            return intervals
+        return replace_intervals(self, self.problem, self.evaluator_at_solution(), intervals, level)
 
     def profile(self, name: str, *, level: float = 0.95, callback: Progress | None = None) -> Profile:
         """Return the profile likelihood of one parameter or transition time, see `switchfit.profile`.

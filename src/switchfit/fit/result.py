@@ -384,7 +384,7 @@ class Fit:
 
         Of unknowns on a logarithmic scale theta times or by exp(quantile x relative standard error).
         NaN for an unknown that is held by a bound, a collapsed mode or a kink: the quadratic approximation knows no
-        interval there. `profile` does.
+        interval there. `profile` does, and at a kink an `Estimate` with its model.
 
         Parameters
         ----------

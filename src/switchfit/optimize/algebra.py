@@ -25,6 +25,8 @@ EIGENVALUE_REPLACEMENT = 1e-4
 ARMIJO = 1e-4
 #: The same for a step across a breakpoint, where the prediction may be wrong however short the step.
 ARMIJO_ACROSS = 0.1
+#: The same for steepest descent.
+ARMIJO_DESCENT = 0.4
 #: Differences of costs below this part of the cost say nothing: where residuals are small beside what is measured, the
 #: rounding of a sum of their squares is a few hundred units, and a search by costs takes many short steps at the end.
 NOISE = 4096 * EPS

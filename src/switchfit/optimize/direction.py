@@ -35,6 +35,7 @@ class Direction(NamedTuple):
     reduction: float
     regular: bool
     radius: float = np.inf
+    descends: bool = False
 
 
 def find_direction(problem: Problem, state: State, piece: tuple[FloatArray, FloatArray] | None = None) -> Direction:
@@ -90,7 +91,8 @@ def _solve_on_sides(
     if found.multipliers is not None:
         force = constraints.A.T @ found.multipliers[: constraints.b.size] - found.product
     radius = np.inf if box is None else box.radius_for(found.definite)
-    return Direction(found.step, slope, -(slope + 0.5 * float(found.step @ found.product)), regular, radius), force
+    reduction = -(slope + 0.5 * float(found.step @ found.product))
+    return Direction(found.step, slope, reduction, regular, radius, _descends(problem, hessian, room.free)), force
 
 
 def _room(problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[FloatArray, FloatArray] | None) -> Room:
@@ -122,8 +124,13 @@ def _model(
     After a failed line search each unknown is taken by itself.
     """
     d = state.point.theta.size
-    descent = problem.hessian == "descent-first" and not hessian.is_definite_on(free)
-    if descent or not problem.uses_hessian:
+    if _descends(problem, hessian, free):
         return Dense.identity(d, 1.0 / state.metric), None
     labels = np.arange(d, dtype=float) if state.careful else problem.labels
     return hessian if labels is None else hessian.mask(labels), state.floor
+
+
+def _descends(problem: Problem, hessian: SymmetricMatrix, free: NDArray[np.bool_] | None) -> bool:
+    """Return whether the step is one of steepest descent."""
+    indefinite = problem.hessian == "descent-first" and not hessian.is_definite_on(free)
+    return indefinite or not problem.uses_hessian

@@ -19,7 +19,14 @@ from dataclasses import replace
 import numpy as np
 
 from switchfit.optimize import box
-from switchfit.optimize.algebra import ARMIJO, ARMIJO_ACROSS, NOISE, cost_allows, optimality_allows
+from switchfit.optimize.algebra import (
+    ARMIJO,
+    ARMIJO_ACROSS,
+    ARMIJO_DESCENT,
+    NOISE,
+    cost_allows,
+    optimality_allows,
+)
 from switchfit.optimize.direction import Direction, find_direction
 from switchfit.optimize.feasibility import move
 from switchfit.optimize.point import Oracle
@@ -28,6 +35,8 @@ from switchfit.optimize.state import Accepted, State
 #: Shortened steps across breakpoints are tried while they still cross this many.
 MANY_BREAKPOINTS = 3
 MAX_BACKTRACKS = 60
+#: Halvings of a step of the steepest descent, whose first length knows nothing of the curvature.
+MAX_HALVINGS = 200
 #: Iterations after which a step that fails in a trust region is followed by one more before the region shrinks.
 PATIENCE = 15
 
@@ -38,6 +47,8 @@ def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | Non
     breakpoints, constraints = problem.breakpoints, problem.constraints
     if problem.has_box:
         return _search_in_box(oracle, state, direction)
+    if direction.descends:
+        return _descend(oracle, state, direction)
     alpha = 1.0
     crossed = breakpoints.count_crossed(theta, direction.step)
     while crossed > 0:
@@ -119,6 +130,32 @@ def _backtrack(oracle: Oracle, state: State, direction: Direction) -> Accepted |
         if k > 5 and alpha * -direction.slope < 0.01 * NOISE * abs(state.point.cost):
             break
     return _blind_step(oracle, state, direction)
+
+
+def _descend(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
+    """Halve the step of the steepest descent until Armijo's rule holds ([1]_, algorithm 3.1), inside the constraints.
+
+    A large fraction of the predicted decrease keeps the steps across the narrow direction of a valley short of its
+    other side. Derivatives need not jump at a breakpoint: the step ends there only where J is lowest there.
+    """
+    problem, point = oracle.problem, state.point
+    breakpoints, constraints = problem.breakpoints, problem.constraints
+    alpha, longer = 1.0, direction
+    for k in range(MAX_HALVINGS):
+        accepted = _attempt(oracle, state, direction, 1.0, ARMIJO_DESCENT)
+        if accepted is not None or (k > 5 and -direction.slope < 0.01 * NOISE * abs(point.cost)):
+            break
+        alpha *= 0.5
+        longer, direction = direction, find_direction(problem, replace(state, metric=alpha * state.metric))
+    crossed = 0 if longer is direction else breakpoints.count_crossed(point.theta, longer.step)
+    if accepted is None or 0 < crossed < MANY_BREAKPOINTS:
+        piece = breakpoints.piece(point.theta, constraints.lower, constraints.upper)
+        length = 1.0 if accepted is None else 2.0 * alpha
+        nearer = find_direction(problem, replace(state, metric=length * state.metric), piece)
+        stop = _attempt(oracle, state, nearer, 1.0, ARMIJO_ACROSS)
+        if stop is not None and (accepted is None or stop.point.jumps):
+            return Accepted(stop.point, alpha)
+    return _blind_step(oracle, state, direction) if accepted is None else Accepted(accepted.point, alpha)
 
 
 def _attempt(oracle: Oracle, state: State, direction: Direction, alpha: float, fraction: float) -> Accepted | None:

@@ -22,6 +22,9 @@ from switchfit.optimize.kinks import steepest_descent
 from switchfit.optimize.matrix import Curvature, SymmetricMatrix
 from switchfit.optimize.problem import Problem
 
+#: Jumps of a derivative above this part of the largest derivative are no errors of the integration.
+LARGE_JUMP = 1e-6
+
 
 @dataclass(frozen=True, eq=False)
 class Sample:
@@ -81,6 +84,12 @@ class Point:
     def is_interior(self) -> bool:
         """Whether no constraint is active and no coordinate at a kink."""
         return self.active.size == 0 and self.kink is None
+
+    @property
+    def jumps(self) -> bool:
+        """Whether a derivative jumps upwards at a breakpoint here, by more than an integrator's error explains."""
+        jump = self.plus.gradient - self.minus.gradient
+        return self.kink is not None and bool((jump[self.kink] > LARGE_JUMP * self.largest_derivative).any())
 
     @property
     def largest_derivative(self) -> float:

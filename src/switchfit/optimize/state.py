@@ -27,7 +27,7 @@ class State:
     step_length : float
         Of the last iteration.
     metric : float
-        Steepest descent: B = I / metric.
+        Steepest descent: B = I / metric, the first step length tried: 1, or twice the last one if that was above ½.
     settled : int
         Iterations since the optimality fell below the tolerance.
     scale : array, shape (d,)
@@ -65,7 +65,6 @@ class State:
         """Return the state before the first iteration."""
         return cls(
             point=point,
-            metric=1.0 / max(1.0, point.optimality),
             scale=np.abs(point.theta),
             cost_scale=abs(point.cost),
             gradient_scale=point.largest_derivative,
@@ -79,7 +78,7 @@ class State:
             point=point,
             iteration=self.iteration + 1,
             step_length=alpha,
-            metric=self.metric * (2.0 if alpha >= 1.0 else alpha),
+            metric=max(1.0, 2.0 * alpha * self.metric),
             settled=self.settled + 1 if point.optimality <= tolerance else 0,
             scale=np.maximum(self.scale, np.abs(point.theta)),
             cost_scale=max(self.cost_scale, abs(point.cost)),

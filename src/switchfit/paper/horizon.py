@@ -41,6 +41,26 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
     for tf in QUICK_ENDS if quick else ENDS:
         say(f"0 to {tf:g} s")
         found["horizons"].append(_horizon(tf, runs, starts, folder))
+    found["samples"] = _sample_sets()
+    return found
+
+
+def _sample_sets() -> list[Found]:
+    """Return the standard error of mu from 1 Hz positions over several horizons, and without those taken in slip."""
+    path = simulate_drive(tf=ENDS[-1])
+    begin, end = TRUTH[:2]
+    sets = [(f"0 to {tf:g} s", tf, np.arange(tf + 1)) for tf in (end, 11.0, 12.0, 13.0, HORIZON, 20.0, 30.0)]
+    seconds = np.arange(HORIZON + 1)
+    outside = seconds[(seconds <= begin) | (seconds > end)]
+    sets.append((f"0 to {HORIZON:g} s without those in slip", HORIZON, outside))
+    found: list[Found] = []
+    for label, tf, times in sets:
+        theta = TRUTH if tf > end else (TRUTH[0], TRUTH[2])
+        positions = states_at(path, times)[:, [0, 2]]
+        hessian = evaluate(stick_slip(Measurements(times, positions, position, sigma=SIGMA), theta, tf=tf)).hessian
+        inside = int(np.sum((times > begin) & (times <= end)))
+        errors = np.sqrt(np.diag(np.linalg.inv(hessian)))
+        found.append({"label": label, "samples": len(times), "in_slip": inside, "mu": float(errors[-1])})
     return found
 
 
@@ -114,6 +134,14 @@ def rows(found: Found) -> list[Row]:
     return [
         Row(f"Horizon 0 to {level['tf']:g} s", "left for further analysis", _line(level), remark)
         for level in found["horizons"]
+    ] + [
+        Row(
+            f"V-A 3: standard error of mu, 1 Hz positions {line['label']}",
+            "effectively only four measurements affect it",
+            f"{line['mu']:.4f}",
+            f"{line['samples']} samples, {line['in_slip']} of them in slip; sigma {SIGMA:g} m",
+        )
+        for line in found["samples"]
     ]
 
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from switchfit.estimation.estimator import fit_locally
 from switchfit.fit.evaluator import evaluate
-from switchfit.models.magic_formula import MAGIC_FORMULA
+from switchfit.models.magic_formula import MAGIC_FORMULA, lateral_force, longitudinal_force
 from switchfit.paper.part import BLUE, DARK, LIGHT, PAGE, RED, Found, Row, Say, conditions, new_figure, tidy
 from switchfit.paper.vehicle import (
     COMMANDED,
@@ -27,6 +29,7 @@ from switchfit.paper.vehicle import (
 )
 from switchfit.problem.data import Measurements
 from switchfit.problem.experiment import Parameter
+from switchfit.problem.functions import use_float64
 from switchfit.report.plot import MODE_COLOURS
 from switchfit.uncertainty.identification import identifiability
 
@@ -39,6 +42,10 @@ PAPER = {"tau_1": 5.0, "tau_2": 11.7, "mu": 0.676}
 SECONDS = np.arange(16.0)
 #: Eigenvalues below this part of the largest are rounding.
 ROUNDING = 1e-15
+#: Times (s) in which the wheels take up and lose their difference of speed, of which the paper prints none.
+RAMPS = ((0.6, 0.6), (0.6, 1.5), (0.6, 2.5), (0.6, 3.4), (1.5, 3.4), (3.4, 3.4), (3.4, 0.6))
+#: Static load of a wheel (kN), and the part of it by which load transfer changes it in the comparison.
+LOAD, TRANSFER = 0.1962, 0.2
 
 
 def compute(quick: bool, folder: Path, say: Say) -> Found:
@@ -64,8 +71,50 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
             "yaw": fit.trajectory.states[:, 5].round(5).tolist(),
             "rms_position_error": float(np.sqrt(np.mean(np.sum((fitted - positions) ** 2, axis=1)))),
         }
+    found["ramps"] = _ramps(say)
+    found["forces"] = {"static": _force_spectrum((LOAD,)), "transfer": _force_spectrum(_transferred())}
     found.update(_coefficients(speeds, say))
     return found
+
+
+def _ramps(say: Say) -> list[Found]:
+    """Return what stick-slip finds where the wheels follow their command at other rates."""
+    lines: list[Found] = []
+    for rise, fall in RAMPS:
+        say(f"ramp of {rise:g} s up and {fall:g} s down")
+        positions, _ = log_on_tyres(SECONDS, wheel_speeds(rise=rise, fall=fall))
+        fit = fit_locally(stick_slip(gps_reference(SECONDS, positions), START))
+        lines.append({"rise": rise, "fall": fall, **summary(fit)})
+    return lines
+
+
+def _transferred() -> tuple[float, ...]:
+    return LOAD * (1 - TRANSFER), LOAD, LOAD * (1 + TRANSFER)
+
+
+def _force_spectrum(loads: tuple[float, ...]) -> list[float]:
+    """Return the singular values of the tyre forces' derivatives in the 16 coefficients, in units of their values.
+
+    A force at one load depends on the coefficients through D, BCD and E alone: three numbers a direction, six in all.
+    """
+    names = list(MAGIC_FORMULA)
+    with use_float64():
+        slips = jnp.linspace(0.5, 30.0, 40)
+
+        def forces(values: Any) -> Any:
+            p = dict(zip(names, values, strict=True))
+            found = [force(slips, load, p) for load in loads for force in (longitudinal_force, lateral_force)]
+            return jnp.concatenate(found)
+
+        values = jnp.asarray(list(MAGIC_FORMULA.values()))
+        derivative = np.asarray(jax.jacfwd(forces)(values))
+    size = np.array([abs(value) or 1.0 for value in MAGIC_FORMULA.values()])
+    return np.linalg.svd(derivative * size, compute_uv=False).tolist()
+
+
+def rank(singular_values: list[float]) -> int:
+    """Return the number of singular values above rounding."""
+    return int(np.sum(np.array(singular_values) > 1e-12 * singular_values[0]))
 
 
 def _coefficients(speeds: Any, say: Say) -> Found:
@@ -148,6 +197,7 @@ def rows(found: Found) -> list[Row]:
             f"{literal['rms_position_error']:.2f} m rms (with reset {reset['rms_position_error']:.2f} m)",
             "taken literally, (18) keeps turning after it sticks again",
         ),
+        *_ramp_rows(found["ramps"]),
         Row("Fig. 3: optimality", "necessary and sufficient conditions", conditions(literal)),
         Row(
             "V-A 1: Hessian in 16 Magic Formula coefficients",
@@ -156,4 +206,27 @@ def rows(found: Found) -> list[Row]:
             f"positions at 10 Hz without noise, coefficients in units of their values; the identifiability analysis "
             f"(scaled Hessian) says of one that it cannot be seen: {found['worst'][0]}",
         ),
+        Row(
+            "V-A 1: rank of the tyre forces in the 16 coefficients, at the static load",
+            "not done",
+            f"{rank(found['forces']['static'])} of 16; {rank(found['forces']['transfer'])} with loads of "
+            f"±{100 * TRANSFER:g} % beside it",
+            "at one load a force depends on its eight coefficients through D, BCD and E alone: the Hessian is singular "
+            f"for any data; singular values 6 and 7 are {found['forces']['static'][5]:.1e} and "
+            f"{found['forces']['static'][6]:.0e}, the largest {found['forces']['static'][0]:.1e}",
+        ),
+    ]
+
+
+def _ramp_rows(ramps: list[Found]) -> list[Row]:
+    """Return a line for each ramp."""
+    theta = [line["theta"] for line in ramps]
+    return [
+        Row(
+            f"Fig. 3: the wheels take {line['rise']:g} s to turn and {line['fall']:g} s to stop turning",
+            f"not printed; finds {PAPER['tau_1']:g}, {PAPER['tau_2']:g}, {PAPER['mu']:g}",
+            f"{t['tau_1']:.2f}, {t['tau_2']:.2f}, {t['mu']:.3f}",
+            "tau_1, tau_2 (s), mu",
+        )
+        for line, t in zip(ramps, theta, strict=True)
     ]

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, cast
 
-from switchfit.paper import convergence, horizon, lti, magic, noise, trials
+from switchfit.paper import convergence, drawing, horizon, lti, magic, noise, starts, trials
 from switchfit.paper.part import Found, Part, Row, Say
 from switchfit.runtime.errors import get_first_line
 from switchfit.runtime.files import set_aside, write_atomically
@@ -22,11 +22,13 @@ from switchfit.runtime.files import set_aside, write_atomically
 #: Name -> part, in the order of the paper.
 PARTS: Mapping[str, Part] = MappingProxyType(
     {
+        "vehicle": cast(Part, drawing),
         "lti": cast(Part, lti),
         "magic-formula": cast(Part, magic),
         "convergence": cast(Part, convergence),
         "noise": cast(Part, noise),
         "trials": cast(Part, trials),
+        "starts": cast(Part, starts),
         "horizon": cast(Part, horizon),
     }
 )

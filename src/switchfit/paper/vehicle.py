@@ -79,18 +79,20 @@ def build_simulated_problem(start: tuple[float, float, float] = START, tf: float
     return stick_slip(ReferenceSignal.from_samples(path.times, path.states), start, tf=tf)
 
 
-def wheel_speeds(differential: float = DIFFERENTIAL, stick_force: float = 15.0) -> Input:
+def wheel_speeds(
+    differential: float = DIFFERENTIAL, stick_force: float = 15.0, *, rise: float = RISE, fall: float = RISE
+) -> Input:
     """Return wheel speeds of the Magic Formula vehicle (rad/s): the paper does not print its own, so these are a
     choice.
 
     The mean speed of the treads is the forward speed that (18) has with the paper's torques, mu = 0.7 and slip from 5
     to 10 s (with reset at re-stick, so that it drives straight on). From 5 to 10 s wheels 1 and 4 are `differential`
-    faster and 2 and 3 as much slower, which they become and cease to be within RISE.
+    faster and 2 and 3 as much slower, which they become within `rise` and cease to be within `fall` (s).
     """
     path = simulate_drive((*COMMANDED, TRUTH[2]), stick_force=stick_force, restick="reset")
     theta = path.states[:, 4]
     forward = np.cos(theta) * path.states[:, 1] + np.sin(theta) * path.states[:, 3]
-    knots = [0.0, COMMANDED[0], COMMANDED[0] + RISE, COMMANDED[1], COMMANDED[1] + RISE, HORIZON]
+    knots = [0.0, COMMANDED[0], COMMANDED[0] + rise, COMMANDED[1], COMMANDED[1] + fall, HORIZON]
     times = np.unique(np.concatenate([np.arange(0.0, HORIZON + 0.05, 0.1).round(1), knots]))
     mean = np.interp(times, path.times, forward)
     extra = np.interp(times, knots, [0.0, 0.0, differential, differential, 0.0, 0.0])

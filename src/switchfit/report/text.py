@@ -28,6 +28,8 @@ from switchfit.uncertainty.residuals import correct_errors
 from switchfit.uncertainty.verdict import Verdict, judge
 
 WIDTH = 100
+ONE_SIDED = 1.2
+"""Ratio of the two sides of an interval above which it is said that they differ."""
 LABEL = 18
 """Columns of the labels at the left."""
 
@@ -252,12 +254,14 @@ def _format_unknowns(fit: Fit, most: int) -> list[str]:
     joins = {t.index: f"{t.before} -> {t.after}" for t in fit.transitions}
     rows = [["", "value", "std. error", "", "naive", "", "first guess", ""]]
     shown = _select_unknowns(fit, most)
+    intervals, plain_intervals = fit.confidence_intervals(), Fit.confidence_intervals(fit)
     for i in shown:
         name = fit.theta_names[i]
         value, error, relative = format_rounded(fit.theta[i], np.nan if name in fit.idle else errors[i])
         plain = format_rounded(fit.theta[i], np.nan if name in fit.idle else naive[i])[1]
         prior = f"prior: {fit.priors[name]}" if name in fit.priors else ""
-        notes = [joins.get(i, ""), prior, _format_log_scale(fit, i, errors), _mark_unknown(fit, name)]
+        sided = _format_sides(intervals[i], plain_intervals[i], fit.theta[i]) if i in joins else ""
+        notes = [joins.get(i, ""), prior, _format_log_scale(fit, i, errors), sided, _mark_unknown(fit, name)]
         note = ", ".join(note for note in notes if note)
         unit = format_unit(fit.theta_units[i])
         rows.append([name, value, error, relative, plain, unit, f"{fit.initial_theta[i]:.6g}", note])
@@ -288,6 +292,16 @@ def _compare_covariances(fit: Fit) -> str:
     if found is None:
         return ""
     return f"; Gauss-Newton's are within {100 * (found.factor - 1):.2g} % of them" if found.factor < DIFFERENT else ""
+
+
+def _format_sides(ends: FloatArray, symmetric: FloatArray, value: float) -> str:
+    """Return the interval of a transition time that kinks at samples make longer to one side; else nothing."""
+    below, above = value - ends[0], ends[1] - value
+    if not min(below, above) > 0 or np.array_equal(ends, symmetric):
+        return ""
+    if np.isfinite(symmetric).all() and max(below, above) < ONE_SIDED * min(below, above):
+        return ""
+    return f"95 % in [{ends[0]:.4g}, {ends[1]:.4g}], not symmetric: samples make kinks"
 
 
 def _format_log_scale(fit: Fit, i: int, errors: FloatArray) -> str:

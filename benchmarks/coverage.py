@@ -1,0 +1,75 @@
+"""How often 95 % intervals of a transition time hold the truth, with the truth on, beside and between samples.
+
+A state rests at 0 and rises to 1 with the time constant 1/8 s from tau on; it is sampled every 0.1 s, so that most of
+what is known about tau comes from the one or two samples after it. ``python benchmarks/coverage.py [RUNS]`` prints the
+table of ``docs/coverage-results.md``.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import switchfit as sf
+from switchfit.fit.result import Fit
+
+TIMES = np.arange(1, 41) / 10
+RATE, SIGMA, RUNS = 8.0, 0.05, 1000
+PLACES = {2.0: "on a sample", 2.01: "0.01 s beside it", 2.05: "between two samples"}
+
+
+class Coverage(NamedTuple):
+    """Parts of the intervals that hold the truth, and of the fits that end at a kink."""
+
+    quadratic: float
+    piecewise: float
+    at_kink: float
+
+
+def rest(t: Any, x: Any, p: Any) -> Any:
+    """x' = 0."""
+    return 0.0 * x
+
+
+def charge(t: Any, x: Any, p: Any) -> Any:
+    """x' = k (1 - x)."""
+    return p["k"] * (1.0 - x)
+
+
+def build_problem(values: Any, tau: float, *, rate_known: bool, sigma: float = SIGMA) -> sf.Problem:
+    """Return the problem with tau as the first guess."""
+    system = sf.HybridSystem(modes={"rest": rest, "charge": charge}, initial_state=[0.0])
+    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=sigma), ("rest", "charge"), (tau,), 0.0, 4.0)
+    k = sf.Parameter(RATE, fixed=True) if rate_known else sf.Parameter(RATE, lower=0.5, upper=40.0)
+    return sf.Problem(system, run, {"k": k})
+
+
+def measure_coverage(tau: float, runs: int, *, rate_known: bool, seed: int = 5) -> Coverage:
+    """Fit `runs` logs with noise and count the intervals that hold tau."""
+    rng = np.random.default_rng(seed)
+    clean = np.where(tau < TIMES, 1 - np.exp(-RATE * (TIMES - tau)), 0.0)
+    counts = np.zeros(3)
+    for _ in range(runs):
+        values = clean + SIGMA * rng.standard_normal(len(TIMES))
+        fit = sf.estimate(build_problem(values[:, None], tau, rate_known=rate_known), strategy="local")
+        (low, high), (lower, upper) = Fit.confidence_intervals(fit)[0], fit.confidence_intervals()[0]
+        counts += low <= tau <= high, lower <= tau <= upper, bool(fit.kinks)
+    return Coverage(*(counts / runs))
+
+
+def main(runs: int = RUNS) -> None:
+    """Print the table."""
+    print("| true transition time | rate | theta ± quantile x standard error | piecewise | fits at a kink |")
+    print("|---|---|---|---|---|")
+    for tau, place in PLACES.items():
+        for known in (True, False):
+            found = measure_coverage(tau, runs, rate_known=known)
+            rate = "known" if known else "estimated"
+            print(f"| {place} | {rate} | {' | '.join(f'{100 * part:.1f} %' for part in found)} |")
+    print(f"\n{runs} logs a line.")
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:2]))

@@ -1,0 +1,115 @@
+"""Where estimates end that begin anywhere within the bounds: the paper holds that they would generally agree."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from switchfit.estimation.estimator import Estimate, fit_locally
+from switchfit.optimize import Status
+from switchfit.paper.part import Found, Row, Say
+from switchfit.paper.vehicle import HORIZON, build_simulated_problem
+from switchfit.problem.data import FloatArray
+from switchfit.runtime.errors import NotIntegrableError
+from switchfit.strategy.choice import estimate
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from switchfit.problem.problem import Problem
+
+TITLE = "Starts"
+COUNT, QUICK_COUNT = 1000, 30
+LOWER_MU, UPPER_MU = 0.05, 2.0
+#: Ends that agree to this part of the horizon, or of mu, are one.
+SAME = 1e-3
+#: Ends of the table, the most frequent ones.
+SHOWN = 4
+WAYS = {"exact": "one fit, exact Hessian", "local": "one fit, trust region", "auto": 'strategy "auto"'}
+
+
+def compute(quick: bool, folder: Path, say: Say) -> Found:
+    """Fit from starts all over the bounds, in three ways."""
+    problem = build_simulated_problem()
+    starts = draw_starts(QUICK_COUNT if quick else COUNT)
+    found: Found = {"starts": len(starts), "ways": {}}
+    for way, label in WAYS.items():
+        ends: list[Found] = []
+        for k, start in enumerate(starts):
+            if k % 100 == 0:
+                say(f"{label}: start {k} of {len(starts)}")
+            _count(ends, _fit(problem, way, start))
+        found["ways"][way] = sorted(ends, key=lambda end: -end["count"])
+    return found
+
+
+def draw_starts(count: int) -> FloatArray:
+    """Return ordered transition times anywhere in the horizon, and mu anywhere within its bounds: (count, 3)."""
+    rng = np.random.default_rng(0)
+    times = np.sort(rng.uniform(0.0, HORIZON, (count, 2)), axis=1)
+    return np.column_stack([times, rng.uniform(LOWER_MU, UPPER_MU, count)])
+
+
+def _fit(problem: Problem, way: str, start: FloatArray) -> Estimate | None:
+    """Return the estimate; None where it cannot be computed at the start."""
+    try:
+        if way == "exact":
+            fit = fit_locally(problem, hessian="exact", start=start)
+        else:
+            fit = estimate(problem, strategy="local" if way == "local" else "auto", start=start)
+    except NotIntegrableError:
+        return None
+    if fit.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
+    return fit
+
+
+def _count(ends: list[Found], fit: Estimate | None) -> None:
+    """Count an end with those that it agrees with."""
+    if fit is None or not fit.status.successful:
+        theta, cost = None, None
+        fitting = [end for end in ends if end["theta"] is None]
+    else:
+        theta, cost = fit.theta.tolist(), fit.cost
+        size = np.array([HORIZON, HORIZON, 1.0])
+        fitting = [
+            end
+            for end in ends
+            if end["theta"] is not None and np.all(np.abs(np.array(end["theta"]) - fit.theta) < SAME * size)
+        ]
+    if fitting:
+        fitting[0]["count"] += 1
+    else:
+        ends.append({"theta": theta, "cost": cost, "count": 1})
+
+
+def draw(found: Found) -> dict[str, Figure]:
+    """Draw nothing: the table says it."""
+    return {}
+
+
+def rows(found: Found) -> list[Row]:
+    """Return a line for each way to fit."""
+    return [
+        Row(
+            f"V-B: {found['starts']} starts all over the bounds, {WAYS[way]}",
+            "would generally lead to the same estimate",
+            "; ".join(_name(end) for end in ends[:SHOWN]),
+            _rest(ends[SHOWN:]),
+        )
+        for way, ends in found["ways"].items()
+    ]
+
+
+def _name(end: Found) -> str:
+    if end["theta"] is None:
+        return f"{end['count']} not converged"
+    tau_1, tau_2, mu = end["theta"]
+    return f"{end['count']} at ({tau_1:.2f}, {tau_2:.2f}, {mu:.3f}), J = {end['cost']:.3g}"
+
+
+def _rest(ends: list[Found]) -> str:
+    text = "tau uniform in 0 to 15 s, mu in its bounds; (tau_1, tau_2, mu)"
+    return text + (f"; {sum(end['count'] for end in ends)} elsewhere" if ends else "")
