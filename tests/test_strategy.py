@@ -380,3 +380,15 @@ def test_a_run_that_is_not_determined_leaves_the_others_their_errors():
     for name in ("room0.tau_1", "k", "power_0", "power_1"):
         assert np.isfinite(errors[name])
     assert errors["room0.tau_1"] == pytest.approx(whole.standard_errors[0], rel=0.2)
+
+
+def test_runs_are_set_aside_by_name():
+    problem = two_runs()
+    rest = problem.without_runs("room1")
+    assert rest.theta_names == ("tau_1", "k", "power_0")
+    alone = sf.estimate(rest)
+    assert alone.verdict.level == "good"
+    with pytest.raises(ValueError, match="there is no experiment 'room7'; there are room0, room1"):
+        problem.without_runs("room7")
+    with pytest.raises(ValueError, match="none is left"):
+        problem.without_runs("room0", "room1")
