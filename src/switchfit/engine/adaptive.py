@@ -125,12 +125,13 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
     inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
     steps = [np.array([experiment.t0])]
     native = native_experiment(structure, whole, coarse.times, order=Order.COST)
-    x = _require_finite(
+    x = np.asarray(
         _call_jax(initial_state, arguments, p, structure=structure.functions)
         if native is None
-        else native.initial_state(p),
-        f"initial_state at p = {_round_parameters(problem.split(theta)[1])}",
+        else native.initial_state(p)
     )
+    if not np.isfinite(x).all():
+        raise _not_finite(f"initial_state at p = {_round_parameters(problem.split(theta)[1])}", x)
     for i, mode in enumerate(structure.mode_of_segment):
         if i > 0 and structure.reset_maps[i - 1] is not None:
             names = tuple(experiment.mode_sequence[i - 1 : i + 1])
@@ -138,7 +139,10 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
                 value = _call_jax(after_reset, arguments, ends[i], x, p, structure=structure, i=i - 1)
             else:
                 value = native.after_reset(i - 1, ends[i], x, p)
-            x = _require_finite(value, f"reset map {names} at t = {ends[i]:.6g}{unit}, x = {x.tolist()}")
+            if not np.isfinite(value).all():
+                before = f"t = {ends[i]:.6g}{unit}, x = {x.tolist()}"
+                raise _not_finite(f"reset map {names} at {before}", np.asarray(value))
+            x = np.asarray(value)
         knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
         stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
         for start, end in pairwise(stops.tolist()):
@@ -281,11 +285,8 @@ def _has_too_many_steps(accepted: Sequence[float] | FloatArray, end: float) -> b
     return len(accepted) + PACE * (end - accepted[-1]) / (accepted[-1] - accepted[-PACE - 1]) > MAX_STEPS
 
 
-def _require_finite(value: jax.Array | FloatArray, what: str) -> FloatArray:
-    state = np.asarray(value)
-    if not np.isfinite(state).all():
-        raise NotIntegrableError(f"{what} returned {state.tolist()}, which is not finite: use a better guess.")
-    return state
+def _not_finite(what: str, state: FloatArray) -> NotIntegrableError:
+    return NotIntegrableError(f"{what} returned {state.tolist()}, which is not finite: use a better guess.")
 
 
 def _round_parameters(parameters: Mapping[str, FloatArray]) -> dict[str, Any]:

@@ -478,7 +478,7 @@ class Problem:
         >>> float(problem.name_parameters(problem.initial_theta, 0)["k"])
         0.5
         """
-        own = self.split(theta)[1]
+        own = self._split_parameters(theta)
         mapped = self.experiments[e].parameter_map
         return own | {name: own[target] for name, target in mapped.items()}
 
@@ -646,12 +646,15 @@ class Problem:
         >>> times, float(parameters["k"])
         ([array([2.])], 0.5)
         """
-        times = [ends[1:-1] for ends in self.ends_of_modes(theta)]
+        return [ends[1:-1] for ends in self.ends_of_modes(theta)], self._split_parameters(theta)
+
+    def _split_parameters(self, theta: FloatArray) -> dict[str, FloatArray]:
+        """Return all parameters by name, fixed ones included."""
         parameters = {}
         for name, parameter in self.parameters.items():
             span = self.unknowns.parameters.get(name)
             parameters[name] = parameter.value if span is None else theta[span].reshape(parameter.shape)
-        return times, parameters
+        return parameters
 
 
 def _clock(experiment: Experiment) -> float:
