@@ -130,14 +130,14 @@ def test_over_runs_the_spread_is_that_of_the_runs():
 
 def test_a_run_weighs_as_often_as_it_was_drawn():
     problem = ramps([0.9, 1.0, 1.2])
-    fit = sf.estimate(problem)
+    fit = sf.estimate(problem, strategy="local")
     study = sf.bootstrap(fit, 6, resample="runs", seed=2)
     work = _Runs(problem, list(fit.evaluator.meshes), fit.theta, 2, 1e-7, 200)
     for k in range(6):
         weights = np.round(work.weights(k)).astype(int)
         assert weights.sum() == 3
         drawn = np.repeat(np.arange(3), weights)
-        again = sf.estimate(replace(problem, experiments=[problem.experiments[e] for e in drawn]))
+        again = sf.estimate(replace(problem, experiments=[problem.experiments[e] for e in drawn]), strategy="local")
         assert study.theta[k][-1] == pytest.approx(again.theta[-1], rel=1e-6)
 
 

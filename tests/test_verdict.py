@@ -38,7 +38,9 @@ def line(t, x, p):
 def straight(values, *, sigma=None, times=TIMES, a=1.0, b=1.0, **settings) -> sf.Estimate:
     """Fit a straight line to values."""
     parameters = {"a": sf.Parameter(a), "b": sf.Parameter(b, **settings)}
-    return sf.estimate(curve(line, times, np.asarray(values)[:, None], parameters, tf=float(times[-1]), sigma=sigma))
+    return sf.estimate(
+        curve(line, times, np.asarray(values)[:, None], parameters, tf=float(times[-1]), sigma=sigma), strategy="local"
+    )
 
 
 def noise(size=1.0, count=100, seed=0) -> np.ndarray:
@@ -132,8 +134,8 @@ def test_one_wrong_run_of_many_is_found_and_named():
             runs.append(sf.Experiment(run, ("on", "off"), (3.0,), 0.0, 6.0, name=f"room{e}"))
         return sf.Problem(heated_room(), runs, {"power": 2.0, "k": 0.5})
 
-    assert sf.estimate(problem(0.0)).verdict.level == "good"
-    fit = sf.estimate(problem(1.5))
+    assert sf.estimate(problem(0.0), strategy="local").verdict.level == "good"
+    fit = sf.estimate(problem(1.5), strategy="local")
     assert fit.residual_variance < 1.15
     assert fit.verdict.level == "bad"
     assert fit.verdict.reasons[0].subjects == ("room7 T",)
@@ -194,7 +196,7 @@ def test_outliers_that_a_robust_loss_weighs_down_are_not_missed():
     def fit(slope: sf.Parameter) -> sf.Estimate:
         system = sf.HybridSystem({"still": lambda t, x, p: 0.0 * x}, [0.0])
         run = sf.Experiment(data, ("still",), (), 0.0, 10.0)
-        return sf.estimate(sf.Problem(system, run, {"a": 1.0, "b": slope}))
+        return sf.estimate(sf.Problem(system, run, {"a": 1.0, "b": slope}), strategy="local")
 
     right = fit(sf.Parameter(0.3))
     assert right.verdict.level == "good"
@@ -246,7 +248,7 @@ def test_the_error_of_a_time_is_corrected_by_its_own_run():
     for e, wave in enumerate((0.0, 0.05)):
         values = temperature(times, 3.0 + 0.01 * e, 2.0, 0.5) + wave * np.sin(2 * times) + noise(0.02, 60, seed=e)
         runs.append(sf.Experiment(sf.Measurements(times, values), ("on", "off"), (3.0,), 0.0, 6.0))
-    fit = sf.estimate(sf.Problem(heated_room(), runs, {"power": 2.0, "k": 0.5}))
+    fit = sf.estimate(sf.Problem(heated_room(), runs, {"power": 2.0, "k": 0.5}), strategy="local")
     factors = fit.corrected_standard_errors / fit.standard_errors
     assert factors[0] == 1.0
     assert factors[1] > 1.5
@@ -259,7 +261,7 @@ def test_the_error_of_a_time_is_corrected_by_its_own_run():
 def heated(values, sequence=("on", "off"), guess=(4.0,), *, sigma=0.05, **parameters) -> sf.Estimate:
     times = np.linspace(0.1, 9.9, 50)
     run = sf.Experiment(sf.Measurements(times, values, sigma=sigma), sequence, guess, 0.0, 10.0)
-    return sf.estimate(sf.Problem(heated_room(), run, {"power": 2.0, "k": 0.5} | parameters))
+    return sf.estimate(sf.Problem(heated_room(), run, {"power": 2.0, "k": 0.5} | parameters), strategy="local")
 
 
 HEATED = temperature(np.linspace(0.1, 9.9, 50), 4.03, 2.0, 0.5) + noise(0.05, 50, seed=2)
@@ -298,7 +300,7 @@ def test_a_direction_that_the_data_do_not_determine_is_doubtful():
 
     def fit(observe):
         values = (0.5 * TIMES + noise(0.1))[:, None]
-        return sf.estimate(curve(observe, TIMES, values, {"a": 0.7, "b": 0.7}, tf=10.0, sigma=0.1))
+        return sf.estimate(curve(observe, TIMES, values, {"a": 0.7, "b": 0.7}, tf=10.0, sigma=0.1), strategy="local")
 
     found = fit(product)
     assert found.verdict.level == "doubtful"
@@ -313,7 +315,9 @@ def test_a_kink_is_a_note_and_no_doubt():
     for seed in range(20):
         values = temperature(times, 3.0, 2.0, 0.5) + noise(0.05, 24, seed)
         run = sf.Experiment(sf.Measurements(times, values, sigma=0.05), ("on", "off"), (2.6,), 0.0, 6.0)
-        fit = sf.estimate(sf.Problem(heated_room(), run, {"power": 2.0, "k": sf.Parameter(0.5, fixed=True)}))
+        fit = sf.estimate(
+            sf.Problem(heated_room(), run, {"power": 2.0, "k": sf.Parameter(0.5, fixed=True)}), strategy="local"
+        )
         if fit.kinks:
             break
     assert fit.kinks
@@ -328,7 +332,7 @@ def test_a_kink_is_a_note_and_no_doubt():
 
 @pytest.fixture(scope="module")
 def right() -> sf.Estimate:
-    return sf.estimate(heater_problem())
+    return sf.estimate(heater_problem(), strategy="local")
 
 
 @pytest.mark.parametrize(
@@ -360,7 +364,7 @@ def test_other_starts_count(right, starts, level, kind):
 
 
 def test_few_starts_that_agree_are_doubtful_where_nothing_confirms_the_fit():
-    fit = sf.estimate(linear())
+    fit = sf.estimate(linear(), strategy="local")
     assert fit.verdict.level == "good"
     assert replace(fit, starts=(40, 0, 4)).verdict.level == "good"
     few = replace(fit, starts=(40, 0, 3))
@@ -384,7 +388,7 @@ def test_derivatives_that_failed_their_check_are_doubtful(right):
 
 
 def test_a_fit_that_has_not_converged_is_bad():
-    fit = sf.estimate(heater_problem(), max_iterations=1)
+    fit = sf.estimate(heater_problem(), max_iterations=1, strategy="local")
     assert (fit.verdict.level, kinds(fit)) == ("bad", ["not converged"])
     assert not fit.success
     assert str(fit.verdict).startswith("Bad: not converged: stopped after 1 iterations: raise max_iterations, or ")
@@ -395,10 +399,10 @@ def test_a_fit_that_has_not_converged_is_bad():
 
 def test_a_reference_that_is_followed_is_good_and_a_wrong_end_is_not():
     problem = tracked_drive()
-    right = sf.estimate(problem)
+    right = sf.estimate(problem, strategy="local")
     np.testing.assert_allclose(right.theta, VEHICLE_TRUTH, rtol=1e-4)
     assert right.verdict.level == "good"
-    wrong = sf.estimate(problem, start=[0.5, 1.0, 1.9])
+    wrong = sf.estimate(problem, start=[0.5, 1.0, 1.9], strategy="local")
     assert not np.allclose(wrong.theta, VEHICLE_TRUTH, rtol=0.05)
     assert wrong.verdict.level == "bad"
     assert kinds(wrong)[0] in ("reference not followed", "not converged")
@@ -414,7 +418,7 @@ def test_channels_of_no_weight_and_constant_references_are_not_judged():
     def fit(weight):
         data = sf.ReferenceSignal.from_samples(times, values, observe=observe, weights=[1.0, weight, 1.0])
         run = sf.Experiment(data, ("on", "off"), (2.5,), 0.0, 6.0)
-        return sf.estimate(sf.Problem(heated_room(), run, {"power": 1.5, "k": 0.4}))
+        return sf.estimate(sf.Problem(heated_room(), run, {"power": 1.5, "k": 0.4}), strategy="local")
 
     assert fit(0.0).verdict.level == "good"
     seen = fit(1.0)
@@ -423,9 +427,9 @@ def test_channels_of_no_weight_and_constant_references_are_not_judged():
 
 
 def test_a_cost_without_data_is_judged_by_its_minimum():
-    fit = sf.estimate(linear())
+    fit = sf.estimate(linear(), strategy="local")
     assert str(fit.verdict).startswith("Good: a minimum (KKT residual ")
-    collapsed = sf.estimate(fishing())
+    collapsed = sf.estimate(fishing(), strategy="local")
     assert collapsed.verdict.level == "doubtful"
     assert kinds(collapsed) == ["a mode collapsed"]
     assert "No standard errors" not in collapsed.report(full=True)  # nothing can be done about it
@@ -453,11 +457,11 @@ def thermostat() -> sf.Problem:
 
 def test_ends_of_the_thermostat():
     problem = thermostat()
-    right = sf.estimate(problem)
+    right = sf.estimate(problem, strategy="local")
     assert right.verdict.level == "good"
     levels = []
     for start in ([0.4, 1.6, 2.5, 7.4, 8.9, 3.6, 0.5], [1.0, 2.0, 3.0, 4.0, 5.0, 4.0, 2.5], [6, 7, 8, 9, 9.5, 4, 2]):
-        wrong = sf.estimate(problem, start=start)
+        wrong = sf.estimate(problem, start=start, strategy="local")
         assert wrong.cost > 10 * right.cost
         levels.append(wrong.verdict.level)
         assert not wrong.success
@@ -522,13 +526,13 @@ def two_turns() -> sf.Problem:
 def test_ends_of_two_turns():
     """Nine tenths of the wrong ends explain 99 % of positions that go over hundreds of metres: none may be good."""
     problem = two_turns()
-    right = sf.estimate(problem)
+    right = sf.estimate(problem, strategy="local")
     assert right.verdict.level == "good"
     random = np.random.default_rng(3)
     seen = []
     for _ in range(8):
         start = [*np.sort(random.uniform(0.0, 24.0, 4)), random.uniform(0.4, 1.2), random.uniform(0.2, 2.0)]
-        end = sf.estimate(problem, start=start)
+        end = sf.estimate(problem, start=start, strategy="local")
         if end.cost < 1.01 * right.cost:
             assert end.verdict.level == "good"
         else:
@@ -544,9 +548,9 @@ def test_ends_of_the_vehicle():
     seen = np.stack([np.interp(times, path.times, path.states[:, k]) for k in (0, 2)], axis=1)
     data = replace(positions(times, 0.1), values=seen + np.random.default_rng(1).normal(0.0, 0.1, seen.shape))
     problem = drive(data)
-    right = sf.estimate(problem)
+    right = sf.estimate(problem, strategy="local")
     assert right.verdict.level == "good"
-    wrong = sf.estimate(problem, start=[0.5, 1.0, 1.9])
+    wrong = sf.estimate(problem, start=[0.5, 1.0, 1.9], strategy="local")
     assert wrong.cost > 10 * right.cost
     assert wrong.verdict.level == "bad"
 
@@ -574,7 +578,7 @@ def many_runs() -> sf.Problem:
     ids=["vehicle", "fishing", "thermostat", "two turns", "200 runs"],
 )
 def test_a_report_begins_with_the_verdict_and_fits_one_screen(problem, level):
-    fit = sf.estimate(problem())
+    fit = sf.estimate(problem(), strategy="local")
     lines = str(fit).splitlines()
     assert " ".join(lines[: lines.index("")]).replace("   ", " ") == str(fit.verdict)
     assert fit.verdict.level == level
@@ -600,7 +604,7 @@ def test_a_multistart_begins_with_the_verdict_on_its_best():
 
 def test_the_verdict_costs_nothing_until_it_is_asked_for():
     """A fit simulates its trajectories at the first access; neither the fit nor its status needs them."""
-    fit = sf.estimate(heater_problem())
+    fit = sf.estimate(heater_problem(), strategy="local")
     assert fit.status.successful
     assert "_simulation" in vars(fit)
     assert fit.success

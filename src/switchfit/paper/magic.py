@@ -72,7 +72,7 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
             "rms_position_error": float(np.sqrt(np.mean(np.sum((fitted - positions) ** 2, axis=1)))),
         }
     found["ramps"] = _ramps(say)
-    found["forces"] = {"static": _force_spectrum((LOAD,)), "transfer": _force_spectrum(_transferred())}
+    found["forces"] = {"static": _force_spectrum((LOAD,)), "transfer": _force_spectrum(_transfer_load())}
     found.update(_coefficients(speeds, say))
     return found
 
@@ -88,7 +88,7 @@ def _ramps(say: Say) -> list[Found]:
     return lines
 
 
-def _transferred() -> tuple[float, ...]:
+def _transfer_load() -> tuple[float, ...]:
     return LOAD * (1 - TRANSFER), LOAD, LOAD * (1 + TRANSFER)
 
 

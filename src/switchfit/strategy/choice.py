@@ -52,6 +52,9 @@ PERFECT = 0.9999
 """Share of the variance of a reference that must be explained for a fit not to need confirmation: wrong ends of the
 benchmarks reach 0.9989."""
 
+ITERATIONS = 200
+"""Most iterations of a fit on one mesh, unless said otherwise."""
+
 MORE_ITERATIONS = 2000
 """Iterations of a fit that goes on where the first has not converged within those that it was allowed."""
 
@@ -65,7 +68,7 @@ def estimate(
     strategy: Strategy = "auto",
     hessian: HessianKind = "auto",
     tolerance: float = 1e-7,
-    max_iterations: int = 200,
+    max_iterations: int = ITERATIONS,
     callback: Callable[[IterationRecord], object] | None = None,
     start: ArrayLike | None = None,
     time_budget: float | None = None,
@@ -91,7 +94,8 @@ def estimate(
         counts by its logarithm, one whose first guess is below 1e-3 or above 1e3 in units of (about) that guess.
     max_iterations : int
         Most iterations on one mesh. Where a fit has converged but the integration error asks for a finer mesh, at most
-        twice, it is resumed there with as many again; ``iterations`` counts all of them.
+        twice, it is resumed there with as many again; ``iterations`` counts all of them. With fewer than usual
+        "auto" is "local" where they do not suffice.
     callback : callable, optional
         Called with each `IterationRecord` of the first fit and of those that end a strategy; a true return value stops.
         Ctrl-C does as well; both return the best point so far.
@@ -145,7 +149,8 @@ def estimate(
         if search.best is None:
             raise
         return search.finish(search.best)
-    if strategy == "local" or (strategy == "auto" and (hessian != "auto" or _is_enough(problem, best))):
+    limited = best.status is Status.MAX_ITERATIONS and max_iterations < ITERATIONS
+    if strategy == "local" or (strategy == "auto" and (hessian != "auto" or limited or _is_enough(problem, best))):
         return best
     search = Search(problem, best, problem.check_theta(start), strategy, settings, began, budget)
     search.run()
