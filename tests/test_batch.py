@@ -722,7 +722,7 @@ def test_the_lowest_end_may_raise_an_error_when_it_is_fitted_again(monkeypatch):
     study = sf.multistart(problem, [[2.0, 0.9], [1.5, 0.7]])
     assert sorted(study.status.tolist()) == ["CONVERGED", "ERROR"]
     assert study.best.success
-    monkeypatch.setattr(starts, "estimate", lambda problem, **settings: 1 / 0)
+    monkeypatch.setattr(starts, "fit_locally", lambda problem, **settings: 1 / 0)
     study = sf.multistart(problem, [[2.0, 0.9], [1.5, 0.7]])
     assert study.best is None
     assert study.status.tolist() == ["ERROR"] * 2

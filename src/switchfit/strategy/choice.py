@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from switchfit.estimation.estimator import Estimate, fit_locally
 from switchfit.fit.result import Step
-from switchfit.fit.solution import is_least_squares, is_sigma_known
+from switchfit.fit.solution import is_least_squares, is_sigma_known, smallest_cost
 from switchfit.optimize import IterationRecord, Status
 from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
@@ -354,7 +354,9 @@ class Search:
         evaluations = end.evaluations
         # The cost of a fit whose constraints are not met says nothing: any that meets them is better.
         before = np.inf if self.best is None or self.best.violated else self.best.cost
-        if not end.failed and (before == np.inf or end.cost < before - LOWER * abs(before)):
+        if not end.failed and (
+            before == np.inf or end.cost < before - max(LOWER * abs(before), smallest_cost(self.problem))
+        ):
             fit = fit_locally(self.problem, start=end.theta, first_cost=self.first_cost, **self.settings)
             evaluations += fit.evaluations
             if self.best is None or (fit.cost < before and not fit.violated) or self.best.violated:
