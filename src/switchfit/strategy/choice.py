@@ -339,6 +339,11 @@ class Search:
         self.starts = found.tried, 0, found.agreeing
         return found.end
 
+    def _margin(self, cost: float) -> float:
+        """Return by how much an end has to be lower than a cost: where a fit is perfect, J is rounding."""
+        size = smallest_cost(self.problem)
+        return max(LOWER * abs(cost), size if is_least_squares(self.problem) else LOWER * size)
+
     def _fit_on_new_meshes(self, fit: Estimate) -> None:
         """Fit again from where the best fit ended, on meshes made for it."""
         began = time.perf_counter()
@@ -354,9 +359,7 @@ class Search:
         evaluations = end.evaluations
         # The cost of a fit whose constraints are not met says nothing: any that meets them is better.
         before = np.inf if self.best is None or self.best.violated else self.best.cost
-        if not end.failed and (
-            before == np.inf or end.cost < before - max(LOWER * abs(before), smallest_cost(self.problem))
-        ):
+        if not end.failed and (before == np.inf or end.cost < before - self._margin(before)):
             fit = fit_locally(self.problem, start=end.theta, first_cost=self.first_cost, **self.settings)
             evaluations += fit.evaluations
             if self.best is None or (fit.cost < before and not fit.violated) or self.best.violated:
