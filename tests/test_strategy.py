@@ -11,6 +11,7 @@ import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.random_starts import draw_starts
 from switchfit.strategy.choice import without_guards
+from switchfit.strategy.constrained import meet_constraints
 from switchfit.strategy.horizon import can_grow, grow_horizon
 from switchfit.strategy.quick import fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
@@ -392,3 +393,26 @@ def test_runs_are_set_aside_by_name():
         problem.without_runs("room7")
     with pytest.raises(ValueError, match="none is left"):
         problem.without_runs("room0", "room1")
+
+
+def test_constraints_are_met_from_afar():
+    """Rest to rest of a double integrator in least time: 2 sqrt(distance), with one switch half-way."""
+    system = sf.HybridSystem(
+        {
+            "forward": lambda t, x, p: jnp.stack([x[1], 1.0 + 0.0 * x[1]]),
+            "back": lambda t, x, p: jnp.stack([x[1], -1.0 + 0.0 * x[1]]),
+        },
+        [0.0, 0.0],
+    )
+    data = [
+        sf.RunningCost(lambda t, x, p: 1.0 + 0.0 * x[0]),
+        sf.TerminalConstraint(lambda x, p: jnp.stack([x[0] - 4.0, x[1]])),
+    ]
+    run = sf.Experiment(data, ("forward", "back"), (0.3,), 0.0, sf.Parameter(0.9, lower=0.5, upper=12.0))
+    problem = sf.Problem(system, run)
+    theta, evaluations = meet_constraints(problem, problem.initial_theta)
+    np.testing.assert_allclose(theta, [2.0, 4.0], rtol=1e-4)
+    assert evaluations < 100
+    found = sf.estimate(problem)
+    assert not found.violated
+    np.testing.assert_allclose(found.theta, [2.0, 4.0], rtol=1e-7)

@@ -25,7 +25,7 @@ from switchfit.strategy.quick import End, fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
 from switchfit.strategy.runs import fit_runs_alone, has_runs
 from switchfit.strategy.scan import can_scan, scan_intervals
-from switchfit.strategy.starts import try_starts
+from switchfit.strategy.starts import SAME_COST, try_starts
 from switchfit.uncertainty.quality import measure_quality
 from switchfit.uncertainty.verdict import UNLIKELY
 
@@ -43,10 +43,12 @@ SCAN, GROW, REINSERT, STARTS = (
 )
 """Names of strategies."""
 
-REMESH = "new meshes"
+REMESH, INSIDE = "new meshes", "constraints inside the programme"
 
-EVERYWHERE = frozenset({GROW, REINSERT, STARTS})
-"""Strategies that look everywhere."""
+CONSTRAINTS_AGREE = "constraints inside the programme agree"
+
+EVERYWHERE = frozenset({GROW, REINSERT, STARTS, CONSTRAINTS_AGREE})
+"""Strategies that look everywhere, and the one that meets constraints in another way, if it ends at the same cost."""
 
 PERFECT = 0.9999
 """Share of the variance of a reference that must be explained for a fit not to need confirmation: wrong ends of the
@@ -267,8 +269,8 @@ class Search:
             for name, find in self._list_strategies():
                 if self.late:
                     break
-                self._try(name, find)
-                tried.add(name)
+                agrees = self._try(name, find)
+                tried.add(CONSTRAINTS_AGREE if agrees and name == INSIDE else name)
                 if self.strategy == "auto" and self.best is not None and _is_enough(self.problem, self.best, tried):
                     break
                 if self.best is not None and self.best.status is Status.INTERRUPTED:
@@ -297,6 +299,7 @@ class Search:
         found: list[tuple[str, Callable[[FloatArray], End]]] = []
         doubted = best is None or is_doubted(best)
         if problem.constraint_names:
+            found.append((INSIDE, lambda theta: fit_briefly(problem, self.theta)))
             if any(structure.guarded for structure in problem.structures):
                 found.append(("transitions free of their guards", self._free_transitions))
             return [*found, (STARTS, self._try_starts)]
@@ -352,8 +355,11 @@ class Search:
         self.evaluations += again.evaluations
         self.steps.append(Step(REMESH, self.best.cost, again.evaluations, time.perf_counter() - began))
 
-    def _try(self, name: str, find: Callable[[FloatArray], End]) -> None:
-        """Run one strategy; a full fit follows where its end is lower than the best so far."""
+    def _try(self, name: str, find: Callable[[FloatArray], End]) -> bool:
+        """Run one strategy; a full fit follows where its end is lower than the best so far.
+
+        Returns whether it ended at the same cost as the best.
+        """
         began = time.perf_counter()
         end = find(self.theta if self.best is None else self.best.theta)
         evaluations = end.evaluations
@@ -367,3 +373,4 @@ class Search:
         self.evaluations += evaluations
         cost = np.inf if self.best is None else self.best.cost
         self.steps.append(Step(name, cost, evaluations, time.perf_counter() - began))
+        return bool(np.isfinite(before) and abs(end.cost - before) <= SAME_COST * abs(before))
