@@ -6,7 +6,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from switchfit.optimize import LinearConstraints, kkt, qp, solve_qp
-from switchfit.optimize.dense import Dense, convexify, split_space
+from switchfit.optimize.dense import Dense, _solve_in_bounds, convexify, split_space
 from switchfit.optimize.kkt import kkt_residual
 from switchfit.optimize.matrix import diagonal_scaling
 
@@ -236,3 +236,28 @@ def test_a_face_that_is_nearly_flat_leaves_a_definite_matrix():
         unit = np.sqrt(np.diag(B))
         assert np.linalg.eigvalsh(B / np.outer(unit, unit))[0] > 0.0
         assert_kkt(np.ones(3), B, normals, np.zeros(1), solve_qp(np.ones(3), B, normals, np.zeros(1)))
+
+
+@pytest.mark.parametrize("d", [1, 2, 3, 7])
+def test_programmes_with_bounds_alone_are_solved_as_by_the_general_method(d):
+    """Of random convex programmes in a box, with a row that may be violated: then there is no answer."""
+    random = np.random.default_rng(d)
+    solved = refused = 0
+    for _ in range(200):
+        root = random.standard_normal((d, d))
+        convex, gradient = root @ root.T + 0.1 * np.eye(d), 3.0 * random.standard_normal(d)
+        normals = np.vstack([random.standard_normal((1, d)), np.eye(d), -np.eye(d)])
+        offsets = -random.uniform(0.0, 1.0, 2 * d + 1)
+        newton = -np.linalg.solve(convex, gradient)
+        found = _solve_in_bounds(gradient, convex, newton, normals, offsets)
+        expected = solve_qp(gradient, convex, normals, offsets)
+        if found is None:
+            refused += 1
+            continue
+        solved += 1
+        step, multipliers = found
+        np.testing.assert_allclose(step, expected.step, atol=1e-9)
+        np.testing.assert_allclose(convex @ step + gradient, normals.T @ multipliers, atol=1e-9)
+        assert (multipliers >= 0).all()
+    assert solved > 50
+    assert refused > 5
