@@ -205,7 +205,8 @@ def _cost_of_means(problem: Problem) -> float:
         for run in problem.experiments:
             for item in run.data:
                 times = np.linspace(run.t0, run.end, REFERENCE_POINTS)
-                deviation = item.signal(times) - item.signal(times).mean(axis=0)
+                followed = item.signal(times)
+                deviation = followed - followed.mean(axis=0)
                 total += (
                     0.5 * float(np.einsum("ki,ij,kj->", deviation, item.weights, deviation)) * (times[1] - times[0])
                 )
