@@ -77,6 +77,9 @@ def test_what_each_step_brought_is_told(far_fit):
     assert costs == sorted(costs, reverse=True)
     assert costs[-1] == far_fit.cost < 0.02 * costs[0]
     assert sum(step.evaluations for step in far_fit.steps) == far_fit.evaluations
+    text = " ".join(str(far_fit).split())
+    assert f"tried local: J = {costs[0]:.6g}" in text
+    assert f"growing horizon: J = {far_fit.cost:.6g}" in text
     assert far_fit.seconds >= sum(step.seconds for step in far_fit.steps) > 0
 
 

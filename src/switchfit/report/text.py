@@ -165,12 +165,15 @@ def _format_data(comparison: Comparison) -> str:
 
 
 def _format_course(fit: Fit, *, full: bool) -> list[str]:
-    """Return method, effort, and how it ended."""
+    """Return method, effort, the strategies with the lowest J after each, and how it ended."""
     lines = _format_row("method", METHODS.get(fit.hessian_kind, fit.hessian_kind))
     effort = f"{_count(fit.iterations, 'iteration')}, {_count(fit.evaluations, 'evaluation')}, {fit.seconds:.3g} s"
     lines += _format_row("effort", effort if fit.engine is None or full else f"{effort}. {fit.engine}")
     if fit.engine is not None and full:
         lines += _format_row("", str(fit.engine))
+    if fit.steps:
+        tried = (f"{step.strategy}: J = {step.cost:.6g} ({step.seconds:.2g} s)" for step in fit.steps)
+        lines += _format_row("tried", "; ".join(tried))
     lines += _format_row("status", fit.message if full or not fit.status.successful else _shorten_status(fit))
     return lines
 

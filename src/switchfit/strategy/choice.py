@@ -283,15 +283,13 @@ class Search:
 
     def finish(self, best: Estimate) -> Estimate:
         """Return the best fit with all that was done."""
-        seconds = time.perf_counter() - self.began
-        starts = self.starts
         return replace(
             best,
             initial_theta=self.theta,
             steps=tuple(self.steps),
-            starts=starts,
+            starts=self.starts,
             evaluations=self.evaluations,
-            seconds=seconds,
+            seconds=time.perf_counter() - self.began,
         )
 
     def _list_strategies(self) -> list[tuple[str, Callable[[FloatArray], End]]]:
