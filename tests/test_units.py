@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from test_report import made, trajectory_of
 from test_save import CERTIFICATE
+from texts import squeezed, without_wall_time
 from typer.testing import CliRunner
 
 import switchfit as sf
@@ -216,12 +217,6 @@ def everything(unit, folder):
     return {name: without_wall_time(text) for name, text in found.items()}
 
 
-def without_wall_time(text):
-    """Seconds of the clock on the wall are seconds whatever the unit of the log is."""
-    text = re.sub(r"(evaluations?), [\d.e+-]+\s+s\b", r"\1", text)
-    return re.sub(r"fits in [\d.]+ s \([\d.]+ ms each\)", "fits", text)
-
-
 @pytest.fixture(scope="module")
 def in_seconds(tmp_path_factory):
     return everything("s", tmp_path_factory.mktemp("s"))
@@ -238,11 +233,6 @@ def test_the_unit_of_times_is_the_only_one_that_is_printed(unit, in_seconds, tmp
             continue
         replaced = LONE_S.sub(lambda _: unit, expected)
         assert squeezed(text) == squeezed(replaced), name
-
-
-def squeezed(text):
-    """Without line breaks and spaces, which move with the length of the unit."""
-    return re.sub(r"\s", "", text)
 
 
 def test_where_a_time_is_printed_its_unit_is(in_seconds):
