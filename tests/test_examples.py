@@ -84,7 +84,8 @@ def test_heaters_were_switched_when_the_log_says():
     recorded = module["read"]()[2]
     np.testing.assert_allclose(recorded, [10.006, 100.028, 200.229, 300.269, 400.439, 500.682], atol=1e-3)
     assert np.abs(module["GUESS"] - recorded).min() > 10.0
-    balance, power = (sf.estimate(module["make_problem"](model)) for model in ("balance", "power"))
+    # The guesses are near enough for one fit; to say that nothing is lower elsewhere takes far longer.
+    balance, power = (sf.estimate(module["make_problem"](model), strategy="local") for model in ("balance", "power"))
     assert balance.success
     assert power.success
     # The energy balance is wrong by up to 44 s, says that it is sure, and its residuals say that it should not be.
