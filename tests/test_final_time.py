@@ -123,6 +123,7 @@ def test_derivatives_pass_every_check():
     assert found.passed, str(found)
 
 
+@pytest.mark.slow  # compiles for a quarter of a minute; the closed form above is met by both methods in any case
 def test_forward_and_automatic_derivatives_are_those_of_the_backward_sweep():
     problem = replace(
         hard_problem(), experiments=replace(hard_problem().experiments[0], data=hard_problem().experiments[0].data[:3])
