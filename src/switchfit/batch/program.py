@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 import threading
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -209,7 +210,11 @@ def fit_chunk(
         try:
             with _compile_once(layout, given):
                 outcome = jax.tree.map(lambda a: np.asarray(a)[:count], _fits(*given, layout=layout))
-        except Exception:  # of one fit, as where a function of the model calls back into Python: each by itself, then
+        except Exception as error:
+            # A function of the model that calls back into Python may raise for one fit and ends the whole program: the
+            # fits are then done one by one, and that one is listed. Any other error is a defect of the program.
+            if not _is_raised_in_callback(error):
+                warnings.warn(_NO_PROGRAM.format(error=describe_error(error)), RuntimeWarning, stacklevel=2)
             outcome = _leave_all(np.asarray(starts, dtype=float))
     return _finish_rest(problem, evaluator, varying, outcome, tolerance, max_iterations)
 
@@ -374,15 +379,33 @@ def _group_alike(layout: Layout, arguments: tuple[Arguments, ...]) -> list[list[
     return list(groups.values())
 
 
+_NO_PROGRAM = (
+    "The compiled program of many fits failed ({error}); they are done one by one, which takes much longer. This is an "
+    "error in switchfit itself: please report it."
+)
+
+
+def _is_raised_in_callback(error: BaseException) -> bool:
+    """Return whether a function that a program calls in Python raised it: JAX raises a ValueError or a JaxRuntimeError
+    of its own, with the traceback in its text.
+    """
+    return "error calling callback" in str(error)
+
+
 def error_message(error: BaseException) -> str:
     """Return what to list for a fit that ended with an error, on one line."""
+    return str(Termination.of_error(describe_error(error)))
+
+
+def describe_error(error: BaseException) -> str:
+    """Return kind and text of an error on one line, of one that JAX hands on those of what raised it."""
     text = str(error)
     if "Traceback" in text:  # as JAX hands on what a callback raised: its last line says what it was
         raised = [line.strip() for line in text.splitlines() if RAISED.match(line)]
         text = raised[-1] if raised else text
     else:
         text = f"{type(error).__name__}: {text}"
-    return str(Termination.of_error(" ".join(text.split())[:LONGEST_ERROR]))
+    return " ".join(text.split())[:LONGEST_ERROR]
 
 
 def with_errors(chunk: Chunk, errors: Mapping[int, BaseException]) -> Chunk:
