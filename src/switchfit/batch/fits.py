@@ -14,6 +14,7 @@ import scipy.special
 from numpy.typing import NDArray
 
 from switchfit.batch.chunks import Work, run_chunks
+from switchfit.batch.verdict import find_levels, judge_many
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.hidden import refuse_hidden_switches
 from switchfit.fit.result import interval
@@ -24,6 +25,10 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_path
 from switchfit.runtime.presentation import format_text
 from switchfit.runtime.progress import show_progress
+from switchfit.uncertainty.verdict import Verdict
+
+CHUNK_FORMAT = "fits 2"
+"""Part of every fingerprint: it changes where the arrays of a chunk do, so that folders of before are not used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +57,16 @@ class Fits:
         As `Estimate.covariance`; NaN where the cost has no noise model.
     samples : (R,) int
         Measured values that are not missing.
+    explained : (R,)
+        Share of the variance of all data together that each explains; NaN where J is not half a sum of squares.
+    collapsed : (R,) int
+        Modes that last no longer than they must.
+    at_bounds : (R,) int
+        Parameters and initial states at a bound.
     sigma_known : bool or None
         Whether the noise of the measurements is known; None where the cost has no noise model.
+    priors : int
+        Unknowns with a prior, which counts as a sample.
     log_scaled : tuple of str
         Unknowns that were estimated on a logarithmic scale.
     seconds : float
@@ -68,8 +81,8 @@ class Fits:
     >>> import switchfit as sf
     >>> from switchfit.models import heater_problem
     >>> fits = sf.estimate_many([heater_problem(), heater_problem()])
-    >>> len(fits), fits.success
-    (2, array([ True,  True]))
+    >>> len(fits), fits.success, fits.verdict.level
+    (2, array([ True,  True]), 'good')
     >>> fits.theta.round(3)
     array([[2.462, 0.393],
            [2.462, 0.393]])
@@ -92,7 +105,11 @@ class Fits:
     free: NDArray[np.int64]
     covariance: FloatArray
     samples: NDArray[np.int64]
+    explained: FloatArray
+    collapsed: NDArray[np.int64]
+    at_bounds: NDArray[np.int64]
     sigma_known: bool | None
+    priors: int
     log_scaled: tuple[str, ...]
     seconds: float
 
@@ -101,8 +118,22 @@ class Fits:
         return len(self.cost)
 
     @cached_property
+    def verdict(self) -> Verdict:
+        """Whether to believe them: how many are good, doubtful and bad, why, and what to do next. Print it for a line.
+
+        Each fit is judged by how it ended and by chi-square or the share of the variance that it explains; residuals
+        are not tested for correlation, nor channels one by one. `Estimate.verdict` does that for a single fit.
+        """
+        return judge_many(self)
+
+    @cached_property
+    def levels(self) -> NDArray[np.str_]:
+        """The level of each fit, "good", "doubtful" or "bad": (R,)."""
+        return find_levels(self)
+
+    @cached_property
     def success(self) -> NDArray[np.bool_]:
-        """Which of them converged, by `Status.successful`: (R,). Many fits have no verdict, an `Estimate` has."""
+        """Which of them converged, by `Status.successful`, however well they fit: (R,). See `levels`."""
         good = [status.name for status in Status if status.successful]
         return np.isin(self.status, good)
 
@@ -137,7 +168,7 @@ class Fits:
                 [0.38, 0.4 ]]])
         """
         level = as_level(level)
-        freedom, tail = np.maximum(self.samples - self.free, 1), 0.5 + level / 2
+        freedom, tail = np.maximum(self.samples + self.priors - self.free, 1), 0.5 + level / 2
         quantile = scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail)
         half = np.reshape(quantile, (-1, 1)) * self.standard_errors
         return interval(self.theta, half, np.isin(self.theta_names, self.log_scaled))
@@ -213,7 +244,8 @@ def _collect_fields(
     """
     known = is_sigma_known(problem)
     samples = arrays["samples"]
-    freedom = samples - arrays["free"]
+    priors = int(np.count_nonzero(problem.unknowns.priors.precision))
+    freedom = samples + priors - arrays["free"]
     scale = np.ones(len(samples)) if known else np.full(len(samples), np.nan)
     if known is False:
         scale = np.where(freedom > 0, 2 * arrays["cost"] / np.maximum(freedom, 1), np.nan)
@@ -226,6 +258,7 @@ def _collect_fields(
         "requested": requested,
         "runs": runs,
         "sigma_known": known,
+        "priors": priors,
         "log_scaled": problem.unknowns.log_names,
         "seconds": seconds,
         **found,

@@ -13,12 +13,14 @@ import numpy as np
 
 from switchfit.batch.again import adopt, is_resolved
 from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.fits import Fits, check_long_run, count_samples, repeat
+from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, count_samples, repeat
 from switchfit.batch.program import Varying, chunk_size, error_message, fit_chunk, make_failed_chunk
+from switchfit.batch.quality import describe_ends, measure_variation
 from switchfit.estimation.estimator import check_settings, fit_locally
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import is_sigma_known
 from switchfit.optimize import Status
+from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_instance, as_sequence, join_names
 
@@ -143,6 +145,7 @@ class _Work:
                 except Exception as error:
                     arrays["status"][k], arrays["message"][k] = Status.ERROR.name, error_message(error)
         arrays["message"], arrays["status"] = arrays["message"].astype(str), arrays["status"].astype(str)
+        arrays |= _describe_each(problems, arrays["theta"], arrays["cost"])
         return {**arrays, "start": starts, "samples": np.array([count_samples(problem) for problem in problems])}
 
     def _list_failed(self, errors: dict[int, Exception]) -> Arrays:
@@ -150,7 +153,8 @@ class _Work:
         starts = np.array([self.problems[k].initial_theta for k in errors])
         found = make_failed_chunk(starts, dict(enumerate(errors.values())))
         samples = np.array([count_samples(self.problems[k]) for k in errors])
-        return {**found._asdict(), "start": starts, "samples": samples}
+        ends = _describe_each([self.problems[k] for k in errors], found.theta, found.cost)
+        return {**found._asdict(), **ends, "start": starts, "samples": samples}
 
     def _redo_unresolved(self, problem: Problem, k: int, arrays: Arrays) -> None:
         """Do a fit again by `estimate` if its integration error is too large."""
@@ -163,7 +167,7 @@ class _Work:
             )
 
     def fingerprint(self) -> str:
-        parts: list[Any] = ["logs", len(self.problems), self.tolerance, self.max_iterations]
+        parts: list[Any] = [CHUNK_FORMAT, "logs", len(self.problems), self.tolerance, self.max_iterations]
         for problem in self.problems:
             parts += [problem.theta_names, problem.initial_theta, *problem.unknowns.priors, problem.digests]
             try:
@@ -173,6 +177,15 @@ class _Work:
             else:
                 parts += map(np.asarray, jax.tree.leaves(tuple(evaluator.arguments)))
         return compute_fingerprint(*parts)
+
+
+def _describe_each(problems: Sequence[Problem], theta: FloatArray, cost: FloatArray) -> Arrays:
+    """Return how well each problem's fit explains its data, and where it ended, as `describe_ends` does."""
+    each = [
+        describe_ends(problem, theta[k : k + 1], cost[k : k + 1], measure_variation(problem).sum())
+        for k, problem in enumerate(problems)
+    ]
+    return {name: np.concatenate([one[name] for one in each]) for name in each[0]}
 
 
 def _get_kind(problem: Problem) -> Any:

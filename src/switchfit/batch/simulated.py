@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +15,10 @@ from numpy.typing import ArrayLike
 
 from switchfit.batch.again import redo_unresolved
 from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.fits import Fits, check_long_run, count_samples, repeat
+from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, count_samples, repeat
 from switchfit.batch.program import Varying, chunk_size, fit_chunk, with_errors
+from switchfit.batch.quality import describe_ends, measure_variation
+from switchfit.batch.verdict import LEVEL, judge_study
 from switchfit.discretization.arguments import build_arguments, split_by_cell
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh
@@ -28,6 +31,7 @@ from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_callable, as_count, as_instance, as_seed, shorten
 from switchfit.runtime.presentation import draw_figure
+from switchfit.uncertainty.verdict import Verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -66,6 +70,14 @@ class MonteCarlo(Fits):
 
     truth: FloatArray
     integration_error: float
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Whether to believe the study: how many fits converged, in the same minimum as the others, whether chi-square
+        confirms them, and whether their 95 % intervals hold the truth. Print it for a line.
+        """
+        intervals = self.confidence_intervals(LEVEL)
+        return judge_study(self, truth=self.truth, intervals=intervals, error=self.integration_error)
 
     @property
     def errors(self) -> FloatArray:
@@ -427,7 +439,17 @@ class _Work:
         found = with_errors(found, errors) if errors else found
         settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
         found = redo_unresolved(found, lambda k: self.problem_of(runs[k]), self.meshes, **settings)
-        return {**found._asdict(), "start": starts, "samples": np.full(len(runs), count_samples(self.problem))}
+        return {
+            **found._asdict(),
+            **describe_ends(self.problem, found.theta, found.cost, self._variation),
+            "start": starts,
+            "samples": np.full(len(runs), count_samples(self.problem)),
+        }
+
+    @cached_property
+    def _variation(self) -> float:
+        """J of the data of one run that are met by their means; in the others it differs by noise alone."""
+        return float(measure_variation(self.problem_of(self.sound)).sum())
 
     def _without_noise(self) -> dict[tuple[int, int], FloatArray]:
         """Return what stands for the values of a run that could not be drawn."""
@@ -468,7 +490,7 @@ class _Work:
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
         nodes = [mesh.nodes for mesh in self.meshes]
         return compute_fingerprint(
-            "monte carlo", settings, model, self.truth, self.start, *bounds, *nodes, *data, *drawn
+            CHUNK_FORMAT, "monte carlo", settings, model, self.truth, self.start, *bounds, *nodes, *data, *drawn
         )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.batch.again import redo_unresolved
 from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.fits import Fits, check_long_run, count_samples, repeat
+from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, count_samples, repeat
 from switchfit.batch.program import Varying, chunk_size, error_message, fit_chunk
+from switchfit.batch.quality import describe_ends, measure_variation
+from switchfit.batch.verdict import judge_starts
 from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.estimation.estimator import Estimate, check_settings, fit_locally
@@ -27,6 +30,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_count, as_instance, as_seed
 from switchfit.runtime.presentation import draw_figure
+from switchfit.uncertainty.verdict import Verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -74,6 +78,12 @@ class Multistart(Fits):
 
     clusters: NDArray[np.int64]
     best: Estimate | None
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """That on the best end, and how many of the other starts ended there: most of them may well be bad."""
+        best = self.best
+        return judge_starts(self, None if best is None else best.verdict, None if best is None else best.starts)
 
     def plot(self) -> Figure:
         """Draw a waterfall: the cost at the end of every start, ascending, as a matplotlib Figure.
@@ -219,14 +229,19 @@ class _Work:
         )
         settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
         found = redo_unresolved(found, lambda k: self.problem, self.meshes, **settings)
-        return {**found._asdict(), "start": starts, "samples": np.full(len(runs), count_samples(self.problem))}
+        return {
+            **found._asdict(),
+            **describe_ends(self.problem, found.theta, found.cost, measure_variation(self.problem).sum()),
+            "start": starts,
+            "samples": np.full(len(runs), count_samples(self.problem)),
+        }
 
     def fingerprint(self) -> str:
         unknowns = self.problem.unknowns
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
         leaves = jax.tree.leaves([build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes)])
         settings = self.tolerance, self.max_iterations, unknowns.names, self.problem.digests
-        return compute_fingerprint("multistart", settings, self.starts, *bounds, *map(np.asarray, leaves))
+        return compute_fingerprint(CHUNK_FORMAT, "multistart", settings, self.starts, *bounds, *map(np.asarray, leaves))
 
 
 def _check_starts(problem: Problem, starts: Any) -> FloatArray:

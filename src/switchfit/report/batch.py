@@ -14,7 +14,7 @@ from switchfit.batch.simulated import MonteCarlo
 from switchfit.batch.starts import Multistart
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report.tables import format_table
+from switchfit.report.tables import format_table, wrap_text
 from switchfit.runtime.presentation import draw_figure, format_text
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ BOOTSTRAP_TITLES = {
 
 
 def summarise(fits: Fits) -> list[str]:
-    """Return how many fits were done, how they ended, and the first that did not converge.
+    """Return the verdict, how many fits were done, how they ended, and the first that did not converge.
 
     Parameters
     ----------
@@ -42,7 +42,8 @@ def summarise(fits: Fits) -> list[str]:
     """
     count, good = len(fits), int(fits.success.sum())
     each = 1e3 * fits.seconds / max(count, 1)
-    lines = [f"{count} fits in {fits.seconds:.1f} s ({each:.2f} ms each), {good} converged"]
+    lines = wrap_text(str(fits.verdict))
+    lines.append(f"{count} fits in {fits.seconds:.1f} s ({each:.2f} ms each), {good} converged")
     if count < fits.requested:
         lines.append(f"STOPPED: {fits.requested - count} of {fits.requested} fits were not done")
     endings = Counter(fits.status.tolist()).most_common()
@@ -58,7 +59,7 @@ def summarise(fits: Fits) -> list[str]:
 
 @format_text.register(Fits)
 def write_fits(fits: Fits) -> str:
-    """Return how the fits ended.
+    """Return the verdict, and how the fits ended.
 
     Parameters
     ----------
@@ -69,7 +70,7 @@ def write_fits(fits: Fits) -> str:
 
 @format_text.register(MonteCarlo)
 def write_monte_carlo(study: MonteCarlo) -> str:
-    """Return how the fits ended, and a line for each unknown.
+    """Return the verdict, how the fits ended, and a line for each unknown.
 
     Parameters
     ----------
@@ -80,7 +81,7 @@ def write_monte_carlo(study: MonteCarlo) -> str:
 
 @format_text.register(Bootstrap)
 def write_bootstrap(study: Bootstrap) -> str:
-    """Return how the fits ended, what was resampled, and a line for each unknown.
+    """Return the verdict, how the fits ended, what was resampled, and a line for each unknown.
 
     Parameters
     ----------
@@ -92,7 +93,7 @@ def write_bootstrap(study: Bootstrap) -> str:
 
 @format_text.register(Multistart)
 def write_multistart(study: Multistart) -> str:
-    """Return the verdict on the best, how the fits ended, and a line for each of the ten lowest minima.
+    """Return the verdict, how the fits ended, and a line for each of the ten lowest minima.
 
     Parameters
     ----------
@@ -105,8 +106,7 @@ def write_multistart(study: Multistart) -> str:
         columns = zip(study.theta_names, study.theta[here[0]], study.theta_units, strict=True)
         place = ", ".join(f"{name} = {value:.6g}{unit_suffix(unit)}" for name, value, unit in columns)
         rows.append((f"J = {study.cost[here].min():.9g}", f"{len(here)} starts", place))
-    best = [] if study.best is None else [str(study.best.verdict)]
-    return "\n".join([*best, *summarise(study), "", f"{minima} minima:", *format_table(rows, "<><")])
+    return "\n".join([*summarise(study), "", f"{minima} minima:", *format_table(rows, "<><")])
 
 
 def tabulate_monte_carlo(study: MonteCarlo) -> list[str]:

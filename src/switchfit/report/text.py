@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import textwrap
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -16,7 +15,7 @@ from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report.numbers import format_rounded, format_unit, get_unit
-from switchfit.report.tables import format_table
+from switchfit.report.tables import format_table, wrap_text
 from switchfit.report.uncertainty import write_direction
 from switchfit.report.verdict import format_share
 from switchfit.runtime.presentation import format_text
@@ -27,7 +26,6 @@ from switchfit.uncertainty.quality import explain_channel
 from switchfit.uncertainty.residuals import correct_errors
 from switchfit.uncertainty.verdict import Verdict, judge
 
-WIDTH = 100
 ONE_SIDED = 1.2
 """Ratio of the two sides of an interval above which it is said that they differ."""
 LABEL = 18
@@ -97,7 +95,7 @@ def report(
     limits = EVERYTHING if full else SCREEN
     weak = analyse_solution(fit, None) if found is None else found
     sections = [
-        _wrap(str(verdict), "", "  "),
+        wrap_text(str(verdict), "", "  "),
         _format_section(
             "Fit", _format_experiments(fit, limits.experiments, full=full) + _format_course(fit, full=full)
         ),
@@ -352,13 +350,13 @@ def _format_correlations(fit: Fit, most: int, *, full: bool) -> list[str]:
         return format_table(rows, "<>")
     more = len(above) - len(rows)
     listed = [f"{pair} {value}" for pair, value in rows] + ([f"and {more} more"] if more > 0 else [])
-    return _wrap("; ".join(listed), "  ", "    ")
+    return wrap_text("; ".join(listed), "  ", "    ")
 
 
 def _describe_weak(fit: Fit, found: Identifiability, most: int) -> list[str]:
     """Return the combinations of unknowns that the data hardly see, if there are any."""
     weak = [d for d in found.directions if d.eigenvalue < WEAK] if fit.status.successful else []
-    lines = [line for direction in weak[:most] for line in _wrap(write_direction(found, direction), "  - ", "    ")]
+    lines = [line for direction in weak[:most] for line in wrap_text(write_direction(found, direction), "  - ", "    ")]
     more = len(weak) - len(weak[:most])
     return lines + ([f"  and {_count(more, 'direction')} more"] if more else [])
 
@@ -386,7 +384,7 @@ def _format_warnings(fit: Fit, verdict: Verdict, most: int, *, full: bool) -> li
     """Return what to be wary of; on one screen without what the verdict has said."""
     said = set() if full else set().union(*(_SAID.get(reason.kind, set()) for reason in verdict.reasons))
     issues = [issue for issue in find_issues(fit) if issue.kind not in said]
-    lines = [line for issue in issues[:most] for line in _wrap(str(issue), "  - ", "    ")]
+    lines = [line for issue in issues[:most] for line in wrap_text(str(issue), "  - ", "    ")]
     more = len(issues) - len(issues[:most])
     return lines + ([f"  and {_count(more, 'warning')} more"] if more else [])
 
@@ -406,14 +404,8 @@ def _format_section(title: str, lines: Sequence[str]) -> list[str]:
 def _format_row(label: str, text: str) -> list[str]:
     """Return a label at the left and text, wrapped, beside it."""
     if len(label) > LABEL:
-        return [f"  {label}", *_wrap(text, " " * (LABEL + 4), " " * (LABEL + 4))]
-    return _wrap(text, f"  {label:<{LABEL}}  ", " " * (LABEL + 4))
-
-
-def _wrap(text: str, first: str, others: str) -> list[str]:
-    return textwrap.wrap(
-        text, WIDTH, initial_indent=first, subsequent_indent=others, break_long_words=False, break_on_hyphens=False
-    )
+        return [f"  {label}", *wrap_text(text, " " * (LABEL + 4), " " * (LABEL + 4))]
+    return wrap_text(text, f"  {label:<{LABEL}}  ", " " * (LABEL + 4))
 
 
 def _count(number: int, what: str) -> str:
