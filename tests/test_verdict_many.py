@@ -106,7 +106,9 @@ def test_the_share_of_a_reference_is_that_of_a_single_fit():
 
 def test_a_cost_without_data_has_no_share():
     cost = sf.RunningCost(lambda t, x, p: (x[0] - 0.8) ** 2)
-    problem = sf.Problem(ROOM, sf.Experiment(cost, ("on", "off"), (1.0,), 0.0, 6.0), {"k": sf.Parameter(0.8, fixed=True)})
+    problem = sf.Problem(
+        ROOM, sf.Experiment(cost, ("on", "off"), (1.0,), 0.0, 6.0), {"k": sf.Parameter(0.8, fixed=True)}
+    )
     many = sf.estimate_many([problem])
     assert np.isnan(many.explained).all()
     assert str(many.verdict) == "Good: the only fit is good."
@@ -118,7 +120,9 @@ def test_one_bad_fit_among_many_is_named():
     many = sf.estimate_many(problems)
     assert many.verdict.level == "doubtful"
     assert np.flatnonzero(many.levels == "bad").tolist() == [13]
-    assert str(many.verdict).startswith("Doubtful: 19 of 20 fits are good and 1 is bad; the model is far from the data in ")
+    assert str(many.verdict).startswith(
+        "Doubtful: 19 of 20 fits are good and 1 is bad; the model is far from the data in "
+    )
     assert "(fit 13 explains" in str(many.verdict)
     assert str(many.verdict).endswith("fit problem 13 by itself with sf.estimate.")
 

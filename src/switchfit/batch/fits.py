@@ -14,13 +14,13 @@ import scipy.special
 from numpy.typing import NDArray
 
 from switchfit.batch.chunks import Work, run_chunks
-from switchfit.batch.verdict import find_levels, judge_many
+from switchfit.batch.quality import count_priors
+from switchfit.batch.verdict import find_levels, has_converged, judge_many
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.hidden import refuse_hidden_switches
 from switchfit.fit.result import interval
 from switchfit.fit.solution import is_sigma_known
-from switchfit.optimize import Status
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_path
 from switchfit.runtime.presentation import format_text
@@ -134,8 +134,7 @@ class Fits:
     @cached_property
     def success(self) -> NDArray[np.bool_]:
         """Which of them converged, by `Status.successful`, however well they fit: (R,). See `levels`."""
-        good = [status.name for status in Status if status.successful]
-        return np.isin(self.status, good)
+        return has_converged(self.status)
 
     @property
     def failures(self) -> list[tuple[int, str]]:
@@ -244,7 +243,7 @@ def _collect_fields(
     """
     known = is_sigma_known(problem)
     samples = arrays["samples"]
-    priors = int(np.count_nonzero(problem.unknowns.priors.precision))
+    priors = count_priors(problem)
     freedom = samples + priors - arrays["free"]
     scale = np.ones(len(samples)) if known else np.full(len(samples), np.nan)
     if known is False:
@@ -263,8 +262,3 @@ def _collect_fields(
         "seconds": seconds,
         **found,
     }
-
-
-def count_samples(problem: Problem) -> int:
-    """Return the measured values that are not missing."""
-    return sum(item.count for run in problem.experiments for item in run.data if isinstance(item, Measurements))

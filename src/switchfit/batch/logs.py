@@ -11,11 +11,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from switchfit.batch.again import adopt, is_resolved
+from switchfit.batch.again import adopt, is_resolved, redo_doubted
 from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, count_samples, repeat
+from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
 from switchfit.batch.program import Varying, chunk_size, error_message, fit_chunk, make_failed_chunk
-from switchfit.batch.quality import describe_ends, measure_variation
+from switchfit.batch.quality import count_samples, describe_ends, measure_variation
 from switchfit.estimation.estimator import check_settings, fit_locally
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import is_sigma_known
@@ -136,6 +136,10 @@ class _Work:
             tolerance=self.tolerance,
             max_iterations=self.max_iterations,
         )
+        if problems[0].constraint_names:
+            variation = np.array([measure_variation(problem).sum() for problem in problems])
+            settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
+            found = redo_doubted(found, problems.__getitem__, starts, variation, **settings)
         arrays = {name: np.array(value) for name, value in found._asdict().items()}
         arrays["message"], arrays["status"] = arrays["message"].astype(object), arrays["status"].astype(object)
         for k, problem in enumerate(problems):

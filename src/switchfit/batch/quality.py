@@ -103,3 +103,13 @@ def _count_collapsed(problem: Problem, e: int, theta: FloatArray) -> NDArray[np.
     shortest = problem.min_duration + AT_END * (experiment.end - experiment.t0)
     found: NDArray[np.int64] = np.sum(np.diff(knots, axis=1) <= shortest, axis=1)
     return found
+
+
+def count_samples(problem: Problem) -> int:
+    """Return the measured values that are not missing."""
+    return sum(item.count for run in problem.experiments for item in run.data if isinstance(item, Measurements))
+
+
+def count_priors(problem: Problem) -> int:
+    """Return the unknowns that have a prior."""
+    return int(np.count_nonzero(problem.unknowns.priors.precision))

@@ -39,9 +39,9 @@ import numpy as np
 import scipy.special
 
 from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, count_samples, repeat
+from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
-from switchfit.batch.quality import describe_ends, measure_variation
+from switchfit.batch.quality import count_samples, describe_ends, measure_variation
 from switchfit.batch.simulated import fit_simulated
 from switchfit.batch.verdict import judge_study
 from switchfit.discretization.arguments import build_arguments

@@ -13,11 +13,11 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.batch.again import redo_unresolved
+from switchfit.batch.again import redo_doubted, redo_unresolved
 from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, count_samples, repeat
+from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
 from switchfit.batch.program import Varying, chunk_size, fit_chunk, with_errors
-from switchfit.batch.quality import describe_ends, measure_variation
+from switchfit.batch.quality import count_samples, describe_ends, measure_variation
 from switchfit.batch.verdict import LEVEL, judge_study
 from switchfit.discretization.arguments import build_arguments, split_by_cell
 from switchfit.discretization.mesh import Mesh
@@ -439,6 +439,8 @@ class _Work:
         found = with_errors(found, errors) if errors else found
         settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
         found = redo_unresolved(found, lambda k: self.problem_of(runs[k]), self.meshes, **settings)
+        if self.problem.constraint_names:
+            found = redo_doubted(found, lambda k: self.problem_of(runs[k]), starts, self._variation, **settings)
         return {
             **found._asdict(),
             **describe_ends(self.problem, found.theta, found.cost, self._variation),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -59,17 +60,9 @@ BY_CHI_SQUARE = ("unexplained", "slightly wrong")
 """Reasons that chi-square gives. Their probability, `UNLIKELY`, is shared among the fits."""
 
 
-class ManyFits(Protocol):
-    """What verdicts take of `Fits`."""
+class Ended(Protocol):
+    """What verdicts on each fit take of `Fits`."""
 
-    @property
-    def theta_names(self) -> tuple[str, ...]: ...
-    @property
-    def requested(self) -> int: ...
-    @property
-    def runs(self) -> NDArray[np.intp]: ...
-    @property
-    def theta(self) -> FloatArray: ...
     @property
     def cost(self) -> FloatArray: ...
     @property
@@ -92,8 +85,47 @@ class ManyFits(Protocol):
     def at_bounds(self) -> NDArray[np.int64]: ...
     @property
     def success(self) -> NDArray[np.bool_]: ...
+
+
+class ManyFits(Ended, Protocol):
+    """What verdicts on all of them together take of `Fits`."""
+
+    @property
+    def theta_names(self) -> tuple[str, ...]: ...
+    @property
+    def requested(self) -> int: ...
+    @property
+    def runs(self) -> NDArray[np.intp]: ...
+    @property
+    def theta(self) -> FloatArray: ...
     @property
     def standard_errors(self) -> FloatArray: ...
+
+
+@dataclass(frozen=True)
+class Ends:
+    """The ends of a chunk of fits, for `find_levels`."""
+
+    cost: FloatArray
+    hessian: FloatArray
+    status: NDArray[np.str_]
+    free: NDArray[np.int64]
+    samples: NDArray[np.int64]
+    explained: FloatArray
+    collapsed: NDArray[np.int64]
+    at_bounds: NDArray[np.int64]
+    sigma_known: bool | None
+    priors: int
+
+    @property
+    def success(self) -> NDArray[np.bool_]:
+        """Which of them converged: (R,)."""
+        return has_converged(self.status)
+
+
+def has_converged(status: NDArray[np.str_]) -> NDArray[np.bool_]:
+    """Return which of fits with these names of their `Status` converged: (R,)."""
+    return np.isin(status, [one.name for one in Status if one.successful])
 
 
 class Doubt(NamedTuple):
@@ -112,7 +144,7 @@ class Doubt(NamedTuple):
     which: NDArray[np.bool_]
 
 
-def judge_each(fits: ManyFits) -> list[Doubt]:
+def judge_each(fits: Ended) -> list[Doubt]:
     """Return what speaks against each of the fits, in order of weight."""
     ended = fits.success
     misfits = [Doubt(d.kind, d.level, d.which & ended) for d in _find_misfits(fits)]
@@ -137,7 +169,7 @@ def judge_each(fits: ManyFits) -> list[Doubt]:
     return sorted(found, key=lambda doubt: -LEVELS.index(doubt.level))  # stable
 
 
-def find_levels(fits: ManyFits) -> NDArray[np.str_]:
+def find_levels(fits: Ended) -> NDArray[np.str_]:
     """Return "good", "doubtful" or "bad" for each fit: (R,)."""
     places = np.zeros(len(fits.cost), dtype=int)
     for doubt in judge_each(fits):
@@ -269,7 +301,7 @@ def find_elsewhere(fits: ManyFits, considered: NDArray[np.bool_] | None = None) 
     return away
 
 
-def _find_misfits(fits: ManyFits) -> Iterator[Doubt]:
+def _find_misfits(fits: Ended) -> Iterator[Doubt]:
     """Find fits that explain too little of their data."""
     explained = fits.explained
     if not np.isfinite(explained).any():
@@ -299,7 +331,7 @@ def _find_misfits(fits: ManyFits) -> Iterator[Doubt]:
     yield Doubt("little explained", "doubtful", little & (explained >= HALF) & (explained < MOSTLY))
 
 
-def _is_undetermined(fits: ManyFits) -> NDArray[np.bool_]:
+def _is_undetermined(fits: Ended) -> NDArray[np.bool_]:
     """Return which fits, of those without an active constraint, have a direction that the data hardly determine."""
     found = fits.status == Status.SINGULAR.name
     H = fits.hessian
