@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from benchmarks.starts.bounces import FALL, ball_on_guards
 
 import switchfit as sf
+from benchmarks.starts.bounces import FALL, ball_on_guards
 from switchfit.batch import again
 from switchfit.problem.problem import GIVEN
 

@@ -1,4 +1,4 @@
-"""Verdicts on many fits: the levels are those of single fits as far as J tells, and each rule for all of them together."""
+"""Verdicts on many fits: each as that on a single fit as far as J tells, and rules for all of them together."""
 
 from __future__ import annotations
 
