@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -69,6 +69,7 @@ def report(
     *,
     verdict: Verdict | None = None,
     full: bool = False,
+    files: Mapping[str, str] | None = None,
 ) -> str:
     """Return the verdict, what was fitted, how it ended, how well it fits, the unknowns with their errors, and what to
     be wary of.
@@ -85,6 +86,8 @@ def report(
     full : bool
         All experiments, channels, unknowns, correlations and directions, and all warnings in full; otherwise a screen,
         without the warnings that the verdict gives already.
+    files : mapping of str to str, optional
+        Names of files that have all "runs" and all "unknowns", said where a screen has no room for them.
 
     Returns
     -------
@@ -93,16 +96,17 @@ def report(
     """
     verdict = judge(fit, certificate) if verdict is None else verdict
     limits = EVERYTHING if full else SCREEN
+    runs, unknowns = (f", all in {files[name]}" if files and name in files else "" for name in ("runs", "unknowns"))
     weak = analyse_solution(fit, None) if found is None else found
     sections = [
         wrap_text(str(verdict), "", "  "),
         _format_section(
-            "Fit", _format_experiments(fit, limits.experiments, full=full) + _format_course(fit, full=full)
+            "Fit", _format_experiments(fit, limits.experiments, runs, full=full) + _format_course(fit, full=full)
         ),
         _format_section(
-            "Quality of the fit", [*_format_quality(fit, full=full), *_format_channels(fit, limits.channels)]
+            "Quality of the fit", [*_format_quality(fit, full=full), *_format_channels(fit, limits.channels, runs)]
         ),
-        _format_section("Unknowns", _format_unknowns(fit, limits.unknowns)),
+        _format_section("Unknowns", _format_unknowns(fit, limits.unknowns, unknowns)),
         _format_section("Held fixed", _format_fixed(fit, limits.fixed)),
         _format_section(CORRELATIONS, _format_correlations(fit, limits.correlations, full=full)),
         _format_section("Determined worst by the data", _describe_weak(fit, weak, limits.directions)),
@@ -119,18 +123,19 @@ def write_fit(fit: Fit, *, full: bool = False) -> str:
 
 
 @format_text.register(Estimate)
-def write_estimate(estimate: Estimate, *, full: bool = False) -> str:
+def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str, str] | None = None) -> str:
     """Return the report of an estimate, with its certificate if that is known already, and J evaluated where it is
     weak.
     """
     verdict = estimate.verdict
-    return report(estimate, estimate.known_certificate, estimate.identifiability, verdict=verdict, full=full)
+    found = estimate.identifiability
+    return report(estimate, estimate.known_certificate, found, verdict=verdict, full=full, files=files)
 
 
 # --- sections ---------------------------------------------------------------------------------------------------------
 
 
-def _format_experiments(fit: Fit, most: int, *, full: bool) -> list[str]:
+def _format_experiments(fit: Fit, most: int, where: str, *, full: bool) -> list[str]:
     """Return each experiment's modes, its horizon and its data; on one screen of several a line each."""
     lines: list[str] = []
     single = len(fit.trajectories) == 1
@@ -146,7 +151,7 @@ def _format_experiments(fit: Fit, most: int, *, full: bool) -> list[str]:
         else:
             lines += _format_row(name, "; ".join([f"{sequence}, {horizon}", *data]))
     if len(names) > most:
-        lines += _format_row("", f"and {len(names) - most} more experiments")
+        lines += _format_row("", f"and {len(names) - most} more experiments{where}")
     return lines
 
 
@@ -210,7 +215,7 @@ def _format_quality(fit: Fit, *, full: bool) -> Iterator[str]:
     )
 
 
-def _format_channels(fit: Fit, most: int) -> list[str]:
+def _format_channels(fit: Fit, most: int, where: str) -> list[str]:
     """Return a table of the channels: root mean square of the residuals, in units and in sigmas, and the share of the
     variance that is explained; of more than `most` those that are explained worst.
     """
@@ -232,7 +237,7 @@ def _format_channels(fit: Fit, most: int) -> list[str]:
     header = ["channel", "values", "rmse", "", in_sigmas, "explained"]
     table = format_table([header, *(rows[k] for k in kept)], "<>><>>")
     more = len(rows) - len(kept)
-    return ["", *table] + ([f"  and {more} more channels, of which more is explained"] if more else [])
+    return ["", *table] + ([f"  and {more} more channels, of which more is explained{where}"] if more else [])
 
 
 def _format_residuals(comparison: Comparison, k: int) -> tuple[str, str, str]:
@@ -247,7 +252,7 @@ def _format_residuals(comparison: Comparison, k: int) -> tuple[str, str, str]:
     return count, f"{rmse:.4g}", "" if isinstance(scaled, str) else f"{np.sqrt(np.mean(scaled**2)):.3g}"
 
 
-def _format_unknowns(fit: Fit, most: int) -> list[str]:
+def _format_unknowns(fit: Fit, most: int, where: str) -> list[str]:
     """Return the table of the unknowns; standard errors that are corrected have the naive ones beside them."""
     naive, errors = fit.standard_errors, correct_errors(fit)
     known = bool(np.isfinite(errors).any())
@@ -269,7 +274,7 @@ def _format_unknowns(fit: Fit, most: int) -> list[str]:
     columns = [k for k in range(8) if (known or k not in (2, 3, 4)) and (corrected or k != 4)]
     table = format_table([[row[k] for k in columns] for row in rows], "".join("<><><<><"[k] for k in columns))
     more = len(fit.theta) - len(shown)
-    table += [f"  and {more} more unknowns"] if more else []
+    table += [f"  and {more} more unknowns{where}"] if more else []
     if not known:
         return table
     if corrected:
