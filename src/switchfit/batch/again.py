@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.batch.program import Chunk
 from switchfit.batch.quality import count_priors, count_samples, describe_ends
@@ -132,6 +133,11 @@ def _is_doubted(problem: Problem, arrays: dict[str, Any], k: int, variation: flo
         **ends,
     )
     return bool(find_levels(found)[0] == "bad")
+
+
+def differ(one: Chunk, other: Chunk) -> NDArray[np.bool_]:
+    """Return which fits ended elsewhere in one chunk than in the other, since they were done again: (R,)."""
+    return np.asarray(np.any(one.theta != other.theta, axis=1))
 
 
 def _open(chunk: Chunk) -> dict[str, Any]:

@@ -14,6 +14,7 @@ import scipy.special
 from numpy.typing import NDArray
 
 from switchfit.batch.chunks import Work, run_chunks
+from switchfit.batch.intervals import list_places, replace_intervals
 from switchfit.batch.quality import count_priors
 from switchfit.batch.verdict import find_levels, has_converged, judge_many
 from switchfit.fit.evaluator import evaluator_of
@@ -63,6 +64,11 @@ class Fits:
         Modes that last no longer than they must.
     at_bounds : (R,) int
         Parameters and initial states at a bound.
+    pieces : (R, T, 2, P, 5)
+        Of T transition times with samples within their intervals or at a kink, the profile of J between these samples
+        to both sides: where it starts and stops, by how much it exceeds J, slope, curvature. NaN elsewhere.
+    piece_places : (T,) int
+        Where in theta these transition times stand.
     sigma_known : bool or None
         Whether the noise of the measurements is known; None where the cost has no noise model.
     priors : int
@@ -108,6 +114,8 @@ class Fits:
     explained: FloatArray
     collapsed: NDArray[np.int64]
     at_bounds: NDArray[np.int64]
+    pieces: FloatArray
+    piece_places: NDArray[np.intp]
     sigma_known: bool | None
     priors: int
     log_scaled: tuple[str, ...]
@@ -150,8 +158,8 @@ class Fits:
     def confidence_intervals(self, level: float = 0.95) -> FloatArray:
         """Return intervals theta +- quantile x standard error of each fit: (R, d, 2).
 
-        They take the cost for one parabola: of a transition time with samples within its interval, and at a kink,
-        where they are NaN, those of a single `Estimate.confidence_intervals` are better.
+        Of a transition time with a few samples within its interval, or at a kink, from one parabola for each stretch
+        between samples, as `Estimate.confidence_intervals`. NaN for any other unknown that is held.
 
         See Also
         --------
@@ -170,7 +178,9 @@ class Fits:
         freedom, tail = np.maximum(self.samples + self.priors - self.free, 1), 0.5 + level / 2
         quantile = scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail)
         half = np.reshape(quantile, (-1, 1)) * self.standard_errors
-        return interval(self.theta, half, np.isin(self.theta_names, self.log_scaled))
+        found = interval(self.theta, np.where(half > 0, half, np.nan), np.isin(self.theta_names, self.log_scaled))
+        scale = np.ones(len(self)) if self.sigma_known else 2 * self.cost / freedom
+        return replace_intervals(found, self.pieces, self.piece_places, 0.5 * quantile**2 * scale)
 
     def __str__(self) -> str:
         return format_text(self)
@@ -258,6 +268,7 @@ def _collect_fields(
         "runs": runs,
         "sigma_known": known,
         "priors": priors,
+        "piece_places": list_places(problem),
         "log_scaled": problem.unknowns.log_names,
         "seconds": seconds,
         **found,

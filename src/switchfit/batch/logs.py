@@ -5,16 +5,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from switchfit.batch.again import adopt, is_resolved, redo_doubted
+from switchfit.batch.again import adopt, differ, is_resolved, redo_doubted
 from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
-from switchfit.batch.program import Varying, chunk_size, error_message, fit_chunk, make_failed_chunk
+from switchfit.batch.intervals import make_no_pieces, trace_chunk
+from switchfit.batch.program import Chunk, Evaluations, Varying, chunk_size, error_message, fit_chunk, make_failed_chunk
 from switchfit.batch.quality import count_samples, describe_ends, measure_variation
 from switchfit.estimation.estimator import check_settings, fit_locally
 from switchfit.fit.evaluator import evaluator_of
@@ -128,7 +130,7 @@ class _Work:
         stacked = tuple(np.stack([np.asarray(leaf) for leaf in column]) for column in zip(*leaves, strict=True))
         varying = Varying(tuple(range(len(stacked))), stacked)
         starts = np.array([problem.initial_theta for problem in problems])
-        found = fit_chunk(
+        first = found = fit_chunk(
             problems[0],
             evaluator_of(problems[0]).meshes,
             varying,
@@ -150,6 +152,10 @@ class _Work:
                     arrays["status"][k], arrays["message"][k] = Status.ERROR.name, error_message(error)
         arrays["message"], arrays["status"] = arrays["message"].astype(str), arrays["status"].astype(str)
         arrays |= _describe_each(problems, arrays["theta"], arrays["cost"])
+        evaluations = partial(Evaluations, problems[0], evaluator_of(problems[0]).meshes, varying)
+        last = Chunk(**{name: arrays[name] for name in Chunk._fields})
+        of = problems.__getitem__
+        arrays["pieces"] = trace_chunk(last, differ(first, last), of, evaluations, of)
         return {**arrays, "start": starts, "samples": np.array([count_samples(problem) for problem in problems])}
 
     def _list_failed(self, errors: dict[int, Exception]) -> Arrays:
@@ -158,6 +164,7 @@ class _Work:
         found = make_failed_chunk(starts, dict(enumerate(errors.values())))
         samples = np.array([count_samples(self.problems[k]) for k in errors])
         ends = _describe_each([self.problems[k] for k in errors], found.theta, found.cost)
+        ends["pieces"] = make_no_pieces(self.problems[0], len(errors))
         return {**found._asdict(), **ends, "start": starts, "samples": samples}
 
     def _redo_unresolved(self, problem: Problem, k: int, arrays: Arrays) -> None:

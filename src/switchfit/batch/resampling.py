@@ -40,6 +40,7 @@ import scipy.special
 
 from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
+from switchfit.batch.intervals import make_no_pieces
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
 from switchfit.batch.quality import count_samples, describe_ends, measure_variation
 from switchfit.batch.simulated import fit_simulated
@@ -408,6 +409,7 @@ class _Runs:
         return {
             **found._asdict(),
             **describe_ends(self.problem, found.theta, found.cost, weights @ measure_variation(self.problem)),
+            "pieces": make_no_pieces(self.problem, len(runs)),  # of the times of single runs this says nothing
             "start": starts,
             "samples": np.full(len(runs), count_samples(self.problem)),
         }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,10 +13,11 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.batch.again import redo_doubted, redo_unresolved
+from switchfit.batch.again import differ, redo_doubted, redo_unresolved
 from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
-from switchfit.batch.program import Varying, chunk_size, fit_chunk, with_errors
+from switchfit.batch.intervals import trace_chunk
+from switchfit.batch.program import Evaluations, Varying, chunk_size, fit_chunk, with_errors
 from switchfit.batch.quality import count_samples, describe_ends, measure_variation
 from switchfit.batch.verdict import LEVEL, judge_study
 from switchfit.discretization.arguments import build_arguments, split_by_cell
@@ -96,7 +97,7 @@ class MonteCarlo(Fits):
 
     def coverage(self, level: float = 0.95) -> FloatArray:
         """Return the part of the fits that converged whose interval contains the truth: (d,); NaN without a noise
-        model.
+        model, and for an unknown that is held in all of them.
 
         See Also
         --------
@@ -114,7 +115,7 @@ class MonteCarlo(Fits):
         """
         low, high = np.moveaxis(self.confidence_intervals(level)[self.success], 2, 0)
         inside = (low <= self.truth) & (self.truth <= high)
-        return np.where(np.isnan(low).any(0), np.nan, inside.mean(0))
+        return np.where(np.isnan(low).all(0), np.nan, inside.mean(0))
 
     def plot(self) -> Figure:
         """Draw a histogram of the estimates of each unknown with the truth, as a matplotlib Figure.
@@ -428,7 +429,7 @@ class _Work:
                 errors[place] = error
         varying = self._stack_values({key: np.stack([values[key] for values in noisy]) for key in noisy[0]})
         starts = np.repeat(self.start[None], len(runs), axis=0)
-        found = fit_chunk(
+        first = found = fit_chunk(
             self.problem,
             self.meshes,
             varying,
@@ -441,9 +442,13 @@ class _Work:
         found = redo_unresolved(found, lambda k: self.problem_of(runs[k]), self.meshes, **settings)
         if self.problem.constraint_names:
             found = redo_doubted(found, lambda k: self.problem_of(runs[k]), starts, self._variation, **settings)
+        evaluations = partial(Evaluations, self.problem, self.meshes, varying)
+        own, again = lambda k: self.problem_of(runs[k]), differ(first, found)
+        pieces = trace_chunk(found, again, lambda k: self.problem, evaluations, own)
         return {
             **found._asdict(),
             **describe_ends(self.problem, found.theta, found.cost, self._variation),
+            "pieces": pieces,
             "start": starts,
             "samples": np.full(len(runs), count_samples(self.problem)),
         }

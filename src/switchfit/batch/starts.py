@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,10 +14,11 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.batch.again import redo_doubted, redo_unresolved
+from switchfit.batch.again import differ, redo_doubted, redo_unresolved
 from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
-from switchfit.batch.program import Varying, chunk_size, error_message, fit_chunk
+from switchfit.batch.intervals import trace_chunk
+from switchfit.batch.program import Evaluations, Varying, chunk_size, error_message, fit_chunk
 from switchfit.batch.quality import count_samples, describe_ends, measure_variation
 from switchfit.batch.verdict import judge_starts
 from switchfit.discretization.arguments import build_arguments
@@ -235,7 +236,7 @@ class _Work:
 
     def __call__(self, runs: range) -> Arrays:
         starts = self.starts[runs.start : runs.stop]
-        found = fit_chunk(
+        first = found = fit_chunk(
             self.problem,
             self.meshes,
             Varying((), ()),
@@ -248,9 +249,13 @@ class _Work:
         found = redo_unresolved(found, lambda k: self.problem, self.meshes, **settings)
         if self.problem.constraint_names:
             found = redo_doubted(found, lambda k: self.problem, starts, variation, **settings)
+        evaluations = partial(Evaluations, self.problem, self.meshes, Varying((), ()))
+        own, again = lambda k: self.problem, differ(first, found)
+        pieces = trace_chunk(found, again, lambda k: self.problem, evaluations, own)
         return {
             **found._asdict(),
             **describe_ends(self.problem, found.theta, found.cost, variation),
+            "pieces": pieces,
             "start": starts,
             "samples": np.full(len(runs), count_samples(self.problem)),
         }
