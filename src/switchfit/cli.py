@@ -66,7 +66,11 @@ def _collect_options(
 def fit(
     problem: ProblemPath,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for report.txt, estimate.json and fit.png.", show_default=False)
+        Path | None,
+        typer.Option(
+            help="Folder for report.txt, estimate.json and fit.png; runs.csv and unknowns.csv where they are many.",
+            show_default=False,
+        ),
     ] = None,
     strategy: Annotated[
         Literal["local", "auto", "thorough"] | None,
@@ -115,10 +119,12 @@ def fit(
             _make_folder(out)
         estimate = _estimate(loaded, options, prepare_figures=figures)
         checked = f"\n\nCertificate\n{estimate.certificate}" if certificate else ""
-        report = estimate.report(full=full) + checked  # after the certificate, which counts in the verdict
+        tables = _choose_tables(estimate, out)
+        report = _write_report(estimate, full, tables) + checked  # after the certificate, which counts in the verdict
         _print(report)
         if out is not None:
             _write(out / "report.txt", report + "\n")
+            _write_tables(estimate, tables)
             with _explain_write_errors(out / "estimate.json") as path:
                 _save(estimate, path, complete=certificate)
             if figures:
@@ -352,6 +358,29 @@ def _estimate(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: 
             return stopped()
 
         return sf.estimate(loaded.problem, callback=callback, **options)
+
+
+def _choose_tables(estimate: Any, out: Path | None) -> dict[str, Path]:
+    """Return the CSV files for what a screen of the report has no room for."""
+    from switchfit.report.text import SCREEN
+
+    counts = {"runs": len(estimate.run_names), "unknowns": len(estimate.theta)}
+    most = {"runs": SCREEN.experiments, "unknowns": SCREEN.unknowns}
+    return {} if out is None else {name: out / f"{name}.csv" for name in counts if counts[name] > most[name]}
+
+
+def _write_tables(estimate: Any, tables: dict[str, Path]) -> None:
+    from switchfit.io.result_tables import write_runs, write_unknowns
+
+    writers = {"runs": write_runs, "unknowns": write_unknowns}
+    for name, path in tables.items():
+        _write(path, writers[name](estimate))
+
+
+def _write_report(estimate: Any, full: bool, tables: dict[str, Path]) -> str:
+    from switchfit.runtime.presentation import format_text
+
+    return str(format_text(estimate, full=full, files={name: str(path) for name, path in tables.items()}))
 
 
 def _import_figures() -> None:

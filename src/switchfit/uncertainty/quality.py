@@ -37,6 +37,7 @@ class ChannelQuality:
     ----------
     label : str
         Its name, with that of the experiment where there are several.
+    experiment : int, from 0
     kind : "measurements" or "reference"
     count : int
         Values that are not missing.
@@ -54,6 +55,7 @@ class ChannelQuality:
     """
 
     label: str
+    experiment: int
     kind: str
     count: int
     explained: float
@@ -143,6 +145,7 @@ def measure_quality(fit: Fit) -> Quality:
                 channels.append(
                     ChannelQuality(
                         label=name if single else f"{fit.run_names[e]} {name}",
+                        experiment=e,
                         kind=comparison.kind,
                         count=int(np.isfinite(comparison.measured[:, k]).sum()),
                         explained=1 - squares / spread if spread > 0 else np.nan,
