@@ -14,7 +14,7 @@ adjoint    with the derivative psi of the cost to go in x+,
            ``w_j = h b_j psi + h sum_l a_lj mu_l``,  ``mu_j = D_x (w_j . f + h b_j ell)``,
            ``psi_before = psi + sum_j mu_j``;
 
-second     with Z_j the derivative of (t_j, X_j, p) along theta and V the derivative of the cost to go in h at fixed t_j,
+second     with Z_j the derivative of (t_j, X_j, p) along theta, and V that of the cost to go in h at fixed t_j,
 
            ``D^2 = sum_j Z_j' D^2 (w_j . f + h b_j ell) Z_j + h' x V' + V' x h'``,
            ``V = sum_j b_j (psi . K_j + ell_j) + sum_j mu_j . sum_l a_jl K_l``.

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.fit.evaluator import Evaluation, Evaluator, evaluator_of, knows_paper
+from switchfit.fit.evaluator import Evaluation, Evaluator, evaluator_of, is_covered_by_paper
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_instance, as_seed
@@ -168,7 +168,7 @@ def measure_derivative_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[flo
     minimum the gradient vanishes; its gap is then relative to the gradient that a change of all unknowns by 0.1 % would
     cause.
     """
-    if not knows_paper(evaluator.problem):
+    if not is_covered_by_paper(evaluator.problem):
         return np.nan, np.nan
     paper, discrete = evaluator(theta, method="adjoint"), evaluator(theta)
     scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(discrete.hessian)), 1e-300))
