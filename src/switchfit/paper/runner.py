@@ -152,7 +152,7 @@ def _earlier(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         return {}
     except (ValueError, RecursionError) as error:
-        set_aside(path, f"it is no valid JSON ({get_first_line(error)})", "The other parts have to be computed again.")
+        set_aside(path, f"it is not valid JSON ({get_first_line(error)})", "The other parts have to be computed again.")
         return {}
     fields = {"quick": bool, "seconds": float, "found": dict}
     for name, entry in earlier.items() if isinstance(earlier, dict) else [("", None)]:
