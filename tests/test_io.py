@@ -370,7 +370,7 @@ def test_examples_load(path):
         ("room.py:room", "room.py:seven", r"model 'room\.py:seven' must be an sf\.HybridSystem or a .*got int"),
         ("room.py:room", "room.py:broken_factory", r"failed: .*room\.py, line 20, in broken_factory: RuntimeError: no"),
         ("room.py:room", "room.py:broken", r"room\.py, line 23, in broken_mode: mode 'on': .* NameError: name 'undef"),
-        ("room.py:room", "room.py:nameless", r"observe names states, but the model has no state_names; give it some"),
+        ("room.py:room", "room.py:nameless", r"observe names states, but the model has no state_names; add them"),
         ('"room.py:room"', '{ name = "room.py:room", arguments = { a = 1 } }', "is not a function; leave out its arg"),
         ('"room.py:room"', '{ name = "room.py:make", arguments = { a = 1 } }', "argument 'a'; it takes start"),
         ('"room.py:room"', '{ name = "skid_steer", arguments = { restick = "x" } }', "failed: ValueError: restick"),

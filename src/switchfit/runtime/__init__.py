@@ -1,1 +1,1 @@
-"""What a process needs whatever it computes: files, caches, XLA's flags, progress. Imports no other room."""
+"""Services of a process that are independent of problems: files, caches, XLA's flags, progress. Imports no other room."""
