@@ -267,7 +267,7 @@ def test_it_can_be_stopped():
 
 def test_what_cannot_be_profiled():
     fit = ramp(np.minimum(TIMES, 2.05) + noise(3))
-    with pytest.raises(ValueError, match="there is no unknown 'mu'; there are tau_1, v"):
+    with pytest.raises(ValueError, match="there is no unknown 'mu'; the unknowns are tau_1, v"):
         fit.profile("mu")
     with pytest.raises(ValueError, match="level must lie between 0 and 1; got 1"):
         fit.profile("v", level=1)

@@ -1,1 +1,1 @@
-"""Services of a process that are independent of problems: files, caches, XLA's flags, progress. Imports no other room."""
+"""Services that do not depend on the problem: files, caches, XLA's flags, progress. Imports no other room."""
