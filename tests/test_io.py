@@ -334,7 +334,7 @@ def test_examples_load(path):
         ("value = 0.3, lower = 0.0", "value = 0.3, lower = 0.4", r"parameters\.heating: .* lies outside its bounds"),
         ("cooling = 0.05", 'cooling = "little"', r"'parameters\.cooling' must be a table; got 'little' \(a parameter"),
         ("cooling = 0.05", "cooling = { val = 1 }", r"unknown key 'parameters\.cooling\.val'; did you mean 'value'\?"),
-        ("cooling = 0.05", "", r"asks for the parameter 'cooling', which the problem lacks"),
+        ("cooling = 0.05", "", r"reads the parameter 'cooling', which the problem lacks"),
         ('columns = ["T"]', 'columns = ["temp"]', r"log\.csv has no column 'temp'; its columns are t, T, sd, u"),
         ('"log.csv"', '"lgo.csv"', r"There is no file .*lgo\.csv"),
         ('time = "t"', 'time = "T"', r"log\.csv, column 'T': the time of sample 3 is missing"),

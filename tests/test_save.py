@@ -373,12 +373,12 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
         (
             ("fit", "theta"),
             {"dtype": "a", "shape": [0], "values": []},
-            "fit.theta has the dtype 'a', which is neither",
+            "fit.theta has the dtype 'a', which is not a dtype",
         ),
         (
             ("fit", "theta"),
             {"dtype": "O", "shape": [0], "values": []},
-            "fit.theta has the dtype 'O', which is neither",
+            "fit.theta has the dtype 'O', which is not a dtype",
         ),
         (("fit", "theta"), {"dtype": "<f8", "shape": [2], "values": []}, "has the shape (2,) but 0 values"),
         (

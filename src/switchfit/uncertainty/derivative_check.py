@@ -28,7 +28,7 @@ class TaylorTable(NamedTuple):
 
 
 def build_taylor_table(evaluator: Evaluator, theta: FloatArray, *, seed: int = 0) -> TaylorTable:
-    """Return remainders of J with its gradient and its Hessian along a random direction, near theta and off the nodes."""
+    """Return remainders of J with its gradient and Hessian along a random direction, near theta but off the nodes."""
     at = _move_off_nodes(evaluator, theta)
     base = evaluator(at)
     direction = np.random.default_rng(seed).choice([-1.0, 1.0], size=len(at)) * _choose_scales(base, at)
