@@ -460,7 +460,7 @@ def test_a_reference_signal_that_outlasts_a_free_tf_cannot_be_simulated():
 
 
 def test_a_profile_with_constraints_is_refused(cooled):
-    with pytest.raises(ValueError, match="a profile knows no guards and no terminal constraints"):
+    with pytest.raises(ValueError, match="a profile does not support guards and terminal constraints"):
         cooled.profile("tf")
 
 
