@@ -241,7 +241,33 @@ def test_parameter(build, said):
         (
             {"data": reference([0, 0.1, 0.2, 0.3], [1, 2, 3, 4])},
             ValueError,
-            ["A ReferenceSignal must reach over (t0, tf) = (0.0, 1.0); this one is known from 0.0 to 0.3"],
+            ["A ReferenceSignal must reach over (t0, tf) = (0.0, 1.0); this one is known from 0.0 to 0.3", "Give t0"],
+        ),
+        (
+            {"data": sf.RunningCost(lambda t, x, p: x[0]), "t0": None, "tf": None},
+            ValueError,
+            ["t0 and tf are left out, but nothing among the data (RunningCost) has times", "give t0 and tf."],
+        ),
+        (
+            {"data": sf.TerminalCost(lambda x, p: x[0]), "tf": None},
+            ValueError,
+            ["tf is left out, but nothing among the data (TerminalCost) has times", "give tf."],
+        ),
+        (
+            {"data": samples(), "t0": None, "tf": None},
+            ValueError,
+            ["t0 and tf are left out", "span of the data, from 0.5 to 0.5, the horizon (t0, tf) would be (0.5, 0.5)"],
+        ),
+        ({"t0": 2.0, "tf": None}, ValueError, ["tf is left out", "would be (2.0, 1.0): give tf, so that t0 < tf"]),
+        (
+            {"t0": None, "tf": sf.Parameter(-1.0, upper=2.0)},
+            ValueError,
+            ["t0 is left out", "would be (0.0, -1.0): give t0"],
+        ),
+        (
+            {"data": [samples([0.0, 2.0], [1, 1]), reference([0, 0.5, 1, 1.5], [1, 1, 1, 1])], "tf": None},
+            ValueError,
+            ["A ReferenceSignal must reach over (t0, tf) = (0.0, 2.0)", "Give t0 and tf inside that"],
         ),
     ],
 )

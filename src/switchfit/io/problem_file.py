@@ -563,24 +563,18 @@ def _build_experiment(
         for place, item in zip(places, table.data, strict=True)
     ]
     times = table.transition_times
-    spans = [item.seen_times if isinstance(item, Measurements) else item.signal.knots for item in data]
     return Experiment(
         data=data,
         mode_sequence=tuple(table.mode_sequence),
         transition_times=None if times is None else tuple(map(_build_parameter, times)),  # type: ignore[arg-type]
-        t0=min(span[0] for span in spans) if table.t0 is None else table.t0,
-        tf=_build_final_time(table, spans),
+        t0=table.t0,  # type: ignore[arg-type]  # None: from the data
+        tf=None if table.tf is None else _build_parameter(table.tf),  # type: ignore[arg-type]
         inputs=None if table.inputs is None else _build_at(f"{where}.inputs", _build_input, folder, table.inputs),
         initial_state=_build_initial_state(table),
         parameter_map=table.parameter_map,
         name=table.name,
         time_unit=table.time_unit,
     )
-
-
-def _build_final_time(table: ExperimentTable, spans: list[Any]) -> float | Parameter:
-    """Return tf: an unknown if given as a table; if left out, the end of the data."""
-    return float(max(span[-1] for span in spans)) if table.tf is None else _build_parameter(table.tf)
 
 
 def _build_initial_state(table: ExperimentTable) -> list[Parameter] | list[float] | None:

@@ -53,6 +53,8 @@ def _describe_experiment(experiment: Experiment) -> list[str]:
     sequence, horizon = " -> ".join(experiment.mode_sequence), f"[{ends[0]:.6g}, {ends[-1]:.6g}]{unit}"
     if experiment.has_free_tf:
         horizon += " (tf is estimated)"
+    if experiment.taken_from_data:
+        horizon += f" ({' and '.join(experiment.taken_from_data)} from the data)"
     lines = [f"{sequence} on {horizon}, at {times}{unit}" if times else f"{sequence} on {horizon}"]
     for item in experiment.data:
         if isinstance(item, Measurements):
