@@ -66,9 +66,8 @@ def measure_coverage(tau: float, runs: int, *, rate_known: bool, seed: int = 5) 
 
 def main(runs: int = RUNS) -> None:
     """Print the table."""
-    print(
-        "| true transition time | rate | theta ± quantile x standard error | piecewise | of `estimate_many` | fits at a kink |"
-    )
+    kinds = "theta ± quantile x standard error | piecewise | of `estimate_many`"
+    print(f"| true transition time | rate | {kinds} | fits at a kink |")
     print("|---|---|---|---|---|---|")
     for tau, place in PLACES.items():
         for known in (True, False):
