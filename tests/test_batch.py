@@ -812,6 +812,15 @@ def test_an_error_of_the_program_itself_is_said(monkeypatch):
     np.testing.assert_allclose(study.theta, sf.monte_carlo(room(), 3, **settings).theta, rtol=1e-6)
 
 
+@pytest.mark.parametrize("name", ["loss", "leak"])
+def test_models_with_the_same_machine_code_share_an_operation(name):
+    """The second differs from the first in the name of a parameter alone; XLA takes the name of an operation once."""
+    system = sf.HybridSystem({"on": lambda t, x, p: 1.5 - p[name] * x, "off": lambda t, x, p: -1.0 * x}, [0.2])
+    run = sf.Experiment(sf.Measurements(TIMES, np.zeros(24), sigma=0.01), ("on", "off"), (1.7,), 0.0, 6.0)
+    problem = sf.Problem(system, run, {name: sf.Parameter(1.0, lower=0.1, upper=5.0)})
+    assert sf.monte_carlo(problem, 3, theta=TRUTH).success.all()  # a warning would be an error
+
+
 # Budgets, and fits that crawl
 
 
