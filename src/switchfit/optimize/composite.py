@@ -38,6 +38,9 @@ NORMAL_PART = 0.95
 DEPENDENT = 1e-10
 """Rows of a Jacobian whose part across the others is below this part of the largest row depend on them."""
 
+FLAT = 1e-8
+"""Curvature that counts as none, as a part of the largest slope: where J is linear, the trust region ends the step."""
+
 RIDGE = 1e-12
 """Part of the mean curvature of ½‖c + A v‖² that is added to all directions, to make the shortest of all v the
 solution."""
@@ -166,7 +169,8 @@ def solve_composite(
     force = np.zeros(d)
     step = normal
     if null.shape[1]:
-        matrix = make_positive(null.T @ bending @ null)
+        least = FLAT * float(np.max(np.abs(slope))) + np.finfo(float).tiny
+        matrix = make_positive(null.T @ bending @ null, least)
         inside = np.vstack([within @ null, null, -null])
         left = np.concatenate([room - within @ normal, -radius - normal, normal - radius])
         found = solve_qp(null.T @ (slope + bending @ normal), matrix, inside, np.minimum(left, 0.0))
