@@ -36,6 +36,8 @@ SMALLEST_RADIUS = 1e-10
 SHRINK = 0.5
 #: A violation that a normal step reduces by less than this part of it is stationary.
 STATIONARY = 1e-6
+#: Iterations without a fall of the violation by a tenth after which it counts as stationary.
+STAGNANT = 20
 
 
 def search_merit(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
@@ -84,9 +86,14 @@ def raise_penalty(penalty: float, point: Point, direction: Direction) -> float:
 
 
 def is_stuck(oracle: Oracle, state: State, direction: Direction) -> bool:
-    """Return whether the violation of constraints that are not met is stationary: no step reduces it to first order."""
+    """Return whether the violation of constraints that are not met is stationary: no step reduces it to first order.
+
+    Or nearly so: it has not fallen by a tenth for many iterations.
+    """
     problem, point = oracle.problem, state.point
     violation = point.violation
+    if violation > MET and state.stagnant >= STAGNANT:
+        return True
     if violation <= MET or violation - direction.left > STATIONARY * violation:
         return False
     equalities = point.equalities(point.reported_sides)
@@ -117,10 +124,14 @@ def _accept(
     found = _judge(oracle, state, trial, first, penalty, reduction, fraction)
     if found is not None or not corrects:
         return found
-    length = box.measure(oracle.problem, trial.theta - state.point.theta)
-    moved = correct(oracle, trial, first, state.scale, 2.0 * max(1.0, length))
-    first = None if moved is None else oracle.first(moved)
-    if moved is None or first is None:
+    problem = oracle.problem
+    moved = correct(oracle, trial, first, state.scale, np.inf)
+    # What is longer than the step that it is to correct corrects nothing.
+    length = box.measure(problem, trial.theta - state.point.theta)
+    if moved is None or not box.measure(problem, moved.theta - trial.theta) < length:
+        return None
+    first = oracle.first(moved)
+    if first is None:
         return None
     return _judge(oracle, state, moved, first, penalty, reduction, fraction)
 
