@@ -33,12 +33,16 @@ LARGE_JUMP = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One evaluation: cost, gradient, shape (d,), and Hessian, symmetric, of the Lagrangian if there are equalities."""
+    """One evaluation: cost, gradient, shape (d,), and Hessian, symmetric.
+
+    If there are equality constraints, the Hessian is that of the Lagrangian with these multipliers, shape (k,).
+    """
 
     cost: float
     gradient: FloatArray
     hessian: SymmetricMatrix
     equalities: Equalities | None = None
+    multipliers: FloatArray | None = None
 
     def lagrangian(self, multipliers: FloatArray) -> tuple[float, FloatArray]:
         """Return ``J + lam . c`` and its gradient (d,); J and its own where there are no equality constraints."""
@@ -200,7 +204,7 @@ class Oracle:
             return None
         if self.problem.uses_hessian and not hessian.finite:
             return None
-        return Sample(cost, gradient, hessian, equalities)
+        return Sample(cost, gradient, hessian, equalities, self.multipliers)
 
     def _scale(self, value: Any) -> Equalities | None:
         """Return the equality constraints of an evaluation in their units; None if they are not finite."""
@@ -269,11 +273,14 @@ class Oracle:
         if plus is minus:
             # The distance from the cone of the inequalities and the span of A is one within the null space of A.
             null = rows.null
-            reduced = plus.gradient @ null
-            optimality, values = kkt_residual(reduced, reduced, normals @ null)
-            downhill = side
-            multipliers[active] = values
-            forces = rows.multipliers(plus.gradient - normals.T @ values)
+            reduced, force, downhill = plus.gradient @ null, plus.gradient, side
+            if active.size:
+                optimality, values = kkt_residual(reduced, reduced, normals @ null)
+                multipliers[active] = values
+                force = force - normals.T @ values
+            else:
+                optimality = math.sqrt(reduced @ reduced)
+            forces = rows.multipliers(force)
         else:
             stacked = np.vstack([normals, A, -A])
             optimality, values, downhill = steepest_descent(minus.gradient, plus.gradient, kink, side, stacked, None)

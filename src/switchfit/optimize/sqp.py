@@ -45,6 +45,9 @@ from switchfit.optimize.status import Callback, IterationRecord, Result, Status
 #: Times a minimisation begins anew from where its line search has failed.
 RESTARTS = 3
 
+#: Relative change of the multipliers of equality constraints that is not worth another evaluation of the Hessian.
+SAME_MULTIPLIERS = 1e-9
+
 
 def minimize(
     evaluate: Evaluate,
@@ -276,7 +279,12 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
 def _with_own_multipliers(oracle: Oracle, state: State) -> State:
     """Return the state with the Hessian of the Lagrangian at its own multipliers; itself without equalities."""
     point = state.point
-    if not oracle.problem.equalities:
+    used = point.plus.multipliers
+    if (
+        used is None
+        or not oracle.problem.equalities
+        or np.allclose(used, point.forces, rtol=SAME_MULTIPLIERS, atol=0.0)
+    ):
         return state
     oracle.multipliers = point.forces
     again = oracle.point(Trial.at(oracle.problem.constraints, point.theta), state.scale)
