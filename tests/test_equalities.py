@@ -273,12 +273,14 @@ def test_constraints_that_cannot_be_met_are_named():
     assert not found.status.successful
     assert found.violated[-1][0] == "c1"
     assert found.violated[-1][1] == pytest.approx(1.0, abs=1e-3)
+    assert found.evaluations < 60
 
 
 def test_constraints_that_contradict_each_other_are_named():
     found = solve(lambda x: x[0] ** 2 + x[1] ** 2, lambda x: [x[0] - 1.0, x[0] - 2.0], [0.0, 0.0])
     assert found.status is Status.INFEASIBLE
     assert {name for name, _ in found.violated} == {"c0", "c1"}
+    assert found.evaluations < 10
 
 
 def test_a_saddle_on_a_surface_is_left():
@@ -339,6 +341,23 @@ def test_a_kink_that_does_not_hold_the_solution_is_passed():
         assert found.status is Status.CONVERGED, start
         # y - 3 + 2 y 0.2 = 0
         assert found.theta[1] == pytest.approx(3.0 / 1.4, abs=1e-8)
+
+
+def test_a_kink_is_left_where_constraints_cannot_be_met_on_it():
+    """5 |x - 1| + y²/2 with x = 0.7: the kink at which the start is holds x, and has to let go of it."""
+
+    def evaluate(z, side, multipliers):
+        x, y = z
+        slope = 5.0 * (np.sign(x - 1.0) or side)
+        cost = 5.0 * abs(x - 1) + 0.5 * y**2
+        return Here(cost, np.array([slope, y]), np.diag([0.0, 1.0]), np.array([x - 0.7]), np.array([[1.0, 0.0]]))
+
+    found = minimize(
+        evaluate, [1.0, 0.5], constraints=free(2), breakpoints=([1.0], ()), hessian="auto", equalities=("place",)
+    )
+    assert found.status is Status.CONVERGED
+    np.testing.assert_allclose(found.theta, [0.7, 0.0], atol=1e-10)
+    assert found.equalities[0][2] == pytest.approx(5.0)
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
