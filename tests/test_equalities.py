@@ -273,7 +273,7 @@ def test_constraints_that_cannot_be_met_are_named():
     assert not found.status.successful
     assert found.violated[-1][0] == "c1"
     assert found.violated[-1][1] == pytest.approx(1.0, abs=1e-3)
-    assert found.evaluations < 60
+    assert found.evaluations < 40  # 53 where only a trust region that has vanished ends it
 
 
 def test_constraints_that_contradict_each_other_are_named():
