@@ -25,7 +25,7 @@ from switchfit.strategy.quick import End, fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
 from switchfit.strategy.runs import fit_runs_alone, has_runs
 from switchfit.strategy.scan import can_scan, scan_intervals
-from switchfit.strategy.starts import SAME_COST, try_starts
+from switchfit.strategy.starts import try_starts
 from switchfit.uncertainty.quality import measure_quality
 from switchfit.uncertainty.verdict import UNLIKELY
 
@@ -43,12 +43,10 @@ SCAN, GROW, REINSERT, STARTS = (
 )
 """Names of strategies."""
 
-REMESH, INSIDE = "new meshes", "constraints inside the programme"
+REMESH = "new meshes"
 
-CONSTRAINTS_AGREE = "constraints inside the programme agree"
-
-EVERYWHERE = frozenset({GROW, REINSERT, STARTS, CONSTRAINTS_AGREE})
-"""Strategies that look everywhere, and the one that meets constraints in another way, if it ends at the same cost."""
+EVERYWHERE = frozenset({GROW, REINSERT, STARTS})
+"""Strategies that look everywhere."""
 
 PERFECT = 0.9999
 """Share of the variance of a reference that must be explained for a fit not to need confirmation: wrong ends of the
@@ -88,7 +86,7 @@ def estimate(
     hessian : {"auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"}
         Quadratic term of the sequential quadratic programme: equation (3), shifted inside a trust region where it is
         not positive definite; equation (3), its eigenvalues made positive where they are not, with a line search, which
-        guards and 16 experiments or more have in any case; steepest descent until it is positive definite, then
+        16 experiments or more have in any case; steepest descent until it is positive definite, then
         equation (3), as the paper does it (Section II-A); equation (4); the Gauss-Newton matrix; or none (steepest
         descent). With another than "auto" the strategy is "local" unless "thorough" is asked for.
     tolerance : float
@@ -270,8 +268,8 @@ class Search:
             for name, find in self._list_strategies():
                 if self.late:
                     break
-                agrees = self._try(name, find)
-                tried.add(CONSTRAINTS_AGREE if agrees and name == INSIDE else name)
+                self._try(name, find)
+                tried.add(name)
                 if self.strategy == "auto" and self.best is not None and _is_enough(self.problem, self.best, tried):
                     break
                 if self.best is not None and self.best.status is Status.INTERRUPTED:
@@ -298,7 +296,6 @@ class Search:
         found: list[tuple[str, Callable[[FloatArray], End]]] = []
         doubted = best is None or is_doubted(best)
         if problem.constraint_names:
-            found.append((INSIDE, lambda theta: fit_briefly(problem, self.theta)))
             if any(structure.guarded for structure in problem.structures):
                 found.append(("transitions free of their guards", self._free_transitions))
             return [*found, (STARTS, self._try_starts)]
@@ -354,11 +351,8 @@ class Search:
         self.evaluations += again.evaluations
         self.steps.append(Step(REMESH, self.best.cost, again.evaluations, time.perf_counter() - began))
 
-    def _try(self, name: str, find: Callable[[FloatArray], End]) -> bool:
-        """Run one strategy; a full fit follows where its end is lower than the best so far.
-
-        Returns whether it ended at the same cost as the best.
-        """
+    def _try(self, name: str, find: Callable[[FloatArray], End]) -> None:
+        """Run one strategy; a full fit follows where its end is lower than the best so far."""
         began = time.perf_counter()
         end = find(self.theta if self.best is None else self.best.theta)
         evaluations = end.evaluations
@@ -372,4 +366,3 @@ class Search:
         self.evaluations += evaluations
         cost = np.inf if self.best is None else self.best.cost
         self.steps.append(Step(name, cost, evaluations, time.perf_counter() - began))
-        return bool(np.isfinite(before) and abs(end.cost - before) <= SAME_COST * abs(before))
