@@ -155,7 +155,7 @@ class Evaluator:
     ) -> ConstrainedEvaluation:
         """Return cost, constraints and the augmented Lagrangian with multipliers and penalties, (m,) or ()."""
         d, count = len(theta), len(self.problem.constraint_names)
-        multipliers, penalty = np.zeros(count) + multipliers, np.zeros(count) + penalty
+        multipliers, penalty = np.full(count, multipliers, dtype=float), np.full(count, penalty, dtype=float)
         cost, value, gradient, slope, hessian = 0.0, 0.0, np.zeros(d), np.zeros(d), np.zeros((d, d))
         jacobian, c = np.zeros((count, d)), np.zeros(count)
         last = 0

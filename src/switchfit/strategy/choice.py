@@ -21,6 +21,7 @@ from switchfit.problem.problem import GIVEN, Problem
 from switchfit.problem.validation import as_choice, as_positive
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.strategy.horizon import REFERENCE_POINTS, can_grow, grow_horizon
+from switchfit.strategy.minimum_time import is_minimum_time, try_shorter_horizons
 from switchfit.strategy.quick import End, fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
 from switchfit.strategy.runs import fit_runs_alone, has_runs
@@ -334,7 +335,10 @@ class Search:
         return None if left == np.inf else max(left, 1e-3)
 
     def _try_starts(self, theta: FloatArray) -> End:
-        found = try_starts(self.problem, theta, stop=lambda: self.late)
+        if self.best is not None and is_minimum_time(self.problem, self.best):
+            found = try_shorter_horizons(self.problem, self.best, lambda: self.late)
+        else:
+            found = try_starts(self.problem, theta, stop=lambda: self.late)
         self.starts = found.tried, 0, found.agreeing
         return found.end
 
