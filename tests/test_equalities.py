@@ -343,21 +343,23 @@ def test_a_kink_that_does_not_hold_the_solution_is_passed():
         assert found.theta[1] == pytest.approx(3.0 / 1.4, abs=1e-8)
 
 
-def test_a_kink_is_left_where_constraints_cannot_be_met_on_it():
-    """5 |x - 1| + y²/2 with x = 0.7: the kink at which the start is holds x, and has to let go of it."""
+@pytest.mark.parametrize("place", [0.7, 1.3])
+@pytest.mark.parametrize("weight", [5.0, -1e-9])
+def test_a_kink_is_left_where_constraints_cannot_be_met_on_it(place, weight):
+    """w |x - 1| + y²/2 with x given: the kink at which the start is holds x, or keeps it to one side."""
 
     def evaluate(z, side, multipliers):
         x, y = z
-        slope = 5.0 * (np.sign(x - 1.0) or side)
-        cost = 5.0 * abs(x - 1) + 0.5 * y**2
-        return Here(cost, np.array([slope, y]), np.diag([0.0, 1.0]), np.array([x - 0.7]), np.array([[1.0, 0.0]]))
+        slope = weight * (np.sign(x - 1.0) or side)
+        cost = weight * abs(x - 1) + 0.5 * y**2
+        return Here(cost, np.array([slope, y]), np.diag([0.0, 1.0]), np.array([x - place]), np.array([[1.0, 0.0]]))
 
     found = minimize(
         evaluate, [1.0, 0.5], constraints=free(2), breakpoints=([1.0], ()), hessian="auto", equalities=("place",)
     )
     assert found.status is Status.CONVERGED
-    np.testing.assert_allclose(found.theta, [0.7, 0.0], atol=1e-10)
-    assert found.equalities[0][2] == pytest.approx(5.0)
+    np.testing.assert_allclose(found.theta, [place, 0.0], atol=1e-10)
+    assert found.equalities[0][2] == pytest.approx(weight * np.sign(1 - place))
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])

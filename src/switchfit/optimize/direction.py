@@ -66,7 +66,7 @@ def find_direction(problem: Problem, state: State, piece: tuple[FloatArray, Floa
     if point.kink is None:
         return best
     if best.left > max(HALF * point.violation, MET):
-        # The equality constraints cannot be met while these coordinates are held.
+        # The equality constraints cannot be met while these coordinates are held, or kept to one side.
         sides = _open_kinks(problem, state, sides, piece)
         best, force = _solve_on_sides(problem, state, sides, piece)
     for _ in range(2 * int(point.kink.sum())):
@@ -147,14 +147,14 @@ def _solve_constrained(
 def _open_kinks(
     problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[FloatArray, FloatArray] | None
 ) -> NDArray[np.int_]:
-    """Return the sides (d,) with coordinates that are held released to where the normal step takes them."""
+    """Return the sides (d,) with all coordinates at kinks released to where the normal step takes them."""
     point = state.point
     if point.kink is None:
         return sides
     room = _room(problem, state, np.where(point.kink, 0, sides), piece)
     normal = find_normal_step(point.equalities(sides), problem.constraints.normals, room.offsets, problem.reach, np.inf)
     opened = np.where(normal > 0.0, 1, -1)
-    return np.where(point.kink & (sides == 0), opened, sides)
+    return np.where(point.kink, opened, sides)
 
 
 def _room(problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[FloatArray, FloatArray] | None) -> Room:
