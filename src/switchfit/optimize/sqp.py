@@ -1,15 +1,17 @@
-"""Sequential quadratic programming for a piecewise smooth cost under linear constraints.
+"""Sequential quadratic programming for a piecewise smooth cost under linear constraints and equalities.
 
 The problem is to minimise J(theta) subject to A theta >= b and lower <= theta <= upper, where J is continuous and
 smooth except where a coordinate passes one of its breakpoints: there its derivatives jump. (A transition time that
-passes a sample time is such a coordinate.) All constraints are linear, so every iterate is feasible, and the line
-search looks at J alone.
+passes a sample time is such a coordinate.) These constraints are linear, so every iterate satisfies them, and the line
+search looks at J alone. Beside them there may be nonlinear equality constraints c(theta) = 0, which are met in the end.
 
 One iteration, `_step`, maps a state (`state`) at a point (`point`) to the next state:
 
-1. *direction* (`direction`): a convex quadratic programme (`qp`, with the matrices of `dense` or `arrow`);
+1. *direction* (`direction`): a convex quadratic programme (`qp`, with the matrices of `dense` or `arrow`), or with
+   equality constraints a step composed of the solutions of two (`composite`);
 2. *line search* (`line_search`): the full step first, even across breakpoints, then inside the present smooth piece;
-   by default in a trust region that shrinks (`box`); every trial is made feasible (`feasibility`);
+   by default in a trust region that shrinks (`box`); with equality constraints it looks at a merit function (`merit`);
+   every trial is made feasible (`feasibility`);
 3. *kinks* (`kinks`): coordinates that sit on a breakpoint are held, or released to one side.
 
 At a stationary point the curvature tells a minimum from a saddle, which is left along negative curvature (`saddles`);
