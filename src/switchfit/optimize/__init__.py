@@ -1,4 +1,4 @@
-"""Minimisation of a piecewise smooth cost under linear constraints and equalities; knows nothing of differential equations."""
+"""Minimisation of a piecewise smooth cost under linear constraints and equalities; knows no differential equation."""
 
 from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.problem import Evaluation, HessianKind
