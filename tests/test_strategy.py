@@ -11,7 +11,6 @@ import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.random_starts import draw_starts
 from switchfit.strategy.choice import without_guards
-from switchfit.strategy.constrained import meet_constraints
 from switchfit.strategy.horizon import can_grow, grow_horizon
 from switchfit.strategy.quick import fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
@@ -422,9 +421,8 @@ def test_constraints_are_met_from_afar():
     ]
     run = sf.Experiment(data, ("forward", "back"), (0.3,), 0.0, sf.Parameter(0.9, lower=0.5, upper=12.0))
     problem = sf.Problem(system, run)
-    theta, evaluations = meet_constraints(problem, problem.initial_theta)
-    np.testing.assert_allclose(theta, [2.0, 4.0], rtol=1e-4)
-    assert evaluations < 100
-    found = sf.estimate(problem)
-    assert not found.violated
-    np.testing.assert_allclose(found.theta, [2.0, 4.0], rtol=1e-7)
+    for strategy in ("local", "auto"):
+        found = sf.estimate(problem, strategy=strategy)
+        assert not found.violated
+        np.testing.assert_allclose(found.theta, [2.0, 4.0], rtol=1e-7)
+    assert sf.estimate(problem, strategy="local").evaluations < 30

@@ -16,16 +16,13 @@ from switchfit.engine.adaptive import refine_mesh
 from switchfit.estimation.saved import load_fit, save_fit
 from switchfit.fit.accuracy import worst_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.guards import place_on_near_guards
 from switchfit.fit.hidden import refuse_jumps
 from switchfit.fit.result import CovarianceKind, Fit
 from switchfit.fit.solution import (
-    constraints_of,
     is_least_squares,
     is_plain_least_squares,
     is_sigma_known,
     minimize_cost,
-    minimize_with_constraints,
 )
 from switchfit.fit.termination import termination_of
 from switchfit.fit.trajectory import SimulatedProblem
@@ -580,12 +577,9 @@ def check_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:
 
 
 def _prepare_start(problem: Problem, start: ArrayLike | None) -> tuple[FloatArray, Evaluator]:
-    """Return the start of a fit (d,), with transitions moved to their guards if these are near, and its meshes."""
+    """Return the start of a fit (d,) and its meshes."""
     theta = problem.check_theta(start, "start")
     evaluator = evaluator_of(problem) if start is None else Evaluator(problem, theta)
-    placed = place_on_near_guards(evaluator, theta)
-    if not np.array_equal(placed, theta):
-        theta, evaluator = placed, Evaluator(problem, placed)
     return theta, evaluator
 
 
@@ -604,11 +598,8 @@ def _minimize(
 ) -> tuple[Result, Held]:
     """Minimize the cost on the meshes of an evaluator; the callback's records continue the count of `last`."""
     report = None if callback is None else lambda record: callback(record.continue_from(last))
-    problem = evaluator.problem
-    if problem.constraint_names:
-        return minimize_with_constraints(evaluator, theta, tolerance, max_iterations, report)
-    constraints = constraints_of(problem)
-    return minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, report, constraints), ()
+    result = minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, report)
+    return result, result.equalities
 
 
 def _judge_meshes(

@@ -155,7 +155,7 @@ class Evaluator:
     ) -> ConstrainedEvaluation:
         """Return cost, constraints and the augmented Lagrangian with multipliers and penalties, (m,) or ()."""
         d, count = len(theta), len(self.problem.constraint_names)
-        multipliers, penalty = (np.broadcast_to(np.asarray(a, float), count) for a in (multipliers, penalty))
+        multipliers, penalty = np.full(count, multipliers, dtype=float), np.full(count, penalty, dtype=float)
         cost, value, gradient, slope, hessian = 0.0, 0.0, np.zeros(d), np.zeros(d), np.zeros((d, d))
         jacobian, c = np.zeros((count, d)), np.zeros(count)
         last = 0
@@ -163,10 +163,15 @@ class Evaluator:
             here = slice(last, last := last + self.problem.constraint_counts[e])
             at = self.problem.vectors(theta, e)
             J, L_d, H, c_e, A = self.engines[e].constrained(*at, side, multipliers[here], penalty[here])
-            H = H + (A.T * penalty[here]) @ A
+            weights = multipliers[here] + penalty[here] * c_e
+            if penalty.any():
+                H = H + (A.T * penalty[here]) @ A
             cost += J
             value += J + float(multipliers[here] @ c_e + 0.5 * penalty[here] @ c_e**2)
-            np.add.at(gradient, mine, (L_d - (multipliers[here] + penalty[here] * c_e) @ A)[own])
+            if self.problem.one_to_one:
+                gradient, slope, hessian, jacobian, c = L_d - weights @ A, L_d, H, A, c_e
+                break
+            np.add.at(gradient, mine, (L_d - weights @ A)[own])
             np.add.at(slope, mine, L_d[own])
             np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
             np.add.at(jacobian[here].T, mine, A[:, own].T)

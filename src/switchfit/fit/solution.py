@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.fit.collapsed import idle_unknowns
-from switchfit.fit.evaluator import ArrowEvaluation, Evaluation, Evaluator
+from switchfit.fit.evaluator import ArrowEvaluation, ConstrainedEvaluation, Evaluation, Evaluator
 from switchfit.fit.hidden import refuse_hidden_switches, refuse_jumps
 from switchfit.fit.termination import linear_constraints_of
-from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize, minimize_constrained
+from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
 from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.diagnosis import Finding
 from switchfit.optimize.problem import REACH, HessianKind
@@ -60,14 +60,15 @@ def minimize_cost(
     """Run the optimizer once on the evaluator's meshes; arguments as in `estimate`.
 
     `constraints` are by default those of the problem. `by_blocks` is whether to use the arrow shape of the Hessian of
-    several runs; by default, it is used where that is faster.
+    several runs; by default, it is used where that is faster, and never with guards or terminal constraints.
     """
     problem = evaluator.problem
-
+    names = problem.constraint_names
     unknowns = problem.unknowns
     matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
     if by_blocks is None:
-        by_blocks = len(problem.experiments) >= MANY_RUNS and 2 * len(evaluator.layout.shared) < len(theta)
+        many = len(problem.experiments) >= MANY_RUNS and not names
+        by_blocks = many and 2 * len(evaluator.layout.shared) < len(theta)
     variables = unknowns.variables
     constraints = constraints_of(problem) if constraints is None else constraints
     identity = variables.identity
@@ -79,8 +80,11 @@ def minimize_cost(
         here = evaluator(theta, side, matrix=matrix)
         return CostAndGradient(here.cost, here.gradient) if hessian == "none" else here
 
-    def evaluate(z: Any, side: int) -> Any:
+    def evaluate(z: Any, side: int, multipliers: FloatArray | None = None) -> Any:
         theta = z if identity else _to_theta(variables, constraints, z)
+        if multipliers is not None:
+            held = evaluator.constrained(theta, side, multipliers)
+            return held if identity else _to_constrained(variables, theta, held, multipliers)
         here = evaluate_theta(theta, side)
         if not seen:
             seen.append(True)
@@ -104,41 +108,16 @@ def minimize_cost(
         max_iterations=max_iterations,
         callback=report,
         size=problem.sizes if identity else variables.sizes_inward(problem.sizes),
-        idle=idle,
+        idle=None if names else idle,
         reach=_reach_of(problem),
+        equalities=names,
     )
-    if result.status is Status.LINE_SEARCH_FAILED:
+    if result.status is Status.LINE_SEARCH_FAILED and not names:
         refuse_jumps(evaluator, result.theta if identity else _to_theta(variables, constraints, result.theta))
-    return result if identity else _convert_result(variables, constraints, result)
-
-
-def minimize_with_constraints(
-    evaluator: Evaluator,
-    theta: FloatArray,
-    tolerance: float,
-    max_iterations: int,
-    callback: Callable[[IterationRecord], object] | None = None,
-) -> tuple[Result, tuple[tuple[str, float, float], ...]]:
-    """Run the optimizer once with guards and terminal constraints; arguments as in `estimate`.
-
-    Returns its result, and the name, value and multiplier of each constraint.
-    """
-    problem = evaluator.problem
-    names = problem.constraint_names
-    found = minimize_constrained(
-        evaluator.constrained,
-        theta,
-        names,
-        tolerance=tolerance,
-        max_iterations=max_iterations,
-        callback=callback,
-        constraints=constraints_of(problem),
-        breakpoints=evaluator.breakpoints(),
-        size=problem.sizes,
-        scale=problem.measure_from_start(theta),
-    )
-    values, multipliers = found.constraints.tolist(), found.multipliers.tolist()
-    return found.result, tuple(zip(names, values, multipliers, strict=True))
+    if identity:
+        return result
+    converted = _convert_result(variables, constraints, result)
+    return converted if not names else _convert_constrained(evaluator, converted)
 
 
 def _reach_of(problem: Problem) -> FloatArray:
@@ -172,6 +151,16 @@ def _to_variables(variables: Variables, theta: FloatArray, here: Any) -> Any:
     return Evaluation(here.cost, *variables.derivatives_inward(theta, here.gradient, here.hessian))
 
 
+def _to_constrained(
+    variables: Variables, theta: FloatArray, here: ConstrainedEvaluation, multipliers: FloatArray
+) -> ConstrainedEvaluation:
+    """Return an evaluation with constraints at theta as one of the optimiser's variables."""
+    D, _ = variables.slopes(theta)
+    slope = here.gradient + multipliers @ here.jacobian
+    hessian = variables.derivatives_inward(theta, slope, here.hessian)[1]
+    return replace(here, gradient=D * here.gradient, hessian=hessian, jacobian=here.jacobian * D)
+
+
 def _convert_constraints(variables: Variables, constraints: LinearConstraints) -> LinearConstraints:
     """Convert constraints to the optimizer's variables. Only bounds change: rows involve transition times alone."""
     lower, upper = variables.inward(constraints.lower), variables.inward(constraints.upper)
@@ -199,6 +188,17 @@ def _convert_result(variables: Variables, constraints: LinearConstraints, result
         multipliers=result.multipliers / np.concatenate([rows, slopes, slopes]),
         reason=None if result.reason is None else _convert_reason(variables, result.theta, slopes, result.reason),
     )
+
+
+def _convert_constrained(evaluator: Evaluator, result: Result) -> Result:
+    """Return a result of the optimiser's variables with the Hessian and the free directions that it has in theta.
+
+    Both mix what bends the change of variables with what bends the constraints.
+    """
+    here = evaluator.constrained(result.theta, 1, [multiplier for _, _, multiplier in result.equalities])
+    slopes = evaluator.problem.unknowns.variables.slopes(result.theta)[0]
+    basis = np.linalg.qr(slopes[:, None] * result.free_basis)[0]
+    return replace(result, hessian=here.hessian, curvature=replace(result.curvature, basis=basis))
 
 
 def _convert_reason(variables: Variables, z: FloatArray, slopes: FloatArray, found: Finding) -> Finding:

@@ -21,6 +21,7 @@ from switchfit.problem.problem import GIVEN, Problem
 from switchfit.problem.validation import as_choice, as_positive
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.strategy.horizon import REFERENCE_POINTS, can_grow, grow_horizon
+from switchfit.strategy.minimum_time import is_minimum_time, try_shorter_horizons
 from switchfit.strategy.quick import End, fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
 from switchfit.strategy.runs import fit_runs_alone, has_runs
@@ -43,15 +44,13 @@ SCAN, GROW, REINSERT, STARTS = (
 )
 """Names of strategies."""
 
-REMESH, INSIDE = "new meshes", "constraints inside the programme"
-
-CONSTRAINTS_AGREE = "constraints inside the programme agree"
+REMESH = "new meshes"
 
 GROWTH_AGREES = "growing horizon agrees"
 """The growing horizon, which does not start from the guess, has ended at the same cost as the fit."""
 
-EVERYWHERE = frozenset({GROW, REINSERT, STARTS, CONSTRAINTS_AGREE})
-"""Strategies that look everywhere, and the one that meets constraints in another way, if it ends at the same cost."""
+EVERYWHERE = frozenset({GROW, REINSERT, STARTS})
+"""Strategies that look everywhere."""
 
 PERFECT = 0.9999
 """Share of the variance of a reference that must be explained for a fit not to need confirmation: wrong ends of the
@@ -91,7 +90,7 @@ def estimate(
     hessian : {"auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"}
         Quadratic term of the sequential quadratic programme: equation (3), shifted inside a trust region where it is
         not positive definite; equation (3), its eigenvalues made positive where they are not, with a line search, which
-        guards and 16 experiments or more have in any case; steepest descent until it is positive definite, then
+        16 experiments or more have in any case; steepest descent until it is positive definite, then
         equation (3), as the paper does it (Section II-A); equation (4); the Gauss-Newton matrix; or none (steepest
         descent). With another than "auto" the strategy is "local" unless "thorough" is asked for.
     tolerance : float
@@ -276,7 +275,7 @@ class Search:
                 if self.late:
                     break
                 agrees = self._try(name, find)
-                tried.add(CONSTRAINTS_AGREE if agrees and name == INSIDE else name)
+                tried.add(name)
                 if agrees and name == GROW:
                     tried.add(GROWTH_AGREES)
                 if self.strategy == "auto" and self.best is not None and _is_enough(self.problem, self.best, tried):
@@ -305,7 +304,6 @@ class Search:
         found: list[tuple[str, Callable[[FloatArray], End]]] = []
         doubted = best is None or is_doubted(best)
         if problem.constraint_names:
-            found.append((INSIDE, lambda theta: fit_briefly(problem, self.theta)))
             if any(structure.guarded for structure in problem.structures):
                 found.append(("transitions free of their guards", self._free_transitions))
             return [*found, (STARTS, self._try_starts)]
@@ -344,7 +342,10 @@ class Search:
         return None if left == np.inf else max(left, 1e-3)
 
     def _try_starts(self, theta: FloatArray) -> End:
-        found = try_starts(self.problem, theta, stop=lambda: self.late)
+        if self.best is not None and is_minimum_time(self.problem, self.best):
+            found = try_shorter_horizons(self.problem, self.best, lambda: self.late)
+        else:
+            found = try_starts(self.problem, theta, stop=lambda: self.late)
         self.starts = found.tried, 0, found.agreeing
         return found.end
 

@@ -7,10 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.solution import minimize_cost, minimize_with_constraints
+from switchfit.fit.solution import minimize_cost
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
-from switchfit.strategy.constrained import meet_constraints
 
 ITERATIONS = 60
 """Iterations of a short fit: what has not converged by then is in a valley that leads nowhere."""
@@ -39,13 +38,8 @@ def fit_briefly(problem: Problem, theta: FloatArray, iterations: int = ITERATION
     failed = End(theta, np.inf, 0)
     try:
         with np.errstate(all="ignore"):  # far from the data numbers may overflow
-            taken = 0
-            if problem.constraint_names:
-                theta, taken = meet_constraints(problem, theta)
-                result, _ = minimize_with_constraints(Evaluator(problem, theta), theta, TOLERANCE, iterations)
-            else:
-                result = minimize_cost(Evaluator(problem, theta), theta, "auto", TOLERANCE, iterations)
+            result = minimize_cost(Evaluator(problem, theta), theta, "auto", TOLERANCE, iterations)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return failed
     usable = np.isfinite(result.cost) and not result.violated
-    return End(result.theta, result.cost if usable else np.inf, taken + result.evaluations)
+    return End(result.theta, result.cost if usable else np.inf, result.evaluations)
