@@ -80,6 +80,11 @@ def test_what_each_step_brought_is_told(far_fit):
     text = " ".join(str(far_fit).split())
     assert f"tried local: J = {costs[0]:.6g}" in text
     assert f"growing horizon: J = {far_fit.cost:.6g}" in text
+    problem = thermostat(FAR)
+    guess = sf.evaluate(problem).cost
+    assert far_fit.initial_cost == pytest.approx(guess, rel=1e-6)
+    assert f"cost J {far_fit.cost:.8g} (first guess: {far_fit.initial_cost:.8g})" in text
+    assert f"{far_fit.evaluations} evaluations" in text
     assert far_fit.seconds >= sum(step.seconds for step in far_fit.steps) > 0
 
 
@@ -249,11 +254,14 @@ def test_a_mode_is_only_moved_where_the_sequence_stays_the_same():
 def test_many_starts_stop_when_nothing_new_is_found(right):
     problem = two_runs()
     found = try_starts(problem, problem.initial_theta)
-    assert found.tried < 127
-    assert found.agreeing >= 2
+    best = sf.estimate(problem, strategy="local").cost
+    assert len(found.costs) < 127
+    assert found.ended == "settled"
+    assert found.count_agreeing(best, 1e-9) >= 2
+    assert found.count_agreeing(0.5 * best, 1e-9) == 0  # another minimum
     assert found.end.cost == pytest.approx(sf.estimate(problem, strategy="local").cost, rel=1e-6)
     few = try_starts(problem, problem.initial_theta, stop=lambda: True)
-    assert few.tried == 1
+    assert (len(few.costs), few.ended) == (1, "time")
 
 
 def test_starts_of_unknowns_without_bounds_are_drawn_around_the_guess():
@@ -349,6 +357,41 @@ def test_an_interrupted_search_keeps_the_best(monkeypatch):
     found = sf.estimate(thermostat(FAR))
     assert found.steps[-1].strategy == "interrupted"
     assert np.isfinite(found.cost)
+
+
+def interrupt_after(monkeypatch, calls):
+    """Let Ctrl-C come during the evaluation with this number, of those from now on."""
+    count, evaluate = [0], Evaluator.__call__
+
+    def counted(self, *given, **settings):
+        count[0] += 1
+        if count[0] == calls:
+            raise KeyboardInterrupt
+        return evaluate(self, *given, **settings)
+
+    monkeypatch.setattr(Evaluator, "__call__", counted)
+    return count
+
+
+def test_ctrl_c_in_a_short_fit_ends_the_search(monkeypatch):
+    """The optimiser takes Ctrl-C for the end of its own work; the search must not go on with the next short fit."""
+    problem = thermostat(FAR)
+    alone = sf.estimate(problem, strategy="local")
+    count = interrupt_after(monkeypatch, alone.evaluations + 40)
+    found = sf.estimate(problem)
+    assert found.steps[-1].strategy == "interrupted"
+    assert found.cost == pytest.approx(alone.cost)
+    assert count[0] < alone.evaluations + 50  # nothing is fitted any more
+
+
+def test_ctrl_c_keeps_what_the_starts_have_found(monkeypatch, right):
+    problem = thermostat(FAR)
+    first = try_starts(problem, right.theta, stop=lambda: True)
+    interrupt_after(monkeypatch, 3 + 2 * first.end.evaluations)
+    found = try_starts(problem, right.theta)
+    assert found.ended == "interrupted"
+    assert 0 < len(found.costs) < 10
+    assert found.end.cost == pytest.approx(right.cost, rel=1e-6)
 
 
 def test_steps_are_saved(tmp_path, far_fit):

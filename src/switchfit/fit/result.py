@@ -65,6 +65,9 @@ class Step:
         The lowest J after it.
     evaluations : int
     seconds : float
+    ended : str
+        Why the many starts ended: "settled", no further minimum was likely; "most", as many as are tried at most;
+        "time" or "interrupted". Empty for other strategies.
 
     See Also
     --------
@@ -82,6 +85,7 @@ class Step:
     cost: float
     evaluations: int
     seconds: float
+    ended: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +110,10 @@ class Fit:
     optimality : float
         KKT residual; the norm of the gradient where no constraint is active.
     iterations, evaluations : int
+        Iterations of the fit that found theta; evaluations of everything that was tried.
     status : Status
     history : tuple of IterationRecord
+        Of the fit that found theta. Where strategies were tried, it begins where one of them ended.
     active : tuple of ActiveConstraint
         Bounds, and shortest durations of modes, that hold with equality.
     kinks : tuple of Kink
@@ -154,10 +160,12 @@ class Fit:
     reason : Issue or None
         Why the line search failed, or the error with which the fit ended.
     starts : (tried, better, agreeing) or None
-        How many other starts were fitted, how many of them ended lower, and how many in the same minimum; None where
-        none were.
+        How many other starts were fitted, how many of them ended lower than this fit, and how many at its J; None
+        where none were.
     steps : tuple of Step
         The strategies that were tried, in their order; empty where the first fit was enough.
+    initial_cost : float
+        J at `initial_theta`; NaN where it cannot be evaluated there, or is not known.
     """
 
     theta_names: tuple[str, ...]
@@ -205,6 +213,7 @@ class Fit:
     reason: Issue | None = None
     starts: tuple[int, int, int] | None = None
     steps: tuple[Step, ...] = ()
+    initial_cost: float = np.nan
 
     @property
     def termination(self) -> Termination:

@@ -25,7 +25,7 @@ from switchfit.strategy.quick import End, fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
 from switchfit.strategy.runs import fit_runs_alone, has_runs
 from switchfit.strategy.scan import can_scan, scan_intervals
-from switchfit.strategy.starts import SAME_COST, try_starts
+from switchfit.strategy.starts import SAME_COST, Starts, try_starts
 from switchfit.uncertainty.quality import measure_quality
 from switchfit.uncertainty.verdict import UNLIKELY
 
@@ -224,6 +224,13 @@ def is_doubted(fit: Estimate) -> bool:
     return not fit.status.successful or any(step.kind == MORE_STARTS for step in fit.verdict.next_steps)
 
 
+def was_interrupted(fit: Estimate) -> bool:
+    """Return whether Ctrl-C or a callback ended a fit, or the search that found it."""
+    last = fit.steps[-1] if fit.steps else None
+    searching = last is not None and "interrupted" in (last.strategy, last.ended)
+    return searching or fit.status is Status.INTERRUPTED
+
+
 def without_guards(problem: Problem) -> Problem:
     """Return the same problem with transitions that may happen anywhere, guards or not."""
     given = {name: getattr(problem, name) for name in GIVEN}
@@ -250,8 +257,8 @@ class Search:
         proposed = any(run.is_guess_proposed for run in problem.experiments)
         name = "local, from evenly spaced times" if proposed else "local"
         self.steps = [Step(name, cost, self.evaluations, time.perf_counter() - began)]
-        self.first_cost = best.history[0].cost if best is not None and best.history else 0.0
-        self.starts: tuple[int, int, int] | None = None
+        self.first_cost = np.nan if best is None else best.initial_cost
+        self.starts: Starts | None = None
 
     @property
     def late(self) -> bool:
@@ -274,7 +281,9 @@ class Search:
                 tried.add(CONSTRAINTS_AGREE if agrees and name == INSIDE else name)
                 if self.strategy == "auto" and self.best is not None and _is_enough(self.problem, self.best, tried):
                     break
-                if self.best is not None and self.best.status is Status.INTERRUPTED:
+                if self.best is not None and was_interrupted(self.best):
+                    break
+                if self.starts is not None and self.starts.ended == "interrupted":
                     break
         except KeyboardInterrupt:
             if self.best is None:
@@ -283,11 +292,17 @@ class Search:
 
     def finish(self, best: Estimate) -> Estimate:
         """Return the best fit with all that was done."""
+        starts = None
+        if self.starts is not None:
+            accuracy = max(self.problem.rtol * abs(best.cost), self._margin(best.cost))
+            agreeing = self.starts.count_agreeing(best.cost, accuracy)
+            starts = len(self.starts.costs), 0, agreeing  # the lowest of them is what `best` began at
         return replace(
             best,
             initial_theta=self.theta,
+            initial_cost=self.first_cost,
             steps=tuple(self.steps),
-            starts=self.starts,
+            starts=starts,
             evaluations=self.evaluations,
             seconds=time.perf_counter() - self.began,
         )
@@ -318,7 +333,7 @@ class Search:
 
     def _free_transitions(self, theta: FloatArray) -> End:
         """Fit with transitions that may happen anywhere, and from there with their guards."""
-        free = estimate(without_guards(self.problem), start=self.theta, time_budget=self._time_left)
+        free = self._estimate_inside(without_guards(self.problem), self.theta)
         end = fit_briefly(self.problem, free.theta)
         return end._replace(evaluations=end.evaluations + free.evaluations)
 
@@ -326,10 +341,17 @@ class Search:
         """Fit each run by itself, then all together."""
 
         def fit(part: Problem, start: FloatArray) -> tuple[FloatArray, FloatArray, int]:
-            found = estimate(part, start=start, time_budget=self._time_left)
+            found = self._estimate_inside(part, start)
             return found.theta, found.hessian, found.evaluations
 
         return fit_runs_alone(self.problem, self.theta, fit)
+
+    def _estimate_inside(self, problem: Problem, start: FloatArray) -> Estimate:
+        """Estimate another problem within the time that is left; Ctrl-C then ends this search as well."""
+        found = estimate(problem, start=start, time_budget=self._time_left)
+        if was_interrupted(found):
+            raise KeyboardInterrupt
+        return found
 
     @property
     def _time_left(self) -> float | None:
@@ -337,9 +359,8 @@ class Search:
         return None if left == np.inf else max(left, 1e-3)
 
     def _try_starts(self, theta: FloatArray) -> End:
-        found = try_starts(self.problem, theta, stop=lambda: self.late)
-        self.starts = found.tried, 0, found.agreeing
-        return found.end
+        self.starts = try_starts(self.problem, theta, stop=lambda: self.late)
+        return self.starts.end
 
     def _margin(self, cost: float) -> float:
         """Return by how much an end has to be lower than a cost: where a fit is perfect, J is rounding."""
@@ -349,7 +370,7 @@ class Search:
     def _fit_on_new_meshes(self, fit: Estimate) -> None:
         """Fit again from where the best fit ended, on meshes made for it."""
         began = time.perf_counter()
-        again = fit_locally(self.problem, start=fit.theta, first_cost=self.first_cost, **self.settings)
+        again = fit_locally(self.problem, start=fit.theta, first_cost=np.nan_to_num(self.first_cost), **self.settings)
         self.best = again if again.integration_error < fit.integration_error else fit
         self.evaluations += again.evaluations
         self.steps.append(Step(REMESH, self.best.cost, again.evaluations, time.perf_counter() - began))
@@ -365,11 +386,12 @@ class Search:
         # The cost of a fit whose constraints are not met says nothing: any that meets them is better.
         before = np.inf if self.best is None or self.best.violated else self.best.cost
         if not end.failed and (before == np.inf or end.cost < before - self._margin(before)):
-            fit = fit_locally(self.problem, start=end.theta, first_cost=self.first_cost, **self.settings)
+            fit = fit_locally(self.problem, start=end.theta, first_cost=np.nan_to_num(self.first_cost), **self.settings)
             evaluations += fit.evaluations
             if self.best is None or (fit.cost < before and not fit.violated) or self.best.violated:
                 self.best = fit
         self.evaluations += evaluations
         cost = np.inf if self.best is None else self.best.cost
-        self.steps.append(Step(name, cost, evaluations, time.perf_counter() - began))
+        ended = self.starts.ended if self.starts is not None and name == STARTS else ""
+        self.steps.append(Step(name, cost, evaluations, time.perf_counter() - began, ended))
         return bool(np.isfinite(before) and abs(end.cost - before) <= SAME_COST * abs(before))

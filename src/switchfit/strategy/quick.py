@@ -8,6 +8,7 @@ import numpy as np
 
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import minimize_cost, minimize_with_constraints
+from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.strategy.constrained import meet_constraints
@@ -47,5 +48,7 @@ def fit_briefly(problem: Problem, theta: FloatArray, iterations: int = ITERATION
                 result = minimize_cost(Evaluator(problem, theta), theta, "auto", TOLERANCE, iterations)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return failed
+    if result.status is Status.INTERRUPTED:  # Ctrl-C, which the optimiser takes for the end of its own work
+        raise KeyboardInterrupt
     usable = np.isfinite(result.cost) and not result.violated
     return End(result.theta, result.cost if usable else np.inf, taken + result.evaluations)

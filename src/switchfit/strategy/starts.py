@@ -23,12 +23,22 @@ SAME_COST = 1e-6
 
 
 class Starts(NamedTuple):
-    """The lowest end, and how many starts were tried, ended lower than where the search began, and at the lowest."""
+    """Where short fits ended: the lowest end, the costs of all (n,), and why there are no more (`Step.ended`)."""
 
     end: End
-    tried: int
-    better: int
-    agreeing: int
+    costs: FloatArray
+    ended: str
+
+    def count_agreeing(self, cost: float, accuracy: float) -> int:
+        """Return how many ended where a fit did whose J is `cost`: at the lowest end, if that is at this J.
+
+        Short fits have meshes of their own, whose J is accurate to `accuracy` alone; among themselves ends of one
+        minimum differ by `SAME_COST`.
+        """
+        lowest = self.end.cost
+        if not abs(lowest - cost) <= accuracy + SAME_COST * abs(cost):
+            return 0
+        return int(np.sum(self.costs <= max(lowest, cost) + accuracy + SAME_COST * abs(cost)))
 
 
 def try_starts(
@@ -37,7 +47,7 @@ def try_starts(
     """Return the lowest end of short fits from random starts, theta (d,) among them.
 
     They stop where, after n fits that ended in w different minima, no more than half a minimum is expected to be
-    missing ([1]_), and the lowest has been found `AGREE` times.
+    missing ([1]_), and the lowest has been found `AGREE` times. Ctrl-C ends them as well, once one has ended.
 
     Parameters
     ----------
@@ -56,18 +66,22 @@ def try_starts(
        Math. Program. 37 (1987) 59-80.
     """
     first = fit_briefly(problem, theta)
-    ends, evaluations = [first], first.evaluations
-    for start in draw_starts(problem, most, seed)[1:]:
-        end = fit_briefly(problem, start)
-        evaluations += end.evaluations
-        ends.append(end)
-        if stop() or _is_enough(np.array([one.cost for one in ends if not one.failed])):
-            break
+    ends, evaluations, ended = [first], first.evaluations, "most"
+    try:
+        for start in draw_starts(problem, most, seed)[1:]:
+            end = fit_briefly(problem, start)
+            evaluations += end.evaluations
+            ends.append(end)
+            if _is_enough(np.array([one.cost for one in ends if not one.failed])):
+                ended = "settled"
+                break
+            if stop():
+                ended = "time"
+                break
+    except KeyboardInterrupt:
+        ended = "interrupted"
     best = min(ends, key=lambda one: one.cost)
-    costs = np.array([one.cost for one in ends[1:]])
-    margin = SAME_COST * abs(best.cost)
-    better = int(np.sum(costs < first.cost - SAME_COST * abs(first.cost)))
-    return Starts(best._replace(evaluations=evaluations), len(costs), better, int(np.sum(costs <= best.cost + margin)))
+    return Starts(best._replace(evaluations=evaluations), np.array([one.cost for one in ends[1:]]), ended)
 
 
 def _is_enough(costs: FloatArray) -> bool:
