@@ -1,5 +1,6 @@
 """From a poor guess to the right answer: each strategy by itself, and how `estimate` chooses among them."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.random_starts import draw_starts
 from switchfit.strategy.choice import without_guards
 from switchfit.strategy.constrained import meet_constraints
-from switchfit.strategy.horizon import can_grow, grow_horizon
+from switchfit.strategy.horizon import can_grow, find_shared, grow_horizon
 from switchfit.strategy.quick import fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
 from switchfit.strategy.runs import fit_runs_alone, isolate_run
@@ -127,11 +128,75 @@ def test_growing_horizon_keeps_what_is_fixed_and_bounded(right):
     assert end.cost > right.cost
 
 
-def test_growing_horizon_wants_one_run_with_data():
+def test_growing_horizon_wants_data_along_transitions():
     assert can_grow(thermostat(FAR))
     cost = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("on", "off"), (1.0,), 0.0, 2.0)
     assert not can_grow(sf.Problem(HEATER, cost, {"power": 1.0, "k": 1.0}))
-    assert not can_grow(sf.Problem(HEATER, thermostat(FAR).experiments * 2, {"power": 1.0, "k": 1.0}))
+    assert can_grow(sf.Problem(HEATER, thermostat(FAR).experiments * 2, {"power": 1.0, "k": 1.0}))
+    still = sf.Experiment(thermostat(FAR).experiments[0].data[0], ("on",), (), 0.0, 10.0)
+    assert not can_grow(sf.Problem(HEATER, still, {"power": 1.0, "k": 1.0}))
+    assert can_grow(sf.Problem(HEATER, [still, *thermostat(FAR).experiments], {"power": 1.0, "k": 1.0}))
+
+
+def three_rooms(guesses=None):
+    """Three thermostats whose loss coefficient is one; room1 has one that stays on as well."""
+    random = np.random.default_rng(4)
+    switches = ((1.83, 3.4, 5.32, 6.7, 8.1), (1.0, 2.9, 4.1), ())
+    runs = []
+    for e, truth in enumerate(switches):
+        values = temperatures(TIMES, truth, 1.0 + 0.2 * e, 0.8) + random.normal(0.0, 0.02, len(TIMES))
+        data = sf.Measurements(TIMES, values, sigma=0.02)
+        modes = ("on", "off", "on", "off", "on", "off")[: len(truth) + 1]
+        guess = truth if guesses is None else guesses[e]
+        mapped = {"power": f"power_{e}"}
+        runs.append(sf.Experiment(data, modes, guess, 0.0, 10.0, parameter_map=mapped, name=f"room{e}"))
+    powers = {f"power_{e}": sf.Parameter(2.5, lower=0.2, upper=5.0) for e in range(3)}
+    return sf.Problem(HEATER, runs, {"k": sf.Parameter(2.0, lower=0.05, upper=3.0), **powers})
+
+
+def test_runs_with_a_shared_parameter_grow_together():
+    near = three_rooms()
+    best = sf.estimate(near, strategy="local", start=[*near.initial_theta[:8], 0.8, 1.0, 1.2, 1.4])
+    assert best.verdict.level == "good"
+    assert find_shared(near) == {"k"}
+    far = three_rooms((FAR, (7.0, 8.0, 9.0), ()))
+    assert sf.estimate(far, strategy="local").cost > 10 * best.cost
+    end = grow_horizon(far, far.initial_theta)
+    assert end.cost == pytest.approx(best.cost, rel=1e-6)
+    np.testing.assert_allclose(end.theta, best.theta, rtol=1e-4)
+
+
+def test_growing_runs_keep_what_is_fixed():
+    run = replace(three_rooms().experiments[1], transition_times=(sf.Parameter(1.0, fixed=True), 7.0, 9.0))
+    rooms = (replace(three_rooms().experiments[0], transition_times=FAR), run)
+    problem = sf.Problem(HEATER, rooms, {"k": 2.0, "power_0": 2.0, "power_1": sf.Parameter(1.2, fixed=True)})
+    end = grow_horizon(problem, problem.initial_theta)
+    assert problem.theta_names[5:] == ("room1.tau_2", "room1.tau_3", "k", "power_0")
+    near = sf.estimate(problem, strategy="local", start=[*TRUTH[:5], 2.9, 4.1, 0.8, 1.0])
+    assert end.cost == pytest.approx(near.cost, rel=1e-6)
+
+
+def test_a_free_final_time_is_an_unknown_of_the_last_window():
+    """When a room whose heater is off has cooled to 0.1: the samples end before, and say nothing of tf."""
+    known = thermostat(FAR).experiments[0].data[0]
+    after = sf.TerminalCost(lambda x, p: 1e4 * (x[0] - 0.1) ** 2)
+
+    def build(guess, tf):
+        run = sf.Experiment([known, after], ("on", "off") * 3, guess, 0.0, sf.Parameter(tf, lower=10.0, upper=20.0))
+        parameters = {"power": sf.Parameter(1.2, lower=0.2, upper=5.0), "k": sf.Parameter(0.6, lower=0.05, upper=3.0)}
+        level = sf.Experiment([known], ("on", "off") * 3, guess, 0.0, 10.0)
+        return sf.Problem(HEATER, run, parameters), sf.Problem(HEATER, level, parameters)
+
+    near, alone = (sf.estimate(one, strategy="local") for one in build(tuple(TRUTH[:5]), 10.5))
+    far = build((0.5, 1.0, 1.5, 2.0, 9.0), 18.0)[0]
+    assert can_grow(far)
+    end = grow_horizon(far, far.initial_theta)
+    assert end.cost == pytest.approx(near.cost, rel=1e-6)
+    np.testing.assert_allclose(end.theta, near.theta, rtol=1e-4)
+    assert near.theta_names[5] == "tf"
+    assert near.cost == pytest.approx(alone.cost, rel=1e-6)
+    final = temperatures(near.theta[5:6], near.theta[:5], *near.theta[6:])
+    assert final[0] == pytest.approx(0.1, abs=1e-6)
 
 
 def test_scan_finds_the_lowest_of_all_sample_intervals():

@@ -26,6 +26,7 @@ from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
 from switchfit.strategy.runs import fit_runs_alone, has_runs
 from switchfit.strategy.scan import can_scan, scan_intervals
 from switchfit.strategy.starts import SAME_COST, Starts, try_starts
+from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 from switchfit.uncertainty.quality import measure_quality
 from switchfit.uncertainty.verdict import UNLIKELY
 
@@ -215,7 +216,12 @@ def _cost_of_means(problem: Problem) -> float:
 
 
 def _is_coarse(fit: Estimate) -> bool:
-    """Return whether the integration error is too large: mostly, since the meshes were made for where the fit began."""
+    """Return whether the integration error is too large: mostly, since the meshes were made for where the fit began.
+
+    A fit that has not converged is resumed on no finer meshes: it may have gone down into their error.
+    """
+    if not fit.status.successful and fit.integration_error > LARGE_INTEGRATION_ERROR:
+        return True
     return any(step.kind == SMALLER_RTOL for step in fit.verdict.next_steps)
 
 
@@ -324,8 +330,9 @@ class Search:
         if can_scan(problem):
             found.append((SCAN, lambda theta: scan_intervals(problem, theta)))
         if can_grow(problem):
-            # Far from the data the intervals near by are hopeless.
-            place = 0 if best is None or best.verdict.level == "bad" else len(found)
+            # Far from the data the intervals near by are hopeless; several runs have been fitted alone by then.
+            far = best is None or best.verdict.level == "bad"
+            place = 0 if far and not has_runs(problem) else len(found)
             found.insert(place, (GROW, lambda theta: grow_horizon(problem, theta)))
         if can_reinsert(problem):
             found.append((REINSERT, lambda theta: reinsert_modes(problem, theta)))
