@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 import scipy.special
@@ -18,8 +18,9 @@ from switchfit.optimize import IterationRecord, Status
 from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.problem import GIVEN, Problem
-from switchfit.problem.validation import as_choice, as_positive
+from switchfit.problem.validation import as_callable, as_choice, as_positive
 from switchfit.runtime.errors import NotIntegrableError
+from switchfit.runtime.progress import Line, show_line
 from switchfit.strategy.horizon import REFERENCE_POINTS, can_grow, grow_horizon
 from switchfit.strategy.quick import End, fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
@@ -139,25 +140,40 @@ def estimate(
     """
     strategy = as_choice(strategy, "strategy", STRATEGIES)
     budget = np.inf if time_budget is None else as_positive(time_budget, "time_budget")
-    settings: dict[str, Any] = {"tolerance": tolerance, "max_iterations": max_iterations, "callback": callback}
-    settings["hessian"] = hessian
+    if callback is not None:
+        as_callable(callback, "callback", "a function callback(record)", arguments=1)
+    settings: dict[str, Any] = {"tolerance": tolerance, "max_iterations": max_iterations, "hessian": hessian}
     began = time.perf_counter()
-    try:
-        best = fit_locally(problem, start=start, **settings)
-    except NotIntegrableError:
-        if strategy == "local":
-            raise
-        search = Search(problem, None, problem.check_theta(start), strategy, settings, began, budget)
-        search.run()
-        if search.best is None:
-            raise
-        return search.finish(search.best)
-    limited = best.status is Status.MAX_ITERATIONS and max_iterations < ITERATIONS
-    if strategy == "local" or (strategy == "auto" and (hessian != "auto" or limited or _is_enough(problem, best))):
-        return best
-    search = Search(problem, best, problem.check_theta(start), strategy, settings, began, budget)
-    search.run()
-    return search.finish(search.best or best)
+    with show_line("fit: not begun, or compiling (only the first time)") as line:
+        settings["callback"] = _write_to(line, "fit", callback)
+        try:
+            best = fit_locally(problem, start=start, **settings)
+        except NotIntegrableError:
+            if strategy == "local":
+                raise
+            search = Search(problem, None, problem.check_theta(start), strategy, settings, began, budget)
+            search.run(line, callback)
+            if search.best is None:
+                raise
+            return search.finish(search.best)
+        limited = best.status is Status.MAX_ITERATIONS and max_iterations < ITERATIONS
+        if strategy == "local" or (strategy == "auto" and (hessian != "auto" or limited or _is_enough(problem, best))):
+            return best
+        search = Search(problem, best, problem.check_theta(start), strategy, settings, began, budget)
+        search.run(line, callback)
+        return search.finish(search.best or best)
+
+
+def _write_to(
+    line: Line, name: str, callback: Callable[[IterationRecord], object] | None
+) -> Callable[[IterationRecord], object]:
+    """Return the callback of a fit, which writes to the line of progress as well."""
+
+    def report(record: IterationRecord) -> object:
+        line.write(f"{name}: iteration {record.iteration}, J = {record.cost:.6g}, optimality {record.optimality:.1e}")
+        return callback is not None and callback(record)
+
+    return report
 
 
 def _is_enough(problem: Problem, fit: Estimate, tried: Collection[str] = ()) -> bool:
@@ -230,6 +246,11 @@ def is_doubted(fit: Estimate) -> bool:
     return not fit.status.successful or any(step.kind == MORE_STARTS for step in fit.verdict.next_steps)
 
 
+def is_searching() -> bool:
+    """Return whether strategies are being tried: Ctrl-C then keeps the best so far, wherever it comes."""
+    return Search.running > 0
+
+
 def was_interrupted(fit: Estimate) -> bool:
     """Return whether Ctrl-C or a callback ended a fit, or the search that found it."""
     last = fit.steps[-1] if fit.steps else None
@@ -245,6 +266,8 @@ def without_guards(problem: Problem) -> Problem:
 
 class Search:
     """The strategies in turn, the best fit so far, and what each brought."""
+
+    running: ClassVar[int] = 0
 
     def __init__(
         self,
@@ -271,8 +294,22 @@ class Search:
         """Whether the time budget is spent."""
         return time.perf_counter() - self.began > self.budget
 
-    def run(self) -> None:
+    def run(self, line: Line, callback: Callable[[IterationRecord], object] | None) -> None:
         """Try one strategy after the other until the verdict is good; Ctrl-C ends it with the best so far."""
+        self.line, self.callback = line, callback
+        Search.running += 1
+        try:
+            self._run()
+        finally:
+            Search.running -= 1
+
+    def _begin(self, name: str) -> None:
+        """Say on the line of progress which strategy is under way, and the lowest J before it."""
+        lowest = "" if self.best is None else f", lowest J = {self.best.cost:.6g}"
+        self.settings["callback"] = _write_to(self.line, f"{name}{lowest}, fit of its end", self.callback)
+        self.line.write(f"{name}{lowest}")
+
+    def _run(self) -> None:
         tried: set[str] = set()
         try:
             if self.best is not None and _is_coarse(self.best):
@@ -377,6 +414,7 @@ class Search:
     def _fit_on_new_meshes(self, fit: Estimate) -> None:
         """Fit again from where the best fit ended, on meshes made for it."""
         began = time.perf_counter()
+        self._begin(REMESH)
         again = fit_locally(self.problem, start=fit.theta, first_cost=np.nan_to_num(self.first_cost), **self.settings)
         self.best = again if again.integration_error < fit.integration_error else fit
         self.evaluations += again.evaluations
@@ -388,6 +426,7 @@ class Search:
         Returns whether it ended at the same cost as the best.
         """
         began = time.perf_counter()
+        self._begin(name)
         end = find(self.theta if self.best is None else self.best.theta)
         evaluations = end.evaluations
         # The cost of a fit whose constraints are not met says nothing: any that meets them is better.

@@ -28,6 +28,7 @@ from switchfit.problem.experiment import Experiment
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.priors import LogNormal, Normal
 from switchfit.problem.problem import GIVEN, Problem
+from switchfit.runtime.progress import show_detail
 from switchfit.strategy.quick import End, fit_briefly
 
 WINDOWS_EACH = 3
@@ -87,6 +88,7 @@ def grow_horizon(problem: Problem, theta: FloatArray) -> End:
     count = max(len(run.windows) for run in runs)
     evaluations = 0
     for window in range(1, count + 1):
+        show_detail(f"window {window} of {count}")
         for run in runs:
             evaluations += run.grow(-(-window * len(run.windows) // count), rest)
         if any(run.is_lost for run in runs):

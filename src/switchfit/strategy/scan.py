@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
+from switchfit.runtime.progress import show_detail
 from switchfit.strategy.horizon import list_sample_times
 from switchfit.strategy.quick import End, fit_briefly
 
@@ -111,7 +112,10 @@ class Scan:
 
     def choose(self) -> FloatArray:
         """Return the theta that is the best of all combinations of intervals, as far as parabolas tell."""
-        options = [self._scan_run(e) for e in range(len(self.problem.experiments))]
+        options = []
+        for e in range(len(self.problem.experiments)):
+            show_detail(f"run {e + 1} of {len(self.problem.experiments)}")
+            options.append(self._scan_run(e))
         move = np.zeros(len(self.shared))
         for _ in range(20):
             best = [min(own, key=lambda option: self._predict(option, move)) for own in options]

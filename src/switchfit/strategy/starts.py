@@ -10,6 +10,7 @@ import numpy as np
 from switchfit.fit.random_starts import draw_starts
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
+from switchfit.runtime.progress import show_detail
 from switchfit.strategy.quick import End, fit_briefly
 
 MOST = 128
@@ -72,6 +73,8 @@ def try_starts(
             end = fit_briefly(problem, start)
             evaluations += end.evaluations
             ends.append(end)
+            lowest = min(one.cost for one in ends)
+            show_detail(f"start {len(ends) - 1} of at most {most - 1}, lowest J of these {lowest:.6g}")
             if _is_enough(np.array([one.cost for one in ends if not one.failed])):
                 ended = "settled"
                 break
