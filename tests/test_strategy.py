@@ -217,7 +217,7 @@ def test_parabolas_of_a_scan_are_those_of_the_cost():
     """Slope and curvature in the shared unknown, by differences of fits with it held at either side."""
     problem = two_runs()
     theta = sf.estimate(problem, strategy="local").theta
-    scan = Scan(problem, theta, everywhere=False)
+    scan = Scan(problem, Evaluator(problem, theta), theta)
     assert [problem.theta_names[k] for k in scan.shared] == ["k"]
     option = scan._fit_inside(theta, 0, -1, -np.inf, np.inf)
     assert option is not None

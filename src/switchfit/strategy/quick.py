@@ -33,9 +33,22 @@ class End(NamedTuple):
         return not np.isfinite(self.cost)
 
 
-def fit_briefly(problem: Problem, theta: FloatArray, iterations: int = ITERATIONS) -> End:
+def prepare_meshes(problem: Problem, theta: FloatArray) -> Evaluator | None:
+    """Return the problem on meshes for theta (d,); None where it cannot be integrated there."""
+    try:
+        with np.errstate(all="ignore"):
+            return Evaluator(problem, theta)
+    except (ValueError, ArithmeticError):
+        return None
+
+
+def fit_briefly(
+    problem: Problem, theta: FloatArray, iterations: int = ITERATIONS, evaluator: Evaluator | None = None
+) -> End:
     """Return where a short fit from theta (d,) ends; with an infinite cost where it cannot begin, or where guards or
     terminal constraints are not met: their violation may make the cost as low as it likes.
+
+    Without constraints it works on the meshes of the evaluator, if there is one.
     """
     failed = End(theta, np.inf, 0)
     try:
@@ -45,7 +58,8 @@ def fit_briefly(problem: Problem, theta: FloatArray, iterations: int = ITERATION
                 theta, taken = meet_constraints(problem, theta)
                 result, _ = minimize_with_constraints(Evaluator(problem, theta), theta, TOLERANCE, iterations)
             else:
-                result = minimize_cost(Evaluator(problem, theta), theta, "auto", TOLERANCE, iterations)
+                evaluator = evaluator or Evaluator(problem, theta)
+                result = minimize_cost(evaluator, theta, "auto", TOLERANCE, iterations)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return failed
     if result.status is Status.INTERRUPTED:  # Ctrl-C, which the optimiser takes for the end of its own work
