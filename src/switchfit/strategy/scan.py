@@ -146,8 +146,8 @@ class Scan:
             theta[own] = option.theta[own] + option.follows @ move
         unknowns = self.problem.unknowns
         theta = np.clip(theta, unknowns.lower, unknowns.upper)
-        before = sum(self._derivatives(self.theta, e, 1)[0] for e in range(len(best)))
-        return self._in_order(theta), before - sum(self._predict(option, move) for option in best)
+        cost = sum(self._derivatives(self.theta, e, 1)[0] for e in range(len(best)))
+        return self._in_order(theta), cost - sum(self._predict(option, move) for option in best)
 
     def _in_order(self, theta: FloatArray) -> FloatArray:
         """Return theta with the transition times of each run inside its horizon and in order."""

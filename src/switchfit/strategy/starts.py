@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.runtime.progress import show_detail
 from switchfit.strategy.quick import End, fit_briefly
+from switchfit.strategy.workers import fit_all
 
 MOST = 128
 """Starts at most; a study of more is what `multistart` is for."""
@@ -43,7 +45,13 @@ class Starts(NamedTuple):
 
 
 def try_starts(
-    problem: Problem, theta: FloatArray, *, seed: int = 0, most: int = MOST, stop: Callable[[], bool] = lambda: False
+    problem: Problem,
+    theta: FloatArray,
+    *,
+    seed: int = 0,
+    most: int = MOST,
+    stop: Callable[[], bool] = lambda: False,
+    cores: int | None = None,
 ) -> Starts:
     """Return the lowest end of short fits from random starts, theta (d,) among them.
 
@@ -60,6 +68,8 @@ def try_starts(
         Starts at most.
     stop : callable
         Asked after each fit; true ends the search.
+    cores : int, optional
+        Processes at most; as many as there are cores if left out. What is found does not depend on it.
 
     References
     ----------
@@ -69,18 +79,18 @@ def try_starts(
     first = fit_briefly(problem, theta)
     ends, evaluations, ended = [first], first.evaluations, "most"
     try:
-        for start in draw_starts(problem, most, seed)[1:]:
-            end = fit_briefly(problem, start)
-            evaluations += end.evaluations
-            ends.append(end)
-            lowest = min(one.cost for one in ends)
-            show_detail(f"start {len(ends) - 1} of at most {most - 1}, lowest J of these {lowest:.6g}")
-            if _is_enough(np.array([one.cost for one in ends if not one.failed])):
-                ended = "settled"
-                break
-            if stop():
-                ended = "time"
-                break
+        with closing(fit_all(problem, draw_starts(problem, most, seed)[1:], cores)) as found:
+            for end in found:
+                evaluations += end.evaluations
+                ends.append(end)
+                lowest = min(one.cost for one in ends)
+                show_detail(f"start {len(ends) - 1} of at most {most - 1}, lowest J of these {lowest:.6g}")
+                if _is_enough(np.array([one.cost for one in ends if not one.failed])):
+                    ended = "settled"
+                    break
+                if stop():
+                    ended = "time"
+                    break
     except KeyboardInterrupt:
         ended = "interrupted"
     best = min(ends, key=lambda one: one.cost)
