@@ -566,6 +566,7 @@ def fit_locally(
         integration_error_of=output,
         seconds=time.perf_counter() - began,
         constraints=held,
+        initial_cost=history[0].cost if history else np.nan,
     )
     found.simulate_later(simulation)
     return found

@@ -65,6 +65,9 @@ class Step:
         The lowest J after it.
     evaluations : int
     seconds : float
+    ended : str
+        Why the many starts ended: "settled", no further minimum was likely; "most", as many as are tried at most;
+        "time" or "interrupted". Empty for other strategies.
 
     See Also
     --------
@@ -82,6 +85,7 @@ class Step:
     cost: float
     evaluations: int
     seconds: float
+    ended: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +110,10 @@ class Fit:
     optimality : float
         KKT residual; the norm of the gradient if no constraint is active.
     iterations, evaluations : int
+        Iterations of the fit that found theta; evaluations of everything that was tried.
     status : Status
     history : tuple of IterationRecord
+        Of the fit that found theta. Where strategies were tried, it begins where one of them ended.
     active : tuple of ActiveConstraint
         Bounds, and shortest durations of modes, that hold with equality.
     kinks : tuple of Kink
@@ -156,10 +162,12 @@ class Fit:
     reason : Issue or None
         Why the line search failed, or the error with which the fit ended.
     starts : (tried, better, agreeing) or None
-        Numbers of other starts that were fitted, that ended lower, and that ended in the same minimum; None without
+        Numbers of other starts that were fitted, that ended lower than this fit, and that ended at its J; None without
         other starts.
     steps : tuple of Step
         The strategies that were tried, in order; empty if the first fit was enough.
+    initial_cost : float
+        J at `initial_theta`; NaN if it is unknown or cannot be evaluated there.
     """
 
     theta_names: tuple[str, ...]
@@ -207,6 +215,7 @@ class Fit:
     reason: Issue | None = None
     starts: tuple[int, int, int] | None = None
     steps: tuple[Step, ...] = ()
+    initial_cost: float = np.nan
 
     @property
     def termination(self) -> Termination:
