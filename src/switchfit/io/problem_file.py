@@ -222,7 +222,7 @@ class DataTable(LogTable):
     )
     sigma: float | str | list[float | str] | None = Field(
         default=None,
-        description="standard deviation of the noise: a number, one a column, the names of columns that hold it, or "
+        description="standard deviation of the noise: a number, one per column, the names of columns that hold it, or "
         "of parameters that it is; left out, it is unknown (measurements only)",
     )
     loss: Literal["linear", "soft_l1", "huber", "cauchy"] = Field(
@@ -309,7 +309,7 @@ class OptionsTable(_Table):
         default=None, description="one fit, more if its verdict is not good, or all strategies"
     )
     time_budget: float | None = Field(default=None, gt=0, description="seconds after which no further strategy begins")
-    hessian: HessianKind | None = Field(default=None, description="quadratic term of the optimiser")
+    hessian: HessianKind | None = Field(default=None, description="quadratic term of the optimizer")
     tolerance: float | None = Field(default=None, gt=0, description="optimality at which to stop")
     max_iterations: int | None = Field(default=None, ge=0, description="most iterations")
 

@@ -724,7 +724,7 @@ def _check(fit: Fit) -> None:
         raise ValueError("a profile needs a noise model: a cost of Measurements alone, with or without sigma.")
     if fit.sigma_known is False and fit.freedom < 1:
         raise ValueError(
-            f"sigma is unknown, and {fit.samples} values are too few to estimate it along with the unknowns."
+            f"sigma is unknown and {fit.samples} values are too few to estimate it along with the unknowns."
         )
 
 
