@@ -105,7 +105,7 @@ def minimize_cost(
         callback=report,
         size=problem.sizes if identity else variables.sizes_inward(problem.sizes),
         idle=idle,
-        reach=_reach_of(problem),
+        reach=_compute_reach(problem),
     )
     if result.status is Status.LINE_SEARCH_FAILED:
         refuse_jumps(evaluator, result.theta if identity else _to_theta(variables, constraints, result.theta))
@@ -141,7 +141,7 @@ def minimize_with_constraints(
     return found.result, tuple(zip(names, values, multipliers, strict=True))
 
 
-def _reach_of(problem: Problem) -> FloatArray:
+def _compute_reach(problem: Problem) -> FloatArray:
     """Return how far each variable may move in the optimizer's first trust-region step: (d,).
 
     This is a part of the horizon for a transition time, and a part of the first guess for any other unknown; if the

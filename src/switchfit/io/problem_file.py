@@ -275,18 +275,18 @@ class ExperimentTable(_Table):
     tf: Annotated[TransitionTable | None, pydantic.BeforeValidator(_end_as_table)] = Field(
         default=None,
         description="end of the horizon; left out, the last sample. A number, or a table with value, lower and upper "
-        "where it is to be estimated",
+        "if it is to be estimated",
     )
     initial_state: list[Annotated[StateTable, pydantic.BeforeValidator(_known_as_table)]] | None = Field(
         default=None,
-        description="state at t0, instead of the model's: a number, or a table where it is to be estimated",
+        description="state at t0, instead of the model's: a number, or a table if it is to be estimated",
     )
     parameter_map: dict[str, str] = Field(
         default_factory=dict,
         description="the model's name of a parameter = the name under [parameters] that this run uses for it",
     )
     inputs: InputTable | None = Field(default=None, description="a known input")
-    name: str | None = Field(default=None, description="used in the report where there are several experiments")
+    name: str | None = Field(default=None, description="used in the report if there are several experiments")
 
 
 class ModelTable(_Table):

@@ -25,7 +25,7 @@ def _register(library: Structure, sizes: Sizes) -> tuple[str, Program]:
     """Register the foreign function of a library with XLA; return its name and its program."""
     program = program_of(library, sizes, Order.HESSIAN)
     if isinstance(program, str):
-        raise ValueError(f"there is no machine code: {program}")
+        raise ValueError(f"the experiment has no machine code: {program}")
     name = f"switchfit_{program.key[:32]}"
     new_capsule = ctypes.pythonapi.PyCapsule_New
     new_capsule.restype, new_capsule.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
