@@ -320,7 +320,7 @@ class Namespace:
     def __getattr__(self, name: str) -> Callable[..., Any]:
         operation = BY_VALUE.get(getattr(np, name))
         if operation is None:
-            raise AttributeError(f"no operation implements numpy.{name}: add one to engine/native/operations.py")
+            raise AttributeError(f"no operation for numpy.{name}: add it to engine/native/operations.py")
         return np.frompyfunc(partial(self._graph.apply, operation.name), operation.operands, 1)
 
 
