@@ -30,10 +30,10 @@ def engine_of(problem: Problem, e: int, arguments: Arguments, mesh: Mesh) -> Exp
     by_jax = JaxEngine(structure, arguments, mesh)
     if problem.engine == "jax":
         return by_jax
-    return _native_or(by_jax, structure, arguments, mesh, insist=problem.engine == "native")
+    return _choose_native(by_jax, structure, arguments, mesh, insist=problem.engine == "native")
 
 
-def _native_or(
+def _choose_native(
     by_jax: JaxEngine, structure: Structure, arguments: Arguments, mesh: Mesh, *, insist: bool
 ) -> ExperimentEngine:
     reason = reason_for_jax(structure, arguments, Order.HESSIAN)

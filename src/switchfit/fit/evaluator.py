@@ -135,7 +135,7 @@ class Evaluator:
         `matrix` selects the Hessian, the Gauss-Newton matrix in its place, or neither (NaN).
         """
         d = len(theta)
-        results = self._results(theta, side, method, matrix)
+        results = self._evaluate_experiments(theta, side, method, matrix)
         if self.problem.one_to_one:
             total, gradient, hessian = float(results[0][0]), results[0][1], results[0][2]
         else:
@@ -186,7 +186,7 @@ class Evaluator:
         """Evaluate by the method "auto", in time and memory that are linear in the number of experiments."""
         total, gradient, parts = 0.0, np.zeros(len(theta)), []
         size = self.layout.own.shape[1] + len(self.layout.shared)
-        results = self._results(theta, side, "auto", matrix)
+        results = self._evaluate_experiments(theta, side, "auto", matrix)
         for (J, g, H), (own, mine), slots in zip(results, self.problem.own_places, self._slots, strict=True):
             total += float(J)
             np.add.at(gradient, mine, g[own])
@@ -231,7 +231,7 @@ class Evaluator:
         vectors = (self.problem.vectors(theta, e) for e in range(len(self.engines)))
         return [engine.simulate(*at, tangents=tangents) for engine, at in zip(self.engines, vectors, strict=True)]
 
-    def _results(self, theta: FloatArray, side: int, method: Method, matrix: Matrix) -> list[Derivatives]:
+    def _evaluate_experiments(self, theta: FloatArray, side: int, method: Method, matrix: Matrix) -> list[Derivatives]:
         """Return the cost, gradient and Hessian of each experiment in its own unknowns."""
         theta = np.asarray(theta, dtype=np.float64)
         vectors = [self.problem.vectors(theta, e) for e in range(len(self.engines))]

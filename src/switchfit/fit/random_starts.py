@@ -35,7 +35,7 @@ def draw_starts(problem: Problem, count: int, seed: int) -> FloatArray:
     unknowns = problem.unknowns
     sobol = qmc.Sobol(len(unknowns.names), seed=seed)
     cube = sobol.random(1 << max(count - 1, 0).bit_length())[:count]
-    low, high, log = _ranges(problem)
+    low, high, log = _compute_ranges(problem)
     points = low + cube * (high - low)
     points[:, log] = low[log] * (high[log] / low[log]) ** cube[:, log]
     for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
@@ -48,7 +48,7 @@ def draw_starts(problem: Problem, count: int, seed: int) -> FloatArray:
     return np.array([find_nearest_feasible(problem, point) for point in points])
 
 
-def _ranges(problem: Problem) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+def _compute_ranges(problem: Problem) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """Return the range of each unknown, (d,) and (d,), and whether it is drawn on a logarithmic scale, (d,)."""
     unknowns = problem.unknowns
     guess, is_time = unknowns.initial, unknowns.is_time

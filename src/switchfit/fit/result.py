@@ -31,7 +31,7 @@ class Transition:
     ----------
     experiment : int, from 0
     run : str
-        The experiment's name; empty where there is only one.
+        The experiment's name; empty if there is only one.
     name : str
         As in `Fit.theta_names`.
     time : float
@@ -285,7 +285,7 @@ class Fit:
     @property
     def samples(self) -> int:
         """Number of measured values that are not missing."""
-        return sum(int(np.isfinite(c.measured).sum()) for run in self.comparisons for c in run if _discrete(c))
+        return sum(int(np.isfinite(c.measured).sum()) for run in self.comparisons for c in run if _is_discrete(c))
 
     @property
     def residual_variance(self) -> float:
@@ -566,5 +566,5 @@ def compute_scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> ScaledSpectru
     return ScaledSpectrum(values, basis @ vectors, size)
 
 
-def _discrete(comparison: Comparison) -> bool:
+def _is_discrete(comparison: Comparison) -> bool:
     return comparison.kind == "measurements"

@@ -109,7 +109,7 @@ def minimize_cost(
         callback=report,
         size=problem.sizes if identity else variables.sizes_inward(problem.sizes),
         idle=None if names else idle,
-        reach=_reach_of(problem),
+        reach=_compute_reach(problem),
         equalities=names,
     )
     if result.status is Status.LINE_SEARCH_FAILED and not names:
@@ -120,7 +120,7 @@ def minimize_cost(
     return converted if not names else _convert_constrained(evaluator, converted)
 
 
-def _reach_of(problem: Problem) -> FloatArray:
+def _compute_reach(problem: Problem) -> FloatArray:
     """Return how far each variable may move in the optimizer's first trust-region step: (d,).
 
     This is a part of the horizon for a transition time, and a part of the first guess for any other unknown; if the

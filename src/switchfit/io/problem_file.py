@@ -222,7 +222,7 @@ class DataTable(LogTable):
     )
     sigma: float | str | list[float | str] | None = Field(
         default=None,
-        description="standard deviation of the noise: a number, one a column, the names of columns that hold it, or "
+        description="standard deviation of the noise: a number, one per column, the names of columns that hold it, or "
         "of parameters that it is; left out, it is unknown (measurements only)",
     )
     loss: Literal["linear", "soft_l1", "huber", "cauchy"] = Field(
@@ -275,18 +275,18 @@ class ExperimentTable(_Table):
     tf: Annotated[TransitionTable | None, pydantic.BeforeValidator(_end_as_table)] = Field(
         default=None,
         description="end of the horizon; left out, the last sample. A number, or a table with value, lower and upper "
-        "where it is to be estimated",
+        "if it is to be estimated",
     )
     initial_state: list[Annotated[StateTable, pydantic.BeforeValidator(_known_as_table)]] | None = Field(
         default=None,
-        description="state at t0, instead of the model's: a number, or a table where it is to be estimated",
+        description="state at t0, instead of the model's: a number, or a table if it is to be estimated",
     )
     parameter_map: dict[str, str] = Field(
         default_factory=dict,
         description="the model's name of a parameter = the name under [parameters] that this run uses for it",
     )
     inputs: InputTable | None = Field(default=None, description="a known input")
-    name: str | None = Field(default=None, description="used in the report where there are several experiments")
+    name: str | None = Field(default=None, description="used in the report if there are several experiments")
 
 
 class ModelTable(_Table):
@@ -309,7 +309,7 @@ class OptionsTable(_Table):
         default=None, description="one fit, more if its verdict is not good, or all strategies"
     )
     time_budget: float | None = Field(default=None, gt=0, description="seconds after which no further strategy begins")
-    hessian: HessianKind | None = Field(default=None, description="quadratic term of the optimiser")
+    hessian: HessianKind | None = Field(default=None, description="quadratic term of the optimizer")
     tolerance: float | None = Field(default=None, gt=0, description="optimality at which to stop")
     max_iterations: int | None = Field(default=None, ge=0, description="most iterations")
 

@@ -211,8 +211,8 @@ def _build_prediction(fit: Fit, problem: Problem, e: int, points: Points) -> Pre
     covariance = fit.covariance
     if not np.isfinite(covariance).all():
         raise ValueError(
-            "There are no bands without a covariance: the cost must be made of Measurements alone, with more values "
-            "than unknowns, and the Hessian positive definite. The report says what is missing."
+            "There are no bands without a covariance: the cost must consist of Measurements alone, with more values "
+            "than unknowns, and the Hessian must be positive definite. The report says what is missing."
         )
     trajectory = fit.trajectories[e]
     names = [name for comparison in fit.comparisons[e] for name in comparison.names]

@@ -34,7 +34,7 @@ def _register(library: Structure, sizes: Sizes) -> str:
     """
     program = program_of(library, sizes, Order.HESSIAN)
     if isinstance(program, str):
-        raise ValueError(f"there is no machine code: {program}")
+        raise ValueError(f"the experiment has no machine code: {program}")
     name = f"switchfit_{program.key[:32]}"
     with _one_at_a_time:
         if name not in _registered:
