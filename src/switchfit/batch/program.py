@@ -178,8 +178,8 @@ def fit_chunk(
     unknowns = problem.unknowns
     lockstep = in_lockstep() if lockstep is None else lockstep
     evaluator = Evaluator(problem, meshes=meshes)
-    natively = not lockstep and problem.engine != "jax" and runs_natively(problem.structures, evaluator.arguments)
-    structures = problem.structures
+    natively = not lockstep and problem.engine != "jax" and runs_natively(evaluator.structures, evaluator.arguments)
+    structures = evaluator.structures
     layout = Layout(
         tuple(structure.library for structure in structures) if natively else structures,
         tuple(structure.N for structure in structures),

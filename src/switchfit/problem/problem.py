@@ -40,6 +40,8 @@ from switchfit.problem.variables import Variables
 GIVEN = ("system", "experiments", "parameters", "min_duration", "solver", "rtol", "atol", "engine", "max_transitions")
 """What a `Problem` is built from."""
 
+SOLVERS = ("auto", "explicit", "stiff")
+
 SMALLEST_RTOL = 1e-13
 """Local errors below this part of the state are rounding."""
 
@@ -115,8 +117,13 @@ class Problem:
     min_duration : float, optional
         Shortest time a mode may last, in the time unit that all experiments then share; 0 lets a mode vanish, which
         the result then reports.
-    solver : {"explicit", "stiff"}, optional
-        Butcher's explicit Runge-Kutta method of order 5, or Radau IIA of order 5 for stiff modes.
+    solver : {"auto", "explicit", "stiff"}, optional
+        The steps of the integrator: Butcher's explicit Runge-Kutta method of order 5, or implicit ones, Radau IIA of
+        order 5, for stiff modes. "auto" takes explicit steps in an experiment unless they are hopeless there: limited
+        by stability in one of its modes, a thousand or more in that mode, and implicit steps are at least five times
+        fewer. This is decided whenever a mesh is made, at the guess and where a fit refines it, and for an experiment
+        as a whole: its other modes take implicit steps too. `Evaluation.stiffness`, `Estimate.engine`, the report and
+        the log say so. "explicit" and "stiff" are taken as they are.
     rtol, atol : float, optional
         Tolerances of the local error by which the mesh is refined. With the defaults J has a relative error of about
         1e-8, its gradient and its Hessian of about 1e-7. Ten times smaller tolerances make these errors about ten times
@@ -166,7 +173,7 @@ class Problem:
     experiments: Any
     parameters: Mapping[str, Any] = field(default_factory=dict)
     min_duration: float = 0.0
-    solver: Literal["explicit", "stiff"] = "explicit"
+    solver: Literal["auto", "explicit", "stiff"] = "auto"
     rtol: float = 1e-8
     atol: float = 1e-10
     engine: Literal["auto", "native", "jax"] = "auto"
@@ -187,7 +194,7 @@ class Problem:
                         f"mode_sequence names the unknown mode {shorten(mode)}; the modes are "
                         f"{join_names(self.system.modes)}."
                     )
-        object.__setattr__(self, "solver", as_choice(self.solver, "solver", ("explicit", "stiff")))
+        object.__setattr__(self, "solver", as_choice(self.solver, "solver", SOLVERS))
         object.__setattr__(self, "engine", as_choice(self.engine, "engine", ("auto", "native", "jax")))
         if self.max_transitions is not None:
             longest = max(len(e.transition_times) for e in experiments)
@@ -211,7 +218,7 @@ class Problem:
         self._check_delays()
         targets = frozenset(name for e in experiments for name in e.parameter_map.values())
         functions = Functions(parameters, targets)
-        settings = functions, self.solver, self.max_transitions
+        settings = functions, "stiff" if self.solver == "stiff" else "explicit", self.max_transitions
         structures = tuple(trace_structure(self.system, e, *settings) for e in experiments)
         for structure in structures:
             self.system.check_labels_of(structure.n)
