@@ -319,7 +319,8 @@ def _solve(
             raise _too_slow(problem, name, accepted, solver.y, end, unit, watch, explicit)
         accepted.append(float(solver.t))
         if watch is not None and watch.add(name, 1) and explicit:
-            watch.look(name, accepted[-1] - accepted[-2], right_hand_side, accepted[-1], solver.y, _scale_of(problem))
+            later = partial(_call_jax, right_hand_side)
+            watch.look(name, accepted[-1] - accepted[-2], later, accepted[-1], solver.y, _scale_of(problem))
     return np.array(accepted[1:]), np.asarray(solver.y[:-1])
 
 

@@ -6,9 +6,9 @@ the vector field, whether or not its component is there any more. A mode in whic
 (Hairer and Wanner II, section IV.2). Explicit steps are then many, and have no slack: at a theta with a larger
 eigenvalue the same mesh is unstable.
 
-The explicit solve is watched: every `STEPS_BETWEEN` accepted steps the eigenvalues are computed. Where they say that
-stability limits the step, the implicit method solves the experiment too, and is taken if it needs far fewer steps. A
-solve of fewer steps is not looked at.
+The explicit solve is watched: of a mode that took many steps the eigenvalues are computed at every `STEPS_BETWEEN`
+of them. Where they say that stability limits a good part of the steps, the implicit method solves the experiment too,
+and is taken if it needs far fewer.
 
 A fit may come to a theta where its modes are stiff, and the explicit steps of its mesh unstable: no step to where it
 should go is possible then. Where it has failed, the eigenvalues there are compared with the mesh.
@@ -19,6 +19,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,17 +30,19 @@ from switchfit.runtime.errors import NotIntegrableError
 
 log = logging.getLogger("switchfit")
 
-STEPS_BETWEEN = 1000
-"""Accepted steps in a mode between two looks at its eigenvalues; a mode with fewer is not called stiff. A look, some
-evaluations of the vector field and the eigenvalues of its Jacobian, takes less than a tenth of so many steps."""
+STEPS_BETWEEN = 250
+"""Accepted steps in a mode between two looks at its eigenvalues."""
+
+STEPS_BETWEEN_AFTER_FAILURE = 64
+"""The same where a fit has failed, and it is asked whether its mesh is to blame."""
+
+FEW_STEPS = 1000
+"""A mode with fewer steps is not called stiff, and its eigenvalues are not computed."""
 
 LIMITED = 2.0
 """``|lambda| h`` from which stability limits the step: the region of stability reaches to 3.3 for eigenvalues whose
 damping ratio is above 0.3, to 2.1 for one of 0.02. Accuracy limits it to less: at rtol = 1e-8 to 0.1 in an
 oscillation."""
-
-STEPS_BETWEEN_AFTER_FAILURE = 64
-"""The same where a fit has failed, and it is asked whether its mesh is to blame."""
 
 FEWER = 5
 """Times fewer steps that implicit ones have to be. An implicit step takes some hundred times as long as an explicit one
@@ -49,28 +53,49 @@ FEWER_AFTER_FAILURE = 2
 """The same where explicit steps have failed."""
 
 
+class _Look(NamedTuple):
+    """A state of an explicit solve at which the eigenvalues can be computed: the arguments of `Watch.look`."""
+
+    step: float
+    slope: Callable[[float, FloatArray], FloatArray]
+    t: float
+    y: FloatArray
+    smallest: float
+
+    def measure_rate(self) -> float:
+        """Return the largest ``|lambda|`` of a component that decays; 0 if none does, or the model is undefined."""
+        try:
+            with np.errstate(all="ignore"):
+                jacobian = _differentiate(self.slope, self.t, self.y, self.smallest)
+        except NotIntegrableError:  # beside the trajectory the model need not be defined
+            return 0.0
+        return _largest_decay(jacobian) if np.isfinite(jacobian).all() else 0.0
+
+
 @dataclass
 class _ModeSteps:
-    """Accepted steps in one mode, and what the eigenvalues are where they were looked at.
-
-    Attributes
-    ----------
-    count, looked : int
-        Steps by now, and at the last look.
-    looks : list of (t, |lambda|, |lambda| h)
-    projected : float
-        Steps that the solve would have taken if it had not been given up.
-    """
+    """Accepted steps in one mode, by now and at the last look, and what a solve that was given up would have taken."""
 
     count: int = 0
     looked: int = 0
-    looks: list[tuple[float, float, float]] = field(default_factory=list)
     projected: float = 0.0
+    looks: list[_Look] = field(default_factory=list)
+
+    @cached_property
+    def rates(self) -> list[float]:
+        """``|lambda|`` at each look."""
+        return [look.measure_rate() for look in self.looks]
 
     @property
     def limited(self) -> list[float]:
-        """``|lambda| h`` where stability limits the step."""
-        return [ratio for _, _, ratio in self.looks if ratio > LIMITED]
+        """``|lambda| h`` at the looks where stability limits the step."""
+        ratios = (rate * look.step for rate, look in zip(self.rates, self.looks, strict=True))
+        return [ratio for ratio in ratios if ratio > LIMITED]
+
+    @property
+    def is_stiff(self) -> bool:
+        """Whether there are many steps, and stability limits a good part of them."""
+        return self.total >= FEW_STEPS and 4 * len(self.limited) > len(self.looks)
 
     @property
     def total(self) -> int:
@@ -100,8 +125,8 @@ class Watch:
 
     @property
     def stiffest(self) -> tuple[str, float] | None:
-        """The mode with the most steps of those in which stability limits most of them, and ``|lambda| h`` there."""
-        found = {name: mode for name, mode in self.modes.items() if 2 * len(mode.limited) > len(mode.looks)}
+        """The stiff mode with the most steps, and ``|lambda| h`` where stability limits them."""
+        found = {name: mode for name, mode in self.modes.items() if mode.is_stiff}
         name = max(found, key=lambda name: found[name].total, default=None)
         return None if name is None else (name, float(np.median(found[name].limited)))
 
@@ -112,8 +137,8 @@ class Watch:
         last = len(mesh.times) - 2
         found = []
         for name, mode in self.modes.items():
-            for t, rate, _ in mode.looks:
-                cell = min(int(np.searchsorted(mesh.times, t)) - 1, last)
+            for rate, look in zip(mode.rates, mode.looks, strict=True):
+                cell = min(int(np.searchsorted(mesh.times, look.t)) - 1, last)
                 found.append((float(rate * (mesh.times[cell + 1] - mesh.times[cell])), name))
         ratio, name = max(found, default=(0.0, ""))
         return (name, ratio) if ratio > LIMITED else None
@@ -141,7 +166,7 @@ class Watch:
         y: FloatArray,
         smallest: float,
     ) -> None:
-        """Note the eigenvalues of a mode.
+        """Note where the eigenvalues of a mode can be computed, if it comes to that.
 
         Parameters
         ----------
@@ -157,14 +182,7 @@ class Watch:
         """
         mode = self.modes[name]
         mode.looked = mode.count
-        try:
-            with np.errstate(all="ignore"):
-                jacobian = _differentiate(slope, t, y, smallest)
-        except NotIntegrableError:  # beside the trajectory the model need not be defined
-            return
-        if np.isfinite(jacobian).all():
-            rate = _largest_decay(jacobian)
-            mode.looks.append((t, rate, rate * step))
+        mode.looks.append(_Look(step, slope, t, y.copy(), smallest))
 
     def give_up(self, name: str, steps: float) -> None:
         """Note that the solve of a mode was given up, and how many steps it would take at its pace."""
