@@ -116,8 +116,12 @@ class Experiment:
 
     def __post_init__(self) -> None:
         data = _check_data(self.data)
-        object.__setattr__(self, "taken_from_data", tuple(n for n in ("t0", "tf") if getattr(self, n) is None))
-        t0, tf = _choose_horizon(self.t0, self.tf, data, self.taken_from_data)
+        if self.t0 is None or self.tf is None:
+            missing = tuple(name for name in ("t0", "tf") if getattr(self, name) is None)
+            t0, tf = _choose_horizon(self.t0, self.tf, data, missing)
+            object.__setattr__(self, "taken_from_data", missing)
+        else:
+            t0, tf = as_number(self.t0, "t0"), _check_final_time(self.tf)
         last = float(tf.value) if isinstance(tf, Parameter) else tf
         if not (np.isfinite(t0) and np.isfinite(last) and t0 < last):
             raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got ({t0}, {last}).")
@@ -309,8 +313,6 @@ def _choose_horizon(
     t0: Any, tf: Any, data: tuple[Data, ...], missing: tuple[str, ...]
 ) -> tuple[float, float | Parameter]:
     """Return t0 and tf as given and checked; those that are missing are taken from the span of the data."""
-    if not missing:
-        return as_number(t0, "t0"), _check_final_time(tf)
     left_out = f"{' and '.join(missing)} {'are' if len(missing) > 1 else 'is'} left out"
     spans = [item.seen_times[[0, -1]] for item in data if isinstance(item, Measurements)]
     spans += [item.signal.knots[[0, -1]] for item in data if isinstance(item, ReferenceSignal)]
