@@ -56,6 +56,8 @@ class Fits:
         Whether the noise of the measurements is known; None where the cost has no noise model.
     log_scaled : tuple of str
         Unknowns that were estimated on a logarithmic scale.
+    log_origins : (d,)
+        From where these logarithms count: t0 for a transition time, otherwise 0.
     seconds : float
         Wall time of all.
 
@@ -94,6 +96,7 @@ class Fits:
     samples: NDArray[np.int64]
     sigma_known: bool | None
     log_scaled: tuple[str, ...]
+    log_origins: FloatArray
     seconds: float
 
     def __len__(self) -> int:
@@ -140,7 +143,7 @@ class Fits:
         freedom, tail = np.maximum(self.samples - self.free, 1), 0.5 + level / 2
         quantile = scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail)
         half = np.reshape(quantile, (-1, 1)) * self.standard_errors
-        return interval(self.theta, half, np.isin(self.theta_names, self.log_scaled))
+        return interval(self.theta, half, np.isin(self.theta_names, self.log_scaled), self.log_origins)
 
     def __str__(self) -> str:
         return format_text(self)
@@ -227,6 +230,7 @@ def _collect_fields(
         "runs": runs,
         "sigma_known": known,
         "log_scaled": problem.unknowns.log_names,
+        "log_origins": problem.unknowns.origin,
         "seconds": seconds,
         **found,
     }

@@ -171,7 +171,7 @@ def fit_chunk(
     lockstep : bool, optional
         Whether to run all fits in lockstep; decided by the device if left out.
     """
-    if problem.constraint_names:  # which the program does not know
+    if problem.constraint_names or problem.unknowns.log_times.any():  # which the program does not know
         evaluator = Evaluator(problem, meshes=meshes)
         outcome = _leave_all(np.asarray(starts, dtype=float))
         return _finish_rest(problem, evaluator, varying, outcome, tolerance, max_iterations)

@@ -180,6 +180,9 @@ class TransitionTable(_Table):
     prior: PriorTable | None = Field(
         default=None, description="what is known of it: { mean, sd } or { median, log_sd }"
     )
+    scale: Literal["linear", "log"] = Field(
+        default="linear", description="'log': estimated as the logarithm of the time since t0"
+    )
 
 
 class StateTable(_Table):

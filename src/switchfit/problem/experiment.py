@@ -40,6 +40,8 @@ class Experiment:
     transition_times : sequence of float or Parameter, or None
         First guess of each transition, in the experiment's time unit, one fewer than modes, strictly increasing inside
         ``(t0, tf)``; an entry may be a `Parameter` with bounds, or fixed. Its unit, where given, must be `time_unit`.
+        With ``scale="log"``, which all free times of an experiment then have, a free tf among them, the optimiser works
+        in log(tau - t0): for times that may lie in other decades than their guess.
         None: `estimate` looks for them all over the horizon; the guess is evenly spaced.
     t0 : float, optional
         Start of the horizon, in the experiment's time unit. Left out, the first time of the data: the first sample of
@@ -216,8 +218,13 @@ class Experiment:
                 )
 
     def _check_times(self) -> None:
-        if any(tau.scale != "linear" for tau in self.transition_times):
-            raise ValueError("transition_times are estimated as they are; leave out scale='log'.")
+        scales = {tau.scale for tau in self.times if not tau.fixed}
+        if len(scales) > 1:
+            raise ValueError(
+                "the transition times of an experiment that are estimated, and a free tf, must be on one scale, since "
+                f"their order is a constraint; got {shorten([tau.scale for tau in self.times])}. Give scale='log' to "
+                "all of them, or to none."
+            )
         if any(tau.shape != () for tau in self.transition_times):
             shapes = [tau.shape for tau in self.transition_times]
             raise ValueError(
@@ -342,8 +349,6 @@ def _check_final_time(given: Any) -> float | Parameter:
         raise ValueError(f"tf must be a single number or a Parameter of one; got the shape {given.shape}.")
     if given.fixed:
         return float(given.value)
-    if given.scale != "linear":
-        raise ValueError("tf is estimated as it is; leave out scale='log'.")
     if not np.isfinite(given.upper):
         raise ValueError(
             "A free tf needs a finite upper bound, such as sf.Parameter(2.0, upper=5.0): the latest time to which the "

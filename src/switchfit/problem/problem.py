@@ -67,6 +67,7 @@ class Unknowns:
     rows : tuple of Constraint, what each row of A theta >= b is
     priors : PriorTerms
     log : (d,) bool, whether an unknown is estimated on a logarithmic scale
+    origin : (d,), from where a logarithm counts: t0 for a transition time or a free tf, otherwise 0
     """
 
     names: tuple[str, ...]
@@ -82,6 +83,7 @@ class Unknowns:
     rows: tuple[Constraint, ...]
     priors: PriorTerms
     log: NDArray[np.bool_]
+    origin: FloatArray
 
     @cached_property
     def is_time(self) -> NDArray[np.bool_]:
@@ -93,8 +95,13 @@ class Unknowns:
 
     @cached_property
     def variables(self) -> Variables:
-        """What the optimiser works with: transition times as they are, other unknowns scaled or their logarithms."""
-        return Variables.of(self.initial, self.lower, self.upper, self.log, keep=self.is_time)
+        """What the optimiser works with: logarithms, transition times as they are, other unknowns scaled."""
+        return Variables.of(self.initial, self.lower, self.upper, self.log, keep=self.is_time, origin=self.origin)
+
+    @cached_property
+    def log_times(self) -> NDArray[np.bool_]:
+        """Which of the unknowns are transition times, or a free tf, on a logarithmic scale: (d,)."""
+        return self.log & self.is_time
 
     @property
     def log_names(self) -> tuple[str, ...]:
@@ -723,9 +730,13 @@ def _list_unknowns(
     flat = {key: np.concatenate([getattr(q, key).ravel() for q in pieces]) for key in ("value", "lower", "upper")}
     priors = PriorTerms.join([PriorTerms.of(q.prior, q.shape) for q in pieces])
     log = np.concatenate([np.full(q.value.size, q.scale == "log") for q in pieces])
+    origin = np.zeros(len(names))
+    for experiment, positions in zip(experiments, where, strict=True):
+        origin[positions[positions >= 0]] = experiment.t0
     A, b, rows = _build_ordering(experiments, where, len(names), dwell)
     vectors = flat["value"], flat["lower"], flat["upper"]
-    return Unknowns(tuple(names), tuple(units), *vectors, tuple(where), spans, tuple(states), A, b, rows, priors, log)
+    places = tuple(where), spans, tuple(states)
+    return Unknowns(tuple(names), tuple(units), *vectors, *places, A, b, rows, priors, log, origin)
 
 
 def _find_delay_targets(experiment: Experiment) -> set[str]:
@@ -756,6 +767,13 @@ def _build_ordering(
         raise ValueError(f"min_duration must be zero or positive; got {dwell}.")
     rows, bounds, constraints = [], [], []
     labels = name_runs(experiments)
+    if dwell > 0 and any(
+        tau.scale == "log" and not tau.fixed for experiment in experiments for tau in experiment.times
+    ):
+        raise ValueError(
+            f"min_duration must be 0 where transition times are on a logarithmic scale, as the difference of two of "
+            f"them is then not linear in what is estimated; got {dwell}. Leave out min_duration, or scale='log'."
+        )
     if dwell > 0:
         units = {name: experiment.time_unit for name, experiment in zip(labels, experiments, strict=True)}
         _require_one_time_unit(units, "min_duration", "leave it out and bound the transition times of each")
