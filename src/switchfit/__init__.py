@@ -5,6 +5,7 @@ from switchfit.batch.logs import estimate_many
 from switchfit.batch.resampling import Bootstrap, bootstrap
 from switchfit.batch.simulated import MonteCarlo, monte_carlo
 from switchfit.batch.starts import Multistart, multistart
+from switchfit.discretization.mesh import Stiffness
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluation, evaluate
 from switchfit.fit.guards import GuardedEvaluation, evaluate_on_guards
@@ -77,6 +78,7 @@ __all__ = [
     "RunningCost",
     "Status",
     "Step",
+    "Stiffness",
     "TerminalConstraint",
     "TerminalCost",
     "Termination",

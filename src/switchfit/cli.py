@@ -157,9 +157,10 @@ def check(
     with _report_errors(debug):
         loaded = _load(problem)
         import switchfit as sf
-        from switchfit.io.summary import describe
+        from switchfit.io.summary import describe, describe_steps
 
         _print(f"{describe(loaded.problem)}\n")
+        _print(f"{describe_steps(loaded.problem)}\n")
         derivatives = sf.check_derivatives(loaded.problem)
         _print(f"{derivatives}\n")
         _print(sf.identifiability(loaded.problem))

@@ -173,15 +173,15 @@ def fit_chunk(
     lockstep : bool, optional
         Whether to run all fits in lockstep; decided by the device if left out.
     """
-    if problem.constraint_names:  # which the program does not know
+    if problem.constraint_names or problem.unknowns.log_times.any():  # which the program does not know
         evaluator = Evaluator(problem, meshes=meshes)
         outcome = _leave_all(np.asarray(starts, dtype=float))
         return _finish_rest(problem, evaluator, varying, outcome, tolerance, max_iterations)
     unknowns = problem.unknowns
     lockstep = in_lockstep() if lockstep is None else lockstep
     evaluator = Evaluator(problem, meshes=meshes)
-    natively = not lockstep and problem.engine != "jax" and runs_natively(problem.structures, evaluator.arguments)
-    structures = problem.structures
+    natively = not lockstep and problem.engine != "jax" and runs_natively(evaluator.structures, evaluator.arguments)
+    structures = evaluator.structures
     layout = Layout(
         tuple(structure.library for structure in structures) if natively else structures,
         tuple(structure.N for structure in structures),

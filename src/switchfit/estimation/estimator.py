@@ -12,7 +12,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.engine.adaptive import refine_mesh
+from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
 from switchfit.estimation.saved import load_fit, save_fit
 from switchfit.fit.accuracy import worst_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
@@ -547,9 +547,13 @@ def fit_locally(
         scale = max(first_cost, history[0].cost if history else 0.0)
         fine, simulation, error, output = _judge_meshes(evaluator, result, scale, values, first=not attempt)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
-        if result.status in STOPPED or attempt == REFINEMENTS or not excess > 1:
+        if attempt == REFINEMENTS or result.status is Status.INTERRUPTED:
             break
-        evaluator = _refine(fine, problem.check_theta(start), theta, excess)
+        failed = not result.status.successful or excess > 2**ORDER
+        stable = _stabilize(evaluator, problem.check_theta(start), theta) if failed else None
+        if stable is None and (result.status in STOPPED or not excess > 1):
+            break
+        evaluator = stable or _refine(fine, problem.check_theta(start), theta, excess)
     if excess > 1 and result.status.successful and not problem.constraint_names:
         refuse_jumps(evaluator, theta)  # the error of steps across a jump does not vanish with their size
     found = _estimate(
@@ -618,6 +622,18 @@ def _judge_meshes(
         if error > max(LARGEST_INTEGRATION_ERROR, evaluator.problem.rtol):
             break
     return fine, simulation, error, output
+
+
+def _stabilize(evaluator: Evaluator, start: FloatArray, theta: FloatArray) -> Evaluator | None:
+    """Return the problem with implicit steps where the explicit ones are unstable near theta; None if they are not.
+
+    A fit cannot go beyond a theta at which the steps of its mesh become unstable: J is not finite there.
+    """
+    problem = evaluator.problem
+    found = [refine_if_unstable(problem, e, mesh, start, theta) for e, mesh in enumerate(evaluator.meshes)]
+    if not any(found):
+        return None
+    return Evaluator(problem, meshes=[new or mesh for new, mesh in zip(found, evaluator.meshes, strict=True)])
 
 
 def _refine(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:

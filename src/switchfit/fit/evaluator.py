@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.discretization.arguments import Arguments, build_arguments
-from switchfit.discretization.mesh import Mesh, pad_to_common_lengths
+from switchfit.discretization.mesh import Mesh, Stiffness, get_structure_on, pad_to_common_lengths
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import engine_of, summarize
 from switchfit.engine.jax.engine import JaxEngine
@@ -22,6 +22,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Structure
 from switchfit.problem.validation import as_choice, as_instance
 from switchfit.runtime.cache import use_compilation_cache
 
@@ -38,6 +39,8 @@ class Evaluation:
     cost : J
     gradient : (d,), J's derivative in theta
     hessian : (d, d)
+    stiffness : tuple of Stiffness
+        From `evaluate`: of each experiment in which ``solver="auto"`` chose implicit steps, why; empty if in none.
 
     See Also
     --------
@@ -57,6 +60,7 @@ class Evaluation:
     cost: float
     gradient: FloatArray
     hessian: FloatArray
+    stiffness: tuple[Stiffness, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +111,7 @@ class Evaluator:
         indices = range(len(problem.experiments))
         at = problem.initial_theta if theta is None else theta
         given = list(meshes) if meshes is not None else [refine_mesh(problem, e, at) for e in indices]
+        self.meshes = given
         self.replace_arguments(
             [build_arguments(problem, e, m) for e, m in enumerate(pad_to_common_lengths(problem, given))]
         )
@@ -208,11 +213,28 @@ class Evaluator:
     def _slots(self) -> list[NDArray[np.intp]]:
         return [self.layout.slots(e, mine) for e, (_, mine) in enumerate(self.problem.own_places)]
 
+    @cached_property
+    def structures(self) -> tuple[Structure, ...]:
+        """The structure of each experiment, with the method of the steps on its mesh."""
+        return tuple(get_structure_on(self.problem, e, mesh) for e, mesh in enumerate(self.meshes))
+
+    @property
+    def stiffness(self) -> tuple[Stiffness, ...]:
+        """Why implicit steps are taken in each experiment in which ``solver="auto"`` has chosen them."""
+        return tuple(mesh.stiffness for mesh in self.meshes if mesh.stiffness is not None)
+
+    @property
+    def takes_implicit_steps(self) -> bool:
+        """Whether an experiment is integrated by implicit steps."""
+        return any(structure.solver == "stiff" for structure in self.structures)
+
     def replace_arguments(self, arguments: Sequence[Arguments]) -> None:
         """Replace data and constants; the meshes are those of the new nodes."""
         self.__dict__.pop("halved", None)
         self.arguments = list(arguments)
-        self.meshes = [Mesh.from_times(np.asarray(own.nodes)) for own in arguments]
+        before = zip(self.meshes, arguments, strict=True)
+        self.meshes = [Mesh.from_times(np.asarray(own.nodes), mesh.stiffness) for mesh, own in before]
+        self.__dict__.pop("structures", None)
         given = enumerate(zip(self.arguments, self.meshes, strict=True))
         self.engines = [engine_of(self.problem, e, own, mesh) for e, (own, mesh) in given]
 
@@ -237,7 +259,7 @@ class Evaluator:
         vectors = [self.problem.vectors(theta, e) for e in range(len(self.engines))]
         if method == "auto":
             return [engine.derivatives(*at, side, matrix) for engine, at in zip(self.engines, vectors, strict=True)]
-        given = list(zip(self.problem.structures, self.arguments, self.meshes, vectors, strict=True))
+        given = list(zip(self.structures, self.arguments, self.meshes, vectors, strict=True))
         if method == "adjoint":
             if not is_covered_by_paper(self.problem):
                 raise ValueError("the paper's equations have no TransitionCost: choose another method.")
@@ -317,4 +339,6 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     method = as_choice(method, "method", METHODS)
-    return evaluator_of(problem)(problem.check_theta(theta), method=method)
+    evaluator = evaluator_of(problem)
+    found = evaluator(problem.check_theta(theta), method=method)
+    return replace(found, stiffness=evaluator.stiffness) if evaluator.stiffness else found

@@ -18,7 +18,8 @@ MOST_DRAWN = 2**30
 
 FACTOR = 10.0
 """Range of an unknown without bounds: a positive guess is divided and multiplied by this factor, on a logarithmic
-scale; any other guess varies by plus or minus so many times its size."""
+scale; any other guess varies by plus or minus so many times its size. Times on a logarithmic scale are drawn on that
+scale, from the time since t0 of the first guess divided by this factor to the end of the horizon."""
 
 
 def draw_starts(problem: Problem, count: int, seed: int) -> FloatArray:
@@ -43,6 +44,11 @@ def draw_starts(problem: Problem, count: int, seed: int) -> FloatArray:
             # Sorted uniform numbers are uniform over all ordered times; minimum durations are added to their gaps.
             room = end - begin - (len(group) + 1) * problem.min_duration
             ordered = np.sort(cube[:, group], axis=1)
+            if unknowns.log[group].all():
+                first = unknowns.initial[group[0]] - experiment.t0
+                low, high = max(begin - experiment.t0, first / FACTOR), end - experiment.t0
+                points[:, group] = experiment.t0 + low * (high / low) ** ordered
+                continue
             points[:, group] = begin + max(room, 0.0) * ordered + problem.min_duration * np.arange(1, len(group) + 1)
     points[0] = unknowns.initial
     return np.array([find_nearest_feasible(problem, point) for point in points])

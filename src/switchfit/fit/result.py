@@ -240,6 +240,17 @@ class Fit:
         return tuple(self.theta_names.index(name) if own else -1 for name, own in zip(names, free, strict=True))
 
     @property
+    def log_origins(self) -> FloatArray:
+        """From where the logarithms of `log_scaled` unknowns count, (d,): t0 for a transition time, otherwise 0."""
+        origins = np.zeros(len(self.theta_names))
+        if not self.is_time[np.isin(self.theta_names, self.log_scaled)].any():
+            return origins
+        for e, trajectory in enumerate(self.trajectories):
+            places = np.append(self.transition_places[e], self.final_places[e])
+            origins[places[places >= 0]] = trajectory.times[0]
+        return origins
+
+    @property
     def is_time(self) -> NDArray[np.bool_]:
         """Which of the unknowns are transition times or a free tf: (d,)."""
         found = np.zeros(len(self.theta_names), dtype=bool)
@@ -420,7 +431,7 @@ class Fit:
         """
         half = self.quantile(level) * np.sqrt(np.diag(self.covariance_from(hessian)))
         log = np.isin(self.theta_names, self.log_scaled)
-        low, high = interval(self.theta, np.where(half > 0, half, np.nan), log).T
+        low, high = interval(self.theta, np.where(half > 0, half, np.nan), log, self.log_origins).T
         return np.stack([np.maximum(low, self.lower), np.minimum(high, self.upper)], axis=1)
 
 
@@ -474,11 +485,12 @@ def disagreement(fit: Fit) -> Disagreement | None:
     return Disagreement(factor, fit.theta_names[k], float(errors[0][k]), float(errors[1][k]))
 
 
-def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_]) -> FloatArray:
-    """Return ``theta -+ half``, or if `log` ``theta exp(-+ half / theta)``: (..., 2)."""
-    size = np.where(log, theta, 1.0)
-    factor = np.exp(np.where(log, half / size, 0.0))
-    return np.stack([np.where(log, theta / factor, theta - half), np.where(log, theta * factor, theta + half)], axis=-1)
+def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_], origin: FloatArray) -> FloatArray:
+    """Return ``theta -+ half``, or if `log` ``o + (theta - o) exp(-+ half / (theta - o))``, o the origin: (..., 2)."""
+    away = theta - origin
+    factor = np.exp(np.where(log, half / np.where(log, away, 1.0), 0.0))
+    low, high = (np.where(log, origin + end, theta) for end in (away / factor, away * factor))
+    return np.stack([np.where(log, low, theta - half), np.where(log, high, theta + half)], axis=-1)
 
 
 UNDETERMINED = 1e-14

@@ -180,6 +180,9 @@ class TransitionTable(_Table):
     prior: PriorTable | None = Field(
         default=None, description="what is known of it: { mean, sd } or { median, log_sd }"
     )
+    scale: Literal["linear", "log"] = Field(
+        default="linear", description="'log': estimated as the logarithm of the time since t0"
+    )
 
 
 class StateTable(_Table):
@@ -302,7 +305,9 @@ class OptionsTable(_Table):
     min_duration: float | None = Field(
         default=None, ge=0, description="shortest time a mode may last, in the time_unit of the experiments"
     )
-    solver: Literal["explicit", "stiff"] | None = Field(default=None, description="integrator")
+    solver: Literal["auto", "explicit", "stiff"] | None = Field(
+        default=None, description="steps of the integrator; 'stiff' takes implicit ones, 'auto' where they are needed"
+    )
     rtol: float | None = Field(default=None, gt=0, description="relative tolerance of the integrator")
     atol: float | None = Field(default=None, gt=0, description="absolute tolerance of the integrator")
     strategy: Literal["local", "auto", "thorough"] | None = Field(

@@ -40,6 +40,8 @@ class Experiment:
     transition_times : sequence of float or Parameter, or None
         First guess of each transition, in the experiment's time unit, one fewer than modes, strictly increasing inside
         ``(t0, tf)``; an entry may be a `Parameter` with bounds, or fixed. Its unit, where given, must be `time_unit`.
+        With ``scale="log"``, which all free times of an experiment then have, a free tf among them, the optimiser works
+        in log(tau - t0): for times that may lie in other decades than their guess.
         None: `estimate` looks for them all over the horizon; the guess is evenly spaced.
     t0 : float, optional
         Start of the horizon, in the experiment's time unit. Left out, the first time of the data: the first sample of
@@ -116,8 +118,12 @@ class Experiment:
 
     def __post_init__(self) -> None:
         data = _check_data(self.data)
-        object.__setattr__(self, "taken_from_data", tuple(n for n in ("t0", "tf") if getattr(self, n) is None))
-        t0, tf = _choose_horizon(self.t0, self.tf, data, self.taken_from_data)
+        if self.t0 is None or self.tf is None:
+            missing = tuple(name for name in ("t0", "tf") if getattr(self, name) is None)
+            t0, tf = _choose_horizon(self.t0, self.tf, data, missing)
+            object.__setattr__(self, "taken_from_data", missing)
+        else:
+            t0, tf = as_number(self.t0, "t0"), _check_final_time(self.tf)
         last = float(tf.value) if isinstance(tf, Parameter) else tf
         if not (np.isfinite(t0) and np.isfinite(last) and t0 < last):
             raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got ({t0}, {last}).")
@@ -212,8 +218,13 @@ class Experiment:
                 )
 
     def _check_times(self) -> None:
-        if any(tau.scale != "linear" for tau in self.transition_times):
-            raise ValueError("transition_times are estimated as they are; leave out scale='log'.")
+        scales = {tau.scale for tau in self.times if not tau.fixed}
+        if len(scales) > 1:
+            raise ValueError(
+                "the transition times of an experiment that are estimated, and a free tf, must be on one scale, since "
+                f"their order is a constraint; got {shorten([tau.scale for tau in self.times])}. Give scale='log' to "
+                "all of them, or to none."
+            )
         if any(tau.shape != () for tau in self.transition_times):
             shapes = [tau.shape for tau in self.transition_times]
             raise ValueError(
@@ -309,8 +320,6 @@ def _choose_horizon(
     t0: Any, tf: Any, data: tuple[Data, ...], missing: tuple[str, ...]
 ) -> tuple[float, float | Parameter]:
     """Return t0 and tf as given and checked; those that are missing are taken from the span of the data."""
-    if not missing:
-        return as_number(t0, "t0"), _check_final_time(tf)
     left_out = f"{' and '.join(missing)} {'are' if len(missing) > 1 else 'is'} left out"
     spans = [item.seen_times[[0, -1]] for item in data if isinstance(item, Measurements)]
     spans += [item.signal.knots[[0, -1]] for item in data if isinstance(item, ReferenceSignal)]
@@ -340,8 +349,6 @@ def _check_final_time(given: Any) -> float | Parameter:
         raise ValueError(f"tf must be a single number or a Parameter of one; got the shape {given.shape}.")
     if given.fixed:
         return float(given.value)
-    if given.scale != "linear":
-        raise ValueError("tf is estimated as it is; leave out scale='log'.")
     if not np.isfinite(given.upper):
         raise ValueError(
             "A free tf needs a finite upper bound, such as sf.Parameter(2.0, upper=5.0): the latest time to which the "

@@ -340,7 +340,8 @@ def _format_log_scale(fit: Fit, i: int, errors: FloatArray) -> str:
         return ""
     low, high = fit.confidence_intervals()[i]
     if low < high and errors[i] > fit.standard_errors[i]:
-        ends = interval(fit.theta[i : i + 1], fit.quantile(0.95) * errors[i : i + 1], np.ones(1, dtype=bool))[0]
+        half, origin = fit.quantile(0.95) * errors[i : i + 1], fit.log_origins[i]
+        ends = interval(fit.theta[i : i + 1], half, np.ones(1, dtype=bool), origin)[0]
         low, high = np.clip(ends, fit.lower[i], fit.upper[i])
     return f"95 % in [{low:.4g}, {high:.4g}]" if low < high else ""
 
