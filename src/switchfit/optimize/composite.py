@@ -21,6 +21,7 @@ References
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -29,7 +30,7 @@ import numpy as np
 from scipy.linalg.lapack import dgeqp3, dorgqr, dtrtrs
 
 from switchfit.optimize.algebra import FloatArray
-from switchfit.optimize.dense import make_positive
+from switchfit.optimize.dense import make_positive, solve_in_bounds
 from switchfit.optimize.qp import solve_qp
 
 NORMAL_PART = 0.95
@@ -208,4 +209,12 @@ def _find_normal_step(
     if radius < np.inf:
         inside = np.vstack([normals, identity, -identity])
         left = np.concatenate([offsets, np.full(2 * d, -radius)])
-    return solve_qp(A.T @ equalities.values, matrix, inside, np.minimum(left, 0.0)).step
+    left = np.minimum(left, 0.0)
+    slope = A.T @ equalities.values
+    found = None
+    if radius < np.inf:
+        with suppress(np.linalg.LinAlgError):
+            found = solve_in_bounds(slope, matrix, shortest, inside, left)
+    if found is not None:
+        return found[0]
+    return solve_qp(slope, matrix, inside, left).step

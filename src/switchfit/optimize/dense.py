@@ -198,7 +198,7 @@ def _minimize(
         return ModelStep(step, convex @ step, None, convex is hessian)
     d = gradient.size
     if box is not None:
-        inside = _solve_in_bounds(gradient, convex, step, normals, offsets)
+        inside = solve_in_bounds(gradient, convex, step, normals, offsets)
         if inside is not None:
             return ModelStep(inside[0], convex @ inside[0], inside[1], convex is hessian)
     step, multipliers = solve_whitened(gradient, convex, factor, normals, offsets)
@@ -206,7 +206,7 @@ def _minimize(
     return ModelStep(step, convex @ step, multipliers, convex is hessian)
 
 
-def _solve_in_bounds(
+def solve_in_bounds(
     gradient: FloatArray, convex: FloatArray, newton: FloatArray, normals: FloatArray, offsets: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
     """Return the step (d,) and the multipliers (m + 2 d,) of a programme in which nothing but bounds is active.
