@@ -6,7 +6,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from switchfit.optimize import LinearConstraints, kkt, qp, solve_qp
-from switchfit.optimize.dense import Dense, solve_in_bounds, convexify, split_space
+from switchfit.optimize.dense import Dense, convexify, solve_in_bounds, split_space
 from switchfit.optimize.kkt import kkt_residual
 from switchfit.optimize.matrix import diagonal_scaling
 
