@@ -1,8 +1,8 @@
 """The command line: ``switchfit fit | check | simulate | paper``.
 
 Exit codes: 0 converged and the verdict is good or doubtful, 1 not converged or bad (what was found is still written),
-2 a problem with what was given, 3 an error of switchfit itself, 130 interrupted by Ctrl-C. Only typer is imported here; the numerical parts load when a
-command needs them, so that ``--help`` is quick.
+2 a problem with what was given, 3 an error of switchfit itself, 130 interrupted by Ctrl-C. Only typer is imported here;
+the numerical parts load when a command needs them, so that ``--help`` is quick.
 """
 
 from __future__ import annotations
