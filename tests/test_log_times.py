@@ -122,10 +122,19 @@ def test_all_that_is_returned_is_that_of_the_times_themselves():
 
 def test_a_fit_that_ends_at_a_sample_ends_there_to_the_bit():
     """Rounding of the logarithm would put it beside the sample, where the one-sided derivatives are others."""
-    linear, log = (sf.estimate(ramp(4, scale), strategy="local") for scale in ("linear", "log"))
+    hours = np.linspace(0.1, 2.0, 20)
+    scales = (1e3 * (1 + 1e-4 * k) for k in range(100))
+    times = next(scale * hours for scale in scales if np.exp(np.log(scale * hours[11])) != scale * hours[11])
+    values = 3 * np.minimum(hours, 1.2) + 0.05 * np.random.default_rng(4).normal(size=20)
+    data = sf.Measurements(times, values, sigma=0.05)
+
+    def fit_on(scale):
+        run = sf.Experiment(data, ("up", "rest"), (sf.Parameter(times[9], scale=scale),), 0.0)
+        return sf.estimate(sf.Problem(RAMP, run, {"v": sf.Parameter(0.002, scale="log")}), strategy="local")
+
+    linear, log = fit_on("linear"), fit_on("log")
     assert log.status is sf.Status.CONVERGED_AT_KINK
-    assert log.theta[0] == linear.theta[0]
-    assert log.theta[0] in log.problem.experiments[0].data[0].times
+    assert log.theta[0] == linear.theta[0] == times[11]
     (kink,), (expected,) = log.kinks, linear.kinks
     assert kink.value == expected.value
     assert (kink.left, kink.right) == pytest.approx((expected.left, expected.right), rel=1e-6)
