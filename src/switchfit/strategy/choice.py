@@ -121,6 +121,12 @@ def estimate(
     TypeError
         If an argument is of the wrong type.
 
+    Notes
+    -----
+    On a terminal, a line on stderr says from a second on which strategy is under way, the lowest J, how far it is and
+    for how long. Many starts that last are fitted by other processes as well, one a core, where the model runs in
+    machine code and cloudpickle is installed; what is found does not depend on them.
+
     See Also
     --------
     estimate_many, multistart : many fits.
@@ -360,7 +366,8 @@ class Search:
             if any(structure.guarded for structure in problem.structures):
                 found.append(("transitions free of their guards", self._free_transitions))
             return [*found, (STARTS, self._try_starts)]
-        if best is not None and best.status is Status.MAX_ITERATIONS and not can_grow(problem):
+        unfinished = best is not None and best.status is Status.MAX_ITERATIONS
+        if unfinished and (has_runs(problem) or not can_grow(problem)):
             found.append(("more iterations", lambda theta: fit_briefly(problem, theta, MORE_ITERATIONS)))
         if has_runs(problem) and (doubted or self.strategy == "thorough"):
             found.append(("each run alone", self._fit_runs_alone))
