@@ -16,7 +16,8 @@ import sys
 import threading
 import time
 from collections.abc import Generator
-from typing import IO, Any
+from contextlib import suppress
+from typing import IO, Any, cast
 
 import numpy as np
 
@@ -163,9 +164,7 @@ class _Worker:
         self._thread.start()
 
     def _feed(self, blob: bytes) -> None:
-        sent, received = self._process.stdin, self._process.stdout
-        assert sent is not None
-        assert received is not None
+        sent, received = (cast("IO[bytes]", pipe) for pipe in (self._process.stdin, self._process.stdout))
         taken: int | None = None
         try:
             pickle.dump(blob, sent)
@@ -190,15 +189,8 @@ class _Worker:
         self._process.wait()
         self._thread.join()
         for pipe in (self._process.stdin, self._process.stdout):
-            if pipe is not None:
-                _close(pipe)
-
-
-def _close(pipe: IO[bytes]) -> None:
-    try:
-        pipe.close()
-    except OSError:  # what was not sent any more
-        return
+            with suppress(OSError):  # what was not sent any more
+                cast("IO[bytes]", pipe).close()
 
 
 def serve() -> None:
