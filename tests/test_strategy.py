@@ -12,7 +12,7 @@ import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.random_starts import draw_starts
 from switchfit.optimize import Status
-from switchfit.strategy.choice import without_guards
+from switchfit.strategy.choice import Search, without_guards
 from switchfit.strategy.constrained import meet_constraints
 from switchfit.strategy.horizon import can_grow, find_shared, grow_horizon
 from switchfit.strategy.quick import fit_briefly
@@ -107,6 +107,12 @@ def test_a_fit_that_has_not_converged_on_coarse_meshes_is_repeated_on_new_ones(m
     found = sf.estimate(thermostat(FAR))
     assert [step.strategy for step in found.steps] == ["local", "new meshes"]
     assert found.cost == pytest.approx(right.cost, rel=1e-9)
+
+
+def test_a_cost_whose_constraints_are_not_met_is_not_the_lowest(right):
+    violated = replace(right, violated=(("terminal constraint 1", 0.3),))
+    assert Search(thermostat(FAR), violated, right.theta, "auto", {}, 0.0, np.inf).steps[0].cost == np.inf
+    assert Search(thermostat(FAR), right, right.theta, "auto", {}, 0.0, np.inf).steps[0].cost == right.cost
 
 
 def test_transition_times_need_not_be_given(right):
