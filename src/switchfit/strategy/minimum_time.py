@@ -45,7 +45,10 @@ def is_minimum_time(problem: Problem, fit: Estimate) -> bool:
 
 
 def try_shorter_horizons(problem: Problem, fit: Estimate, stop: Callable[[], bool]) -> Starts:
-    """Return the lowest end of starts over shorter and shorter horizons, beginning with that of a fit."""
+    """Return the lowest end of starts over shorter and shorter horizons, beginning with that of a fit.
+
+    How many starts were tried and agree is that of the last horizon, over which none was better.
+    """
     end = End(fit.theta, np.inf if fit.violated else fit.cost, 0)
     evaluations, tried, seed = 0, 0, 0
     while True:
@@ -55,7 +58,7 @@ def try_shorter_horizons(problem: Problem, fit: Estimate, stop: Callable[[], boo
         lower = not found.end.failed and (end.failed or found.end.cost < end.cost * (1 - SAME_COST))
         end = found.end if lower else end
         if stop() or (not lower and not end.failed) or (end.failed and tried >= MOST):
-            return found._replace(end=end._replace(evaluations=evaluations), tried=tried)
+            return found._replace(end=end._replace(evaluations=evaluations))
 
 
 def shorten_horizon(problem: Problem, theta: FloatArray) -> Problem:
