@@ -152,7 +152,12 @@ IN_EQUALITIES: dict[str, tuple[str, Replacements]] = {
     ),
     "a violation that does not fall ends it": (
         MERIT,
-        [("return state.point.violation > MET and state.stagnant >= STAGNANT", "return False")],
+        [
+            (
+                "return violation > MET and state.stagnant >= STAGNANT and direction.left > FALL * violation",
+                "return False",
+            )
+        ],
     ),
     "the constraints in the Hessian of the Lagrangian": (POINT, [("self.multipliers / units)", "0.0 * units)")]),
     "bounds of the normal step": (

@@ -234,8 +234,8 @@ def test_multistart_draws_tf_between_its_bounds_and_monte_carlo_varies_it():
     assert drawn.min() >= 2.0
     assert drawn.max() <= 9.0
     assert np.ptp(drawn) > 4.0
-    found = starts.theta[starts.success]
-    assert len(found) >= 12
+    assert starts.success.all()  # some with constraints that are nearly met all the way, and never better than at first
+    found = starts.theta
     np.testing.assert_allclose(found, np.broadcast_to(found[0], found.shape), rtol=1e-6)
     fits = sf.monte_carlo(problem, runs=12, seed=3, theta=[np.log(1 / LEVEL) / RATE, RATE])
     assert fits.success.all()

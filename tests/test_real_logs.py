@@ -373,7 +373,8 @@ def test_nothing_compiles_anew_as_delay_and_noise_move(case):
 
 def test_variables_there_and_back():
     """Against JAX: gradient and Hessian in z of a cost that is given in theta."""
-    variables = Variables(np.array([1.0, 2.0**-20, 1.0]), np.array([False, False, True]))
+    origin = np.array([0.0, 0.0, 15.0])
+    variables = Variables(np.array([1.0, 2.0**-20, 1.0]), np.array([False, False, True]), origin)
     with use_float64():
         theta = jnp.array([0.3, 3e-6, 40.0])
 

@@ -221,7 +221,7 @@ def test_the_choice_is_said(caplog):
     assert "implicit steps; mode 'm' is stiff" in describe_steps(problem)
     assert "explicit steps" in describe_steps(relaxing(1.0))
     by_jax = relaxing(engine="jax")
-    assert "engine='jax' asks for it; mode 'm' is stiff" in evaluator_of(by_jax).engine.reason
+    assert "engine='jax' is set; mode 'm' is stiff" in evaluator_of(by_jax).engine.reason
     with pytest.raises(ValueError, match="engine='native' asks for machine code, but mode 'm' is stiff"):
         sf.evaluate(relaxing(engine="native"))
 

@@ -36,6 +36,8 @@ SMALLEST_RADIUS = 1e-10
 SHRINK = 0.5
 #: Iterations in which the violation has to fall by a tenth: with 6 to 40 of them as many fits end right.
 STAGNANT = 10
+#: Part of the violation that a step has to leave, by the linearized constraints, for constraints to count as stuck.
+FALL = 0.9
 
 
 def search_merit(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
@@ -83,9 +85,13 @@ def raise_penalty(penalty: float, point: Point, direction: Direction) -> float:
     return penalty if penalty >= needed else RAISED * needed
 
 
-def is_stuck(state: State) -> bool:
-    """Return whether constraints are not met, and their violation does not fall any more."""
-    return state.point.violation > MET and state.stagnant >= STAGNANT
+def is_stuck(state: State, direction: Direction) -> bool:
+    """Return whether constraints are not met, their violation has stagnated, and the next step will hardly reduce it.
+
+    Along curved constraints the violation may stagnate while J falls; a step then still leads to where they are met.
+    """
+    violation = state.point.violation
+    return violation > MET and state.stagnant >= STAGNANT and direction.left > FALL * violation
 
 
 def correct(oracle: Oracle, trial: Trial, sample: Sample, scale: FloatArray, radius: float) -> Trial | None:
