@@ -24,7 +24,7 @@ class Variables(NamedTuple):
 
     size: Any
     log: Any
-    origin: Any
+    origin: Any = 0.0
 
     @classmethod
     def of(
