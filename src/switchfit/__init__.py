@@ -11,6 +11,8 @@ from switchfit.fit.guards import GuardedEvaluation, evaluate_on_guards
 from switchfit.fit.result import Step
 from switchfit.fit.termination import Kink, Termination
 from switchfit.fit.trajectory import Comparison, Trajectory, simulate
+from switchfit.io.logs.log import Log
+from switchfit.io.logs.reader import read_log
 from switchfit.optimize import Status
 from switchfit.problem.constraints import ActiveConstraint
 from switchfit.problem.data import (
@@ -63,6 +65,7 @@ __all__ = [
     "Input",
     "Issue",
     "Kink",
+    "Log",
     "LogNormal",
     "Measurements",
     "MonteCarlo",
@@ -94,6 +97,7 @@ __all__ = [
     "multistart",
     "predict",
     "profile",
+    "read_log",
     "simulate",
 ]
 

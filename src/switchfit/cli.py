@@ -154,6 +154,7 @@ def check(
         from switchfit.io.summary import describe
 
         _print(f"{describe(loaded.problem)}\n")
+        _print_issues(problem)
         derivatives = sf.check_derivatives(loaded.problem)
         _print(f"{derivatives}\n")
         _print(sf.identifiability(loaded.problem))
@@ -327,6 +328,15 @@ def _load(problem: Path) -> ProblemFile:
     return load_problem(problem)
 
 
+def _print_issues(problem: Path) -> None:
+    """Print what is odd about the logs of a problem file."""
+    from switchfit.io.problem_file import list_issues
+
+    issues = list_issues(problem)
+    if issues:
+        _print("\n".join(["Logs", *(f"  {issue}" for issue in issues), ""]))
+
+
 def _check_files(problem: Path) -> None:
     """Print what can be known of a problem without running a Python file."""
     from switchfit.io.problem_file import read_experiments
@@ -335,6 +345,7 @@ def _check_files(problem: Path) -> None:
     experiments = read_experiments(problem)
     if experiments:
         _print(f"{describe_experiments(experiments)}\n")
+        _print_issues(problem)
     _print("No Python file was run: modes, states, functions and names of parameters are not checked.")
 
 

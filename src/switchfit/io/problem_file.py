@@ -18,10 +18,13 @@ from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import pydantic
+from numpy.typing import NDArray
 from pydantic import Field
 from pydantic_core import PydanticCustomError
 
-from switchfit.io.csv import read_columns
+from switchfit.io.logs.log import Log
+from switchfit.io.logs.reader import read_source
+from switchfit.io.logs.units import SECONDS, normalize_time_unit
 from switchfit.io.python_file import call, describe_error, find_object, find_user_place, load_object
 from switchfit.models import BUILT_IN
 from switchfit.problem.data import FloatArray, Input, Measurements, ReferenceSignal
@@ -31,6 +34,7 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import is_device
+from switchfit.runtime.issue import Issue
 
 OPTIONS = {"strategy", "time_budget", "hessian", "tolerance", "max_iterations"}
 """Options of `estimate`."""
@@ -110,6 +114,29 @@ def read_experiments(path: str | Path) -> tuple[Experiment, ...]:
     return _build_experiments(path, contents, None)
 
 
+def list_issues(path: str | Path) -> tuple[Issue, ...]:
+    """Return what is odd about the logs that a problem file names, each issue once.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Raises
+    ------
+    InputError
+        As of `load_problem`.
+    """
+    path = Path(path)
+    contents = _validate(path, _parse(path))
+    found: dict[str, Issue] = {}
+    for experiment in contents.experiments:
+        tables: list[DataTable | InputTable] = [*experiment.data]
+        for table in tables if experiment.inputs is None else [*tables, experiment.inputs]:
+            names = table.columns.values() if isinstance(table.columns, dict) else table.columns
+            found |= {str(issue): issue for issue in _open_log(path.parent, table, list(names)).issues}
+    return tuple(found.values())
+
+
 # --- the format -------------------------------------------------------------------------------------------------------
 
 
@@ -142,6 +169,16 @@ def _name_as_table(given: Any) -> Any:
 def _table_as_list(given: Any) -> Any:
     """Return a list of tables, of one table a list of one."""
     return [given] if isinstance(given, dict) else given
+
+
+def _first_as_none(given: Any) -> Any:
+    """Return None for ``"first"``, the time of the first row."""
+    return None if given == "first" else given
+
+
+def _repair_as_list(given: Any) -> Any:
+    """Return a list of one for a single repair."""
+    return [given] if isinstance(given, str) else given
 
 
 class PriorTable(_Table):
@@ -197,15 +234,24 @@ class StateTable(_Table):
 
 
 class LogTable(_Table):
-    """Columns of a CSV file over time."""
+    """Channels of a log over time."""
 
-    file: str = Field(description="CSV file, relative to the problem file")
-    time: str = Field(description="name of the column with the time")
+    file: str = Field(description="the log, relative to the problem file")
+    time: str | None = Field(default=None, description="name of the column with the time; left out, it is found")
     window: Annotated[list[float], Field(min_length=2, max_length=2)] | None = Field(
         default=None, description="[from, to]: only rows with the time column in between are used"
     )
-    time_offset: float = Field(default=0.0, description="subtracted from the time column")
-    time_scale: float = Field(default=1.0, gt=0, description="then multiplied: 1e-3 turns ms into s")
+    time_offset: Annotated[float | None, pydantic.BeforeValidator(_first_as_none)] = Field(
+        default=0.0, description="subtracted from the time column; 'first': the time of the first row"
+    )
+    time_scale: float | None = Field(
+        default=None, gt=0, description="then multiplied: 1e-3 turns ms into s; left out, 1"
+    )
+    repair: Annotated[list[str], pydantic.BeforeValidator(_repair_as_list)] = Field(
+        default_factory=list,
+        description="what may be changed: 'sort', 'drop-duplicates', 'drop-missing-times', 'drop-broken-lines', "
+        "'unwrap:CHANNEL'",
+    )
 
 
 class DataTable(LogTable):
@@ -559,7 +605,7 @@ def _build_experiment(
 ) -> Experiment:
     places = [f"{where}.data[{k}]" for k in range(1, len(table.data) + 1)]
     data = [
-        _build_at(place, _build_data, folder, item, system, place, parameters)
+        _build_at(place, _build_data, folder, item, system, place, parameters, table.time_unit)
         for place, item in zip(places, table.data, strict=True)
     ]
     times = table.transition_times
@@ -570,7 +616,9 @@ def _build_experiment(
         transition_times=None if times is None else tuple(map(_build_parameter, times)),  # type: ignore[arg-type]
         t0=min(span[0] for span in spans) if table.t0 is None else table.t0,
         tf=_build_final_time(table, spans),
-        inputs=None if table.inputs is None else _build_at(f"{where}.inputs", _build_input, folder, table.inputs),
+        inputs=None
+        if table.inputs is None
+        else _build_at(f"{where}.inputs", _build_input, folder, table.inputs, table.time_unit),
         initial_state=_build_initial_state(table),
         parameter_map=table.parameter_map,
         name=table.name,
@@ -593,7 +641,12 @@ def _build_initial_state(table: ExperimentTable) -> list[Parameter] | list[float
 
 
 def _build_data(
-    folder: Path, table: DataTable, system: HybridSystem | None, where: str, parameters: frozenset[str]
+    folder: Path,
+    table: DataTable,
+    system: HybridSystem | None,
+    where: str,
+    parameters: frozenset[str],
+    time_unit: str,
 ) -> Measurements | ReferenceSignal:
     observe = _build_observe(folder, table, system, where)
     names = tuple(table.observe) if isinstance(table.observe, list) else tuple(table.columns)
@@ -603,15 +656,15 @@ def _build_data(
         for key, default in (("loss", "linear"), ("delay", 0.0)):
             if getattr(table, key) != default:
                 raise ValueError(f"{key} belongs to kind = 'measurements', not to a reference.")
-        times, values = _read_log(folder, table, table.columns)
+        times, values, units = _read_log(folder, table, table.columns, time_unit, "ReferenceSignal")
         return ReferenceSignal.from_samples(
-            times, values, observe=observe, lowpass_hz=table.lowpass_hz, weights=table.weights, names=names
+            times, values, observe=observe, lowpass_hz=table.lowpass_hz, weights=table.weights, names=names, units=units
         )
     for key in ("lowpass_hz", "weights"):
         if getattr(table, key) is not None:
             raise ValueError(f"{key} belongs to kind = 'reference'; measurements have sigma.")
     sigma_columns = _find_sigma_columns(table, parameters)
-    times, values = _read_log(folder, table, [*table.columns, *sigma_columns])
+    times, values, units = _read_log(folder, table, [*table.columns, *sigma_columns], time_unit, "Measurements")
     q = len(table.columns)
     sigma = values[:, q:] if sigma_columns else table.sigma
     return Measurements(
@@ -623,6 +676,7 @@ def _build_data(
         loss=table.loss,
         loss_scale=table.loss_scale,
         delay=table.delay,
+        units=units[:q],
     )
 
 
@@ -640,31 +694,72 @@ def _find_sigma_columns(table: DataTable, parameters: frozenset[str]) -> list[st
     return named
 
 
-def _build_input(folder: Path, table: InputTable) -> Input:
+def _build_input(folder: Path, table: InputTable, time_unit: str) -> Input:
     if isinstance(table.columns, dict):
-        times, values = _read_log(folder, table, list(table.columns.values()))
-        return Input(times, dict(zip(table.columns, values.T, strict=True)), kind=table.kind)
-    times, values = _read_log(folder, table, table.columns)
-    return Input(times, values[:, 0] if len(table.columns) == 1 else values, kind=table.kind)
+        times, values, units = _read_log(folder, table, list(table.columns.values()), time_unit, "Input")
+        named = dict(zip(table.columns, values.T, strict=True))
+        ordered = tuple(unit for _, unit in sorted(zip(table.columns, units, strict=True)))
+        return Input(times, named, kind=table.kind, units=ordered)
+    times, values, units = _read_log(folder, table, table.columns, time_unit, "Input")
+    return Input(times, values[:, 0] if len(table.columns) == 1 else values, kind=table.kind, units=units)
 
 
-def _read_log(folder: Path, table: LogTable, columns: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-    """Return times (K,) and the values of some columns (K, q) in the rows inside the window."""
-    path = folder / table.file
-    rows = read_columns(path, [table.time, *columns])
-    missing = np.isnan(rows[:, 0])
-    if missing.any():
-        raise InputError(f"{path}, column {table.time!r}: the time of sample {missing.argmax() + 1} is missing.")
+def _read_log(
+    folder: Path, table: LogTable, columns: Sequence[str], time_unit: str, what: str
+) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
+    """Return times (K,) and the values of some columns (K, q) in the rows inside the window, and their units.
+
+    `what` is made from them, for messages.
+    """
+    log = _open_log(folder, table, columns)
+    times, inside = log.times, np.ones(len(log), dtype=bool)
     if table.window is not None:
         first, last = table.window
-        inside = (rows[:, 0] >= first) & (rows[:, 0] <= last)
+        inside = (times >= first) & (times <= last)
         if not inside.any():
             raise InputError(
-                f"{path}: no time in column {table.time!r} lies in the window [{first}, {last}]; they reach from "
-                f"{rows[:, 0].min()} to {rows[:, 0].max()}."
+                f"{log.source}: no time in column {log.time_name!r} lies in the window [{first}, {last}]; they reach "
+                f"from {times.min()} to {times.max()}."
             )
-        rows = rows[inside]
-    return (rows[:, 0] - table.time_offset) * table.time_scale, rows[:, 1:]
+    times = times[inside]
+    _check_order(log, times, log.rows[inside], what)
+    offset = times[0] if table.time_offset is None else table.time_offset
+    values = np.stack([log[name][inside] for name in columns], axis=1)
+    units = tuple(log.units[log.find_channel(name)] for name in columns)
+    return (times - offset) * _find_time_scale(log, table, time_unit), values, units
+
+
+def _open_log(folder: Path, table: LogTable, columns: Sequence[str] | None) -> Log:
+    wanted = None if columns is None else list(dict.fromkeys(columns))
+    return read_source(
+        folder / table.file, columns=wanted, time=table.time, time_unit=None, repair=table.repair, keep_epoch=True
+    )
+
+
+def _check_order(log: Log, times: FloatArray, rows: NDArray[np.intp], what: str) -> None:
+    """Raise for times that do not increase, with the line; a reference may have a time twice."""
+    steps = np.diff(times)
+    wrong = (steps < 0) if what == "ReferenceSignal" else (steps <= 0)
+    if wrong.any():
+        k = int(wrong.argmax()) + 1
+        repair = "sort" if steps[k - 1] < 0 else "drop-duplicates"
+        raise ValueError(
+            f"{what} times must increase strictly; in {log.source}, {log.place} {rows[k]}, {times[k]} follows "
+            f"{times[k - 1]}. repair = [{repair!r}] mends that, if the log is otherwise right."
+        )
+
+
+def _find_time_scale(log: Log, table: LogTable, time_unit: str) -> float:
+    """Return what times are multiplied by; raise if the log states another unit than the experiment."""
+    unit = normalize_time_unit(time_unit)
+    if table.time_scale is not None or log.time_unit in ("", unit) or unit not in SECONDS:
+        return 1.0 if table.time_scale is None else table.time_scale
+    scale = SECONDS[log.time_unit] / SECONDS[unit]
+    raise InputError(
+        f"{log.source}: the times are in {log.time_unit}, but time_unit of the experiment is {time_unit!r}. Set "
+        f"time_scale = {scale:.12g} to convert them, or time_unit = {log.time_unit!r}; time_scale = 1 leaves them as "
+        "they are."
+    )
 
 
 def _build_observe(

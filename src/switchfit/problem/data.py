@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.problem.losses import LOSSES
+from switchfit.problem.tables import find_names, find_units
 from switchfit.problem.validation import (
     as_array,
     as_callable,
@@ -24,6 +25,8 @@ from switchfit.problem.validation import (
     as_names,
     as_number,
     as_positive,
+    as_sequence,
+    as_text,
     shorten,
 )
 
@@ -89,9 +92,13 @@ class Input:
         start by t0, its last value is kept.
     values : (K,) or (K, q) array_like, or mapping of str to (K,) array_like
         The modes get a scalar u, or a ``(q,)`` array. With samples by name they get a dict of scalars, ``u["left"]``;
-        so they do with a DataFrame whose columns all have names (strings).
+        so they do with a table whose columns all have names (strings): a DataFrame of pandas or polars, a Dataset of
+        xarray, a `Log`.
     kind : {"hold", "linear", "cubic"}
         Between samples: the last value is held, straight lines, or a cubic spline.
+    units : sequence of str, optional
+        One for each entry of u, in the order of `names` where they have names. Left out, those of the table, from its
+        ``attrs["units"]``.
 
     Raises
     ------
@@ -123,15 +130,18 @@ class Input:
     times: Any
     values: Any
     kind: Literal["hold", "linear", "cubic"] = "hold"
+    units: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         kind = as_choice(self.kind, "Input kind", ("hold", "linear", "cubic"))
         at_least = {"hold": 1, "linear": 2, "cubic": 4}[kind]
+        units = self.units
         values: Any
         named = as_named_columns(self.values, "Input values", "(K,) samples")
         if named is None:
             times, values = _check_samples(self.times, self.values, "Input", at_least=at_least)
             _require_finite(values, "Input values")
+            units = find_units(self.values) if units is None else units
         else:
             # Sorted: experiments whose inputs are named in different orders share one program.
             values = {}
@@ -139,9 +149,13 @@ class Input:
                 what = f"Input {shorten(name)}"
                 times, values[name] = _check_samples(self.times, named[name], what, at_least=at_least, columns=False)
                 _require_finite(values[name], f"{what} values")
+            found = find_units(self.values)
+            if units is None and found is not None:
+                units = tuple(unit for _, unit in sorted(zip(named, found, strict=True)))
         object.__setattr__(self, "kind", kind)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values)
+        object.__setattr__(self, "units", _check_units(units, int(np.prod(self.shape))))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -345,6 +359,8 @@ class ReferenceSignal:
         What the signal was made from.
     lowpass_hz : float, optional
         The cut-off with which it was made.
+    units : sequence of str, optional
+        One for each channel.
 
     See Also
     --------
@@ -367,6 +383,7 @@ class ReferenceSignal:
     names: tuple[str, ...] | None = None
     samples: tuple[FloatArray, FloatArray] | None = None
     lowpass_hz: float | None = None
+    units: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.signal, PiecewisePolynomial):
@@ -377,6 +394,7 @@ class ReferenceSignal:
         _check_observe(self.observe)
         object.__setattr__(self, "weights", _build_weight_matrix(self.weights, self.signal.channels))
         object.__setattr__(self, "names", _check_channel_names(self.names, self.signal.channels))
+        object.__setattr__(self, "units", _check_units(self.units, self.signal.channels))
 
     @classmethod
     def from_samples(
@@ -388,6 +406,7 @@ class ReferenceSignal:
         lowpass_hz: float | None = None,
         weights: ArrayLike | None = None,
         names: Sequence[str] | None = None,
+        units: Sequence[str] | None = None,
     ) -> ReferenceSignal:
         """Interpolate samples by cubic splines and, if asked, low-pass filter them without phase shift.
 
@@ -397,14 +416,15 @@ class ReferenceSignal:
             Increasing sample times in the experiment's time unit, four or more. A time given twice breaks the spline
             there, as at the transitions of a simulated trajectory; each part then needs four samples.
         values : (K,) or (K, q) array_like
-            NaN marks a missing value, as does the mask of a masked array; it is bridged by the interpolation.
+            NaN marks a missing value, as does the mask of a masked array; it is bridged by the interpolation. Tables
+            of pandas, polars and xarray, and a `Log`, bring their names and units.
         observe : callable ``h(t, x, p) -> (q,)``, optional
         lowpass_hz : float, optional
             Cut-off, in cycles per time unit of the experiment (Hz only where that is s), of a second-order Butterworth
             filter run forward and backward over the interpolated signal, so that no phase shift remains (the gain at
             the cut-off is then 1/2).
         weights : (q,) or (q, q) array_like, optional
-        names : sequence of str, optional
+        names, units : sequence of str, optional
 
         Raises
         ------
@@ -427,6 +447,7 @@ class ReferenceSignal:
         >>> reference.signal([1.0]).round(6)
         array([[0.841471]])
         """
+        names, units = _find_labels(values, names, units)
         times, values = _check_samples(times, values, "ReferenceSignal", at_least=4, breaks=True, missing=True)
         table = values.reshape(len(times), -1)
         if np.isinf(table).any():
@@ -437,7 +458,7 @@ class ReferenceSignal:
         if lowpass_hz is not None:
             lowpass_hz = as_positive(lowpass_hz, "lowpass_hz")
             signal = _filter_lowpass(signal, lowpass_hz)
-        return cls(signal, observe, weights, names, (times, table), lowpass_hz)  # type: ignore[arg-type]  # made a tuple there
+        return cls(signal, observe, weights, names, (times, table), lowpass_hz, units)  # type: ignore[arg-type]  # made tuples there
 
 
 @dataclass(frozen=True, eq=False)
@@ -453,7 +474,8 @@ class Measurements:
     times : (K,) array_like
         Increasing sample times in the experiment's time unit; they may be irregular.
     values : (K,) or (K, q) array_like
-        Samples; NaN marks a missing one, as does the mask of a masked array.
+        Samples; NaN marks a missing one, as does the mask of a masked array. Tables of pandas, polars and xarray, and
+        a `Log`, bring their names and units.
     observe : callable ``h(t, x, p) -> (q,)``, optional
         Left out, the whole state is measured. At a transition with a reset map the sample is of the state
         just before the jump.
@@ -462,7 +484,7 @@ class Measurements:
         that it is, for all channels; in a list of q entries, for one of them. Left out it is
         unknown: all samples weigh 1 and the covariance is scaled by the residual variance.
     names : sequence of str, optional
-        One for each channel.
+        One for each channel; left out, those of the table.
     loss : {"linear", "soft_l1", "huber", "cauchy"}, optional
         As in `scipy.optimize.least_squares`; all but the first count outliers for less.
     loss_scale : float, optional
@@ -471,6 +493,8 @@ class Measurements:
         By how much the sensor is late, in the experiment's time unit: a sample stamped t_k is of the state at
         ``t_k - delay``, and `observe` is called with that time. A string names the parameter that it is. Give channels
         of different delays as several `Measurements`.
+    units : sequence of str, optional
+        One for each channel; left out, those of the table, from its ``attrs["units"]``.
 
     Raises
     ------
@@ -511,8 +535,10 @@ class Measurements:
     loss: Literal["linear", "soft_l1", "huber", "cauchy"] = "linear"
     loss_scale: float = 1.0
     delay: float | str = 0.0
+    units: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
+        names, units = _find_labels(self.values, self.names, self.units)
         times, values = _check_samples(self.times, self.values, "Measurements", at_least=1, missing=True)
         values = values.reshape(len(times), -1)
         if np.isinf(values).any():
@@ -523,7 +549,8 @@ class Measurements:
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "sigma", _check_sigma(self.sigma, values.shape))
-        object.__setattr__(self, "names", _check_channel_names(self.names, values.shape[1]))
+        object.__setattr__(self, "names", _check_channel_names(names, values.shape[1]))
+        object.__setattr__(self, "units", _check_units(units, values.shape[1]))
         self._check_loss()
         if isinstance(self.delay, str):
             delay: float | str = as_name(self.delay, "delay")
@@ -702,6 +729,23 @@ def _check_channel_names(names: Sequence[str] | None, channels: int) -> tuple[st
     checked = as_names(given, "names", "a sequence of strings, one for each channel")
     if len(checked) != channels:
         raise ValueError(f"names must have one entry for each of the {channels} channels; got {shorten(checked)}.")
+    return checked
+
+
+def _find_labels(
+    values: Any, names: Sequence[str] | None, units: Sequence[str] | None
+) -> tuple[Sequence[str] | None, Sequence[str] | None]:
+    """Return names and units, those of the table of values where they are left out."""
+    return find_names(values) if names is None else names, find_units(values) if units is None else units
+
+
+def _check_units(units: Sequence[str] | None, channels: int) -> tuple[str, ...] | None:
+    if units is None:
+        return None
+    given = as_sequence((units,) if isinstance(units, str) else units, "units", "a sequence of strings")
+    checked = tuple(as_text(unit, "each of units") for unit in given)
+    if len(checked) != channels:
+        raise ValueError(f"units must have one entry for each of the {channels} channels; got {shorten(checked)}.")
     return checked
 
 
