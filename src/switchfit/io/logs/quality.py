@@ -124,7 +124,7 @@ def _handle_angles(log: Log, unwrapped: Sequence[str], issues: list[Issue]) -> L
         known = np.flatnonzero(np.isfinite(samples))
         steps = np.abs(np.diff(samples[known]))
         jumps = steps > turn / 2
-        if jumps.any() and np.median(steps) < turn / 8:
+        if jumps.any() and np.median(steps) < turn / 4:
             first = int(known[int(jumps.argmax()) + 1])
             figures = {"count": jumps.sum(), "turn": turn, "repaired": name in unwrapped}
             issues.append(_make_issue("log: wrapped angle", log, first, name, **figures))
