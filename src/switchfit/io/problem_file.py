@@ -23,7 +23,7 @@ from pydantic import Field
 from pydantic_core import PydanticCustomError
 
 from switchfit.io.logs.log import Log
-from switchfit.io.logs.reader import read_source
+from switchfit.io.logs.reader import align_starts, read_source
 from switchfit.io.logs.units import SECONDS, normalize_time_unit
 from switchfit.io.python_file import call, describe_error, find_object, find_user_place, load_object
 from switchfit.models import BUILT_IN
@@ -129,11 +129,10 @@ def list_issues(path: str | Path) -> tuple[Issue, ...]:
     path = Path(path)
     contents = _validate(path, _parse(path))
     found: dict[str, Issue] = {}
-    for experiment in contents.experiments:
-        tables: list[DataTable | InputTable] = [*experiment.data]
-        for table in tables if experiment.inputs is None else [*tables, experiment.inputs]:
-            names = table.columns.values() if isinstance(table.columns, dict) else table.columns
-            found |= {str(issue): issue for issue in _open_log(path.parent, table, list(names)).issues}
+    for k, table in enumerate(contents.experiments, start=1):
+        known = frozenset(contents.parameters) | frozenset(table.parameter_map)
+        for log in _open_logs(path.parent, table, f"{path}: experiments[{k}]", known):
+            found |= {str(issue): issue for issue in log.issues}
     return tuple(found.values())
 
 
@@ -238,6 +237,15 @@ class LogTable(_Table):
 
     file: str = Field(description="the log, relative to the problem file")
     time: str | None = Field(default=None, description="name of the column with the time; left out, it is found")
+    topic: str | None = Field(default=None, description="topic of a ROS bag, or struct of a .mat file")
+    origin: Annotated[list[float], Field(min_length=2, max_length=3)] | None = Field(
+        default=None,
+        description="[latitude, longitude] or [latitude, longitude, altitude] of the origin of east, north and up; "
+        "left out, the first position",
+    )
+    range_error: float | None = Field(
+        default=None, gt=0, description="standard deviation of the distance to a satellite in m; HDOP times it is sigma"
+    )
     window: Annotated[list[float], Field(min_length=2, max_length=2)] | None = Field(
         default=None, description="[from, to]: only rows with the time column in between are used"
     )
@@ -604,9 +612,10 @@ def _build_experiment(
     folder: Path, table: ExperimentTable, system: HybridSystem | None, where: str, parameters: frozenset[str]
 ) -> Experiment:
     places = [f"{where}.data[{k}]" for k in range(1, len(table.data) + 1)]
+    logs = _open_logs(folder, table, where, parameters)
     data = [
-        _build_at(place, _build_data, folder, item, system, place, parameters, table.time_unit)
-        for place, item in zip(places, table.data, strict=True)
+        _build_at(place, _build_data, folder, item, log, system, place, parameters, table.time_unit)
+        for place, item, log in zip(places, table.data, logs, strict=False)  # that of the inputs comes after them
     ]
     times = table.transition_times
     spans = [item.seen_times if isinstance(item, Measurements) else item.signal.knots for item in data]
@@ -618,7 +627,7 @@ def _build_experiment(
         tf=_build_final_time(table, spans),
         inputs=None
         if table.inputs is None
-        else _build_at(f"{where}.inputs", _build_input, folder, table.inputs, table.time_unit),
+        else _build_at(f"{where}.inputs", _build_input, table.inputs, logs[-1], table.time_unit),
         initial_state=_build_initial_state(table),
         parameter_map=table.parameter_map,
         name=table.name,
@@ -643,6 +652,7 @@ def _build_initial_state(table: ExperimentTable) -> list[Parameter] | list[float
 def _build_data(
     folder: Path,
     table: DataTable,
+    log: Log,
     system: HybridSystem | None,
     where: str,
     parameters: frozenset[str],
@@ -656,7 +666,7 @@ def _build_data(
         for key, default in (("loss", "linear"), ("delay", 0.0)):
             if getattr(table, key) != default:
                 raise ValueError(f"{key} belongs to kind = 'measurements', not to a reference.")
-        times, values, units = _read_log(folder, table, table.columns, time_unit, "ReferenceSignal")
+        times, values, units = _cut_log(log, table, table.columns, time_unit, "ReferenceSignal")
         return ReferenceSignal.from_samples(
             times, values, observe=observe, lowpass_hz=table.lowpass_hz, weights=table.weights, names=names, units=units
         )
@@ -664,7 +674,7 @@ def _build_data(
         if getattr(table, key) is not None:
             raise ValueError(f"{key} belongs to kind = 'reference'; measurements have sigma.")
     sigma_columns = _find_sigma_columns(table, parameters)
-    times, values, units = _read_log(folder, table, [*table.columns, *sigma_columns], time_unit, "Measurements")
+    times, values, units = _cut_log(log, table, [*table.columns, *sigma_columns], time_unit, "Measurements")
     q = len(table.columns)
     sigma = values[:, q:] if sigma_columns else table.sigma
     return Measurements(
@@ -694,24 +704,23 @@ def _find_sigma_columns(table: DataTable, parameters: frozenset[str]) -> list[st
     return named
 
 
-def _build_input(folder: Path, table: InputTable, time_unit: str) -> Input:
+def _build_input(table: InputTable, log: Log, time_unit: str) -> Input:
     if isinstance(table.columns, dict):
-        times, values, units = _read_log(folder, table, list(table.columns.values()), time_unit, "Input")
+        times, values, units = _cut_log(log, table, list(table.columns.values()), time_unit, "Input")
         named = dict(zip(table.columns, values.T, strict=True))
         ordered = tuple(unit for _, unit in sorted(zip(table.columns, units, strict=True)))
         return Input(times, named, kind=table.kind, units=ordered)
-    times, values, units = _read_log(folder, table, table.columns, time_unit, "Input")
+    times, values, units = _cut_log(log, table, table.columns, time_unit, "Input")
     return Input(times, values[:, 0] if len(table.columns) == 1 else values, kind=table.kind, units=units)
 
 
-def _read_log(
-    folder: Path, table: LogTable, columns: Sequence[str], time_unit: str, what: str
+def _cut_log(
+    log: Log, table: LogTable, columns: Sequence[str], time_unit: str, what: str
 ) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
     """Return times (K,) and the values of some columns (K, q) in the rows inside the window, and their units.
 
     `what` is made from them, for messages.
     """
-    log = _open_log(folder, table, columns)
     times, inside = log.times, np.ones(len(log), dtype=bool)
     if table.window is not None:
         first, last = table.window
@@ -729,10 +738,31 @@ def _read_log(
     return (times - offset) * _find_time_scale(log, table, time_unit), values, units
 
 
-def _open_log(folder: Path, table: LogTable, columns: Sequence[str] | None) -> Log:
-    wanted = None if columns is None else list(dict.fromkeys(columns))
+def _open_logs(folder: Path, table: ExperimentTable, where: str, parameters: frozenset[str]) -> list[Log]:
+    """Return the logs of data and inputs, in this order; the times of those with dates begin together."""
+    logs = [
+        _build_at(
+            f"{where}.data[{k}]", _open_log, folder, item, [*item.columns, *_find_sigma_columns(item, parameters)]
+        )
+        for k, item in enumerate(table.data, start=1)
+    ]
+    if table.inputs is not None:
+        given = table.inputs.columns
+        names = list(given.values() if isinstance(given, dict) else given)
+        logs.append(_build_at(f"{where}.inputs", _open_log, folder, table.inputs, names))
+    return align_starts(logs)
+
+
+def _open_log(folder: Path, table: LogTable, columns: Sequence[str]) -> Log:
     return read_source(
-        folder / table.file, columns=wanted, time=table.time, time_unit=None, repair=table.repair, keep_epoch=True
+        folder / table.file,
+        columns=list(dict.fromkeys(columns)),
+        time=table.time,
+        topic=table.topic,
+        origin=table.origin,
+        range_error=table.range_error,
+        repair=table.repair,
+        keep_epoch=True,
     )
 
 

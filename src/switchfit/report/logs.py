@@ -78,6 +78,10 @@ LOG_ISSUES: dict[str, Callable[[Issue], str]] = {
     "log: repeated time": _describe_repeated_time,
     "log: missing times": lambda issue: f"{_locate(issue)}: without a time; left out.",
     "log: broken lines": lambda issue: f"{_locate(issue)}: broken; left out.",
+    "log: damaged sentences": lambda issue: f"{_locate(issue)}: no sentence, or with a wrong checksum; left out.",
+    "log: no stamps": lambda issue: (
+        f"{issue.subjects[0]}: messages of {issue.subjects[1]} have no stamps; the times are those of the recorder."
+    ),
     "log: gap": _describe_gap,
     "log: wrapped angle": _describe_wrapped_angle,
     "log: text": _describe_text,

@@ -70,6 +70,8 @@ class Log:
         What `rows` counts: "line", "row", "message" or "point".
     time_name : str
         The column with the times.
+    has_positions : bool
+        Whether latitude and longitude are those of a format of positions, to which east and north are added.
 
     See Also
     --------
@@ -101,6 +103,7 @@ class Log:
     rows: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     place: str = "line"
     time_name: str = "t"
+    has_positions: bool = False
 
     @property
     def channels(self) -> tuple[str, ...]:

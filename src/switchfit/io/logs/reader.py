@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from switchfit.io.logs.geodesy import FRAME, add_local_frame, check_origin
 from switchfit.io.logs.log import Log
 from switchfit.io.logs.quality import check_repairs, inspect_log
 from switchfit.io.logs.text import read_text
 from switchfit.io.logs.units import SECONDS
-from switchfit.problem.validation import as_choice, as_names, as_path
+from switchfit.problem.validation import as_choice, as_names, as_path, as_positive
+from switchfit.runtime.files import is_regular
 
 
 @dataclass(frozen=True)
@@ -20,12 +23,13 @@ class Options:
     Attributes
     ----------
     columns : sequence of str, optional
-    time : str, optional
+    time, topic : str, optional
     keep_epoch, drop_broken : bool
     """
 
     columns: Sequence[str] | None = None
     time: str | None = None
+    topic: str | None = None
     keep_epoch: bool = False
     drop_broken: bool = False
 
@@ -36,20 +40,31 @@ def read_log(
     columns: Sequence[str] | None = None,
     time: str | None = None,
     time_unit: str | None = None,
+    topic: str | None = None,
+    origin: Sequence[float] | None = None,
+    range_error: float | None = None,
     repair: str | Sequence[str] = (),
 ) -> Log:
-    """Read a log: a table of text in any dialect.
+    """Read a log: a table of text in any dialect, Parquet, MATLAB, GPX, NMEA 0183, a ROS bag or MCAP.
 
     Parameters
     ----------
     path : str or Path
-        The file, which gzip may have compressed.
+        The file, or the folder of a bag of ROS 2. Text may be compressed by gzip.
     columns : sequence of str, optional
         Names of the channels that are wanted; left out, all that are numbers.
     time : str, optional
         The column with the times; left out, the one that is called so.
     time_unit : {"ns", "us", "ms", "s", "min", "h", "d"}, optional
         Convert the times to this unit. Times of a file that states no unit are taken to be in it.
+    topic : str, optional
+        The topic of a bag, or the struct of a ``.mat`` file; may be left out where there is one.
+    origin : (latitude, longitude) or (latitude, longitude, altitude), optional
+        Of the channels east, north and up, in degrees and metres; left out, the first position. In a table they are
+        computed if `origin` is given or `columns` names them.
+    range_error : float, optional
+        Standard deviation of the distance to a satellite in metres, 3 to 6 for a receiver without corrections: HDOP
+        times it becomes sigma_east and sigma_north where the log has none.
     repair : str or sequence of str, optional
         What may be changed: "sort" (by time), "drop-duplicates" (of a time, the first sample is kept),
         "drop-missing-times", "drop-broken-lines", "unwrap:CHANNEL" (an angle, in rad or deg). Nothing is repaired
@@ -63,7 +78,7 @@ def read_log(
     Raises
     ------
     InputError
-        For anything wrong with the file, with its name and the line.
+        For anything wrong with the file, with its name and the line; or if the library that reads it is missing.
 
     See Also
     --------
@@ -83,7 +98,14 @@ def read_log(
     >>> Path("drive.csv").unlink()
     """
     return read_source(
-        as_path(path, "path"), columns=columns, time=time, time_unit=time_unit, repair=repair, keep_epoch=False
+        as_path(path, "path"),
+        columns=columns,
+        time=time,
+        time_unit=time_unit,
+        topic=topic,
+        origin=origin,
+        range_error=range_error,
+        repair=repair,
     )
 
 
@@ -92,17 +114,20 @@ def read_source(
     *,
     columns: Sequence[str] | None,
     time: str | None,
-    time_unit: str | None,
+    topic: str | None,
+    origin: Sequence[float] | None,
+    range_error: float | None,
     repair: str | Sequence[str],
-    keep_epoch: bool,
+    time_unit: str | None = None,
+    keep_epoch: bool = False,
 ) -> Log:
     """Read a log as `read_log` does.
 
     Parameters
     ----------
-    path, columns, time, time_unit, repair
+    path, columns, time, topic, origin, range_error, repair, time_unit
         As of `read_log`.
-    keep_epoch : bool
+    keep_epoch : bool, optional
         Leave numbers that count from 1970 as they are.
     """
     repairs = check_repairs(repair)
@@ -110,8 +135,14 @@ def read_source(
         columns = as_names((columns,) if isinstance(columns, str) else columns, "columns", "a sequence of strings")
     if time_unit is not None:
         as_choice(time_unit, "time_unit", tuple(SECONDS))
-    options = Options(columns, time, keep_epoch, "drop-broken-lines" in repairs)
-    log = inspect_log(_choose_reader(path)(path, options), repairs)
+    place, error = check_origin(origin), None if range_error is None else as_positive(range_error, "range_error")
+    options = Options(columns, time, topic, keep_epoch, "drop-broken-lines" in repairs)
+    log = _choose_reader(path)(path, options)
+    wanted = any(name in FRAME and name not in log for name in columns or ())
+    if wanted or place is not None or error is not None or log.has_positions:
+        log = add_local_frame(log, place, error)
+    log = log if columns is None else log[list(columns)]
+    log = inspect_log(log, repairs)
     return log if time_unit is None else convert_times(log, time_unit)
 
 
@@ -134,14 +165,47 @@ def convert_times(log: Log, unit: str) -> Log:
     return _scale_times(log, unit, lambda t: t * factor)
 
 
+def align_starts(logs: Sequence[Log]) -> list[Log]:
+    """Return logs of one run, so that 0 is the same moment in all that have dates: the earliest start among them.
+
+    Parameters
+    ----------
+    logs : sequence of Log
+    """
+    starts = [log.offset * SECONDS[log.time_unit] for log in logs if log.offset]
+    return [_shift_start(log, min(starts)) if log.offset else log for log in logs]
+
+
+def _shift_start(log: Log, start: float) -> Log:
+    shift = log.offset - start / SECONDS[log.time_unit]
+    events = tuple(event._replace(time=event.time + shift) for event in log.events)
+    return replace(log, times=log.times + shift, offset=log.offset - shift, events=events)
+
+
 def _scale_times(log: Log, unit: str, scale: Callable[..., float]) -> Log:
     events = tuple(event._replace(time=scale(event.time)) for event in log.events)
     return replace(log, times=scale(log.times), offset=scale(log.offset), time_unit=unit, events=events)  # type: ignore[arg-type]
 
 
 def _choose_reader(path: Path) -> Callable[[Path, Options], Log]:
-    """Return the reader of a file by its first bytes and the end of its name."""
-    return _read_text
+    """Return the reader of a file, by the end of its name or by how it begins."""
+    ending = path.suffix.lower()
+    if ending in BAGS or (path / "metadata.yaml").is_file():
+        return _read_bag
+    if ending in _READERS:
+        return _READERS[ending]
+    return _read_nmea if _begins_as_nmea(path) else _read_text
+
+
+def _begins_as_nmea(path: Path) -> bool:
+    """Return whether the first line of a file is a sentence of NMEA 0183."""
+    if not is_regular(path):
+        return False
+    try:
+        with path.open("rb") as file:
+            return bool(_SENTENCE.match(file.read(400)))
+    except OSError:
+        return False
 
 
 def _read_text(path: Path, options: Options) -> Log:
@@ -152,3 +216,46 @@ def _read_text(path: Path, options: Options) -> Log:
         keep_epoch=options.keep_epoch,
         drop_broken=options.drop_broken,
     )
+
+
+def _read_nmea(path: Path, options: Options) -> Log:
+    from switchfit.io.logs.gps import read_nmea
+
+    return read_nmea(path)
+
+
+def _read_gpx(path: Path, options: Options) -> Log:
+    from switchfit.io.logs.gps import read_gpx
+
+    return read_gpx(path)
+
+
+def _read_bag(path: Path, options: Options) -> Log:
+    from switchfit.io.logs.ros import read_bag
+
+    return read_bag(path, options.topic)
+
+
+def _read_mat(path: Path, options: Options) -> Log:
+    from switchfit.io.logs.matlab import read_mat
+
+    return read_mat(path, options.time, options.topic, options.keep_epoch)
+
+
+def _read_parquet(path: Path, options: Options) -> Log:
+    from switchfit.io.logs.parquet import read_parquet
+
+    return read_parquet(path, options.time, options.keep_epoch)
+
+
+BAGS = (".bag", ".mcap", ".db3")
+"""Endings of bags of ROS."""
+_READERS = {
+    ".gpx": _read_gpx,
+    ".mat": _read_mat,
+    ".nmea": _read_nmea,
+    ".nma": _read_nmea,
+    ".parquet": _read_parquet,
+    ".pq": _read_parquet,
+}
+_SENTENCE = re.compile(rb"\s*\$[A-Z]{5},")

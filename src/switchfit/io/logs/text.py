@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.io.logs.dates import is_date, parse_clock, parse_dates
+from switchfit.io.logs.geodesy import FRAME, find_position
 from switchfit.io.logs.header import (
     SNIFFED,
     Header,
@@ -25,17 +26,13 @@ from switchfit.io.logs.header import (
     split_lines,
 )
 from switchfit.io.logs.log import Event, FloatArray, Log
-from switchfit.io.logs.units import SECONDS, find_epoch_unit, normalize_time_unit
+from switchfit.io.logs.times import interpret_times, is_time_name, subtract_first
 from switchfit.problem.validation import join_names
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import is_device
 from switchfit.runtime.issue import Issue
 
 COMMENTS = ("#", "%")
-_TIME_NAMES = re.compile(
-    r"t|times?|timestamps?|stamp|zeit|utc|clock|secs?|seconds|elapsed.*|date_?time|date|datum"
-    r"|(t|time|timestamp|zeit)[ _.\-/].*|.*[ _.](time|timestamp|stamp)"
-)
 _DATE_NAMES = ("date", "datum", "day")
 _COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 _POINT_NUMBER = re.compile(r"[+-]?(?:\d+\.\d*|\.\d+)(?:[eE][+-]?\d+)?")
@@ -80,7 +77,7 @@ def read_text(
         Drop lines with another number of fields, or with text in a column of numbers.
     """
     table = _read_table(path, drop_broken)
-    wanted = None if columns is None else [_find_column(table, name) for name in columns]
+    wanted = None if columns is None else _find_columns(table, columns)
     column = _find_time(table) if time is None else _find_column(table, time)
     if drop_broken:
         table = _drop_text(table, column, wanted)
@@ -265,11 +262,24 @@ def _find_column(table: _Table, name: str) -> int:
     raise InputError(f"{table.source} has no column {name!r}; its columns are {join_names(names)}.")
 
 
+def _find_columns(table: _Table, columns: Sequence[str]) -> list[int]:
+    """Return the columns of some names; for east, north and up, those of the position on the globe."""
+    names = table.header.names
+    own = [name for name in columns if name not in FRAME or name in names or name in table.header.labels]
+    if len(own) < len(columns):
+        own += [name for name in [*(find_position(names) or []), *_find_hdop(names)] if name not in own]
+    return [_find_column(table, name) for name in own]
+
+
+def _find_hdop(names: Sequence[str]) -> list[str]:
+    return [name for name in names if name.lower() == "hdop"]
+
+
 def _find_time(table: _Table) -> int:
     """Return the column with the times: the first one that is called so, or the first one if it never falls."""
     labels = {k: label for label, k in table.header.labels.items()}
     for k, name in enumerate(table.header.names):
-        if any(_TIME_NAMES.fullmatch(text.strip().lower()) for text in (name, labels.get(k, name))):
+        if is_time_name(name) or is_time_name(labels.get(k, name)):
             return k
     numbers, bad = _parse_numbers(table.list_cells(0), table.comma)
     if len(table.header.names) > 1 and not bad.any() and np.all(np.diff(numbers) >= 0) and numbers[-1] > numbers[0]:
@@ -286,31 +296,14 @@ def _read_times(table: _Table, column: int, keep_epoch: bool) -> tuple[FloatArra
     sample = next((cell for cell in cells if not is_missing(cell)), "")
     if is_date(sample):
         places = [f"{table.source}, line {line}, column {table.header.names[column]!r}" for line, _ in table.rows]
-        return (*_parse_dated(table, cells, sample, places),)
-    unit = normalize_time_unit(table.header.units[column])
-    unit = unit if unit in SECONDS else ""
+        return _parse_dated(table, cells, sample, places)
     numbers, bad = _parse_numbers(cells, table.comma)
     if bad.any():
         _refuse_cell(table, column, int(bad.argmax()))
-    finite = numbers[np.isfinite(numbers)]
-    epoch = find_epoch_unit(float(finite[0])) if len(finite) else None
-    if epoch is None or (unit and unit != epoch) or (not unit and _resemble_uptime(finite)):
-        return numbers, unit, 0.0
-    if keep_epoch:
-        return numbers, epoch, 0.0
-    if all(_LONG_INTEGER.fullmatch(cell) for cell in cells):  # beyond 2**53: doubles would round them
-        integers = np.array([int(cell) for cell in cells])
-        return (integers - integers[0]).astype(np.float64), epoch, float(integers[0])
-    return numbers - finite[0], epoch, float(finite[0])
-
-
-def _resemble_uptime(times: FloatArray) -> bool:
-    """Return whether times that could be seconds since 1970 are rather microseconds since a start: whole, far apart."""
-    steps = np.diff(times)
-    if len(steps) == 0 or find_epoch_unit(float(times[0])) != "s":
-        return False
-    step = float(np.median(steps))
-    return bool(np.all(times == np.rint(times)) and step >= 1000 and step % 60 != 0)
+    times, unit, offset = interpret_times(numbers, table.header.units[column], keep_epoch=keep_epoch)
+    if offset and all(map(_LONG_INTEGER.fullmatch, cells)):
+        times, unit, offset = subtract_first(list(map(int, cells)), unit)
+    return times, unit, offset
 
 
 def _parse_dated(table: _Table, cells: list[str], sample: str, places: list[str]) -> tuple[FloatArray, str, float]:

@@ -1,0 +1,62 @@
+"""Which column has the times, in which unit they are, and whether they count from 1970."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from switchfit.io.logs.log import FloatArray
+from switchfit.io.logs.units import SECONDS, find_epoch_unit, normalize_time_unit
+
+_NAMES = re.compile(
+    r"t|times?|timestamps?|stamp|zeit|utc|clock|secs?|seconds|elapsed.*|date_?time|date|datum"
+    r"|(t|time|timestamp|zeit)[ _.\-/].*|.*[ _.](time|timestamp|stamp)"
+)
+
+
+def is_time_name(name: str) -> bool:
+    """Return whether a column of this name has the times."""
+    return bool(_NAMES.fullmatch(name.strip().lower()))
+
+
+def find_time_name(names: Sequence[str]) -> str | None:
+    """Return the first name that is one of times; None if there is none."""
+    return next((name for name in names if is_time_name(name)), None)
+
+
+def interpret_times(numbers: FloatArray, unit: str, *, keep_epoch: bool = False) -> tuple[FloatArray, str, float]:
+    """Return times, their unit, and what was subtracted from them.
+
+    Parameters
+    ----------
+    numbers : (K,) array
+        As they stand in the file.
+    unit : str
+        As the file states it; "" if it does not.
+    keep_epoch : bool, optional
+        Leave times that count from 1970 as they are; otherwise the first one is subtracted.
+    """
+    unit = normalize_time_unit(unit)
+    unit = unit if unit in SECONDS else ""
+    finite = numbers[np.isfinite(numbers)]
+    epoch = find_epoch_unit(float(finite[0])) if len(finite) else None
+    if epoch is None or (unit and unit != epoch) or (not unit and _resemble_uptime(finite)):
+        return numbers, unit, 0.0
+    return (numbers, epoch, 0.0) if keep_epoch else (numbers - finite[0], epoch, float(finite[0]))
+
+
+def subtract_first(counts: Sequence[int], unit: str) -> tuple[FloatArray, str, float]:
+    """Return integers since 1970 as times from the first one on; doubles would round nanoseconds."""
+    integers = np.array(counts, dtype=np.int64)
+    return (integers - integers[0]).astype(np.float64), unit, float(integers[0])
+
+
+def _resemble_uptime(times: FloatArray) -> bool:
+    """Return whether times that could be seconds since 1970 are rather microseconds since a start: whole, far apart."""
+    steps = np.diff(times)
+    if len(steps) == 0 or find_epoch_unit(float(times[0])) != "s":
+        return False
+    step = float(np.median(steps))
+    return bool(np.all(times == np.rint(times)) and step >= 1000 and step % 60 != 0)
