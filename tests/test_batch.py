@@ -779,6 +779,21 @@ def test_a_log_that_raises_an_error_is_listed(limit, tmp_path):
     assert first.status.tolist() == ["ERROR", "CONVERGED"]
 
 
+def test_an_error_of_the_program_itself_is_said(monkeypatch):
+    """It must not pass silently for a model that cannot be evaluated: all fits would take many times as long."""
+    from switchfit.batch import program
+
+    def fail(*given, layout):
+        raise TypeError("unhashable layout")
+
+    monkeypatch.setattr(program, "_fits", fail)
+    settings = {"theta": TRUTH, "seed": 1}
+    with pytest.warns(RuntimeWarning, match=r"failed \(TypeError: unhashable layout\); they are done one by one"):
+        study = sf.monte_carlo(room(), 3, **settings)
+    monkeypatch.undo()
+    np.testing.assert_allclose(study.theta, sf.monte_carlo(room(), 3, **settings).theta, rtol=1e-6)
+
+
 # Budgets, and fits that crawl
 
 

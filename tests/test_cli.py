@@ -342,7 +342,7 @@ def test_folder_that_cannot_be_made(folder, tmp_path):
     (tmp_path / "file").write_text("")
     result = run("fit", folder / "problem.toml", "--out", tmp_path / "file")
     assert result.exit_code == 2
-    assert f"the folder {tmp_path / 'file'} cannot be made" in result.stderr
+    assert f"the folder {tmp_path / 'file'} cannot be created" in result.stderr
 
 
 def test_file_that_cannot_be_written(folder, tmp_path):

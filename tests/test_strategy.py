@@ -83,6 +83,15 @@ def test_what_each_step_brought_is_told(far_fit):
     assert far_fit.seconds >= sum(step.seconds for step in far_fit.steps) > 0
 
 
+def test_where_the_model_is_doubted_two_searches_that_agree_are_enough(right):
+    """With sigma given too small nothing explains the data to the noise; many starts would not change that."""
+    problem = thermostat(tuple(TRUTH[:5]), sigma=0.01)
+    fit = sf.estimate(problem)
+    assert fit.verdict.level == "doubtful"
+    assert [step.strategy for step in fit.steps] == ["local", "scan over sample intervals", "growing horizon"]
+    assert fit.cost == pytest.approx(4 * right.cost, rel=1e-6)
+
+
 def test_a_good_fit_tries_nothing_else(right):
     again = sf.estimate(thermostat(tuple(TRUTH[:5])))
     assert again.steps == ()

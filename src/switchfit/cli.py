@@ -1,8 +1,8 @@
 """The command line: ``switchfit fit | check | simulate | paper``.
 
-Exit codes: 0 converged, 1 not converged (what was found is still written), 2 a problem with what was given,
-3 an error of switchfit itself, 130 interrupted by Ctrl-C. Only typer is imported here; the numerical parts load when a
-command needs them, so that ``--help`` is quick.
+Exit codes: 0 converged, 1 not converged (the result is still written), 2 wrong input, 3 an error of switchfit itself,
+130 interrupted by Ctrl-C. Only typer is imported here; the numerical parts are imported when a command needs them, so
+that ``--help`` is fast.
 """
 
 from __future__ import annotations
@@ -66,18 +66,22 @@ def _collect_options(
 def fit(
     problem: ProblemPath,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for report.txt, estimate.json and fit.png.", show_default=False)
+        Path | None,
+        typer.Option(
+            help="Folder for report.txt, estimate.json and fit.png; runs.csv and unknowns.csv where they are many.",
+            show_default=False,
+        ),
     ] = None,
     strategy: Annotated[
         Literal["local", "auto", "thorough"] | None,
-        typer.Option(help="One fit, more where its verdict is not good, or all.", show_default="auto"),
+        typer.Option(help="One fit, more if its verdict is not good, or all strategies.", show_default="auto"),
     ] = None,
     time_budget: Annotated[
         float | None, typer.Option(min=0.0, help="Seconds after which no further strategy begins.", show_default="none")
     ] = None,
     hessian: Annotated[
         Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"] | None,
-        typer.Option(help="Quadratic term of the optimiser.", show_default="auto"),
+        typer.Option(help="Quadratic term of the optimizer.", show_default="auto"),
     ] = None,
     tolerance: Annotated[
         float | None, typer.Option(min=0.0, help="Optimality at which to stop.", show_default="the library's")
@@ -87,7 +91,7 @@ def fit(
     ] = None,
     no_figures: Annotated[bool, typer.Option("--no-figures", help="Write no figure.")] = False,
     certificate: Annotated[
-        bool, typer.Option("--certificate", help="Check with the paper's equations too, and print how.")
+        bool, typer.Option("--certificate", help="Check with the paper's equations too, and print the checks.")
     ] = False,
     full: Annotated[
         bool, typer.Option("--full", help="Report all runs, channels, unknowns and warnings, not one screen.")
@@ -96,9 +100,9 @@ def fit(
 ) -> None:
     """Estimate transition times and parameters; report on the terminal, report and figure in --out.
 
-    Options given here win over those in the problem file. Ctrl-C stops after the iteration that is under way and
-    reports what was found. Exit code 0: converged, the verdict is good or doubtful; 1: not converged or bad, what was
-    found is still written; 2: something is wrong with what was given.
+    Options given here override those in the problem file. Ctrl-C stops after the current iteration and reports the
+    result so far. Exit code 0: converged, the verdict is good or doubtful; 1: not converged or bad, the result is still
+    written; 2: the input is wrong.
     """
     given = {
         "strategy": strategy,
@@ -115,10 +119,12 @@ def fit(
             _make_folder(out)
         estimate = _estimate(loaded, options, prepare_figures=figures)
         checked = f"\n\nCertificate\n{estimate.certificate}" if certificate else ""
-        report = estimate.report(full=full) + checked  # after the certificate, which counts in the verdict
+        tables = _choose_tables(estimate, out)
+        report = _write_report(estimate, full, tables) + checked  # after the certificate, which is part of the verdict
         _print(report)
         if out is not None:
             _write(out / "report.txt", report + "\n")
+            _write_tables(estimate, tables)
             with _explain_write_errors(out / "estimate.json") as path:
                 _save(estimate, path, complete=certificate)
             if figures:
@@ -140,9 +146,9 @@ def check(
     ] = False,
     debug: Debug = False,
 ) -> None:
-    """Check a problem without fitting it: data, derivatives, what the data can tell at the first guess.
+    """Check a problem without fitting it: data, derivatives, identifiability at the first guess.
 
-    Exit code 0: the derivatives are right; 1: they are not; 2: something is wrong with what was given.
+    Exit code 0: the derivatives are right; 1: they are not; 2: the input is wrong.
     """
     if no_run:
         with _report_errors(debug):
@@ -170,7 +176,7 @@ def simulate(
 ) -> None:
     """Integrate the model at the first guess and write time, mode and states as CSV.
 
-    The column of times is called t, or "t (min)" where the experiments' time_unit is "min" and not "s".
+    The column of times is named t, or for example "t (min)" if the experiments' time_unit is "min" instead of "s".
     """
     with _report_errors(debug):
         loaded = _load(problem)
@@ -212,9 +218,9 @@ def paper(
     ] = None,
     debug: Debug = False,
 ) -> None:
-    """Do every experiment and figure of Miller and Murphey's paper, and set its numbers beside ours.
+    """Reproduce every experiment and figure of Miller and Murphey's paper, and compare its numbers with ours.
 
-    An interrupted run goes on where it stopped when the same command is given again.
+    An interrupted run resumes when the same command is run again.
     """
     os.environ.setdefault("MPLBACKEND", "Agg")
     with _report_errors(debug):
@@ -226,7 +232,7 @@ def paper(
         try:
             run(out, quick=quick, only=only, say=lambda text: _print(text, err=True))
         except KeyboardInterrupt:
-            _fail("interrupted; the same command goes on from here.", INTERRUPTED)
+            _fail("interrupted; run the same command again to resume.", INTERRUPTED)
         except OSError as error:
             raise InputError(f"{out} cannot be written: {error.strerror}; name another with --out.") from error
         _print((out / TABLE).read_text(encoding="utf-8"))
@@ -237,16 +243,16 @@ def paper(
 
 
 def _print(text: object, *, err: bool = False) -> None:
-    """Print to stdout or stderr; if its reader is gone, as ``head`` after its lines, print nothing from then on.
+    """Print to stdout or stderr; if its reader has closed it, as ``head`` does, print nothing from then on.
 
-    The command goes on: what it writes to files and its exit code do not depend on who reads along.
+    The command continues: its files and its exit code do not depend on a reader.
     """
     try:
         typer.echo(text, err=err)
     except BrokenPipeError:
         stream = sys.stderr if err else sys.stdout
         nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, stream.fileno())  # what is buffered is flushed there, at the latest when Python exits
+        os.dup2(nowhere, stream.fileno())  # buffered text is flushed there, at the latest when Python exits
         os.close(nowhere)
 
 
@@ -263,7 +269,7 @@ def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
 
 @contextlib.contextmanager
 def _report_errors(debug: bool) -> Iterator[None]:
-    """Turn exceptions into a sentence on stderr and an exit code, those of model files whatever they are."""
+    """Turn exceptions into a sentence on stderr and an exit code, including any exception of a model file."""
     try:
         with _handle_interrupt(_interrupt):
             yield
@@ -283,7 +289,7 @@ def _report_errors(debug: bool) -> Iterator[None]:
 
 
 def _explain(error: BaseException, *, users: bool, debug: bool) -> NoReturn:
-    """Say what is wrong; `users`: it was raised in a file of the user's."""
+    """Print the error and exit; `users` is whether it was raised in a file of the user."""
     from switchfit.io.python_file import describe_error
     from switchfit.runtime.errors import InputError
 
@@ -300,8 +306,8 @@ def _explain(error: BaseException, *, users: bool, debug: bool) -> NoReturn:
 
 @contextlib.contextmanager
 def _handle_interrupt(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-    """Return a context in which Ctrl-C calls a handler; not where it is ignored, nor outside the main thread, which has
-    them.
+    """Return a context in which Ctrl-C calls a handler; without effect if SIGINT is ignored, or outside the main
+    thread, which alone has signal handlers.
     """
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or before in (signal.SIG_IGN, None):
@@ -338,7 +344,7 @@ def _print_issues(problem: Path) -> None:
 
 
 def _check_files(problem: Path) -> None:
-    """Print what can be known of a problem without running a Python file."""
+    """Print the parts of a problem that are known without running a Python file."""
     from switchfit.io.problem_file import read_experiments
     from switchfit.io.summary import describe_experiments
 
@@ -350,7 +356,7 @@ def _check_files(problem: Path) -> None:
 
 
 def _estimate(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: bool) -> Any:
-    """Call `switchfit.estimate` with a live line on stderr; Ctrl-C ends it after the iteration under way."""
+    """Call `switchfit.estimate` with a live line on stderr; Ctrl-C ends it after the current iteration."""
     import switchfit as sf
 
     if prepare_figures:  # matplotlib, which must not look for a display, loads while XLA compiles
@@ -365,6 +371,29 @@ def _estimate(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: 
         return sf.estimate(loaded.problem, callback=callback, **options)
 
 
+def _choose_tables(estimate: Any, out: Path | None) -> dict[str, Path]:
+    """Return the CSV files for what a screen of the report has no room for."""
+    from switchfit.report.text import SCREEN
+
+    counts = {"runs": len(estimate.run_names), "unknowns": len(estimate.theta)}
+    most = {"runs": SCREEN.experiments, "unknowns": SCREEN.unknowns}
+    return {} if out is None else {name: out / f"{name}.csv" for name in counts if counts[name] > most[name]}
+
+
+def _write_tables(estimate: Any, tables: dict[str, Path]) -> None:
+    from switchfit.io.result_tables import write_runs, write_unknowns
+
+    writers = {"runs": write_runs, "unknowns": write_unknowns}
+    for name, path in tables.items():
+        _write(path, writers[name](estimate))
+
+
+def _write_report(estimate: Any, full: bool, tables: dict[str, Path]) -> str:
+    from switchfit.runtime.presentation import format_text
+
+    return str(format_text(estimate, full=full, files={name: str(path) for name, path in tables.items()}))
+
+
 def _import_figures() -> None:
     with contextlib.suppress(ImportError):
         import matplotlib.backends.backend_agg
@@ -372,7 +401,7 @@ def _import_figures() -> None:
 
 
 def _save(estimate: Any, path: Path, *, complete: bool) -> None:
-    """Save an estimate; not `complete` leaves the paper's equations out of its certificate, which take seconds."""
+    """Save an estimate; unless `complete`, its certificate omits the paper's equations, which take seconds."""
     from switchfit.estimation.saved import save_fit
     from switchfit.uncertainty.certificate import certify
 
@@ -381,22 +410,22 @@ def _save(estimate: Any, path: Path, *, complete: bool) -> None:
 
 @contextlib.contextmanager
 def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Return a context in which the first Ctrl-C only asks to stop; the second is a KeyboardInterrupt."""
-    asked = threading.Event()
+    """Return a context in which the first Ctrl-C requests a stop, and the second raises KeyboardInterrupt."""
+    requested = threading.Event()
 
-    def ask(number: int, frame: FrameType | None) -> None:
-        if asked.is_set():
+    def request(number: int, frame: FrameType | None) -> None:
+        if requested.is_set():
             raise _CtrlC
-        asked.set()
+        requested.set()
         _print("stopping after this iteration; Ctrl-C again to stop at once", err=True)
 
-    with _handle_interrupt(ask):
-        yield asked.is_set
+    with _handle_interrupt(request):
+        yield requested.is_set
 
 
 @contextlib.contextmanager
 def _show_progress() -> Iterator[Callable[[Any], None]]:
-    """Return a context that yields what shows a record in a live line on stderr; nothing if that is no terminal."""
+    """Return a context that yields a function to show a record in a live line on stderr, if that is a terminal."""
     if not sys.stderr.isatty():
         yield lambda record: None
         return
@@ -426,12 +455,14 @@ def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"the folder {folder} cannot be made: {error.strerror}; name another with --out.") from error
+        raise InputError(
+            f"the folder {folder} cannot be created: {error.strerror}; name another with --out."
+        ) from error
 
 
 @contextlib.contextmanager
 def _explain_write_errors(path: Path) -> Iterator[Path]:
-    """Return a context that says in an InputError which file cannot be written, and why."""
+    """Return a context that turns an OSError into an InputError with the name of the file and the reason."""
     from switchfit.runtime.errors import InputError
 
     try:
@@ -441,7 +472,7 @@ def _explain_write_errors(path: Path) -> Iterator[Path]:
 
 
 def _write(path: Path, content: str | bytes) -> None:
-    """Write a file whole or not at all."""
+    """Write a file atomically."""
     from switchfit.runtime.files import write_atomically
 
     with _explain_write_errors(path):

@@ -1,12 +1,12 @@
 """The mesh: fixed nodes, cut by the transition times.
 
 The *nodes* of an experiment are t0, tf, all sample times, the knots of inputs and reference signals and a refinement
-grid. They stay where they are while the optimiser works. The transition times cut the *cells* between them into
-*rows*: one row is one Runge-Kutta step, in one mode, inside one cell. Every moment that matters is thus the end of a
-row, and only the rows beside a transition move with it.
+grid. They are fixed while the optimizer runs. The transition times cut the *cells* between them into *rows*: one row is
+one Runge-Kutta step, in one mode, inside one cell. Samples, knots and transitions are thus always ends of rows, and
+only the two rows at a transition move with it.
 
 Rows are laid out in chunks of `CHUNK` rows of one segment (the time a mode is active), each segment padded to whole
-chunks with rows of length zero, so that a chunk has one mode and all shapes are fixed whatever the transition times.
+chunks with rows of length zero, so that a chunk has one mode and no shape depends on the transition times.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from switchfit.problem.lengths import choose_common_lengths, pad_length
 from switchfit.problem.problem import Problem
 
 CHUNK = 16
-"""Rows in a chunk: long enough to fill vector registers (rows times stages), short enough to waste few in padding."""
+"""Rows in a chunk: enough to fill vector registers (rows times stages), few enough to waste little on padding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +35,10 @@ class Mesh:
     Attributes
     ----------
     nodes : (G + 1,) array
-        Increasing, from t0 to tf; padded at the end with tf to a length out of `pad_length`, so that
+        Increasing, from t0 to tf; padded at the end with tf to a length from `pad_length`, so that
         experiments of similar size share one compiled program.
     cells : int
-        Cells before the padding.
+        Number of cells without the padding.
     """
 
     nodes: FloatArray
@@ -51,7 +51,7 @@ class Mesh:
 
     @classmethod
     def pad(cls, nodes: FloatArray) -> Mesh:
-        """Return the mesh with these nodes, which increase strictly, and padding of a usual length."""
+        """Return the mesh with these strictly increasing nodes, padded to a length from `pad_length`."""
         cells = len(nodes) - 1
         padding = np.full(pad_length(cells) - cells, nodes[-1])
         return cls(np.concatenate([nodes, padding]), cells)
@@ -62,7 +62,7 @@ class Mesh:
         return self.nodes[: self.cells + 1]
 
     def pad_to(self, cells: int) -> Mesh:
-        """Return the mesh with its padding made so long that it has the given number of cells."""
+        """Return the mesh padded to the given number of cells."""
         return Mesh(np.append(self.times, np.full(cells - self.cells, self.times[-1])), self.cells)
 
     def divide(self, parts: int = 2) -> Mesh:
@@ -70,13 +70,13 @@ class Mesh:
         nodes = self.times
         inside = nodes[:-1, None] + np.diff(nodes)[:, None] * np.arange(parts) / parts
         divided = np.append(inside, nodes[-1])
-        # Equal parts of a cell as short as rounding may coincide.
+        # Parts of a cell that is as short as rounding may coincide.
         return Mesh.pad(divided) if (divided[1:] > divided[:-1]).all() else Mesh.from_times(divided)
 
     def halve_rows(self, transition_times: FloatArray) -> Mesh:
         """Return the mesh with every row cut in two: every cell, or its parts where transitions (N,) cut it.
 
-        A transition in the second half of a cell has behind it a row that a cut through the cell would leave as it is.
+        Halving cells would not do: after a transition in the second half of a cell, the row would keep its length.
         """
         cuts = np.unique(np.concatenate([self.times, transition_times]))
         return Mesh.from_times(np.concatenate([self.times, 0.5 * (cuts[:-1] + cuts[1:])]))
@@ -87,7 +87,7 @@ class Mesh:
 
 
 def pad_to_common_lengths(problem: Problem, meshes: Sequence[Mesh]) -> list[Mesh]:
-    """Return the meshes of all experiments, those of experiments that are alike padded to common lengths."""
+    """Return the meshes of all experiments; those of experiments with equal structure are padded to common lengths."""
     padded = list(meshes)
     if len(padded) == 1:
         return padded
@@ -103,7 +103,7 @@ class Rows(NamedTuple):
 
     Attributes
     ----------
-    segment : (Q,) int, which entry of the mode sequence
+    segment : (Q,) int, index in the mode sequence
     opens : (Q,) bool, whether the chunk opens a segment other than the first (a transition precedes it)
     cell : (Q, C) int
     start, end : (Q, C) times
@@ -126,9 +126,9 @@ class Rows(NamedTuple):
 
 
 def count_chunks(cells: int, transitions: int) -> int:
-    """Return how many chunks hold all rows wherever the transition times lie.
+    """Return a number of chunks that holds all rows for any transition times.
 
-    The padding wastes at most C - 1 rows a segment.
+    The padding wastes at most C - 1 rows per segment.
     """
     return (cells + transitions + (transitions + 1) * (CHUNK - 1)) // CHUNK
 
@@ -137,12 +137,11 @@ def build_rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
     """Cut the cells between `nodes` (G + 1,) at `tau` (N,).
 
     Where tau_i equals a node, `side` = +1 lets segment i begin in the cell after it, so that derivatives are those
-    for tau_i increasing, and -1 in the cell before it. Computed in the arrays of
-    `xp`, JAX's or NumPy's.
+    for tau_i increasing, and -1 in the cell before it. Arrays are those of `xp`, JAX or NumPy.
     """
     cells, N = nodes.shape[0] - 1, tau.shape[0]
     passed = xp.where(side > 0, nodes[None] <= tau[:, None], nodes[None] < tau[:, None]).sum(1)
-    real_cells = (nodes[1:] > nodes[:-1]).sum()  # without the padding, so that tau = tf stays before what is at tf
+    real_cells = (nodes[1:] > nodes[:-1]).sum()  # without padding: tau = tf stays before the samples and costs at tf
     first_cell = xp.clip(passed - 1, 0, real_cells - 1)
     first_cell = xp.concatenate([xp.zeros(1, first_cell.dtype), first_cell])
     last_cell = xp.concatenate([first_cell[1:], xp.full(1, cells - 1, first_cell.dtype)])

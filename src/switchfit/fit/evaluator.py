@@ -1,4 +1,4 @@
-"""The cost of a problem and its exact derivatives at any theta, on a mesh that stays the same."""
+"""The cost of a problem and its exact derivatives at any theta, on a fixed mesh."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Evaluation:
 
 @dataclass(frozen=True, eq=False)
 class ArrowEvaluation:
-    """Cost and derivatives of many runs: as `Evaluation`, with the Hessian in the shape of an arrow."""
+    """Cost and derivatives of many runs: like `Evaluation`, with an arrow-shaped Hessian."""
 
     cost: float
     gradient: FloatArray
@@ -91,13 +91,13 @@ class ConstrainedEvaluation:
 
 
 class Evaluator:
-    """A problem on fixed meshes, one an experiment: cost, gradient and Hessian as functions of theta alone.
+    """A problem on fixed meshes, one per experiment: cost, gradient and Hessian as functions of theta alone.
 
     Parameters
     ----------
     problem : Problem
     theta : (d,) array, optional
-        Where the meshes are refined; the problem's initial guess if left out.
+        Point at which the meshes are refined; the problem's initial guess if left out.
     meshes : sequence of Mesh, optional
         Meshes to use instead of refined ones.
     """
@@ -122,7 +122,7 @@ class Evaluator:
         return self.divide(2)
 
     def halve_rows(self, theta: FloatArray) -> Evaluator:
-        """Return the same problem with every step cut in two that it takes at theta, to judge the integration error."""
+        """Return the same problem with every step at theta cut in two, to estimate the integration error."""
         times = [self.problem.vectors(theta, e)[0] for e in range(len(self.meshes))]
         meshes = [mesh.halve_rows(tau) for mesh, tau in zip(self.meshes, times, strict=True)]
         return Evaluator(self.problem, meshes=meshes)
@@ -130,9 +130,9 @@ class Evaluator:
     def __call__(
         self, theta: FloatArray, side: int = 1, method: Method = "auto", matrix: Matrix = "exact"
     ) -> Evaluation:
-        """Return the cost, gradient and Hessian; where a transition time sits on a node, the derivatives to its `side`.
+        """Return the cost, gradient and Hessian; for a transition time on a node, the derivatives on its `side`.
 
-        `matrix` asks for the Gauss-Newton matrix in place of the Hessian, or for none (it is NaN then).
+        `matrix` selects the Hessian, the Gauss-Newton matrix in its place, or neither (NaN).
         """
         d = len(theta)
         results = self._results(theta, side, method, matrix)
@@ -142,7 +142,7 @@ class Evaluator:
             total, gradient, hessian = 0.0, np.zeros(d), np.zeros((d, d))
             for (J, g, H), (own, mine) in zip(results, self.problem.own_places, strict=True):
                 total += float(J)
-                # Two names of the model may mean one parameter: its place then stands twice, and both count.
+                # Two names of the model may refer to one parameter: its index then occurs twice, and both count.
                 np.add.at(gradient, mine, g[own])
                 np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
         if self._priors is not None:
@@ -178,7 +178,7 @@ class Evaluator:
         return ConstrainedEvaluation(cost, gradient, value, slope, hessian, c, jacobian)
 
     def arrow(self, theta: FloatArray, side: int = 1, matrix: Matrix = "exact") -> ArrowEvaluation:
-        """Evaluate the same by the method "auto", in time and memory that are linear in the number of experiments."""
+        """Evaluate by the method "auto", in time and memory that are linear in the number of experiments."""
         total, gradient, parts = 0.0, np.zeros(len(theta)), []
         size = self.layout.own.shape[1] + len(self.layout.shared)
         results = self._results(theta, side, "auto", matrix)
@@ -196,7 +196,7 @@ class Evaluator:
 
     @cached_property
     def layout(self) -> ArrowLayout:
-        """Which unknowns are whose."""
+        """Layout of the arrow-shaped Hessian: the unknowns of each experiment, and shared ones."""
         return ArrowLayout.of(len(self.problem.theta_names), self.problem.places)
 
     @cached_property
@@ -218,11 +218,11 @@ class Evaluator:
 
     @property
     def engine(self) -> Engine:
-        """What evaluates cost, gradient and exact Hessian by the method "auto": machine code, or JAX and why."""
+        """Engine of cost, gradient and exact Hessian by the method "auto": machine code, or JAX with the reason."""
         return summarize(self.engines, name_runs(self.problem.experiments))
 
     def simulate(self, theta: FloatArray, *, tangents: bool = False) -> list[Simulation]:
-        """Simulate all experiments row by row, with their derivatives in their own unknowns if asked for."""
+        """Simulate all experiments row by row, with derivatives in their own unknowns if `tangents`."""
         vectors = (self.problem.vectors(theta, e) for e in range(len(self.engines)))
         return [engine.simulate(*at, tangents=tangents) for engine, at in zip(self.engines, vectors, strict=True)]
 
@@ -234,8 +234,8 @@ class Evaluator:
             return [engine.derivatives(*at, side, matrix) for engine, at in zip(self.engines, vectors, strict=True)]
         given = list(zip(self.problem.structures, self.arguments, self.meshes, vectors, strict=True))
         if method == "adjoint":
-            if not knows_paper(self.problem):
-                raise ValueError("the paper's equations know no TransitionCost: take another method.")
+            if not is_covered_by_paper(self.problem):
+                raise ValueError("the paper's equations have no TransitionCost: choose another method.")
             with use_float64(), use_compilation_cache():
                 found = [evaluate_paper(a, *at, float(side), structure=s) for s, a, _, at in given]
             return [Derivatives(float(J), np.array(g), np.array(H)) for J, g, H in found]
@@ -251,13 +251,13 @@ class Evaluator:
         return points
 
 
-def knows_paper(problem: Problem) -> bool:
-    """Return whether the paper's equations know all that the cost consists of."""
+def is_covered_by_paper(problem: Problem) -> bool:
+    """Return whether the paper's equations cover all terms of the cost."""
     return not any(any(f is not None for f in s.transition_costs) for s in problem.structures)
 
 
 def evaluator_of(problem: Problem) -> Evaluator:
-    """Return the problem's own evaluator, made once and kept with it; its meshes are refined at the initial guess."""
+    """Return the problem's own evaluator, built once and cached; its meshes are refined at the initial guess."""
     if "evaluator" not in problem.__dict__:
         object.__setattr__(problem, "evaluator", Evaluator(problem))
     own: Evaluator = problem.__dict__["evaluator"]
@@ -273,11 +273,11 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     theta : (d,) array_like, optional
         In the order of ``problem.theta_names``; the initial guess if left out.
     method : {"auto", "forward", "discrete-adjoint", "adjoint", "autodiff"}
-        "forward" and "discrete-adjoint" are exact for the discretised cost, second order forward and backward, in JAX.
-        "auto" is the latter in machine code of its own, which takes a tenth of the time, and in JAX where a function
-        of the model cannot be written as a straight line of scalars, or steps are implicit. "adjoint" evaluates the
-        paper's equations (6)-(17), which agree with them to the integration error. "autodiff" leaves everything to
-        JAX; slow, an independent check.
+        "forward" and "discrete-adjoint" are exact for the discretized cost, second order forward and backward, in JAX.
+        "auto" is the latter in machine code, which takes a tenth of the time; JAX evaluates where a function of the
+        model cannot be compiled as straight-line code, or steps are implicit. "adjoint" evaluates the paper's
+        equations (6)-(17), which agree with the others to the integration error. "autodiff" differentiates by JAX
+        alone: slow, an independent check.
 
     Returns
     -------
@@ -293,8 +293,8 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
 
     Notes
     -----
-    The mesh is refined once, at the initial guess, so that J is one smooth function of theta. Where a transition
-    time sits exactly on a sample time the derivatives are those for increasing it.
+    The mesh is refined once, at the initial guess, so that J is one smooth function of theta. If a transition time
+    equals a sample time, the derivatives are those for increasing it.
 
     See Also
     --------

@@ -1,4 +1,4 @@
-"""One run of the optimiser on a problem whose meshes are given: what fits, profiles and many fits have in common."""
+"""One run of the optimizer on a problem with given meshes, for fits, profiles and many fits."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.variables import Variables
 
 MANY_RUNS = 16
-"""Experiments from which on the Hessian's shape of an arrow is made use of; with fewer, the algebra of full matrices
+"""Number of experiments from which the arrow shape of the Hessian is used; with fewer, the algebra of full matrices
 takes no longer (the runs part of the benchmarks)."""
 
 PERFECT_RESIDUAL = 1e-8
-"""Part of the samples that a residual is where a fit is perfect."""
+"""Residual of a perfect fit, as a part of the sample."""
 
 TIME_REACH = 0.01
-"""Part of the horizon by which a transition time may move in the first step inside a trust region."""
+"""Largest change of a transition time in the first trust-region step, as a part of the horizon."""
 
 
 @dataclass(frozen=True, eq=False)
 class CostAndGradient:
-    """All that steepest descent is given."""
+    """Evaluation without Hessian, for steepest descent."""
 
     cost: float
     gradient: FloatArray
@@ -42,7 +42,7 @@ class CostAndGradient:
 
 
 def constraints_of(problem: Problem) -> LinearConstraints:
-    """Return the ordering, minimum durations and bounds of a problem as the optimiser takes them."""
+    """Return the ordering, minimum durations and bounds of a problem in the optimizer's form."""
     unknowns = problem.unknowns
     return LinearConstraints(unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, linear_constraints_of(problem))
 
@@ -57,10 +57,10 @@ def minimize_cost(
     constraints: LinearConstraints | None = None,
     by_blocks: bool | None = None,
 ) -> Result:
-    """Run the optimiser once on the evaluator's meshes; arguments as of `estimate`.
+    """Run the optimizer once on the evaluator's meshes; arguments as in `estimate`.
 
-    The problem's own constraints hold unless others are given. `by_blocks` says whether to use the shape that the
-    Hessian of several runs has; left out, where it pays.
+    `constraints` are by default those of the problem. `by_blocks` is whether to use the arrow shape of the Hessian of
+    several runs; by default, it is used where that is faster.
     """
     problem = evaluator.problem
 
@@ -90,19 +90,19 @@ def minimize_cost(
     def idle(z: FloatArray, everything: bool) -> NDArray[np.bool_]:
         return idle_unknowns(evaluator, z if identity else _to_theta(variables, constraints, z), everything)
 
-    told = callback
+    report = callback
     if callback is not None and not identity:
-        told = lambda record: callback(_convert_record(variables, constraints, record))  # noqa: E731
+        report = lambda record: callback(_convert_record(variables, constraints, record))  # noqa: E731
     result = minimize(
         evaluate,
         theta if identity else variables.inward(np.asarray(theta)),
         constraints=constraints if identity else _convert_constraints(variables, constraints),
         breakpoints=evaluator.breakpoints(),
-        hessian="exact" if by_blocks and hessian == "auto" else hessian,  # one radius for many runs would serve none
+        hessian="exact" if by_blocks and hessian == "auto" else hessian,  # a trust region's one radius suits no run
         blocks=unknowns.is_time.astype(int),
         tolerance=tolerance,
         max_iterations=max_iterations,
-        callback=told,
+        callback=report,
         size=problem.sizes if identity else variables.sizes_inward(problem.sizes),
         idle=idle,
         reach=_reach_of(problem),
@@ -119,9 +119,9 @@ def minimize_with_constraints(
     max_iterations: int,
     callback: Callable[[IterationRecord], object] | None = None,
 ) -> tuple[Result, tuple[tuple[str, float, float], ...]]:
-    """Run the optimiser once with guards and terminal constraints; arguments as of `estimate`.
+    """Run the optimizer once with guards and terminal constraints; arguments as in `estimate`.
 
-    Returns its result, and each constraint with its value and its multiplier.
+    Returns its result, and the name, value and multiplier of each constraint.
     """
     problem = evaluator.problem
     names = problem.constraint_names
@@ -142,10 +142,10 @@ def minimize_with_constraints(
 
 
 def _reach_of(problem: Problem) -> FloatArray:
-    """Return how far each variable may move in the first step inside the optimiser's trust region: (d,).
+    """Return how far each variable may move in the optimizer's first trust-region step: (d,).
 
-    A transition time a part of the horizon, any other unknown a part of its first guess, or of the way between its
-    bounds where that is zero.
+    This is a part of the horizon for a transition time, and a part of the first guess for any other unknown; if the
+    guess is zero, of the range between its bounds.
     """
     unknowns = problem.unknowns
     width = unknowns.upper - unknowns.lower
@@ -157,12 +157,12 @@ def _reach_of(problem: Problem) -> FloatArray:
 
 
 def _to_theta(variables: Variables, constraints: LinearConstraints, z: FloatArray) -> FloatArray:
-    """Return theta at z, inside its bounds whatever the rounding."""
+    """Return theta at z, kept inside its bounds against rounding."""
     return np.asarray(np.clip(variables.outward(z), constraints.lower, constraints.upper))
 
 
 def _to_variables(variables: Variables, theta: FloatArray, here: Any) -> Any:
-    """Return an evaluation at theta as one of the optimiser's variables."""
+    """Convert an evaluation at theta to the optimizer's variables."""
     if here.hessian is None:
         return CostAndGradient(here.cost, variables.slopes(theta)[0] * here.gradient)
     if isinstance(here.hessian, Arrow):
@@ -173,21 +173,21 @@ def _to_variables(variables: Variables, theta: FloatArray, here: Any) -> Any:
 
 
 def _convert_constraints(variables: Variables, constraints: LinearConstraints) -> LinearConstraints:
-    """Return the bounds of the optimiser's variables; the rows join transition times alone, which are not changed."""
+    """Convert constraints to the optimizer's variables. Only bounds change: rows involve transition times alone."""
     lower, upper = variables.inward(constraints.lower), variables.inward(constraints.upper)
     return replace(constraints, lower=lower, upper=upper)
 
 
 def _convert_record(variables: Variables, constraints: LinearConstraints, record: IterationRecord) -> IterationRecord:
-    """Return a record of the optimiser's with theta in place of its own variables."""
+    """Convert a record of the optimizer from its variables to theta."""
     return replace(record, theta=_to_theta(variables, constraints, record.theta))
 
 
 def _convert_result(variables: Variables, constraints: LinearConstraints, result: Result) -> Result:
-    """Return the optimiser's result in theta; its optimality and its eigenvalues stay those of its own variables."""
+    """Convert the optimizer's result to theta; optimality and eigenvalues remain those of its variables."""
     theta = _to_theta(variables, constraints, result.theta)
     slopes = variables.slopes(theta)[0]
-    rows = np.ones(len(constraints.b))  # these join transition times alone, which are not changed
+    rows = np.ones(len(constraints.b))  # rows involve transition times alone, whose scale is 1
     gradient, hessian = variables.derivatives_outward(theta, result.gradient, result.hessian)
     history = tuple(_convert_record(variables, constraints, record) for record in result.history)
     return replace(
@@ -202,7 +202,7 @@ def _convert_result(variables: Variables, constraints: LinearConstraints, result
 
 
 def _convert_reason(variables: Variables, z: FloatArray, slopes: FloatArray, found: Finding) -> Finding:
-    """Return why the line search failed, in theta instead of the variables z (d,); `slopes`: dtheta/dz (d,)."""
+    """Convert why the line search failed from the variables z (d,) to theta; `slopes`: dtheta/dz (d,)."""
     places = []
     for i, value in found.places:
         there = z.copy()
@@ -213,10 +213,10 @@ def _convert_reason(variables: Variables, z: FloatArray, slopes: FloatArray, fou
 
 
 def smallest_cost(problem: Problem) -> float:
-    """Return a cost below which an error is not measured against it.
+    """Return the cost below which errors are not measured relative to the cost itself.
 
-    Half a sum of squares: that of residuals of 1e-8 of the samples. The negative logarithm of a likelihood may be
-    anything, 0 too; its parts are of the size of half the samples.
+    For half a sum of squares it is the cost of a perfect fit, with residuals of 1e-8 of the samples. A negative log
+    likelihood may have any value, 0 too; its terms are of the size of half the number of samples.
     """
     items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
     if not is_least_squares(problem):
@@ -233,16 +233,16 @@ def is_least_squares(problem: Problem) -> bool:
 
 
 def is_plain_least_squares(problem: Problem) -> bool:
-    """Return whether J is half a sum of squares of the samples alone, each of the moment at which it was taken."""
+    """Return whether J is half a sum of squares of samples alone, without priors and delays that are parameters."""
     items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
     delayed = any(isinstance(item.delay, str) for item in items)
     return is_least_squares(problem) and not problem.unknowns.priors.any and not delayed
 
 
 def is_sigma_known(problem: Problem) -> bool | None:
-    """Return whether sigma is known for all measurements, as a number or as a parameter beside the others.
+    """Return whether sigma is given for all measurements, as a number or as a parameter.
 
-    None where the cost is not made of measurements alone.
+    None if the cost has other terms than measurements and terminal constraints.
     """
     items = [item for run in problem.experiments for item in run.data if not isinstance(item, TerminalConstraint)]
     if not items or not all(isinstance(item, Measurements) for item in items):

@@ -1,7 +1,7 @@
 """Problem files: a model, its data, guesses and bounds, in TOML.
 
-The `pydantic` models below are the format: their fields are the keys, a field's description says what the key is
-for, in the reference page and in error messages. ``docs/problem-file.md`` shows it by example.
+The `pydantic` models below define the format. Their fields are the keys; the description of a field is used in error
+messages. ``docs/problem-file.md`` shows the format by example.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ HessianKind = Literal["auto", "exact", "descent-first", "block-diagonal", "gauss
 
 @dataclass(frozen=True)
 class ProblemFile:
-    """What a problem file says.
+    """Contents of a problem file.
 
     Attributes
     ----------
     path : Path
     problem : Problem
     options : dict
-        Keyword arguments for `switchfit.estimate`, as far as the file gives them.
+        Keyword arguments for `switchfit.estimate` that the file sets.
     """
 
     path: Path
@@ -65,7 +65,7 @@ def load_problem(path: str | Path) -> ProblemFile:
     Parameters
     ----------
     path : str or Path
-        A TOML file. Files it names are looked for in its folder.
+        A TOML file. Paths in it are relative to its folder.
 
     Returns
     -------
@@ -74,8 +74,8 @@ def load_problem(path: str | Path) -> ProblemFile:
     Raises
     ------
     InputError
-        For anything wrong with the file or with what it names: one sentence with the file, the key, what was given
-        and what to do.
+        For any error in the file or in the files that it names; the message has the file, the key, the value that was
+        given, and what to do.
     """
     path = Path(path)
     contents = _validate(path, _parse(path))
@@ -94,12 +94,12 @@ def read_experiments(path: str | Path) -> tuple[Experiment, ...]:
     Returns
     -------
     tuple of Experiment
-        With data and horizon, but without functions for what is observed; none if the whole problem is made in Python.
+        With data and horizon, but without observation functions; empty if the whole problem is built in Python.
 
     Raises
     ------
     InputError
-        As of `load_problem`.
+        As in `load_problem`.
     """
     path = Path(path)
     contents = _validate(path, _parse(path))
@@ -149,12 +149,12 @@ def _number_as_table(given: Any) -> Any:
 
 
 def _known_as_table(given: Any) -> Any:
-    """Return ``{ value = 0.5, fixed = true }`` for ``0.5``: a state at t0 that is given as a number is known."""
+    """Return ``{ value = 0.5, fixed = true }`` for ``0.5``: a state at t0 given as a number is known."""
     return {"value": given, "fixed": True} if isinstance(given, (int, float)) and not isinstance(given, bool) else given
 
 
 def _end_as_table(given: Any) -> Any:
-    """Return ``{ value = 6.0, fixed = true }`` for ``6.0``: a tf that is given as a number is known."""
+    """Return ``{ value = 6.0, fixed = true }`` for ``6.0``: a tf given as a number is known."""
     if given is not None and not isinstance(given, dict) and _known_as_table(given) is given:
         raise PydanticCustomError("float_type", "Input should be a valid number")
     return _known_as_table(given)
@@ -166,7 +166,7 @@ def _name_as_table(given: Any) -> Any:
 
 
 def _table_as_list(given: Any) -> Any:
-    """Return a list of tables, of one table a list of one."""
+    """Return a list of tables; a single table becomes a list of one."""
     return [given] if isinstance(given, dict) else given
 
 
@@ -181,7 +181,7 @@ def _repair_as_list(given: Any) -> Any:
 
 
 class PriorTable(_Table):
-    """What is known of an unknown: normal with mean and sd, or log-normal with median and log_sd."""
+    """A prior: normal with mean and sd, or log-normal with median and log_sd."""
 
     mean: float | None = Field(default=None, description="mean of a normal prior")
     sd: float | None = Field(default=None, description="standard deviation of a normal prior")
@@ -192,7 +192,7 @@ class PriorTable(_Table):
 
 
 class ParameterTable(_Table):
-    """A guess and what is known about it; a bare number is a guess without bounds."""
+    """A guess with bounds, unit and prior; a bare number is a guess without bounds."""
 
     value: float | list[float] = Field(description="first guess, or the value itself where fixed")
     lower: float = Field(default=-np.inf, description="lower bound")
@@ -206,7 +206,7 @@ class ParameterTable(_Table):
 
 
 class TransitionTable(_Table):
-    """First guess of a transition time, or of tf, with bounds of its own."""
+    """First guess of a transition time, or of tf, with bounds."""
 
     value: float = Field(description="first guess of the transition time, in the experiment's time_unit")
     lower: float = Field(default=-np.inf, description="earliest time")
@@ -219,7 +219,7 @@ class TransitionTable(_Table):
 
 
 class StateTable(_Table):
-    """An entry of the initial state that is not known, or a guess of it."""
+    """An entry of the initial state: a guess, or a known value."""
 
     value: float = Field(description="first guess of the state at t0, or the value itself where fixed")
     lower: float = Field(default=-np.inf, description="lower bound")
@@ -263,7 +263,7 @@ class LogTable(_Table):
 
 
 class DataTable(LogTable):
-    """What the model is compared with."""
+    """Data to which the model is fitted."""
 
     columns: list[str] = Field(min_length=1, description="names of the columns with the values")
     kind: Literal["measurements", "reference"] = Field(
@@ -280,12 +280,12 @@ class DataTable(LogTable):
         "of parameters that it is; left out, it is unknown (measurements only)",
     )
     loss: Literal["linear", "soft_l1", "huber", "cauchy"] = Field(
-        default="linear", description="what outliers cost (measurements only)"
+        default="linear", description="loss of the residuals, for outliers (measurements only)"
     )
-    loss_scale: float = Field(default=1.0, gt=0, description="size of a residual, in sigmas, beyond which it is one")
+    loss_scale: float = Field(default=1.0, gt=0, description="residual, in sigmas, above which it counts as an outlier")
     delay: float | str = Field(
         default=0.0,
-        description="by how much the sensor is late, in the experiment's time_unit, or the parameter that it is "
+        description="delay of the sensor, in the experiment's time_unit, or the name of the parameter that it is "
         "(measurements only)",
     )
     lowpass_hz: float | None = Field(
@@ -298,7 +298,7 @@ class DataTable(LogTable):
 
 
 class InputTable(LogTable):
-    """A known input u(t); modes are then called as f(t, x, p, u)."""
+    """A known input u(t); the modes are then functions f(t, x, p, u)."""
 
     columns: Annotated[
         Annotated[list[str], Field(min_length=1), pydantic.Tag("list")]
@@ -307,7 +307,7 @@ class InputTable(LogTable):
     ] = Field(
         description="names of the columns with the values, or { name in the model = column }, with which u is a dict"
     )
-    kind: Literal["hold", "linear", "cubic"] = Field(default="hold", description="what happens between samples")
+    kind: Literal["hold", "linear", "cubic"] = Field(default="hold", description="interpolation between samples")
 
 
 class ExperimentTable(_Table):
@@ -316,14 +316,14 @@ class ExperimentTable(_Table):
     mode_sequence: list[str] = Field(min_length=1, description="names of the modes in the order of their activity")
     transition_times: list[Annotated[TransitionTable, pydantic.BeforeValidator(_number_as_table)]] | None = Field(
         default=None,
-        description="first guess of each transition time, in time_unit, one fewer than modes; left out, they are "
-        "looked for all over the log",
+        description="first guess of each transition time, in time_unit, one fewer than modes; if left out, all of the "
+        "log is searched",
     )
     time_unit: str = Field(
         default="s", min_length=1, description="unit of all times of the run, for the report; nothing is converted"
     )
     data: Annotated[list[DataTable], pydantic.BeforeValidator(_table_as_list)] = Field(
-        min_length=1, description="what the model is compared with; several tables add up"
+        min_length=1, description="data to which the model is fitted; the costs of several tables are added"
     )
     t0: float | None = Field(default=None, description="start of the horizon; left out, the first sample")
     tf: Annotated[TransitionTable | None, pydantic.BeforeValidator(_end_as_table)] = Field(
@@ -337,7 +337,7 @@ class ExperimentTable(_Table):
     )
     parameter_map: dict[str, str] = Field(
         default_factory=dict,
-        description="the model's name of a parameter = the name under [parameters] of what this run has for it",
+        description="the model's name of a parameter = the name under [parameters] that this run uses for it",
     )
     inputs: InputTable | None = Field(default=None, description="a known input")
     name: str | None = Field(default=None, description="used in the report where there are several experiments")
@@ -351,7 +351,7 @@ class ModelTable(_Table):
 
 
 class OptionsTable(_Table):
-    """How to solve; what is left out has the library's default."""
+    """Options of the fit; options that are left out have the library's defaults."""
 
     min_duration: float | None = Field(
         default=None, ge=0, description="shortest time a mode may last, in the time_unit of the experiments"
@@ -360,7 +360,7 @@ class OptionsTable(_Table):
     rtol: float | None = Field(default=None, gt=0, description="relative tolerance of the integrator")
     atol: float | None = Field(default=None, gt=0, description="absolute tolerance of the integrator")
     strategy: Literal["local", "auto", "thorough"] | None = Field(
-        default=None, description="one fit, more where its verdict is not good, or all that can be tried"
+        default=None, description="one fit, more if its verdict is not good, or all strategies"
     )
     time_budget: float | None = Field(default=None, gt=0, description="seconds after which no further strategy begins")
     hessian: HessianKind | None = Field(default=None, description="quadratic term of the optimiser")
@@ -402,7 +402,7 @@ def _parse(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
     except RecursionError as error:
         raise InputError(f"{path} is not valid TOML: brackets are nested too deep.") from error
-    except ValueError as error:  # of TOML, of UTF-8, of a number with thousands of digits
+    except ValueError as error:  # invalid TOML, invalid UTF-8, or a number with thousands of digits
         raise InputError(f"{path} is not valid TOML: {error}.") from error
 
 
@@ -414,7 +414,7 @@ def _validate(path: Path, given: dict[str, Any]) -> Contents:
     if contents.problem is not None:
         others = [key for key in ("model", "parameters", "experiments") if key in given]
         if others:
-            raise InputError(f"{path}: 'problem' stands for everything but options; leave out {' and '.join(others)}.")
+            raise InputError(f"{path}: 'problem' replaces everything but options; leave out {' and '.join(others)}.")
     elif contents.model is None:
         raise InputError(f"{path}: the key 'model' is missing; name one of {', '.join(BUILT_IN)} or 'file.py:object'.")
     elif not contents.experiments:
@@ -423,7 +423,7 @@ def _validate(path: Path, given: dict[str, Any]) -> Contents:
 
 
 def _describe_error(error: pydantic.ValidationError) -> str:
-    """Return the first thing that is wrong, in words."""
+    """Return the first error as a sentence."""
     errors = sorted(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
     first = errors[0]
     table, steps = _follow_location(first["loc"])
@@ -463,7 +463,7 @@ def _follow_location(location: Sequence[str | int]) -> tuple[type[_Table] | None
 
 
 class _ParameterNames(_Table):
-    """Stands for [parameters], whose keys are free."""
+    """Placeholder for [parameters], whose keys are chosen by the user."""
 
 
 def _find_table(annotation: Any) -> type[_Table] | None:
@@ -543,7 +543,7 @@ def _build_experiments(path: Path, contents: Contents, system: HybridSystem | No
 
 
 def _build_at(where: str, build: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-    """Build something; what it says is wrong is said with the place in the problem file."""
+    """Build something; add the place in the problem file to its error messages."""
     try:
         return build(*arguments, **named)
     except (InputError, KeyboardInterrupt):
@@ -578,8 +578,8 @@ def _build_system(path: Path, table: ModelTable) -> HybridSystem:
 def _check_model_name(what: str, table: ModelTable) -> None:
     if ".py" not in table.name:
         raise InputError(
-            f"{what} {table.name!r} is not known; the built-in models are {', '.join(BUILT_IN)}, your own is given as "
-            "'file.py:object'."
+            f"{what} {table.name!r} is not known; the built-in models are {', '.join(BUILT_IN)}. Give a model of your "
+            "own as 'file.py:object'."
         )
 
 
@@ -636,12 +636,12 @@ def _build_experiment(
 
 
 def _build_final_time(table: ExperimentTable, spans: list[Any]) -> float | Parameter:
-    """Return tf, of which a table makes an unknown; left out, it is where the data end."""
+    """Return tf: an unknown if given as a table; if left out, the end of the data."""
     return float(max(span[-1] for span in spans)) if table.tf is None else _build_parameter(table.tf)
 
 
 def _build_initial_state(table: ExperimentTable) -> list[Parameter] | list[float] | None:
-    """Return the state at t0 for an Experiment: plain numbers where all of it is known."""
+    """Return the state at t0 for an Experiment: numbers if all of it is known."""
     if table.initial_state is None:
         return None
     if all(entry.fixed for entry in table.initial_state):
@@ -691,7 +691,7 @@ def _build_data(
 
 
 def _find_sigma_columns(table: DataTable, parameters: frozenset[str]) -> list[str]:
-    """Return the columns that hold sigma; none where it is numbers, or names of parameters."""
+    """Return the columns that hold sigma; an empty list if it is numbers, or names of parameters."""
     given = table.sigma if isinstance(table.sigma, list) else []
     named = [entry for entry in given if isinstance(entry, str)]
     if not named or all(name in parameters for name in named):
@@ -795,7 +795,7 @@ def _find_time_scale(log: Log, table: LogTable, time_unit: str) -> float:
 def _build_observe(
     folder: Path, table: DataTable, system: HybridSystem | None, where: str
 ) -> Callable[..., Any] | None:
-    """Return the observation h(t, x, p), or None for the whole state, and where there is no system to observe."""
+    """Return the observation h(t, x, p); None for the whole state, or without a system."""
     if table.observe is None:
         return None
     if isinstance(table.observe, str):
@@ -813,7 +813,7 @@ def _build_observe(
     if system is None:
         return None
     if system.state_names is None:
-        raise ValueError("observe names states, but the model has no state_names; give it some.")
+        raise ValueError("observe names states, but the model has no state_names; add them to it.")
     unknown = [name for name in table.observe if name not in system.state_names]
     if unknown:
         raise ValueError(
@@ -824,7 +824,7 @@ def _build_observe(
 
 @functools.cache
 def select_states(indices: tuple[int, ...]) -> Callable[..., Any]:
-    """Return the observation ``h(t, x, p) = x[indices]``; the same function for the same indices, so it compiles once.
+    """Return the observation ``h(t, x, p) = x[indices]``, cached by indices so that it compiles once.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What `switchfit check` says about a problem before any fit: its data and its unknowns."""
+"""Summary of a problem for `switchfit check`: its data and its unknowns."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def _describe_experiment(experiment: Experiment) -> list[str]:
 
 
 def _describe_sensor(item: Measurements, unit: str) -> str:
-    """Return what is to be said of delay, noise and loss, where there is anything."""
+    """Return a description of delay, noise and loss, empty for a sensor without these."""
     named = sorted({name for name in item.sigma_names if name})
     said = [
         f"late by {item.delay}{'' if isinstance(item.delay, str) else unit}" if item.delay else "",

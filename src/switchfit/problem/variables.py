@@ -1,8 +1,8 @@
-"""The variables in which the optimiser works: unknowns of any size made to be of size one, or their logarithms.
+"""Variables of the optimizer: unknowns scaled to the size of one, or their logarithms.
 
     theta = s z,  or  theta = exp(z):      d theta / dz = D,    g_z = D g,    H_z = D H D + diag(E g),
 
-with E = d^2 theta / dz^2, 0 or theta. What is near one as it is stays as it is: s = 1.
+with E = d^2 theta / dz^2, 0 or theta. Unknowns whose size is near one are not scaled: s = 1.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 ORDINARY = (1e-3, 1e3)
-"""Sizes of an unknown between which it is not scaled; the tolerance on the gradient is then that of theta itself."""
+"""Range of sizes in which an unknown is not scaled; the tolerance on the gradient is then that of theta itself."""
 
 
 class Variables(NamedTuple):
@@ -28,25 +28,25 @@ class Variables(NamedTuple):
     def of(
         cls, theta: FloatArray, lower: FloatArray, upper: FloatArray, log: NDArray[np.bool_], keep: NDArray[np.bool_]
     ) -> Variables:
-        """Return variables for unknowns of the size of a first guess, or of the bounds where that is 0.
+        """Return variables scaled by the first guess, or by the bounds if it is 0.
 
         Parameters
         ----------
         theta, lower, upper : (d,)
         log : (d,) of bool
-        keep : (d,) of bool, what is not to be scaled
+        keep : (d,) of bool, unknowns that are not scaled
         """
         bounds = np.maximum(
             np.where(np.isfinite(lower), np.abs(lower), 0), np.where(np.isfinite(upper), np.abs(upper), 0)
         )
         typical = np.where(theta != 0.0, np.abs(theta), bounds)
         outside = (typical > 0) & ((typical < ORDINARY[0]) | (typical > ORDINARY[1])) & ~keep & ~log
-        # A power of 2, so that scaling rounds nothing.
+        # A power of 2, so that scaling causes no rounding.
         return cls(2.0 ** np.round(np.log2(np.where(outside, typical, 1.0))), log)
 
     @property
     def identity(self) -> bool:
-        """Whether nothing changes."""
+        """Whether the variables equal theta."""
         return not self.log.any() and bool(np.all(self.size == 1.0))
 
     def outward(self, z: Any, xp: Any = np) -> Any:
@@ -59,7 +59,7 @@ class Variables(NamedTuple):
         return xp.where(self.log, xp.where(theta > 0, xp.log(positive), -xp.inf), theta / self.size)
 
     def sizes_inward(self, sizes: FloatArray) -> FloatArray:
-        """Return sizes of z for sizes of theta (d,): rounding of a logarithm is measured by 1."""
+        """Return sizes of z for sizes of theta (d,); the size of a logarithm is 1."""
         return np.where(self.log, 1.0, sizes / self.size)
 
     def slopes(self, theta: Any, xp: Any = np) -> tuple[Any, Any]:

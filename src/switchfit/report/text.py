@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +15,7 @@ from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report.numbers import format_rounded, format_unit, get_unit
-from switchfit.report.tables import format_table
+from switchfit.report.tables import format_table, wrap_text
 from switchfit.report.uncertainty import write_direction
 from switchfit.report.verdict import format_share
 from switchfit.runtime.presentation import format_text
@@ -27,7 +26,6 @@ from switchfit.uncertainty.quality import explain_channel
 from switchfit.uncertainty.residuals import correct_errors
 from switchfit.uncertainty.verdict import Verdict, judge
 
-WIDTH = 100
 ONE_SIDED = 1.2
 """Ratio of the two sides of an interval above which it is said that they differ."""
 LABEL = 18
@@ -71,6 +69,7 @@ def report(
     *,
     verdict: Verdict | None = None,
     full: bool = False,
+    files: Mapping[str, str] | None = None,
 ) -> str:
     """Return the verdict, what was fitted, how it ended, how well it fits, the unknowns with their errors, and what to
     be wary of.
@@ -87,6 +86,8 @@ def report(
     full : bool
         All experiments, channels, unknowns, correlations and directions, and all warnings in full; otherwise a screen,
         without the warnings that the verdict gives already.
+    files : mapping of str to str, optional
+        Names of files that have all "runs" and all "unknowns", said where a screen has no room for them.
 
     Returns
     -------
@@ -95,16 +96,17 @@ def report(
     """
     verdict = judge(fit, certificate) if verdict is None else verdict
     limits = EVERYTHING if full else SCREEN
+    runs, unknowns = (f", all in {files[name]}" if files and name in files else "" for name in ("runs", "unknowns"))
     weak = analyse_solution(fit, None) if found is None else found
     sections = [
-        _wrap(str(verdict), "", "  "),
+        wrap_text(str(verdict), "", "  "),
         _format_section(
-            "Fit", _format_experiments(fit, limits.experiments, full=full) + _format_course(fit, full=full)
+            "Fit", _format_experiments(fit, limits.experiments, runs, full=full) + _format_course(fit, full=full)
         ),
         _format_section(
-            "Quality of the fit", [*_format_quality(fit, full=full), *_format_channels(fit, limits.channels)]
+            "Quality of the fit", [*_format_quality(fit, full=full), *_format_channels(fit, limits.channels, runs)]
         ),
-        _format_section("Unknowns", _format_unknowns(fit, limits.unknowns)),
+        _format_section("Unknowns", _format_unknowns(fit, limits.unknowns, unknowns)),
         _format_section("Held fixed", _format_fixed(fit, limits.fixed)),
         _format_section(CORRELATIONS, _format_correlations(fit, limits.correlations, full=full)),
         _format_section("Determined worst by the data", _describe_weak(fit, weak, limits.directions)),
@@ -121,18 +123,19 @@ def write_fit(fit: Fit, *, full: bool = False) -> str:
 
 
 @format_text.register(Estimate)
-def write_estimate(estimate: Estimate, *, full: bool = False) -> str:
+def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str, str] | None = None) -> str:
     """Return the report of an estimate, with its certificate if that is known already, and J evaluated where it is
     weak.
     """
     verdict = estimate.verdict
-    return report(estimate, estimate.known_certificate, estimate.identifiability, verdict=verdict, full=full)
+    found = estimate.identifiability
+    return report(estimate, estimate.known_certificate, found, verdict=verdict, full=full, files=files)
 
 
 # --- sections ---------------------------------------------------------------------------------------------------------
 
 
-def _format_experiments(fit: Fit, most: int, *, full: bool) -> list[str]:
+def _format_experiments(fit: Fit, most: int, where: str, *, full: bool) -> list[str]:
     """Return each experiment's modes, its horizon and its data; on one screen of several a line each."""
     lines: list[str] = []
     single = len(fit.trajectories) == 1
@@ -148,7 +151,7 @@ def _format_experiments(fit: Fit, most: int, *, full: bool) -> list[str]:
         else:
             lines += _format_row(name, "; ".join([f"{sequence}, {horizon}", *data]))
     if len(names) > most:
-        lines += _format_row("", f"and {len(names) - most} more experiments")
+        lines += _format_row("", f"and {len(names) - most} more experiments{where}")
     return lines
 
 
@@ -212,7 +215,7 @@ def _format_quality(fit: Fit, *, full: bool) -> Iterator[str]:
     )
 
 
-def _format_channels(fit: Fit, most: int) -> list[str]:
+def _format_channels(fit: Fit, most: int, where: str) -> list[str]:
     """Return a table of the channels: root mean square of the residuals, in units and in sigmas, and the share of the
     variance that is explained; of more than `most` those that are explained worst.
     """
@@ -234,7 +237,7 @@ def _format_channels(fit: Fit, most: int) -> list[str]:
     header = ["channel", "values", "rmse", "", in_sigmas, "explained"]
     table = format_table([header, *(rows[k] for k in kept)], "<>><>>")
     more = len(rows) - len(kept)
-    return ["", *table] + ([f"  and {more} more channels, of which more is explained"] if more else [])
+    return ["", *table] + ([f"  and {more} more channels, of which more is explained{where}"] if more else [])
 
 
 def _format_residuals(comparison: Comparison, k: int) -> tuple[str, str, str]:
@@ -249,7 +252,7 @@ def _format_residuals(comparison: Comparison, k: int) -> tuple[str, str, str]:
     return count, f"{rmse:.4g}", "" if isinstance(scaled, str) else f"{np.sqrt(np.mean(scaled**2)):.3g}"
 
 
-def _format_unknowns(fit: Fit, most: int) -> list[str]:
+def _format_unknowns(fit: Fit, most: int, where: str) -> list[str]:
     """Return the table of the unknowns; standard errors that are corrected have the naive ones beside them."""
     naive, errors = fit.standard_errors, correct_errors(fit)
     known = bool(np.isfinite(errors).any())
@@ -271,7 +274,7 @@ def _format_unknowns(fit: Fit, most: int) -> list[str]:
     columns = [k for k in range(8) if (known or k not in (2, 3, 4)) and (corrected or k != 4)]
     table = format_table([[row[k] for k in columns] for row in rows], "".join("<><><<><"[k] for k in columns))
     more = len(fit.theta) - len(shown)
-    table += [f"  and {more} more unknowns"] if more else []
+    table += [f"  and {more} more unknowns{where}"] if more else []
     if not known:
         return table
     if corrected:
@@ -352,13 +355,13 @@ def _format_correlations(fit: Fit, most: int, *, full: bool) -> list[str]:
         return format_table(rows, "<>")
     more = len(above) - len(rows)
     listed = [f"{pair} {value}" for pair, value in rows] + ([f"and {more} more"] if more > 0 else [])
-    return _wrap("; ".join(listed), "  ", "    ")
+    return wrap_text("; ".join(listed), "  ", "    ")
 
 
 def _describe_weak(fit: Fit, found: Identifiability, most: int) -> list[str]:
     """Return the combinations of unknowns that the data hardly see, if there are any."""
     weak = [d for d in found.directions if d.eigenvalue < WEAK] if fit.status.successful else []
-    lines = [line for direction in weak[:most] for line in _wrap(write_direction(found, direction), "  - ", "    ")]
+    lines = [line for direction in weak[:most] for line in wrap_text(write_direction(found, direction), "  - ", "    ")]
     more = len(weak) - len(weak[:most])
     return lines + ([f"  and {_count(more, 'direction')} more"] if more else [])
 
@@ -386,7 +389,7 @@ def _format_warnings(fit: Fit, verdict: Verdict, most: int, *, full: bool) -> li
     """Return what to be wary of; on one screen without what the verdict has said."""
     said = set() if full else set().union(*(_SAID.get(reason.kind, set()) for reason in verdict.reasons))
     issues = [issue for issue in find_issues(fit) if issue.kind not in said]
-    lines = [line for issue in issues[:most] for line in _wrap(str(issue), "  - ", "    ")]
+    lines = [line for issue in issues[:most] for line in wrap_text(str(issue), "  - ", "    ")]
     more = len(issues) - len(issues[:most])
     return lines + ([f"  and {_count(more, 'warning')} more"] if more else [])
 
@@ -406,14 +409,8 @@ def _format_section(title: str, lines: Sequence[str]) -> list[str]:
 def _format_row(label: str, text: str) -> list[str]:
     """Return a label at the left and text, wrapped, beside it."""
     if len(label) > LABEL:
-        return [f"  {label}", *_wrap(text, " " * (LABEL + 4), " " * (LABEL + 4))]
-    return _wrap(text, f"  {label:<{LABEL}}  ", " " * (LABEL + 4))
-
-
-def _wrap(text: str, first: str, others: str) -> list[str]:
-    return textwrap.wrap(
-        text, WIDTH, initial_indent=first, subsequent_indent=others, break_long_words=False, break_on_hyphens=False
-    )
+        return [f"  {label}", *wrap_text(text, " " * (LABEL + 4), " " * (LABEL + 4))]
+    return wrap_text(text, f"  {label:<{LABEL}}  ", " " * (LABEL + 4))
 
 
 def _count(number: int, what: str) -> str:

@@ -6,23 +6,23 @@ import sys
 from collections.abc import Callable
 
 Progress = Callable[[int, int], object]
-"""``progress(done, total)``; a true value stops."""
+"""``progress(done, total)``; a true return value stops the run."""
 
 
 def show_progress(callback: Progress | None, title: str) -> tuple[Progress, Callable[[], None]]:
-    """Return a context that yields the callback of a long run: the user's, with a bar on a terminal.
+    """Return the callback of a long run, which calls the user's and draws a bar on a terminal.
 
     Parameters
     ----------
     callback : callable, optional
     title : str
-        Of the bar.
+        Title of the bar.
 
     Returns
     -------
     report : callable ``(done, total)``
     end : callable without arguments
-        Takes the bar away.
+        Removes the bar.
     """
     if not sys.stderr.isatty():
         return (lambda done, total: callback is not None and callback(done, total)), lambda: None

@@ -47,6 +47,9 @@ REMESH, INSIDE = "new meshes", "constraints inside the programme"
 
 CONSTRAINTS_AGREE = "constraints inside the programme agree"
 
+GROWTH_AGREES = "growing horizon agrees"
+"""The growing horizon, which does not start from the guess, has ended at the same cost as the fit."""
+
 EVERYWHERE = frozenset({GROW, REINSERT, STARTS, CONSTRAINTS_AGREE})
 """Strategies that look everywhere, and the one that meets constraints in another way, if it ends at the same cost."""
 
@@ -170,6 +173,8 @@ def _is_enough(problem: Problem, fit: Estimate, tried: Collection[str] = ()) -> 
         return True
     if _is_confirmed(problem, fit):
         return True
+    if GROWTH_AGREES in tried and SCAN in tried and fit.status.successful:
+        return True  # what is doubted is the model: two searches that share no start have found the same minimum
     if is_doubted(fit) or (_is_coarse(fit) and REMESH not in tried):
         return False
     if any(run.is_guess_proposed for run in problem.experiments) and fit.sigma_known is not True:
@@ -272,6 +277,8 @@ class Search:
                     break
                 agrees = self._try(name, find)
                 tried.add(CONSTRAINTS_AGREE if agrees and name == INSIDE else name)
+                if agrees and name == GROW:
+                    tried.add(GROWTH_AGREES)
                 if self.strategy == "auto" and self.best is not None and _is_enough(self.problem, self.best, tried):
                     break
                 if self.best is not None and self.best.status is Status.INTERRUPTED:

@@ -1,12 +1,12 @@
-"""Samples that are seen late by a delay d that is a parameter: the state at ``s_k = t_k - d``.
+"""Late samples, with a delay d that is a parameter: they see the state at ``s_k = t_k - d``.
 
-The nodes of the mesh stay where they are. The state at s_k comes from one Runge-Kutta step of its own, from the start
-of the row that holds s_k to s_k itself; this step is part of the discretised system, and its derivatives are exact. A
-sample thus is a cost of (start of the row, state there, p), with s_k a function of p; the start moves with tau_i where
-the row opens a mode. Everything is found by forward differentiation, sample by sample.
+The nodes of the mesh are fixed. The state at s_k comes from one Runge-Kutta step of its own, from the start of the row
+that holds s_k to s_k itself; this step is part of the discretized system, and its derivatives are exact. A sample thus
+is a cost of (start of the row, state there, p), with s_k a function of p; the start moves with tau_i where the row
+opens a mode. All derivatives are computed in forward mode, sample by sample.
 
 Where s_k passes a transition, J has a kink, as where a transition passes a sample; where it passes a node of the mesh,
-one of the size of the integration error.
+J has a kink of the size of the integration error.
 """
 
 from __future__ import annotations

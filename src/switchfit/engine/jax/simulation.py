@@ -1,8 +1,8 @@
-"""Simulations by JAX, some rows at a time: one small program a model, whatever the mesh and the number of samples.
+"""Simulations by JAX, a block of rows at a time: one small program per model, for any mesh and number of samples.
 
-Where derivatives are asked for, they are carried from row to row beside the state. What is carried is the derivative of
-x at the end of a row, which moves with theta where it is a transition; what is returned is that at the time at which
-the end is: less dx/dt times the end's own derivative.
+If derivatives are requested, they are propagated from row to row with the state. The propagated derivative is that of
+x at the end of a row, which moves with theta where it is a transition. The returned derivative is that at fixed time:
+the propagated one minus dx/dt times the derivative of the end.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from switchfit.problem.structure import Structure
 from switchfit.runtime.cache import use_compilation_cache
 
 BLOCK = 64
-"""Rows that one call of the program takes: with shapes that do not depend on the mesh it is compiled once a model."""
+"""Rows per call of the program. Its shapes do not depend on the mesh, so that it is compiled once per model."""
 
 
 def simulate_by_jax(
     structure: Structure, whole: Arguments, mesh: Mesh, tau: FloatArray, p: FloatArray, tangents: bool
 ) -> Simulation:
-    """Return all rows of one experiment, and their derivatives if asked for."""
+    """Return all rows of one experiment, with their derivatives if `tangents`."""
     arguments = whole.without_mesh()
     layout = build_rows(mesh.nodes, tau, 1.0, np)
     cell, start, end = (np.reshape(a, -1) for a in (layout.cell, layout.start, layout.end))
@@ -90,7 +90,7 @@ def simulate_by_jax(
 
 
 def _cost_of_samples(structure: Structure, arguments: Arguments, seen: tuple[FloatArray, ...], p: FloatArray) -> float:
-    """Return the costs of all samples from the outputs, in NumPy: a program of JAX would be compiled for each count."""
+    """Return the costs of all samples from the outputs, in NumPy: JAX would compile a program for each sample count."""
     named, total = _name_parameters(structure, arguments, p), 0.0
     for samples, sensor, y in zip(arguments.samples, structure.measurements, seen, strict=True):
         there = np.asarray(samples.weight) > 0
@@ -105,7 +105,7 @@ def _cost_of_samples(structure: Structure, arguments: Arguments, seen: tuple[Flo
 
 def _name_parameters(structure: Structure, arguments: Arguments, p: FloatArray) -> dict[str, Any]:
     """Return the parameters by the model's names."""
-    return dict(Model(structure, arguments).parameters(p))  # type: ignore[arg-type]  # arrays of NumPy's
+    return dict(Model(structure, arguments).parameters(p))  # type: ignore[arg-type]  # NumPy arrays
 
 
 def _segment(
@@ -120,8 +120,8 @@ def _segment(
 ) -> tuple[FloatArray, FloatArray, float, list[FloatArray]]:
     """Return all rows of a segment, block by block; the last block is padded with rows of length zero at fixed times.
 
-    Returns the state behind it and its derivative, the running cost, and columns: states before and after, outputs
-    before and after; then their derivatives, if asked for.
+    Returns the state after it and its derivative, the running cost, and columns: states before and after, outputs
+    before and after; then their derivatives, if requested.
     """
     end, count = given[1], len(given[0])
     missing = -count % BLOCK
@@ -185,7 +185,7 @@ def _block(
     structure: Structure,
     tangents: bool,
 ) -> tuple[tuple[jax.Array, jax.Array], jax.Array, tuple[jax.Array, ...]]:
-    """Return x and X behind a block of rows in one mode, its running cost, and columns as of `_segment`."""
+    """Return x and X after a block of rows in one mode, its running cost, and columns as in `_segment`."""
     model = Model(structure, arguments)
     P = _of_parameters(X, p) if tangents else X
 

@@ -1,6 +1,6 @@
-"""Entries taken from arrays, and put into them, at indices that may depend on the state: gather, scatter and slices.
+"""Gather, scatter and slices of arrays at indices that may depend on the state.
 
-Which entry it is, selections decide at run time (`entries.pick`). Indices out of range are treated as JAX does.
+Selections choose the entry at run time (`entries.pick`). Indices out of range are treated as in JAX.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def take(graph: Graph, a: Any, starts: Sequence[Any], sizes: Sequence[int]) -> A
 
 
 def _reach(start: Any, size: int) -> slice:
-    """Return the range of places that a window may reach."""
+    """Return the range of indices that a window may reach."""
     return slice(start.low, start.high + size) if isinstance(start, Integer) else slice(start, start + size)
 
 
@@ -91,13 +91,13 @@ def put(graph: Graph, a: Objects, starts: Sequence[Any], window: Any, combine: C
 
 
 def dynamic_slice(graph: Graph, equation: Any, a: Any, *starts: Any) -> Any:
-    """Do what `jax.lax.dynamic_slice` does: a window that does not fit is moved inside."""
+    """Trace `jax.lax.dynamic_slice`: a window that is out of range is moved inside."""
     sizes = equation.params["slice_sizes"]
     return take(graph, a, _move_inside(graph, starts, a.shape, sizes), sizes)
 
 
 def dynamic_update_slice(graph: Graph, equation: Any, a: Any, update: Any, *starts: Any) -> Any:
-    """Do what `jax.lax.dynamic_update_slice` does."""
+    """Trace `jax.lax.dynamic_update_slice`."""
     result = a.astype(object)
     inside = _move_inside(graph, starts, a.shape, update.shape)
     put(graph, result, inside, update, lambda here, old, new: choose(graph, here, new, old))
@@ -115,11 +115,11 @@ class _Window:
     Attributes
     ----------
     starts : list
-        Where it begins along each axis of the operand, moved into range.
+        First index along each axis of the operand, moved into range.
     fits : bool or Node
-        Whether nothing had to be moved.
+        Whether the window was in range.
     among : tuple
-        Its place in the array of all windows; entries along slices are those of `kept` axes.
+        Index of the window in the array of all windows, with slices along the axes inside windows.
     """
 
     starts: list[Any]
@@ -130,7 +130,7 @@ class _Window:
 def _windows(
     graph: Graph, shape: Sequence[int], indices: Any, sizes: Sequence[int], numbers: Any, inside: Any, many: int
 ) -> Iterator[_Window]:
-    """Yield the windows of a gather or scatter; `inside` are the axes in windows, of the `many` of their array."""
+    """Yield the windows of a gather or scatter; `inside` are the window axes among the `many` axes of their array."""
     gathers = hasattr(numbers, "start_index_map")
     axes = numbers.start_index_map if gathers else numbers.scatter_dims_to_operand_dims
     batched = dict(
@@ -157,7 +157,7 @@ def _windows(
 
 
 def gather(graph: Graph, equation: Any, a: Any, indices: Any) -> Any:
-    """Do what `jax.lax.gather` does."""
+    """Trace `jax.lax.gather`."""
     params, out = equation.params, equation.outvars[0].aval
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
@@ -182,7 +182,7 @@ def _fill_value(given: Any, dtype: np.dtype[Any]) -> Any:
 
 
 def scatter(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any, combine: Combine) -> Any:
-    """Do what `jax.lax.scatter`, `scatter_add` and the like do."""
+    """Trace `jax.lax.scatter`, `scatter_add` and their variants."""
     params = equation.params
     numbers = params["dimension_numbers"]
     inside, dropped = numbers.update_window_dims, (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
@@ -199,7 +199,7 @@ def scatter(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any, com
 
 
 def add_where(graph: Graph, add: Callable[[Any, Any], Any], of_integers: bool) -> Combine:
-    """Return how an update is added where a condition holds."""
+    """Return a function that adds an update if a condition holds."""
 
     def combine(here: Any, old: Any, update: Any) -> Any:
         if not isinstance(here, Node):

@@ -1,6 +1,6 @@
-"""Linear algebra of small matrices, written out: LU with pivots chosen at run time, Cholesky, triangular systems.
+"""Unrolled linear algebra of small matrices: LU with pivots chosen at run time, Cholesky, triangular systems.
 
-As LAPACK does it, for matrices that lie in the last two axes of arrays.
+The algorithms are those of LAPACK; the matrices are the last two axes of arrays.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from switchfit.engine.native.entries import Unsupported, both, choose, equal, kn
 from switchfit.engine.native.scalars import Graph, Objects
 
 MOST_ROWS_TO_PIVOT = 5
-"""Rows of a matrix in an LU factorization, whose pivots are chosen by selections."""
+"""Largest number of rows in an LU factorization, whose pivots take selections."""
 
 MOST_ROWS = 6
-"""Rows of a matrix in a Cholesky factorization, or of a triangular system that depends on the state."""
+"""Largest number of rows in a Cholesky factorization, or in a triangular system that depends on the state."""
 
 MOST_KNOWN_ROWS = 30
-"""Rows of a triangular system whose matrix is known."""
+"""Largest number of rows in a triangular system whose matrix is known."""
 
 
 def _for_each(function: Callable[..., tuple[Any, ...]], *arrays: Any) -> list[Any]:
@@ -31,7 +31,7 @@ def _for_each(function: Callable[..., tuple[Any, ...]], *arrays: Any) -> list[An
 
 
 def lu(graph: Graph, equation: Any, a: Any) -> list[Any]:
-    """Do what `jax.lax.linalg.lu` does: L and U in one matrix, the row that each step exchanges, the order."""
+    """Trace `jax.lax.linalg.lu`: L and U in one matrix, the pivots, the permutation."""
     _check_rows(max(a.shape[-2:]), MOST_ROWS_TO_PIVOT)
     return _for_each(lambda matrix: _lu(graph, matrix), a)
 
@@ -47,7 +47,7 @@ def _lu(graph: Graph, matrix: Objects) -> tuple[Any, ...]:
             a = _exchange_rows(graph, a, k, pivots[k])
             order = _exchange_rows(graph, order[:, None], k, pivots[k])[:, 0]
         pivot = a[k, k]
-        # LAPACK leaves a column of zeros as it is.
+        # Like LAPACK, leave a column of zeros unchanged.
         inverse = graph.apply("div", 1.0, choose(graph, graph.apply("eq", pivot, 0.0), 1.0, pivot))
         for i in range(k + 1, rows):
             a[i, k] = graph.apply("mul", a[i, k], inverse)
@@ -82,7 +82,7 @@ def _exchange_rows(graph: Graph, a: Any, k: int, other: Any) -> Any:
 
 
 def cholesky(graph: Graph, equation: Any, a: Any) -> list[Any]:
-    """Do what `jax.lax.linalg.cholesky` does for a symmetric matrix; all is NaN if it is not positive definite."""
+    """Trace `jax.lax.linalg.cholesky` for a symmetric matrix; L is NaN if the matrix is not positive definite."""
     _check_rows(a.shape[-1], MOST_ROWS)
     return _for_each(lambda matrix: (_cholesky(graph, matrix),), a)
 
@@ -116,7 +116,7 @@ def _sum_of_products(graph: Graph, a: Any, b: Any) -> Any:
 
 
 def triangular_solve(graph: Graph, equation: Any, a: Any, b: Any) -> list[Any]:
-    """Do what `jax.lax.linalg.triangular_solve` does."""
+    """Trace `jax.lax.linalg.triangular_solve`."""
     params = equation.params
     _check_rows(a.shape[-1], MOST_ROWS if a.dtype == object else MOST_KNOWN_ROWS)
     lower = params["lower"] != params["transpose_a"]

@@ -1,4 +1,4 @@
-"""The loops over samples, in LLVM's language, by hand: those at nodes, and late ones, which lie between them."""
+"""Loops over samples in hand-written LLVM IR: samples at nodes, and late samples, which lie between nodes."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _next_sample(writer: Writer, work: int) -> None:
 def _late_row(
     writer: Writer, k: int, found: dict[str, str], own: dict[str, str]
 ) -> tuple[str, dict[str, str], str, int]:
-    """Take the row of a late sample forward; return the index of the row that holds it, pointers, mode and work."""
+    """Write the forward step of a late sample's row; return the index of the row around it, pointers, mode, work."""
     n, S, width = writer.sizes.n, writer.sizes.signals, writer.sizes.width
     cell, segment = (writer.load("i64", writer.at(own[name], "%sample")) for name in ("cell", "segment"))
     row = writer.let(f"add i64 {cell}, {segment}")
@@ -104,9 +104,9 @@ def _late_row(
 
 
 def write_late_samples(writer: Writer, k: int, counts: list[int]) -> str:
-    """Write the loop over the samples of the k-th Measurements, which are late: each ends a row of its own.
+    """Write the loop over the late samples of the k-th Measurements; each ends a row of its own.
 
-    `counts` are the numbers of entries of the second derivatives of such a row, by modes.
+    `counts` are the numbers of second derivatives at a stage of such a row, one for each mode.
     """
     n, q = writer.sizes.n, writer.library.measurements[k].channels
     found, own = writer.pointers(), writer.samples_of(k)

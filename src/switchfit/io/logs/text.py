@@ -148,7 +148,7 @@ def decode(path: Path) -> str:
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
     except ValueError as error:
-        raise InputError(f"{str(path)!r} is no name of a file: {error}.") from error
+        raise InputError(f"{str(path)!r} is not a file name: {error}.") from error
     for mark, encoding in ((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")):
         if data.startswith(mark):
             return _decode_as(path, data, encoding)
@@ -174,7 +174,7 @@ def _read_table(path: Path, drop_broken: bool) -> _Table:
     lines = list(enumerate(re.split(r"\r\n|\n|\r", decode(path)), start=1))
     kept = [(k, line) for k, line in lines if line.strip() and not line.lstrip().startswith(COMMENTS)]
     if not kept:
-        raise InputError(f"{path} is empty; it needs a line with the names of the columns and one line a sample.")
+        raise InputError(f"{path} is empty; it needs a line with the names of the columns and one line per sample.")
     delimiter = find_delimiter([line for _, line in kept[:SNIFFED]])
     rows = _split_rows(path, kept, delimiter)
     comments = [line for k, line in lines[: kept[0][0] - 1] if line.lstrip().startswith(COMMENTS)]
