@@ -296,7 +296,7 @@ def test_wrapped_angles(write, name, turn):
 
 def test_angles_that_are_not_wrapped(write):
     assert sf.read_log(write(table(range(9), np.linspace(0, 6, 9), "yaw"))).issues == ()
-    with pytest.raises(InputError, match="repair='unwrap:x' needs an angle in rad or deg; the unit of 'x' is 'm'"):
+    with pytest.raises(InputError, match="repair='unwrap:x' needs an angle in rad or deg; its unit is 'm'"):
         sf.read_log(write(table(range(9), name="x [m]")), repair="unwrap:x")
     with pytest.raises(InputError, match="has no column 'z'"):
         sf.read_log(write(table(range(9))), repair="unwrap:z")

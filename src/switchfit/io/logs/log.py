@@ -178,7 +178,7 @@ class Log:
             return name
         if name in self.labels:
             return self.labels[name]
-        raise InputError(f"{self.source} has no column {name!r}; its columns are {join_names(self.values)}.")
+        raise InputError(f"{self.source} has no column {shorten(name)}; its columns are {join_names(self.values)}.")
 
     def _select(self, names: Sequence[str]) -> Log:
         kept = {label: name for label, name in self.labels.items() if name in names}

@@ -12,7 +12,7 @@ from switchfit.io.logs.libraries import import_library
 from switchfit.io.logs.log import Log
 from switchfit.io.logs.tables import build_log
 from switchfit.io.logs.times import find_time_name
-from switchfit.problem.validation import join_names
+from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -48,7 +48,9 @@ def read_mat(path: Path, time: str | None, topic: str | None, keep_epoch: bool) 
         )
     chosen = next(iter(groups)) if topic is None else topic
     if chosen not in groups:
-        raise InputError(f"{path} has no struct {chosen!r} with times; those that have are {join_names(groups)}.")
+        raise InputError(
+            f"{path} has no struct {shorten(chosen)} with times; those that have are {join_names(groups)}."
+        )
     group = groups[chosen]
     key = _find_times(group, time) or ""
     times = np.ravel(group[key])

@@ -144,7 +144,7 @@ def _find_turn(name: str, unit: str, samples: FloatArray, asked: bool) -> float 
     if unit == "" and (asked or _ANGLE.fullmatch(name)):
         return 360.0 if np.ptp(known) > 2.2 * np.pi else 2 * np.pi
     if asked:
-        raise InputError(f"repair='unwrap:{name}' needs an angle in rad or deg; the unit of {name!r} is {unit!r}.")
+        raise InputError(f"repair='unwrap:{name}' needs an angle in rad or deg; its unit is {shorten(unit)}.")
     return None
 
 

@@ -12,7 +12,7 @@ from switchfit.io.logs.log import Log
 from switchfit.io.logs.quality import check_repairs, inspect_log
 from switchfit.io.logs.text import read_text
 from switchfit.io.logs.units import SECONDS
-from switchfit.problem.validation import as_choice, as_names, as_path, as_positive
+from switchfit.problem.validation import as_choice, as_name, as_names, as_path, as_positive
 from switchfit.runtime.files import is_regular
 
 
@@ -133,6 +133,9 @@ def read_source(
     repairs = check_repairs(repair)
     if columns is not None:
         columns = as_names((columns,) if isinstance(columns, str) else columns, "columns", "a sequence of strings")
+    for what, name in (("time", time), ("topic", topic)):
+        if name is not None:
+            as_name(name, what)
     if time_unit is not None:
         as_choice(time_unit, "time_unit", tuple(SECONDS))
     place, error = check_origin(origin), None if range_error is None else as_positive(range_error, "range_error")

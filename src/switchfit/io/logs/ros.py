@@ -12,6 +12,7 @@ from switchfit.io.logs.geodesy import SIGMA
 from switchfit.io.logs.libraries import import_library
 from switchfit.io.logs.log import Event, Log
 from switchfit.io.logs.tables import stack_records
+from switchfit.problem.validation import shorten
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.issue import Issue
 
@@ -111,7 +112,7 @@ def _choose_connections(path: Path, connections: Sequence[Any], topic: str | Non
         topic = known[0]
     chosen = [connection for connection in connections if connection.topic == topic]
     if not chosen:
-        raise InputError(f"{path} has no topic {topic!r}; its topics are {listed}.")
+        raise InputError(f"{path} has no topic {shorten(topic)}; its topics are {listed}.")
     return chosen
 
 

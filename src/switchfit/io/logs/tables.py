@@ -10,7 +10,7 @@ import numpy as np
 from switchfit.io.logs.log import FloatArray, Log
 from switchfit.io.logs.times import find_time_name, interpret_times, subtract_first
 from switchfit.io.logs.units import SECONDS, split_unit
-from switchfit.problem.validation import join_names
+from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError
 
 
@@ -49,7 +49,7 @@ def build_log(
             "time = ..."
         )
     if time not in columns:
-        raise InputError(f"{source} has no column {time!r}; its columns are {join_names(columns)}.")
+        raise InputError(f"{source} has no column {shorten(time)}; its columns are {join_names(columns)}.")
     stated = {name: units.get(name, "") or split_unit(name)[1] for name in columns}
     times, time_unit, offset = _convert_times(columns[time], stated[time], keep_epoch)
     values = {

@@ -27,7 +27,7 @@ from switchfit.io.logs.header import (
 )
 from switchfit.io.logs.log import Event, FloatArray, Log
 from switchfit.io.logs.times import interpret_times, is_time_name, subtract_first
-from switchfit.problem.validation import join_names
+from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import is_device
 from switchfit.runtime.issue import Issue
@@ -254,12 +254,12 @@ def _use_decimal_commas(path: Path, rows: list[Row]) -> bool:
 def _find_column(table: _Table, name: str) -> int:
     names = table.header.names
     if names.count(name) > 1:
-        raise InputError(f"{table.source} has {names.count(name)} columns {name!r}; rename all but one.")
+        raise InputError(f"{table.source} has {names.count(name)} columns {shorten(name)}; rename all but one.")
     if name in names:
         return names.index(name)
     if name in table.header.labels:
         return table.header.labels[name]
-    raise InputError(f"{table.source} has no column {name!r}; its columns are {join_names(names)}.")
+    raise InputError(f"{table.source} has no column {shorten(name)}; its columns are {join_names(names)}.")
 
 
 def _find_columns(table: _Table, columns: Sequence[str]) -> list[int]:
