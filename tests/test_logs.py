@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
-from switchfit.io.problem_file import list_issues, load_problem
+from switchfit.io.problem_file import load_problem
 from switchfit.runtime.errors import InputError
 
 
@@ -436,8 +436,7 @@ def test_times_out_of_order_are_said_with_their_line(problem, write, times, mess
 
 def test_check_says_what_is_odd(problem):
     loaded = problem(("sigma", 'time_scale = 1e-3\nobserve = "model.py:observe"\nsigma'), ('"Weg"', '"Weg", "Winkel"'))
-    issues = list_issues(loaded.path)
-    assert [issue.kind for issue in issues] == ["log: wrapped angle"]
+    assert [issue.kind for issue in loaded.issues] == ["log: wrapped angle"]
     for options in ([], ["--no-run"]):
         result = CliRunner().invoke(cli.app, ["check", str(loaded.path), *options])
         assert result.exit_code == 0, result.stderr

@@ -9,12 +9,13 @@ from __future__ import annotations
 import difflib
 import functools
 import inspect
+import os
 import re
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import pydantic
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from pydantic_core import PydanticCustomError
 
+from switchfit.io.logs.files import find_logs, name_logs
 from switchfit.io.logs.log import Log
 from switchfit.io.logs.reader import align_starts, read_source
 from switchfit.io.logs.units import SECONDS, normalize_time_unit
@@ -52,20 +54,39 @@ class ProblemFile:
     problem : Problem
     options : dict
         Keyword arguments for `switchfit.estimate` that the file sets.
+    issues : tuple of Issue
+        What is odd about the logs; of kind "log: refused" for those of many that could not be used.
     """
 
     path: Path
     problem: Problem
     options: dict[str, Any]
+    issues: tuple[Issue, ...] = ()
 
 
-def load_problem(path: str | Path) -> ProblemFile:
+class Runs(NamedTuple):
+    """The experiments of a problem file, and what is odd about their logs.
+
+    Attributes
+    ----------
+    experiments : tuple of Experiment
+    issues : tuple of Issue
+        As of a `ProblemFile`.
+    """
+
+    experiments: tuple[Experiment, ...]
+    issues: tuple[Issue, ...]
+
+
+def load_problem(path: str | Path, log: str | Path | None = None) -> ProblemFile:
     """Read a problem file, the data files it names, and the Python file of its model.
 
     Parameters
     ----------
     path : str or Path
         A TOML file. Paths in it are relative to its folder.
+    log : str or Path, optional
+        Instead of the file that the data of the only experiment name; inputs and further data from other files stay.
 
     Returns
     -------
@@ -79,12 +100,15 @@ def load_problem(path: str | Path) -> ProblemFile:
     """
     path = Path(path)
     contents = _validate(path, _parse(path))
+    if log is not None:
+        contents = _replace_log(path, contents, os.path.abspath(log))
     options = contents.options.model_dump(include=OPTIONS, exclude_none=True)
     build = _build_from_tables if contents.problem is None else _load_from_python
-    return ProblemFile(path, build(path, contents), options)
+    problem, issues = build(path, contents)
+    return ProblemFile(path, problem, options, issues)
 
 
-def read_experiments(path: str | Path) -> tuple[Experiment, ...]:
+def read_experiments(path: str | Path) -> Runs:
     """Read a problem file and the data files it names, but do not run the Python file that it names.
 
     Parameters
@@ -93,7 +117,7 @@ def read_experiments(path: str | Path) -> tuple[Experiment, ...]:
 
     Returns
     -------
-    tuple of Experiment
+    Runs
         With data and horizon, but without observation functions; empty if the whole problem is built in Python.
 
     Raises
@@ -105,35 +129,13 @@ def read_experiments(path: str | Path) -> tuple[Experiment, ...]:
     contents = _validate(path, _parse(path))
     if contents.problem is not None:
         find_object(contents.problem, path.parent, f"{path}: problem")
-        return ()
+        return Runs((), ())
     if contents.model is not None and contents.model.name not in BUILT_IN:
         _check_model_name(f"{path}: model", contents.model)
         find_object(contents.model.name, path.parent, f"{path}: model")
     for name, table in contents.parameters.items():
         _build_at(f"{path}: parameters.{name}", _build_parameter, table)
     return _build_experiments(path, contents, None)
-
-
-def list_issues(path: str | Path) -> tuple[Issue, ...]:
-    """Return what is odd about the logs that a problem file names, each issue once.
-
-    Parameters
-    ----------
-    path : str or Path
-
-    Raises
-    ------
-    InputError
-        As of `load_problem`.
-    """
-    path = Path(path)
-    contents = _validate(path, _parse(path))
-    found: dict[str, Issue] = {}
-    for k, table in enumerate(contents.experiments, start=1):
-        known = frozenset(contents.parameters) | frozenset(table.parameter_map)
-        for log in _open_logs(path.parent, table, f"{path}: experiments[{k}]", known):
-            found |= {str(issue): issue for issue in log.issues}
-    return tuple(found.values())
 
 
 # --- the format -------------------------------------------------------------------------------------------------------
@@ -235,7 +237,11 @@ class StateTable(_Table):
 class LogTable(_Table):
     """Channels of a log over time."""
 
-    file: str = Field(description="the log, relative to the problem file")
+    file: str | None = Field(
+        default=None,
+        description="the log, relative to the problem file; a pattern such as 'logs/*.csv' or a folder stands for one "
+        "run a log; left out, a log given to switchfit fit --problem",
+    )
     time: str | None = Field(default=None, description="name of the column with the time; left out, it is found")
     topic: str | None = Field(default=None, description="topic of a ROS bag, or struct of a .mat file")
     origin: Annotated[list[float], Field(min_length=2, max_length=3)] | None = Field(
@@ -505,7 +511,7 @@ def _shorten(given: Any) -> str:
 # --- from tables to a problem -----------------------------------------------------------------------------------------
 
 
-def _load_from_python(path: Path, contents: Contents) -> Problem:
+def _load_from_python(path: Path, contents: Contents) -> tuple[Problem, tuple[Issue, ...]]:
     given = contents.options.model_dump(include={"min_duration", "solver", "rtol", "atol"}, exclude_none=True)
     if given:
         raise InputError(f"{path}: with 'problem', {', '.join(given)} is set where the sf.Problem is built, not here.")
@@ -518,28 +524,83 @@ def _load_from_python(path: Path, contents: Contents) -> Problem:
             f"{path}: problem {reference!r} must be an sf.Problem or a function that returns one; "
             f"got {type(found).__name__}."
         )
-    return found
+    return found, ()
 
 
-def _build_from_tables(path: Path, contents: Contents) -> Problem:
+def _build_from_tables(path: Path, contents: Contents) -> tuple[Problem, tuple[Issue, ...]]:
     system = _build_system(path, contents.model or ModelTable(name=""))
-    experiments = _build_experiments(path, contents, system)
+    runs = _build_experiments(path, contents, system)
     parameters = {
         name: _build_at(f"{path}: parameters.{name}", _build_parameter, table)
         for name, table in contents.parameters.items()
     }
     options = contents.options.model_dump(include={"min_duration", "solver", "rtol", "atol"}, exclude_none=True)
-    return _build_at(f"{path}", Problem, system, experiments, parameters, **options)
+    return _build_at(f"{path}", Problem, system, runs.experiments, parameters, **options), runs.issues
 
 
-def _build_experiments(path: Path, contents: Contents, system: HybridSystem | None) -> tuple[Experiment, ...]:
-    """Return the experiments; without a system their observations are left out."""
-    experiments = []
-    for k, table in enumerate(contents.experiments, start=1):
+def _build_experiments(path: Path, contents: Contents, system: HybridSystem | None) -> Runs:
+    """Return the experiments, one for each log that a pattern stands for; without a system they observe nothing."""
+    experiments: list[Experiment] = []
+    issues: dict[str, Issue] = {}
+    for k, given in enumerate(contents.experiments, start=1):
         where = f"{path}: experiments[{k}]"
-        known = frozenset(contents.parameters) | frozenset(table.parameter_map)
-        experiments.append(_build_at(where, _build_experiment, path.parent, table, system, where, known))
-    return tuple(experiments)
+        known = frozenset(contents.parameters) | frozenset(given.parameter_map)
+        tables = _build_at(where, _expand_patterns, path.parent, given)
+        refused: list[ValueError] = []
+        for table in tables:
+            try:
+                logs = _open_logs(path.parent, table, where, known)
+                issues |= {str(issue): issue for log in logs for issue in log.issues}
+                arguments = (path.parent, table, logs, system, where, known)
+                experiments.append(_build_at(where, _build_experiment, *arguments))
+            except ValueError as error:
+                refused.append(error)
+        if len(refused) == len(tables):
+            raise refused[0]
+        issues |= {str(error): Issue("log: refused", (str(error),)) for error in refused}
+    return Runs(tuple(experiments), tuple(issues.values()))
+
+
+def _expand_patterns(folder: Path, table: ExperimentTable) -> list[ExperimentTable]:
+    """Return an experiment for each log that patterns and folders in it stand for; logs of one name go together."""
+    given = {item.file for item in _list_log_tables(table) if item.file is not None}
+    found = {pattern: find_logs(folder, pattern) for pattern in sorted(given)}
+    named = {pattern: dict(zip(name_logs(logs), logs, strict=True)) for pattern, logs in found.items() if logs}
+    if not named:
+        return [table]
+    names = set.union(*(set(logs) for logs in named.values()))
+    for pattern, logs in named.items():
+        if missing := sorted(names - set(logs)):
+            raise ValueError(f"{folder / pattern} has no log {missing[0]!r}, which another pattern of the run has.")
+    prefix = "" if table.name is None else f"{table.name} "
+    return [
+        _replace_files(table, {pattern: logs[name] for pattern, logs in named.items()}, f"{prefix}{name}")
+        for name in sorted(names)
+    ]
+
+
+def _list_log_tables(table: ExperimentTable) -> list[LogTable]:
+    return [*table.data, *([] if table.inputs is None else [table.inputs])]
+
+
+def _replace_files(table: ExperimentTable, files: Mapping[str | None, str], name: str | None) -> ExperimentTable:
+    """Return an experiment with other files in place of some."""
+
+    def replace(item: Any) -> Any:
+        return item.model_copy(update={"file": files.get(item.file, item.file)})
+
+    inputs = None if table.inputs is None else replace(table.inputs)
+    return table.model_copy(update={"data": [replace(item) for item in table.data], "inputs": inputs, "name": name})
+
+
+def _replace_log(path: Path, contents: Contents, log: str) -> Contents:
+    """Return the contents with a log in place of the files that are left out; if none is, of the data's first file."""
+    if len(contents.experiments) != 1:
+        raise InputError(f"{path} must have one [[experiments]] to be fitted to logs; got {len(contents.experiments)}.")
+    (table,) = contents.experiments
+    left_out = any(item.file is None for item in _list_log_tables(table))
+    files = {None if left_out else table.data[0].file: log}
+    return contents.model_copy(update={"experiments": [_replace_files(table, files, table.name)]})
 
 
 def _build_at(where: str, build: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
@@ -609,10 +670,14 @@ def _build_prior(table: PriorTable) -> Prior:
 
 
 def _build_experiment(
-    folder: Path, table: ExperimentTable, system: HybridSystem | None, where: str, parameters: frozenset[str]
+    folder: Path,
+    table: ExperimentTable,
+    logs: Sequence[Log],
+    system: HybridSystem | None,
+    where: str,
+    parameters: frozenset[str],
 ) -> Experiment:
     places = [f"{where}.data[{k}]" for k in range(1, len(table.data) + 1)]
-    logs = _open_logs(folder, table, where, parameters)
     data = [
         _build_at(place, _build_data, folder, item, log, system, place, parameters, table.time_unit)
         for place, item, log in zip(places, table.data, logs, strict=False)  # that of the inputs comes after them
@@ -741,19 +806,25 @@ def _cut_log(
 def _open_logs(folder: Path, table: ExperimentTable, where: str, parameters: frozenset[str]) -> list[Log]:
     """Return the logs of data and inputs, in this order; the times of those with dates begin together."""
     logs = [
-        _build_at(
-            f"{where}.data[{k}]", _open_log, folder, item, [*item.columns, *_find_sigma_columns(item, parameters)]
-        )
+        _build_at(f"{where}.data[{k}]", _open_data, folder, item, parameters)
         for k, item in enumerate(table.data, start=1)
     ]
     if table.inputs is not None:
-        given = table.inputs.columns
-        names = list(given.values() if isinstance(given, dict) else given)
-        logs.append(_build_at(f"{where}.inputs", _open_log, folder, table.inputs, names))
+        logs.append(_build_at(f"{where}.inputs", _open_input, folder, table.inputs))
     return align_starts(logs)
 
 
+def _open_data(folder: Path, table: DataTable, parameters: frozenset[str]) -> Log:
+    return _open_log(folder, table, [*table.columns, *_find_sigma_columns(table, parameters)])
+
+
+def _open_input(folder: Path, table: InputTable) -> Log:
+    return _open_log(folder, table, list(table.columns.values() if isinstance(table.columns, dict) else table.columns))
+
+
 def _open_log(folder: Path, table: LogTable, columns: Sequence[str]) -> Log:
+    if table.file is None:
+        raise ValueError("the key 'file' is missing: name the log, or give logs: switchfit fit LOG ... --problem FILE.")
     return read_source(
         folder / table.file,
         columns=list(dict.fromkeys(columns)),

@@ -82,6 +82,7 @@ LOG_ISSUES: dict[str, Callable[[Issue], str]] = {
     "log: no stamps": lambda issue: (
         f"{issue.subjects[0]}: messages of {issue.subjects[1]} have no stamps; the times are those of the recorder."
     ),
+    "log: refused": lambda issue: f"Left out: {issue.subjects[0]}",
     "log: gap": _describe_gap,
     "log: wrapped angle": _describe_wrapped_angle,
     "log: text": _describe_text,
