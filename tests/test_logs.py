@@ -72,6 +72,25 @@ def test_encodings_and_compression(write, tmp_path, encoding):
         (tmp_path / "a.csv.gz").write_bytes(gzip.compress(path.read_bytes()))
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "t,x,y\n0,,1\n1,2,\n2,,\n,3,4\n",
+        "t;x;y\n0;;1\n1;2;\n2;;\n;3;4\n",
+        "t;x;y;\n0;;1;\n1;2;;\n2;;;\n;3;4;\n",
+        "t,x,y\n0,NA,1\n1,2,nan\n2,,N/A\nNULL,3,4\n",
+        't,x,y\n0,"",1\n1,2,""\n2,,\n,3,4\n',
+    ],
+)
+def test_missing_cells(write, text):
+    """Those that NumPy's reader is given, and those that are read one by one."""
+    log = sf.read_log(write(text), repair="drop-missing-times")
+    np.testing.assert_array_equal(log.times, [0, 1, 2])
+    np.testing.assert_array_equal(log[["x", "y"]], [[np.nan, 1], [2, np.nan], [np.nan, np.nan]])
+    with pytest.raises(InputError, match=r"the time of sample 4 is missing \(line 5\)"):
+        sf.read_log(write(text))
+
+
 def test_missing_values_and_names_with_commas(write):
     values = sf.read_log(write('t,"x, in m"\n0,\n1,NA\n2,nan\n3,4\n'))["x, in m"]
     np.testing.assert_array_equal(values, [np.nan, np.nan, np.nan, 4])
