@@ -241,7 +241,33 @@ def test_parameter(build, said):
         (
             {"data": reference([0, 0.1, 0.2, 0.3], [1, 2, 3, 4])},
             ValueError,
-            ["A ReferenceSignal must reach over (t0, tf) = (0.0, 1.0); this one is known from 0.0 to 0.3"],
+            ["A ReferenceSignal must reach over (t0, tf) = (0.0, 1.0); this one is known from 0.0 to 0.3", "Give t0"],
+        ),
+        (
+            {"data": sf.RunningCost(lambda t, x, p: x[0]), "t0": None, "tf": None},
+            ValueError,
+            ["t0 and tf are left out, but nothing among the data (RunningCost) has times", "give t0 and tf."],
+        ),
+        (
+            {"data": sf.TerminalCost(lambda x, p: x[0]), "tf": None},
+            ValueError,
+            ["tf is left out, but nothing among the data (TerminalCost) has times", "give tf."],
+        ),
+        (
+            {"data": samples(), "t0": None, "tf": None},
+            ValueError,
+            ["t0 and tf are left out", "span of the data, from 0.5 to 0.5, the horizon (t0, tf) would be (0.5, 0.5)"],
+        ),
+        ({"t0": 2.0, "tf": None}, ValueError, ["tf is left out", "would be (2.0, 1.0): give tf, so that t0 < tf"]),
+        (
+            {"t0": None, "tf": sf.Parameter(-1.0, upper=2.0)},
+            ValueError,
+            ["t0 is left out", "would be (0.0, -1.0): give t0"],
+        ),
+        (
+            {"data": [samples([0.0, 2.0], [1, 1]), reference([0, 0.5, 1, 1.5], [1, 1, 1, 1])], "tf": None},
+            ValueError,
+            ["A ReferenceSignal must reach over (t0, tf) = (0.0, 2.0)", "Give t0 and tf inside that"],
         ),
     ],
 )
@@ -275,7 +301,7 @@ FIXED = sf.Parameter(0.4, fixed=True)
             ValueError,
             ["mode_sequence names the unknown mode 'fall'; the modes are grow, shrink"],
         ),
-        (lambda: problem(solver="euler"), ValueError, ["solver must be 'explicit' or 'stiff'; got 'euler'"]),
+        (lambda: problem(solver="euler"), ValueError, ["solver must be 'auto', 'explicit' or 'stiff'; got 'euler'"]),
         (lambda: problem(rtol=0), ValueError, ["rtol must be positive; got 0.0"]),
         (lambda: problem(rtol="small"), ValueError, ["rtol must be a number", "got 'small'"]),
         (lambda: problem(rtol=1e-16), ValueError, ["rtol must lie between 1e-13", "got 1e-16"]),
@@ -485,7 +511,7 @@ def test_a_reset_map_that_returns_nan():
 def test_the_explicit_solver_refuses_a_very_stiff_mode_soon_and_names_the_other_solver():
     """At the pace of its first steps it would need 1e8 of them."""
     began = time.perf_counter()
-    stiff = on_a_long_horizon(lambda t, x, p: -1e8 * (x - jnp.cos(t)))
+    stiff = on_a_long_horizon(lambda t, x, p: -1e8 * (x - jnp.cos(t)), solver="explicit")
     said = ["mode 'grow' cannot be integrated", "more than 200000 steps", "use solver='stiff'"]
     refused(lambda: sf.evaluate(stiff), ValueError, *said)
     assert time.perf_counter() - began < 20.0

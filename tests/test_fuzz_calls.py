@@ -481,7 +481,7 @@ def catalogue():
                 "time": ("time must", "column"),
                 "path": ("file", "path", "folder"),
             }
-            | {"origin": ("origin", "latitude"), "range_error": ("range_error", "latitude")},
+            | {"origin": ("origin", "latitude"), "range_error": ("range_error", "latitude"), "topic": ("topic",)},
             inside={"columns": lambda bad: ["yaw", bad], "origin": lambda bad: [bad, 1.0]},
         ),
         "RunningCost": Door(lambda **given: problem(experiment(sf.RunningCost(**given))), {"ell": energy}),

@@ -139,6 +139,7 @@ def test_short_forms_and_defaults(folder):
     )
     experiment = loaded.problem.experiments[0]
     assert (experiment.t0, experiment.tf) == (0.0, 6.0)
+    assert "on -> off on [0, 6] s (t0 and tf from the data), at 3 s" in describe(loaded.problem)
     assert experiment.data[0].sigma is None
     assert experiment.data[0].observe is None
     assert loaded.options == {}
@@ -150,6 +151,12 @@ def test_fixed_values_stay_out_of_theta(folder):
         folder, ("cooling = 0.05", "cooling = { value = 0.05, fixed = true }"), ("upper = 5.0 }", "fixed = true }")
     )
     assert loaded.problem.theta_names == ("heating",)
+
+
+def test_a_horizon_of_which_one_end_is_left_out(folder):
+    problem = changed(folder, ("t0 = 0.0\ntf = 6.0\n", "tf = 7.5\n"), ("sigma = 0.1\n", "delay = 0.25\n")).problem
+    assert (problem.experiments[0].t0, problem.experiments[0].tf) == (-0.25, 7.5)
+    assert "on [-0.25, 7.5] s (t0 from the data)" in describe(problem)
 
 
 def test_window_offset_and_scale(folder):

@@ -480,6 +480,40 @@ def test_a_library_that_is_missing(path, tmp_path, monkeypatch):
         sf.read_log(tmp_path / path)
 
 
+def test_options_that_mean_nothing(tmp_path):
+    write_gpx(tmp_path / "a.gpx")
+    (tmp_path / "a.csv").write_text("t,x\n0,1\n1,2\n")
+    (tmp_path / "a.nmea").write_text("")
+    pq.write_table(pa.table({"t": [0.0, 1.0], "x": [0.0, 1.0]}), tmp_path / "a.parquet")
+    for name, form, option in (
+        ("a.gpx", "a GPX track", "time"),
+        ("a.nmea", "an NMEA 0183 log", "topic"),
+        ("a.csv", "a table of text", "topic"),
+        ("a.parquet", "a Parquet file", "topic"),
+        ("a.bag", "a ROS bag", "time"),
+    ):
+        with pytest.raises(
+            InputError, match=rf"{name} is {form}, for which {option} means nothing; leave out {option}"
+        ):
+            sf.read_log(tmp_path / name, **{option: "x"})
+
+
+def test_times_that_are_text(tmp_path):
+    pq.write_table(pa.table({"time": ["a", "b"], "x": [0.0, 1.0]}), tmp_path / "a.parquet")
+    with pytest.raises(InputError, match=r"a\.parquet: column 'time' has neither numbers nor dates\. Name ano"):
+        sf.read_log(tmp_path / "a.parquet")
+
+
+def test_a_sigma_that_is_missing_with_its_value():
+    """Where a receiver has no fix there is no sigma."""
+    values, sigma = np.array([[0.0], [np.nan], [2.0]]), np.array([[0.1], [np.nan], [0.2]])
+    data = sf.Measurements([0.0, 1.0, 2.0], values, sigma=sigma)
+    np.testing.assert_allclose(data.weights[:, 0], [100.0, 0.0, 25.0])
+    sigma[2] = np.nan
+    with pytest.raises(ValueError, match=r"sigma must be .*; it is NaN at index \[2, 0\], and the value is not"):
+        sf.Measurements([0.0, 1.0, 2.0], values, sigma=sigma)
+
+
 # --- in problem files -------------------------------------------------------------------------------------------------
 
 

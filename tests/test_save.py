@@ -182,6 +182,18 @@ def test_a_real_fit_comes_back(tmp_path):
     np.testing.assert_array_equal(loaded.standard_errors, estimate.standard_errors)
 
 
+def test_the_fit_of_a_horizon_from_the_data_comes_back(tmp_path):
+    times = np.linspace(0.05, 1.95, 20)
+    data = sf.Measurements(times, 3.0 * np.minimum(times, 1.23) - 0.15 + 0.01 * np.cos(40 * times))
+    problem = sf.Problem(RAMP, sf.Experiment(data, ("up", "rest"), (1.0,)), {"v": 2.0})
+    estimate = sf.estimate(problem)
+    estimate.save(tmp_path / "fit.json")
+    loaded = sf.Estimate.load(tmp_path / "fit.json", problem=problem)
+    assert (loaded.trajectories[0].times[0], loaded.trajectories[0].times[-1]) == (times[0], times[-1])
+    np.testing.assert_array_equal(loaded.theta, estimate.theta)
+    np.testing.assert_allclose(loaded.predict([1.0]).outputs, estimate.predict([1.0]).outputs, rtol=1e-9)
+
+
 # --- files of earlier versions ----------------------------------------------------------------------------------------
 
 EARLIER = Path(__file__).parent / "saved" / "version_3.json"

@@ -176,10 +176,11 @@ def check(
     with _report_errors(debug):
         loaded = _load(problem)
         import switchfit as sf
-        from switchfit.io.summary import describe
+        from switchfit.io.summary import describe, describe_steps
 
         _print(f"{describe(loaded.problem)}\n")
         _print_issues(loaded.issues)
+        _print(f"{describe_steps(loaded.problem)}\n")
         derivatives = sf.check_derivatives(loaded.problem)
         _print(f"{derivatives}\n")
         _print(sf.identifiability(loaded.problem))
@@ -383,19 +384,14 @@ def _check_files(problem: Path) -> None:
 
 
 def _estimate(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: bool) -> Any:
-    """Call `switchfit.estimate` with a live line on stderr; Ctrl-C ends it after the current iteration."""
+    """Call `switchfit.estimate`, which shows a line on a terminal; Ctrl-C ends a fit after the current iteration."""
     import switchfit as sf
 
     if prepare_figures:  # matplotlib, which must not look for a display, loads while XLA compiles
         os.environ.setdefault("MPLBACKEND", "Agg")
         threading.Thread(target=_import_figures, daemon=True).start()
-    with _stop_on_interrupt() as stopped, _show_progress() as show:
-
-        def callback(record: Any) -> bool:
-            show(record)
-            return stopped()
-
-        return sf.estimate(loaded.problem, callback=callback, **options)
+    with _stop_on_interrupt() as stopped:
+        return sf.estimate(loaded.problem, callback=lambda record: stopped(), **options)
 
 
 def _choose_tables(estimate: Any, out: Path | None) -> dict[str, Path]:
@@ -504,40 +500,23 @@ def _save(estimate: Any, path: Path, *, complete: bool) -> None:
 
 @contextlib.contextmanager
 def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Return a context in which the first Ctrl-C requests a stop, and the second raises KeyboardInterrupt."""
+    """Return a context in which the first Ctrl-C requests a stop, and the second raises KeyboardInterrupt.
+
+    During a search with strategies, which no callback can stop, the first one raises it: the search keeps its best fit.
+    """
+    from switchfit.strategy.choice import is_searching
+
     requested = threading.Event()
 
     def request(number: int, frame: FrameType | None) -> None:
-        if requested.is_set():
+        if requested.is_set() or is_searching():
+            requested.set()
             raise _CtrlC
         requested.set()
         _print("stopping after this iteration; Ctrl-C again to stop at once", err=True)
 
     with _handle_interrupt(request):
         yield requested.is_set
-
-
-@contextlib.contextmanager
-def _show_progress() -> Iterator[Callable[[Any], None]]:
-    """Return a context that yields a function to show a record in a live line on stderr, if that is a terminal."""
-    if not sys.stderr.isatty():
-        yield lambda record: None
-        return
-    from rich.console import Console
-    from rich.live import Live
-    from rich.spinner import Spinner
-    from rich.text import Text
-
-    waiting = Spinner("dots", "compiling (only the first time)")
-    with Live(waiting, console=Console(stderr=True), transient=True, refresh_per_second=12) as live:
-        yield lambda record: live.update(Text(_format_record(record)))
-
-
-def _format_record(record: Any) -> str:
-    return (
-        f"iteration {record.iteration:3d}   cost {record.cost:.8g}   optimality {record.optimality:.2e}   "
-        f"step {record.step:.2g}"
-    )
 
 
 # --- files ------------------------------------------------------------------------------------------------------------

@@ -75,6 +75,8 @@ class Fits:
         Unknowns with a prior, which counts as a sample.
     log_scaled : tuple of str
         Unknowns that were estimated on a logarithmic scale.
+    log_origins : (d,)
+        From where these logarithms count: t0 for a transition time, otherwise 0.
     seconds : float
         Wall time of all.
 
@@ -119,6 +121,7 @@ class Fits:
     sigma_known: bool | None
     priors: int
     log_scaled: tuple[str, ...]
+    log_origins: FloatArray
     seconds: float
 
     def __len__(self) -> int:
@@ -178,7 +181,8 @@ class Fits:
         freedom, tail = np.maximum(self.samples + self.priors - self.free, 1), 0.5 + level / 2
         quantile = scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail)
         half = np.reshape(quantile, (-1, 1)) * self.standard_errors
-        found = interval(self.theta, np.where(half > 0, half, np.nan), np.isin(self.theta_names, self.log_scaled))
+        log = np.isin(self.theta_names, self.log_scaled)
+        found = interval(self.theta, np.where(half > 0, half, np.nan), log, self.log_origins)
         scale = np.ones(len(self)) if self.sigma_known else 2 * self.cost / freedom
         return replace_intervals(found, self.pieces, self.piece_places, 0.5 * quantile**2 * scale)
 
@@ -270,6 +274,7 @@ def _collect_fields(
         "priors": priors,
         "piece_places": list_places(problem),
         "log_scaled": problem.unknowns.log_names,
+        "log_origins": problem.unknowns.origin,
         "seconds": seconds,
         **found,
     }

@@ -229,14 +229,31 @@ def replace_intervals(
         By how much J may exceed its minimum.
     """
     found = intervals.copy()
-    for r, t in np.argwhere(~np.isnan(pieces[:, :, 0, 0, 0])).tolist():
-        low, high = intervals[r, places[t]]
-        several = ~np.isnan(pieces[r, t, :, 1, 0])
-        first = pieces[r, t, :, 0, 1]
-        inside = (several[0] and first[0] >= low) or (several[1] and first[1] <= high)
-        if inside or np.isnan(low):
-            for end, side in enumerate((-1, 1)):
-                rows = pieces[r, t, end]
-                known = [Piece(*row) for row in rows[~np.isnan(rows[:, 0])].tolist()]
-                found[r, places[t], end] = find_end(known, float(thresholds[r]), side)
+    if not len(places):
+        return found
+    low, high = np.moveaxis(found[:, places], 2, 0)
+    several = ~np.isnan(pieces[:, :, :, 1, 0])
+    first = pieces[:, :, :, 0, 1]
+    inside = (several[:, :, 0] & (first[:, :, 0] >= low)) | (several[:, :, 1] & (first[:, :, 1] <= high))
+    replaced = ~np.isnan(pieces[:, :, 0, 0, 0]) & (inside | np.isnan(low))
+    for end, side in enumerate((-1, 1)):
+        ends = _find_ends(pieces[:, :, end], thresholds[:, None], side)
+        found[:, places, end] = np.where(replaced, ends, found[:, places, end])
+    return found
+
+
+def _find_ends(pieces: FloatArray, thresholds: FloatArray, side: int) -> FloatArray:
+    """Return where profiles (..., P, 5) reach thresholds (...), as `find_end`; NaN where there are no pieces."""
+    found = np.full(pieces.shape[:-2], np.nan)
+    searched = np.ones(found.shape, dtype=bool)
+    for piece in np.moveaxis(pieces, -2, 0):
+        start, stop, rise, slope, curvature = np.moveaxis(piece, -1, 0)
+        height = thresholds - rise
+        with np.errstate(invalid="ignore", divide="ignore"):
+            root = slope + np.sqrt(slope**2 + 2 * curvature * height)
+            reach = np.where(root > 0, 2 * height / root, np.inf)
+        above, within = height <= 0, reach <= side * (stop - start)
+        searched &= ~np.isnan(start)
+        found = np.where(searched, np.where(above, start, np.where(within, start + side * reach, stop)), found)
+        searched &= ~(above | within)
     return found

@@ -208,4 +208,4 @@ def _get_kind(problem: Problem) -> Any:
     numbers += [*unknowns.priors, *unknowns.variables]
     times = [experiment.initial_times for experiment in problem.experiments]
     fixed = [np.where(where < 0, t, 0.0) for where, t in zip(unknowns.times, times, strict=True)]
-    return problem.structures, shapes, tuple(np.asarray(a).tobytes() for a in (*numbers, *fixed))
+    return evaluator.structures, shapes, tuple(np.asarray(a).tobytes() for a in (*numbers, *fixed))

@@ -30,9 +30,8 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.engine.choice import derivatives_inside_program, runs_natively
 from switchfit.engine.native.experiment import places_in_library
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.guards import place_on_near_guards
 from switchfit.fit.result import inverse_on
-from switchfit.fit.solution import constraints_of, minimize_cost, minimize_with_constraints
+from switchfit.fit.solution import constraints_of, minimize_cost
 from switchfit.fit.termination import Kink, Termination, termination_of
 from switchfit.optimize import Status
 from switchfit.optimize.qp import nearest_feasible
@@ -174,15 +173,15 @@ def fit_chunk(
     lockstep : bool, optional
         Whether to run all fits in lockstep; decided by the device if left out.
     """
-    if problem.constraint_names:  # which the program does not know
+    if problem.constraint_names or problem.unknowns.log_times.any():  # which the program does not know
         evaluator = Evaluator(problem, meshes=meshes)
         outcome = _leave_all(np.asarray(starts, dtype=float))
         return _finish_rest(problem, evaluator, varying, outcome, tolerance, max_iterations)
     unknowns = problem.unknowns
     lockstep = in_lockstep() if lockstep is None else lockstep
     evaluator = Evaluator(problem, meshes=meshes)
-    natively = not lockstep and problem.engine != "jax" and runs_natively(problem.structures, evaluator.arguments)
-    structures = problem.structures
+    natively = not lockstep and problem.engine != "jax" and runs_natively(evaluator.structures, evaluator.arguments)
+    structures = evaluator.structures
     layout = Layout(
         tuple(structure.library for structure in structures) if natively else structures,
         tuple(structure.N for structure in structures),
@@ -597,12 +596,7 @@ def _finish_rest(
             give_data(evaluator, base, varying, int(k))
             left = max_iterations - int(found["iterations"][k])
             start = nearest_feasible(constraints, found["theta"][k])
-            if problem.constraint_names:
-                result, _ = minimize_with_constraints(
-                    evaluator, place_on_near_guards(evaluator, start), tolerance, left
-                )
-            else:
-                result = minimize_cost(evaluator, start, "exact", tolerance, left, constraints=constraints)
+            result = minimize_cost(evaluator, start, "exact", tolerance, left, constraints=constraints)
         except Exception as error:  # whatever it is, it must not end the other fits
             status[k], message[k] = Status.ERROR.name, error_message(error)
             free[k] = 0

@@ -12,7 +12,7 @@ chunks with rows of length zero, so that a chunk has one mode and no shape depen
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -23,9 +23,54 @@ from numpy.typing import NDArray
 from switchfit.problem.data import FloatArray
 from switchfit.problem.lengths import choose_common_lengths, pad_length
 from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Structure
 
 CHUNK = 16
 """Rows in a chunk: enough to fill vector registers (rows times stages), few enough to waste little on padding."""
+
+
+@dataclass(frozen=True)
+class Stiffness:
+    """Why ``solver="auto"`` takes implicit steps in an experiment; print it for a sentence.
+
+    Attributes
+    ----------
+    mode : str
+        The stiff mode; that with the most explicit steps if there are several.
+    explicit_steps, implicit_steps : int
+        Steps that either method needs in it, to the same tolerance.
+    stability : float
+        ``|lambda| h`` of the explicit steps, lambda being the largest eigenvalue of the Jacobian whose component
+        decays. An explicit method is unstable above about 3.3.
+
+    See Also
+    --------
+    Problem : takes `solver`.
+    Evaluation, evaluate
+
+    Examples
+    --------
+    >>> import jax.numpy as jnp
+    >>> import switchfit as sf
+    >>> fast = sf.HybridSystem({"relax": lambda t, x, p: -p["rate"] * (x - jnp.cos(t))}, [0.0])
+    >>> run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("relax",), (), 0.0, 10.0)
+    >>> problem = sf.Problem(fast, run, {"rate": 1e5})
+    >>> found = sf.evaluate(problem).stiffness[0]
+    >>> found.mode, found.implicit_steps < found.explicit_steps / 100
+    ('relax', True)
+    """
+
+    mode: str
+    explicit_steps: int
+    implicit_steps: int
+    stability: float
+
+    def __str__(self) -> str:
+        return (
+            f"mode {self.mode!r} is stiff: it takes {self.explicit_steps:,} explicit steps (limited by stability: "
+            f"|lambda| h is about {self.stability:.2g}) or {self.implicit_steps:,} implicit ones; solver='stiff' was "
+            "chosen"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,22 +84,25 @@ class Mesh:
         experiments of similar size share one compiled program.
     cells : int
         Number of cells without the padding.
+    stiffness : Stiffness or None
+        Why implicit steps are taken on this mesh, if ``solver="auto"`` has chosen them; else None.
     """
 
     nodes: FloatArray
     cells: int
+    stiffness: Stiffness | None = None
 
     @classmethod
-    def from_times(cls, times: FloatArray) -> Mesh:
+    def from_times(cls, times: FloatArray, stiffness: Stiffness | None = None) -> Mesh:
         """Return the mesh whose nodes are `times`, in any order and with repetitions."""
-        return cls.pad(np.unique(times))
+        return cls.pad(np.unique(times), stiffness)
 
     @classmethod
-    def pad(cls, nodes: FloatArray) -> Mesh:
+    def pad(cls, nodes: FloatArray, stiffness: Stiffness | None = None) -> Mesh:
         """Return the mesh with these strictly increasing nodes, padded to a length from `pad_length`."""
         cells = len(nodes) - 1
         padding = np.full(pad_length(cells) - cells, nodes[-1])
-        return cls(np.concatenate([nodes, padding]), cells)
+        return cls(np.concatenate([nodes, padding]), cells, stiffness)
 
     @property
     def times(self) -> FloatArray:
@@ -63,7 +111,11 @@ class Mesh:
 
     def pad_to(self, cells: int) -> Mesh:
         """Return the mesh padded to the given number of cells."""
-        return Mesh(np.append(self.times, np.full(cells - self.cells, self.times[-1])), self.cells)
+        return replace(self, nodes=np.append(self.times, np.full(cells - self.cells, self.times[-1])))
+
+    def insert(self, times: FloatArray) -> Mesh:
+        """Return the mesh with more nodes."""
+        return Mesh.from_times(np.concatenate([self.times, times]), self.stiffness)
 
     def divide(self, parts: int = 2) -> Mesh:
         """Return the mesh with every cell cut into equal parts."""
@@ -71,7 +123,8 @@ class Mesh:
         inside = nodes[:-1, None] + np.diff(nodes)[:, None] * np.arange(parts) / parts
         divided = np.append(inside, nodes[-1])
         # Parts of a cell that is as short as rounding may coincide.
-        return Mesh.pad(divided) if (divided[1:] > divided[:-1]).all() else Mesh.from_times(divided)
+        build = Mesh.pad if (divided[1:] > divided[:-1]).all() else Mesh.from_times
+        return build(divided, self.stiffness)
 
     def halve_rows(self, transition_times: FloatArray) -> Mesh:
         """Return the mesh with every row cut in two: every cell, or its parts where transitions (N,) cut it.
@@ -79,7 +132,7 @@ class Mesh:
         Halving cells would not do: after a transition in the second half of a cell, the row would keep its length.
         """
         cuts = np.unique(np.concatenate([self.times, transition_times]))
-        return Mesh.from_times(np.concatenate([self.times, 0.5 * (cuts[:-1] + cuts[1:])]))
+        return self.insert(0.5 * (cuts[:-1] + cuts[1:]))
 
     def cell_ending_at(self, times: FloatArray) -> NDArray[np.intp]:
         """Return the index of the cell that ends at each of `times`, which must be nodes; -1 for t0."""
@@ -96,6 +149,12 @@ def pad_to_common_lengths(problem: Problem, meshes: Sequence[Mesh]) -> list[Mesh
         for e, length in zip(group, lengths, strict=True):
             padded[e] = meshes[e] if len(group) == 1 else meshes[e].pad_to(length)
     return padded
+
+
+def get_structure_on(problem: Problem, e: int, mesh: Mesh) -> Structure:
+    """Return the structure of experiment e with the method of the steps on a mesh."""
+    structure = problem.structures[e]
+    return structure if mesh.stiffness is None else replace(structure, solver="stiff")
 
 
 class Rows(NamedTuple):

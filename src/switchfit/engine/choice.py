@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from switchfit.discretization.arguments import Arguments
-from switchfit.discretization.mesh import Mesh
+from switchfit.discretization.mesh import Mesh, get_structure_on
 from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.jax.programs import derivatives
 from switchfit.engine.native.engine import NativeEngine
@@ -26,19 +26,23 @@ def engine_of(problem: Problem, e: int, arguments: Arguments, mesh: Mesh) -> Exp
     ValueError
         If ``engine="native"`` and the experiment cannot be compiled; the message gives the reason.
     """
-    structure = problem.structures[e]
+    structure = get_structure_on(problem, e, mesh)
     by_jax = JaxEngine(structure, arguments, mesh)
     if problem.engine == "jax":
+        if mesh.stiffness is not None:
+            by_jax.reason += f"; {mesh.stiffness}"
         return by_jax
-    return _native_or(by_jax, structure, arguments, mesh, insist=problem.engine == "native")
+    return _choose_native(by_jax, structure, arguments, mesh, insist=problem.engine == "native")
 
 
-def _native_or(
+def _choose_native(
     by_jax: JaxEngine, structure: Structure, arguments: Arguments, mesh: Mesh, *, insist: bool
 ) -> ExperimentEngine:
     reason = reason_for_jax(structure, arguments, Order.HESSIAN)
     if reason is None:
         return NativeEngine(structure, arguments, mesh, by_jax)
+    if mesh.stiffness is not None:
+        reason = f"{mesh.stiffness}, which has no machine code"
     if insist:
         raise ValueError(f"engine='native' requires machine code, but {reason}. Leave engine out to evaluate with JAX.")
     by_jax.reason = reason

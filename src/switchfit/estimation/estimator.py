@@ -12,20 +12,17 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.engine.adaptive import refine_mesh
+from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
 from switchfit.estimation.saved import load_fit, save_fit
 from switchfit.fit.accuracy import worst_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.guards import place_on_near_guards
 from switchfit.fit.hidden import refuse_jumps
 from switchfit.fit.result import CovarianceKind, Fit
 from switchfit.fit.solution import (
-    constraints_of,
     is_least_squares,
     is_plain_least_squares,
     is_sigma_known,
     minimize_cost,
-    minimize_with_constraints,
 )
 from switchfit.fit.termination import termination_of
 from switchfit.fit.trajectory import SimulatedProblem
@@ -550,9 +547,13 @@ def fit_locally(
         scale = max(first_cost, history[0].cost if history else 0.0)
         fine, simulation, error, output = _judge_meshes(evaluator, result, scale, values, first=not attempt)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
-        if result.status in STOPPED or attempt == REFINEMENTS or not excess > 1:
+        if attempt == REFINEMENTS or result.status is Status.INTERRUPTED:
             break
-        evaluator = _refine(fine, problem.check_theta(start), theta, excess)
+        failed = not result.status.successful or excess > 2**ORDER
+        stable = _stabilize(evaluator, problem.check_theta(start), theta) if failed else None
+        if stable is None and (result.status in STOPPED or not excess > 1):
+            break
+        evaluator = stable or _refine(fine, problem.check_theta(start), theta, excess)
     if excess > 1 and result.status.successful and not problem.constraint_names:
         refuse_jumps(evaluator, theta)  # the error of steps across a jump does not vanish with their size
     found = _estimate(
@@ -569,6 +570,7 @@ def fit_locally(
         integration_error_of=output,
         seconds=time.perf_counter() - began,
         constraints=held,
+        initial_cost=history[0].cost if history else np.nan,
     )
     found.simulate_later(simulation)
     return found
@@ -580,12 +582,9 @@ def check_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:
 
 
 def _prepare_start(problem: Problem, start: ArrayLike | None) -> tuple[FloatArray, Evaluator]:
-    """Return the start of a fit (d,), with transitions moved to their guards if these are near, and its meshes."""
+    """Return the start of a fit (d,) and its meshes."""
     theta = problem.check_theta(start, "start")
     evaluator = evaluator_of(problem) if start is None else Evaluator(problem, theta)
-    placed = place_on_near_guards(evaluator, theta)
-    if not np.array_equal(placed, theta):
-        theta, evaluator = placed, Evaluator(problem, placed)
     return theta, evaluator
 
 
@@ -604,11 +603,8 @@ def _minimize(
 ) -> tuple[Result, Held]:
     """Minimize the cost on the meshes of an evaluator; the callback's records continue the count of `last`."""
     report = None if callback is None else lambda record: callback(record.continue_from(last))
-    problem = evaluator.problem
-    if problem.constraint_names:
-        return minimize_with_constraints(evaluator, theta, tolerance, max_iterations, report)
-    constraints = constraints_of(problem)
-    return minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, report, constraints), ()
+    result = minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, report)
+    return result, result.equalities
 
 
 def _judge_meshes(
@@ -626,6 +622,18 @@ def _judge_meshes(
         if error > max(LARGEST_INTEGRATION_ERROR, evaluator.problem.rtol):
             break
     return fine, simulation, error, output
+
+
+def _stabilize(evaluator: Evaluator, start: FloatArray, theta: FloatArray) -> Evaluator | None:
+    """Return the problem with implicit steps where the explicit ones are unstable near theta; None if they are not.
+
+    A fit cannot go beyond a theta at which the steps of its mesh become unstable: J is not finite there.
+    """
+    problem = evaluator.problem
+    found = [refine_if_unstable(problem, e, mesh, start, theta) for e, mesh in enumerate(evaluator.meshes)]
+    if not any(found):
+        return None
+    return Evaluator(problem, meshes=[new or mesh for new, mesh in zip(found, evaluator.meshes, strict=True)])
 
 
 def _refine(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:

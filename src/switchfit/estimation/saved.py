@@ -374,12 +374,18 @@ def _upgrade(content: dict[str, Any], version: int) -> None:
             _upgrade_certificate(content["certificate"], content["fit"])
         content["fit"].setdefault("starts", None)
         content["fit"].setdefault("steps", [])
+        content["fit"].setdefault("initial_cost", _read_first_cost(content["fit"]["history"]))
         for comparison in (comparison for run in content["fit"]["comparisons"] for comparison in run):
             comparison.setdefault("weights", None)
     except (LookupError, TypeError, AttributeError) as error:
         raise ValueError(
             f"it does not match the format of version {content['version']} ({get_first_line(error)})"
         ) from error
+
+
+def _read_first_cost(history: list[dict[str, Any]]) -> Any:
+    """Return J at the first guess: before there were strategies, every history began there."""
+    return history[0]["cost"] if history else "NaN"
 
 
 def _upgrade_fit(fit: dict[str, Any]) -> None:

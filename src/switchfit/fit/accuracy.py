@@ -102,14 +102,14 @@ def constraint_values(
             ends = np.stack([simulation.after[rows][-1] for rows in simulation.segments])
             states = np.concatenate([simulation.before, simulation.after])
             with use_float64(), use_compilation_cache():
-                found = _constraint_values(arguments.without_mesh(), tau, ends, p, structure=structure)
+                found = _evaluate_constraints(arguments.without_mesh(), tau, ends, p, structure=structure)
             values.append(np.asarray(found[0]))
             scales.append(np.abs(found[1]) @ np.ptp(states, axis=0))
     return np.concatenate(values), np.concatenate(scales)
 
 
 @partial(jax.jit, static_argnames=("structure",))
-def _constraint_values(
+def _evaluate_constraints(
     arguments: Arguments, tau: jax.Array, ends: jax.Array, p: jax.Array, *, structure: Structure
 ) -> tuple[jax.Array, jax.Array]:
     """Return guards, then terminal constraints c (m,) at the ends (N + 1, n) of the segments; and D c, (m, n)."""

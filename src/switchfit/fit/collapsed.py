@@ -42,16 +42,16 @@ def idle_unknowns(evaluator: Evaluator, theta: FloatArray, parameters: bool) -> 
     """
     problem = evaluator.problem
     idle = np.zeros(len(theta), dtype=bool)
-    for group in _idle_groups(problem, theta):
+    for group in _list_idle_groups(problem, theta):
         idle[group[0]] = True
     opened = _open_modes(problem, theta) if parameters else theta
     if not np.array_equal(opened, theta):
-        for i in _parameters(problem):
+        for i in _list_parameters(problem):
             idle[i] = _is_idle(evaluator, theta, opened, i)
     return idle
 
 
-def _idle_groups(problem: Problem, theta: FloatArray) -> Iterator[NDArray[np.intp]]:
+def _list_idle_groups(problem: Problem, theta: FloatArray) -> Iterator[NDArray[np.intp]]:
     """Yield the indices in theta of transitions that coincide and may move together without effect.
 
     No transition among them is fixed or at an end of the horizon, the modes before and after them are the same, and no
@@ -60,19 +60,19 @@ def _idle_groups(problem: Problem, theta: FloatArray) -> Iterator[NDArray[np.int
     system = problem.system
     for e, experiment in enumerate(problem.experiments):
         sequence, where = experiment.mode_sequence, problem.unknowns.times[e]
-        for first, last in _coincident(problem, theta, e):
+        for first, last in _list_coincident(problem, theta, e):
             passed = [*zip(sequence[first : last + 1], sequence[first + 1 : last + 2], strict=True)]
             smooth = all(system.reset_map(*pair) is None and system.guard(*pair) is None for pair in passed)
             if smooth and sequence[first] == sequence[last + 1] and np.all(where[first : last + 1] >= 0):
                 yield where[first : last + 1]
 
 
-def _coincident(problem: Problem, theta: FloatArray, e: int) -> Iterator[tuple[int, int]]:
+def _list_coincident(problem: Problem, theta: FloatArray, e: int) -> Iterator[tuple[int, int]]:
     """Yield the first and last of two or more transitions that coincide strictly inside the horizon."""
     experiment, times = problem.experiments[e], problem.vectors(theta, e)[0]
     if not np.any(times[1:] - times[:-1] <= _estimate_rounding(experiment)):  # the usual case: tested at every step
         return
-    short, room = _lengths(problem, theta, e)
+    short, room = _find_collapsed(problem, theta, e)
     first = 0
     for i in range(1, len(times) + 1):
         if i < len(times) and short[i]:
@@ -86,7 +86,7 @@ def _open_modes(problem: Problem, theta: FloatArray) -> FloatArray:
     """Return theta with transition times moved so that every collapsed mode lasts a little, if there is room."""
     opened = theta.copy()
     for e, (experiment, where) in enumerate(zip(problem.experiments, problem.unknowns.times, strict=True)):
-        times, short = problem.vectors(theta, e)[0], _lengths(problem, theta, e)[0]
+        times, short = problem.vectors(theta, e)[0], _find_collapsed(problem, theta, e)[0]
         if not short.any():
             continue
         gap = OPENED * experiment.initial_length * short
@@ -99,7 +99,7 @@ def _open_modes(problem: Problem, theta: FloatArray) -> FloatArray:
     return opened
 
 
-def _lengths(problem: Problem, theta: FloatArray, e: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _find_collapsed(problem: Problem, theta: FloatArray, e: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which modes of experiment e have no duration (N + 1,), and which transitions are at an end of it (N,).
 
     A free tf counts as a transition at the end, to a mode that lasts.
@@ -117,7 +117,7 @@ def _estimate_rounding(experiment: Experiment) -> float:
     return 32 * EPS * max(experiment.end - experiment.t0, abs(experiment.t0), abs(experiment.end))
 
 
-def _parameters(problem: Problem) -> list[int]:
+def _list_parameters(problem: Problem) -> list[int]:
     """Return the indices in theta of the model's parameters."""
     return [i for span in problem.unknowns.parameters.values() for i in range(span.start, span.stop)]
 

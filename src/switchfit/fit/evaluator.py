@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.discretization.arguments import Arguments, build_arguments
-from switchfit.discretization.mesh import Mesh, pad_to_common_lengths
+from switchfit.discretization.mesh import Mesh, Stiffness, get_structure_on, pad_to_common_lengths
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import engine_of, summarize
 from switchfit.engine.jax.engine import JaxEngine
@@ -22,6 +22,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Structure
 from switchfit.problem.validation import as_choice, as_instance
 from switchfit.runtime.cache import use_compilation_cache
 
@@ -38,6 +39,8 @@ class Evaluation:
     cost : J
     gradient : (d,), J's derivative in theta
     hessian : (d, d)
+    stiffness : tuple of Stiffness
+        From `evaluate`: of each experiment in which ``solver="auto"`` chose implicit steps, why; empty if in none.
 
     See Also
     --------
@@ -57,6 +60,7 @@ class Evaluation:
     cost: float
     gradient: FloatArray
     hessian: FloatArray
+    stiffness: tuple[Stiffness, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +111,7 @@ class Evaluator:
         indices = range(len(problem.experiments))
         at = problem.initial_theta if theta is None else theta
         given = list(meshes) if meshes is not None else [refine_mesh(problem, e, at) for e in indices]
+        self.meshes = given
         self.replace_arguments(
             [build_arguments(problem, e, m) for e, m in enumerate(pad_to_common_lengths(problem, given))]
         )
@@ -135,7 +140,7 @@ class Evaluator:
         `matrix` selects the Hessian, the Gauss-Newton matrix in its place, or neither (NaN).
         """
         d = len(theta)
-        results = self._results(theta, side, method, matrix)
+        results = self._evaluate_experiments(theta, side, method, matrix)
         if self.problem.one_to_one:
             total, gradient, hessian = float(results[0][0]), results[0][1], results[0][2]
         else:
@@ -155,7 +160,7 @@ class Evaluator:
     ) -> ConstrainedEvaluation:
         """Return cost, constraints and the augmented Lagrangian with multipliers and penalties, (m,) or ()."""
         d, count = len(theta), len(self.problem.constraint_names)
-        multipliers, penalty = (np.broadcast_to(np.asarray(a, float), count) for a in (multipliers, penalty))
+        multipliers, penalty = np.full(count, multipliers, dtype=float), np.full(count, penalty, dtype=float)
         cost, value, gradient, slope, hessian = 0.0, 0.0, np.zeros(d), np.zeros(d), np.zeros((d, d))
         jacobian, c = np.zeros((count, d)), np.zeros(count)
         last = 0
@@ -163,10 +168,15 @@ class Evaluator:
             here = slice(last, last := last + self.problem.constraint_counts[e])
             at = self.problem.vectors(theta, e)
             J, L_d, H, c_e, A = self.engines[e].constrained(*at, side, multipliers[here], penalty[here])
-            H = H + (A.T * penalty[here]) @ A
+            weights = multipliers[here] + penalty[here] * c_e
+            if penalty.any():
+                H = H + (A.T * penalty[here]) @ A
             cost += J
             value += J + float(multipliers[here] @ c_e + 0.5 * penalty[here] @ c_e**2)
-            np.add.at(gradient, mine, (L_d - (multipliers[here] + penalty[here] * c_e) @ A)[own])
+            if self.problem.one_to_one:
+                gradient, slope, hessian, jacobian, c = L_d - weights @ A, L_d, H, A, c_e
+                break
+            np.add.at(gradient, mine, (L_d - weights @ A)[own])
             np.add.at(slope, mine, L_d[own])
             np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
             np.add.at(jacobian[here].T, mine, A[:, own].T)
@@ -181,7 +191,7 @@ class Evaluator:
         """Evaluate by the method "auto", in time and memory that are linear in the number of experiments."""
         total, gradient, parts = 0.0, np.zeros(len(theta)), []
         size = self.layout.own.shape[1] + len(self.layout.shared)
-        results = self._results(theta, side, "auto", matrix)
+        results = self._evaluate_experiments(theta, side, "auto", matrix)
         for (J, g, H), (own, mine), slots in zip(results, self.problem.own_places, self._slots, strict=True):
             total += float(J)
             np.add.at(gradient, mine, g[own])
@@ -203,11 +213,28 @@ class Evaluator:
     def _slots(self) -> list[NDArray[np.intp]]:
         return [self.layout.slots(e, mine) for e, (_, mine) in enumerate(self.problem.own_places)]
 
+    @cached_property
+    def structures(self) -> tuple[Structure, ...]:
+        """The structure of each experiment, with the method of the steps on its mesh."""
+        return tuple(get_structure_on(self.problem, e, mesh) for e, mesh in enumerate(self.meshes))
+
+    @property
+    def stiffness(self) -> tuple[Stiffness, ...]:
+        """Why implicit steps are taken in each experiment in which ``solver="auto"`` has chosen them."""
+        return tuple(mesh.stiffness for mesh in self.meshes if mesh.stiffness is not None)
+
+    @property
+    def takes_implicit_steps(self) -> bool:
+        """Whether an experiment is integrated by implicit steps."""
+        return any(structure.solver == "stiff" for structure in self.structures)
+
     def replace_arguments(self, arguments: Sequence[Arguments]) -> None:
         """Replace data and constants; the meshes are those of the new nodes."""
         self.__dict__.pop("halved", None)
         self.arguments = list(arguments)
-        self.meshes = [Mesh.from_times(np.asarray(own.nodes)) for own in arguments]
+        before = zip(self.meshes, arguments, strict=True)
+        self.meshes = [Mesh.from_times(np.asarray(own.nodes), mesh.stiffness) for mesh, own in before]
+        self.__dict__.pop("structures", None)
         given = enumerate(zip(self.arguments, self.meshes, strict=True))
         self.engines = [engine_of(self.problem, e, own, mesh) for e, (own, mesh) in given]
 
@@ -226,13 +253,13 @@ class Evaluator:
         vectors = (self.problem.vectors(theta, e) for e in range(len(self.engines)))
         return [engine.simulate(*at, tangents=tangents) for engine, at in zip(self.engines, vectors, strict=True)]
 
-    def _results(self, theta: FloatArray, side: int, method: Method, matrix: Matrix) -> list[Derivatives]:
+    def _evaluate_experiments(self, theta: FloatArray, side: int, method: Method, matrix: Matrix) -> list[Derivatives]:
         """Return the cost, gradient and Hessian of each experiment in its own unknowns."""
         theta = np.asarray(theta, dtype=np.float64)
         vectors = [self.problem.vectors(theta, e) for e in range(len(self.engines))]
         if method == "auto":
             return [engine.derivatives(*at, side, matrix) for engine, at in zip(self.engines, vectors, strict=True)]
-        given = list(zip(self.problem.structures, self.arguments, self.meshes, vectors, strict=True))
+        given = list(zip(self.structures, self.arguments, self.meshes, vectors, strict=True))
         if method == "adjoint":
             if not is_covered_by_paper(self.problem):
                 raise ValueError("the paper's equations have no TransitionCost: choose another method.")
@@ -312,4 +339,6 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     method = as_choice(method, "method", METHODS)
-    return evaluator_of(problem)(problem.check_theta(theta), method=method)
+    evaluator = evaluator_of(problem)
+    found = evaluator(problem.check_theta(theta), method=method)
+    return replace(found, stiffness=evaluator.stiffness) if evaluator.stiffness else found

@@ -51,7 +51,7 @@ def refuse_hidden_switches(evaluator: Evaluator, theta: FloatArray, gradient: Fl
         name = next((name for name, span in spans if span.start <= hidden[0] < span.stop), unknowns.names[hidden[0]])
         shown = ", ".join(unknowns.names[i] for i in hidden)
         raise ValueError(
-            f"the cost changes with {shown}, but its derivative is zero at all points tried: {_advice(name)}"
+            f"the cost changes with {shown}, but its derivative is zero at all points tried: {_write_advice(name)}"
         )
 
 
@@ -67,16 +67,16 @@ def refuse_jumps(evaluator: Evaluator, theta: FloatArray) -> None:
     unknowns = evaluator.problem.unknowns
     for name, span in unknowns.parameters.items():
         for i in range(span.start, span.stop):
-            jump = _jump(evaluator, theta, i)
-            if jump is not None and _stays_on_a_finer_mesh(evaluator, theta, i, jump[1]):
+            jump = _find_jump(evaluator, theta, i)
+            if jump is not None and _is_jump_of_model(evaluator, theta, i, jump[1]):
                 place, finding = jump
                 raise ValueError(
                     f"the cost jumps from {finding.before:.8g} to {finding.after:.8g} where {unknowns.names[i]} passes "
-                    f"{place:.8g}, which its derivative does not show: {_advice(name)}"
+                    f"{place:.8g}, which its derivative does not show: {_write_advice(name)}"
                 )
 
 
-def _advice(name: str) -> str:
+def _write_advice(name: str) -> str:
     """Return how a function uses such a parameter, and what to write instead."""
     return (
         f'a function switches by comparing with it, as in jnp.where(t < p["{name}"], a, b), and derivatives do not '
@@ -86,7 +86,7 @@ def _advice(name: str) -> str:
     )
 
 
-def _jump(evaluator: Evaluator, theta: FloatArray, i: int) -> tuple[float, Finding] | None:
+def _find_jump(evaluator: Evaluator, theta: FloatArray, i: int) -> tuple[float, Finding] | None:
     """Find where the cost jumps as unknown i changes, with the costs on both sides; None without a jump."""
     lower, upper = evaluator.problem.unknowns.lower[i], evaluator.problem.unknowns.upper[i]
 
@@ -112,7 +112,7 @@ def _jump(evaluator: Evaluator, theta: FloatArray, i: int) -> tuple[float, Findi
     return None
 
 
-def _stays_on_a_finer_mesh(evaluator: Evaluator, theta: FloatArray, i: int, finding: Finding) -> bool:
+def _is_jump_of_model(evaluator: Evaluator, theta: FloatArray, i: int, finding: Finding) -> bool:
     """Return whether a jump is that of the model, and not of a mesh so coarse that J is steeper than its derivative.
 
     On meshes with four times as many steps, a model with a hidden switch jumps at other points, and by about a quarter.
@@ -120,7 +120,7 @@ def _stays_on_a_finer_mesh(evaluator: Evaluator, theta: FloatArray, i: int, find
     size = abs(finding.after - finding.before)
     if size < SMALLEST_JUMP * max(abs(finding.before), abs(finding.after)):
         return False
-    again = _jump(evaluator.divide(4), theta, i)
+    again = _find_jump(evaluator.divide(4), theta, i)
     return again is not None and abs(again[1].after - again[1].before) >= KEPT * size
 
 

@@ -18,7 +18,8 @@ MOST_DRAWN = 2**30
 
 FACTOR = 10.0
 """Range of an unknown without bounds: a positive guess is divided and multiplied by this factor, on a logarithmic
-scale; any other guess varies by plus or minus so many times its size."""
+scale; any other guess varies by plus or minus so many times its size. Times on a logarithmic scale are drawn on that
+scale, from the time since t0 of the first guess divided by this factor to the end of the horizon."""
 
 
 def draw_starts(problem: Problem, count: int, seed: int) -> FloatArray:
@@ -35,7 +36,7 @@ def draw_starts(problem: Problem, count: int, seed: int) -> FloatArray:
     unknowns = problem.unknowns
     sobol = qmc.Sobol(len(unknowns.names), seed=seed)
     cube = sobol.random(1 << max(count - 1, 0).bit_length())[:count]
-    low, high, log = _ranges(problem)
+    low, high, log = _compute_ranges(problem)
     points = low + cube * (high - low)
     points[:, log] = low[log] * (high[log] / low[log]) ** cube[:, log]
     for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
@@ -43,12 +44,17 @@ def draw_starts(problem: Problem, count: int, seed: int) -> FloatArray:
             # Sorted uniform numbers are uniform over all ordered times; minimum durations are added to their gaps.
             room = end - begin - (len(group) + 1) * problem.min_duration
             ordered = np.sort(cube[:, group], axis=1)
+            if unknowns.log[group].all():
+                first = unknowns.initial[group[0]] - experiment.t0
+                low, high = max(begin - experiment.t0, first / FACTOR), end - experiment.t0
+                points[:, group] = experiment.t0 + low * (high / low) ** ordered
+                continue
             points[:, group] = begin + max(room, 0.0) * ordered + problem.min_duration * np.arange(1, len(group) + 1)
     points[0] = unknowns.initial
     return np.array([find_nearest_feasible(problem, point) for point in points])
 
 
-def _ranges(problem: Problem) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+def _compute_ranges(problem: Problem) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """Return the range of each unknown, (d,) and (d,), and whether it is drawn on a logarithmic scale, (d,)."""
     unknowns = problem.unknowns
     guess, is_time = unknowns.initial, unknowns.is_time

@@ -31,7 +31,7 @@ class Transition:
     ----------
     experiment : int, from 0
     run : str
-        The experiment's name; empty where there is only one.
+        The experiment's name; empty if there is only one.
     name : str
         As in `Fit.theta_names`.
     time : float
@@ -65,6 +65,9 @@ class Step:
         The lowest J after it.
     evaluations : int
     seconds : float
+    ended : str
+        Why the many starts ended: "settled", no further minimum was likely; "most", as many as are tried at most;
+        "time" or "interrupted". Empty for other strategies.
 
     See Also
     --------
@@ -82,6 +85,7 @@ class Step:
     cost: float
     evaluations: int
     seconds: float
+    ended: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +110,10 @@ class Fit:
     optimality : float
         KKT residual; the norm of the gradient if no constraint is active.
     iterations, evaluations : int
+        Iterations of the fit that found theta; evaluations of everything that was tried.
     status : Status
     history : tuple of IterationRecord
+        Of the fit that found theta. Where strategies were tried, it begins where one of them ended.
     active : tuple of ActiveConstraint
         Bounds, and shortest durations of modes, that hold with equality.
     kinks : tuple of Kink
@@ -156,10 +162,12 @@ class Fit:
     reason : Issue or None
         Why the line search failed, or the error with which the fit ended.
     starts : (tried, better, agreeing) or None
-        Numbers of other starts that were fitted, that ended lower, and that ended in the same minimum; None without
+        Numbers of other starts that were fitted, that ended lower than this fit, and that ended at its J; None without
         other starts.
     steps : tuple of Step
         The strategies that were tried, in order; empty if the first fit was enough.
+    initial_cost : float
+        J at `initial_theta`; NaN if it is unknown or cannot be evaluated there.
     """
 
     theta_names: tuple[str, ...]
@@ -207,6 +215,7 @@ class Fit:
     reason: Issue | None = None
     starts: tuple[int, int, int] | None = None
     steps: tuple[Step, ...] = ()
+    initial_cost: float = np.nan
 
     @property
     def termination(self) -> Termination:
@@ -229,6 +238,17 @@ class Fit:
         names = ["tf"] if len(self.run_names) == 1 else [f"{run}.tf" for run in self.run_names]
         free = [name in self.theta_names and name not in self.parameters for name in names]  # a parameter may be "tf"
         return tuple(self.theta_names.index(name) if own else -1 for name, own in zip(names, free, strict=True))
+
+    @property
+    def log_origins(self) -> FloatArray:
+        """From where the logarithms of `log_scaled` unknowns count, (d,): t0 for a transition time, otherwise 0."""
+        origins = np.zeros(len(self.theta_names))
+        if not self.is_time[np.isin(self.theta_names, self.log_scaled)].any():
+            return origins
+        for e, trajectory in enumerate(self.trajectories):
+            places = np.append(self.transition_places[e], self.final_places[e])
+            origins[places[places >= 0]] = trajectory.times[0]
+        return origins
 
     @property
     def is_time(self) -> NDArray[np.bool_]:
@@ -276,7 +296,7 @@ class Fit:
     @property
     def samples(self) -> int:
         """Number of measured values that are not missing."""
-        return sum(int(np.isfinite(c.measured).sum()) for run in self.comparisons for c in run if _discrete(c))
+        return sum(int(np.isfinite(c.measured).sum()) for run in self.comparisons for c in run if _is_discrete(c))
 
     @property
     def residual_variance(self) -> float:
@@ -411,7 +431,7 @@ class Fit:
         """
         half = self.quantile(level) * np.sqrt(np.diag(self.covariance_from(hessian)))
         log = np.isin(self.theta_names, self.log_scaled)
-        low, high = interval(self.theta, np.where(half > 0, half, np.nan), log).T
+        low, high = interval(self.theta, np.where(half > 0, half, np.nan), log, self.log_origins).T
         return np.stack([np.maximum(low, self.lower), np.minimum(high, self.upper)], axis=1)
 
 
@@ -465,11 +485,12 @@ def disagreement(fit: Fit) -> Disagreement | None:
     return Disagreement(factor, fit.theta_names[k], float(errors[0][k]), float(errors[1][k]))
 
 
-def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_]) -> FloatArray:
-    """Return ``theta -+ half``, or if `log` ``theta exp(-+ half / theta)``: (..., 2)."""
-    size = np.where(log, theta, 1.0)
-    factor = np.exp(np.where(log, half / size, 0.0))
-    return np.stack([np.where(log, theta / factor, theta - half), np.where(log, theta * factor, theta + half)], axis=-1)
+def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_], origin: FloatArray) -> FloatArray:
+    """Return ``theta -+ half``, or if `log` ``o + (theta - o) exp(-+ half / (theta - o))``, o the origin: (..., 2)."""
+    away = theta - origin
+    factor = np.exp(np.where(log, half / np.where(log, away, 1.0), 0.0))
+    low, high = (np.where(log, origin + end, theta) for end in (away / factor, away * factor))
+    return np.stack([np.where(log, low, theta - half), np.where(log, high, theta + half)], axis=-1)
 
 
 UNDETERMINED = 1e-14
@@ -557,5 +578,5 @@ def compute_scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> ScaledSpectru
     return ScaledSpectrum(values, basis @ vectors, size)
 
 
-def _discrete(comparison: Comparison) -> bool:
+def _is_discrete(comparison: Comparison) -> bool:
     return comparison.kind == "measurements"

@@ -150,13 +150,13 @@ def termination_of(result: Result, problem: Problem) -> Termination:
         tolerance=result.tolerance,
         iterations=result.iterations,
         earlier_iterations=result.earlier,
-        active=_active(result, problem),
+        active=_list_active(result, problem),
         kinks=tuple(Kink(names[i], float(result.theta[i]), left, right) for i, left, right in result.kinks),
         idle=tuple(names[i] for i in result.idle),
         smallest_eigenvalue=smallest,
         flat_direction=tuple((names[i], float(direction[i])) for i in largest),
         violated=result.violated,
-        reason=None if result.reason is None else _reason(result.reason, problem),
+        reason=None if result.reason is None else _describe_failure(result.reason, problem),
     )
 
 
@@ -168,7 +168,7 @@ def linear_constraints_of(problem: Problem) -> tuple[Constraint, ...]:
     return *unknowns.rows, *lower, *upper
 
 
-def _active(result: Result, problem: Problem) -> tuple[ActiveConstraint, ...]:
+def _list_active(result: Result, problem: Problem) -> tuple[ActiveConstraint, ...]:
     if not result.active:
         return ()
     multipliers = dict(zip(linear_constraints_of(problem), result.multipliers.tolist(), strict=True))
@@ -176,7 +176,7 @@ def _active(result: Result, problem: Problem) -> tuple[ActiveConstraint, ...]:
     return tuple(ActiveConstraint(**vars(constraint), multiplier=multipliers[constraint]) for constraint in found)
 
 
-def _reason(found: Finding, problem: Problem) -> Issue:
+def _describe_failure(found: Finding, problem: Problem) -> Issue:
     """Return why the line search failed, with the names of the unknowns."""
     names = problem.unknowns.names
     figures: dict[str, float | tuple[float, ...]] = {}

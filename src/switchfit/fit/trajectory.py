@@ -123,7 +123,7 @@ class Comparison:
 
     @property
     def rmse(self) -> FloatArray:
-        """Root mean square of the residuals of each channel: (q,); NaN where there is no sample."""
+        """Root mean square of the residuals of each channel: (q,); NaN without samples."""
         known = np.isfinite(self.measured)
         squares = np.where(known, self.residuals, 0.0) ** 2
         return np.sqrt(squares.sum(0) / np.where(known.any(0), known.sum(0), np.nan))
@@ -172,7 +172,7 @@ def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: in
     mesh = refine_mesh(problem, experiment, checked)
     engine = engine_of(problem, experiment, build_arguments(problem, experiment, mesh), mesh)
     simulation = engine.simulate(*problem.vectors(checked, experiment), tangents=False)
-    return _trajectory(problem, experiment, simulation)
+    return _build_trajectory(problem, experiment, simulation)
 
 
 class SimulatedProblem:
@@ -216,9 +216,9 @@ def compare(
     problem: Problem, theta: FloatArray, simulations: Sequence[Simulation]
 ) -> tuple[tuple[Trajectory, ...], tuple[tuple[Comparison, ...], ...]]:
     """Return the trajectories and comparisons of all experiments."""
-    trajectories = tuple(_trajectory(problem, e, simulation) for e, simulation in enumerate(simulations))
+    trajectories = tuple(_build_trajectory(problem, e, simulation) for e, simulation in enumerate(simulations))
     pairs = enumerate(zip(simulations, trajectories, strict=True))
-    return trajectories, tuple(_comparisons(problem, e, theta, *pair) for e, pair in pairs)
+    return trajectories, tuple(_build_comparisons(problem, e, theta, *pair) for e, pair in pairs)
 
 
 def select_visible(simulation: Simulation, before: FloatArray, after: FloatArray) -> FloatArray:
@@ -232,7 +232,7 @@ def select_visible(simulation: Simulation, before: FloatArray, after: FloatArray
     return np.concatenate(parts)
 
 
-def _trajectory(problem: Problem, e: int, simulation: Simulation) -> Trajectory:
+def _build_trajectory(problem: Problem, e: int, simulation: Simulation) -> Trajectory:
     structure, system = problem.structures[e], problem.system
     moving = simulation.end > simulation.start
     counts = [1 + int(moving[rows].sum()) for rows in simulation.segments]
@@ -250,7 +250,7 @@ def _trajectory(problem: Problem, e: int, simulation: Simulation) -> Trajectory:
     )
 
 
-def _comparisons(
+def _build_comparisons(
     problem: Problem, e: int, theta: FloatArray, simulation: Simulation, trajectory: Trajectory
 ) -> tuple[Comparison, ...]:
     """Compare measured with fitted for each reference signal and each Measurements."""

@@ -218,6 +218,9 @@ class TransitionTable(_Table):
     prior: PriorTable | None = Field(
         default=None, description="what is known of it: { mean, sd } or { median, log_sd }"
     )
+    scale: Literal["linear", "log"] = Field(
+        default="linear", description="'log': estimated as the logarithm of the time since t0"
+    )
 
 
 class StateTable(_Table):
@@ -282,7 +285,7 @@ class DataTable(LogTable):
     )
     sigma: float | str | list[float | str] | None = Field(
         default=None,
-        description="standard deviation of the noise: a number, one a column, the names of columns that hold it, or "
+        description="standard deviation of the noise: a number, one per column, the names of columns that hold it, or "
         "of parameters that it is; left out, it is unknown (measurements only)",
     )
     loss: Literal["linear", "soft_l1", "huber", "cauchy"] = Field(
@@ -335,18 +338,18 @@ class ExperimentTable(_Table):
     tf: Annotated[TransitionTable | None, pydantic.BeforeValidator(_end_as_table)] = Field(
         default=None,
         description="end of the horizon; left out, the last sample. A number, or a table with value, lower and upper "
-        "where it is to be estimated",
+        "if it is to be estimated",
     )
     initial_state: list[Annotated[StateTable, pydantic.BeforeValidator(_known_as_table)]] | None = Field(
         default=None,
-        description="state at t0, instead of the model's: a number, or a table where it is to be estimated",
+        description="state at t0, instead of the model's: a number, or a table if it is to be estimated",
     )
     parameter_map: dict[str, str] = Field(
         default_factory=dict,
         description="the model's name of a parameter = the name under [parameters] that this run uses for it",
     )
     inputs: InputTable | None = Field(default=None, description="a known input")
-    name: str | None = Field(default=None, description="used in the report where there are several experiments")
+    name: str | None = Field(default=None, description="used in the report if there are several experiments")
 
 
 class ModelTable(_Table):
@@ -362,14 +365,16 @@ class OptionsTable(_Table):
     min_duration: float | None = Field(
         default=None, ge=0, description="shortest time a mode may last, in the time_unit of the experiments"
     )
-    solver: Literal["explicit", "stiff"] | None = Field(default=None, description="integrator")
+    solver: Literal["auto", "explicit", "stiff"] | None = Field(
+        default=None, description="steps of the integrator; 'stiff' takes implicit ones, 'auto' where they are needed"
+    )
     rtol: float | None = Field(default=None, gt=0, description="relative tolerance of the integrator")
     atol: float | None = Field(default=None, gt=0, description="absolute tolerance of the integrator")
     strategy: Literal["local", "auto", "thorough"] | None = Field(
         default=None, description="one fit, more if its verdict is not good, or all strategies"
     )
     time_budget: float | None = Field(default=None, gt=0, description="seconds after which no further strategy begins")
-    hessian: HessianKind | None = Field(default=None, description="quadratic term of the optimiser")
+    hessian: HessianKind | None = Field(default=None, description="quadratic term of the optimizer")
     tolerance: float | None = Field(default=None, gt=0, description="optimality at which to stop")
     max_iterations: int | None = Field(default=None, ge=0, description="most iterations")
 
@@ -683,13 +688,12 @@ def _build_experiment(
         for place, item, log in zip(places, table.data, logs, strict=False)  # that of the inputs comes after them
     ]
     times = table.transition_times
-    spans = [item.seen_times if isinstance(item, Measurements) else item.signal.knots for item in data]
     return Experiment(
         data=data,
         mode_sequence=tuple(table.mode_sequence),
         transition_times=None if times is None else tuple(map(_build_parameter, times)),  # type: ignore[arg-type]
-        t0=min(span[0] for span in spans) if table.t0 is None else table.t0,
-        tf=_build_final_time(table, spans),
+        t0=table.t0,  # type: ignore[arg-type]  # None: from the data
+        tf=None if table.tf is None else _build_parameter(table.tf),  # type: ignore[arg-type]
         inputs=None
         if table.inputs is None
         else _build_at(f"{where}.inputs", _build_input, table.inputs, logs[-1], table.time_unit),
@@ -698,11 +702,6 @@ def _build_experiment(
         name=table.name,
         time_unit=table.time_unit,
     )
-
-
-def _build_final_time(table: ExperimentTable, spans: list[Any]) -> float | Parameter:
-    """Return tf: an unknown if given as a table; if left out, the end of the data."""
-    return float(max(span[-1] for span in spans)) if table.tf is None else _build_parameter(table.tf)
 
 
 def _build_initial_state(table: ExperimentTable) -> list[Parameter] | list[float] | None:

@@ -101,7 +101,7 @@ def magic_formula(
     Notes
     -----
     The published coefficients were fitted to loads of 2 to 8 kN per tyre; at this vehicle's 0.2 kN they extrapolate. At
-    a velocity V, slip decays at the rate 230 V⁻¹ m/s²: use ``sf.Problem(..., solver="stiff")``.
+    a velocity V, slip decays at the rate 230 V⁻¹ m/s², so that the model is stiff at low speeds.
 
     References
     ----------

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate, fit_locally
-from switchfit.optimize import Status
 from switchfit.paper.part import Found, Row, Say
 from switchfit.paper.vehicle import HORIZON, build_simulated_problem
 from switchfit.problem.data import FloatArray
 from switchfit.runtime.errors import NotIntegrableError
-from switchfit.strategy.choice import estimate
+from switchfit.strategy.choice import estimate, was_interrupted
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,7 +60,7 @@ def _fit(problem: Problem, method: str, start: FloatArray) -> Estimate | None:
             fit = estimate(problem, strategy="local" if method == "local" else "auto", start=start)
     except NotIntegrableError:
         return None
-    if fit.status is Status.INTERRUPTED:
+    if was_interrupted(fit):
         raise KeyboardInterrupt
     return fit
 

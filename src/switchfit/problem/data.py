@@ -547,7 +547,7 @@ class Measurements:
         _check_observe(self.observe)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values)
-        object.__setattr__(self, "sigma", _check_sigma(self.sigma, values.shape))
+        object.__setattr__(self, "sigma", _check_sigma(self.sigma, values))
         object.__setattr__(self, "names", _check_channel_names(names, values.shape[1]))
         object.__setattr__(self, "units", _check_units(units, values.shape[1]))
         self._check_loss()
@@ -677,7 +677,9 @@ def _require_finite(values: FloatArray, what: str) -> None:
         raise ValueError(f"{what} must be finite; got {values[tuple(where)]} at index {where}.")
 
 
-def _check_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | tuple[str | float, ...] | None:
+def _check_sigma(sigma: Any, values: FloatArray) -> FloatArray | tuple[str | float, ...] | None:
+    """Return sigma of values (K, q), checked; that of a missing value may be missing too, and becomes 1."""
+    shape = values.shape
     if sigma is None:
         return None
     if isinstance(sigma, str):
@@ -690,6 +692,11 @@ def _check_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | tuple[str |
             f"sigma must be a number, of shape ({shape[1]},) (one per channel) or {shape} (one per sample); "
             f"got shape {sigma.shape}."
         )
+    if sigma.shape == shape:
+        sigma = np.where(np.isnan(sigma) & np.isnan(values), 1.0, sigma)
+        if np.isnan(sigma).any():
+            where = np.argwhere(np.isnan(sigma))[0].tolist()
+            raise ValueError(f"sigma must be positive and finite; it is NaN at index {where}, and the value is not.")
     if not np.all(sigma > 0) or not np.all(np.isfinite(sigma)):
         raise ValueError(f"sigma must be positive and finite; got a smallest value of {sigma.min()}.")
     _check_inverse_square(sigma)

@@ -1,8 +1,9 @@
 """Variables of the optimizer: unknowns scaled to the size of one, or their logarithms.
 
-    theta = s z,  or  theta = exp(z):      d theta / dz = D,    g_z = D g,    H_z = D H D + diag(E g),
+    theta = s z,  or  theta = o + exp(z):      d theta / dz = D,    g_z = D g,    H_z = D H D + diag(E g),
 
-with E = d^2 theta / dz^2, 0 or theta. Unknowns whose size is near one are not scaled: s = 1.
+with E = d^2 theta / dz^2, 0 or theta - o. Unknowns whose size is near one are not scaled: s = 1. The origin o of a
+logarithm is 0; for a transition time it is the t0 of its experiment.
 """
 
 from __future__ import annotations
@@ -19,14 +20,21 @@ ORDINARY = (1e-3, 1e3)
 
 
 class Variables(NamedTuple):
-    """The change of variables: ``size`` (d,), powers of 2, and ``log`` (d,) of bool."""
+    """The change of variables: ``size`` (d,), powers of 2, ``log`` (d,) of bool, and ``origin`` (d,) of logarithms."""
 
     size: Any
     log: Any
+    origin: Any
 
     @classmethod
     def of(
-        cls, theta: FloatArray, lower: FloatArray, upper: FloatArray, log: NDArray[np.bool_], keep: NDArray[np.bool_]
+        cls,
+        theta: FloatArray,
+        lower: FloatArray,
+        upper: FloatArray,
+        log: NDArray[np.bool_],
+        keep: NDArray[np.bool_],
+        origin: FloatArray,
     ) -> Variables:
         """Return variables scaled by the first guess, or by the bounds if it is 0.
 
@@ -35,6 +43,7 @@ class Variables(NamedTuple):
         theta, lower, upper : (d,)
         log : (d,) of bool
         keep : (d,) of bool, unknowns that are not scaled
+        origin : (d,)
         """
         bounds = np.maximum(
             np.where(np.isfinite(lower), np.abs(lower), 0), np.where(np.isfinite(upper), np.abs(upper), 0)
@@ -42,7 +51,7 @@ class Variables(NamedTuple):
         typical = np.where(theta != 0.0, np.abs(theta), bounds)
         outside = (typical > 0) & ((typical < ORDINARY[0]) | (typical > ORDINARY[1])) & ~keep & ~log
         # A power of 2, so that scaling causes no rounding.
-        return cls(2.0 ** np.round(np.log2(np.where(outside, typical, 1.0))), log)
+        return cls(2.0 ** np.round(np.log2(np.where(outside, typical, 1.0))), log, origin)
 
     @property
     def identity(self) -> bool:
@@ -51,12 +60,13 @@ class Variables(NamedTuple):
 
     def outward(self, z: Any, xp: Any = np) -> Any:
         """Return theta at z: (d,)."""
-        return xp.where(self.log, xp.exp(xp.where(self.log, z, 0.0)), self.size * z)
+        return xp.where(self.log, self.origin + xp.exp(xp.where(self.log, z, 0.0)), self.size * z)
 
     def inward(self, theta: Any, xp: Any = np) -> Any:
-        """Return z at theta (d,): a bound of 0 becomes one of minus infinity for a logarithm."""
-        positive = xp.where(self.log & (theta > 0), theta, 1.0)
-        return xp.where(self.log, xp.where(theta > 0, xp.log(positive), -xp.inf), theta / self.size)
+        """Return z at theta (d,): a bound at the origin becomes one of minus infinity for a logarithm."""
+        away = theta - self.origin
+        positive = xp.where(self.log & (away > 0), away, 1.0)
+        return xp.where(self.log, xp.where(away > 0, xp.log(positive), -xp.inf), theta / self.size)
 
     def sizes_inward(self, sizes: FloatArray) -> FloatArray:
         """Return sizes of z for sizes of theta (d,); the size of a logarithm is 1."""
@@ -64,7 +74,8 @@ class Variables(NamedTuple):
 
     def slopes(self, theta: Any, xp: Any = np) -> tuple[Any, Any]:
         """Return D and E at theta: (d,) each."""
-        return xp.where(self.log, theta, self.size), xp.where(self.log, theta, 0.0)
+        away = theta - self.origin
+        return xp.where(self.log, away, self.size), xp.where(self.log, away, 0.0)
 
     def derivatives_outward(self, theta: Any, gradient: Any, hessian: Any, xp: Any = np) -> tuple[Any, Any]:
         """Return the gradient and Hessian in theta from those in z."""

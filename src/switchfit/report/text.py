@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.fit.result import Fit, disagreement, interval
+from switchfit.fit.result import Fit, Step, disagreement, interval
 from switchfit.fit.trajectory import Comparison
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
@@ -17,7 +17,7 @@ from switchfit.problem.parameter import unit_suffix
 from switchfit.report.numbers import format_rounded, format_unit, get_unit
 from switchfit.report.tables import format_table, wrap_text
 from switchfit.report.uncertainty import write_direction
-from switchfit.report.verdict import format_share
+from switchfit.report.verdict import format_share, write_agreement
 from switchfit.runtime.presentation import format_text
 from switchfit.uncertainty.certificate import Certificate
 from switchfit.uncertainty.identification import WEAK, Identifiability, analyse_solution
@@ -170,15 +170,35 @@ def _format_data(comparison: Comparison) -> str:
 def _format_course(fit: Fit, *, full: bool) -> list[str]:
     """Return method, effort, the strategies with the lowest J after each, and how it ended."""
     lines = _format_row("method", METHODS.get(fit.hessian_kind, fit.hessian_kind))
-    effort = f"{_count(fit.iterations, 'iteration')}, {_count(fit.evaluations, 'evaluation')}, {fit.seconds:.3g} s"
+    iterations, evaluations = _count(fit.iterations, "iteration"), _count(fit.evaluations, "evaluation")
+    effort = f"{iterations}, {evaluations}, {fit.seconds:.3g} s"
+    if fit.steps:  # the iterations of short fits are not counted, and the last fit has few
+        effort = f"{evaluations}, {fit.seconds:.3g} s in all, {iterations} in the last fit"
     lines += _format_row("effort", effort if fit.engine is None or full else f"{effort}. {fit.engine}")
     if fit.engine is not None and full:
         lines += _format_row("", str(fit.engine))
     if fit.steps:
-        tried = (f"{step.strategy}: J = {step.cost:.6g} ({step.seconds:.2g} s)" for step in fit.steps)
-        lines += _format_row("tried", "; ".join(tried))
+        lines += _format_row("tried", "; ".join(map(_format_step, fit.steps)))
+    if fit.starts is not None and fit.starts[0]:
+        ended = next((step.ended for step in reversed(fit.steps) if step.ended), "")
+        lines += _format_row("starts", f"{write_agreement(*fit.starts)}{_ENDED.get(ended, '')}")
     lines += _format_row("status", fit.message if full or not fit.status.successful else _shorten_status(fit))
     return lines
+
+
+_ENDED = {
+    "settled": "; no further minimum is likely",
+    "most": "; there may be further minima",
+    "time": "; ended by time_budget",
+    "interrupted": "; interrupted",
+}
+"""Why the many starts ended."""
+
+
+def _format_step(step: Step) -> str:
+    """Return a strategy and the lowest J after it."""
+    cost = f"J = {step.cost:.6g}" if np.isfinite(step.cost) else "not integrable"
+    return f"{step.strategy}: {cost} ({step.seconds:.2g} s)"
 
 
 def _shorten_status(fit: Fit) -> str:
@@ -194,7 +214,11 @@ def _shorten_status(fit: Fit) -> str:
 
 def _format_quality(fit: Fit, *, full: bool) -> Iterator[str]:
     """Return cost, optimality (which the status says as well), residual variance, integration error."""
-    start = f"   (first guess: {fit.history[0].cost:.8g})" if fit.history else ""
+    first = fit.initial_cost
+    if np.isnan(first) and fit.history and not fit.steps:
+        first = fit.history[0].cost
+    guess = f"{first:.8g}" if np.isfinite(first) else "not integrable" if fit.steps else ""
+    start = f"   (first guess: {guess})" if guess else ""
     yield from _format_row("cost J", f"{fit.cost:.8g}{start}")
     if full:
         yield from _format_row("KKT residual", f"{fit.optimality:.1e}   (tolerance: {fit.tolerance:.1e})")
@@ -316,7 +340,8 @@ def _format_log_scale(fit: Fit, i: int, errors: FloatArray) -> str:
         return ""
     low, high = fit.confidence_intervals()[i]
     if low < high and errors[i] > fit.standard_errors[i]:
-        ends = interval(fit.theta[i : i + 1], fit.quantile(0.95) * errors[i : i + 1], np.ones(1, dtype=bool))[0]
+        half, origin = fit.quantile(0.95) * errors[i : i + 1], fit.log_origins[i]
+        ends = interval(fit.theta[i : i + 1], half, np.ones(1, dtype=bool), origin)[0]
         low, high = np.clip(ends, fit.lower[i], fit.upper[i])
     return f"95 % in [{low:.4g}, {high:.4g}]" if low < high else ""
 

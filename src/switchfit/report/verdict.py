@@ -55,7 +55,24 @@ def write_step(step: Issue) -> str:
     ----------
     step : Issue
     """
-    return _STEPS.get(step.kind.removeprefix("next: "), step.kind).format(*step.subjects)
+    text = _STEPS.get(step.kind.removeprefix("next: "), step.kind).format(*step.subjects)
+    return text.replace("one of them", "it") if len(step.subjects) == 1 else text
+
+
+def write_agreement(tried: int, better: int, agreeing: int, *, few: bool = False) -> str:
+    """Return from how many of the other starts the lowest J was found, as a part of a sentence.
+
+    Parameters
+    ----------
+    tried, better, agreeing : int
+        As in `Fit.starts`.
+    few : bool
+        Whether the agreement is small enough to be doubted.
+    """
+    if better > 0:
+        return f"{better} of {tried} other starts are better"
+    count = "none" if not agreeing else f"only {agreeing}" if few else str(agreeing)
+    return f"the lowest J was found from {count} of {tried} other starts"
 
 
 def _figure(issue: Issue, name: str) -> float:
@@ -117,6 +134,11 @@ def _count_modes(collapsed: list[Issue]) -> str:
     return f"{len(names)} modes collapsed ({_name(names)})"
 
 
+def _read_starts(issue: Issue) -> tuple[int, int, int]:
+    tried, better, agreeing = (int(_figure(issue, name)) for name in ("tried", "better", "agreeing"))
+    return tried, better, agreeing
+
+
 _ENDINGS: Mapping[str, str] = {
     Status.MAX_ITERATIONS.name: "not converged: stopped after {iterations:.0f} iterations",
     Status.LINE_SEARCH_FAILED.name: "not converged: the line search failed (optimality {optimality:.1e})",
@@ -175,9 +197,7 @@ def _write_failures(issue: Issue) -> str:
 _REASONS: dict[str, Callable[[Issue], str]] = {
     "fits": _explain,
     "a minimum": lambda issue: f"a minimum (KKT residual {_figure(issue, 'optimality'):.1e})",
-    "starts agree": lambda issue: (
-        f"{_figure(issue, 'agreeing'):.0f} of {_figure(issue, 'tried'):.0f} other starts agree, none is better"
-    ),
+    "starts agree": lambda issue: write_agreement(*_read_starts(issue)),
     "at kinks": lambda issue: f"{_name(issue.subjects)} at a kink of the cost",
     "not converged": _write_ending,
     "unexplained": _explain_worst,
@@ -203,12 +223,8 @@ _REASONS: dict[str, Callable[[Issue], str]] = {
     "a mode collapsed": lambda issue: f"{_name_mode(issue)} collapsed",
     "a mode is short": lambda issue: f"{_name_mode(issue)} is at its minimum duration",
     "idle": lambda issue: f"the cost does not depend on {_name(issue.subjects)}",
-    "other starts are better": lambda issue: (
-        f"{_figure(issue, 'better'):.0f} of {_figure(issue, 'tried'):.0f} other starts are better"
-    ),
-    "few starts agree": lambda issue: (
-        f"only {_figure(issue, 'agreeing'):.0f} of {_figure(issue, 'tried'):.0f} other starts agree, none is better"
-    ),
+    "other starts are better": lambda issue: write_agreement(*_read_starts(issue)),
+    "few starts agree": lambda issue: write_agreement(*_read_starts(issue), few=True),
     "not determined": lambda issue: f"the data hardly determine {_name(issue.subjects)}",
     "at bounds": lambda issue: f"{_name(issue.subjects)} at a bound",
     "integration error": lambda issue: (

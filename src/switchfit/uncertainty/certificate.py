@@ -133,7 +133,7 @@ def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
     if evaluator is not None:
         gaps = measure_derivative_gap(evaluator, fit.theta)
         orders = estimate_orders(build_taylor_table(evaluator, fit.theta).orders)
-    stiff = evaluator is not None and evaluator.problem.solver == "stiff"
+    stiff = evaluator is not None and evaluator.takes_implicit_steps
     smallest = float(scaled[0]) if len(scaled) else np.nan
     return Certificate(
         optimality=fit.optimality,

@@ -158,7 +158,9 @@ def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, seed:
     at = table.theta
     gaps = measure_derivative_gap(evaluator, at)
     halved = measure_derivative_gap(evaluator.halved, at)
-    return DerivativeCheck(table.steps, table.remainders, table.orders, *gaps, *halved, at, problem.solver == "stiff")
+    return DerivativeCheck(
+        table.steps, table.remainders, table.orders, *gaps, *halved, at, evaluator.takes_implicit_steps
+    )
 
 
 def measure_derivative_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[float, float]:

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.discretization.mesh import Mesh
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
@@ -201,7 +200,7 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
         points = estimate.sensitivities[experiment].nodes
     else:
         asked = _check_times(times, problem, experiment, fit.trajectories[experiment])
-        mesh = Mesh.from_times(np.concatenate([evaluator.meshes[experiment].times, asked]))
+        mesh = evaluator.meshes[experiment].insert(asked)
         found: Sensitivity = compute_sensitivity(problem, experiment, fit.theta, mesh)
         points = found.at(asked)
     return _build_prediction(fit, problem, experiment, points)
@@ -211,8 +210,8 @@ def _build_prediction(fit: Fit, problem: Problem, e: int, points: Points) -> Pre
     covariance = fit.covariance
     if not np.isfinite(covariance).all():
         raise ValueError(
-            "There are no bands without a covariance: the cost must be made of Measurements alone, with more values "
-            "than unknowns, and the Hessian positive definite. The report says what is missing."
+            "There are no bands without a covariance: the cost must consist of Measurements alone, with more values "
+            "than unknowns, and the Hessian must be positive definite. The report says what is missing."
         )
     trajectory = fit.trajectories[e]
     names = [name for comparison in fit.comparisons[e] for name in comparison.names]

@@ -108,7 +108,7 @@ class Trace:
         self.points = [self.centre]
         self.ends: dict[int, End] = {}
         self.fits = 0
-        self.limits = {side: self._limit(side) for side in (-1, 1)}
+        self.limits = {side: self._find_limit(side) for side in (-1, 1)}
         self.interrupted = False
         self.jumps: list[float] = []
         self.coarse = False
@@ -133,7 +133,7 @@ class Trace:
 
     # --- adding points
 
-    def _limit(self, side: int) -> float:
+    def _find_limit(self, side: int) -> float:
         """Return the limit that the constraints set to the unknown on one side."""
         k, c = self.index, self.constraints
         coupled = np.flatnonzero(np.any(c.A != 0, axis=0))
@@ -145,7 +145,7 @@ class Trace:
         # The centre is feasible; rounding of the linear program must not put a limit on the wrong side of it.
         return side * max(side * float(found.x[coupled == k][0]), side * float(self.fit.theta[k]))
 
-    def _feasible(self, target: FloatArray, inside: FloatArray) -> FloatArray | None:
+    def _find_feasible(self, target: FloatArray, inside: FloatArray) -> FloatArray | None:
         """Return the feasible point nearest to `target` with the same value of the unknown, given a feasible point
         `inside` with another value.
 
@@ -160,7 +160,7 @@ class Trace:
         # Other unknowns move only as far as the constraints force them: a quadratic program in them, which starts on
         # the line from `inside` to a feasible point at the limit. It is feasible since the constraints are convex.
         side = 1 if value > inside[k] else -1
-        extreme = self._extreme(side, inside)
+        extreme = self._find_extreme(side, inside)
         span = extreme[k] - inside[k]
         start = inside + (0.0 if span == 0 else (value - inside[k]) / span) * (extreme - inside)
         start[k] = value
@@ -175,7 +175,7 @@ class Trace:
         violated = c.A @ start - c.b
         return start if np.all(violated >= -1e-9 * (1 + np.abs(c.b))) else None
 
-    def _extreme(self, side: int, inside: FloatArray) -> FloatArray:
+    def _find_extreme(self, side: int, inside: FloatArray) -> FloatArray:
         """Return a feasible point at the limit; unknowns that no constraint couples with this one are unchanged."""
         c = self.constraints
         coupled = np.flatnonzero(np.any(c.A != 0, axis=0))
@@ -216,7 +216,7 @@ class Trace:
         best: Point | None = None
         for start in starts:
             start[k] = value
-            feasible = self._feasible(start, near.theta)
+            feasible = self._find_feasible(start, near.theta)
             found = None if feasible is None else self._fit(value, feasible)
             if found is not None and (
                 best is None or (not found.converged, found.cost) < (not best.converged, best.cost)
@@ -252,7 +252,7 @@ class Trace:
         if len(points) > 1 and abs(self.zeta(points[-1])) >= BEYOND * threshold:
             self.ends[side] = "crossed"
             return
-        step = abs(points[-1].value - points[-2].value) if len(points) > 1 else self._first_step(side, spacing)
+        step = abs(points[-1].value - points[-2].value) if len(points) > 1 else self._choose_first_step(side, spacing)
         ahead = 0
         self.ends[side] = "stopped"
         for _ in range(MOST_POINTS):
@@ -260,20 +260,20 @@ class Trace:
             height = abs(self.zeta(last))
             if last.value == self.limits[side]:
                 self.ends[side] = "crossed" if abs(self.zeta(last)) >= threshold else "limit"
-                return self._dip(side)
+                return self._add_minima(side)
             if height >= BEYOND * threshold:
                 self.ends[side] = "crossed"
                 if ahead >= LOOK_AHEAD * (1 + (side * last.slope < 0)):
-                    return self._dip(side)
+                    return self._add_minima(side)
                 ahead += 1
                 step = abs(last.value - self.centre.value)
             elif abs(last.value - self.centre.value) > self._far:
                 self.ends[side] = "flat"
                 return
-            new = self._next(side, points, step, spacing, threshold, looking=ahead > 0)
+            new = self._add_next(side, points, step, spacing, threshold, looking=ahead > 0)
             if new is None:
                 self.ends[side] = "crossed" if height >= threshold else "failed"
-                return self._dip(side)
+                return self._add_minima(side)
             if new.cost < last.cost - 1e-9 * abs(last.cost):
                 self._sweep_inward(side)
             points = self.side(side)
@@ -282,7 +282,7 @@ class Trace:
             step = abs(new.value - last.value) * float(np.clip(growth, 0.4, LONGEST_GROWTH))
         self.ends[side] = "flat" if self.ends[side] == "stopped" else self.ends[side]
 
-    def _next(
+    def _add_next(
         self, side: int, points: list[Point], step: float, spacing: float, threshold: float, *, looking: bool
     ) -> Point | None:
         """Return the next point outwards; the step is shortened if a fit fails or zeta rises too much."""
@@ -323,7 +323,7 @@ class Trace:
             found = self.add(inner.value + float(part) * (outer.value - inner.value), previous)
             previous = found if found is not None else previous
 
-    def _dip(self, side: int) -> None:
+    def _add_minima(self, side: int) -> None:
         """Add points at minima between points far apart, where the slopes show one."""
         points = self.side(side)[1:]
         for inner, outer in pairwise(points):
@@ -345,7 +345,7 @@ class Trace:
         for inner in inward:
             start = outer.theta.copy()
             start[self.index] = inner.value
-            feasible = self._feasible(start, outer.theta)
+            feasible = self._find_feasible(start, outer.theta)
             found = None if feasible is None else self._fit(inner.value, feasible)
             if found is None or not found.converged or found.cost >= inner.cost - 1e-9 * abs(inner.cost):
                 return
@@ -360,7 +360,7 @@ class Trace:
         theta = centre.theta - column / column[self.index]
         return Point(float(theta[self.index]), np.nan, np.nan, theta, True)
 
-    def _first_step(self, side: int, spacing: float) -> float:
+    def _choose_first_step(self, side: int, spacing: float) -> float:
         """Return the step after which zeta should equal the spacing: from the standard error, or at a kink or a bound
         from the slope.
         """
@@ -407,7 +407,7 @@ class Trace:
         """Return all intervals found in which |zeta| is at most the threshold, ascending; open ends are infinite."""
         points = list(self.points)
         inside = [abs(self.zeta(q)) <= threshold for q in points]
-        low = self._open_end(-1) if inside[0] else None
+        low = self._get_open_end(-1) if inside[0] else None
         found: list[tuple[float, float]] = []
         for a, b, a_in, b_in in zip(points[:-1], points[1:], inside[:-1], inside[1:], strict=True):
             if a_in != b_in:
@@ -417,9 +417,9 @@ class Trace:
                 elif low is not None:
                     found.append((low, edge))
                     low = None
-        return found if low is None else [*found, (low, self._open_end(1))]
+        return found if low is None else [*found, (low, self._get_open_end(1))]
 
-    def _open_end(self, side: int) -> float:
+    def _get_open_end(self, side: int) -> float:
         """Return the end of a region on a side where the threshold was not crossed."""
         end, last = self.ends.get(side, "stopped"), self.side(side)[-1].value
         if end in ("limit", "crossed"):
@@ -672,7 +672,7 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     _check(fit)
     threshold = fit.quantile(level)
     index = fit.theta_names.index(name)
-    times = _sample_times(evaluator, index)
+    times = _list_sample_times(evaluator, index)
     report, end = show_progress(callback, f"Profile of {name}")
     trace = Trace(fit, evaluator, index)
     try:
@@ -724,11 +724,11 @@ def _check(fit: Fit) -> None:
         raise ValueError("a profile needs a noise model: a cost of Measurements alone, with or without sigma.")
     if fit.sigma_known is False and fit.freedom < 1:
         raise ValueError(
-            f"sigma is unknown, and {fit.samples} values are too few to estimate it along with the unknowns."
+            f"sigma is unknown and {fit.samples} values are too few to estimate it along with the unknowns."
         )
 
 
-def _sample_times(evaluator: Evaluator, index: int) -> FloatArray:
+def _list_sample_times(evaluator: Evaluator, index: int) -> FloatArray:
     """Return the sample times of the run of which this unknown is a transition time; empty for a parameter."""
     problem = evaluator.problem
     for experiment, where in zip(problem.experiments, problem.unknowns.times, strict=True):

@@ -149,7 +149,7 @@ def measure_quality(fit: Fit) -> Quality:
                         kind=comparison.kind,
                         count=int(np.isfinite(comparison.measured[:, k]).sum()),
                         explained=1 - squares / spread if spread > 0 else np.nan,
-                        chi_square=_chi_square(comparison, k),
+                        chi_square=_compute_chi_square(comparison, k),
                         whiteness=whiteness,
                         correlated=correlated,
                         outliers=_share_outliers(comparison, k),
@@ -190,7 +190,7 @@ def _sum_squares(comparison: Comparison, k: int) -> tuple[float, float, float]:
         there &= ~comparison.downweighted[:, k]
     if not there.any():
         return np.nan, np.nan, 1.0
-    weight = _weights(comparison)[there]
+    weight = _compute_weights(comparison)[there]
     y, residual = y[there], residual[there]
     size = 1.0
     if comparison.sigma is not None:
@@ -212,7 +212,7 @@ def _share_outliers(comparison: Comparison, k: int) -> float:
     return float(comparison.downweighted[there, k].mean())
 
 
-def _weights(comparison: Comparison) -> FloatArray:
+def _compute_weights(comparison: Comparison) -> FloatArray:
     """Return the weight of each row: 1 for a sample, that of the trapezoidal rule for a node of a reference signal."""
     if comparison.kind == "measurements":
         return np.ones(len(comparison.times))
@@ -220,7 +220,7 @@ def _weights(comparison: Comparison) -> FloatArray:
     return 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
 
 
-def _chi_square(comparison: Comparison, k: int) -> float:
+def _compute_chi_square(comparison: Comparison, k: int) -> float:
     """Return the sum of the squared residuals over sigma; NaN if sigma is unknown or a loss is robust."""
     if comparison.sigma is None or comparison.downweighted is not None:
         return np.nan

@@ -1,4 +1,4 @@
-"""Gradient and exact Hessian of the *discretised* cost in forward mode, for few unknowns and as a check of the adjoint.
+"""Gradient and exact Hessian of the *discretized* cost in forward mode, for few unknowns and as a check of the adjoint.
 
 With z = (x_k, theta) the arguments of node map k and Z_k their derivative in theta,
 
@@ -58,7 +58,7 @@ class Second(NamedTuple):
 
 
 def forward_hessian(model: Model, first: Forward, p: Array) -> Array:
-    """Return the Hessian (D, D) of the discretised cost, D = N + M, without an adjoint.
+    """Return the Hessian (D, D) of the discretized cost, D = N + M, without an adjoint.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def forward_hessian(model: Model, first: Forward, p: Array) -> Array:
 
 
 def forward_gradient(model: Model, first: Forward, p: Array) -> tuple[Array, Array]:
-    """Return the discretised cost () and its gradient (D,), without an adjoint.
+    """Return the discretized cost () and its gradient (D,), without an adjoint.
 
     The derivatives of all running costs, samples, transitions and terminal costs, along the tangents of the forward
     sweep. The Gauss-Newton matrix needs these tangents too, and no adjoint.

@@ -64,7 +64,7 @@ def _costs(model: Model, k: int) -> Callable[..., Array]:
     return cost
 
 
-def _each(function: Callable[..., Any], *given: Any) -> Any:
+def _map_samples(function: Callable[..., Any], *given: Any) -> Any:
     """Map ``function(sample, anchor, ...)`` over all samples."""
     return lax.map(lambda of_sample: function(*of_sample), given, batch_size=SAMPLES_AT_ONCE)
 
@@ -83,7 +83,7 @@ def late_gradients(
         gradient, value = jax.jacfwd(of, argnums=(0, 1, 2), has_aux=True)(at.start, at.x, p)
         return value, gradient
 
-    return _each(one, samples, at)
+    return _map_samples(one, samples, at)
 
 
 def _along(model: Model, at: Anchors, x_d: Array, p: Array, e: Array) -> tuple[Array, Array, Array]:
@@ -105,7 +105,7 @@ def late_curvature(model: Model, at: Anchors, x_d: Array, k: int, samples: Sampl
 
         return jax.jacfwd(jax.jacfwd(along))(jnp.zeros(x_d.shape[-1]))
 
-    return _each(one, samples, at, x_d).sum(0)
+    return _map_samples(one, samples, at, x_d).sum(0)
 
 
 def late_gauss_newton(model: Model, at: Anchors, x_d: Array, k: int, samples: Samples, p: Array) -> Array:
@@ -125,7 +125,7 @@ def late_gauss_newton(model: Model, at: Anchors, x_d: Array, k: int, samples: Sa
             H = H + 2.0 * s_d.T @ s_d
         return H
 
-    return _each(one, samples, at, x_d).sum(0)
+    return _map_samples(one, samples, at, x_d).sum(0)
 
 
 def late_state_derivatives(model: Model, at: Anchors, k: int, samples: Samples, p: Array) -> tuple[Any, Any]:
@@ -145,4 +145,4 @@ def late_state_derivatives(model: Model, at: Anchors, k: int, samples: Samples, 
         first = jax.jacfwd(of, argnums=(0, 1))
         return first(at.x, p), jax.jacfwd(first, argnums=(0, 1))(at.x, p)
 
-    return _each(one, samples, at)
+    return _map_samples(one, samples, at)

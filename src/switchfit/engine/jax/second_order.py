@@ -1,4 +1,4 @@
-"""Exact Hessian of the *discretised* cost by a backward sweep, after the forward sweep.
+"""Exact Hessian of the *discretized* cost by a backward sweep, after the forward sweep.
 
 With z = (x_k, theta) the arguments of node map k, Z_k their derivative in theta and psi_{k+1} the derivative of the
 cost to go,
@@ -46,7 +46,7 @@ SAMPLES_AT_ONCE = 1024
 
 
 def adjoint_hessian(model: Model, first: Forward, back: Backward, p: Array, weights: Array | None = None) -> Array:
-    """Return the Hessian (D, D) of the discretised cost, with ``weights . c`` of the constraints (m,) if given.
+    """Return the Hessian (D, D) of the discretized cost, with ``weights . c`` of the constraints (m,) if given.
 
     `back` is the backward sweep of the same sum.
     """

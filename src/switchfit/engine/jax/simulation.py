@@ -46,11 +46,11 @@ def simulate_by_jax(
     costly = {i for i, _ in list_costs_at_transitions(Model(structure, arguments))}
     kept, parts, cost = [], [], 0.0
     with use_float64(), use_compilation_cache():
-        start_of = partial(_start, structure=structure.functions, N=structure.N, tangents=tangents)
+        start_of = partial(_compute_initial_state, structure=structure.functions, N=structure.N, tangents=tangents)
         x, X = map(np.asarray, start_of(arguments, p))
         for i, mode in enumerate(structure.mode_of_segment):
             if i > 0 and structure.reset_maps[i - 1] is not None:
-                through = partial(_through_reset, structure=structure, i=i - 1, tangents=tangents)
+                through = partial(_apply_reset, structure=structure, i=i - 1, tangents=tangents)
                 x, X = map(np.asarray, through(arguments, tau[i - 1], x, X, p))
             first = int(layout.first_chunk[i]) * CHUNK
             count = int(layout.last_row[i]) + 1 - first
@@ -59,13 +59,13 @@ def simulate_by_jax(
             here = slice(first, first + count)
             pieces = Piece(whole.nodes[cell[here]], whole.signals[cell[here]])
             given = start[here], end[here], starts_d[here], ends_d[here], pieces
-            x, X, added, columns = _segment(structure, arguments, mode, x, X, p, given, tangents)
+            x, X, added, columns = _simulate_segment(structure, arguments, mode, x, X, p, given, tangents)
             kept.append(np.arange(here.start, here.stop))
             parts.append(columns)
             cost += added
             if i in costly:
-                cost += float(_at_transition(arguments, tau[i], x, p, structure=structure, i=i))
-        cost += float(_terminal(arguments, x, p, structure=structure.functions))
+                cost += float(_compute_transition_cost(arguments, tau[i], x, p, structure=structure, i=i))
+        cost += float(_compute_terminal_cost(arguments, x, p, structure=structure.functions))
     own = np.concatenate(kept)
     before, after, y_before, y_after, *derivatives = (np.concatenate(column) for column in zip(*parts, strict=True))
     simulation = Simulation(
@@ -81,7 +81,7 @@ def simulate_by_jax(
         tangents=Tangents(*derivatives) if tangents else None,
     )
     late = {
-        k: _late_outputs(structure, whole, simulation, k, cell[own], p)
+        k: _compute_late_outputs(structure, whole, simulation, k, cell[own], p)
         for k, sensor in enumerate(structure.measurements)
         if sensor.delay is not None
     }
@@ -108,7 +108,7 @@ def _name_parameters(structure: Structure, arguments: Arguments, p: FloatArray) 
     return dict(Model(structure, arguments).parameters(p))  # type: ignore[arg-type]  # NumPy arrays
 
 
-def _segment(
+def _simulate_segment(
     structure: Structure,
     arguments: Arguments,
     mode: int,
@@ -128,7 +128,7 @@ def _segment(
     still = (np.repeat(end[-1:], missing),) * 2 + (np.zeros((missing, given[2].shape[1])),) * 2
     times = [np.concatenate([a, b]) for a, b in zip(given[:4], still, strict=True)]
     pieces = jax.tree.map(lambda a: np.concatenate([a, np.repeat(a[-1:], missing, axis=0)]), given[4])
-    block = partial(_block, structure=structure.functions, tangents=tangents)
+    block = partial(_simulate_block, structure=structure.functions, tangents=tangents)
     parts, cost = [], 0.0
     for k in range(0, count + missing, BLOCK):
         span = slice(k, k + BLOCK)
@@ -141,7 +141,7 @@ def _segment(
 
 
 @partial(jax.jit, static_argnames=("structure", "N", "tangents"))
-def _start(
+def _compute_initial_state(
     arguments: Arguments, p: jax.Array, *, structure: Structure, N: int, tangents: bool
 ) -> tuple[jax.Array, jax.Array]:
     """Return x(t0) and its derivative in (tau, p): (n,), (n, D)."""
@@ -153,7 +153,7 @@ def _start(
 
 
 @partial(jax.jit, static_argnames=("structure", "i", "tangents"))
-def _through_reset(
+def _apply_reset(
     arguments: Arguments,
     t: jax.Array,
     x: jax.Array,
@@ -174,7 +174,7 @@ def _through_reset(
 
 
 @partial(jax.jit, static_argnames=("structure", "tangents"))
-def _block(
+def _simulate_block(
     arguments: Arguments,
     mode: jax.Array,
     x: jax.Array,
@@ -185,7 +185,7 @@ def _block(
     structure: Structure,
     tangents: bool,
 ) -> tuple[tuple[jax.Array, jax.Array], jax.Array, tuple[jax.Array, ...]]:
-    """Return x and X after a block of rows in one mode, its running cost, and columns as in `_segment`."""
+    """Return x and X after a block of rows in one mode, its running cost, and columns as in `_simulate_segment`."""
     model = Model(structure, arguments)
     P = _of_parameters(X, p) if tangents else X
 
@@ -235,7 +235,7 @@ def _of_parameters(X: jax.Array, p: jax.Array) -> jax.Array:
 
 
 @partial(jax.jit, static_argnames=("structure", "i"))
-def _at_transition(
+def _compute_transition_cost(
     arguments: Arguments, t: jax.Array, x: jax.Array, p: jax.Array, *, structure: Structure, i: int
 ) -> jax.Array:
     """Return the costs at transition i (from 0)."""
@@ -246,11 +246,11 @@ def _at_transition(
 
 
 @partial(jax.jit, static_argnames=("structure",))
-def _terminal(arguments: Arguments, x: jax.Array, p: jax.Array, *, structure: Structure) -> jax.Array:
+def _compute_terminal_cost(arguments: Arguments, x: jax.Array, p: jax.Array, *, structure: Structure) -> jax.Array:
     return Model(structure, arguments).terminal(x, p)
 
 
-def _late_outputs(
+def _compute_late_outputs(
     structure: Structure, whole: Arguments, simulation: Simulation, k: int, cell: NDArray[np.intp], p: FloatArray
 ) -> FloatArray:
     """Return the outputs of all sensors at the samples of the k-th Measurements, which are late: (K, Q)."""
@@ -265,12 +265,14 @@ def _late_outputs(
     with use_float64(), use_compilation_cache():
         for first in range(0, len(padded[0]), BLOCK):
             block = [a[first : first + BLOCK] for a in padded]
-            parts.append(np.asarray(_late_block(whole.without_mesh(), *block, p, structure=structure.functions)))
+            parts.append(
+                np.asarray(_simulate_late_block(whole.without_mesh(), *block, p, structure=structure.functions))
+            )
     return np.concatenate(parts)[: len(times)]
 
 
 @partial(jax.jit, static_argnames=("structure",))
-def _late_block(
+def _simulate_late_block(
     arguments: Arguments,
     times: jax.Array,
     mode: jax.Array,

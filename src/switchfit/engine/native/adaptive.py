@@ -77,7 +77,7 @@ def write_step(module: Module, sizes: Sizes) -> None:
     def write(name: str, values: Objects) -> None:
         module.write_straight_line(name, STEP, [("argument", k, node) for k, node in enumerate(values)])
 
-    *of_stages, of_end, of_judgement = step_functions()
+    *of_stages, of_end, of_control = step_functions()
     for j, name in enumerate(of_stages, start=1):
         _, state, y, K = begin(j)
         write(name, stage_state(ADAPTIVE.tableau.a[j], state[at.step], y, K))
@@ -97,4 +97,4 @@ def write_step(module: Module, sizes: Sizes) -> None:
     stores = [("state", at.t, now.t), ("state", at.step, now.step)]
     for place, flag in ((at.refused, now.refused), (at.stuck, now.stuck)):
         stores.append(("state", place, graph.apply("select", flag, 1.0, 0.0)))
-    module.write_straight_line(of_judgement, STEP, stores + [("y", k, node) for k, node in enumerate(y_now)])
+    module.write_straight_line(of_control, STEP, stores + [("y", k, node) for k, node in enumerate(y_now)])

@@ -81,11 +81,11 @@ class NativeEngine:
         native, plain = self.at(Order.HESSIAN if tangents else Order.COST), self.at(Order.COST)
         found = None
         if native is not None and plain is not None:
-            found = _simulation(self._structure, self._arguments, native, plain, tau, p, tangents)
+            found = _simulate(self._structure, self._arguments, native, plain, tau, p, tangents)
         return self._fallback.simulate(tau, p, tangents=tangents) if found is None else found
 
 
-def _simulation(
+def _simulate(
     structure: Structure,
     arguments: Arguments,
     native: NativeExperiment,

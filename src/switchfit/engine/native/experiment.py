@@ -123,7 +123,7 @@ class NativeExperiment:
             [np.arange(structure.N), np.arange(N, D)]
         )  # positions of its unknowns in the program
         self._all_own = structure.N == N
-        counts = [_count(samples) for samples in arguments.samples]
+        counts = [_count_samples(samples) for samples in arguments.samples]
         pointer, number = ctypes.c_void_p, ctypes.c_int64
         self._program = program  # keeps its code alive
         self._evaluate = program.function(f"{self._prefix}evaluate", pointer, pointer, *[number] * len(counts))
@@ -155,7 +155,7 @@ class NativeExperiment:
             "units": units,
         }
         arrays |= places_in_library(structure)
-        arrays |= _parts(self._sums, lengths)
+        arrays |= _split_array(self._sums, lengths)
         self._check, self._J = arrays[CHECKED], arrays["J"]
         self._lengths = {name: length.at(cells + N) for name, length in memory(library, sizes, order).items()}
         self._size = sum(self._lengths.values())
@@ -178,7 +178,7 @@ class NativeExperiment:
         self._address = self._table.ctypes.data
         self._progress = (ctypes.c_int64 * 3)()
         self._result = self._named["g"][:D], self._named["H"].reshape(D, width)[:, :D]
-        self._delays = _places_of_delays(structure, arguments)
+        self._delays = _find_delays(structure, arguments)
 
     def __call__(self, tau: FloatArray, p: FloatArray, side: float) -> Derivatives | None:
         """Return J, its gradient (D,) and its Hessian (D, D), which is NaN at orders below the second.
@@ -365,7 +365,7 @@ class NativeExperiment:
     def _run(self, tau: FloatArray, p: FloatArray, side: float) -> None:
         self._tau[:] = tau
         self._own_p[:] = p
-        self._place(tau, side)
+        self._find_first_cells(tau, side)
         self._workspace.reserve(self._size)
         if self._memory is not self._workspace.memory:
             self._bind(self._workspace.memory)
@@ -373,7 +373,7 @@ class NativeExperiment:
         for part in self._zeroed:
             part[:] = 0.0
         if self._late:
-            self._place_late(p)
+            self._find_late_cells(p)
         self._call_in_pieces(self._evaluate, *self._counts)
 
     def _call_in_pieces(self, function: Callable[..., object], *given: Any) -> None:
@@ -387,20 +387,20 @@ class NativeExperiment:
     def _bind(self, workspace: FloatArray) -> None:
         """Store the addresses of another workspace in the table."""
         self._memory = workspace
-        found = _parts(workspace, self._lengths)
+        found = _split_array(workspace, self._lengths)
         self._zeroed = [found[name] for name in ZEROED if found[name].size]
         self._named |= found
         for k, name in enumerate(self._pointers):
             if name in found:
                 self._table[k] = found[name].ctypes.data
 
-    def _place(self, tau: FloatArray, side: float) -> None:
+    def _find_first_cells(self, tau: FloatArray, side: float) -> None:
         """Find the cells in which segments begin, as in `switchfit.discretization.mesh.rows`."""
         if len(tau):
             passed = self.times.searchsorted(tau, "right" if side > 0 else "left")
             self._begins[:] = np.minimum(np.maximum(passed - 1, 0), self._cells - 1)
 
-    def _place_late(self, p: FloatArray) -> None:
+    def _find_late_cells(self, p: FloatArray) -> None:
         """Find the cells and segments of the late samples: those of the rows with ``start < t - delay <= end``."""
         for _, name, times, cell, segment in self._late:
             place, value = self._delays[name]
@@ -409,13 +409,13 @@ class NativeExperiment:
             segment[:] = self._tau.searchsorted(seen, "left")
 
 
-def _parts(whole: FloatArray, lengths: dict[str, int]) -> dict[str, FloatArray]:
+def _split_array(whole: FloatArray, lengths: dict[str, int]) -> dict[str, FloatArray]:
     """Return consecutive parts of an array by their names and lengths."""
     ends = np.cumsum(list(lengths.values())).tolist()
     return {name: whole[end - length : end] for (name, length), end in zip(lengths.items(), ends, strict=True)}
 
 
-def _places_of_delays(structure: Structure, arguments: Arguments) -> dict[str, tuple[int | None, float]]:
+def _find_delays(structure: Structure, arguments: Arguments) -> dict[str, tuple[int | None, float]]:
     """Return the position in p of each scalar parameter, or its value if it is fixed."""
     found: dict[str, tuple[int | None, float]] = {}
     fixed, position = iter(arguments.fixed), 0
@@ -427,7 +427,7 @@ def _places_of_delays(structure: Structure, arguments: Arguments) -> dict[str, t
     return found
 
 
-def _count(samples: Samples) -> int:
+def _count_samples(samples: Samples) -> int:
     """Return the number of samples up to the last with a nonzero weight, at least 1; the rest is padding."""
     there = np.flatnonzero(np.asarray(samples.weight).any(1))
     return int(there[-1]) + 1 if len(there) else 1

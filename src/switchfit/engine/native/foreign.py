@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import threading
 from collections.abc import Mapping
 from functools import cache
 from typing import Any
@@ -19,19 +20,34 @@ from switchfit.engine.native.templates import Order, Sizes, constants_of
 from switchfit.engine.native.workspace import GIVEN, constraint_rows, memory, sums
 from switchfit.problem.structure import Structure
 
+_registered: dict[str, Program] = {}
+"""Programs whose addresses XLA keeps, by the names of their operations: they must stay alive."""
+_one_at_a_time = threading.Lock()
 
-@cache  # XLA keeps the address: the program must stay alive
-def _register(library: Structure, sizes: Sizes) -> tuple[str, Program]:
-    """Register the foreign function of a library with XLA; return its name and its program."""
+
+@cache
+def _register(library: Structure, sizes: Sizes) -> str:
+    """Register the operation of a library with XLA; return its name.
+
+    XLA takes a name once. Models with the same machine code, which may differ in the names of their parameters, share
+    the operation of the first.
+    """
     program = program_of(library, sizes, Order.HESSIAN)
     if isinstance(program, str):
-        raise ValueError(f"there is no machine code: {program}")
+        raise ValueError(f"the experiment has no machine code: {program}")
     name = f"switchfit_{program.key[:32]}"
+    with _one_at_a_time:
+        if name not in _registered:
+            jax.ffi.register_ffi_target(name, _make_capsule(program), platform="cpu")
+            _registered[name] = program
+    return name
+
+
+def _make_capsule(program: Program) -> Any:
+    """Return the address of a program's handler as XLA takes it."""
     new_capsule = ctypes.pythonapi.PyCapsule_New
     new_capsule.restype, new_capsule.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
-    capsule = new_capsule(program.address("xla_handler"), b"xla._CUSTOM_CALL_TARGET", None)
-    jax.ffi.register_ffi_target(name, capsule, platform="cpu")
-    return name, program
+    return new_capsule(program.address("xla_handler"), b"xla._CUSTOM_CALL_TARGET", None)
 
 
 def can_be_foreign(structure: Structure) -> bool:
@@ -57,7 +73,7 @@ def foreign_derivatives(
     ``structure.library`` may be passed in place of the structure, as the key of that program.
     """
     sizes, library = Sizes.of(structure, arguments), structure.library
-    name, _ = _register(library, sizes)
+    name = _register(library, sizes)
     N, D, width = sizes.N, sizes.D, sizes.width
     idle = N - tau.shape[0]  # number of segments that the sequence does not need: they begin and end at tf
     places = places_in_library(structure) if places is None else places

@@ -36,7 +36,7 @@ Combine = Callable[[Any, Any, Any], Any]
 def take(graph: Graph, a: Any, starts: Sequence[Any], sizes: Sequence[int]) -> Any:
     """Return a window of an array: (sizes); each start is in range, an int or an `Integer`."""
     moving = [k for k, start in enumerate(starts) if isinstance(start, Integer)]
-    a = a[tuple(_reach(start, size) for start, size in zip(starts, sizes, strict=True))]
+    a = a[tuple(_get_reach(start, size) for start, size in zip(starts, sizes, strict=True))]
     if len(moving) > 1 and not any(is_traced(e) and known_number(e) is None for e in a.reshape(-1)):
         return _from_table(graph, a, [starts[k] for k in moving], moving, sizes)
     for axis in moving:
@@ -49,7 +49,7 @@ def take(graph: Graph, a: Any, starts: Sequence[Any], sizes: Sequence[int]) -> A
     return a
 
 
-def _reach(start: Any, size: int) -> slice:
+def _get_reach(start: Any, size: int) -> slice:
     """Return the range of indices that a window may reach."""
     return slice(start.low, start.high + size) if isinstance(start, Integer) else slice(start, start + size)
 
@@ -127,7 +127,7 @@ class _Window:
     among: tuple[Any, ...]
 
 
-def _windows(
+def _list_windows(
     graph: Graph, shape: Sequence[int], indices: Any, sizes: Sequence[int], numbers: Any, inside: Any, many: int
 ) -> Iterator[_Window]:
     """Yield the windows of a gather or scatter; `inside` are the window axes among the `many` axes of their array."""
@@ -162,7 +162,7 @@ def gather(graph: Graph, equation: Any, a: Any, indices: Any) -> Any:
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
     result = np.empty(out.shape, dtype=object)
-    for window in _windows(graph, a.shape, indices, sizes, numbers, numbers.offset_dims, len(out.shape)):
+    for window in _list_windows(graph, a.shape, indices, sizes, numbers, numbers.offset_dims, len(out.shape)):
         taken = np.squeeze(take(graph, a, window.starts, sizes), axis=dropped)
         if params["mode"] == GatherScatterMode.FILL_OR_DROP and window.fits is not True:
             fill = _fill_value(params["fill_value"], out.dtype)
@@ -189,7 +189,7 @@ def scatter(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any, com
     lengths = iter([updates.shape[k] for k in inside])
     sizes = [1 if k in dropped else next(lengths) for k in range(a.ndim)]
     result = a.astype(object)
-    for window in _windows(graph, a.shape, indices, sizes, numbers, inside, updates.ndim):
+    for window in _list_windows(graph, a.shape, indices, sizes, numbers, inside, updates.ndim):
         fits = True if params["mode"] == GatherScatterMode.CLIP else window.fits
         if fits is False:
             continue

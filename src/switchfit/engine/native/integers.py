@@ -44,7 +44,7 @@ def _from_bounds(op: str, bounds: Callable[..., tuple[int, int]]) -> Meaning:
         def apply(*given: Any) -> Any:
             args = [Integer.of(graph, a) for a in given]
             low, high = bounds(*((a.low, a.high) for a in args))
-            node = _without_sign_of_zero(graph, graph.apply(op, *(a.node for a in args)), low, high, op)
+            node = _drop_sign_of_zero(graph, graph.apply(op, *(a.node for a in args)), low, high, op)
             return within(graph, node, low, high, dtype)
 
         return apply
@@ -52,7 +52,7 @@ def _from_bounds(op: str, bounds: Callable[..., tuple[int, int]]) -> Meaning:
     return get_meaning
 
 
-def _without_sign_of_zero(graph: Graph, node: Node, low: int, high: int, op: str) -> Node:
+def _drop_sign_of_zero(graph: Graph, node: Node, low: int, high: int, op: str) -> Node:
     if op not in ("mul", "neg", "trunc") or low > 0 or high < 0 or node.op == "const":
         return node if node.number != 0.0 else graph.constant(0.0)
     return graph.apply("select", graph.apply("eq", node, 0.0), 0.0, node)
@@ -75,7 +75,7 @@ def _quotient(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., 
         largest = max(abs(a.low), abs(a.high), 1)
         node = graph.apply("trunc", a.node / b.node)
         found = within(
-            graph, _without_sign_of_zero(graph, node, -largest, largest, "trunc"), *_signs(a, b, largest), dtype
+            graph, _drop_sign_of_zero(graph, node, -largest, largest, "trunc"), *_signs(a, b, largest), dtype
         )
         return choose(graph, equal(graph, b, 0), -1, found)
 

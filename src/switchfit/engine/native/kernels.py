@@ -222,7 +222,7 @@ class Kernels:
                 entries = [one + c_j * (other - one) for one, other in zip(starts, ends, strict=True)]
                 of_time = start_d + c_j * (end_d - start_d), entries
             rows = self._add_curvature(graph, rows, second, [of_time, *self._state_directions(graph, "XZ", j * n)])
-        self.module.write_straight_line(name, CURVATURE, _change(H, rows))
+        self.module.write_straight_line(name, CURVATURE, _store_changed_rows(H, rows))
 
     def length(self) -> None:
         """Write ``H += h' x V' + V' x h'``, V' being what `backward_row` stored for a row that moves."""
@@ -432,7 +432,7 @@ class Kernels:
                 of_time = graph.load("moves", 0, vector=True), [graph.load("moves", d) for d in range(D)]
             H = [graph.load("H", d, vector=True) for d in range(D)]
             along = [of_time, *self._state_directions(graph, "Z")]
-            stores += _change(H, self._add_curvature(graph, H, _entries(second, with_time=moving), along))
+            stores += _store_changed_rows(H, self._add_curvature(graph, H, _entries(second, with_time=moving), along))
         return stores
 
     def _cost(self, graph: Graph, found: Sequence[Objects], moving: bool) -> list[Store]:
@@ -508,7 +508,7 @@ def _entries(second: Sequence[Objects], with_time: bool) -> dict[tuple[int, int]
     return entries
 
 
-def _change(H: list[Node], rows: list[Node]) -> list[Store]:
+def _store_changed_rows(H: list[Node], rows: list[Node]) -> list[Store]:
     return [("H", d, row) for d, (old, row) in enumerate(zip(H, rows, strict=True)) if row is not old]
 
 

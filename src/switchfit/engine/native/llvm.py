@@ -72,7 +72,7 @@ class Module:
         nodes = list_needed([node for _, _, node in stores])
         for node in nodes:
             writer.value(node)
-        self._work[self.prefix + name] = sum(self._effort(node) for node in nodes)
+        self._work[self.prefix + name] = sum(self._estimate_cost(node) for node in nodes)
         for pointer, offset, node in stores:
             writer.store(pointer, offset, node)
         arguments = ", ".join(f"ptr %{pointer}" for pointer in pointers)
@@ -84,7 +84,7 @@ class Module:
         """Return the cost of a function of the current prefix, in additions."""
         return self._work[self.prefix + name]
 
-    def _effort(self, node: Node) -> int:
+    def _estimate_cost(self, node: Node) -> int:
         operation = OPERATIONS.get(node.op)
         effort = LOOKUP if node.op == "lookup" else 1 if operation is None else operation.effort
         return effort * (1 + self.width // 4 if node.vector else 1)
@@ -103,7 +103,7 @@ class Module:
         return "\n".join([*self._declared.values(), *self.functions])
 
 
-def _declaration(operation: Operation) -> str:
+def _write_declaration(operation: Operation) -> str:
     """Return the declaration of the function that an operation calls; C functions are declared without side effects."""
     operands = ", ".join(["double"] * operation.operands)
     memory = " memory(none) nounwind willreturn" if operation.function in FROM_LIBM else ""
@@ -151,7 +151,7 @@ class _Writer:
             return self.emit(f"load double, ptr {address}, align 8")
         operation = OPERATIONS[op]
         if operation.function is not None:
-            self.module.declare(operation.function, _declaration(operation))
+            self.module.declare(operation.function, _write_declaration(operation))
         return self.emit(operation.code.format(*(self._as(a, node.vector) for a in args), type=self._type(node)))
 
     def _table(self, values: NDArray[np.float64]) -> str:
@@ -237,15 +237,15 @@ class Program:
 
 def compile_module(text: str) -> Program:
     """Compile a module for this processor, or load its code from the cache."""
-    _start()
-    key = hashlib.sha256("\n".join([text, llvmlite.__version__, *_processor()]).encode()).hexdigest()
-    name, features = _processor()
+    _initialize_llvm()
+    key = hashlib.sha256("\n".join([text, llvmlite.__version__, *_get_processor()]).encode()).hexdigest()
+    name, features = _get_processor()
     machine = llvm.Target.from_default_triple().create_target_machine(cpu=name, features=features, opt=2)
     folder = get_usable_folder()
     path = None if folder is None else folder / f"native-{key}"
     code = None if path is None else read_code(path)
     if code is None:
-        code = _object_code(machine, text)
+        code = _compile_to_object_code(machine, text)
         if path is not None:
             write_code(path, code)
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
@@ -254,7 +254,7 @@ def compile_module(text: str) -> Program:
     return Program(engine, key)
 
 
-def _object_code(machine: Any, text: str) -> bytes:
+def _compile_to_object_code(machine: Any, text: str) -> bytes:
     """Compile in a thread: long functions take seconds, and Ctrl-C can interrupt the wait for a thread."""
     executor = ThreadPoolExecutor(1)
     future = executor.submit(lambda: bytes(machine.emit_object(llvm.parse_assembly(text))))
@@ -265,12 +265,12 @@ def _object_code(machine: Any, text: str) -> bytes:
 
 
 @cache
-def _processor() -> tuple[str, str]:
+def _get_processor() -> tuple[str, str]:
     return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
 
 
 @cache
-def _start() -> None:
+def _initialize_llvm() -> None:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     for name in (*FROM_LIBM, "sincos"):
@@ -280,12 +280,12 @@ def _start() -> None:
 
 
 @cache
-def _library() -> Any:
+def _load_libm() -> Any:
     if sys.platform == "win32":
         return ctypes.CDLL("ucrtbase")
     return ctypes.CDLL(ctypes.util.find_library("m"))
 
 
 def _address(name: str) -> int | None:
-    function = getattr(_library(), name, None)
+    function = getattr(_load_libm(), name, None)
     return None if function is None else ctypes.cast(function, ctypes.c_void_p).value

@@ -196,7 +196,7 @@ class Graph:
         if args[0].op == "const" and all(a.op == "const" for a in args):
             with np.errstate(all="ignore"):
                 return self.constant(OPERATIONS[op].value(*(a.args[0] for a in args)))
-        simpler = self._simpler(op, args)
+        simpler = self._simplify(op, args)
         if simpler is not None:
             return simpler
         if op in COMMUTATIVE and args[0].index > args[1].index:
@@ -233,7 +233,7 @@ class Graph:
             total = total + self.certain_product(0.0, node)
         return [(CHECKED, 0, total)] if self.presumed else []
 
-    def _simpler(self, op: str, args: tuple[Node, ...]) -> Node | None:
+    def _simplify(self, op: str, args: tuple[Node, ...]) -> Node | None:
         a, b = args[0], args[-1]
         if op in ("add", "sub"):
             if b.number == 0.0:
@@ -320,7 +320,7 @@ class Namespace:
     def __getattr__(self, name: str) -> Callable[..., Any]:
         operation = BY_VALUE.get(getattr(np, name))
         if operation is None:
-            raise AttributeError(f"there is no operation for numpy.{name}: add it to engine/native/operations.py")
+            raise AttributeError(f"no operation for numpy.{name}: add it to engine/native/operations.py")
         return np.frompyfunc(partial(self._graph.apply, operation.name), operation.operands, 1)
 
 

@@ -162,7 +162,7 @@ def segment_pointers(writer: Writer, found: dict[str, str]) -> dict[str, str]:
     return {"next": next_, "before": before, "after": after, "given": given}
 
 
-def _reset_of(writer: Writer, found: dict[str, str], name: str) -> tuple[str, dict[str, str], list[str]]:
+def _switch_to_reset(writer: Writer, found: dict[str, str], name: str) -> tuple[str, dict[str, str], list[str]]:
     """Emit a switch to the reset map at the start of a segment; return its index, its pointers and the blocks."""
     n, width = writer.sizes.n, writer.sizes.width
     transition = writer.let("sub i64 %segment, 1")
@@ -185,7 +185,7 @@ def write_forward(writer: Writer) -> str:
     place = segment_pointers(writer, found)
     state = state_pointers(writer, found, place["before"])
     if writer.library.reset_maps:
-        which, given, labels = _reset_of(writer, found, "reset")
+        which, given, labels = _switch_to_reset(writer, found, "reset")
         for k, label in enumerate(labels):
             writer.label(label)
             writer.call(f"reset_{k}", RESET, found | state | given)
@@ -206,12 +206,14 @@ def write_forward(writer: Writer) -> str:
     state = state_pointers(writer, found, place["after"])
     writer.call("check_state", STATES, found | state)
     if writer.sizes.N:
-        _transition(writer, found, place, state)
+        _call_transition_functions(writer, found, place, state)
     writer.line("ret i1 true")
     return writer.end_function(f"internal i1 @forward_any({WHOLE})", returns=False)
 
 
-def _transition(writer: Writer, found: dict[str, str], place: dict[str, str], state: dict[str, str]) -> None:
+def _call_transition_functions(
+    writer: Writer, found: dict[str, str], place: dict[str, str], state: dict[str, str]
+) -> None:
     """Call the functions at the transition that ends a segment."""
     n, width = writer.sizes.n, writer.sizes.width
     kinds = [kind for kind in AT_TRANSITIONS if getattr(writer.library, kind.name)]
@@ -263,7 +265,7 @@ def write_backward(writer: Writer) -> str:
     writer.label("mode_end")
     if writer.library.reset_maps:
         state = state_pointers(writer, found, place["before"])
-        _, given, labels = _reset_of(writer, found, "reset")
+        _, given, labels = _switch_to_reset(writer, found, "reset")
         for k, label in enumerate(labels):
             writer.label(label)
             writer.call(f"reset_back_{k}", RESET_BACK, found | state | given)

@@ -50,7 +50,7 @@ def trace_scalars(
     graph = Graph()
     inputs = [graph.loads(str(k), int(np.prod(shape))).reshape(shape) for k, shape in enumerate(shapes)]
     try:
-        closed = _jaxpr_of(function, structs)
+        closed = _make_jaxpr(function, structs)
         with np.errstate(all="ignore"):
             outputs = _run(graph, closed.jaxpr, closed.consts, inputs)
         if any(variable.aval.dtype != np.float64 for variable in closed.jaxpr.outvars):
@@ -60,7 +60,7 @@ def trace_scalars(
     return Template(outputs, list(graph.presumed.values()))
 
 
-def _jaxpr_of(function: Callable[..., Sequence[Any]], structs: Sequence[Any]) -> Any:
+def _make_jaxpr(function: Callable[..., Sequence[Any]], structs: Sequence[Any]) -> Any:
     try:
         return jax.make_jaxpr(function)(*structs)
     except Exception as error:  # raised by the function, or by JAX: for example, an operation without derivative
@@ -102,29 +102,29 @@ def _add_location(error: Unsupported, equation: Any) -> Unsupported:
     that of another call. The location of the call itself is therefore used.
     """
     inner = equation.params.get("jaxpr") if equation.primitive.name in ("jit", "pjit") else None
-    name = None if inner is None else _public_name(inner.jaxpr)
+    name = None if inner is None else _find_public_name(inner.jaxpr)
     if name is not None:
         calls, _, why = error.what.partition(", which ")
         why = why if calls.startswith("calls ") else error.what
         more = f", which {why}" if why else ""
-        return Unsupported(f"calls {name}{more}", _line_of(equation))
-    return Unsupported(error.what, error.where or _line_of(equation))
+        return Unsupported(f"calls {name}{more}", _find_line(equation))
+    return Unsupported(error.what, error.where or _find_line(equation))
 
 
-def _public_name(jaxpr: Any) -> str | None:
+def _find_public_name(jaxpr: Any) -> str | None:
     """Return the public name of a function of JAX; None for any other function."""
     info = getattr(jaxpr, "debug_info", None)
     file, name = getattr(info, "func_filename", None), str(getattr(info, "func_name", "")).lstrip("_")
     if file is None or not file.startswith(os.path.dirname(jax.__file__) + os.sep):
         return None
-    for place, module in _modules():
+    for place, module in _list_modules():
         if hasattr(module, name):
             return f"{place}.{name}"
     return name or "a function of JAX"
 
 
 @cache
-def _modules() -> list[tuple[str, Any]]:
+def _list_modules() -> list[tuple[str, Any]]:
     import jax.scipy.linalg
     import jax.scipy.special
 
@@ -142,7 +142,7 @@ def _modules() -> list[tuple[str, Any]]:
     ]
 
 
-def _line_of(equation: Any) -> str | None:
+def _find_line(equation: Any) -> str | None:
     """Return file and line of the user's code from which an operation comes; None if JAX does not say."""
     try:  # private API of JAX: if it changes, messages have no location
         frame = source_info_util.user_frame(equation.source_info.traceback)

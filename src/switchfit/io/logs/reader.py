@@ -12,7 +12,8 @@ from switchfit.io.logs.log import Log
 from switchfit.io.logs.quality import check_repairs, inspect_log
 from switchfit.io.logs.text import read_text
 from switchfit.io.logs.units import SECONDS
-from switchfit.problem.validation import as_choice, as_name, as_names, as_path, as_positive
+from switchfit.problem.validation import as_choice, as_name, as_names, as_path, as_positive, shorten
+from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import is_regular
 
 
@@ -192,8 +193,8 @@ def _scale_times(log: Log, unit: str, scale: Callable[..., float]) -> Log:
 
 def _choose_reader(path: Path) -> Callable[[Path, Options], Log]:
     """Return the reader of a file, by the end of its name or by how it begins."""
-    ending = path.suffix.lower()
-    if ending in BAGS or (path / "metadata.yaml").is_file():
+    ending = Path(path.name.lower().removesuffix(".gz")).suffix
+    if ending in BAGS or is_regular(path / "metadata.yaml"):
         return _read_bag
     if ending in _READERS:
         return _READERS[ending]
@@ -211,7 +212,15 @@ def _begins_as_nmea(path: Path) -> bool:
         return False
 
 
+def _refuse_options(path: Path, form: str, **given: str | None) -> None:
+    """Raise for options that a format does not have."""
+    for name, value in given.items():
+        if value is not None:
+            raise InputError(f"{path} is {form}, for which {name} means nothing; leave out {name} = {shorten(value)}.")
+
+
 def _read_text(path: Path, options: Options) -> Log:
+    _refuse_options(path, "a table of text", topic=options.topic)
     return read_text(
         path,
         columns=options.columns,
@@ -224,18 +233,21 @@ def _read_text(path: Path, options: Options) -> Log:
 def _read_nmea(path: Path, options: Options) -> Log:
     from switchfit.io.logs.gps import read_nmea
 
+    _refuse_options(path, "an NMEA 0183 log", time=options.time, topic=options.topic)
     return read_nmea(path)
 
 
 def _read_gpx(path: Path, options: Options) -> Log:
     from switchfit.io.logs.gps import read_gpx
 
+    _refuse_options(path, "a GPX track", time=options.time, topic=options.topic)
     return read_gpx(path)
 
 
 def _read_bag(path: Path, options: Options) -> Log:
     from switchfit.io.logs.ros import read_bag
 
+    _refuse_options(path, "a ROS bag", time=options.time)
     return read_bag(path, options.topic)
 
 
@@ -248,6 +260,7 @@ def _read_mat(path: Path, options: Options) -> Log:
 def _read_parquet(path: Path, options: Options) -> Log:
     from switchfit.io.logs.parquet import read_parquet
 
+    _refuse_options(path, "a Parquet file", topic=options.topic)
     return read_parquet(path, options.time, options.keep_epoch)
 
 

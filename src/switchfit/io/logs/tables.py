@@ -51,6 +51,10 @@ def build_log(
     if time not in columns:
         raise InputError(f"{source} has no column {shorten(time)}; its columns are {join_names(columns)}.")
     stated = {name: units.get(name, "") or split_unit(name)[1] for name in columns}
+    if columns[time].dtype.kind not in "biufMm":
+        raise InputError(
+            f"{source}: column {time!r} has neither numbers nor dates. Name the one with the times: time = ..."
+        )
     times, time_unit, offset = _convert_times(columns[time], stated[time], keep_epoch)
     values = {
         name: np.asarray(column, dtype=np.float64)
