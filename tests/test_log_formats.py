@@ -500,7 +500,7 @@ def test_options_that_mean_nothing(tmp_path):
 
 def test_times_that_are_text(tmp_path):
     pq.write_table(pa.table({"time": ["a", "b"], "x": [0.0, 1.0]}), tmp_path / "a.parquet")
-    with pytest.raises(InputError, match=r"a\.parquet: column 'time' has neither numbers nor dates\. Name ano"):
+    with pytest.raises(InputError, match=r"a\.parquet: column 'time' has neither numbers nor dates\. Name the"):
         sf.read_log(tmp_path / "a.parquet")
 
 
