@@ -124,6 +124,7 @@ def test_every_name_in_the_header_leads_to_its_channel(write):
     [
         ("t", ""), ("t [ms]", "ms"), ("time (msec)", "ms"), ("t_s", "s"), ("Time_us", "us"), ("timestamp [µs]", "us"),
         ("t_min", "min"), ("elapsed time [h]", "h"), ("time (indoors)", ""),
+        ("millis", "ms"), ("__time", ""), ("seconds_elapsed", "s"), ("time_usec", "us"),
     ],
 )  # fmt: skip
 def test_units_of_time(write, header, unit):
@@ -134,6 +135,22 @@ def test_units_of_time(write, header, unit):
     factor = {"": 1, "ms": 1e-3, "us": 1e-6, "s": 1, "min": 60, "h": 3600}[unit]
     np.testing.assert_allclose(seconds.times, np.array([0, 36, 72]) * factor, rtol=1e-15)
     assert seconds.time_unit == "s"
+
+
+@pytest.mark.parametrize(
+    ("header", "times"),
+    [
+        ("t_motor,t,x", 1),  # a temperature
+        ("date,x,time", 2),
+        ("x,lap_time,time", 2),
+        ("field.header.seq,x,field.header.stamp", 2),
+        ("x,start_time,y", 1),
+        ("k,x,y", 0),  # the first one, as it rises
+    ],
+)
+def test_which_column_has_the_times(write, header, times):
+    log = sf.read_log(write(f"{header}\n0,10,20\n1,11,21\n2,12,22\n"))
+    np.testing.assert_array_equal(log.times, 10 * times + np.arange(3))
 
 
 @pytest.mark.parametrize(
@@ -170,7 +187,7 @@ def test_microseconds_since_boot_are_not_seconds_since_1970(write):
     ],
 )
 def test_dates(write, rows):
-    log = sf.read_log(write("\n".join(rows)), time="Time" if rows[0].startswith("Date") else None)
+    log = sf.read_log(write("\n".join(rows)))
     np.testing.assert_array_equal(log.times, [0, 1.5])
     assert (f"{log.start:%Y-%m-%d %H:%M:%S}", log.time_unit) == ("2024-05-01 12:00:00", "s")
     np.testing.assert_array_equal(log["x"], [1, 2])

@@ -55,7 +55,7 @@ def build_log(
         raise InputError(
             f"{source}: column {time!r} has neither numbers nor dates. Name the one with the times: time = ..."
         )
-    times, time_unit, offset = _convert_times(columns[time], stated[time], keep_epoch)
+    times, time_unit, offset = _convert_times(columns[time], time, stated[time], keep_epoch)
     values = {
         name: np.asarray(column, dtype=np.float64)
         for name, column in columns.items()
@@ -76,7 +76,7 @@ def build_log(
     )
 
 
-def _convert_times(column: Any, unit: str, keep_epoch: bool) -> tuple[FloatArray, str, float]:
+def _convert_times(column: Any, name: str, unit: str, keep_epoch: bool) -> tuple[FloatArray, str, float]:
     if column.dtype.kind == "M":
         nanoseconds = column.astype("datetime64[ns]")
         missing = np.isnat(nanoseconds)
@@ -86,4 +86,4 @@ def _convert_times(column: Any, unit: str, keep_epoch: bool) -> tuple[FloatArray
         return seconds, "s", first * SECONDS["ns"]
     if column.dtype.kind == "m":
         return column.astype("timedelta64[ns]").astype(np.int64) * SECONDS["ns"], "s", 0.0
-    return interpret_times(np.asarray(column, dtype=np.float64), unit, keep_epoch=keep_epoch)
+    return interpret_times(np.asarray(column, dtype=np.float64), name, unit, keep_epoch=keep_epoch)

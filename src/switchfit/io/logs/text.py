@@ -26,7 +26,7 @@ from switchfit.io.logs.header import (
     split_lines,
 )
 from switchfit.io.logs.log import Event, FloatArray, Log
-from switchfit.io.logs.times import interpret_times, is_time_name, subtract_first
+from switchfit.io.logs.times import find_time_name, interpret_times, subtract_first
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import is_device
@@ -342,10 +342,9 @@ def _find_hdop(names: Sequence[str]) -> list[str]:
 
 def _find_time(table: _Table) -> int:
     """Return the column with the times: the first one that is called so, or the first one if it never falls."""
-    labels = {k: label for label, k in table.header.labels.items()}
-    for k, name in enumerate(table.header.names):
-        if is_time_name(name) or is_time_name(labels.get(k, name)):
-            return k
+    found = find_time_name([*table.header.names, *table.header.labels])
+    if found is not None:
+        return table.header.names.index(found) if found in table.header.names else table.header.labels[found]
     numbers, bad = table.parse_column(0)
     if len(table.header.names) > 1 and not bad.any() and np.all(np.diff(numbers) >= 0) and numbers[-1] > numbers[0]:
         return 0
@@ -364,7 +363,9 @@ def _read_times(table: _Table, column: int, keep_epoch: bool) -> tuple[FloatArra
     numbers, bad = table.parse_column(column)
     if bad.any():
         _refuse_cell(table, column, int(bad.argmax()))
-    times, unit, offset = interpret_times(numbers, table.header.units[column], keep_epoch=keep_epoch)
+    times, unit, offset = interpret_times(
+        numbers, table.header.names[column], table.header.units[column], keep_epoch=keep_epoch
+    )
     if offset and cells and all(map(_LONG_INTEGER.fullmatch, cells)):
         times, unit, offset = subtract_first(list(map(int, cells)), unit)
     return times, unit, offset

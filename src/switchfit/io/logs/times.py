@@ -3,43 +3,50 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from switchfit.io.logs.log import FloatArray
-from switchfit.io.logs.units import SECONDS, find_epoch_unit, normalize_time_unit
+from switchfit.io.logs.units import SECONDS, find_epoch_unit, find_spelled_unit, normalize_time_unit
 
-_NAMES = re.compile(
-    r"t|times?|timestamps?|stamp|zeit|utc|clock|secs?|seconds|elapsed.*|date_?time|date|datum"
-    r"|(t|time|timestamp|zeit)[ _.\-/].*|.*[ _.](time|timestamp|stamp)"
+_NAMES = (
+    re.compile(
+        r"_*(t|times?|timestamps?|stamp|zeit|utc|clock|date_?time|secs?|seconds|millis|micros|elapsed.*|.*[ _]elapsed)"
+    ),
+    re.compile(
+        r"_*(t_(rel|abs|[num]?s|sec|min|h)|(time|timestamp|stamp|zeit)[ _.\-/].*|.*[ _./](time|timestamp|stamp))"
+    ),
+    re.compile(r"date|datum|day"),
 )
+"""Names of columns of times: those of the first kind before those of the second."""
 
 
-def is_time_name(name: str) -> bool:
-    """Return whether a column of this name has the times."""
-    return bool(_NAMES.fullmatch(name.strip().lower()))
+def find_time_name(names: Iterable[str]) -> str | None:
+    """Return the name that is most clearly one of times; None if there is none."""
+    listed = list(names)
+    found = (name for kind in _NAMES for name in listed if kind.fullmatch(name.strip().lower()))
+    return next(found, None)
 
 
-def find_time_name(names: Sequence[str]) -> str | None:
-    """Return the first name that is one of times; None if there is none."""
-    return next((name for name in names if is_time_name(name)), None)
-
-
-def interpret_times(numbers: FloatArray, unit: str, *, keep_epoch: bool = False) -> tuple[FloatArray, str, float]:
+def interpret_times(
+    numbers: FloatArray, name: str, unit: str, *, keep_epoch: bool = False
+) -> tuple[FloatArray, str, float]:
     """Return times, their unit, and what was subtracted from them.
 
     Parameters
     ----------
     numbers : (K,) array
         As they stand in the file.
+    name : str
+        Of the column, which may say the unit.
     unit : str
         As the file states it; "" if it does not.
     keep_epoch : bool, optional
         Leave times that count from 1970 as they are; otherwise the first one is subtracted.
     """
     unit = normalize_time_unit(unit)
-    unit = unit if unit in SECONDS else ""
+    unit = unit if unit in SECONDS else find_spelled_unit(name)
     finite = numbers[np.isfinite(numbers)]
     epoch = find_epoch_unit(float(finite[0])) if len(finite) else None
     if epoch is None or (unit and unit != epoch) or (not unit and _resemble_uptime(finite)):

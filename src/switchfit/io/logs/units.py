@@ -9,7 +9,7 @@ SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.
 
 _SPELLINGS = {
     "ns": ("ns", "nsec", "nsecs", "nanosecond", "nanoseconds"),
-    "us": ("us", "µs", "μs", "usec", "usecs", "microsecond", "microseconds"),
+    "us": ("us", "µs", "μs", "usec", "usecs", "micros", "microsecond", "microseconds"),
     "ms": ("ms", "msec", "msecs", "millis", "millisecond", "milliseconds"),
     "s": ("s", "sec", "secs", "second", "seconds"),
     "min": ("min", "mins", "minute", "minutes"),
@@ -68,6 +68,12 @@ def split_unit(name: str) -> tuple[str, str]:
 def normalize_time_unit(text: str) -> str:
     """Return the key of `SECONDS` that a text stands for, or the text itself if it is no unit of time."""
     return _TIME_UNITS.get(strip_brackets(text).lower(), text)
+
+
+def find_spelled_unit(name: str) -> str:
+    """Return the unit of time that is a word in a name, such as in ``seconds_elapsed`` or ``millis``; "" if none is."""
+    words = re.split(r"[ _.\-/]", name.lower())
+    return next((_TIME_UNITS[word] for word in words if len(word) > 3 and word in _TIME_UNITS), "")
 
 
 def find_epoch_unit(time: float) -> str | None:
