@@ -478,3 +478,10 @@ def test_check_says_what_is_odd(problem):
         assert result.exit_code == 0, result.stderr
         assert "9 samples of Weg (m), Winkel (deg), 0 to 0.8 s" in result.stdout
         assert "a.csv, line 9: the angle 'Winkel' jumps by a turn of 360; repair='unwrap" in result.stdout
+
+
+def test_units_are_those_of_the_values_and_not_of_sigma(problem, write):
+    write("Zeit;Weg;Fehler\ns;m;mm\n0;1;2\n1;2;2\n")
+    data = problem(("sigma = 0.1", 'sigma = ["Fehler"]')).problem.experiments[0].data[0]
+    assert data.units == ("m",)
+    np.testing.assert_array_equal(data.sigma, [[2], [2]])
