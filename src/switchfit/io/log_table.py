@@ -11,6 +11,7 @@ from pathlib import Path
 from switchfit.estimation.estimator import Estimate
 from switchfit.io.logs.files import find_logs, name_logs
 from switchfit.io.problem_file import ProblemFile, load_problem
+from switchfit.report.verdict import write_reason
 from switchfit.uncertainty.residuals import correct_errors
 
 
@@ -73,6 +74,8 @@ class ResultTable:
             return
         self.failed += not estimate.success
         message = "" if estimate.status.successful else estimate.message
+        if not message and not estimate.success:
+            message = write_reason(estimate.verdict.reasons[0])
         row = {"log": log, "verdict": estimate.verdict.level, "status": estimate.status.name}
         row |= {"cost": repr(float(estimate.cost))}
         units, errors = estimate.theta_units, correct_errors(estimate)
@@ -92,7 +95,8 @@ class ResultTable:
             for name, value in row.items()
             if name not in skipped and not name.endswith(" std. error")
         ]
-        return f"{row['log']}: {row['verdict']}. {', '.join(numbers)}{'  ' if row['message'] else ''}{row['message']}"
+        message = f". {row['message']}" if row["message"] else ""
+        return f"{row['log']}: {row['verdict']}. {', '.join(numbers)}{message}"
 
     def summarize(self, total: int) -> str:
         """Return how many logs were fitted, in a line.
