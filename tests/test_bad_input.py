@@ -665,7 +665,6 @@ PRIOR = {"k": sf.Parameter(1.0, prior=sf.Normal(1.0, 0.1))}
         (lambda: sf.Parameter(1.0, scale="ln"), ValueError, ["Parameter scale must be 'linear' or 'log'; got 'ln'"]),
         (lambda: sf.Parameter(0.0, scale="log"), ValueError, ["with scale='log' must be positive", "the value 0.0"]),
         (lambda: sf.Parameter(1.0, -1.0, scale="log"), ValueError, ["its lower bound 0 or more", "lower bound -1.0"]),
-        (lambda: experiment(transition_times=(sf.Parameter(0.4, scale="log"),)), ValueError, ["leave out scale='log'"]),
         (lambda: sf.Parameter(1.0, prior=0.1), TypeError, ["must be an sf.Normal or an sf.LogNormal; got 0.1"]),
         (lambda: sf.Parameter(1.0, prior=sf.Normal([1, 2], 1)), ValueError, ["does not fit a value of shape ()"]),
         (

@@ -88,6 +88,9 @@ def test_an_interval_grows_with_its_level_beyond_the_pieces_too():
     ]
     assert np.isfinite(lengths).all()
     assert (np.diff(lengths, axis=0) > 0).all()
+    for side, limit in enumerate((0.0, 4.0)):  # the last piece goes on to the end of the horizon
+        stops = many.pieces[:, 0, side, :, 1]
+        assert (np.where(limit, np.nanmax(stops, axis=1), np.nanmin(stops, axis=1)) == limit).all()
 
 
 def test_an_unknown_that_a_bound_holds_has_no_interval():

@@ -459,7 +459,6 @@ def test_a_fixed_parameter_is_a_number():
         (sf.Parameter(5.0, lower=0.0, upper=9.0), r"The lower bound of tf must lie after t0 = 0.0; got 0.0"),
         (sf.Parameter(-1.0, upper=9.0), r"a finite horizon with t0 < tf; got \(0.0, -1.0\)"),
         (sf.Parameter([5.0, 6.0], upper=9.0), r"tf must be a single number .* the shape \(2,\)"),
-        (sf.Parameter(5.0, upper=9.0, scale="log"), r"tf is estimated as it is; leave out scale='log'"),
         (sf.Parameter(5.0, lower=2.0, upper=9.0, unit="h"), r"tf has the unit 'h', but time_unit of .* is 's'"),
         (
             sf.Parameter(5.0, lower=1.5, upper=9.0),

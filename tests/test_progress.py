@@ -40,8 +40,8 @@ def test_the_line_says_what_is_done_and_how_far_it_is(monkeypatch):
     before = set(threading.enumerate())
     with show_line("begins") as line:
         assert wait_for("begins   ", terminal)
-        line.write("many starts, lowest J = 2")
-        show_detail("start 3 of at most 127")
+        line.write("many starts", 3.0)
+        show_detail("start 3 of at most 127", 2.0)
         assert wait_for("many starts, lowest J = 2, start 3 of at most 127   ", terminal)
         line.write("other")
         assert wait_for("other   ", terminal)

@@ -218,7 +218,7 @@ def test_after_strategies_the_first_guess_is_that_of_the_user():
 def test_a_first_guess_that_cannot_be_integrated_has_no_cost():
     fit = made(steps=(Step("local", np.inf, 0, 0.1), Step("growing horizon", 28.0, 300, 2.0)))
     assert line_with(report(fit), "cost J") == "cost J 28 (first guess: not integrable)"
-    assert line_with(report(fit), "tried") == "tried local: not integrable (0.1 s); growing horizon: J = 28 (2 s)"
+    assert line_with(report(fit), "tried") == "tried local: failed (0.1 s); growing horizon: J = 28 (2 s)"
 
 
 def test_what_failed_is_said_first():

@@ -11,7 +11,8 @@ from models import decay
 import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.random_starts import draw_starts
-from switchfit.strategy.choice import without_guards
+from switchfit.optimize import Status
+from switchfit.strategy.choice import Search, without_guards
 from switchfit.strategy.horizon import can_grow, find_shared, grow_horizon
 from switchfit.strategy.quick import fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
@@ -101,6 +102,25 @@ def test_a_good_fit_tries_nothing_else(right):
     again = sf.estimate(thermostat(tuple(TRUTH[:5])))
     assert again.steps == ()
     assert again.cost == right.cost
+
+
+def test_a_fit_that_has_not_converged_on_coarse_meshes_is_repeated_on_new_ones(monkeypatch, right):
+    """It may have gone down into their error: its J would be lower than that of any honest end."""
+    from switchfit.strategy import choice
+
+    stopped = replace(right, status=Status.MAX_ITERATIONS, integration_error=1e-3, cost=0.9 * right.cost)
+    first = iter([stopped])
+    real = choice.fit_locally
+    monkeypatch.setattr(choice, "fit_locally", lambda *given, **settings: next(first, None) or real(*given, **settings))
+    found = sf.estimate(thermostat(FAR))
+    assert [step.strategy for step in found.steps] == ["local", "new meshes"]
+    assert found.cost == pytest.approx(right.cost, rel=1e-9)
+
+
+def test_a_cost_whose_constraints_are_not_met_is_not_the_lowest(right):
+    violated = replace(right, violated=(("terminal constraint 1", 0.3),))
+    assert Search(thermostat(FAR), violated, right.theta, "auto", {}, 0.0, np.inf).steps[0].cost == np.inf
+    assert Search(thermostat(FAR), right, right.theta, "auto", {}, 0.0, np.inf).steps[0].cost == right.cost
 
 
 def test_transition_times_need_not_be_given(right):

@@ -1,8 +1,8 @@
 """The command line: ``switchfit fit | check | simulate | paper``.
 
-Exit codes: 0 converged, 1 not converged (the result is still written), 2 wrong input, 3 an error of switchfit itself,
-130 interrupted by Ctrl-C. Only typer is imported here; the numerical parts are imported when a command needs them, so
-that ``--help`` is fast.
+Exit codes: 0 converged and the verdict is good or doubtful, 1 not converged or bad (the result is still written),
+2 wrong input, 3 an error of switchfit itself, 130 interrupted by Ctrl-C. Only typer is imported here; the numerical
+parts are imported when a command needs them, so that ``--help`` is fast.
 """
 
 from __future__ import annotations

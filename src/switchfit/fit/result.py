@@ -62,7 +62,7 @@ class Step:
     strategy : str
         "local", the fit from the first guess, or the name of another; "interrupted".
     cost : float
-        The lowest J after it.
+        The lowest J after it; infinite as long as the model could not be integrated, or constraints are not met.
     evaluations : int
     seconds : float
     ended : str

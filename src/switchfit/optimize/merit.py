@@ -37,7 +37,7 @@ SHRINK = 0.5
 #: A violation that a normal step reduces by less than this part of it is stationary.
 STATIONARY = 1e-6
 #: Iterations without a fall of the violation by a tenth after which it counts as stationary.
-STAGNANT = 20
+STAGNANT = 10
 
 
 def search_merit(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
@@ -88,7 +88,7 @@ def raise_penalty(penalty: float, point: Point, direction: Direction) -> float:
 def is_stuck(oracle: Oracle, state: State, direction: Direction) -> bool:
     """Return whether the violation of constraints that are not met is stationary: no step reduces it to first order.
 
-    Or nearly so: it has not fallen by a tenth for many iterations.
+    Or nearly so: it has not fallen by a tenth for some iterations (with 6 to 40 of them as many fits end right).
     """
     problem, point = oracle.problem, state.point
     violation = point.violation

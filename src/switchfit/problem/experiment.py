@@ -127,7 +127,8 @@ class Experiment:
         last = float(tf.value) if isinstance(tf, Parameter) else tf
         if not (np.isfinite(t0) and np.isfinite(last) and t0 < last):
             raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got ({t0}, {last}).")
-        if isinstance(tf, Parameter) and np.isfinite(tf.lower) and tf.lower <= t0:
+        by_scale = isinstance(tf, Parameter) and tf.scale == "log" and tf.lower == 0
+        if isinstance(tf, Parameter) and np.isfinite(tf.lower) and tf.lower <= t0 and not by_scale:
             raise ValueError(
                 f"The lower bound of tf must lie after t0 = {t0}; got {tf.lower}. Leave it out, or raise it."
             )

@@ -196,8 +196,9 @@ _ENDED = {
 
 
 def _format_step(step: Step) -> str:
-    """Return a strategy and the lowest J after it."""
-    cost = f"J = {step.cost:.6g}" if np.isfinite(step.cost) else "not integrable"
+    """Return a strategy and the lowest J after it; none where the model could not be integrated, or constraints are not
+    met."""
+    cost = f"J = {step.cost:.6g}" if np.isfinite(step.cost) else "failed"
     return f"{step.strategy}: {cost} ({step.seconds:.2g} s)"
 
 

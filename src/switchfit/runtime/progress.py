@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 import time
@@ -61,16 +62,16 @@ class Line:
     """
 
     def __init__(self, text: str) -> None:
-        self.text, self.detail = text, ""
+        self.text, self.detail, self.lowest = text, "", math.inf
         self._began = time.monotonic()
         self._live: Any = None
         self._ended = False
         self._lock = threading.Lock()
         self._timer: threading.Timer | None = None
 
-    def write(self, text: str) -> None:
-        """Say something else."""
-        self.text, self.detail = text, ""
+    def write(self, text: str, lowest: float = math.inf) -> None:
+        """Say something else, and the lowest J so far if there is one."""
+        self.text, self.detail, self.lowest = text, "", lowest
 
     def start(self) -> None:
         """Show the line from `DELAY` seconds on."""
@@ -102,7 +103,8 @@ class Line:
     def __rich__(self) -> Any:
         from rich.text import Text
 
-        whole = f"{self.text}, {self.detail}" if self.detail else self.text
+        lowest = f"lowest J = {self.lowest:.6g}" if math.isfinite(self.lowest) else ""
+        whole = ", ".join(part for part in (self.text, lowest, self.detail) if part)
         return Text(f"{whole}   {time.monotonic() - self._began:.0f} s", no_wrap=True, overflow="ellipsis")
 
 
@@ -124,13 +126,14 @@ def show_line(text: str) -> Iterator[Line]:
         line.end()
 
 
-def show_detail(detail: str) -> None:
-    """Add to the line of the call under way how far it is, such as "window 3 of 9".
+def show_detail(detail: str, cost: float = math.inf) -> None:
+    """Add to the line of the call under way how far it is, such as "window 3 of 9", and a J that may be the lowest.
 
     Parameters
     ----------
     detail : str
+    cost : float
     """
     line = _current.get()
     if line is not None:
-        line.detail = detail
+        line.detail, line.lowest = detail, min(line.lowest, cost)

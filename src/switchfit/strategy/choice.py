@@ -123,6 +123,12 @@ def estimate(
     TypeError
         If an argument is of the wrong type.
 
+    Notes
+    -----
+    On a terminal, a line on stderr says from a second on which strategy is under way, the lowest J, how far it is and
+    for how long. Many starts that last are fitted by other processes as well, one a core, where the model runs in
+    machine code and cloudpickle is installed; what is found does not depend on them.
+
     See Also
     --------
     estimate_many, multistart : many fits.
@@ -286,10 +292,9 @@ class Search:
         self.problem, self.best, self.theta = problem, best, theta
         self.strategy, self.settings, self.began, self.budget = strategy, settings, began, budget
         self.evaluations = 0 if best is None else best.evaluations
-        cost = np.inf if best is None else best.cost
         proposed = any(run.is_guess_proposed for run in problem.experiments)
         name = "local, from evenly spaced times" if proposed else "local"
-        self.steps = [Step(name, cost, self.evaluations, time.perf_counter() - began)]
+        self.steps = [Step(name, self.lowest, self.evaluations, time.perf_counter() - began)]
         self.first_cost = np.nan if best is None else best.initial_cost
         self.starts: Starts | None = None
 
@@ -307,11 +312,15 @@ class Search:
         finally:
             Search.running -= 1
 
+    @property
+    def lowest(self) -> float:
+        """The lowest J so far; infinite where there is none, or constraints are not met: J says nothing then."""
+        return np.inf if self.best is None or self.best.violated else self.best.cost
+
     def _begin(self, name: str) -> None:
         """Say on the line of progress which strategy is under way, and the lowest J before it."""
-        lowest = "" if self.best is None else f", lowest J = {self.best.cost:.6g}"
-        self.settings["callback"] = _write_to(self.line, f"{name}{lowest}, fit of its end", self.callback)
-        self.line.write(f"{name}{lowest}")
+        self.settings["callback"] = _write_to(self.line, f"{name}, fit of its end", self.callback)
+        self.line.write(name, self.lowest)
 
     def _run(self) -> None:
         tried: set[str] = set()
@@ -337,7 +346,7 @@ class Search:
         except KeyboardInterrupt:
             if self.best is None:
                 raise
-            self.steps.append(Step("interrupted", self.best.cost, 0, 0.0))
+            self.steps.append(Step("interrupted", self.lowest, 0, 0.0))
 
     def finish(self, best: Estimate) -> Estimate:
         """Return the best fit with all that was done."""
@@ -365,7 +374,8 @@ class Search:
             if any(structure.guarded for structure in problem.structures):
                 found.append(("transitions free of their guards", self._free_transitions))
             return [*found, (STARTS, self._try_starts)]
-        if best is not None and best.status is Status.MAX_ITERATIONS and not can_grow(problem):
+        unfinished = best is not None and best.status is Status.MAX_ITERATIONS
+        if unfinished and (has_runs(problem) or not can_grow(problem)):
             found.append(("more iterations", lambda theta: fit_briefly(problem, theta, MORE_ITERATIONS)))
         if has_runs(problem) and (doubted or self.strategy == "thorough"):
             found.append(("each run alone", self._fit_runs_alone))
@@ -426,7 +436,7 @@ class Search:
         again = fit_locally(self.problem, start=fit.theta, first_cost=np.nan_to_num(self.first_cost), **self.settings)
         self.best = again if again.integration_error < fit.integration_error else fit
         self.evaluations += again.evaluations
-        self.steps.append(Step(REMESH, self.best.cost, again.evaluations, time.perf_counter() - began))
+        self.steps.append(Step(REMESH, self.lowest, again.evaluations, time.perf_counter() - began))
 
     def _try(self, name: str, find: Callable[[FloatArray], End]) -> bool:
         """Run one strategy; a full fit follows where its end is lower than the best so far.
@@ -438,14 +448,13 @@ class Search:
         end = find(self.theta if self.best is None else self.best.theta)
         evaluations = end.evaluations
         # The cost of a fit whose constraints are not met says nothing: any that meets them is better.
-        before = np.inf if self.best is None or self.best.violated else self.best.cost
+        before = self.lowest
         if not end.failed and (before == np.inf or end.cost < before - self._margin(before)):
             fit = fit_locally(self.problem, start=end.theta, first_cost=np.nan_to_num(self.first_cost), **self.settings)
             evaluations += fit.evaluations
             if self.best is None or (fit.cost < before and not fit.violated) or self.best.violated:
                 self.best = fit
         self.evaluations += evaluations
-        cost = np.inf if self.best is None else self.best.cost
         ended = self.starts.ended if self.starts is not None and name == STARTS else ""
-        self.steps.append(Step(name, cost, evaluations, time.perf_counter() - began, ended))
+        self.steps.append(Step(name, self.lowest, evaluations, time.perf_counter() - began, ended))
         return bool(np.isfinite(before) and abs(end.cost - before) <= SAME_COST * abs(before))

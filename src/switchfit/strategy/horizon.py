@@ -62,8 +62,12 @@ def can_grow(problem: Problem) -> bool:
 
     What stays excluded, and why:
 
-    - Costs without data, and data at fewer than `FEWEST_WINDOWS` times: a part of the horizon says nothing of its
-      transitions then. The minimum of a running cost on a part of the horizon is that of another problem.
+    - Costs without data: the minimum of a running cost on a part of the horizon is that of another problem.
+    - Data at `FEWEST_WINDOWS` times or fewer, of all runs with transitions together: a window brings in too little to
+      say whether a transition has happened.
+
+    `choice` does not ask where there are guards or terminal constraints: what is met at the end says nothing of a part
+    of the horizon, and guards place the transitions by themselves.
     """
     along = [list_sample_times(run) for run in problem.experiments if run.transition_times]
     return sum(map(len, along)) > FEWEST_WINDOWS

@@ -51,7 +51,7 @@ def reinsert_modes(problem: Problem, theta: FloatArray) -> End:
     current = fit_briefly(problem, theta)
     evaluations = current.evaluations
     for repeated in range(ROUNDS):
-        show_detail(f"round {repeated + 1}, J = {current.cost:.6g}")
+        show_detail(f"round {repeated + 1}", current.cost)
         better = None
         for candidate, tried in _list_candidates(problem, current.theta):
             end = fit_briefly(problem, candidate)

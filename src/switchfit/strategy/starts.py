@@ -83,8 +83,7 @@ def try_starts(
             for end in found:
                 evaluations += end.evaluations
                 ends.append(end)
-                lowest = min(one.cost for one in ends)
-                show_detail(f"start {len(ends) - 1} of at most {most - 1}, lowest J of these {lowest:.6g}")
+                show_detail(f"start {len(ends) - 1} of at most {most - 1}", min(one.cost for one in ends))
                 if _is_enough(np.array([one.cost for one in ends if not one.failed])):
                     ended = "settled"
                     break

@@ -16,7 +16,8 @@ import sys
 import threading
 import time
 from collections.abc import Generator
-from typing import IO, Any
+from contextlib import suppress
+from typing import IO, Any, cast
 
 import numpy as np
 
@@ -36,7 +37,13 @@ AHEAD = 4
 POLL = 0.05
 """Seconds between two looks at what has been done: Ctrl-C is heard in between."""
 
-SINGLE_THREADS = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM")}
+MOST_WORKERS = 15
+"""Workers at most: each takes some 300 MB."""
+
+SETTINGS = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM")} | {
+    "JAX_PLATFORMS": "cpu"  # JAX would take most of a GPU's memory for each worker, and only traces
+}
+"""Environment of a worker."""
 
 
 def fit_all(problem: Problem, starts: FloatArray, cores: int | None = None) -> Generator[End, None, None]:
@@ -53,10 +60,11 @@ def fit_all(problem: Problem, starts: FloatArray, cores: int | None = None) -> G
     began = time.monotonic()
     for k, start in enumerate(starts):
         elapsed = time.monotonic() - began
-        if k and cores > 1 and elapsed >= START_UP and elapsed / k * (len(starts) - k) >= START_UP:
-            blob = _pack(problem)
+        if k and cores > 1 and elapsed >= START_UP:
+            worth = int(elapsed / k * (len(starts) - k) / START_UP)
+            blob = _pack(problem) if worth else None
             if blob is not None:
-                yield from _fit_with_workers(problem, starts[k:], blob, cores - 1)
+                yield from _fit_with_workers(problem, starts[k:], blob, min(cores - 1, worth, MOST_WORKERS))
                 return
             cores = 1
         yield fit_briefly(problem, start)
@@ -78,8 +86,10 @@ def _pack(problem: Problem) -> bytes | None:
 def _fit_with_workers(problem: Problem, starts: FloatArray, blob: bytes, count: int) -> Generator[End, None, None]:
     """Yield the ends in the order of the starts; this process fits as well."""
     shared = _Shared(starts, AHEAD * (count + 1))
-    workers = [_Worker(blob, shared) for _ in range(min(count, len(starts)))]
+    workers: list[_Worker] = []
     try:
+        for _ in range(count):
+            workers.append(_Worker(blob, shared))
         for k in range(len(starts)):
             while (end := shared.wait_for(k)) is None:
                 mine = shared.take()
@@ -143,20 +153,18 @@ class _Worker:
         self._shared = shared
         path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
         self._process = subprocess.Popen(
-            [sys.executable, "-c", "from switchfit.strategy.workers import serve; serve()"],
+            [sys.executable, "-P", "-c", "from switchfit.strategy.workers import serve; serve()"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env=os.environ | SINGLE_THREADS | {"PYTHONPATH": path},
+            env=os.environ | SETTINGS | {"PYTHONPATH": path},
             start_new_session=True,  # Ctrl-C is for this process alone
         )
         self._thread = threading.Thread(target=self._feed, args=(blob,), daemon=True)
         self._thread.start()
 
     def _feed(self, blob: bytes) -> None:
-        sent, received = self._process.stdin, self._process.stdout
-        assert sent is not None
-        assert received is not None
+        sent, received = (cast("IO[bytes]", pipe) for pipe in (self._process.stdin, self._process.stdout))
         taken: int | None = None
         try:
             pickle.dump(blob, sent)
@@ -181,15 +189,8 @@ class _Worker:
         self._process.wait()
         self._thread.join()
         for pipe in (self._process.stdin, self._process.stdout):
-            if pipe is not None:
-                _close(pipe)
-
-
-def _close(pipe: IO[bytes]) -> None:
-    try:
-        pipe.close()
-    except OSError:  # what was not sent any more
-        return
+            with suppress(OSError):  # what was not sent any more
+                cast("IO[bytes]", pipe).close()
 
 
 def serve() -> None:
