@@ -52,7 +52,7 @@ def test_patterns_and_folders(tmp_path):
     (tmp_path / "empty").mkdir()
     assert find_logs(tmp_path, "*.csv") == ["a.csv", "b.csv", "c[1].csv"]
     assert find_logs(tmp_path, ".") == [f"./{name}" for name in ("a.csv", "a.csv.gz", "b.csv", "bag", "c[1].csv")]
-    for one in ("a.csv", "missing.csv", "bag", "c[1].csv"):
+    for one in ("a.csv", "missing.csv", "bag", "c[1].csv", "", "x" * 5000, "a\0b"):
         assert find_logs(tmp_path, one) is None
     assert find_logs(tmp_path.parent, str(tmp_path / "a.*")) == [str(tmp_path / "a.csv"), str(tmp_path / "a.csv.gz")]
     with pytest.raises(InputError, match=r"No file matches .*x\*\.csv; check the pattern and the folder"):

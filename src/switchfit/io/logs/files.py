@@ -31,11 +31,15 @@ def find_logs(folder: Path, given: str) -> list[str] | None:
     """
     path = folder / given
     try:
-        is_folder, exists = path.is_dir(), path.exists()
+        is_folder, exists = path.is_dir() and given.strip() != "", path.exists()
     except (OSError, ValueError):  # no name that a file can have
         return None
     if is_folder and not _is_log(path):
-        inside = sorted(name for name in os.listdir(path) if not name.startswith(".") and _is_log(path / name))
+        try:
+            names = os.listdir(path)
+        except OSError as error:
+            raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+        inside = sorted(name for name in names if not name.startswith(".") and _is_log(path / name))
         if not inside:
             raise InputError(f"{path} has no logs: no file in it ends in {', '.join(ENDINGS)}.")
         return [os.path.join(given, name) for name in inside]
