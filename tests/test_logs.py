@@ -45,6 +45,7 @@ DIALECTS = {
     "units in brackets": "t [s],x [m],y [m]\n0,1,2\n1,3,4\n",
     "three lines": "Time;Position along X;Position along Y\ns;m;m\nt;x;y\n0;1;2\n1;3;4\n",
     "a preamble": "Logger 3\nfirmware: 1.2\n\nt,x,y\n0,1,2\n1,3,4\n",
+    "a note of Excel": "sep=;\nt;x;y\n0;1;2\n1;3;4\n",
     "old line ends": "t,x,y\r0,1,2\r1,3,4\r",
 }
 

@@ -36,6 +36,8 @@ COMMENTS = ("#", "%")
 _DATE_NAMES = ("date", "datum", "day")
 _COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 _POINT_NUMBER = re.compile(r"[+-]?(?:\d+\.\d*|\.\d+)(?:[eE][+-]?\d+)?")
+_EXCEL = re.compile(r"sep=.?")
+"""The line in which Excel notes the delimiter; the one that is found is the same."""
 _LONG_INTEGER = re.compile(r"\d{16,19}")
 
 
@@ -195,6 +197,8 @@ def _decode_as(path: Path, data: bytes, encoding: str) -> str:
 def _read_table(path: Path, drop_broken: bool) -> _Table:
     lines = list(enumerate(re.split(r"\r\n|\n|\r", decode(path)), start=1))
     kept = [(k, line) for k, line in lines if line.strip() and not line.lstrip().startswith(COMMENTS)]
+    if kept and _EXCEL.fullmatch(kept[0][1].strip()):
+        kept = kept[1:]
     if not kept:
         raise InputError(f"{path} is empty; it needs a line with the names of the columns and one line per sample.")
     delimiter = find_delimiter([line for _, line in kept[:SNIFFED]])
