@@ -107,6 +107,7 @@ def test_gpx(tmp_path):
     np.testing.assert_allclose(log["sigma_north"], 1.2 * 5 / np.sqrt(2))
     np.testing.assert_allclose(log.origin, ORIGIN, atol=1e-8)
     assert log.events == ((0.5, "waypoint", "gate"),)
+    assert "  origin: latitude 48.10000000, longitude 11.60000000, altitude 520.00 m\n" in str(log)
     elsewhere = sf.read_log(tmp_path / "a.gpx", origin=globe(100, 0), columns=["east"])
     np.testing.assert_allclose(elsewhere["east"], X - 100, atol=1e-2)
 

@@ -218,12 +218,15 @@ class Log:
         return table
 
     def __str__(self) -> str:
-        """Return source, span, channels and issues as text."""
+        """Return source, span, channels, origin and issues as text."""
         unit = f" {self.time_unit}" if self.time_unit else ""
         span = f", {self.times[0]:.6g} to {self.times[-1]:.6g}{unit}" if len(self) else ""
         start = f" from {self.start:%Y-%m-%d %H:%M:%S} UTC" if self.start else ""
         names = [f"{name} ({self.units[name]})" if self.units.get(name) else name for name in self.values]
         lines = [f"{self.source}: {len(self)} samples{span}{start}", f"  channels: {', '.join(names) or 'none'}"]
+        if self.origin:
+            latitude, longitude, altitude = self.origin
+            lines.append(f"  origin: latitude {latitude:.8f}, longitude {longitude:.8f}, altitude {altitude:.2f} m")
         if self.events:
             lines.append(f"  events: {len(self.events)}")
         return "\n".join([*lines, *(f"  {issue}" for issue in self.issues)])
