@@ -150,9 +150,9 @@ IN_EQUALITIES: dict[str, tuple[str, Replacements]] = {
         MERIT,
         [("return penalty if penalty >= needed else RAISED * needed", "return penalty")],
     ),
-    "a stationary violation ends it": (
+    "a violation that does not fall ends it": (
         MERIT,
-        [("return violation - equalities.predict(normal) <= STATIONARY * violation", "return False")],
+        [("return state.point.violation > MET and state.stagnant >= STAGNANT", "return False")],
     ),
     "the constraints in the Hessian of the Lagrangian": (POINT, [("self.multipliers / units)", "0.0 * units)")]),
     "bounds of the normal step": (

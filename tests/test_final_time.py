@@ -345,6 +345,7 @@ def test_a_slower_way_is_left_for_the_fastest():
     assert alone.cost == pytest.approx(sum(PENDULUM_ARCS) + 2 * np.pi, abs=1e-6)
     found = sf.estimate(pendulum(), start=longer)
     assert found.cost == pytest.approx(sum(PENDULUM_ARCS), abs=1e-6)
+    assert found.verdict.level == "good"  # those that ended at slower ways before do not count against it
 
 
 def test_a_problem_is_recognised_as_one_of_minimum_time():

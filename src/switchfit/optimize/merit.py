@@ -34,9 +34,7 @@ RAISED = 1.1
 SMALLEST_RADIUS = 1e-10
 #: Factor by which the trust region shrinks after a step that failed.
 SHRINK = 0.5
-#: A violation that a normal step reduces by less than this part of it is stationary.
-STATIONARY = 1e-6
-#: Iterations without a fall of the violation by a tenth after which it counts as stationary.
+#: Iterations in which the violation has to fall by a tenth: with 6 to 40 of them as many fits end right.
 STAGNANT = 10
 
 
@@ -85,22 +83,9 @@ def raise_penalty(penalty: float, point: Point, direction: Direction) -> float:
     return penalty if penalty >= needed else RAISED * needed
 
 
-def is_stuck(oracle: Oracle, state: State, direction: Direction) -> bool:
-    """Return whether the violation of constraints that are not met is stationary: no step reduces it to first order.
-
-    Or nearly so: it has not fallen by a tenth for some iterations (with 6 to 40 of them as many fits end right).
-    """
-    problem, point = oracle.problem, state.point
-    violation = point.violation
-    if violation > MET and state.stagnant >= STAGNANT:
-        return True
-    if violation <= MET or violation - direction.left > STATIONARY * violation:
-        return False
-    equalities = point.equalities(point.reported_sides)
-    room = -np.maximum(point.slack, 0.0)
-    radius = max(direction.radius, 1.0)
-    normal = find_normal_step(equalities, problem.constraints.normals, room, problem.reach, radius)
-    return violation - equalities.predict(normal) <= STATIONARY * violation
+def is_stuck(state: State) -> bool:
+    """Return whether constraints are not met, and their violation does not fall any more."""
+    return state.point.violation > MET and state.stagnant >= STAGNANT
 
 
 def correct(oracle: Oracle, trial: Trial, sample: Sample, scale: FloatArray, radius: float) -> Trial | None:

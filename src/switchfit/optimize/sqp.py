@@ -172,7 +172,7 @@ def _step(oracle: Oracle, state: State) -> State:
         return _finish(oracle, state, direction, Status.CONVERGED)
     if state.iteration >= problem.max_iterations:
         return replace(state, status=Status.MAX_ITERATIONS)
-    if problem.equalities and is_stuck(oracle, state, direction):
+    if is_stuck(state):
         return replace(state, status=Status.INFEASIBLE)
     accepted = (search_merit if problem.equalities else search)(oracle, state, direction)
     if accepted is None:

@@ -67,7 +67,7 @@ class Unknowns:
     rows : tuple of Constraint, what each row of A theta >= b is
     priors : PriorTerms
     log : (d,) bool, whether an unknown is estimated on a logarithmic scale
-    origin : (d,), from where a logarithm counts: t0 for a transition time or a free tf, otherwise 0
+    starts : tuple of float, t0 of each experiment
     """
 
     names: tuple[str, ...]
@@ -83,7 +83,7 @@ class Unknowns:
     rows: tuple[Constraint, ...]
     priors: PriorTerms
     log: NDArray[np.bool_]
-    origin: FloatArray
+    starts: tuple[float, ...]
 
     @cached_property
     def is_time(self) -> NDArray[np.bool_]:
@@ -92,6 +92,14 @@ class Unknowns:
         for where in self.times:
             found[where[where >= 0]] = True
         return found
+
+    @cached_property
+    def origin(self) -> FloatArray:
+        """From where a logarithm counts, (d,): t0 for a transition time or a free tf, otherwise 0."""
+        origin = np.zeros(len(self.names))
+        for t0, where in zip(self.starts, self.times, strict=True):
+            origin[where[where >= 0]] = t0
+        return origin
 
     @cached_property
     def variables(self) -> Variables:
@@ -730,13 +738,11 @@ def _list_unknowns(
     flat = {key: np.concatenate([getattr(q, key).ravel() for q in pieces]) for key in ("value", "lower", "upper")}
     priors = PriorTerms.join([PriorTerms.of(q.prior, q.shape) for q in pieces])
     log = np.concatenate([np.full(q.value.size, q.scale == "log") for q in pieces])
-    origin = np.zeros(len(names))
-    for experiment, positions in zip(experiments, where, strict=True):
-        origin[positions[positions >= 0]] = experiment.t0
+    starts = tuple(experiment.t0 for experiment in experiments)
     A, b, rows = _build_ordering(experiments, where, len(names), dwell)
     vectors = flat["value"], flat["lower"], flat["upper"]
     places = tuple(where), spans, tuple(states)
-    return Unknowns(tuple(names), tuple(units), *vectors, *places, A, b, rows, priors, log, origin)
+    return Unknowns(tuple(names), tuple(units), *vectors, *places, A, b, rows, priors, log, starts)
 
 
 def _find_delay_targets(experiment: Experiment) -> set[str]:

@@ -45,18 +45,21 @@ def is_minimum_time(problem: Problem, fit: Estimate) -> bool:
 
 
 def try_shorter_horizons(problem: Problem, fit: Estimate, stop: Callable[[], bool]) -> Starts:
-    """Return the lowest end of starts over shorter and shorter horizons, beginning with that of a fit."""
+    """Return the lowest end of starts over shorter and shorter horizons, beginning with that of a fit.
+
+    How many starts were tried and agree is that of the last horizon, over which none was better.
+    """
     end = End(fit.theta, np.inf if fit.violated else fit.cost, 0)
-    evaluations, costs, seed = 0, np.zeros(0), 0
+    evaluations, tried, seed = 0, 0, 0
     while True:
         given = problem if end.failed else shorten_horizon(problem, end.theta)
         found = try_starts(given, end.theta, seed=seed, most=FEW if end.failed else MOST, stop=stop)
-        evaluations, costs, seed = evaluations + found.end.evaluations, np.append(costs, found.costs), seed + 1
+        evaluations, tried, seed = evaluations + found.end.evaluations, tried + len(found.costs), seed + 1
         lower = not found.end.failed and (end.failed or found.end.cost < end.cost * (1 - SAME_COST))
         end = found.end if lower else end
         stopped = found.ended in ("time", "interrupted")
-        if stopped or (not lower and not end.failed) or (end.failed and len(costs) >= MOST):
-            return Starts(end._replace(evaluations=evaluations), costs, found.ended)
+        if stopped or (not lower and not end.failed) or (end.failed and tried >= MOST):
+            return found._replace(end=end._replace(evaluations=evaluations))
 
 
 def shorten_horizon(problem: Problem, theta: FloatArray) -> Problem:
