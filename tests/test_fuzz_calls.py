@@ -343,6 +343,7 @@ DATA_WORDS = {
     "sigma": ("sigma",),
     "names": ("names",),
     "weights": ("weights",),
+    "units": ("units",),
     "observe": ("observe",),
 }
 
@@ -437,6 +438,7 @@ def catalogue():
                 "loss": "huber",
                 "loss_scale": 2.0,
                 "delay": 0.0,
+                "units": ("m", "rad"),
             },
             words=DATA_WORDS,
             inside={
@@ -455,6 +457,7 @@ def catalogue():
                 "lowpass_hz": 2.0,
                 "weights": [1.0, 2.0],
                 "names": None,
+                "units": None,
             },
             words=DATA_WORDS,
             inside={
@@ -465,9 +468,21 @@ def catalogue():
         ),
         "Input": Door(
             build_input,
-            {"times": TIMES, "values": TIMES, "kind": "linear"},
+            {"times": TIMES, "values": TIMES, "kind": "linear", "units": ("m",)},
             words={"times": ("times", "samples", "known over"), "values": ("values", "rows", "mode", "samples")},
             inside={"times": lambda bad: [bad, *TIMES[1:]], "values": lambda bad: [bad, *TIMES[1:]]},
+        ),
+        "read_log": Door(
+            sf.read_log,
+            {"path": log_file(), "columns": ["x", "yaw"], "time": "t", "time_unit": "ms", "topic": None}
+            | {"origin": None, "range_error": None, "repair": ("sort", "unwrap:yaw")},
+            words={
+                "columns": ("columns", "column", "unwrap"),
+                "time": ("time must", "column"),
+                "path": ("file", "path", "folder"),
+            }
+            | {"origin": ("origin", "latitude"), "range_error": ("range_error", "latitude"), "topic": ("topic",)},
+            inside={"columns": lambda bad: ["yaw", bad], "origin": lambda bad: [bad, 1.0]},
         ),
         "RunningCost": Door(lambda **given: problem(experiment(sf.RunningCost(**given))), {"ell": energy}),
         "TransitionCost": Door(
@@ -591,6 +606,12 @@ def keyed(bad, value):
 def saved():
     path = Path("saved.json").resolve()
     made("fit").save(path)
+    return path
+
+
+def log_file():
+    path = Path("log.csv").resolve()
+    path.write_text("t,x,yaw\n0,1,0\n1,2,3\n2,3,-3\n")
     return path
 
 
@@ -733,8 +754,8 @@ def test_the_doors_are_all_that_is_public(doors):
     made_by_switchfit = {
         "ActiveConstraint", "Bootstrap", "Certificate", "ChannelResiduals", "Comparison", "DerivativeCheck",
         "Direction", "Estimate", "Evaluation", "Fits", "GuardedEvaluation", "Identifiability", "Issue", "Kink",
-        "MonteCarlo", "Multistart", "Prediction", "Profile", "ResidualDiagnostics", "Status", "Step", "Termination",
-        "Trajectory", "Verdict",
+        "Log", "MonteCarlo", "Multistart", "Prediction", "Profile", "ResidualDiagnostics", "Status", "Step",
+        "Termination", "Trajectory", "Verdict",
     }  # fmt: skip
     assert set(sf.__all__) - made_by_switchfit <= set(doors)
 

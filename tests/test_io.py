@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.io.csv import read_columns
 from switchfit.io.problem_file import load_problem
 from switchfit.io.python_file import load_object
 from switchfit.io.summary import describe
@@ -104,59 +103,6 @@ def refused(folder, message, *changes):
     with pytest.raises(InputError, match=message) as caught:
         changed(folder, *changes)
     return str(caught.value)
-
-
-# --- tables -----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "t,x,y\n0,1,2\n1,3,4\n",
-        "t;x;y\n0;1;2\n1;3;4",
-        "t\tx\ty\n0\t1\t2\n1\t3\t4\n",
-        "\ufeff t , x , y\r\n 0 , 1 , 2 \r\n1, 3, 4\r\n",
-        '# a comment\n\n"t","x","y"\n0,1,2\n\n# another\n1,3e0,4.0\n',
-    ],
-)
-def test_read_columns(tmp_path, text):
-    (tmp_path / "a.csv").write_text(text, encoding="utf-8")
-    np.testing.assert_array_equal(read_columns(tmp_path / "a.csv", ["y", "t"]), [[2, 0], [4, 1]])
-
-
-def test_read_columns_missing_values_and_names_with_commas(tmp_path):
-    (tmp_path / "a.csv").write_text('t,"x, in m"\n0,\n1,NA\n2,nan\n3,4\n')
-    values = read_columns(tmp_path / "a.csv", ["x, in m"])
-    np.testing.assert_array_equal(values, [[np.nan], [np.nan], [np.nan], [4]])
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", r"a\.csv is empty; it needs a line with the names"),
-        ("\n# only this\n", r"a\.csv is empty"),
-        ("t,x\n", r"a\.csv has a header but no rows"),
-        ("t,y\n0,1\n", r"a\.csv has no column 'x'; its columns are t, y\."),
-        ("t,x,x\n0,1,2\n", r"a\.csv has 2 columns 'x'; rename all but one"),
-        ("t,x\n0,1\n\n1,two\n", r"a\.csv, line 4, column 'x': 'two' is not a number; leave the cell empty"),
-        ("t,x\n0,1\n1\n", r"a\.csv, line 3: 1 fields where the header has 2"),
-        ("t,x\n0,1\n1,2,3\n", r"a\.csv, line 3: 3 fields where the header has 2"),
-    ],
-)
-def test_read_columns_refuses(tmp_path, text, message):
-    (tmp_path / "a.csv").write_text(text)
-    with pytest.raises(InputError, match=message):
-        read_columns(tmp_path / "a.csv", ["t", "x"])
-
-
-def test_read_columns_refuses_what_is_no_text_file(tmp_path):
-    with pytest.raises(InputError, match=r"There is no file .*missing\.csv; check the name"):
-        read_columns(tmp_path / "missing.csv", ["t"])
-    with pytest.raises(InputError, match="is a folder; name a CSV file in it"):
-        read_columns(tmp_path, ["t"])
-    (tmp_path / "a.bin").write_bytes(b"t,x\n\xff\xfe\x00")
-    with pytest.raises(InputError, match=r"a\.bin is not a text file in UTF-8 \(byte 4\)"):
-        read_columns(tmp_path / "a.bin", ["t"])
 
 
 # --- a problem file that is right -------------------------------------------------------------------------------------

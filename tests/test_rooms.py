@@ -36,6 +36,13 @@ APART = {"optimize": set(), "models": {"problem"}}
 """Rooms that may import less than all before them."""
 
 
+LOGS = {"runtime", "problem.validation"}
+"""Rooms and modules of other rooms that `io.logs` may import: it knows no model, no fit and no report."""
+
+OPTIONAL = {"gpxpy", "h5py", "pandas", "polars", "pyarrow", "pymap3d", "pynmea2", "rosbags", "xarray"}
+"""Libraries of the extras, which are imported where they are needed."""
+
+
 def name_of(path: Path) -> str:
     parts = path.relative_to(PACKAGE).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
@@ -78,6 +85,22 @@ def test_each_room_imports_only_those_before_it(module):
     if module == "cli":
         imported -= {""}  # it is a user of what is public
     assert not violations(module, imported)
+
+
+def test_logs_are_read_without_the_rest_of_the_library():
+    modules = {name: path for name, path in MODULES.items() if name.startswith("io.logs")}
+    assert len(modules) > 5
+    for name, path in modules.items():
+        foreign = {other for other in imports_of(path.read_text()) if not other.startswith("io.logs")}
+        assert all(other in LOGS or room_of(other) in LOGS for other in foreign), f"{name}: {foreign}"
+
+
+def test_libraries_of_the_extras_are_imported_where_they_are_needed():
+    for name, path in MODULES.items():
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                imported = [a.name for a in node.names] if isinstance(node, ast.Import) else [node.module or ""]
+                assert not OPTIONAL & {other.partition(".")[0] for other in imported}, name
 
 
 def test_no_module_imports_itself_by_way_of_others():

@@ -12,6 +12,8 @@ from switchfit.fit.guards import GuardedEvaluation, evaluate_on_guards
 from switchfit.fit.result import Step
 from switchfit.fit.termination import Kink, Termination
 from switchfit.fit.trajectory import Comparison, Trajectory, simulate
+from switchfit.io.logs.log import Log
+from switchfit.io.logs.reader import read_log
 from switchfit.optimize import Status
 from switchfit.problem.constraints import ActiveConstraint
 from switchfit.problem.data import (
@@ -64,6 +66,7 @@ __all__ = [
     "Input",
     "Issue",
     "Kink",
+    "Log",
     "LogNormal",
     "Measurements",
     "MonteCarlo",
@@ -96,6 +99,7 @@ __all__ = [
     "multistart",
     "predict",
     "profile",
+    "read_log",
     "simulate",
 ]
 

@@ -15,7 +15,8 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
@@ -24,6 +25,7 @@ import typer
 
 if TYPE_CHECKING:
     from switchfit.io.problem_file import ProblemFile
+    from switchfit.runtime.issue import Issue
 
 CONVERGED, NOT_CONVERGED, BAD_INPUT, INTERNAL_ERROR, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -64,13 +66,30 @@ def _collect_options(
 
 @app.command()
 def fit(
-    problem: ProblemPath,
+    problem: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="PROBLEM.toml",
+            help="Problem file; with --problem, logs, each of which is fitted by itself.",
+            show_default=False,
+        ),
+    ],
     out: Annotated[
         Path | None,
         typer.Option(
             help="Folder for report.txt, estimate.json and fit.png; runs.csv and unknowns.csv where they are many.",
             show_default=False,
         ),
+    ] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            "--problem", metavar="PROBLEM.toml", help="Problem file for the logs that are named.", show_default=False
+        ),
+    ] = None,
+    table: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.csv", help="With --problem: a line for each log.", show_default=False),
     ] = None,
     strategy: Annotated[
         Literal["local", "auto", "thorough"] | None,
@@ -103,6 +122,10 @@ def fit(
     Options given here override those in the problem file. Ctrl-C stops after the current iteration and reports the
     result so far. Exit code 0: converged, the verdict is good or doubtful; 1: not converged or bad, the result is still
     written; 2: the input is wrong.
+
+    LOG ... --problem PROBLEM.toml fits each of the logs by itself, in place of the file that the data name. A pattern
+    or a folder stands for the logs in it. A log that cannot be used is reported, and the next one is fitted; the exit
+    code is that of the worst.
     """
     given = {
         "strategy": strategy,
@@ -111,27 +134,23 @@ def fit(
         "tolerance": tolerance,
         "max_iterations": max_iterations,
     }
+    overrides = {key: value for key, value in given.items() if value is not None}
+    output = _Output(out, figures=out is not None and not no_figures, certificate=certificate, full=full)
+    if model is not None:
+        with _report_errors(debug):
+            code = _fit_logs(problem, model, overrides, output, table)
+        if code != CONVERGED:
+            raise typer.Exit(code)
+        return
+    if len(problem) != 1 or table is not None:
+        _fail("name one problem file; to fit several logs by one, name it with --problem PROBLEM.toml.", BAD_INPUT)
     with _report_errors(debug):
-        loaded = _load(problem)
-        options = loaded.options | {key: value for key, value in given.items() if value is not None}
-        figures = out is not None and not no_figures
+        loaded = _load(problem[0])
         if out is not None:
             _make_folder(out)
-        estimate = _estimate(loaded, options, prepare_figures=figures)
-        checked = f"\n\nCertificate\n{estimate.certificate}" if certificate else ""
-        tables = _choose_tables(estimate, out)
-        report = _write_report(estimate, full, tables) + checked  # after the certificate, which is part of the verdict
-        _print(report)
-        if out is not None:
-            _write(out / "report.txt", report + "\n")
-            _write_tables(estimate, tables)
-            with _explain_write_errors(out / "estimate.json") as path:
-                _save(estimate, path, complete=certificate)
-            if figures:
-                figure = io.BytesIO()
-                estimate.plot().savefig(figure, format="png", dpi=150)
-                _write(out / "fit.png", figure.getvalue())
-            _print(f"written to {out}", err=True)
+        estimate = _estimate(loaded, loaded.options | overrides, prepare_figures=output.figures)
+        _write_estimate(estimate, output, output.folder)
+    _fail_for_refused(loaded.issues)
     if not estimate.success:
         reason = "" if estimate.status.successful else f"not converged. {estimate.message}"
         _print(f"switchfit: {reason or 'the fit is bad; the first line of the report says why.'}", err=True)
@@ -160,10 +179,12 @@ def check(
         from switchfit.io.summary import describe, describe_steps
 
         _print(f"{describe(loaded.problem)}\n")
+        _print_issues(loaded.issues)
         _print(f"{describe_steps(loaded.problem)}\n")
         derivatives = sf.check_derivatives(loaded.problem)
         _print(f"{derivatives}\n")
         _print(sf.identifiability(loaded.problem))
+    _fail_for_refused(loaded.issues)
     if not derivatives.passed:
         raise typer.Exit(NOT_CONVERGED)
 
@@ -334,15 +355,32 @@ def _load(problem: Path) -> ProblemFile:
     return load_problem(problem)
 
 
+def _print_issues(issues: Sequence[Issue]) -> None:
+    """Print what is odd about logs."""
+    if issues:
+        _print("\n".join(["Logs", *(f"  {issue}" for issue in issues), ""]))
+
+
+def _fail_for_refused(issues: Sequence[Issue]) -> None:
+    """Name the logs that could not be used, and end with the exit code that says so."""
+    refused = [issue for issue in issues if issue.kind == "log: refused"]
+    for issue in refused:
+        _print(f"switchfit: {issue}", err=True)
+    if refused:
+        raise typer.Exit(BAD_INPUT)
+
+
 def _check_files(problem: Path) -> None:
     """Print the parts of a problem that are known without running a Python file."""
     from switchfit.io.problem_file import read_experiments
     from switchfit.io.summary import describe_experiments
 
-    experiments = read_experiments(problem)
-    if experiments:
-        _print(f"{describe_experiments(experiments)}\n")
+    runs = read_experiments(problem)
+    if runs.experiments:
+        _print(f"{describe_experiments(runs.experiments)}\n")
+        _print_issues(runs.issues)
     _print("No Python file was run: modes, states, functions and names of parameters are not checked.")
+    _fail_for_refused(runs.issues)
 
 
 def _estimate(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: bool) -> Any:
@@ -377,6 +415,73 @@ def _write_report(estimate: Any, full: bool, tables: dict[str, Path]) -> str:
     from switchfit.runtime.presentation import format_text
 
     return str(format_text(estimate, full=full, files={name: str(path) for name, path in tables.items()}))
+
+
+@dataclass(frozen=True)
+class _Output:
+    """What is printed of a fit, and written."""
+
+    folder: Path | None
+    figures: bool
+    certificate: bool
+    full: bool
+
+
+def _write_estimate(estimate: Any, output: _Output, folder: Path | None, *, show: bool = True) -> None:
+    """Print the report, and write report, estimate and figure into a folder."""
+    checked = f"\n\nCertificate\n{estimate.certificate}" if output.certificate else ""
+    tables = _choose_tables(estimate, folder)
+    # The report after the certificate, which is part of the verdict.
+    report = _write_report(estimate, output.full, tables) + checked
+    if show:
+        _print(report)
+    if folder is None:
+        return
+    _write(folder / "report.txt", report + "\n")
+    _write_tables(estimate, tables)
+    with _explain_write_errors(folder / "estimate.json") as path:
+        _save(estimate, path, complete=output.certificate)
+    if output.figures:
+        figure = io.BytesIO()
+        estimate.plot().savefig(figure, format="png", dpi=150)
+        _write(folder / "fit.png", figure.getvalue())
+    _print(f"written to {folder}", err=True)
+
+
+def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output: _Output, table: Path | None) -> int:
+    """Fit logs one by one, print a line for each, and return the exit code of the worst."""
+    from switchfit.io.log_table import ResultTable, list_logs, load_log
+
+    logs = list_logs(paths)
+    if table is not None:
+        _make_folder(table.parent)
+    results = ResultTable()
+    for name, path in logs:
+        loaded, error = load_log(model, path)
+        estimate = None
+        if loaded is not None:
+            estimate, error = _estimate_log(loaded, overrides, output)
+        results.add(str(path), estimate, error)
+        _print(results.describe_last())
+        if estimate is not None and output.folder is not None:
+            _make_folder(output.folder / name)
+            _write_estimate(estimate, output, output.folder / name, show=False)
+        if table is not None:  # after each log, so that an interrupted run leaves what it has
+            _write(table, results.write())
+        if estimate is not None and estimate.status.name == "INTERRUPTED":
+            break
+    _print(results.summarize(len(logs)), err=True)
+    return BAD_INPUT if results.refused else NOT_CONVERGED if results.failed or len(results) < len(logs) else CONVERGED
+
+
+def _estimate_log(loaded: ProblemFile, overrides: dict[str, Any], output: _Output) -> tuple[Any, str]:
+    """Return the estimate for a log, or None and what is wrong."""
+    from switchfit.io.python_file import describe_error
+
+    try:
+        return _estimate(loaded, loaded.options | overrides, prepare_figures=output.figures), ""
+    except Exception as error:
+        return None, describe_error(error)
 
 
 def _import_figures() -> None:

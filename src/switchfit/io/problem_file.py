@@ -9,19 +9,24 @@ from __future__ import annotations
 import difflib
 import functools
 import inspect
+import os
 import re
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import pydantic
+from numpy.typing import NDArray
 from pydantic import Field
 from pydantic_core import PydanticCustomError
 
-from switchfit.io.csv import read_columns
+from switchfit.io.logs.files import find_logs, name_logs
+from switchfit.io.logs.log import Log
+from switchfit.io.logs.reader import align_starts, read_source
+from switchfit.io.logs.units import SECONDS, normalize_time_unit
 from switchfit.io.python_file import call, describe_error, find_object, find_user_place, load_object
 from switchfit.models import BUILT_IN
 from switchfit.problem.data import FloatArray, Input, Measurements, ReferenceSignal
@@ -31,6 +36,7 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import is_device
+from switchfit.runtime.issue import Issue
 
 OPTIONS = {"strategy", "time_budget", "hessian", "tolerance", "max_iterations"}
 """Options of `estimate`."""
@@ -48,20 +54,39 @@ class ProblemFile:
     problem : Problem
     options : dict
         Keyword arguments for `switchfit.estimate` that the file sets.
+    issues : tuple of Issue
+        What is odd about the logs; of kind "log: refused" for those of many that could not be used.
     """
 
     path: Path
     problem: Problem
     options: dict[str, Any]
+    issues: tuple[Issue, ...] = ()
 
 
-def load_problem(path: str | Path) -> ProblemFile:
+class Runs(NamedTuple):
+    """The experiments of a problem file, and what is odd about their logs.
+
+    Attributes
+    ----------
+    experiments : tuple of Experiment
+    issues : tuple of Issue
+        As of a `ProblemFile`.
+    """
+
+    experiments: tuple[Experiment, ...]
+    issues: tuple[Issue, ...]
+
+
+def load_problem(path: str | Path, log: str | Path | None = None) -> ProblemFile:
     """Read a problem file, the data files it names, and the Python file of its model.
 
     Parameters
     ----------
     path : str or Path
         A TOML file. Paths in it are relative to its folder.
+    log : str or Path, optional
+        Instead of the file that the data of the only experiment name; inputs and further data from other files stay.
 
     Returns
     -------
@@ -75,12 +100,15 @@ def load_problem(path: str | Path) -> ProblemFile:
     """
     path = Path(path)
     contents = _validate(path, _parse(path))
+    if log is not None:
+        contents = _replace_log(path, contents, os.path.abspath(log))
     options = contents.options.model_dump(include=OPTIONS, exclude_none=True)
     build = _build_from_tables if contents.problem is None else _load_from_python
-    return ProblemFile(path, build(path, contents), options)
+    problem, issues = build(path, contents)
+    return ProblemFile(path, problem, options, issues)
 
 
-def read_experiments(path: str | Path) -> tuple[Experiment, ...]:
+def read_experiments(path: str | Path) -> Runs:
     """Read a problem file and the data files it names, but do not run the Python file that it names.
 
     Parameters
@@ -89,7 +117,7 @@ def read_experiments(path: str | Path) -> tuple[Experiment, ...]:
 
     Returns
     -------
-    tuple of Experiment
+    Runs
         With data and horizon, but without observation functions; empty if the whole problem is built in Python.
 
     Raises
@@ -101,7 +129,7 @@ def read_experiments(path: str | Path) -> tuple[Experiment, ...]:
     contents = _validate(path, _parse(path))
     if contents.problem is not None:
         find_object(contents.problem, path.parent, f"{path}: problem")
-        return ()
+        return Runs((), ())
     if contents.model is not None and contents.model.name not in BUILT_IN:
         _check_model_name(f"{path}: model", contents.model)
         find_object(contents.model.name, path.parent, f"{path}: model")
@@ -142,6 +170,16 @@ def _name_as_table(given: Any) -> Any:
 def _table_as_list(given: Any) -> Any:
     """Return a list of tables; a single table becomes a list of one."""
     return [given] if isinstance(given, dict) else given
+
+
+def _first_as_none(given: Any) -> Any:
+    """Return None for ``"first"``, the time of the first row."""
+    return None if given == "first" else given
+
+
+def _repair_as_list(given: Any) -> Any:
+    """Return a list of one for a single repair."""
+    return [given] if isinstance(given, str) else given
 
 
 class PriorTable(_Table):
@@ -200,15 +238,37 @@ class StateTable(_Table):
 
 
 class LogTable(_Table):
-    """Columns of a CSV file over time."""
+    """Channels of a log over time."""
 
-    file: str = Field(description="CSV file, relative to the problem file")
-    time: str = Field(description="name of the column with the time")
+    file: str | None = Field(
+        default=None,
+        description="the log, relative to the problem file; a pattern such as 'logs/*.csv' or a folder stands for one "
+        "run a log; left out, a log given to switchfit fit --problem",
+    )
+    time: str | None = Field(default=None, description="name of the column with the time; left out, it is found")
+    topic: str | None = Field(default=None, description="topic of a ROS bag, or struct of a .mat file")
+    origin: Annotated[list[float], Field(min_length=2, max_length=3)] | None = Field(
+        default=None,
+        description="[latitude, longitude] or [latitude, longitude, altitude] of the origin of east, north and up; "
+        "left out, the first position",
+    )
+    range_error: float | None = Field(
+        default=None, gt=0, description="standard deviation of the distance to a satellite in m; HDOP times it is sigma"
+    )
     window: Annotated[list[float], Field(min_length=2, max_length=2)] | None = Field(
         default=None, description="[from, to]: only rows with the time column in between are used"
     )
-    time_offset: float = Field(default=0.0, description="subtracted from the time column")
-    time_scale: float = Field(default=1.0, gt=0, description="then multiplied: 1e-3 turns ms into s")
+    time_offset: Annotated[float | None, pydantic.BeforeValidator(_first_as_none)] = Field(
+        default=0.0, description="subtracted from the time column; 'first': the time of the first row"
+    )
+    time_scale: float | None = Field(
+        default=None, gt=0, description="then multiplied: 1e-3 turns ms into s; left out, 1"
+    )
+    repair: Annotated[list[str], pydantic.BeforeValidator(_repair_as_list)] = Field(
+        default_factory=list,
+        description="what may be changed: 'sort', 'drop-duplicates', 'drop-missing-times', 'drop-broken-lines', "
+        "'unwrap:CHANNEL'",
+    )
 
 
 class DataTable(LogTable):
@@ -456,7 +516,7 @@ def _shorten(given: Any) -> str:
 # --- from tables to a problem -----------------------------------------------------------------------------------------
 
 
-def _load_from_python(path: Path, contents: Contents) -> Problem:
+def _load_from_python(path: Path, contents: Contents) -> tuple[Problem, tuple[Issue, ...]]:
     given = contents.options.model_dump(include={"min_duration", "solver", "rtol", "atol"}, exclude_none=True)
     if given:
         raise InputError(f"{path}: with 'problem', {', '.join(given)} is set where the sf.Problem is built, not here.")
@@ -469,28 +529,83 @@ def _load_from_python(path: Path, contents: Contents) -> Problem:
             f"{path}: problem {reference!r} must be an sf.Problem or a function that returns one; "
             f"got {type(found).__name__}."
         )
-    return found
+    return found, ()
 
 
-def _build_from_tables(path: Path, contents: Contents) -> Problem:
+def _build_from_tables(path: Path, contents: Contents) -> tuple[Problem, tuple[Issue, ...]]:
     system = _build_system(path, contents.model or ModelTable(name=""))
-    experiments = _build_experiments(path, contents, system)
+    runs = _build_experiments(path, contents, system)
     parameters = {
         name: _build_at(f"{path}: parameters.{name}", _build_parameter, table)
         for name, table in contents.parameters.items()
     }
     options = contents.options.model_dump(include={"min_duration", "solver", "rtol", "atol"}, exclude_none=True)
-    return _build_at(f"{path}", Problem, system, experiments, parameters, **options)
+    return _build_at(f"{path}", Problem, system, runs.experiments, parameters, **options), runs.issues
 
 
-def _build_experiments(path: Path, contents: Contents, system: HybridSystem | None) -> tuple[Experiment, ...]:
-    """Return the experiments; without a system their observations are left out."""
-    experiments = []
-    for k, table in enumerate(contents.experiments, start=1):
+def _build_experiments(path: Path, contents: Contents, system: HybridSystem | None) -> Runs:
+    """Return the experiments, one for each log that a pattern stands for; without a system they observe nothing."""
+    experiments: list[Experiment] = []
+    issues: dict[str, Issue] = {}
+    for k, given in enumerate(contents.experiments, start=1):
         where = f"{path}: experiments[{k}]"
-        known = frozenset(contents.parameters) | frozenset(table.parameter_map)
-        experiments.append(_build_at(where, _build_experiment, path.parent, table, system, where, known))
-    return tuple(experiments)
+        known = frozenset(contents.parameters) | frozenset(given.parameter_map)
+        tables = _build_at(where, _expand_patterns, path.parent, given)
+        refused: list[ValueError] = []
+        for table in tables:
+            try:
+                logs = _open_logs(path.parent, table, where, known)
+                issues |= {str(issue): issue for log in logs for issue in log.issues}
+                arguments = (path.parent, table, logs, system, where, known)
+                experiments.append(_build_at(where, _build_experiment, *arguments))
+            except ValueError as error:
+                refused.append(error)
+        if len(refused) == len(tables):
+            raise refused[0]
+        issues |= {str(error): Issue("log: refused", (str(error),)) for error in refused}
+    return Runs(tuple(experiments), tuple(issues.values()))
+
+
+def _expand_patterns(folder: Path, table: ExperimentTable) -> list[ExperimentTable]:
+    """Return an experiment for each log that patterns and folders in it stand for; logs of one name go together."""
+    given = {item.file for item in _list_log_tables(table) if item.file is not None}
+    found = {pattern: find_logs(folder, pattern) for pattern in sorted(given)}
+    named = {pattern: dict(zip(name_logs(logs), logs, strict=True)) for pattern, logs in found.items() if logs}
+    if not named:
+        return [table]
+    names = set.union(*(set(logs) for logs in named.values()))
+    for pattern, logs in named.items():
+        if missing := sorted(names - set(logs)):
+            raise ValueError(f"{folder / pattern} has no log {missing[0]!r}, which another pattern of the run has.")
+    prefix = "" if table.name is None else f"{table.name} "
+    return [
+        _replace_files(table, {pattern: logs[name] for pattern, logs in named.items()}, f"{prefix}{name}")
+        for name in sorted(names)
+    ]
+
+
+def _list_log_tables(table: ExperimentTable) -> list[LogTable]:
+    return [*table.data, *([] if table.inputs is None else [table.inputs])]
+
+
+def _replace_files(table: ExperimentTable, files: Mapping[str | None, str], name: str | None) -> ExperimentTable:
+    """Return an experiment with other files in place of some."""
+
+    def replace(item: Any) -> Any:
+        return item.model_copy(update={"file": files.get(item.file, item.file)})
+
+    inputs = None if table.inputs is None else replace(table.inputs)
+    return table.model_copy(update={"data": [replace(item) for item in table.data], "inputs": inputs, "name": name})
+
+
+def _replace_log(path: Path, contents: Contents, log: str) -> Contents:
+    """Return the contents with a log in place of the files that are left out; if none is, of the data's first file."""
+    if len(contents.experiments) != 1:
+        raise InputError(f"{path} must have one [[experiments]] to be fitted to logs; got {len(contents.experiments)}.")
+    (table,) = contents.experiments
+    left_out = any(item.file is None for item in _list_log_tables(table))
+    files = {None if left_out else table.data[0].file: log}
+    return contents.model_copy(update={"experiments": [_replace_files(table, files, table.name)]})
 
 
 def _build_at(where: str, build: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
@@ -560,12 +675,17 @@ def _build_prior(table: PriorTable) -> Prior:
 
 
 def _build_experiment(
-    folder: Path, table: ExperimentTable, system: HybridSystem | None, where: str, parameters: frozenset[str]
+    folder: Path,
+    table: ExperimentTable,
+    logs: Sequence[Log],
+    system: HybridSystem | None,
+    where: str,
+    parameters: frozenset[str],
 ) -> Experiment:
     places = [f"{where}.data[{k}]" for k in range(1, len(table.data) + 1)]
     data = [
-        _build_at(place, _build_data, folder, item, system, place, parameters)
-        for place, item in zip(places, table.data, strict=True)
+        _build_at(place, _build_data, folder, item, log, system, place, parameters, table.time_unit)
+        for place, item, log in zip(places, table.data, logs, strict=False)  # that of the inputs comes after them
     ]
     times = table.transition_times
     return Experiment(
@@ -574,7 +694,9 @@ def _build_experiment(
         transition_times=None if times is None else tuple(map(_build_parameter, times)),  # type: ignore[arg-type]
         t0=table.t0,  # type: ignore[arg-type]  # None: from the data
         tf=None if table.tf is None else _build_parameter(table.tf),  # type: ignore[arg-type]
-        inputs=None if table.inputs is None else _build_at(f"{where}.inputs", _build_input, folder, table.inputs),
+        inputs=None
+        if table.inputs is None
+        else _build_at(f"{where}.inputs", _build_input, table.inputs, logs[-1], table.time_unit),
         initial_state=_build_initial_state(table),
         parameter_map=table.parameter_map,
         name=table.name,
@@ -592,7 +714,13 @@ def _build_initial_state(table: ExperimentTable) -> list[Parameter] | list[float
 
 
 def _build_data(
-    folder: Path, table: DataTable, system: HybridSystem | None, where: str, parameters: frozenset[str]
+    folder: Path,
+    table: DataTable,
+    log: Log,
+    system: HybridSystem | None,
+    where: str,
+    parameters: frozenset[str],
+    time_unit: str,
 ) -> Measurements | ReferenceSignal:
     observe = _build_observe(folder, table, system, where)
     names = tuple(table.observe) if isinstance(table.observe, list) else tuple(table.columns)
@@ -602,15 +730,15 @@ def _build_data(
         for key, default in (("loss", "linear"), ("delay", 0.0)):
             if getattr(table, key) != default:
                 raise ValueError(f"{key} belongs to kind = 'measurements', not to a reference.")
-        times, values = _read_log(folder, table, table.columns)
+        times, values, units = _cut_log(log, table, table.columns, time_unit, "ReferenceSignal")
         return ReferenceSignal.from_samples(
-            times, values, observe=observe, lowpass_hz=table.lowpass_hz, weights=table.weights, names=names
+            times, values, observe=observe, lowpass_hz=table.lowpass_hz, weights=table.weights, names=names, units=units
         )
     for key in ("lowpass_hz", "weights"):
         if getattr(table, key) is not None:
             raise ValueError(f"{key} belongs to kind = 'reference'; measurements have sigma.")
     sigma_columns = _find_sigma_columns(table, parameters)
-    times, values = _read_log(folder, table, [*table.columns, *sigma_columns])
+    times, values, units = _cut_log(log, table, [*table.columns, *sigma_columns], time_unit, "Measurements")
     q = len(table.columns)
     sigma = values[:, q:] if sigma_columns else table.sigma
     return Measurements(
@@ -622,6 +750,7 @@ def _build_data(
         loss=table.loss,
         loss_scale=table.loss_scale,
         delay=table.delay,
+        units=units[:q],
     )
 
 
@@ -639,31 +768,98 @@ def _find_sigma_columns(table: DataTable, parameters: frozenset[str]) -> list[st
     return named
 
 
-def _build_input(folder: Path, table: InputTable) -> Input:
+def _build_input(table: InputTable, log: Log, time_unit: str) -> Input:
     if isinstance(table.columns, dict):
-        times, values = _read_log(folder, table, list(table.columns.values()))
-        return Input(times, dict(zip(table.columns, values.T, strict=True)), kind=table.kind)
-    times, values = _read_log(folder, table, table.columns)
-    return Input(times, values[:, 0] if len(table.columns) == 1 else values, kind=table.kind)
+        times, values, units = _cut_log(log, table, list(table.columns.values()), time_unit, "Input")
+        named = dict(zip(table.columns, values.T, strict=True))
+        ordered = tuple(unit for _, unit in sorted(zip(table.columns, units, strict=True)))
+        return Input(times, named, kind=table.kind, units=ordered)
+    times, values, units = _cut_log(log, table, table.columns, time_unit, "Input")
+    return Input(times, values[:, 0] if len(table.columns) == 1 else values, kind=table.kind, units=units)
 
 
-def _read_log(folder: Path, table: LogTable, columns: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-    """Return times (K,) and the values of some columns (K, q) in the rows inside the window."""
-    path = folder / table.file
-    rows = read_columns(path, [table.time, *columns])
-    missing = np.isnan(rows[:, 0])
-    if missing.any():
-        raise InputError(f"{path}, column {table.time!r}: the time of sample {missing.argmax() + 1} is missing.")
+def _cut_log(
+    log: Log, table: LogTable, columns: Sequence[str], time_unit: str, what: str
+) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
+    """Return times (K,) and the values of some columns (K, q) in the rows inside the window, and their units.
+
+    `what` is made from them, for messages.
+    """
+    times, inside = log.times, np.ones(len(log), dtype=bool)
     if table.window is not None:
         first, last = table.window
-        inside = (rows[:, 0] >= first) & (rows[:, 0] <= last)
+        inside = (times >= first) & (times <= last)
         if not inside.any():
             raise InputError(
-                f"{path}: no time in column {table.time!r} lies in the window [{first}, {last}]; they reach from "
-                f"{rows[:, 0].min()} to {rows[:, 0].max()}."
+                f"{log.source}: no time in column {log.time_name!r} lies in the window [{first}, {last}]; they reach "
+                f"from {times.min()} to {times.max()}."
             )
-        rows = rows[inside]
-    return (rows[:, 0] - table.time_offset) * table.time_scale, rows[:, 1:]
+    times = times[inside]
+    _check_order(log, times, log.rows[inside], what)
+    offset = times[0] if table.time_offset is None else table.time_offset
+    values = np.stack([log[name][inside] for name in columns], axis=1)
+    units = tuple(log.units[log.find_channel(name)] for name in columns)
+    return (times - offset) * _find_time_scale(log, table, time_unit), values, units
+
+
+def _open_logs(folder: Path, table: ExperimentTable, where: str, parameters: frozenset[str]) -> list[Log]:
+    """Return the logs of data and inputs, in this order; the times of those with dates begin together."""
+    logs = [
+        _build_at(f"{where}.data[{k}]", _open_data, folder, item, parameters)
+        for k, item in enumerate(table.data, start=1)
+    ]
+    if table.inputs is not None:
+        logs.append(_build_at(f"{where}.inputs", _open_input, folder, table.inputs))
+    return align_starts(logs)
+
+
+def _open_data(folder: Path, table: DataTable, parameters: frozenset[str]) -> Log:
+    return _open_log(folder, table, [*table.columns, *_find_sigma_columns(table, parameters)])
+
+
+def _open_input(folder: Path, table: InputTable) -> Log:
+    return _open_log(folder, table, list(table.columns.values() if isinstance(table.columns, dict) else table.columns))
+
+
+def _open_log(folder: Path, table: LogTable, columns: Sequence[str]) -> Log:
+    if table.file is None:
+        raise ValueError("the key 'file' is missing: name the log, or give logs: switchfit fit LOG ... --problem FILE.")
+    return read_source(
+        folder / table.file,
+        columns=list(dict.fromkeys(columns)),
+        time=table.time,
+        topic=table.topic,
+        origin=table.origin,
+        range_error=table.range_error,
+        repair=table.repair,
+        keep_epoch=True,
+    )
+
+
+def _check_order(log: Log, times: FloatArray, rows: NDArray[np.intp], what: str) -> None:
+    """Raise for times that do not increase, with the line; a reference may have a time twice."""
+    steps = np.diff(times)
+    wrong = (steps < 0) if what == "ReferenceSignal" else (steps <= 0)
+    if wrong.any():
+        k = int(wrong.argmax()) + 1
+        repair = "sort" if steps[k - 1] < 0 else "drop-duplicates"
+        raise ValueError(
+            f"{what} times must increase strictly; in {log.source}, {log.place} {rows[k]}, {times[k]} follows "
+            f"{times[k - 1]}. repair = [{repair!r}] mends that, if the log is otherwise right."
+        )
+
+
+def _find_time_scale(log: Log, table: LogTable, time_unit: str) -> float:
+    """Return what times are multiplied by; raise if the log states another unit than the experiment."""
+    unit = normalize_time_unit(time_unit)
+    if table.time_scale is not None or log.time_unit in ("", unit) or unit not in SECONDS:
+        return 1.0 if table.time_scale is None else table.time_scale
+    scale = SECONDS[log.time_unit] / SECONDS[unit]
+    raise InputError(
+        f"{log.source}: the times are in {log.time_unit}, but time_unit of the experiment is {time_unit!r}. Set "
+        f"time_scale = {scale:.12g} to convert them, or time_unit = {log.time_unit!r}; time_scale = 1 leaves them as "
+        "they are."
+    )
 
 
 def _build_observe(

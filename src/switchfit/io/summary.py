@@ -85,13 +85,13 @@ def _describe_experiment(experiment: Experiment) -> list[str]:
             step = np.median(np.diff(item.times)) if len(item.times) > 1 else np.nan
             missing = item.values.size - item.count
             lines.append(
-                f"{len(item.times)} samples of {_join_channel_names(item.names, item.values.shape[1])}, "
+                f"{len(item.times)} samples of {_join_channel_names(item.names, item.units, item.values.shape[1])}, "
                 f"{item.times[0]:.6g} to {item.times[-1]:.6g}{unit}, typically {step:.4g}{unit} apart, "
                 f"{missing} values missing{_describe_sensor(item, unit)}"
             )
         elif isinstance(item, ReferenceSignal):
             knots = item.signal.knots
-            names = _join_channel_names(item.names, item.signal.channels)
+            names = _join_channel_names(item.names, item.units, item.signal.channels)
             lines.append(f"reference signal of {names}, {knots[0]:.6g} to {knots[-1]:.6g}{unit}, {len(knots)} knots")
         else:
             lines.append(type(item).__name__)
@@ -110,5 +110,10 @@ def _describe_sensor(item: Measurements, unit: str) -> str:
     return "".join(f", {text}" for text in said if text)
 
 
-def _join_channel_names(names: tuple[str, ...] | None, channels: int) -> str:
-    return ", ".join(names) if names else f"{channels} channels"
+def _join_channel_names(names: tuple[str, ...] | None, units: tuple[str, ...] | None, channels: int) -> str:
+    """Return names with their units, or the number of channels where they have no names."""
+    if names is None:
+        return f"{channels} channels"
+    return ", ".join(
+        f"{name} ({unit})" if unit else name for name, unit in zip(names, units or ("",) * channels, strict=True)
+    )

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.problem.losses import LOSSES
+from switchfit.problem.tables import find_names, find_units
 from switchfit.problem.validation import (
     as_array,
     as_callable,
@@ -24,6 +25,8 @@ from switchfit.problem.validation import (
     as_names,
     as_number,
     as_positive,
+    as_sequence,
+    as_text,
     shorten,
 )
 
@@ -88,9 +91,13 @@ class Input:
         to start by t0, as its last value is held.
     values : (K,) or (K, q) array_like, or mapping of str to (K,) array_like
         The modes get a scalar u, or a ``(q,)`` array. With samples by name they get a dict of scalars, ``u["left"]``;
-        likewise with a DataFrame whose columns all have names (strings).
+        likewise with a table whose columns all have names (strings): a DataFrame of pandas or polars, a Dataset of
+        xarray, a `Log`.
     kind : {"hold", "linear", "cubic"}
         Interpolation between samples: hold the last value, straight lines, or a cubic spline.
+    units : sequence of str, optional
+        One for each entry of u, in the order of `names` if they have names. If left out, those of the table, from its
+        ``attrs["units"]``.
 
     Raises
     ------
@@ -122,15 +129,18 @@ class Input:
     times: Any
     values: Any
     kind: Literal["hold", "linear", "cubic"] = "hold"
+    units: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         kind = as_choice(self.kind, "Input kind", ("hold", "linear", "cubic"))
         at_least = {"hold": 1, "linear": 2, "cubic": 4}[kind]
+        units = self.units
         values: Any
         named = as_named_columns(self.values, "Input values", "(K,) samples")
         if named is None:
             times, values = _check_samples(self.times, self.values, "Input", at_least=at_least)
             _require_finite(values, "Input values")
+            units = find_units(self.values) if units is None else units
         else:
             # Sorted, so that experiments whose inputs are named in different orders share one program.
             values = {}
@@ -138,9 +148,13 @@ class Input:
                 what = f"Input {shorten(name)}"
                 times, values[name] = _check_samples(self.times, named[name], what, at_least=at_least, columns=False)
                 _require_finite(values[name], f"{what} values")
+            found = find_units(self.values)
+            if units is None and found is not None:
+                units = tuple(unit for _, unit in sorted(zip(named, found, strict=True)))
         object.__setattr__(self, "kind", kind)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values)
+        object.__setattr__(self, "units", _check_units(units, int(np.prod(self.shape))))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -344,6 +358,8 @@ class ReferenceSignal:
         Samples from which the signal was made.
     lowpass_hz : float, optional
         Cut-off with which it was filtered.
+    units : sequence of str, optional
+        One for each channel.
 
     See Also
     --------
@@ -366,6 +382,7 @@ class ReferenceSignal:
     names: tuple[str, ...] | None = None
     samples: tuple[FloatArray, FloatArray] | None = None
     lowpass_hz: float | None = None
+    units: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.signal, PiecewisePolynomial):
@@ -376,6 +393,7 @@ class ReferenceSignal:
         _check_observe(self.observe)
         object.__setattr__(self, "weights", _build_weight_matrix(self.weights, self.signal.channels))
         object.__setattr__(self, "names", _check_channel_names(self.names, self.signal.channels))
+        object.__setattr__(self, "units", _check_units(self.units, self.signal.channels))
 
     @classmethod
     def from_samples(
@@ -387,6 +405,7 @@ class ReferenceSignal:
         lowpass_hz: float | None = None,
         weights: ArrayLike | None = None,
         names: Sequence[str] | None = None,
+        units: Sequence[str] | None = None,
     ) -> ReferenceSignal:
         """Interpolate samples by cubic splines and, optionally, low-pass filter them without phase shift.
 
@@ -396,14 +415,15 @@ class ReferenceSignal:
             Increasing sample times in the experiment's time unit, four or more. The spline is broken at a time that is
             given twice, as at the transitions of a simulated trajectory; each part then needs four samples.
         values : (K,) or (K, q) array_like
-            NaN marks a missing value, as does the mask of a masked array; it is bridged by the interpolation.
+            NaN marks a missing value, as does the mask of a masked array; it is bridged by the interpolation. Tables
+            of pandas, polars and xarray, and a `Log`, bring their names and units.
         observe : callable ``h(t, x, p) -> (q,)``, optional
         lowpass_hz : float, optional
             Cut-off, in cycles per time unit of the experiment (Hz only if that is s), of a second-order Butterworth
             filter. It runs forward and backward over the interpolated signal, so that no phase shift remains (the gain
             at the cut-off is then 1/2).
         weights : (q,) or (q, q) array_like, optional
-        names : sequence of str, optional
+        names, units : sequence of str, optional
 
         Raises
         ------
@@ -426,6 +446,7 @@ class ReferenceSignal:
         >>> reference.signal([1.0]).round(6)
         array([[0.841471]])
         """
+        names, units = _find_labels(values, names, units)
         times, values = _check_samples(times, values, "ReferenceSignal", at_least=4, breaks=True, missing=True)
         table = values.reshape(len(times), -1)
         if np.isinf(table).any():
@@ -436,7 +457,7 @@ class ReferenceSignal:
         if lowpass_hz is not None:
             lowpass_hz = as_positive(lowpass_hz, "lowpass_hz")
             signal = _filter_lowpass(signal, lowpass_hz)
-        return cls(signal, observe, weights, names, (times, table), lowpass_hz)  # type: ignore[arg-type]  # made a tuple there
+        return cls(signal, observe, weights, names, (times, table), lowpass_hz, units)  # type: ignore[arg-type]  # made tuples there
 
 
 @dataclass(frozen=True, eq=False)
@@ -452,7 +473,8 @@ class Measurements:
     times : (K,) array_like
         Increasing sample times in the experiment's time unit; they may be irregular.
     values : (K,) or (K, q) array_like
-        Samples; NaN marks a missing one, as does the mask of a masked array.
+        Samples; NaN marks a missing one, as does the mask of a masked array. Tables of pandas, polars and xarray, and
+        a `Log`, bring their names and units.
     observe : callable ``h(t, x, p) -> (q,)``, optional
         If left out, the whole state is measured. At a transition with a reset map, the sample is of the state
         just before the jump.
@@ -461,7 +483,7 @@ class Measurements:
         parameter, whose value is sigma: for all channels, or in a list of q entries for one of them. If left out, sigma
         is unknown: all samples have weight 1, and the covariance is scaled by the residual variance.
     names : sequence of str, optional
-        One for each channel.
+        One for each channel; if left out, those of the table.
     loss : {"linear", "soft_l1", "huber", "cauchy"}, optional
         As in `scipy.optimize.least_squares`; all but the first reduce the weight of outliers.
     loss_scale : float, optional
@@ -470,6 +492,8 @@ class Measurements:
         Delay of the sensor, in the experiment's time unit: a sample with time stamp t_k is of the state at
         ``t_k - delay``, and `observe` is called with that time. A string is the name of a parameter, whose value is the
         delay. Give channels with different delays as several `Measurements`.
+    units : sequence of str, optional
+        One for each channel; if left out, those of the table, from its ``attrs["units"]``.
 
     Raises
     ------
@@ -510,8 +534,10 @@ class Measurements:
     loss: Literal["linear", "soft_l1", "huber", "cauchy"] = "linear"
     loss_scale: float = 1.0
     delay: float | str = 0.0
+    units: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
+        names, units = _find_labels(self.values, self.names, self.units)
         times, values = _check_samples(self.times, self.values, "Measurements", at_least=1, missing=True)
         values = values.reshape(len(times), -1)
         if np.isinf(values).any():
@@ -521,8 +547,9 @@ class Measurements:
         _check_observe(self.observe)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values)
-        object.__setattr__(self, "sigma", _check_sigma(self.sigma, values.shape))
-        object.__setattr__(self, "names", _check_channel_names(self.names, values.shape[1]))
+        object.__setattr__(self, "sigma", _check_sigma(self.sigma, values))
+        object.__setattr__(self, "names", _check_channel_names(names, values.shape[1]))
+        object.__setattr__(self, "units", _check_units(units, values.shape[1]))
         self._check_loss()
         if isinstance(self.delay, str):
             delay: float | str = as_name(self.delay, "delay")
@@ -650,7 +677,9 @@ def _require_finite(values: FloatArray, what: str) -> None:
         raise ValueError(f"{what} must be finite; got {values[tuple(where)]} at index {where}.")
 
 
-def _check_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | tuple[str | float, ...] | None:
+def _check_sigma(sigma: Any, values: FloatArray) -> FloatArray | tuple[str | float, ...] | None:
+    """Return sigma of values (K, q), checked; that of a missing value may be missing too, and becomes 1."""
+    shape = values.shape
     if sigma is None:
         return None
     if isinstance(sigma, str):
@@ -663,6 +692,11 @@ def _check_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | tuple[str |
             f"sigma must be a number, of shape ({shape[1]},) (one per channel) or {shape} (one per sample); "
             f"got shape {sigma.shape}."
         )
+    if sigma.shape == shape:
+        sigma = np.where(np.isnan(sigma) & np.isnan(values), 1.0, sigma)
+        if np.isnan(sigma).any():
+            where = np.argwhere(np.isnan(sigma))[0].tolist()
+            raise ValueError(f"sigma must be positive and finite; it is NaN at index {where}, and the value is not.")
     if not np.all(sigma > 0) or not np.all(np.isfinite(sigma)):
         raise ValueError(f"sigma must be positive and finite; got a smallest value of {sigma.min()}.")
     _check_inverse_square(sigma)
@@ -701,6 +735,23 @@ def _check_channel_names(names: Sequence[str] | None, channels: int) -> tuple[st
     checked = as_names(given, "names", "a sequence of strings, one for each channel")
     if len(checked) != channels:
         raise ValueError(f"names must have one entry for each of the {channels} channels; got {shorten(checked)}.")
+    return checked
+
+
+def _find_labels(
+    values: Any, names: Sequence[str] | None, units: Sequence[str] | None
+) -> tuple[Sequence[str] | None, Sequence[str] | None]:
+    """Return names and units, those of the table of values where they are left out."""
+    return find_names(values) if names is None else names, find_units(values) if units is None else units
+
+
+def _check_units(units: Sequence[str] | None, channels: int) -> tuple[str, ...] | None:
+    if units is None:
+        return None
+    given = as_sequence((units,) if isinstance(units, str) else units, "units", "a sequence of strings")
+    checked = tuple(as_text(unit, "each of units") for unit in given)
+    if len(checked) != channels:
+        raise ValueError(f"units must have one entry for each of the {channels} channels; got {shorten(checked)}.")
     return checked
 
 

@@ -6,8 +6,8 @@ required form and the value that was given (shortened, `shorten`).
 
 - `TypeError` for a wrong type, `ValueError` for a wrong value. Text in place of a number is a wrong value, as it is for
   ``float("x")``.
-- Numbers are integers and floating-point numbers of Python, NumPy, JAX and pandas. Truth values, complex numbers,
-  text, dates and `None` are not numbers here, although NumPy would convert most of them.
+- Numbers are integers and floating-point numbers of Python, NumPy, JAX, pandas, polars and xarray. Truth values,
+  complex numbers, text, dates and `None` are not numbers here, although NumPy would convert most of them.
 - Numbers of less than double precision are refused if their values as doubles show that they have lost digits
   (`refuse_single_precision`).
 - Masked entries are missing samples, NaN, where missing samples are allowed; elsewhere they are refused.
@@ -36,6 +36,8 @@ from typing import Any, NamedTuple, NoReturn, TypeVar
 import jax
 import numpy as np
 from numpy.typing import NDArray
+
+from switchfit.problem.tables import is_of_library, list_columns
 
 FloatArray = NDArray[np.float64]
 T = TypeVar("T")
@@ -242,8 +244,9 @@ def _read_exactly(value: Any, argument: _Argument, depth: int) -> Any:
         return value
     if depth > MOST_DIMENSIONS:
         argument.refuse(argument.given, ValueError, f", which is nested more than {MOST_DIMENSIONS} deep")
-    if _is_pandas(value) and hasattr(value, "columns"):  # a DataFrame: its columns may differ in type
-        columns = [_read_exactly(value.iloc[:, k], argument, depth + 1) for k in range(len(value.columns))]
+    table = list_columns(value)
+    if table is not None:  # its columns may differ in type
+        columns = [_read_exactly(column, argument, depth + 1) for _, column in table]
         return np.stack(columns, axis=1) if columns else np.zeros((len(value), 0))
     if hasattr(value, "__array__") and not isinstance(value, type):
         return _read_array_exactly(value, argument, depth)
@@ -271,7 +274,9 @@ def _read_exactly(value: Any, argument: _Argument, depth: int) -> Any:
 def _read_array_exactly(value: Any, argument: _Argument, depth: int) -> Any:
     """Return an array, or another object with a dtype, as an array of integers or doubles."""
     try:
-        array = _read_pandas(value) if _is_pandas(value) else np.asarray(np.ma.getdata(np.asanyarray(value)))
+        array = (
+            _read_pandas(value) if is_of_library(value, "pandas") else np.asarray(np.ma.getdata(np.asanyarray(value)))
+        )
     except Exception as error:
         argument.refuse(value, why=f", which NumPy cannot read ({type(error).__name__})")
     if array.dtype.kind in "Mm":
@@ -292,10 +297,6 @@ def _read_array_exactly(value: Any, argument: _Argument, depth: int) -> Any:
             )
         array = np.where(mask, np.nan, array)
     return array
-
-
-def _is_pandas(value: Any) -> bool:
-    return type(value).__module__.partition(".")[0] == "pandas"
 
 
 def _read_pandas(value: Any) -> NDArray[Any]:
@@ -434,23 +435,25 @@ def as_names(value: Any, what: str, form: str) -> tuple[str, ...]:
 
 
 def as_named_columns(value: Any, what: str, form: str) -> dict[str, Any] | None:
-    """Return the entries of a mapping, or of a DataFrame whose columns are all named by strings; else None.
+    """Return the entries of a mapping, or of a table whose columns are all named by strings; else None.
 
     Raises
     ------
     TypeError
         If a key of a mapping is not a string.
     ValueError
-        If a mapping is empty, a key is empty, or two columns of a DataFrame share a name.
+        If a mapping is empty, a key is empty, or two columns of a table share a name.
     """
+    table = list_columns(value)
+    if table is not None:
+        names = [name for name, _ in table]
+        if names and all(isinstance(name, str) for name in names):
+            return dict(zip(as_names(names, f"columns of {what}", "strings"), (c for _, c in table), strict=True))
+        return None
     if isinstance(value, Mapping):
         if not value:
             raise ValueError(f"{what} must have a name for each entry of u, with its {form}; got an empty dict.")
         return {as_name(name, f"names in {what}", "strings"): entry for name, entry in value.items()}
-    if _is_pandas(value) and hasattr(value, "columns"):
-        names = list(value.columns)
-        if names and all(isinstance(name, str) for name in names):
-            return {name: value.iloc[:, k] for k, name in enumerate(as_names(names, f"columns of {what}", "strings"))}
     return None
 
 

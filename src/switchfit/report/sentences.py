@@ -9,6 +9,7 @@ import numpy as np
 from switchfit.fit.termination import Kink, Termination
 from switchfit.optimize import Status
 from switchfit.problem.constraints import Constraint
+from switchfit.report.logs import LOG_ISSUES
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text
 from switchfit.uncertainty.identification import Combination
@@ -306,6 +307,7 @@ def _add_delay_hint(sentence: Callable[[Issue], str]) -> Callable[[Issue], str]:
 
 
 _ISSUES: dict[str, Callable[[Issue], str]] = {
+    **LOG_ISSUES,
     # Before the numbers are believed
     "mode collapsed": lambda issue: (
         f"{_name_held_mode(issue)} has collapsed to nothing: the data want no such mode there. Leave it out of "

@@ -1,0 +1,1 @@
+"""Logs: files of robots and test rigs, read into times and channels with units; each format has a module of its own."""

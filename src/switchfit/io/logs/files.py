@@ -1,0 +1,74 @@
+"""Which logs a pattern or a folder stands for, and what to call them."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from switchfit.io.logs.reader import BAGS
+from switchfit.runtime.errors import InputError
+
+ENDINGS = (".csv", ".dat", ".gpx", ".log", ".mat", ".nma", ".nmea", ".parquet", ".pq", ".tsv", ".txt", *BAGS)
+"""Endings of the files in a folder that are taken for logs, ``.gz`` after them left out."""
+
+
+def find_logs(folder: Path, given: str) -> list[str] | None:
+    """Return the logs that a pattern or a folder stands for, sorted; None for the name of one log.
+
+    Parameters
+    ----------
+    folder : Path
+        Where names begin.
+    given : str
+        Such as ``"drive.csv"``, ``"logs/*.csv"`` or ``"logs"``. The folder of a bag of ROS 2 is one log.
+
+    Raises
+    ------
+    InputError
+        If nothing matches the pattern, or there is no log in the folder.
+    """
+    path = folder / given
+    try:
+        is_folder, exists = path.is_dir() and given.strip() != "", path.exists()
+    except (OSError, ValueError):  # no name that a file can have
+        return None
+    if is_folder and not _is_log(path):
+        try:
+            names = os.listdir(path)
+        except OSError as error:
+            raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+        inside = sorted(name for name in names if not name.startswith(".") and _is_log(path / name))
+        if not inside:
+            raise InputError(f"{path} has no logs: no file in it ends in {', '.join(ENDINGS)}.")
+        return [os.path.join(given, name) for name in inside]
+    if exists or not glob.has_magic(given):
+        return None
+    found = sorted(glob.glob(given, root_dir=folder, recursive=True))
+    if not found:
+        raise InputError(f"No file matches {path}; check the pattern and the folder.")
+    return found
+
+
+def _is_log(path: Path) -> bool:
+    """Return whether a path is a log by its name, or the folder of a bag."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    name = path.name.lower().removesuffix(".gz")
+    return name.endswith(ENDINGS)
+
+
+def name_logs(paths: Sequence[str]) -> list[str]:
+    """Return a name for each log: that of its file without the ending, or as much of its path as tells it apart."""
+    stems = [Path(path).name.removesuffix(".gz").rpartition(".")[0] or Path(path).name for path in paths]
+    if len(set(stems)) == len(stems):
+        return stems
+    common = os.path.commonpath([os.path.dirname(path) for path in paths])
+    whole = [os.path.relpath(path, common) if common else path for path in paths]
+    return [os.path.splitext(path.removesuffix(".gz"))[0] for path in whole] if _tell_apart(whole) else whole
+
+
+def _tell_apart(paths: Sequence[str]) -> bool:
+    stems = [os.path.splitext(path.removesuffix(".gz"))[0] for path in paths]
+    return len(set(stems)) == len(stems)

@@ -1,0 +1,229 @@
+"""Tracks of GPS receivers: GPX files, and NMEA 0183 sentences (GGA, RMC, GNS and GST)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from datetime import UTC, date, datetime, time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from switchfit.io.logs.libraries import import_library
+from switchfit.io.logs.log import Event, FloatArray, Log
+from switchfit.io.logs.text import decode
+from switchfit.io.logs.times import subtract_first
+from switchfit.runtime.errors import InputError
+from switchfit.runtime.issue import Issue
+
+UNITS = {
+    "latitude": "deg", "longitude": "deg", "altitude": "m", "speed": "m/s", "course": "deg", "hdop": "", "quality": "",
+    "satellites": "", "sigma_east": "m", "sigma_north": "m", "sigma_up": "m",
+}  # fmt: skip
+KNOT = 1852 / 3600
+"""Metres per second."""
+DAY = 86_400_000_000
+"""Microseconds."""
+
+
+def read_gpx(path: Path) -> Log:
+    """Read the points of all tracks of a GPX file; named waypoints with a time are events.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or has no points with a time.
+    """
+    text = decode(path)
+    gpxpy = import_library("gpxpy", "gps", f"{path}: GPX")
+    try:
+        gpx = gpxpy.parse(text)
+    except Exception as error:  # of the parser of XML, of numbers, of dates
+        raise InputError(f"{path} is no GPX file: {error}.") from error
+    points = [point for track in gpx.tracks for segment in track.segments for point in segment.points]
+    if not any(point.time for point in points):
+        raise InputError(f"{path} has no track with times: of {len(points)} points, none has a time.")
+    times, offset = _subtract_start([None if p.time is None else _count_micros(p.time) for p in points])
+    fields = {
+        "latitude": "latitude", "longitude": "longitude", "altitude": "elevation", "speed": "speed", "course": "course",
+        "hdop": "horizontal_dilution",
+    }  # fmt: skip
+    columns = {name: _make_column([getattr(point, field) for point in points]) for name, field in fields.items()}
+    values = {name: column for name, column in columns.items() if np.isfinite(column).any()}
+    events = [
+        Event(_count_micros(point.time) * 1e-6 - offset, "waypoint", point.name)
+        for point in gpx.waypoints
+        if point.time and point.name
+    ]
+    return _build_log(path, times, values, offset, np.arange(1, len(points) + 1), "point", events)
+
+
+def read_nmea(path: Path) -> Log:
+    """Read the fixes of a file of NMEA 0183 sentences, one for each time that they state.
+
+    Latitude, longitude and altitude are missing where the receiver says that it has no fix. Sentences with a wrong
+    checksum are left out, as the standard has it, and reported.
+
+    Raises
+    ------
+    InputError
+        If there is no fix.
+    """
+    pynmea2 = import_library("pynmea2", "gps", f"{path}: NMEA 0183")
+    fixes: list[dict[str, Any]] = []
+    damaged: list[int] = []
+    day: date | None = None
+    for line, sentence in _parse_sentences(pynmea2, decode(path), damaged):
+        clock = getattr(sentence, "timestamp", None)
+        if sentence.sentence_type not in _READERS or not hasattr(clock, "hour"):
+            continue
+        if not fixes or fixes[-1]["clock"] != clock:
+            fixes.append({"clock": clock, "line": line, "day": None})
+        if sentence.sentence_type == "RMC" and isinstance(sentence.datestamp, date):
+            day = fixes[-1]["day"] = sentence.datestamp
+        for name, value in _READERS[sentence.sentence_type](sentence).items():
+            if value is not None:
+                fixes[-1].setdefault(name, value)
+    if not any("latitude" in fix for fix in fixes):
+        raise InputError(
+            f"{path} has no GGA, RMC or GNS sentence with a position and a time; there is nothing to read."
+        )
+    times, offset = _subtract_start(_count_fixes(fixes)) if day else (np.array(_count_fixes(fixes)) * 1e-6, 0.0)
+    values = {name: np.array([fix.get(name, np.nan) for fix in fixes], dtype=np.float64) for name in UNITS}
+    values = {name: column for name, column in values.items() if np.isfinite(column).any()}
+    rows = np.array([fix["line"] for fix in fixes])
+    figures = {"line": float(damaged[0]), "count": float(len(damaged))} if damaged else {}
+    issues = [Issue("log: damaged sentences", (str(path), "line"), figures)] if damaged else []
+    return replace(_build_log(path, times, values, offset, rows, "line", []), issues=tuple(issues))
+
+
+def _parse_sentences(pynmea2: Any, text: str, damaged: list[int]) -> Iterator[tuple[int, Any]]:
+    """Yield the number of each line and its sentence; lines that are none, or damaged, are listed."""
+    for line, raw in enumerate(re.split(r"\r\n|\n|\r", text), start=1):
+        start = raw.find("$")  # loggers put times of their own before
+        if start < 0:
+            continue
+        try:
+            yield line, pynmea2.parse(raw[start:].strip(), check=True)
+        except pynmea2.SentenceTypeError:  # a sentence that the library does not know
+            continue
+        except (pynmea2.ParseError, ValueError, TypeError):
+            damaged.append(line)
+
+
+def _read_gga(sentence: Any) -> dict[str, float | None]:
+    quality = _read_float(sentence.gps_qual)
+    altitude = _read_float(sentence.altitude) if quality else None
+    return {
+        **_read_position(sentence, bool(quality)),
+        "altitude": altitude,
+        "quality": quality,
+        "satellites": _read_float(sentence.num_sats),
+        "hdop": _read_float(sentence.horizontal_dil),
+    }
+
+
+def _read_gns(sentence: Any) -> dict[str, float | None]:
+    fixed = any(mode not in "N" for mode in sentence.mode_indicator or "")
+    return {
+        **_read_position(sentence, fixed),
+        "altitude": _read_float(sentence.altitude) if fixed else None,
+        "satellites": _read_float(sentence.num_sats),
+        "hdop": _read_float(sentence.hdop),
+    }
+
+
+def _read_rmc(sentence: Any) -> dict[str, float | None]:
+    fixed = sentence.status == "A"
+    speed = _read_float(sentence.spd_over_grnd)
+    return {
+        **_read_position(sentence, fixed),
+        "speed": None if speed is None else speed * KNOT,
+        "course": _read_float(sentence.true_course),
+    }
+
+
+def _read_gst(sentence: Any) -> dict[str, float | None]:
+    return {
+        "sigma_east": _read_float(sentence.std_dev_longitude),
+        "sigma_north": _read_float(sentence.std_dev_latitude),
+        "sigma_up": _read_float(sentence.std_dev_altitude),
+    }
+
+
+_READERS = {"GGA": _read_gga, "GNS": _read_gns, "RMC": _read_rmc, "GST": _read_gst}
+
+
+def _read_position(sentence: Any, fixed: bool) -> dict[str, float | None]:
+    if not fixed or not sentence.lat or not sentence.lon:
+        return {"latitude": None, "longitude": None}
+    return {"latitude": sentence.latitude, "longitude": sentence.longitude}
+
+
+def _read_float(given: Any) -> float | None:
+    try:
+        return float(given)
+    except (TypeError, ValueError):
+        return None
+
+
+def _count_fixes(fixes: list[dict[str, Any]]) -> list[int]:
+    """Return microseconds of all fixes, since 1970 if a sentence states the date; days go on after midnight."""
+    first = next((k for k, fix in enumerate(fixes) if fix["day"]), None)
+    days = 0 if first is None else (fixes[first]["day"] - date(1970, 1, 1)).days
+    clocks = [
+        ((fix["clock"].hour * 60 + fix["clock"].minute) * 60 + fix["clock"].second) * 1_000_000
+        + fix["clock"].microsecond
+        for fix in fixes
+    ]
+    midnights = np.cumsum(np.append(0, np.diff(clocks) < -DAY // 2)).astype(int)
+    passed = 0 if first is None else int(midnights[first])
+    return [(days + int(night) - passed) * DAY + clock for night, clock in zip(midnights, clocks, strict=True)]
+
+
+def _count_since_midnight(clock: time) -> int:
+    return ((clock.hour * 60 + clock.minute) * 60 + clock.second) * 1_000_000 + clock.microsecond
+
+
+def _count_micros(moment: datetime) -> int:
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    elapsed = moment - datetime(1970, 1, 1, tzinfo=UTC)
+    return (elapsed.days * 86_400 + elapsed.seconds) * 1_000_000 + elapsed.microseconds
+
+
+def _subtract_start(micros: Sequence[int | None]) -> tuple[FloatArray, float]:
+    """Return seconds since the first moment, NaN where one is missing, and the first one."""
+    known = [entry for entry in micros if entry is not None]
+    times = np.full(len(micros), np.nan)
+    times[[entry is not None for entry in micros]] = subtract_first(known, "us")[0] * 1e-6
+    return times, known[0] * 1e-6
+
+
+def _make_column(entries: list[Any]) -> FloatArray:
+    return np.array([np.nan if entry is None else float(entry) for entry in entries])
+
+
+def _build_log(
+    path: Path,
+    times: FloatArray,
+    values: dict[str, FloatArray],
+    offset: float,
+    rows: Any,
+    place: str,
+    events: list[Event],
+) -> Log:
+    return Log(
+        times=times,
+        values=values,
+        units={name: UNITS[name] for name in values},
+        time_unit="s",
+        source=str(path),
+        events=tuple(events),
+        offset=offset,
+        rows=rows.astype(np.intp),
+        place=place,
+        time_name="time",
+        has_positions=True,
+    )

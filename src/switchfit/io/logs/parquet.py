@@ -1,0 +1,51 @@
+"""Parquet files, by pyarrow."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from switchfit.io.logs.libraries import import_library
+from switchfit.io.logs.log import Log
+from switchfit.io.logs.tables import build_log
+from switchfit.runtime.errors import InputError
+
+
+def read_parquet(path: Path, time: str | None, keep_epoch: bool) -> Log:
+    """Read the columns of a Parquet file; units are those in the metadata of the fields, or of pandas.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    parquet = import_library("pyarrow.parquet", "parquet", f"{path}: Parquet")
+    try:
+        table = parquet.read_table(path)
+        columns = {name: _to_numpy(table.column(name)) for name in table.column_names}
+    except FileNotFoundError:
+        raise InputError(f"There is no file {path}; check the name and the folder.") from None
+    except Exception as error:  # of Arrow, which has many
+        raise InputError(f"{path} cannot be read as a Parquet file: {error}") from error
+    return build_log(str(path), columns, _find_units(table.schema), time, keep_epoch=keep_epoch)
+
+
+def _to_numpy(column: Any) -> Any:
+    """Return a column as an array, missing entries of integers as NaN."""
+    return np.asarray(column.to_numpy(zero_copy_only=False) if hasattr(column, "chunk") else column)
+
+
+def _find_units(schema: Any) -> dict[str, str]:
+    """Return units from the metadata "unit" or "units" of each field, and from the attrs that pandas writes."""
+    pandas = json.loads((schema.metadata or {}).get(b"pandas", b"{}"))
+    attributes = pandas.get("attributes", {})
+    units = dict(attributes.get("units", {})) if isinstance(attributes, dict) else {}
+    for field in schema:
+        metadata = field.metadata or {}
+        stated = metadata.get(b"units", metadata.get(b"unit"))
+        if stated is not None:
+            units[field.name] = stated.decode("utf-8", "replace")
+    return {name: unit for name, unit in units.items() if isinstance(unit, str)}

@@ -1,0 +1,182 @@
+"""What is odd about the times and channels of a log, and the repairs that a user may ask for."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from switchfit.io.logs.log import FloatArray, Log
+from switchfit.problem.validation import as_names, join_names, shorten
+from switchfit.runtime.errors import InputError
+from switchfit.runtime.issue import Issue
+
+REPAIRS = ("sort", "drop-duplicates", "drop-missing-times", "drop-broken-lines")
+"""Repairs by name; beside them "unwrap:CHANNEL"."""
+GAP = 5.0
+"""Length of an interval, in typical ones, from which on it is a gap."""
+MOST_GAPS = 0.1
+"""Share of the intervals beyond which long ones are no gaps but how the log was sampled."""
+NEAR = 5.0
+"""By how many typical intervals times may fall where samples were only written in another order."""
+
+_ANGLE = re.compile(r".*(yaw|heading|course|azimuth|theta|psi|angle|hdg|cog|bearing).*|ang", re.IGNORECASE)
+
+
+def check_repairs(repair: str | Sequence[str]) -> tuple[str, ...]:
+    """Return the names of repairs, checked.
+
+    Raises
+    ------
+    InputError
+        If one is not known.
+    """
+    names = as_names((repair,) if isinstance(repair, str) else repair, "repair", "a sequence of strings")
+    for name in names:
+        if name not in REPAIRS and not (name.startswith("unwrap:") and len(name) > len("unwrap:")):
+            raise InputError(f"repair must be among {', '.join(REPAIRS)} and unwrap:CHANNEL; got {shorten(name)}.")
+    return names
+
+
+def inspect_log(log: Log, repairs: Sequence[str] = ()) -> Log:
+    """Return the log with its issues, and repaired where asked for.
+
+    Parameters
+    ----------
+    log : Log
+    repairs : sequence of str
+        As `check_repairs` returns them.
+
+    Raises
+    ------
+    InputError
+        If a time is missing, or a channel that is to be unwrapped is.
+    """
+    issues = list(log.issues)
+    log = _handle_missing_times(log, "drop-missing-times" in repairs, issues)
+    log = _handle_order(log, "sort" in repairs, issues)
+    log = _handle_duplicates(log, "drop-duplicates" in repairs, issues)
+    issues += _find_gaps(log)
+    wrapped = [repair.removeprefix("unwrap:") for repair in repairs if repair.startswith("unwrap:")]
+    log = _handle_angles(log, [log.find_channel(name) for name in wrapped], issues)
+    issues += _find_constants(log)
+    return replace(log, issues=tuple(issues))
+
+
+def _handle_missing_times(log: Log, repair: bool, issues: list[Issue]) -> Log:
+    missing = ~np.isfinite(log.times)
+    if not missing.any():
+        return log
+    first = int(missing.argmax())
+    if not repair:
+        raise InputError(
+            f"{log.source}, column {log.time_name!r}: the time of sample {first + 1} is missing ({log.place} "
+            f"{log.rows[first]}). repair='drop-missing-times' leaves such samples out."
+        )
+    issues.append(_make_issue("log: missing times", log, first, count=missing.sum(), repaired=True))
+    return _pick_samples(log, np.flatnonzero(~missing))
+
+
+def _handle_order(log: Log, repair: bool, issues: list[Issue]) -> Log:
+    steps = np.diff(log.times)
+    falls = steps < 0
+    if not falls.any():
+        return log
+    first = int(falls.argmax()) + 1
+    typical = _find_typical_step(log.times)
+    back = log.times[falls.argmax()] - log.times[first]
+    far = bool(np.isfinite(typical) and -steps.min() > NEAR * typical)
+    kind = "log: clock jump" if far else "log: unsorted times"
+    figures = {"count": falls.sum(), "step": back, "time": log.times[first]}
+    issues.append(_make_issue(kind, log, first, repaired=repair, **figures))
+    return _pick_samples(log, np.argsort(log.times, kind="stable")) if repair else log
+
+
+def _handle_duplicates(log: Log, repair: bool, issues: list[Issue]) -> Log:
+    same = np.append(False, np.diff(log.times) == 0)
+    if not same.any():
+        return log
+    first = int(same.argmax())
+    issues.append(
+        _make_issue("log: repeated time", log, first, count=same.sum(), time=log.times[first], repaired=repair)
+    )
+    return _pick_samples(log, np.flatnonzero(~same)) if repair else log
+
+
+def _find_gaps(log: Log) -> list[Issue]:
+    steps, typical = np.diff(log.times), _find_typical_step(log.times)
+    long = steps > GAP * typical
+    if not long.any() or long.sum() > max(1.0, MOST_GAPS * len(steps)) or len(steps) < 5:
+        return []
+    longest = int(np.argmax(steps))
+    figures = {"count": long.sum(), "step": steps[longest], "typical": typical, "time": log.times[longest]}
+    return [_make_issue("log: gap", log, longest + 1, **figures)]
+
+
+def _handle_angles(log: Log, unwrapped: Sequence[str], issues: list[Issue]) -> Log:
+    values = dict(log.values)
+    for name, samples in log.values.items():
+        turn = _find_turn(name, log.units.get(name, ""), samples, name in unwrapped)
+        if turn is None:
+            continue
+        known = np.flatnonzero(np.isfinite(samples))
+        steps = np.abs(np.diff(samples[known]))
+        jumps = steps > turn / 2
+        if jumps.any() and np.median(steps) < turn / 4:
+            first = int(known[int(jumps.argmax()) + 1])
+            figures = {"count": jumps.sum(), "turn": turn, "repaired": name in unwrapped}
+            issues.append(_make_issue("log: wrapped angle", log, first, name, **figures))
+        if name in unwrapped:
+            values[name] = samples.copy()
+            values[name][known] = np.unwrap(samples[known], period=turn)
+    return replace(log, values=values)
+
+
+def _find_turn(name: str, unit: str, samples: FloatArray, asked: bool) -> float | None:
+    """Return a full turn in the unit of a channel, None if it is no angle."""
+    known = samples[np.isfinite(samples)]
+    if len(known) < 2:
+        return None
+    if unit in ("deg", "°", "degree", "degrees", "rad"):
+        return 2 * np.pi if unit == "rad" else 360.0
+    if unit == "" and (asked or _ANGLE.fullmatch(name)):
+        return 360.0 if np.ptp(known) > 2.2 * np.pi else 2 * np.pi
+    if asked:
+        raise InputError(f"repair='unwrap:{name}' needs an angle in rad or deg; its unit is {shorten(unit)}.")
+    return None
+
+
+def _find_constants(log: Log) -> list[Issue]:
+    if len(log) < 3:
+        return []
+    known = {name: samples[np.isfinite(samples)] for name, samples in log.values.items()}
+    empty = [name for name, samples in known.items() if len(samples) == 0]
+    constant = [name for name, samples in known.items() if len(samples) > 2 and np.all(samples == samples[0])]
+    return [
+        Issue(kind, (log.source, join_names(names)), {"count": float(len(names))})
+        for kind, names in (("log: constant", constant), ("log: empty", empty))
+        if names
+    ]
+
+
+def _find_typical_step(times: FloatArray) -> float:
+    """Return the median of the intervals that are positive; NaN if none is."""
+    steps = np.diff(times)
+    rising = steps[steps > 0]
+    return float(np.median(rising)) if len(rising) else np.nan
+
+
+def _pick_samples(log: Log, places: np.ndarray) -> Log:
+    values = {name: samples[places] for name, samples in log.values.items()}
+    rows = log.rows[places] if len(log.rows) else log.rows
+    return replace(log, times=log.times[places], values=values, rows=rows)
+
+
+def _make_issue(kind: str, log: Log, sample: int, channel: str | None = None, **figures: float) -> Issue:
+    """Return an issue about a sample; its last subject is the channel, or the unit of the times."""
+    row = log.rows[sample] if len(log.rows) else sample + 1
+    subject = log.time_unit if channel is None else channel
+    numbers = {name: float(value) for name, value in figures.items()}
+    return Issue(kind, (log.source, log.place, subject), {"line": float(row), **numbers})

@@ -1,0 +1,277 @@
+"""`read_log`: the reader of a file's format, then the local frame, the checks and the repairs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from switchfit.io.logs.geodesy import FRAME, add_local_frame, check_origin
+from switchfit.io.logs.log import Log
+from switchfit.io.logs.quality import check_repairs, inspect_log
+from switchfit.io.logs.text import read_text
+from switchfit.io.logs.units import SECONDS
+from switchfit.problem.validation import as_choice, as_name, as_names, as_path, as_positive, shorten
+from switchfit.runtime.errors import InputError
+from switchfit.runtime.files import is_regular
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the reader of a format is told.
+
+    Attributes
+    ----------
+    columns : sequence of str, optional
+    time, topic : str, optional
+    keep_epoch, drop_broken : bool
+    """
+
+    columns: Sequence[str] | None = None
+    time: str | None = None
+    topic: str | None = None
+    keep_epoch: bool = False
+    drop_broken: bool = False
+
+
+def read_log(
+    path: str | Path,
+    *,
+    columns: Sequence[str] | None = None,
+    time: str | None = None,
+    time_unit: str | None = None,
+    topic: str | None = None,
+    origin: Sequence[float] | None = None,
+    range_error: float | None = None,
+    repair: str | Sequence[str] = (),
+) -> Log:
+    """Read a log: a table of text in any dialect, Parquet, MATLAB, GPX, NMEA 0183, a ROS bag or MCAP.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file, or the folder of a bag of ROS 2. Text may be compressed by gzip.
+    columns : sequence of str, optional
+        Names of the channels that are wanted; left out, all that are numbers.
+    time : str, optional
+        The column with the times; left out, the one that is called so.
+    time_unit : {"ns", "us", "ms", "s", "min", "h", "d"}, optional
+        Convert the times to this unit. Times of a file that states no unit are taken to be in it.
+    topic : str, optional
+        The topic of a bag, or the struct of a ``.mat`` file; may be left out where there is one.
+    origin : (latitude, longitude) or (latitude, longitude, altitude), optional
+        Of the channels east, north and up, in degrees and metres; left out, the first position. In a table they are
+        computed if `origin` is given or `columns` names them.
+    range_error : float, optional
+        Standard deviation of the distance to a satellite in metres, 3 to 6 for a receiver without corrections: HDOP
+        times it becomes sigma_east and sigma_north where the log has none.
+    repair : str or sequence of str, optional
+        What may be changed: "sort" (by time), "drop-duplicates" (of a time, the first sample is kept),
+        "drop-missing-times", "drop-broken-lines", "unwrap:CHANNEL" (an angle, in rad or deg). Nothing is repaired
+        unless it is asked for; `Log.issues` says what there is.
+
+    Returns
+    -------
+    Log
+        Times that are dates, or count from 1970, begin at 0; `Log.start` has the date.
+
+    Raises
+    ------
+    InputError
+        For anything wrong with the file, with its name and the line; or if the library that reads it is missing.
+
+    See Also
+    --------
+    Log, Measurements
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import switchfit as sf
+    >>> _ = Path("drive.csv").write_text("Zeit;Weg;\\nms;m;\\n0;0,00;\\n20;0,05;\\n40;0,10;\\n", encoding="latin-1")
+    >>> log = sf.read_log("drive.csv", time_unit="s")
+    >>> log.times, log["Weg"], log.units["Weg"]
+    (array([0.  , 0.02, 0.04]), array([0.  , 0.05, 0.1 ]), 'm')
+    >>> data = sf.Measurements(log.times, log[["Weg"]], sigma=0.01)
+    >>> data.names
+    ('Weg',)
+    >>> Path("drive.csv").unlink()
+    """
+    return read_source(
+        as_path(path, "path"),
+        columns=columns,
+        time=time,
+        time_unit=time_unit,
+        topic=topic,
+        origin=origin,
+        range_error=range_error,
+        repair=repair,
+    )
+
+
+def read_source(
+    path: Path,
+    *,
+    columns: Sequence[str] | None,
+    time: str | None,
+    topic: str | None,
+    origin: Sequence[float] | None,
+    range_error: float | None,
+    repair: str | Sequence[str],
+    time_unit: str | None = None,
+    keep_epoch: bool = False,
+) -> Log:
+    """Read a log as `read_log` does.
+
+    Parameters
+    ----------
+    path, columns, time, topic, origin, range_error, repair, time_unit
+        As of `read_log`.
+    keep_epoch : bool, optional
+        Leave numbers that count from 1970 as they are.
+    """
+    repairs = check_repairs(repair)
+    if columns is not None:
+        columns = as_names((columns,) if isinstance(columns, str) else columns, "columns", "a sequence of strings")
+    for what, name in (("time", time), ("topic", topic)):
+        if name is not None:
+            as_name(name, what)
+    if time_unit is not None:
+        as_choice(time_unit, "time_unit", tuple(SECONDS))
+    place, error = check_origin(origin), None if range_error is None else as_positive(range_error, "range_error")
+    options = Options(columns, time, topic, keep_epoch, "drop-broken-lines" in repairs)
+    log = _choose_reader(path)(path, options)
+    wanted = any(name in FRAME and name not in log for name in columns or ())
+    if wanted or place is not None or error is not None or log.has_positions:
+        log = add_local_frame(log, place, error)
+    log = log if columns is None else log[list(columns)]
+    log = inspect_log(log, repairs)
+    return log if time_unit is None else convert_times(log, time_unit)
+
+
+def convert_times(log: Log, unit: str) -> Log:
+    """Return the log with its times in another unit; times without a unit are taken to be in it.
+
+    Parameters
+    ----------
+    log : Log
+    unit : str
+        A key of `SECONDS`.
+    """
+    if log.time_unit in ("", unit):
+        return replace(log, time_unit=unit)
+    factor = SECONDS[log.time_unit] / SECONDS[unit]
+    if factor < 1:  # a division is exact where a product is not: 40 ms are 0.04 s
+        inverse = SECONDS[unit] / SECONDS[log.time_unit]
+        inverse = round(inverse) if abs(inverse - round(inverse)) < 1e-6 else inverse
+        return _scale_times(log, unit, lambda t: t / inverse)
+    return _scale_times(log, unit, lambda t: t * factor)
+
+
+def align_starts(logs: Sequence[Log]) -> list[Log]:
+    """Return logs of one run, so that 0 is the same moment in all that have dates: the earliest start among them.
+
+    Parameters
+    ----------
+    logs : sequence of Log
+    """
+    starts = [log.offset * SECONDS[log.time_unit] for log in logs if log.offset]
+    return [_shift_start(log, min(starts)) if log.offset else log for log in logs]
+
+
+def _shift_start(log: Log, start: float) -> Log:
+    shift = log.offset - start / SECONDS[log.time_unit]
+    events = tuple(event._replace(time=event.time + shift) for event in log.events)
+    return replace(log, times=log.times + shift, offset=log.offset - shift, events=events)
+
+
+def _scale_times(log: Log, unit: str, scale: Callable[..., float]) -> Log:
+    events = tuple(event._replace(time=scale(event.time)) for event in log.events)
+    return replace(log, times=scale(log.times), offset=scale(log.offset), time_unit=unit, events=events)  # type: ignore[arg-type]
+
+
+def _choose_reader(path: Path) -> Callable[[Path, Options], Log]:
+    """Return the reader of a file, by the end of its name or by how it begins."""
+    ending = Path(path.name.lower().removesuffix(".gz")).suffix
+    if ending in BAGS or is_regular(path / "metadata.yaml"):
+        return _read_bag
+    if ending in _READERS:
+        return _READERS[ending]
+    return _read_nmea if _begins_as_nmea(path) else _read_text
+
+
+def _begins_as_nmea(path: Path) -> bool:
+    """Return whether the first line of a file is a sentence of NMEA 0183."""
+    if not is_regular(path):
+        return False
+    try:
+        with path.open("rb") as file:
+            return bool(_SENTENCE.match(file.read(400)))
+    except OSError:
+        return False
+
+
+def _refuse_options(path: Path, form: str, **given: str | None) -> None:
+    """Raise for options that a format does not have."""
+    for name, value in given.items():
+        if value is not None:
+            raise InputError(f"{path} is {form}, for which {name} means nothing; leave out {name} = {shorten(value)}.")
+
+
+def _read_text(path: Path, options: Options) -> Log:
+    _refuse_options(path, "a table of text", topic=options.topic)
+    return read_text(
+        path,
+        columns=options.columns,
+        time=options.time,
+        keep_epoch=options.keep_epoch,
+        drop_broken=options.drop_broken,
+    )
+
+
+def _read_nmea(path: Path, options: Options) -> Log:
+    from switchfit.io.logs.gps import read_nmea
+
+    _refuse_options(path, "an NMEA 0183 log", time=options.time, topic=options.topic)
+    return read_nmea(path)
+
+
+def _read_gpx(path: Path, options: Options) -> Log:
+    from switchfit.io.logs.gps import read_gpx
+
+    _refuse_options(path, "a GPX track", time=options.time, topic=options.topic)
+    return read_gpx(path)
+
+
+def _read_bag(path: Path, options: Options) -> Log:
+    from switchfit.io.logs.ros import read_bag
+
+    _refuse_options(path, "a ROS bag", time=options.time)
+    return read_bag(path, options.topic)
+
+
+def _read_mat(path: Path, options: Options) -> Log:
+    from switchfit.io.logs.matlab import read_mat
+
+    return read_mat(path, options.time, options.topic, options.keep_epoch)
+
+
+def _read_parquet(path: Path, options: Options) -> Log:
+    from switchfit.io.logs.parquet import read_parquet
+
+    _refuse_options(path, "a Parquet file", topic=options.topic)
+    return read_parquet(path, options.time, options.keep_epoch)
+
+
+BAGS = (".bag", ".mcap", ".db3")
+"""Endings of bags of ROS."""
+_READERS = {
+    ".gpx": _read_gpx,
+    ".mat": _read_mat,
+    ".nmea": _read_nmea,
+    ".nma": _read_nmea,
+    ".parquet": _read_parquet,
+    ".pq": _read_parquet,
+}
+_SENTENCE = re.compile(rb"\s*\$[A-Z]{5},")

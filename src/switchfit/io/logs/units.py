@@ -1,0 +1,82 @@
+"""Units as they stand in the headers of logs: which texts are units, and how long units of time are."""
+
+from __future__ import annotations
+
+import re
+
+SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+"""Length of a unit of time in seconds."""
+
+_SPELLINGS = {
+    "ns": ("ns", "nsec", "nsecs", "nanosecond", "nanoseconds"),
+    "us": ("us", "µs", "μs", "usec", "usecs", "micros", "microsecond", "microseconds"),
+    "ms": ("ms", "msec", "msecs", "millis", "millisecond", "milliseconds"),
+    "s": ("s", "sec", "secs", "second", "seconds"),
+    "min": ("min", "mins", "minute", "minutes"),
+    "h": ("h", "hr", "hrs", "hour", "hours"),
+    "d": ("d", "day", "days"),
+}
+_TIME_UNITS = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings}
+
+EPOCH_SECONDS = (9.4e8, 2.6e9)
+"""Between which numbers seconds since 1970 lie: the years 1999 to 2052."""
+
+_PREFIXED = (
+    "m", "s", "g", "rad", "Hz", "N", "Nm", "Pa", "V", "A", "W", "J", "K", "T", "G", "F", "H", "C", "Ohm", "Ω", "bar",
+    "l", "L", "px",
+)  # fmt: skip
+_PLAIN = (
+    "1", "-", "%", "°", "deg", "degree", "degrees", "grad", "rad", "°C", "degC", "°F", "°/s", "min", "h", "d", "rpm",
+    "ticks", "tick", "counts", "count", "pix", "pixel", "pixels", "ft", "in", "mi", "kn", "kt", "kts", "knots", "mph",
+    "kph", "psi", "rev", "bit", "bool", "fps", "sec", "msec", "usec", "nsec", "mol", "lx", "dB", "mps", "kmh",
+)  # fmt: skip
+_FACTOR = re.compile(
+    rf"(?:{'|'.join(re.escape(u) for u in sorted(_PLAIN, key=len, reverse=True))}"
+    rf"|[nuµμmckMG]?(?:{'|'.join(re.escape(u) for u in sorted(_PREFIXED, key=len, reverse=True))}))"
+    r"(?:\^?-?\d|\*\*-?\d|[²³⁻¹]+)?"
+)
+_SUFFIX = re.compile(r"[^_]_(ns|us|ms|s|sec|min|rad|deg|m|mm|cm|km|Hz|rpm|mps|Nm)$")
+
+
+def is_unit(text: str) -> bool:
+    """Return whether a text is a unit, such as ``m/s^2``, ``°C``, ``ticks`` or ``[rad/s]``."""
+    inner = strip_brackets(text)
+    if not inner:
+        return False
+    factors = re.split(r"[/*·. ]", inner)
+    return all(_FACTOR.fullmatch(factor) for factor in factors)
+
+
+def strip_brackets(text: str) -> str:
+    """Return a text without the brackets around it."""
+    text = text.strip()
+    return text[1:-1].strip() if text[:1] + text[-1:] in ("[]", "()", "{}", "<>") else text
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """Return the name and the unit in a text such as ``"x [m]"``, ``"x (m)"`` or ``"x_m"``.
+
+    A suffix stays in the name; the unit is empty where there is none.
+    """
+    match = re.fullmatch(r"(.*\S)\s*(\[[^\[\]]{1,12}\]|\([^()]{1,12}\))", name)
+    if match and (is_unit(match[2]) or match[2][0] == "["):
+        return match[1], strip_brackets(match[2])
+    suffix = _SUFFIX.search(name)
+    return name, suffix[1] if suffix else ""
+
+
+def normalize_time_unit(text: str) -> str:
+    """Return the key of `SECONDS` that a text stands for, or the text itself if it is no unit of time."""
+    return _TIME_UNITS.get(strip_brackets(text).lower(), text)
+
+
+def find_spelled_unit(name: str) -> str:
+    """Return the unit of time that is a word in a name, such as in ``seconds_elapsed`` or ``millis``; "" if none is."""
+    words = re.split(r"[ _.\-/]", name.lower())
+    return next((_TIME_UNITS[word] for word in words if len(word) > 3 and word in _TIME_UNITS), "")
+
+
+def find_epoch_unit(time: float) -> str | None:
+    """Return the unit in which a number is a time since 1970, None if it is too small for one."""
+    low, high = EPOCH_SECONDS
+    return next((unit for unit in ("s", "ms", "us", "ns") if low <= time * SECONDS[unit] < high), None)

@@ -1,0 +1,562 @@
+"""Logs of robots and other programs: each file is written here by its format's own writer, and read back."""
+
+import sys
+from datetime import UTC, datetime, timedelta
+
+import gpxpy.gpx
+import h5py
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pymap3d
+import pynmea2
+import pytest
+from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from scipy.io import savemat
+
+import switchfit as sf
+from switchfit.io.problem_file import load_problem
+from switchfit.runtime.errors import InputError
+
+START = datetime(2024, 5, 1, 12, 0, 0, tzinfo=UTC)
+EPOCH = int(START.timestamp())
+TIMES = np.array([0.0, 0.25, 0.5, 1.0])
+X = np.array([0.0, 1.0, 3.0, 6.0])
+ORIGIN = (48.1, 11.6, 520.0)
+
+
+def globe(east, north, up=0.0):
+    """Latitude, longitude and altitude of a position in the local frame."""
+    return [float(value) for value in pymap3d.enu2geodetic(east, north, up, *ORIGIN)]
+
+
+# --- the local frame --------------------------------------------------------------------------------------------------
+
+
+def test_a_metre_is_a_metre(tmp_path):
+    """Against the radii of curvature of the ellipsoid, by hand."""
+    a, e2 = 6378137.0, 0.00669437999014
+    latitude = np.deg2rad(48.0)
+    root = np.sqrt(1 - e2 * np.sin(latitude) ** 2)
+    east, north = a / root * np.cos(latitude), a * (1 - e2) / root**3
+    step = 1e-5
+    (tmp_path / "a.csv").write_text(f"t,lat,lon,alt\n0,48,11,0\n1,48,{11 + step},0\n2,{48 + step},11,5\n")
+    log = sf.read_log(tmp_path / "a.csv", columns=["east", "north", "up"])
+    np.testing.assert_allclose(log["east"], [0, np.deg2rad(step) * east, 0], atol=1e-5)
+    np.testing.assert_allclose(log["north"], [0, 0, np.deg2rad(step) * north], atol=1e-5)
+    np.testing.assert_allclose(log["up"], [0, 0, 5], atol=1e-5)
+    assert log.origin == (48, 11, 0)
+    assert log.channels == ("east", "north", "up")
+    assert set(log.units.values()) == {"m"}
+
+
+def test_origin_and_columns_of_a_table(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("t,gps_lat,gps_lon,HDOP\n0,48,11,1.5\n1,,,\n2,48.001,11,2\n")
+    assert sf.read_log(path).channels == ("gps_lat", "gps_lon", "HDOP")  # nothing is computed that is not asked for
+    log = sf.read_log(path, origin=[48.001, 11], range_error=4)
+    np.testing.assert_allclose(log["north"], [-111.2, np.nan, 0], atol=0.1)
+    np.testing.assert_allclose(log["sigma_east"], np.array([1.5, np.nan, 2]) * 4 / np.sqrt(2))
+    assert "up" not in log
+    assert sf.read_log(path, columns=["sigma_north"], range_error=4).channels == ("sigma_north",)
+    for text, options, message in (
+        (
+            "t,lat,lon\n0,480000000,110000000\n1,1,1\n",
+            {"origin": [0, 0]},
+            "lat and lon must be in degrees; some",
+        ),
+        ("t,lat,lon\n0,,\n1,,\n", {"origin": [0, 0]}, "has no position: all of lat and lon are missing"),
+        ("t,x,y\n0,1,2\n1,1,1\n", {"origin": [0, 0]}, "has no latitude and longitude; its columns are x, y"),
+        ("t,lat,lon\n0,1,1\n1,1,1\n", {"origin": [0, 95, 1, 1]}, r"origin must be \[latitude, longitude\] in degrees"),
+        ("t,lat,lon\n0,1,1\n1,1,1\n", {"origin": [95, 0]}, r"origin must be \[latitude, longitude\] in degrees, or wi"),
+        ("t,lat,lon\n0,1,1\n1,1,1\n", {"range_error": 3}, "has no channel hdop, of which range_error makes a sigma"),
+        ("t,lat,lon\n0,1,1\n1,1,1\n", {"range_error": 0}, "range_error must be positive"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=message):
+            sf.read_log(path, **options)
+
+
+# --- GPX and NMEA -----------------------------------------------------------------------------------------------------
+
+
+def write_gpx(path, **changes):
+    gpx = gpxpy.gpx.GPX()
+    gpx.tracks.append(gpxpy.gpx.GPXTrack())
+    gpx.tracks[0].segments.append(gpxpy.gpx.GPXTrackSegment())
+    for t, x in zip(TIMES, X, strict=True):
+        latitude, longitude, altitude = globe(x, 2 * x)
+        time = changes.get("time", START + timedelta(seconds=t))
+        point = gpxpy.gpx.GPXTrackPoint(latitude, longitude, altitude, time, horizontal_dilution=1.2)
+        gpx.tracks[0].segments[0].points.append(point)
+    latitude, longitude, _ = globe(0, 0)
+    place = gpxpy.gpx.GPXWaypoint(latitude, longitude, time=START + timedelta(seconds=0.5), name="gate")
+    gpx.waypoints.append(place)
+    path.write_text(gpx.to_xml())
+    return path
+
+
+def test_gpx(tmp_path):
+    log = sf.read_log(write_gpx(tmp_path / "a.gpx"), range_error=5)
+    np.testing.assert_array_equal(log.times, TIMES)
+    assert (log.start, log.time_unit) == (START, "s")
+    np.testing.assert_allclose(log[["east", "north"]], np.stack([X, 2 * X], axis=1), atol=1e-5)
+    np.testing.assert_allclose(log["sigma_north"], 1.2 * 5 / np.sqrt(2))
+    np.testing.assert_allclose(log.origin, ORIGIN, atol=1e-8)
+    assert log.events == ((0.5, "waypoint", "gate"),)
+    assert "  origin: latitude 48.10000000, longitude 11.60000000, altitude 520.00 m\n" in str(log)
+    elsewhere = sf.read_log(tmp_path / "a.gpx", origin=globe(100, 0), columns=["east"])
+    np.testing.assert_allclose(elsewhere["east"], X - 100, atol=1e-2)
+
+
+def test_gpx_that_cannot_be_read(tmp_path):
+    with pytest.raises(InputError, match=r"a\.gpx has no track with times: of 4 points, none has a time"):
+        sf.read_log(write_gpx(tmp_path / "a.gpx", time=None))
+    (tmp_path / "a.gpx").write_text("<gpx><trk>")
+    with pytest.raises(InputError, match=r"a\.gpx is no GPX file: "):
+        sf.read_log(tmp_path / "a.gpx")
+
+
+def degrees(value, width):
+    """ddmm.mmmmmmm of a number of degrees."""
+    return f"{int(abs(value)):0{width}d}{60 * (abs(value) % 1):010.7f}"
+
+
+def sentences(t, x, quality="1", status="A"):
+    latitude, longitude, _ = globe(x, 2 * x)
+    moment = START + timedelta(seconds=t)
+    clock, day = f"{moment:%H%M%S}.{moment.microsecond // 10000:02d}", f"{moment:%d%m%y}"
+    where = (degrees(latitude, 2), "N", degrees(longitude, 3), "E")
+    return [
+        pynmea2.GGA("GP", "GGA", (clock, *where, quality, "08", "1.1", "520.0", "M", "46.9", "M", "", "")),
+        pynmea2.RMC("GP", "RMC", (clock, status, *where, "10.0", "26.6", day, "", "")),
+        pynmea2.GST("GP", "GST", (clock, "1.0", "0.8", "0.4", "30.0", "0.5", "0.25", "1.5")),
+    ]
+
+
+@pytest.mark.parametrize("name", ["a.nmea", "a.log"])
+def test_nmea(tmp_path, name):
+    lines = [str(s) for t, x in zip(TIMES, X, strict=True) for s in sentences(t, x)]
+    (tmp_path / name).write_text("\r\n".join(lines))
+    log = sf.read_log(tmp_path / name)
+    np.testing.assert_allclose(log.times, TIMES, atol=2e-6)
+    assert log.start == START
+    np.testing.assert_allclose(log[["east", "north"]], np.stack([X, 2 * X], axis=1), atol=1e-3)
+    np.testing.assert_array_equal(log[["sigma_east", "sigma_north", "sigma_up"]], [[0.25, 0.5, 1.5]] * 4)
+    np.testing.assert_allclose(log["speed"], 10 * 1852 / 3600)
+    assert (log.units["speed"], log.units["course"], log["quality"][0]) == ("m/s", "deg", 1)
+    np.testing.assert_array_equal(log.rows, [1, 4, 7, 10])
+
+
+def test_nmea_with_damage_and_without_a_fix(tmp_path):
+    lines = [str(s) for s in sentences(0, 0)] + [str(s) for s in sentences(1, 1, quality="0", status="V")]
+    lines += [str(s) for s in sentences(2, 2)[:1]] + [str(sentences(3, 3)[0]).replace("520.0", "530.0"), "noise", "$GP"]
+    (tmp_path / "a.nmea").write_text("\n".join(lines))
+    log = sf.read_log(tmp_path / "a.nmea")
+    np.testing.assert_allclose(log.times, [0, 1, 2], atol=2e-6)
+    np.testing.assert_allclose(log["east"], [0, np.nan, 2], atol=1e-3)
+    np.testing.assert_array_equal(log["sigma_east"], [0.25, 0.25, np.nan])
+    said = [str(issue) for issue in log.issues if issue.kind == "log: damaged sentences"]
+    assert "a.nmea, line 8 (and 1 more): no sentence, or with a wrong checksum; left out." in said[0]
+    (tmp_path / "a.nmea").write_text("\n".join(str(s) for s in sentences(0, 0, "0", "V")))
+    with pytest.raises(InputError, match=r"a\.nmea has no GGA, RMC or GNS sentence with a position"):
+        sf.read_log(tmp_path / "a.nmea")
+
+
+def test_nmea_over_midnight_without_a_date(tmp_path):
+    lines = [str(sentences(12 * 3600 + t, t)[0]) for t in (-1, 0, 1)]
+    (tmp_path / "a.nmea").write_text("\n".join(lines))
+    log = sf.read_log(tmp_path / "a.nmea")
+    np.testing.assert_array_equal(log.times, [86399, 86400, 86401])
+    assert log.start is None
+    dated = [str(sentences(12 * 3600 + t, t)[k]) for t, k in ((-1, 0), (0, 1), (1, 0))]
+    (tmp_path / "a.nmea").write_text("\n".join(dated))
+    log = sf.read_log(tmp_path / "a.nmea")
+    np.testing.assert_array_equal(log.times, [0, 1, 2])
+    assert log.start == START + timedelta(seconds=12 * 3600 - 1)
+
+
+# --- ROS --------------------------------------------------------------------------------------------------------------
+
+
+class Messages:
+    """Messages of one version of ROS, and the writer of a bag."""
+
+    def __init__(self, store, first):
+        self.store = get_typestore(store)
+        self.first = first  # ROS 1 counts headers
+        self.types = self.store.types
+
+    def make(self, kind, *fields):
+        return self.types[kind](*fields)
+
+    def header(self, t):
+        nanoseconds = EPOCH * 10**9 + round(t * 1e9)
+        stamp = self.make("builtin_interfaces/msg/Time", *divmod(nanoseconds, 10**9))
+        return self.make("std_msgs/msg/Header", *self.first, stamp, "map")
+
+    def turn(self, yaw):
+        return self.make("geometry_msgs/msg/Quaternion", 0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2))
+
+    def point(self, *values):
+        return self.make("geometry_msgs/msg/Point", *map(float, values))
+
+    def vector(self, *values):
+        return self.make("geometry_msgs/msg/Vector3", *map(float, values))
+
+    def fix(self, t, x, status=0):
+        c = np.diag([0.04, 0.09, 0.25]).ravel()
+        state = self.make("sensor_msgs/msg/NavSatStatus", status, 1)
+        return self.make("sensor_msgs/msg/NavSatFix", self.header(t), state, *globe(x, 2 * x), c, 2)
+
+    def odometry(self, t, x):
+        pose = self.make("geometry_msgs/msg/Pose", self.point(x, 0, 0), self.turn(0.1 * x))
+        twist = self.make("geometry_msgs/msg/Twist", self.vector(x, 0, 0), self.vector(0, 0, 2 * x))
+        c, none = np.diag([0.01, 0.04, 0, 0, 0, 0.0025]).ravel(), np.zeros(36)
+        return self.make(
+            "nav_msgs/msg/Odometry",
+            self.header(t),
+            "base",
+            self.make("geometry_msgs/msg/PoseWithCovariance", pose, c),
+            self.make("geometry_msgs/msg/TwistWithCovariance", twist, none),
+        )
+
+    def pose(self, t, x):
+        pose = self.make("geometry_msgs/msg/Pose", self.point(x, 1, 2), self.turn(3.0))
+        return self.make("geometry_msgs/msg/PoseStamped", self.header(t), pose)
+
+    def twist_stamped(self, t, x):
+        return self.make("geometry_msgs/msg/TwistStamped", self.header(t), self.twist(t, x))
+
+    def twist(self, t, x):
+        return self.make("geometry_msgs/msg/Twist", self.vector(x, 0, 0), self.vector(0, 0, -x))
+
+    def imu(self, t, x):
+        known, unknown = np.zeros(9), np.r_[-1.0, np.zeros(8)]
+        fields = (self.turn(0.5), known if x else unknown, self.vector(0, 0, x), known, self.vector(x, 0, 9.81), known)
+        return self.make("sensor_msgs/msg/Imu", self.header(t), *fields)
+
+    def joints(self, t, x):
+        names, none = ["hip", "knee"], np.zeros(0)
+        return self.make(
+            "sensor_msgs/msg/JointState", self.header(t), names, np.array([x, -x]), np.array([1.0, x]), none
+        )
+
+    def text(self, t, x):
+        return self.make("std_msgs/msg/String", f"at {x:g}")
+
+
+ROS1 = Messages(Stores.ROS1_NOETIC, (7,))
+ROS2 = Messages(Stores.ROS2_HUMBLE, ())
+TOPICS = {
+    "/fix": ("sensor_msgs/msg/NavSatFix", "fix"),
+    "/odom": ("nav_msgs/msg/Odometry", "odometry"),
+    "/pose": ("geometry_msgs/msg/PoseStamped", "pose"),
+    "/twist": ("geometry_msgs/msg/TwistStamped", "twist_stamped"),
+    "/cmd_vel": ("geometry_msgs/msg/Twist", "twist"),
+    "/imu": ("sensor_msgs/msg/Imu", "imu"),
+    "/joints": ("sensor_msgs/msg/JointState", "joints"),
+    "/log": ("std_msgs/msg/String", "text"),
+}
+LATE = 0.125
+"""Seconds from the stamp to the recorder."""
+
+
+def write_bag(path, kind, topics=TOPICS, ros=ROS2):
+    """Write a bag, and return what is to be read."""
+    ros = ROS1 if kind == "ros1" else ros
+    if kind == "ros1":
+        writer, serialize = BagWriter(path), ros.store.serialize_ros1
+    else:
+        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+        writer, serialize = Writer(path, version=9, storage_plugin=plugin), ros.store.serialize_cdr
+    with writer:
+        for topic, (type_name, method) in topics.items():
+            connection = writer.add_connection(topic, type_name, typestore=ros.store)
+            for t, x in zip(TIMES, X, strict=True):
+                received = EPOCH * 10**9 + round((t + LATE) * 1e9)
+                writer.write(connection, received, serialize(getattr(ros, method)(t, x), type_name))
+    return next(path.glob("*.mcap")) if kind == "mcap" else path
+
+
+@pytest.fixture(scope="module", params=["ros1", "ros2", "mcap"])
+def bag(request, tmp_path_factory):
+    name = "a.bag" if request.param == "ros1" else "a"
+    return write_bag(tmp_path_factory.mktemp("bags") / name, request.param)
+
+
+def test_fixes(bag):
+    log = sf.read_log(bag, topic="/fix")
+    np.testing.assert_allclose(log.times, TIMES - LATE, atol=1e-12)  # since the bag began, by the stamps of the headers
+    assert log.start == START + timedelta(seconds=LATE)
+    np.testing.assert_allclose(log[["east", "north"]], np.stack([X, 2 * X], axis=1), atol=1e-5)
+    np.testing.assert_allclose(log[["sigma_east", "sigma_north", "sigma_up"]], [[0.2, 0.3, 0.5]] * 4)
+    assert (log.units["latitude"], log.units["east"], log.units["sigma_up"]) == ("deg", "m", "m")
+    assert log.source.endswith("(/fix)")
+
+
+def test_odometry(bag):
+    log = sf.read_log(bag, topic="/odom")
+    np.testing.assert_allclose(log[["x", "yaw", "vx", "wz"]], np.stack([X, 0.1 * X, X, 2 * X], axis=1), atol=1e-12)
+    np.testing.assert_allclose(log[["sigma_x", "sigma_y", "sigma_yaw"]], [[0.1, 0.2, 0.05]] * 4)
+    assert "sigma_z" not in log  # a variance of 0 is one that is not known
+    assert "sigma_vx" not in log
+    assert [log.units[name] for name in ("x", "yaw", "vx", "wz", "sigma_yaw")] == ["m", "rad", "m/s", "rad/s", "rad"]
+
+
+def test_poses_twists_and_others(bag):
+    pose = sf.read_log(bag, topic="/pose")
+    np.testing.assert_allclose(pose[["x", "y", "z", "yaw"]], [[x, 1, 2, 3.0] for x in X], atol=1e-12)
+    np.testing.assert_array_equal(sf.read_log(bag, topic="/twist")["wz"], -X)
+    imu = sf.read_log(bag, topic="/imu")
+    np.testing.assert_allclose(imu["yaw"], [np.nan, 0.5, 0.5, 0.5])
+    np.testing.assert_array_equal(imu[["ax", "az", "wz"]], np.stack([X, 0 * X + 9.81, X], axis=1))
+    assert imu.units["az"] == "m/s^2"
+    joints = sf.read_log(bag, topic="/joints")
+    assert joints.channels == ("hip.position", "knee.position", "hip.velocity", "knee.velocity")
+    np.testing.assert_array_equal(joints["knee.position"], -X)
+    assert joints.units["knee.velocity"] == "rad/s"
+
+
+def test_messages_without_stamps(bag):
+    log = sf.read_log(bag, topic="/cmd_vel")
+    np.testing.assert_allclose(log.times, TIMES, atol=1e-12)
+    assert any("messages of /cmd_vel have no stamps; the times are those of the rec" in str(i) for i in log.issues)
+    text = sf.read_log(bag, topic="/log")
+    assert [event.text for event in text.events] == ["at 0", "at 1", "at 3", "at 6"]
+
+
+def test_types_that_are_not_known(tmp_path):
+    """Every number by its name in the message."""
+
+    class More(Messages):
+        def wrench(self, t, x):
+            wrench = self.make("geometry_msgs/msg/Wrench", self.vector(x, 0, 0), self.vector(0, 0, 0))
+            return self.make("geometry_msgs/msg/WrenchStamped", self.header(t), wrench)
+
+    topics = {"/force": ("geometry_msgs/msg/WrenchStamped", "wrench")}
+    log = sf.read_log(write_bag(tmp_path / "a", "mcap", topics, More(Stores.ROS2_HUMBLE, ())))
+    assert log.channels == tuple(f"wrench.{what}.{axis}" for what in ("force", "torque") for axis in "xyz")
+    np.testing.assert_array_equal(log["wrench.force.x"], X)
+
+
+def test_topics(bag, tmp_path):
+    with pytest.raises(InputError, match=r"has no topic '/gps'; its topics are /cmd_vel \(geometry_msgs/Twist\), /fix"):
+        sf.read_log(bag, topic="/gps")
+    with pytest.raises(InputError, match=r"has several topics, name one: topic = \.\.\. They are /cmd_vel"):
+        sf.read_log(bag)
+    two = {name: TOPICS[name] for name in ("/fix", "/log")}
+    assert "east" in sf.read_log(write_bag(tmp_path / "b", "ros2", two))  # one with numbers
+
+
+def test_no_fix_and_the_clock_of_a_simulation(tmp_path):
+    class Lost(Messages):
+        def fix(self, t, x):
+            return super().fix(t, x, status=-1 if x == 1.0 else 0)
+
+        def header(self, t):
+            stamp = self.make("builtin_interfaces/msg/Time", *divmod(round(t * 1e9), 10**9))
+            return self.make("std_msgs/msg/Header", stamp, "map")
+
+    topics, ros = {"/fix": TOPICS["/fix"]}, Lost(Stores.ROS2_HUMBLE, ())
+    log = sf.read_log(write_bag(tmp_path / "a", "ros2", topics, ros))
+    np.testing.assert_allclose(log["east"], [0, np.nan, 3, 6], atol=1e-5)
+    np.testing.assert_array_equal(log.times, TIMES)
+    assert log.start is None
+
+
+def test_bags_that_cannot_be_read(tmp_path):
+    with pytest.raises(InputError, match=r"There is no file .*a\.mcap; check the name"):
+        sf.read_log(tmp_path / "a.mcap")
+    (tmp_path / "a.mcap").write_bytes(b"no bag")
+    with pytest.raises(InputError, match=r"a\.mcap cannot be read as a ROS bag: "):
+        sf.read_log(tmp_path / "a.mcap")
+
+
+# --- MATLAB and Parquet -----------------------------------------------------------------------------------------------
+
+
+def write_73(path, contents):
+    """Write a .mat file of version 7.3: HDF5 behind 512 bytes, arrays transposed, text as numbers."""
+
+    def write(group, values):
+        for name, value in values.items():
+            if isinstance(value, dict):
+                write(group.create_group(name), value)
+            elif isinstance(value, str):
+                group[name] = np.array([[ord(c)] for c in value], dtype=np.uint16)
+                group[name].attrs["MATLAB_class"] = np.bytes_("char")
+            else:
+                group[name] = np.atleast_2d(value).T if np.ndim(value) > 1 else np.reshape(value, (1, -1))
+
+    with h5py.File(path, "w", userblock_size=512) as file:
+        write(file, contents)
+
+
+@pytest.fixture(params=["5", "7.3"])
+def write_mat(request, tmp_path):
+    def write(**contents):
+        path = tmp_path / "a.mat"
+        (savemat if request.param == "5" else write_73)(path, contents)
+        return path
+
+    return write
+
+
+def test_vectors(write_mat):
+    log = sf.read_log(
+        write_mat(t=TIMES, x=X, matrix=np.stack([X, 2 * X], axis=1), gain=3.0, units={"x": "m", "t": "s"})
+    )
+    np.testing.assert_array_equal(log.times, TIMES)
+    assert set(log.channels) == {"x", "matrix_1", "matrix_2"}
+    np.testing.assert_array_equal(log[["x", "matrix_2"]], np.stack([X, 2 * X], axis=1))
+    assert (log.units["x"], log.time_unit) == ("m", "s")
+
+
+def test_structs(write_mat):
+    drive = {"Time": TIMES, "Data": X, "signals": {"values": 2 * X}}
+    path = write_mat(drive=drive, still={"t": np.arange(3.0), "x": np.arange(3.0)}, note="calibrated")
+    with pytest.raises(InputError, match=r"several structs with times \(drive, still\).*Name one: topic"):
+        sf.read_log(path)
+    log = sf.read_log(path, topic="drive")
+    np.testing.assert_array_equal(log.times, TIMES)
+    assert log.channels == ("Data", "signals.values")
+    np.testing.assert_array_equal(log["signals.values"], 2 * X)
+    assert log.source.endswith("a.mat (drive)")
+    with pytest.raises(InputError, match=r"has no struct 'dive' with times; those that have are drive, still"):
+        sf.read_log(path, topic="dive")
+
+
+def test_mat_files_that_cannot_be_read(write_mat, tmp_path):
+    with pytest.raises(InputError, match=r"a\.mat has no vector of times; its variables are x, y\. Name the one with"):
+        sf.read_log(write_mat(x=X, y=X))
+    np.testing.assert_array_equal(sf.read_log(tmp_path / "a.mat", time="x")["y"], X)
+    (tmp_path / "a.mat").write_bytes(b"x" * 700)
+    with pytest.raises(InputError, match=r"a\.mat cannot be read as a \.mat file: "):
+        sf.read_log(tmp_path / "a.mat")
+
+
+def test_parquet(tmp_path):
+    path = tmp_path / "a.parquet"
+    fields = [
+        pa.field("time", pa.float64(), metadata={"unit": "ms"}),
+        pa.field("x", pa.int64(), metadata={"units": "m"}),
+    ]
+    columns = [pa.array(1e3 * TIMES), pa.array([0, None, 3, 6])]
+    names = pa.field("mode", pa.string())
+    pq.write_table(pa.table([*columns, pa.array(list("abcd"))], schema=pa.schema([*fields, names])), path)
+    log = sf.read_log(path)
+    assert (log.channels, log.units, log.time_unit) == (("x",), {"x": "m"}, "ms")
+    np.testing.assert_array_equal(log.times, 1e3 * TIMES)
+    np.testing.assert_array_equal(log["x"], [0, np.nan, 3, 6])
+    with pytest.raises(InputError, match=r"a\.parquet has no column 'z'; its columns are time, x, mode"):
+        sf.read_log(path, time="z")
+
+
+def test_parquet_of_pandas(tmp_path):
+    path = tmp_path / "a.parquet"
+    table = pd.DataFrame({"x": X}, index=pd.Index(pd.Timestamp(START) + pd.to_timedelta(TIMES, unit="s"), name="time"))
+    table.attrs["units"] = {"x": "m"}
+    table.to_parquet(path)
+    log = sf.read_log(path)
+    np.testing.assert_array_equal(log.times, TIMES)
+    assert (log.start, log.units) == (START, {"x": "m"})
+    sf.read_log(path).to_pandas().to_parquet(path)
+    np.testing.assert_array_equal(sf.read_log(path, time="time (s)")["x"], X)
+    (tmp_path / "b.parquet").write_bytes(b"PAR1")
+    with pytest.raises(InputError, match=r"b\.parquet cannot be read as a Parquet file: "):
+        sf.read_log(tmp_path / "b.parquet")
+
+
+@pytest.mark.parametrize("path", ["a.gpx", "a.nmea", "a.bag", "a.mat", "a.parquet"])
+def test_a_library_that_is_missing(path, tmp_path, monkeypatch):
+    extra = {"a.gpx": "gps", "a.nmea": "gps", "a.bag": "ros", "a.mat": "matlab", "a.parquet": "parquet"}[path]
+    (tmp_path / path).write_bytes(b"\x89HDF\r\n\x1a\n" if extra == "matlab" else b"$")
+    for name in ("gpxpy", "pynmea2", "rosbags.highlevel", "h5py", "pyarrow.parquet"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(InputError, match=rf"{path}: .* cannot be imported \(.*\): pip install 'switchfit\[{extra}\]'"):
+        sf.read_log(tmp_path / path)
+
+
+def test_options_that_mean_nothing(tmp_path):
+    write_gpx(tmp_path / "a.gpx")
+    (tmp_path / "a.csv").write_text("t,x\n0,1\n1,2\n")
+    (tmp_path / "a.nmea").write_text("")
+    pq.write_table(pa.table({"t": [0.0, 1.0], "x": [0.0, 1.0]}), tmp_path / "a.parquet")
+    for name, form, option in (
+        ("a.gpx", "a GPX track", "time"),
+        ("a.nmea", "an NMEA 0183 log", "topic"),
+        ("a.csv", "a table of text", "topic"),
+        ("a.parquet", "a Parquet file", "topic"),
+        ("a.bag", "a ROS bag", "time"),
+    ):
+        with pytest.raises(
+            InputError, match=rf"{name} is {form}, for which {option} means nothing; leave out {option}"
+        ):
+            sf.read_log(tmp_path / name, **{option: "x"})
+
+
+def test_times_that_are_text(tmp_path):
+    pq.write_table(pa.table({"time": ["a", "b"], "x": [0.0, 1.0]}), tmp_path / "a.parquet")
+    with pytest.raises(InputError, match=r"a\.parquet: column 'time' has neither numbers nor dates\. Name the"):
+        sf.read_log(tmp_path / "a.parquet")
+
+
+def test_a_sigma_that_is_missing_with_its_value():
+    """Where a receiver has no fix there is no sigma."""
+    values, sigma = np.array([[0.0], [np.nan], [2.0]]), np.array([[0.1], [np.nan], [0.2]])
+    data = sf.Measurements([0.0, 1.0, 2.0], values, sigma=sigma)
+    np.testing.assert_allclose(data.weights[:, 0], [100.0, 0.0, 25.0])
+    sigma[2] = np.nan
+    with pytest.raises(ValueError, match=r"sigma must be .*; it is NaN at index \[2, 0\], and the value is not"):
+        sf.Measurements([0.0, 1.0, 2.0], values, sigma=sigma)
+
+
+# --- in problem files -------------------------------------------------------------------------------------------------
+
+
+def test_topics_of_one_bag_in_a_problem_file(tmp_path):
+    write_bag(tmp_path / "a", "ros2", {name: TOPICS[name] for name in ("/fix", "/odom", "/cmd_vel")})
+    (tmp_path / "model.py").write_text(
+        "import switchfit as sf\n"
+        "system = sf.HybridSystem({'go': lambda t, x, p, u: p['k'] * u['v'] + 0 * x}, [0.0], state_names=('east',))\n"
+    )
+    (tmp_path / "problem.toml").write_text("""
+model = "model.py:system"
+parameters.k = 1.0
+[experiments]
+mode_sequence = ["go"]
+transition_times = []
+t0 = 0.0
+data = { file = "a", topic = "/fix", columns = ["east"], window = [0.0, 2.0], sigma = ["sigma_east"] }
+inputs = { file = "a", topic = "/cmd_vel", columns = { v = "vx" } }
+""")
+    (run,) = load_problem(tmp_path / "problem.toml").problem.experiments
+    np.testing.assert_allclose(run.data[0].times, TIMES[1:] - LATE)
+    np.testing.assert_allclose(run.data[0].values[:, 0], X[1:], atol=1e-5)
+    np.testing.assert_allclose(run.data[0].sigma, 0.2)
+    np.testing.assert_allclose(run.inputs.times, TIMES)
+    assert run.inputs.units == ("m/s",)
+
+
+def test_logs_with_dates_begin_together(tmp_path):
+    rows = [f"{(START + timedelta(seconds=10 + k)).isoformat()},{k}\n" for k in range(4)]
+    (tmp_path / "a.csv").write_text("time,x\n" + "".join(rows))
+    write_gpx(tmp_path / "a.gpx")
+    (tmp_path / "model.py").write_text(
+        "import switchfit as sf\nsystem = sf.HybridSystem({'go': lambda t, x, p: x}, [1.0])\n"
+    )
+    (tmp_path / "problem.toml").write_text("""
+model = "model.py:system"
+[[experiments]]
+mode_sequence = ["go"]
+transition_times = []
+initial_state = [{ value = 1.0 }]
+data = [{ file = "a.csv", columns = ["x"] }, { file = "a.gpx", columns = ["east"] }]
+""")
+    (run,) = load_problem(tmp_path / "problem.toml").problem.experiments
+    np.testing.assert_allclose(run.data[0].times, [10, 11, 12, 13])
+    np.testing.assert_allclose(run.data[1].times, TIMES)

@@ -1,0 +1,509 @@
+"""Logs: every dialect of text, what is odd about a log, and what is said where one cannot be read."""
+
+import gzip
+import re
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import switchfit as sf
+from switchfit import cli
+from switchfit.io.problem_file import load_problem
+from switchfit.runtime.errors import InputError
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Write a text file and return its path."""
+
+    def write(text, name="a.csv", encoding="utf-8"):
+        path = tmp_path / name
+        path.write_bytes(text.encode(encoding))
+        return path
+
+    return write
+
+
+# --- dialects ---------------------------------------------------------------------------------------------------------
+
+DIALECTS = {
+    "commas": "t,x,y\n0,1,2\n1,3,4\n",
+    "semicolons": "t;x;y\n0;1;2\n1;3;4",
+    "tabs": "t\tx\ty\n0\t1\t2\n1\t3\t4\n",
+    "bars": "t|x|y\n0|1|2\n1|3|4\n",
+    "columns of spaces": "  t    x    y\n0.0  1.0  2.0\n1.0  3.0  4.0\n",
+    "spaces around cells, a byte order mark": "\ufeff t , x , y\r\n 0 , 1 , 2 \r\n1, 3, 4\r\n",
+    "comments, quotes, exponents": '# a comment\n\n"t","x","y"\n0,1,2\n\n# another\n1,3e0,4.0\n',
+    "names in a comment": "# logger 3\n# t x y\n0 1 2\n1 3 4\n",
+    "names behind a percent sign": "%time,x,y\n0,1,2\n1,3,4\n",
+    "separators at the ends of lines": "t;x;y;\n0;1;2;\n1;3;4;\n",
+    "separators at the ends of rows alone": "t;x;y\n0;1;2;\n1;3;4;\n",
+    "decimal commas": "t;x;y\n0,0;1,0;2,0\n1,0;3,0;4,0\n",
+    "decimal commas in columns of tabs": "t\tx\ty\n0,0\t1,0\t2\n1\t3\t4,0\n",
+    "a line of units": "t,x,y\ns,m,m\n0,1,2\n1,3,4\n",
+    "units in brackets": "t [s],x [m],y [m]\n0,1,2\n1,3,4\n",
+    "three lines": "Time;Position along X;Position along Y\ns;m;m\nt;x;y\n0;1;2\n1;3;4\n",
+    "a preamble": "Logger 3\nfirmware: 1.2\n\nt,x,y\n0,1,2\n1,3,4\n",
+    "a note of Excel": "sep=;\nt;x;y\n0;1;2\n1;3;4\n",
+    "old line ends": "t,x,y\r0,1,2\r1,3,4\r",
+}
+
+
+@pytest.mark.parametrize("text", DIALECTS.values(), ids=DIALECTS)
+def test_dialects(write, text):
+    log = sf.read_log(write(text))
+    np.testing.assert_array_equal(log.times, [0, 1])
+    assert log.channels == ("x", "y")
+    np.testing.assert_array_equal(log[["y", "x"]], [[2, 1], [4, 3]])
+    unit = "m" if re.search(r"\[m\]|^s.m.m$", text, re.MULTILINE) else ""
+    assert log.units == {"x": unit, "y": unit}
+    assert log.time_unit == ("s" if unit else "")
+    np.testing.assert_array_equal(sf.read_log(write(text), columns=["y", "x"])["y"], [2, 4])
+
+
+REAL = (
+    "Time;Set robot speed along X axis;Set robot speed along Y axis;Set rotational robot velocity;1st motor set speed;"
+    "2st motor set speed;3st motor set speed;1st motor position;2nd motor position;3rd motor position;"
+    "1st motor velocity;2nd motor velocity;3rd motor velocity;1st motor current;2nd motor current;3rd motor current;\n"
+    "ms;m/s;m/s;rad/s;rad/s;rad/s;rad/s;ticks;ticks;ticks;rad/s;rad/s;rad/s;A;A;A;\n"
+    "t;xsetspeed;ysetspeed;setvel;m1setvel;m2setvel;m3setvel;m1pos;m2pos;m3pos;m1vel;m2vel;m3vel;m1cur;m2cur;m3cur;\n"
+    "0.0002;0.2;0;0;-69.282;0;69.282;0;0;0;0;0;0;0;0;0;\n"
+    "34.0855;0.2;0;0;-69.282;0;69.282;16;-7;0;0;0;0;0.025641;0.025641;0.025641;\n"
+)
+"""The head of a log of a robot with three wheels."""
+
+
+def test_a_real_header(write):
+    log = sf.read_log(write(REAL), time_unit="s")
+    np.testing.assert_allclose(log.times, [2e-7, 0.0340855], rtol=1e-15)
+    assert log.channels[:3] == ("xsetspeed", "ysetspeed", "setvel")
+    assert len(log.channels) == 15
+    np.testing.assert_array_equal(log["1st motor position"], [0, 16])
+    assert (log.units["m3pos"], log.units["m3vel"], log.units["m3cur"]) == ("ticks", "rad/s", "A")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1", "utf-16"])
+def test_encodings_and_compression(write, tmp_path, encoding):
+    text = "Zeit [µs];Längsweg [°]\n0;1,5\n1;2,5\n"
+    path = write(text, encoding=encoding)
+    for file in (path, tmp_path / "a.csv.gz"):
+        log = sf.read_log(file)
+        assert (log.channels, log.units, log.time_unit) == (("Längsweg",), {"Längsweg": "°"}, "us")
+        np.testing.assert_array_equal(log["Längsweg [°]"], [1.5, 2.5])
+        (tmp_path / "a.csv.gz").write_bytes(gzip.compress(path.read_bytes()))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "t,x,y\n0,,1\n1,2,\n2,,\n,3,4\n",
+        "t;x;y\n0;;1\n1;2;\n2;;\n;3;4\n",
+        "t;x;y;\n0;;1;\n1;2;;\n2;;;\n;3;4;\n",
+        "t,x,y\n0,NA,1\n1,2,nan\n2,,N/A\nNULL,3,4\n",
+        't,x,y\n0,"",1\n1,2,""\n2,,\n,3,4\n',
+    ],
+)
+def test_missing_cells(write, text):
+    """Those that NumPy's reader is given, and those that are read one by one."""
+    log = sf.read_log(write(text), repair="drop-missing-times")
+    np.testing.assert_array_equal(log.times, [0, 1, 2])
+    np.testing.assert_array_equal(log[["x", "y"]], [[np.nan, 1], [2, np.nan], [np.nan, np.nan]])
+    with pytest.raises(InputError, match=r"the time of sample 4 is missing \(line 5\)"):
+        sf.read_log(write(text))
+
+
+def test_missing_values_and_names_with_commas(write):
+    values = sf.read_log(write('t,"x, in m"\n0,\n1,NA\n2,nan\n3,4\n'))["x, in m"]
+    np.testing.assert_array_equal(values, [np.nan, np.nan, np.nan, 4])
+
+
+def test_names_in_two_lines(write):
+    log = sf.read_log(write("t,left,left,right,right\ns,m,rad,m,rad\n,x,yaw,x,yaw\n0,1,2,3,4\n1,1,2,3,4\n"))
+    assert log.channels == ("left.x", "left.yaw", "right.x", "right.yaw")
+    assert log.units["right.yaw"] == "rad"
+
+
+def test_no_names_at_all(write):
+    log = sf.read_log(write("0.0 1.0\n0.1 2.0\n"))
+    np.testing.assert_array_equal(log.times, [0, 0.1])
+    np.testing.assert_array_equal(log["column 2"], [1, 2])
+
+
+def test_every_name_in_the_header_leads_to_its_channel(write):
+    log = sf.read_log(write("Time;Position along X\ns;m\nt;x\n0;1\n1;2\n"))
+    for name in ("x", "Position along X"):
+        np.testing.assert_array_equal(log[name], [1, 2])
+        assert name in log
+    with pytest.raises(InputError, match=r"a\.csv has no column 'z'; its columns are x\."):
+        log["z"]
+    with pytest.raises(TypeError, match=r'indexed by a name or a list of names, as in log\["x"\]; got 3'):
+        log[3]
+
+
+@pytest.mark.parametrize(
+    ("header", "unit"),
+    [
+        ("t", ""), ("t [ms]", "ms"), ("time (msec)", "ms"), ("t_s", "s"), ("Time_us", "us"), ("timestamp [µs]", "us"),
+        ("t_min", "min"), ("elapsed time [h]", "h"), ("time (indoors)", ""),
+        ("millis", "ms"), ("__time", ""), ("seconds_elapsed", "s"), ("time_usec", "us"),
+    ],
+)  # fmt: skip
+def test_units_of_time(write, header, unit):
+    log = sf.read_log(write(f"x,{header}\n5,0\n6,36\n7,72\n"))
+    assert log.time_unit == unit
+    np.testing.assert_array_equal(log.times, [0, 36, 72])
+    seconds = sf.read_log(write(f"x,{header}\n5,0\n6,36\n7,72\n"), time_unit="s")
+    factor = {"": 1, "ms": 1e-3, "us": 1e-6, "s": 1, "min": 60, "h": 3600}[unit]
+    np.testing.assert_allclose(seconds.times, np.array([0, 36, 72]) * factor, rtol=1e-15)
+    assert seconds.time_unit == "s"
+
+
+@pytest.mark.parametrize(
+    ("header", "times"),
+    [
+        ("t_motor,t,x", 1),  # a temperature
+        ("date,x,time", 2),
+        ("x,lap_time,time", 2),
+        ("field.header.seq,x,field.header.stamp", 2),
+        ("x,start_time,y", 1),
+        ("k,x,y", 0),  # the first one, as it rises
+    ],
+)
+def test_which_column_has_the_times(write, header, times):
+    log = sf.read_log(write(f"{header}\n0,10,20\n1,11,21\n2,12,22\n"))
+    np.testing.assert_array_equal(log.times, 10 * times + np.arange(3))
+
+
+@pytest.mark.parametrize(
+    ("times", "unit"),
+    [
+        (["1700000000.25", "1700000000.5"], "s"),
+        (["1700000000250", "1700000000500"], "ms"),
+        (["1700000000250000", "1700000000500000"], "us"),
+        (["1700000000250000001", "1700000000500000001"], "ns"),
+    ],
+)
+def test_times_since_1970(write, times, unit):
+    log = sf.read_log(write(f"timestamp,x\n{times[0]},1\n{times[1]},2\n"))
+    assert log.time_unit == unit
+    per_second = {"s": 1, "ms": 1e3, "us": 1e6, "ns": 1e9}[unit]
+    np.testing.assert_array_equal(log.times, [0, 0.25 * per_second])  # nanoseconds too, which doubles cannot hold
+    assert f"{log.start:%Y-%m-%d %H:%M:%S}" == "2023-11-14 22:13:20"
+
+
+def test_microseconds_since_boot_are_not_seconds_since_1970(write):
+    log = sf.read_log(write("timestamp,x\n1700000000,1\n1700004001,2\n1700008002,3\n"))
+    assert (log.times[0], log.start, log.time_unit) == (1.7e9, None, "")
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        ["time,x", "2024-05-01T12:00:00Z,1", "2024-05-01T12:00:01.5Z,2"],
+        ["time;x", "2024-05-01 12:00:00,000;1,0", "2024-05-01 12:00:01,500;2,0"],
+        ["time;x", "01.05.2024 12:00:00;1", "01.05.2024 12:00:01.5;2"],
+        ["time;x", "2024/05/01 12:00:00;1", "2024/5/1 12:00:01.5;2"],
+        ["time,x", "2024-05-01T14:00:00+02:00,1", "2024-05-01T14:00:01.5+02:00,2"],
+        ["Date,Time,x", "2024-05-01,12:00:00,1", "2024-05-01,12:00:01.5,2"],
+    ],
+)
+def test_dates(write, rows):
+    log = sf.read_log(write("\n".join(rows)))
+    np.testing.assert_array_equal(log.times, [0, 1.5])
+    assert (f"{log.start:%Y-%m-%d %H:%M:%S}", log.time_unit) == ("2024-05-01 12:00:00", "s")
+    np.testing.assert_array_equal(log["x"], [1, 2])
+
+
+def test_times_of_day(write):
+    log = sf.read_log(write("time,x\n12:00:00,1\n12:00:01.5,2\n12:01,3\n"))
+    np.testing.assert_array_equal(log.times, [43200, 43201.5, 43260])
+    with pytest.raises(InputError, match=r"a\.csv, line 3, column 'time': 'noon' is not a time of day such as 12:34"):
+        sf.read_log(write("time,x\n12:00:00,1\nnoon,2\n"))
+    with pytest.raises(InputError, match=r"a\.csv, line 3, column 'time': '05/01/2024' is not a date that can be read"):
+        sf.read_log(write("time,x\n2024-05-01,1\n05/01/2024,2\n"))
+
+
+def test_text_becomes_events(write):
+    log = sf.read_log(write("t,mode,x\n0,push,1\n1,push,2\n2,,3\n3,brake,4\n"))
+    assert log.channels == ("x",)
+    assert log.events == ((0.0, "mode", "push"), (3.0, "mode", "brake"))
+
+
+# --- what is wrong is said --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", r"a\.csv is empty; it needs a line with the names"),
+        ("\n# only this\n", r"a\.csv is empty"),
+        ("t,x\n", r"a\.csv has a header but no rows"),
+        ("t,y\n0,1\n", r"a\.csv has no column 'x'; its columns are t, y\."),
+        ("t,x,x\n0,1,2\n", r"a\.csv has 2 columns 'x'; rename all but one"),
+        ("t,x\n0,1\n\n1,two\n", r"a\.csv, line 4, column 'x': 'two' is not a number; leave the cell empty"),
+        ('t,x\n0,1\n1,"1,234"\n', r"a\.csv, line 3, column 'x': '1,234' is not a number"),
+        ("t,x\n0,1\n1,1_0\n", r"a\.csv, line 3, column 'x': '1_0' is not a number"),
+        ("t,x\n0,1\nlate,2\n", r"a\.csv, line 3, column 't': 'late' is not a number"),
+        ("t,x\n0,1\n1\n", r"a\.csv, line 3: 1 fields where the header has 2; is a field missing\? repair='drop-bro"),
+        ("t,x\n0,1\n1,2,3\n", r"a\.csv, line 3: 3 fields where the header has 2"),
+        ("t,x\n0,5,1,5\n1,5,2,5\n", r"a\.csv, line 2: 4 fields .* decimal commas\? Then separate fields by semicolons"),
+        ("t;x\n0,5;1.5\n1;2\n", r"with decimal commas and with decimal points: '0,5' in line 2, '1\.5' in line 2"),
+        ('t,x\n0,1\n1,"2\n' + "3" * 200_000, r"a\.csv, line 4: field larger .*; is a quotation mark missing"),
+        ("t,x\n0,1\n,2\n", r"a\.csv, column 't': the time of sample 2 is missing \(line 3\)\. repair='drop-missing"),
+    ],
+)  # fmt: skip
+def test_text_that_cannot_be_read(write, text, message):
+    with pytest.raises(InputError, match=message):
+        sf.read_log(write(text), columns=["x"])
+
+
+def test_no_column_with_times(write):
+    with pytest.raises(InputError, match=r"a\.csv: no column is called time; its columns are x, y\. Name the one"):
+        sf.read_log(write("x,y\n0,1\n-1,2\n"))
+    np.testing.assert_array_equal(sf.read_log(write("x,y\n0,1\n-1,2\n"), time="y").times, [1, 2])
+    np.testing.assert_array_equal(sf.read_log(write("k,y\n0,1\n1,2\n")).times, [0, 1])  # the first one, as it rises
+
+
+def test_files_that_are_no_text(write, tmp_path):
+    with pytest.raises(InputError, match=r"There is no file .*missing\.csv; check the name"):
+        sf.read_log(tmp_path / "missing.csv")
+    with pytest.raises(InputError, match="is a folder; name a file in it"):
+        sf.read_log(tmp_path)
+    (tmp_path / "a.bin").write_bytes(b"t,x\n\xff\xfe\x00")
+    with pytest.raises(InputError, match=r"a\.bin is not a text file \(byte 6 is 0\); export it as CSV"):
+        sf.read_log(tmp_path / "a.bin")
+    (tmp_path / "odd.csv").write_bytes(b"\xff\xfet")
+    with pytest.raises(InputError, match=r"odd\.csv is not a text file in UTF-16 \(byte"):
+        sf.read_log(tmp_path / "odd.csv")
+    (tmp_path / "a.csv.gz").write_bytes(gzip.compress(b"t,x\n0,1\n" * 100)[:-20])
+    with pytest.raises(InputError, match=r"a\.csv\.gz is compressed by gzip, but damaged or cut off"):
+        sf.read_log(tmp_path / "a.csv.gz")
+    with pytest.raises(InputError, match="is a device; name a file"):
+        sf.read_log("/dev/zero")
+
+
+# --- quality ----------------------------------------------------------------------------------------------------------
+
+
+def issues_of(log):
+    return {issue.kind: str(issue) for issue in log.issues}
+
+
+def table(times, values=None, name="x"):
+    values = np.sin(np.arange(len(times))) if values is None else values
+    return f"t [s],{name}\n" + "".join(f"{t},{v}\n" for t, v in zip(times, values, strict=True))
+
+
+def test_a_good_log_has_no_issues(write):
+    assert sf.read_log(write(table(range(20)))).issues == ()
+    assert sf.read_log(write(table([0, 1, 2, 3, 9, 10, 20, 21, 22, 30]))).issues == ()  # uneven is no gap
+
+
+def test_gaps(write):
+    said = issues_of(sf.read_log(write(table([*range(10), *range(50, 60)]))))
+    assert list(said) == ["log: gap"]
+    assert re.search(
+        r"a\.csv, line 12: a gap of 41 s after 9 s, where samples are typically 1 s apart", said["log: gap"]
+    )
+
+
+def test_repeated_times(write):
+    path = write(table([0, 1, 1, 1, 2]))
+    said = issues_of(sf.read_log(path))
+    assert list(said) == ["log: repeated time"]
+    assert "a.csv, line 4 (and 1 more): the time 1 s stands there twice; repair='drop-dup" in said["log: repeated time"]
+    mended = sf.read_log(path, repair="drop-duplicates")
+    np.testing.assert_array_equal(mended.times, [0, 1, 2])
+    np.testing.assert_array_equal(mended["x"], np.sin([0.0, 1.0, 4.0]))
+    assert "the first sample is kept" in issues_of(mended)["log: repeated time"]
+
+
+def test_times_out_of_order(write):
+    path = write(table([0, 1, 3, 2, 4, 5]))
+    said = issues_of(sf.read_log(path))
+    assert list(said) == ["log: unsorted times"]
+    assert (
+        "a.csv, line 5: times are not in order, 2 s is written too late; repair='sort'" in said["log: unsorted times"]
+    )
+    mended = sf.read_log(path, repair=("sort", "drop-duplicates"))
+    np.testing.assert_array_equal(mended.times, range(6))
+    np.testing.assert_array_equal(mended["x"], np.sin([0.0, 1.0, 3.0, 2.0, 4.0, 5.0]))
+
+
+def test_a_clock_that_jumps_back(write):
+    said = issues_of(sf.read_log(write(table([*range(20), *range(5)]))))
+    assert re.search(r"line 22: the clock jumps back by 19 s, to 0 s; if these are two rec", said["log: clock jump"])
+
+
+@pytest.mark.parametrize(("name", "turn"), [("yaw", 2 * np.pi), ("heading", 360), ("ang [deg]", 360), ("q [rad]", 0)])
+def test_wrapped_angles(write, name, turn):
+    turn = turn or 2 * np.pi
+    true = np.linspace(0, 2.5 * turn, 60)
+    path = write(table(range(60), (true + turn / 2) % turn - turn / 2, name))
+    log = sf.read_log(path)
+    channel = log.channels[0]
+    assert (
+        f"a.csv, line 14 (and 2 more): the angle {channel!r} jumps by a turn of" in issues_of(log)["log: wrapped angle"]
+    )
+    assert abs(np.diff(log[channel])).max() > turn / 2
+    mended = sf.read_log(path, repair=f"unwrap:{channel}")
+    np.testing.assert_allclose(mended[channel], true, atol=1e-9 * turn)
+    assert "unwrapped" in issues_of(mended)["log: wrapped angle"]
+
+
+def test_angles_that_are_not_wrapped(write):
+    assert sf.read_log(write(table(range(9), np.linspace(0, 6, 9), "yaw"))).issues == ()
+    with pytest.raises(InputError, match="repair='unwrap:x' needs an angle in rad or deg; its unit is 'm'"):
+        sf.read_log(write(table(range(9), name="x [m]")), repair="unwrap:x")
+    with pytest.raises(InputError, match="has no column 'z'"):
+        sf.read_log(write(table(range(9))), repair="unwrap:z")
+
+
+def test_channels_that_say_nothing(write):
+    said = issues_of(sf.read_log(write("t,a,b,c\n" + "".join(f"{k},7,,{k}\n" for k in range(5)))))
+    assert re.search(r"a\.csv: constant in all samples: a\.", said["log: constant"])
+    assert re.search(r"a\.csv: without any value: b\.", said["log: empty"])
+
+
+def test_broken_lines(write):
+    path = write("t,x,y\n0,1,1\n1,2,2\nt,x,y\n2,ERR,3\n3,4,4\n4,5,5\n5,6")
+    with pytest.raises(InputError, match=r"line 8: 2 fields where the header has 3"):
+        sf.read_log(path)
+    log = sf.read_log(path, repair="drop-broken-lines")
+    np.testing.assert_array_equal(log.times, [0, 1, 3, 4])
+    np.testing.assert_array_equal(log["x"], [1, 2, 4, 5])
+    assert "a.csv, line 8: broken; left out." in (str(issue)[-32:] for issue in log.issues)
+    assert any("line 4 (and 1 more): broken; left out." in str(issue) for issue in log.issues)
+
+
+def test_a_column_with_some_text_is_left_out(write):
+    log = sf.read_log(write("t,x,y\n0,1,1\n1,ERR,2\n2,3,3\n"))
+    assert log.channels == ("y",)
+    said = issues_of(log)["log: text"]
+    assert "a.csv, line 3: 'ERR' in column 'x' is not a number, and the column is left out" in said
+
+
+def test_missing_times(write):
+    log = sf.read_log(write("t,x\n0,1\n,2\n2,3\n"), repair="drop-missing-times")
+    np.testing.assert_array_equal(log["x"], [1, 3])
+    assert "line 3: without a time; left out" in issues_of(log)["log: missing times"]
+
+
+def test_repairs_that_are_not_known(write):
+    with pytest.raises(
+        InputError, match=r"repair must be among sort, drop-duplicates, .* and unwrap:CHANNEL; got 'sore'"
+    ):
+        sf.read_log(write("t,x\n0,1\n"), repair="sore")
+
+
+def test_two_columns_of_one_name(write):
+    log = sf.read_log(write("t,x,x,y\n0,1,2,3\n1,2,3,4\n"))
+    assert log.channels == ("y",)
+    assert "has several columns 'x', which are left out" in issues_of(log)["log: repeated name"]
+
+
+def test_a_log_in_words(write):
+    text = str(sf.read_log(write("time [ms],x [m],y,mode\n1700000000250,1,2,a\n1700000000500,2,2,b\n")))
+    assert text.splitlines()[0].endswith("a.csv: 2 samples, 0 to 250 ms from 2023-11-14 22:13:20 UTC")
+    assert text.splitlines()[1:] == ["  channels: x (m), y", "  events: 2"]
+
+
+# --- in problem files -------------------------------------------------------------------------------------------------
+
+PROBLEM = """
+model = "model.py:system"
+[parameters]
+v = 1.0
+[[experiments]]
+mode_sequence = ["go"]
+transition_times = []
+[[experiments.data]]
+file = "a.csv"
+columns = ["Weg"]
+sigma = 0.1
+"""
+MODEL = """
+import switchfit as sf
+system = sf.HybridSystem({"go": lambda t, x, p: 0.0 * x + p["v"]}, [0.0])
+
+def observe(t, x, p):
+    import jax.numpy as jnp
+    return jnp.stack([x[0], x[0]])
+"""
+DRIVE = "Zeit;Weg;Winkel\nms;m;deg\n" + "".join(f"{k}00;0,{k};{(k * 60) % 360}\n" for k in range(9))
+
+
+@pytest.fixture
+def problem(write, tmp_path):
+    """Load the problem file after some replacements in it."""
+    write(DRIVE)
+    write(MODEL, "model.py")
+
+    def load(*changes):
+        text = PROBLEM
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new)
+        return load_problem(write(text, "problem.toml"))
+
+    return load
+
+
+def test_a_dialect_in_a_problem_file(problem):
+    (run,) = problem(("sigma", "time_scale = 1e-3\nsigma")).problem.experiments
+    np.testing.assert_allclose(run.data[0].times, np.arange(9) * 0.1)
+    np.testing.assert_allclose(run.data[0].values[:, 0], np.arange(9) * 0.1)
+    assert run.data[0].units == ("m",)
+    (run,) = problem(("transition_times", 'time_unit = "ms"\ntransition_times')).problem.experiments
+    np.testing.assert_array_equal(run.data[0].times, np.arange(9) * 100)
+
+
+def test_units_of_time_that_differ_are_refused(problem):
+    with pytest.raises(
+        InputError, match=r"the times are in ms, but time_unit of the experiment is 's'\. Set time_scale = 0\.001 to"
+    ):
+        problem()
+    assert problem(("sigma", "time_scale = 1\nsigma")).problem.experiments[0].tf == 800.0
+
+
+def test_times_since_1970_in_a_problem_file(problem, write):
+    """They are numbers like others there, and window and time_offset are in them; 'first' makes them begin at 0."""
+    write("Zeit;Weg\n" + "".join(f"{1700000000 + k};{k}\n" for k in range(5)))
+    (run,) = problem(("sigma", "time_offset = 1700000001\nsigma")).problem.experiments
+    np.testing.assert_array_equal(run.data[0].times, [-1, 0, 1, 2, 3])
+    window = "window = [1700000001, 1700000003]\n"
+    (run,) = problem(("sigma", f'{window}time_offset = "first"\nsigma')).problem.experiments
+    np.testing.assert_array_equal(run.data[0].times, [0, 1, 2])
+
+
+@pytest.mark.parametrize(
+    ("times", "message", "repair"),
+    [
+        ("01132", r"Measurements times must increase strictly; in .*a\.csv, line 4, 1\.0 follows 1\.0\.", "drop-dupl"),
+        ("01324", r"Measurements times must increase strictly; in .*a\.csv, line 5, 2\.0 follows 3\.0\.", "sort"),
+    ],
+)
+def test_times_out_of_order_are_said_with_their_line(problem, write, times, message, repair):
+    write("Zeit;Weg\n" + "".join(f"{t};{k}\n" for k, t in enumerate(times)))
+    with pytest.raises(InputError, match=rf"experiments\[1\]\.data\[1\]: {message} repair = \['{repair}"):
+        problem()
+    mended = problem(("sigma", 'repair = ["sort", "drop-duplicates"]\nsigma')).problem.experiments[0].data[0]
+    np.testing.assert_array_equal(mended.times, sorted(map(float, set(times))))
+
+
+def test_check_says_what_is_odd(problem):
+    loaded = problem(("sigma", 'time_scale = 1e-3\nobserve = "model.py:observe"\nsigma'), ('"Weg"', '"Weg", "Winkel"'))
+    assert [issue.kind for issue in loaded.issues] == ["log: wrapped angle"]
+    for options in ([], ["--no-run"]):
+        result = CliRunner().invoke(cli.app, ["check", str(loaded.path), *options])
+        assert result.exit_code == 0, result.stderr
+        assert "9 samples of Weg (m), Winkel (deg), 0 to 0.8 s" in result.stdout
+        assert "a.csv, line 9: the angle 'Winkel' jumps by a turn of 360; repair='unwrap" in result.stdout
+
+
+def test_units_are_those_of_the_values_and_not_of_sigma(problem, write):
+    write("Zeit;Weg;Fehler\ns;m;mm\n0;1;2\n1;2;2\n")
+    data = problem(("sigma = 0.1", 'sigma = ["Fehler"]')).problem.experiments[0].data[0]
+    assert data.units == ("m",)
+    np.testing.assert_array_equal(data.sigma, [[2], [2]])

@@ -1,0 +1,259 @@
+"""Many logs: patterns and folders in problem files, and `switchfit fit LOG ... --problem FILE`."""
+
+import csv
+
+import numpy as np
+import pytest
+from test_cli import PROBLEM, ROOM
+from typer.testing import CliRunner
+
+import switchfit as sf
+from switchfit import cli
+from switchfit.io.logs.files import find_logs, name_logs
+from switchfit.io.problem_file import load_problem
+from switchfit.runtime.errors import InputError
+
+
+def log_of(switch, heating=0.5):
+    """A room that is heated until it is switched off."""
+    times = np.arange(0.25, 6.0, 0.5)
+    heated = heating / 0.05 * (1 - np.exp(-0.05 * np.minimum(times, switch)))
+    values = heated * np.exp(-0.05 * np.maximum(times - switch, 0))
+    return "t;T\ns;K\n" + "".join(f"{t:g};{v!r}\n" for t, v in zip(times, values.tolist(), strict=True))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Two logs, and one that is no log."""
+    (tmp_path / "logs").mkdir()
+    for name, switch in (("monday", 3.2), ("tuesday", 2.1)):
+        (tmp_path / "logs" / f"{name}.csv").write_text(log_of(switch))
+    (tmp_path / "room.py").write_text(ROOM)
+    (tmp_path / "problem.toml").write_text(PROBLEM)
+    return tmp_path
+
+
+def spoil(folder):
+    (folder / "logs" / "sunday.csv").write_text("t;T\n0;1\n1;cold\n")
+
+
+def run(*arguments):
+    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def test_patterns_and_folders(tmp_path):
+    for name in ("b.csv", "a.csv", "a.csv.gz", "notes.md", ".hidden.csv", "c[1].csv"):
+        (tmp_path / name).write_text("")
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "metadata.yaml").write_text("")
+    (tmp_path / "empty").mkdir()
+    assert find_logs(tmp_path, "*.csv") == ["a.csv", "b.csv", "c[1].csv"]
+    assert find_logs(tmp_path, ".") == [f"./{name}" for name in ("a.csv", "a.csv.gz", "b.csv", "bag", "c[1].csv")]
+    for one in ("a.csv", "missing.csv", "bag", "c[1].csv", "", "x" * 5000, "a\0b"):
+        assert find_logs(tmp_path, one) is None
+    assert find_logs(tmp_path.parent, str(tmp_path / "a.*")) == [str(tmp_path / "a.csv"), str(tmp_path / "a.csv.gz")]
+    with pytest.raises(InputError, match=r"No file matches .*x\*\.csv; check the pattern and the folder"):
+        find_logs(tmp_path, "x*.csv")
+    with pytest.raises(InputError, match=r"empty has no logs: no file in it ends in \.csv, \.dat"):
+        find_logs(tmp_path, "empty")
+
+
+@pytest.mark.parametrize(
+    ("paths", "names"),
+    [
+        (["logs/a.csv", "logs/b.csv.gz"], ["a", "b"]),
+        (["1/drive.csv", "2/drive.csv"], ["1/drive", "2/drive"]),
+        (["logs/1/drive.csv", "logs/2/drive.csv"], ["1/drive", "2/drive"]),
+        (["a.csv", "a.mat"], ["a.csv", "a.mat"]),
+        (["bag_1", "bag_2"], ["bag_1", "bag_2"]),
+    ],
+)
+def test_names(paths, names):
+    assert name_logs(paths) == names
+
+
+# --- in problem files -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("pattern", ["logs/*.csv", "logs"])
+def test_a_pattern_is_a_run_for_each_log(folder, pattern):
+    (folder / "problem.toml").write_text(PROBLEM.replace("log.csv", pattern))
+    loaded = load_problem(folder / "problem.toml")
+    assert [run.name for run in loaded.problem.experiments] == ["monday", "tuesday"]
+    assert loaded.problem.theta_names == ("monday.tau_1", "tuesday.tau_1", "heating")
+    np.testing.assert_allclose(sf.estimate(loaded.problem).theta, [3.2, 2.1, 0.5], rtol=1e-5)
+    assert loaded.issues == ()
+
+
+def test_a_bad_log_is_left_out_of_a_problem(folder):
+    spoil(folder)
+    (folder / "problem.toml").write_text(PROBLEM.replace("log.csv", "logs/*.csv"))
+    for command in (["check"], ["check", "--no-run"], ["fit", "--max-iterations", "30"]):
+        result = run(command[0], folder / "problem.toml", *command[1:])
+        assert result.exit_code == 2
+        said = (
+            "sunday.csv, line 3, column 'T': 'cold' is not a number; leave the cell empty where a value is missing.\n"
+        )
+        assert result.stderr.startswith("switchfit: Left out: ")
+        assert result.stderr.endswith(said)
+        assert "monday" in result.stdout
+        assert "tuesday" in result.stdout
+    for name in ("monday", "tuesday"):
+        (folder / "logs" / f"{name}.csv").unlink()
+    with pytest.raises(InputError, match=r"sunday\.csv, line 3"):  # not one of the logs can be used
+        load_problem(folder / "problem.toml")
+
+
+def test_logs_of_one_name_go_together(folder):
+    text = PROBLEM.replace("log.csv", "logs/*.csv").replace("[[experiments]]", '[[experiments]]\nname = "room"')
+    other = '\n[[experiments.data]]\nfile = "more/*.csv"\ncolumns = ["T"]\nsigma = 0.2\n'
+    (folder / "problem.toml").write_text(text + other)
+    (folder / "more").mkdir()
+    (folder / "more" / "tuesday.csv").write_text(log_of(1.0))
+    with pytest.raises(InputError, match=r"experiments\[1\]: .*more.\*\.csv has no log 'monday', which another patte"):
+        load_problem(folder / "problem.toml")
+    (folder / "more" / "monday.csv").write_text(log_of(2.0))
+    runs = load_problem(folder / "problem.toml").problem.experiments
+    assert [run.name for run in runs] == ["room monday", "room tuesday"]
+    for run_of, switches in zip(runs, ((3.2, 2.0), (2.1, 1.0)), strict=True):
+        for data, switch in zip(run_of.data, switches, strict=True):
+            assert data.times[np.argmax(data.values)] == pytest.approx(switch, abs=0.3)
+
+
+# --- one by one -------------------------------------------------------------------------------------------------------
+
+
+def read(path):
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.parametrize("given", ["files", "pattern", "folder"])
+def test_logs_one_by_one(folder, given):
+    logs = folder / "logs"
+    names = {"files": sorted(logs.iterdir()), "pattern": [logs / "*.csv"], "folder": [logs]}[given]
+    out, table = folder / "out", folder / "new" / "table.csv"
+    result = run("fit", *names, "--problem", folder / "problem.toml", "--table", table, "--out", out, "--no-figures")
+    assert result.exit_code == 0, result.stderr
+    rows = read(table)
+    assert [row["log"] for row in rows] == [str(logs / "monday.csv"), str(logs / "tuesday.csv")]
+    np.testing.assert_allclose([float(row["tau_1 (s)"]) for row in rows], [3.2, 2.1], rtol=1e-5)
+    np.testing.assert_allclose([float(row["heating"]) for row in rows], 0.5, rtol=1e-5)
+    assert {row["status"] for row in rows} == {"CONVERGED"}
+    assert all(float(row["tau_1 (s) std. error"]) > 0 for row in rows)
+    assert "monday.csv: " in result.stdout
+    assert "tau_1 (s) = 3.2 +- " in result.stdout
+    assert "2 logs: 2 fitted, 0 not, 0 refused" in result.stderr
+    np.testing.assert_allclose(sf.Estimate.load(out / "tuesday" / "estimate.json").theta, [2.1, 0.5], rtol=1e-5)
+    assert (out / "monday" / "report.txt").exists()
+
+
+def test_a_bad_log_does_not_end_the_run(folder):
+    spoil(folder)
+    (folder / "logs" / "short.csv").write_text("t;U\n0;1\n")
+    table = folder / "table.csv"
+    result = run("fit", folder / "logs", "--problem", folder / "problem.toml", "--table", table)
+    assert result.exit_code == 2
+    rows = {row["log"].rpartition("/")[2]: row for row in read(table)}
+    assert [row["verdict"] == "refused" for row in rows.values()] == [False, True, True, False]
+    assert "short.csv has no column 'T'; its columns are t, U." in rows["short.csv"]["message"]
+    assert "sunday.csv, line 3, column 'T': 'cold' is not a number" in rows["sunday.csv"]["message"]
+    assert float(rows["tuesday.csv"]["tau_1 (s)"]) == pytest.approx(2.1, rel=1e-5)
+    assert rows["sunday.csv"]["tau_1 (s)"] == ""
+    assert "4 logs: 2 fitted, 0 not, 2 refused" in result.stderr
+
+
+def test_a_fit_that_does_not_converge(folder):
+    result = run("fit", folder / "logs", "--problem", folder / "problem.toml", "--max-iterations", 1)
+    assert result.exit_code == 1
+    assert "2 logs: 0 fitted, 2 not, 0 refused" in result.stderr
+    assert "Stopped after 1 iterations" in result.stdout
+
+
+def test_a_fit_that_raises_is_one_bad_log(folder, monkeypatch):
+    real, calls = sf.estimate, []
+
+    def estimate(problem, **options):
+        calls.append(problem)
+        if len(calls) == 1:
+            raise LookupError("no luck")
+        return real(problem, **options)
+
+    monkeypatch.setattr(sf, "estimate", estimate)
+    result = run("fit", folder / "logs", "--problem", folder / "problem.toml")
+    assert result.exit_code == 2
+    assert "monday.csv: refused. LookupError: no luck" in result.stdout
+    assert "2 logs: 1 fitted, 0 not, 1 refused" in result.stderr
+
+
+def test_ctrl_c_ends_the_run_and_leaves_the_table(folder, monkeypatch):
+    import signal
+
+    real = sf.estimate
+
+    def estimate(problem, callback, **options):
+        def interrupted(record):
+            signal.raise_signal(signal.SIGINT)
+            return callback(record)
+
+        return real(problem, callback=interrupted, **options)
+
+    monkeypatch.setattr(sf, "estimate", estimate)
+    table = folder / "table.csv"
+    result = run("fit", folder / "logs", "--problem", folder / "problem.toml", "--table", table)
+    assert result.exit_code == 1
+    assert [row["status"] for row in read(table)] == ["INTERRUPTED"]
+    assert "1 were not begun" in result.stderr
+
+
+def test_where_the_log_goes(folder):
+    """In place of what is left out; otherwise in place of the data's file, wherever it is named."""
+    monday = folder / "logs" / "monday.csv"
+    inputs = '\n[experiments.inputs]\nfile = "log.csv"\ncolumns = ["T"]\n'
+    problem = PROBLEM.replace("t0 = 0.0\ntf = 6.0\n", "")
+    tuesday = inputs.replace("log.csv", "logs/tuesday.csv")
+    driven = ROOM.replace("(t, x, p)", "(t, x, p, u)")
+    (folder / "room.py").write_text(driven)
+    for text, expected in (
+        (problem + inputs, ("monday", "monday")),
+        (problem.replace('file = "log.csv"\n', "") + tuesday, ("monday", "tuesday")),
+        (problem + tuesday, ("monday", "tuesday")),
+    ):
+        (folder / "problem.toml").write_text(text)
+        run_of = load_problem(folder / "problem.toml", monday).problem.experiments[0]
+        peaks = (run_of.data[0].values.max(), run_of.inputs.values.max())
+        assert peaks == tuple(max(sf.read_log(folder / "logs" / f"{name}.csv")["T"]) for name in expected)
+
+
+def test_what_is_missing_or_too_much(folder):
+    result = run("fit", folder / "problem.toml", folder / "problem.toml")
+    assert result.exit_code == 2
+    assert "name one problem file; to fit several logs by one, name it with --problem PROBLEM.toml" in result.stderr
+    assert run("fit", folder / "problem.toml", "--table", folder / "a.csv").exit_code == 2
+    result = run("fit", folder / "logs" / "x*.csv", "--problem", folder / "problem.toml")
+    assert result.exit_code == 2
+    assert "No file matches" in result.stderr
+    (folder / "problem.toml").write_text(PROBLEM.replace('file = "log.csv"\n', ""))
+    with pytest.raises(InputError, match=r"experiments\[1\]\.data\[1\]: the key 'file' is missing: name the log"):
+        load_problem(folder / "problem.toml")
+    two = PROBLEM + PROBLEM[PROBLEM.index("[[experiments]]") :]
+    (folder / "problem.toml").write_text(two)
+    with pytest.raises(InputError, match=r"must have one \[\[experiments\]\] to be fitted to logs; got 2"):
+        load_problem(folder / "problem.toml", folder / "logs" / "monday.csv")
+
+
+def test_a_bad_fit_says_why(folder):
+    """A room that is heated twice, by a model that heats once."""
+    times = np.arange(0.25, 6.0, 0.5)
+    rows = "".join(f"{t:g};{5 * np.sin(3 * t):.6g}\n" for t in times)
+    (folder / "logs" / "monday.csv").write_text("t;T\n" + rows)
+    table = folder / "table.csv"
+    result = run("fit", folder / "logs" / "monday.csv", "--problem", folder / "problem.toml", "--table", table)
+    assert result.exit_code == 1
+    (row,) = read(table)
+    assert row["verdict"] == "bad"
+    assert "of the variance" in row["message"]
+    assert row["message"] in result.stdout
