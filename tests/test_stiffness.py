@@ -222,7 +222,7 @@ def test_the_choice_is_said(caplog):
     assert "explicit steps" in describe_steps(relaxing(1.0))
     by_jax = relaxing(engine="jax")
     assert "engine='jax' is set; mode 'm' is stiff" in evaluator_of(by_jax).engine.reason
-    with pytest.raises(ValueError, match="engine='native' asks for machine code, but mode 'm' is stiff"):
+    with pytest.raises(ValueError, match="engine='native' requires machine code, but mode 'm' is stiff"):
         sf.evaluate(relaxing(engine="native"))
 
 
