@@ -34,7 +34,7 @@ RAISED = 1.1
 SMALLEST_RADIUS = 1e-10
 #: Factor by which the trust region shrinks after a step that failed.
 SHRINK = 0.5
-#: Iterations in which the violation has to fall by a tenth: with 6 to 40 of them as many fits end right.
+#: Iterations in which the violation has to change by a tenth: with 6 to 40 of them as many fits end right.
 STAGNANT = 10
 
 
@@ -84,7 +84,7 @@ def raise_penalty(penalty: float, point: Point, direction: Direction) -> float:
 
 
 def is_stuck(state: State) -> bool:
-    """Return whether constraints are not met, and their violation does not fall any more."""
+    """Return whether constraints are not met, and their violation does not change any more."""
     return state.point.violation > MET and state.stagnant >= STAGNANT
 
 
