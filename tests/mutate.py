@@ -150,7 +150,7 @@ IN_EQUALITIES: dict[str, tuple[str, Replacements]] = {
         MERIT,
         [("return penalty if penalty >= needed else RAISED * needed", "return penalty")],
     ),
-    "a violation that does not fall ends it": (
+    "a violation that does not change ends it": (
         MERIT,
         [
             (

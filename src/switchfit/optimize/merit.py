@@ -34,7 +34,7 @@ RAISED = 1.1
 SMALLEST_RADIUS = 1e-10
 #: Factor by which the trust region shrinks after a step that failed.
 SHRINK = 0.5
-#: Iterations in which the violation has to fall by a tenth: with 6 to 40 of them as many fits end right.
+#: Iterations in which the violation has to change by a tenth: with 6 to 40 of them as many fits end right.
 STAGNANT = 10
 #: Part of the violation that a step has to leave, by the linearized constraints, for constraints to count as stuck.
 FALL = 0.9

@@ -45,8 +45,8 @@ class State:
         Half-width of the trust region, in units of `Problem.reach`; infinite where there is none.
     penalty : float
         Of the equality constraints in the merit function.
-    lowest_violation : float
-        That of the equality constraints when it last fell by a tenth.
+    steady_violation : float
+        That of the equality constraints when it last changed by a tenth.
     stagnant : int
         Iterations since then.
     careful : bool
@@ -68,7 +68,7 @@ class State:
     restarts: int = 0
     radius: float = np.inf
     penalty: float = 0.0
-    lowest_violation: float = 0.0
+    steady_violation: float = 0.0
     stagnant: int = 0
     careful: bool = False
     status: Status | None = None
@@ -84,13 +84,13 @@ class State:
             gradient_scale=point.largest_derivative,
             lowest_cost=point.cost,
             penalty=FIRST_PENALTY * float(np.sqrt(point.forces @ point.forces)),
-            lowest_violation=point.violation,
+            steady_violation=point.violation,
         )
 
     def advance(self, accepted: Accepted, tolerance: float) -> State:
         """Return the state after an accepted step."""
         point, alpha = accepted.point, accepted.step_length
-        fell = point.violation <= 0.9 * self.lowest_violation
+        steady = abs(point.violation - self.steady_violation) <= 0.1 * self.steady_violation
         return State(
             point=point,
             iteration=self.iteration + 1,
@@ -104,8 +104,8 @@ class State:
             restarts=self.restarts,
             radius=accepted.radius,
             penalty=max(self.penalty, accepted.penalty),
-            lowest_violation=point.violation if fell else self.lowest_violation,
-            stagnant=0 if fell else self.stagnant + 1,
+            steady_violation=self.steady_violation if steady else point.violation,
+            stagnant=self.stagnant + 1 if steady else 0,
         )
 
     @property
