@@ -5,5 +5,6 @@ Its modules register how each kind of result is written and drawn (`switchfit.ru
 """
 
 from switchfit.report import batch, plot, sentences, text, uncertainty, verdict
+from switchfit.report.html import page
 
-__all__ = ["batch", "plot", "sentences", "text", "uncertainty", "verdict"]
+__all__ = ["batch", "page", "plot", "sentences", "text", "uncertainty", "verdict"]

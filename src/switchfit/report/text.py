@@ -285,7 +285,7 @@ def _format_residuals(comparison: Comparison, k: int) -> tuple[str, str, str]:
 
 def _format_unknowns(fit: Fit, most: int) -> list[str]:
     """Return the table of the unknowns as lines, those that are left out counted."""
-    table, note = tabulate_unknowns(fit, shown := _select_unknowns(fit, most))
+    table, note = tabulate_unknowns(fit, shown := select_unknowns(fit, most))
     more = len(fit.theta) - len(shown)
     lines = format_table(*table) + ([f"  and {more} more unknowns"] if more else [])
     return [*lines, f"  {note}"] if note else lines
@@ -350,9 +350,14 @@ def format_end(end: float, ends: FloatArray) -> str:
     return format_rounded(end, width / 10)[0]
 
 
-def _select_unknowns(fit: Fit, most: int) -> list[int]:
+def select_unknowns(fit: Fit, most: int) -> list[int]:
     """Return which unknowns are listed: of more than `most` first those at a bound, a kink or of a collapsed mode, then
     parameters, then transition times; in the order of theta.
+
+    Parameters
+    ----------
+    fit : Fit
+    most : int
     """
     marked = [bool(_mark_unknown(fit, name)) for name in fit.theta_names] if len(fit.theta) > most else []
     order = sorted(range(len(fit.theta)), key=lambda i: (not marked[i], bool(fit.is_time[i]))) if marked else None

@@ -37,3 +37,17 @@ def draw_figure(result: Any, **settings: Any) -> Any:
         What that kind of figure can be given.
     """
     raise TypeError(f"no module of switchfit.report draws a {type(result).__name__}; register one with figure_of.")
+
+
+@singledispatch
+def format_page(result: Any, **settings: Any) -> str:
+    """Return a result as one HTML page that needs no other file.
+
+    Parameters
+    ----------
+    result : object
+        Of a kind that a module of `switchfit.report` has registered.
+    settings
+        What that kind of page can be given.
+    """
+    raise TypeError(f"no module of switchfit.report makes a page of a {type(result).__name__}; register one.")

@@ -1,0 +1,202 @@
+"use strict";
+(() => {
+  const payload = JSON.parse(document.getElementById("payload").textContent);
+  const sliders = payload.sliders;
+  const documents = new Map(); // name of a figure -> Bokeh document
+  const dark = window.matchMedia("(prefers-color-scheme: dark)");
+  const printing = window.matchMedia("print");
+  const coarse = window.matchMedia("(pointer: coarse)").matches;
+  const moved = sliders.map(() => 0);
+  let last = 0;
+
+  // --- figures -------------------------------------------------------------------------------------------------------
+
+  function paint(root) {
+    const style = getComputedStyle(document.documentElement);
+    const [page, ink, muted, faint, panel] = ["page", "ink", "muted", "faint", "panel"].map((name) =>
+      style.getPropertyValue(`--${name}`).trim());
+    const tagged = { ink, muted, faint, edge: page };
+    for (const model of root.references()) {
+      if (model.type === "Figure") {
+        model.outline_line_color = faint;
+        if (coarse) model.toolbar.active_drag = null; // a finger scrolls the page
+      } else if (model.type.endsWith("Axis")) {
+        model.setv({
+          axis_line_color: muted, major_tick_line_color: muted, minor_tick_line_color: null,
+          major_label_text_color: ink, axis_label_text_color: ink, axis_label_text_font_style: "normal",
+        });
+      } else if (model.type === "Grid") {
+        model.grid_line_color = faint;
+      } else if (model.type === "Legend") {
+        model.setv({
+          label_text_color: ink, background_fill_color: panel, background_fill_alpha: 0.75, border_line_color: null,
+          inactive_fill_color: page, label_text_font_size: "12px", padding: 4, spacing: 12,
+        });
+      }
+      for (const tag of model.tags) {
+        const colour = tagged[tag];
+        if (colour === undefined) continue;
+        for (const name of tag === "edge" ? ["line_color"] : ["line_color", "fill_color", "text_color"]) {
+          if (!(name in model)) continue;
+          const now = model[name];
+          if (now === null || (typeof now === "object" && now.value == null)) continue;
+          model[name] = typeof now === "object" ? { value: colour } : colour;
+        }
+      }
+    }
+  }
+
+  async function embed(name) {
+    if (documents.has(name)) return;
+    documents.set(name, null);
+    const views = await Bokeh.embed.embed_item(payload.items[name], name);
+    const root = [...views.roots][0].model;
+    paint(root);
+    documents.set(name, root.document);
+  }
+
+  function repaint() {
+    for (const doc of documents.values()) if (doc) doc.roots().forEach(paint);
+  }
+  dark.addEventListener("change", repaint);
+  printing.addEventListener("change", repaint);
+
+  // --- runs ----------------------------------------------------------------------------------------------------------
+
+  async function show(choice) {
+    for (const element of document.querySelectorAll(".run")) {
+      element.classList.toggle("shown", choice === "all" || element.dataset.run === choice);
+    }
+    const chosen = choice === "all" ? Object.keys(payload.groups) : [choice];
+    document.querySelectorAll(".slider").forEach((element, k) => {
+      element.classList.toggle("shown", chosen.some((run) => sliders[k].runs.includes(Number(run))));
+    });
+    for (const run of chosen) for (const name of payload.groups[run]) await embed(name);
+    move();
+  }
+
+  for (const box of document.querySelectorAll("[data-channel]")) {
+    box.addEventListener("change", () => {
+      const doc = documents.get(`run-${box.closest(".run").dataset.run}`);
+      if (doc) doc.get_model_by_name(`channel-${box.dataset.channel}`).visible = box.checked;
+    });
+  }
+
+  // --- sliders -------------------------------------------------------------------------------------------------------
+
+  const ends = (k) => [sliders[k].values[0], sliders[k].values[sliders[k].values.length - 1]];
+  const digits = (value, step) => value.toFixed(Math.min(Math.max(1 - Math.floor(Math.log10(Math.abs(step) || 1)), 0), 12));
+
+  function interpolate(k, value) {
+    const { values, costs } = sliders[k];
+    let i = 1;
+    while (i < values.length - 1 && values[i] < value) i += 1;
+    if (costs[i] === null || costs[i - 1] === null) return null;
+    return costs[i - 1] + (costs[i] - costs[i - 1]) * (value - values[i - 1]) / (values[i] - values[i - 1]);
+  }
+
+  function quadratic(change) {
+    let cost = payload.cost;
+    change.forEach((d, i) => {
+      cost += payload.gradient[i] * d;
+      change.forEach((other, j) => { cost += 0.5 * d * payload.hessian[i][j] * other; });
+    });
+    return cost;
+  }
+
+  function moveCurves(doc) {
+    const by = new Map(sliders.map((slider, k) => [slider.place, moved[k]]));
+    const shift = (place) => by.get(place) || 0;
+    for (const source of doc.roots().flatMap((root) => [...root.references()])) {
+      if (source.type !== "ColumnDataSource" || !source.name) continue;
+      const data = { ...source.data };
+      if (source.name === "modes") {
+        data.left = data.left_b.map((left, i) => left + shift(data.left_place[i]));
+        data.right = data.right_b.map((right, i) => right + shift(data.right_place[i]));
+      } else if (source.name === "transitions") {
+        data.x = Float64Array.from(data.x_b, (x, i) => x + shift(data.place[i]));
+      } else if (/^(curve|samples)-/.test(source.name)) {
+        const { channels, places, delay } = source.tags[0];
+        for (let k = 0; k < channels; k += 1) {
+          const values = Float64Array.from(data[`b${k}`]);
+          for (const place of places) {
+            const d = shift(place);
+            if (d === 0) continue;
+            const slope = data[`d${place}_${k}`];
+            for (let i = 0; i < values.length; i += 1) values[i] += slope[i] * d;
+          }
+          data[`y${k}`] = values;
+        }
+        if (delay >= 0) data.t = Float64Array.from(data.bt, (t) => t + shift(delay));
+      } else continue;
+      source.data = data;
+    }
+    const still = moved.some((d) => d !== 0);
+    for (const model of doc.roots().flatMap((root) => [...root.references()])) {
+      if (model.name === "still") model.visible = still;
+    }
+  }
+
+  function drawSlice() {
+    const doc = documents.get("slice");
+    if (!doc) return;
+    const { values, costs, theta, name, unit } = sliders[last];
+    const change = (value) => sliders.map((_, k) => (k === last ? value - theta : 0));
+    const exact = costs.map((cost) => (cost === null ? NaN : cost));
+    doc.get_model_by_name("slice").data = { x: values, exact, quadratic: values.map((v) => quadratic(change(v))) };
+    const now = interpolate(last, theta + moved[last]);
+    doc.get_model_by_name("mark").data = { x: [theta + moved[last]], y: [now === null ? NaN : now] };
+    doc.get_model_by_name("slice-label").text = unit ? `${name} (${unit})` : name;
+  }
+
+  function move() {
+    if (!sliders.length) return;
+    sliders.forEach((slider, k) => {
+      const [low, high] = ends(k);
+      const step = (high - low) / 400;
+      const output = document.querySelector(`[data-slider="${k}"] output`);
+      const change = moved[k] ? ` (${moved[k] > 0 ? "+" : "−"}${digits(Math.abs(moved[k]), step)})` : "";
+      output.textContent = `${digits(slider.theta + moved[k], step)} ${slider.unit}`.trim() + change;
+    });
+    const away = moved.flatMap((d, k) => (d === 0 ? [] : [k]));
+    const one = away.length === 1 ? interpolate(away[0], sliders[away[0]].theta + moved[away[0]]) : null;
+    const cost = away.length === 0 ? payload.cost : one === null ? quadratic(moved) : one;
+    const how = away.length === 0 ? "at the estimate" : one === null ? "by the quadratic approximation" : "evaluated";
+    const rise = away.length ? `, ${(cost - payload.cost).toPrecision(3)} above the estimate's` : "";
+    document.getElementById("cost").textContent = `J = ${cost.toPrecision(8)}${rise} (${how})`;
+    for (const [name, doc] of documents) if (doc && name.startsWith("run-")) moveCurves(doc);
+    drawSlice();
+  }
+
+  function place(k) {
+    const [low, high] = ends(k);
+    document.getElementById(`slider-${k}`).value = Math.round(400 * (sliders[k].theta + moved[k] - low) / (high - low));
+  }
+
+  sliders.forEach((slider, k) => {
+    place(k);
+    document.getElementById(`slider-${k}`).addEventListener("input", (event) => {
+      const [low, high] = ends(k);
+      const value = low + (high - low) * Number(event.target.value) / 400;
+      moved[k] = Math.abs(value - slider.theta) <= 0.5 * (high - low) / 400 ? 0 : value - slider.theta;
+      last = k;
+      move();
+    });
+  });
+  const reset = document.getElementById("reset");
+  if (reset) reset.addEventListener("click", () => { moved.fill(0); sliders.forEach((_, k) => place(k)); move(); });
+
+  // --- start ---------------------------------------------------------------------------------------------------------
+
+  window.addEventListener("beforeprint", () => {
+    for (const details of document.querySelectorAll("details")) details.open = true;
+  });
+  const chooser = document.getElementById("run");
+  if (chooser) chooser.addEventListener("change", () => show(chooser.value));
+  (async () => {
+    await show("0");
+    for (const name of payload.always) await embed(name);
+    move();
+    document.documentElement.dataset.ready = "true";
+  })();
+})();
