@@ -7,12 +7,13 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
+from switchfit.report.html.columns import FigureData, ModeSpan, TransitionLine, collect_diagnostics, collect_run
 from switchfit.report.html.curves import Curves, choose_points, collect_curves, list_places
 from switchfit.report.html.inputs import collect_inputs
 from switchfit.report.html.sliders import Slider, build_sliders
@@ -39,9 +40,6 @@ from switchfit.uncertainty.issues import find_issues
 from switchfit.uncertainty.quality import explain_channel
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals, diagnose
 
-if TYPE_CHECKING:
-    from switchfit.report.html.figures import Line, Span1
-
 LIBRARIES = ("bokeh", "jinja2")
 """What the extra ``report`` installs."""
 MODE_COLOURS = ("#3b82c4", "#e08a1e", "#3f9b4b", "#9b5fb5", "#b8a400", "#1f9aa0", "#8a8a8a", "#a0643c")
@@ -58,6 +56,8 @@ MOST_ROWS = 300
 """Rows of a table; what is left out is counted."""
 MOST_CORRELATED = 60
 """Unknowns in the heat map."""
+SMALL_GAP = 1e-3
+"""Part of its range by which a curve is not seen to be off."""
 MOST_PAIRS = 12
 """Correlations that are listed beside it."""
 
@@ -156,8 +156,8 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
     return {
         "level": verdict.level,
         "line": str(verdict),
-        "reasons": [_capitalise(write_reason(reason)) for reason in verdict.reasons],
-        "steps": [_capitalise(write_step(step)) for step in verdict.next_steps],
+        "reasons": [write_reason(reason) for reason in verdict.reasons],
+        "steps": [write_step(step) for step in verdict.next_steps],
         "warnings": [str(issue) for issue in find_issues(estimate)],
         "unknowns": unknowns,
         "more_unknowns": len(estimate.theta) - len(shown),
@@ -177,7 +177,7 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
         "diagnostics": Table(tested.rows[: MOST_ROWS + 1], tested.alignment),
         "residual_issues": [str(issue) for issue in diagnostics.issues],
         "identifiability": str(found).split("\n  - ")[0].replace("\n", " "),
-        "directions": [_capitalise(write_direction(found, direction)) for direction in found.directions],
+        "directions": [write_direction(found, direction) for direction in found.directions],
         "correlations": Table(pairs[:MOST_PAIRS], "<>"),
         "more_correlations": max(len(pairs) - MOST_PAIRS, 0),
         "certificate": tabulate_certificate(certificate),
@@ -187,10 +187,6 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
         "iterated": bool(estimate.history),
         "correlated": len(_list_correlated(estimate)),
     }
-
-
-def _capitalise(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _list_correlated(fit: Fit) -> list[int]:
@@ -212,6 +208,7 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[Run], dict[str, Any]]:
     from bokeh.embed import json_item
 
     from switchfit.report.html.figures import (
+        describe_layout,
         draw_convergence,
         draw_correlation,
         draw_diagnostics,
@@ -227,24 +224,27 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[Run], dict[str, Any]]:
     colours = _choose_colours(estimate)
     diagnostics = diagnose(estimate)
     runs: list[Run] = []
-    items: dict[str, Any] = {}
+    drawn: dict[str, Any] = {}
+    layouts: dict[Any, str] = {}
+    figures: dict[str, Any] = {}
     groups: dict[str, list[str]] = {}
     for number, e in enumerate(order):
         tested = [channel for channel in diagnostics.channels if channel.experiment == e][:MOST_DIAGNOSED]
-        run = _describe_run(estimate, e, number, curves[e], colours, tuple(channel.name for channel in tested))
-        figure = draw_run(
-            curves[e],
-            _list_spans(estimate, e, colours),
-            _list_lines(estimate, e, wide),
-            time_unit=estimate.trajectories[e].time_unit,
-            shown=[shown for _, shown in run.channels],
-        )
-        own = {f"run-{number}": figure}
+        runs.append(_describe_run(estimate, e, number, curves[e], colours, tuple(channel.name for channel in tested)))
+        unit = estimate.trajectories[e].time_unit
+        template = layouts.setdefault(describe_layout(curves[e], unit), f"run-{len(layouts)}")
+        spans, lines = _list_spans(estimate, e, colours), _list_lines(estimate, e, wide)
+        data = collect_run(template, curves[e], spans, lines)
+        if template not in drawn:
+            drawn[template] = draw_run(curves[e], data, time_unit=unit)
+        own = {f"run-{number}": data}
         for c, channel in enumerate(tested):
-            own |= {f"residuals-{number}-{c}-{k}": part for k, part in enumerate(draw_diagnostics(channel))}
+            own |= {f"residuals-{number}-{c}-{k}": part for k, part in enumerate(collect_diagnostics(channel))}
+        for part in own.values():
+            if part.template not in drawn:
+                drawn[part.template] = draw_diagnostics(part)
         groups[str(number)] = list(own)
-        items |= {name: json_item(part) for name, part in own.items()}
-        runs.append(run)
+        figures |= {name: part.to_json() for name, part in own.items()}
     always: dict[str, Any] = {}
     sliders: list[Slider] = []
     if estimate.problem is not None:
@@ -259,10 +259,11 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[Run], dict[str, Any]]:
     if estimate.history:
         pair = draw_convergence(estimate.history, estimate.tolerance)
         always |= {f"convergence-{k}": part for k, part in enumerate(pair)}
-    items |= {name: json_item(part) for name, part in always.items()}
+    figures |= {name: FigureData(name, {}, {}, {}).to_json() for name in always}
     moved = [slider.place for slider in sliders]
     return runs, {
-        "items": items,
+        "templates": {name: json_item(part) for name, part in (drawn | always).items()},
+        "figures": figures,
         "groups": groups,
         "always": list(always),
         "cost": _number(estimate.cost),
@@ -328,19 +329,15 @@ def _describe_run(
     )
 
 
-def _list_spans(fit: Fit, e: int, colours: Mapping[str, str]) -> list[Span1]:
-    from switchfit.report.html.figures import Span1
-
+def _list_spans(fit: Fit, e: int, colours: Mapping[str, str]) -> list[ModeSpan]:
     places = [-1, *fit.transition_places[e].tolist(), fit.final_places[e]]
     return [
-        Span1(mode, colours[mode], begin, end, places[i], places[i + 1])
+        ModeSpan(mode, colours[mode], begin, end, places[i], places[i + 1])
         for i, (mode, begin, end) in enumerate(fit.trajectories[e].mode_spans)
     ]
 
 
-def _list_lines(fit: Fit, e: int, intervals: Any) -> list[Line]:
-    from switchfit.report.html.figures import Line
-
+def _list_lines(fit: Fit, e: int, intervals: Any) -> list[TransitionLine]:
     errors = correct_errors(fit)
     found = []
     for t in fit.transitions:
@@ -351,7 +348,7 @@ def _list_lines(fit: Fit, e: int, intervals: Any) -> list[Line]:
         unit = format_unit(t.unit)
         low, high = (format_end(end, ends) for end in ends)
         found.append(
-            Line(
+            TransitionLine(
                 name=t.name,
                 value=" ".join(part for part in (value, error, unit) if part),
                 interval=f"{low} to {high}" if low and high else "not known",
@@ -377,9 +374,17 @@ def _describe_slider(
         "runs": [number for number, e in enumerate(order) if place in places[e]],
         "values": _numbers(slider.values),
         "costs": _numbers(slider.costs),
-        "gap": _number(slider.gap),
-        "gap_text": f"{100 * slider.gap:.2g} %" if np.isfinite(slider.gap) else "",
+        "gap": _format_gap(slider.gap),
     }
+
+
+def _format_gap(gap: float) -> str:
+    """Return how far the curves are off at the ends of a slider, as a sentence."""
+    if not np.isfinite(gap):
+        return "At its ends the model cannot be simulated."
+    if gap < SMALL_GAP:
+        return ""
+    return f"At its ends the curves are off by {100 * gap:.2g} % of their range."
 
 
 def _number(value: float) -> float | None:

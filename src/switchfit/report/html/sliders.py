@@ -21,8 +21,11 @@ SIDE_POINTS = 20
 """Values of J to each side of the estimate."""
 VISIBLE = 0.15
 """Part of a channel's range by which the end of a slider moves the curve, if the bounds allow it."""
+LARGEST_GAP = 0.1
+"""Part of its range by which a curve may be off at the ends of a slider; the slider is made shorter until it is not."""
+HALVINGS = 6
 ERRORS = 3.0
-"""Standard errors that a slider reaches at least."""
+"""Standard errors that a slider reaches, unless the curves are too far off there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,15 +63,20 @@ def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Seq
     """
     found = []
     for place in places:
-        low, high = find_range(estimate, runs, place)
-        theta = float(estimate.theta[place])
+        (low, high), theta = find_range(estimate, runs, place), float(estimate.theta[place])
         if not low < high:
             continue
+        gap = measure_gap(estimate, runs, place, (low, high))
+        for _ in range(HALVINGS):
+            if not gap > LARGEST_GAP:
+                break
+            low, high = 0.5 * (low + theta), 0.5 * (high + theta)
+            gap = measure_gap(estimate, runs, place, (low, high))
         below = np.linspace(low, theta, SIDE_POINTS + 1) if low < theta else np.array([theta])
         above = np.linspace(theta, high, SIDE_POINTS + 1)[1:] if high > theta else np.zeros(0)
         values = np.concatenate([below, above])
         costs = np.array([evaluate_moved(estimate, place, value) for value in values])
-        found.append(Slider(place, values, costs, _measure_gap(estimate, runs, place, (low, high))))
+        found.append(Slider(place, values, costs, gap))
     return found
 
 
@@ -123,8 +131,16 @@ def evaluate_moved(estimate: Estimate, place: int, value: float) -> float:
     return float(total) if np.isfinite(total) else np.nan
 
 
-def _measure_gap(estimate: Estimate, runs: dict[int, list[Curves]], place: int, ends: tuple[float, float]) -> float:
-    """Return how far the linear curves are off at the ends of a slider: root mean square over a channel's range."""
+def measure_gap(estimate: Estimate, runs: dict[int, list[Curves]], place: int, ends: tuple[float, float]) -> float:
+    """Return how far the linear curves are off at the ends of a slider: root mean square over a channel's range.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    runs : mapping of run to its curves
+    place : int
+    ends : (float, float)
+    """
     evaluator = estimate.evaluator_at_solution()
     gaps = []
     for e, run in runs.items():

@@ -11,14 +11,14 @@
 
   // --- figures -------------------------------------------------------------------------------------------------------
 
-  function paint(root) {
+  function paint(root, name) {
     const style = getComputedStyle(document.documentElement);
     const [page, ink, muted, faint, panel] = ["page", "ink", "muted", "faint", "panel"].map((name) =>
       style.getPropertyValue(`--${name}`).trim());
     const tagged = { ink, muted, faint, edge: page };
     for (const model of root.references()) {
       if (model.type === "Figure") {
-        model.outline_line_color = faint;
+        model.border_fill_color = name === "slice" ? panel : page;
         if (coarse) model.toolbar.active_drag = null; // a finger scrolls the page
       } else if (model.type.endsWith("Axis")) {
         model.setv({
@@ -29,8 +29,8 @@
         model.grid_line_color = faint;
       } else if (model.type === "Legend") {
         model.setv({
-          label_text_color: ink, background_fill_color: panel, background_fill_alpha: 0.75, border_line_color: null,
-          inactive_fill_color: page, label_text_font_size: "12px", padding: 4, spacing: 12,
+          label_text_color: ink, background_fill_color: null, border_line_color: null, inactive_fill_color: page,
+          label_text_font_size: "12px", padding: 2, margin: 0, spacing: 12,
         });
       }
       for (const tag of model.tags) {
@@ -46,17 +46,32 @@
     }
   }
 
+  function decode(column) {
+    if (Array.isArray(column)) return column;
+    const bytes = Uint8Array.from(atob(column.f8 || column.f4 || ""), (c) => c.charCodeAt(0));
+    return column.f4 === undefined ? new Float64Array(bytes.buffer) : new Float32Array(bytes.buffer);
+  }
+
   async function embed(name) {
     if (documents.has(name)) return;
     documents.set(name, null);
-    const views = await Bokeh.embed.embed_item(payload.items[name], name);
+    const { template, sources, ranges } = payload.figures[name];
+    const views = await Bokeh.embed.embed_item(payload.templates[template], name);
     const root = [...views.roots][0].model;
-    paint(root);
-    documents.set(name, root.document);
+    const doc = root.document;
+    for (const [key, columns] of Object.entries(sources)) {
+      const data = Object.fromEntries(Object.entries(columns).map(([id, column]) => [id, decode(column)]));
+      doc.get_model_by_name(key).data = data;
+    }
+    for (const [key, [start, end]] of Object.entries(ranges)) {
+      doc.get_model_by_name(key).setv({ start, end, reset_start: start, reset_end: end });
+    }
+    paint(root, name);
+    documents.set(name, doc);
   }
 
   function repaint() {
-    for (const doc of documents.values()) if (doc) doc.roots().forEach(paint);
+    for (const [name, doc] of documents) if (doc) doc.roots().forEach((root) => paint(root, name));
   }
   dark.addEventListener("change", repaint);
   printing.addEventListener("change", repaint);
@@ -72,14 +87,16 @@
       element.classList.toggle("shown", chosen.some((run) => sliders[k].runs.includes(Number(run))));
     });
     for (const run of chosen) for (const name of payload.groups[run]) await embed(name);
+    document.querySelectorAll("[data-channel]").forEach(switchChannel);
     move();
   }
 
+  function switchChannel(box) {
+    const doc = documents.get(`run-${box.closest(".run").dataset.run}`);
+    if (doc) doc.get_model_by_name(`channel-${box.dataset.channel}`).visible = box.checked;
+  }
   for (const box of document.querySelectorAll("[data-channel]")) {
-    box.addEventListener("change", () => {
-      const doc = documents.get(`run-${box.closest(".run").dataset.run}`);
-      if (doc) doc.get_model_by_name(`channel-${box.dataset.channel}`).visible = box.checked;
-    });
+    box.addEventListener("change", () => switchChannel(box));
   }
 
   // --- sliders -------------------------------------------------------------------------------------------------------
@@ -104,32 +121,33 @@
     return cost;
   }
 
-  function moveCurves(doc) {
+  function moveCurves(name, doc) {
     const by = new Map(sliders.map((slider, k) => [slider.place, moved[k]]));
     const shift = (place) => by.get(place) || 0;
-    for (const source of doc.roots().flatMap((root) => [...root.references()])) {
-      if (source.type !== "ColumnDataSource" || !source.name) continue;
+    function change(key, edit) {
+      const source = doc.get_model_by_name(key);
       const data = { ...source.data };
-      if (source.name === "modes") {
-        data.left = data.left_b.map((left, i) => left + shift(data.left_place[i]));
-        data.right = data.right_b.map((right, i) => right + shift(data.right_place[i]));
-      } else if (source.name === "transitions") {
-        data.x = Float64Array.from(data.x_b, (x, i) => x + shift(data.place[i]));
-      } else if (/^(curve|samples)-/.test(source.name)) {
-        const { channels, places, delay } = source.tags[0];
+      edit(data);
+      source.data = data;
+    }
+    change("modes", (data) => {
+      data.left = data.left_b.map((left, i) => left + shift(data.left_place[i]));
+      data.right = data.right_b.map((right, i) => right + shift(data.right_place[i]));
+    });
+    change("transitions", (data) => { data.x = data.x_b.map((x, i) => x + shift(data.place[i])); });
+    for (const [key, { channels, places, delay }] of Object.entries(payload.figures[name].moves)) {
+      change(key, (data) => {
         for (let k = 0; k < channels; k += 1) {
-          const values = Float64Array.from(data[`b${k}`]);
+          const values = data[`b${k}`].slice();
           for (const place of places) {
             const d = shift(place);
-            if (d === 0) continue;
             const slope = data[`d${place}_${k}`];
-            for (let i = 0; i < values.length; i += 1) values[i] += slope[i] * d;
+            if (d !== 0) for (let i = 0; i < values.length; i += 1) values[i] += slope[i] * d;
           }
           data[`y${k}`] = values;
         }
-        if (delay >= 0) data.t = Float64Array.from(data.bt, (t) => t + shift(delay));
-      } else continue;
-      source.data = data;
+        if (delay >= 0) data.t = data.bt.map((t) => t + shift(delay));
+      });
     }
     const still = moved.some((d) => d !== 0);
     for (const model of doc.roots().flatMap((root) => [...root.references()])) {
@@ -142,10 +160,11 @@
     if (!doc) return;
     const { values, costs, theta, name, unit } = sliders[last];
     const change = (value) => sliders.map((_, k) => (k === last ? value - theta : 0));
-    const exact = costs.map((cost) => (cost === null ? NaN : cost));
-    doc.get_model_by_name("slice").data = { x: values, exact, quadratic: values.map((v) => quadratic(change(v))) };
+    const exact = costs.map((cost) => (cost === null ? NaN : cost - payload.cost));
+    const quadratics = values.map((value) => quadratic(change(value)) - payload.cost);
+    doc.get_model_by_name("slice").data = { x: values, exact, quadratic: quadratics };
     const now = interpolate(last, theta + moved[last]);
-    doc.get_model_by_name("mark").data = { x: [theta + moved[last]], y: [now === null ? NaN : now] };
+    doc.get_model_by_name("mark").data = { x: [theta + moved[last]], y: [now === null ? NaN : now - payload.cost] };
     doc.get_model_by_name("slice-label").text = unit ? `${name} (${unit})` : name;
   }
 
@@ -164,7 +183,7 @@
     const how = away.length === 0 ? "at the estimate" : one === null ? "by the quadratic approximation" : "evaluated";
     const rise = away.length ? `, ${(cost - payload.cost).toPrecision(3)} above the estimate's` : "";
     document.getElementById("cost").textContent = `J = ${cost.toPrecision(8)}${rise} (${how})`;
-    for (const [name, doc] of documents) if (doc && name.startsWith("run-")) moveCurves(doc);
+    for (const [name, doc] of documents) if (doc && name.startsWith("run-")) moveCurves(name, doc);
     drawSlice();
   }
 
