@@ -66,7 +66,8 @@ def _collect_options(
 def fit(
     problem: ProblemPath,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for report.txt, estimate.json and fit.png.", show_default=False)
+        Path | None,
+        typer.Option(help="Folder for report.html, report.txt, estimate.json, fit.png.", show_default=False),
     ] = None,
     strategy: Annotated[
         Literal["local", "auto", "thorough"] | None,
@@ -85,7 +86,9 @@ def fit(
     max_iterations: Annotated[
         int | None, typer.Option(min=0, help="Most iterations.", show_default="the library's")
     ] = None,
-    no_figures: Annotated[bool, typer.Option("--no-figures", help="Write no figure.")] = False,
+    no_figures: Annotated[
+        bool, typer.Option("--no-figures", help="Write no figures: neither fit.png nor report.html.")
+    ] = False,
     certificate: Annotated[
         bool, typer.Option("--certificate", help="Check with the paper's equations too, and print how.")
     ] = False,
@@ -125,6 +128,7 @@ def fit(
                 figure = io.BytesIO()
                 estimate.plot().savefig(figure, format="png", dpi=150)
                 _write(out / "fit.png", figure.getvalue())
+                _write_page(estimate, loaded, options, out / "report.html")
             _print(f"written to {out}", err=True)
     if not estimate.success:
         reason = "" if estimate.status.successful else f"not converged. {estimate.message}"
@@ -366,6 +370,19 @@ def _save(estimate: Any, path: Path, *, complete: bool) -> None:
     from switchfit.uncertainty.certificate import certify
 
     save_fit(estimate.complete(), estimate.certificate if complete else certify(estimate, None), path)
+
+
+def _write_page(estimate: Any, loaded: ProblemFile, options: dict[str, Any], path: Path) -> None:
+    """Write the report as an HTML file; without the libraries that it needs, say how to install them."""
+    from switchfit.runtime.errors import MissingExtraError
+    from switchfit.runtime.presentation import format_page
+
+    try:
+        page = format_page(estimate, problem_file=loaded.path, options=options)
+    except MissingExtraError as missing:
+        _print(f"no {path.name}: {missing}", err=True)
+    else:
+        _write(path, page)
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from bokeh.layouts import column
-from bokeh.models import ColumnDataSource, FactorRange, HoverTool, PlainText, PrintfTickFormatter, Range1d, Span
+from bokeh.models import ColumnDataSource, FactorRange, HoverTool, PlainText, PrintfTickFormatter, Range1d
 from bokeh.plotting import figure
 
 from switchfit.optimize import IterationRecord
@@ -27,6 +27,8 @@ BLUE = "#2f74c0"
 HEIGHT, RESIDUAL_HEIGHT, PATH_HEIGHT, SMALL_HEIGHT = 270, 130, 420, 230
 LEFT = 78
 """Pixels to the left of all axes, so that figures below one another share their times."""
+UNBROKEN = {"break-inside": "avoid"}
+"""A channel is printed on one page."""
 TOOLS = "box_zoom,pan,wheel_zoom,reset,save"
 MOST_LABELLED = 12
 """Unknowns up to which the fields of the heat map have their numbers in them."""
@@ -47,7 +49,7 @@ def draw_run(curves: Sequence[Curves], data: FigureData, *, time_unit: str) -> A
     time_unit : str
     """
     sources = {name: make_source(name, columns) for name, columns in data.sources.items()}
-    times = Range1d(*data.ranges["times"], name="times")
+    times = _make_range("times", data)
     blocks: list[Any] = []
     number = 0
     for c, own in enumerate(curves):
@@ -68,7 +70,9 @@ def draw_run(curves: Sequence[Curves], data: FigureData, *, time_unit: str) -> A
             line = panel.select_one({"name": "fitted"})
             _add_hover(panel, line, [("time", "t", time_unit), ("fitted", f"y{k}", ""), ("mode", "mode", "")])
             _put_legend_above(panel)
-            blocks.append(column(*parts, name=f"channel-{number}", sizing_mode="stretch_width", spacing=0))
+            blocks.append(
+                column(*parts, name=f"channel-{number}", sizing_mode="stretch_width", spacing=0, styles=UNBROKEN)
+            )
             number += 1
         if (plane := find_plane(own)) is not None:
             blocks.append(_draw_path(own, plane, sources[f"curve-{c}"], sources[f"samples-{c}"], time_unit))
@@ -99,6 +103,11 @@ def describe_layout(curves: Sequence[Curves], time_unit: str) -> tuple[Any, ...]
         for own in curves
     ]
     return (time_unit, *each)
+
+
+def _make_range(name: str, data: FigureData) -> Range1d:
+    start, end = data.ranges[name]
+    return Range1d(start=start, end=end, name=name)
 
 
 def _add_unit(name: str, unit: str) -> str:
@@ -151,7 +160,8 @@ def _tag(renderer: Any, tag: str) -> Any:
 def _add_hover(plot: Any, renderer: Any, rows: Sequence[tuple[str, str, str]]) -> None:
     """Show (label, column, unit) under the pointer. Bokeh escapes what is in columns, but neither labels nor units."""
     texts = ("mode", "name", "modes", "value", "interval", "x_name", "y_name")
-    tips, formatters = [], {}
+    tips: list[tuple[str, str]] = []
+    formatters: dict[str, Any] = {}
     for label, name, unit in rows:
         if name in texts:
             tips.append((label, f"@{name}"))
@@ -206,7 +216,7 @@ def _draw_samples(plot: Any, curves: Curves, k: int, source: ColumnDataSource, t
 
 
 def _draw_residuals(plot: Any, curves: Curves, k: int, source: ColumnDataSource, time_unit: str) -> None:
-    plot.add_layout(Span(location=0.0, dimension="width", line_color=FIT, line_width=1))
+    plot.hspan(y=0.0, line_color=FIT, line_width=1)
     if curves.kind == "reference":
         drawn = _tag(plot.line("t", f"y{k}", source=source, line_color=DATA, line_width=1.2), "ink")
     else:
@@ -263,9 +273,9 @@ def draw_diagnostics(data: FigureData) -> Any:
         own = sources["lags"]
         plot.segment("x", "zero", "x", "y", source=own, line_color=FIT, line_width=2)
         plot.scatter("x", "y", source=own, size=6, fill_color=FIT, line_color=None)
-        plot.y_range = Range1d(*data.ranges["reach"], name="reach")
+        plot.y_range = _make_range("reach", data)
         plot.xaxis.ticker.min_interval = 1
-        plot.add_layout(Span(location=0.0, dimension="width", line_color=DATA, line_width=1, tags=["ink"]))
+        _tag(plot.hspan(y=0.0, line_color=DATA, line_width=1), "ink")
     else:
         unit = "residual / sigma" if data.template == "histogram-sigma" else "residual / rms"
         plot = _make_small(unit, "density")
@@ -310,8 +320,7 @@ def draw_convergence(history: Sequence[IterationRecord], tolerance: float) -> li
         _add_hover(plot, dots, [("iteration", "x", ""), ("value", "y", ""), ("step", "step", "")])
         plot.xaxis.ticker.min_interval = 1
         if values is optimality:
-            dashed: dict[str, Any] = {"line_color": DATA, "line_dash": "dashed", "tags": ["muted"]}
-            plot.add_layout(Span(location=tolerance, dimension="width", **dashed))
+            _tag(plot.hspan(y=tolerance, line_color=DATA, line_dash="dashed"), "muted")
         found.append(plot)
     return found
 
@@ -325,7 +334,7 @@ def draw_correlation(names: Sequence[str], correlation: FloatArray) -> Any:
     correlation : (d, d)
     """
     d = len(names)
-    rows, columns = (grid.ravel() for grid in np.indices((d, d)))
+    rows, columns = (grid.ravel().tolist() for grid in np.indices((d, d)))
     values = correlation[rows, columns]
     source = ColumnDataSource(
         {
@@ -338,7 +347,7 @@ def draw_correlation(names: Sequence[str], correlation: FloatArray) -> Any:
         }
     )
     side = min(max(220 + 24 * d, 300), 900)
-    plot = _make_figure(side, x_range=FactorRange(*names), y_range=FactorRange(*reversed(names)))
+    plot = _make_figure(side, x_range=FactorRange(factors=list(names)), y_range=FactorRange(factors=list(names)[::-1]))
     plot.max_width = side + 120
     plot.min_border_left = 20
     fill: dict[str, Any] = {"fill_color": "colour", "fill_alpha": "alpha", "line_color": DATA, "line_alpha": 0.25}

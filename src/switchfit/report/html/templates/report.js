@@ -46,28 +46,28 @@
     }
   }
 
-  function decode(column) {
-    if (Array.isArray(column)) return column;
-    const bytes = Uint8Array.from(atob(column.f8 || column.f4 || ""), (c) => c.charCodeAt(0));
-    return column.f4 === undefined ? new Float64Array(bytes.buffer) : new Float32Array(bytes.buffer);
+  // Put numbers into a copy of a drawing, by the names of its sources and ranges.
+  function fill(part, { sources, ranges }) {
+    if (Array.isArray(part)) return part.map((entry) => fill(entry, { sources, ranges }));
+    if (part === null || typeof part !== "object") return part;
+    const copy = Object.fromEntries(Object.entries(part).map(([key, value]) => [key, fill(value, { sources, ranges })]));
+    const name = part.type === "object" && part.attributes && part.attributes.name;
+    if (name && sources[name]) copy.attributes.data = sources[name];
+    if (name && ranges[name]) Object.assign(copy.attributes, ranges[name]);
+    return copy;
   }
 
   async function embed(name) {
     if (documents.has(name)) return;
     documents.set(name, null);
-    const { template, sources, ranges } = payload.figures[name];
-    const views = await Bokeh.embed.embed_item(payload.templates[template], name);
+    const figure = payload.figures[name];
+    if (name === "slice") figure.sources = sliceSources();
+    const views = await Bokeh.embed.embed_item(fill(payload.templates[figure.template], figure), name);
     const root = [...views.roots][0].model;
-    const doc = root.document;
-    for (const [key, columns] of Object.entries(sources)) {
-      const data = Object.fromEntries(Object.entries(columns).map(([id, column]) => [id, decode(column)]));
-      doc.get_model_by_name(key).data = data;
-    }
-    for (const [key, [start, end]] of Object.entries(ranges)) {
-      doc.get_model_by_name(key).setv({ start, end, reset_start: start, reset_end: end });
-    }
     paint(root, name);
-    documents.set(name, doc);
+    documents.set(name, root.document);
+    const run = name.startsWith("run-") ? document.getElementById(name).closest(".run") : null;
+    if (run) run.querySelectorAll("[data-channel]").forEach(switchChannel);
   }
 
   function repaint() {
@@ -87,7 +87,6 @@
       element.classList.toggle("shown", chosen.some((run) => sliders[k].runs.includes(Number(run))));
     });
     for (const run of chosen) for (const name of payload.groups[run]) await embed(name);
-    document.querySelectorAll("[data-channel]").forEach(switchChannel);
     move();
   }
 
@@ -102,6 +101,8 @@
   // --- sliders -------------------------------------------------------------------------------------------------------
 
   const ends = (k) => [sliders[k].values[0], sliders[k].values[sliders[k].values.length - 1]];
+  const number = (value, digits) => (value !== 0 && (Math.abs(value) < 1e-3 || Math.abs(value) >= 1e7)
+    ? value.toExponential(digits - 1) : value.toPrecision(digits));
   const digits = (value, step) => value.toFixed(Math.min(Math.max(1 - Math.floor(Math.log10(Math.abs(step) || 1)), 0), 12));
 
   function interpolate(k, value) {
@@ -131,14 +132,14 @@
       source.data = data;
     }
     change("modes", (data) => {
-      data.left = data.left_b.map((left, i) => left + shift(data.left_place[i]));
-      data.right = data.right_b.map((right, i) => right + shift(data.right_place[i]));
+      data.left = Float64Array.from(data.left_b, (left, i) => left + shift(data.left_place[i]));
+      data.right = Float64Array.from(data.right_b, (right, i) => right + shift(data.right_place[i]));
     });
-    change("transitions", (data) => { data.x = data.x_b.map((x, i) => x + shift(data.place[i])); });
+    change("transitions", (data) => { data.x = Float64Array.from(data.x_b, (x, i) => x + shift(data.place[i])); });
     for (const [key, { channels, places, delay }] of Object.entries(payload.figures[name].moves)) {
       change(key, (data) => {
         for (let k = 0; k < channels; k += 1) {
-          const values = data[`b${k}`].slice();
+          const values = Float64Array.from(data[`b${k}`]);
           for (const place of places) {
             const d = shift(place);
             const slope = data[`d${place}_${k}`];
@@ -146,7 +147,7 @@
           }
           data[`y${k}`] = values;
         }
-        if (delay >= 0) data.t = data.bt.map((t) => t + shift(delay));
+        if (delay >= 0) data.t = Float64Array.from(data.bt, (t) => t + shift(delay));
       });
     }
     const still = moved.some((d) => d !== 0);
@@ -155,16 +156,27 @@
     }
   }
 
+  // What is in the figure of J: columns by source.
+  function sliceColumns() {
+    const { values, costs, theta } = sliders[last];
+    const change = (value) => sliders.map((_, k) => (k === last ? value - theta : 0));
+    const rise = (cost) => (cost === null ? NaN : cost - payload.cost);
+    return {
+      slice: { x: values, exact: costs.map(rise), quadratic: values.map((value) => rise(quadratic(change(value)))) },
+      mark: { x: [theta + moved[last]], y: [rise(interpolate(last, theta + moved[last]))] },
+    };
+  }
+
+  function sliceSources() {
+    return Object.fromEntries(Object.entries(sliceColumns()).map(([name, columns]) =>
+      [name, { type: "map", entries: Object.entries(columns) }]));
+  }
+
   function drawSlice() {
     const doc = documents.get("slice");
     if (!doc) return;
-    const { values, costs, theta, name, unit } = sliders[last];
-    const change = (value) => sliders.map((_, k) => (k === last ? value - theta : 0));
-    const exact = costs.map((cost) => (cost === null ? NaN : cost - payload.cost));
-    const quadratics = values.map((value) => quadratic(change(value)) - payload.cost);
-    doc.get_model_by_name("slice").data = { x: values, exact, quadratic: quadratics };
-    const now = interpolate(last, theta + moved[last]);
-    doc.get_model_by_name("mark").data = { x: [theta + moved[last]], y: [now === null ? NaN : now - payload.cost] };
+    for (const [name, columns] of Object.entries(sliceColumns())) doc.get_model_by_name(name).data = columns;
+    const { name, unit } = sliders[last];
     doc.get_model_by_name("slice-label").text = unit ? `${name} (${unit})` : name;
   }
 
@@ -181,8 +193,8 @@
     const one = away.length === 1 ? interpolate(away[0], sliders[away[0]].theta + moved[away[0]]) : null;
     const cost = away.length === 0 ? payload.cost : one === null ? quadratic(moved) : one;
     const how = away.length === 0 ? "at the estimate" : one === null ? "by the quadratic approximation" : "evaluated";
-    const rise = away.length ? `, ${(cost - payload.cost).toPrecision(3)} above the estimate's` : "";
-    document.getElementById("cost").textContent = `J = ${cost.toPrecision(8)}${rise} (${how})`;
+    const rise = away.length ? `, ${number(cost - payload.cost, 3)} above the estimate's` : "";
+    document.getElementById("cost").textContent = `J = ${number(cost, 8)}${rise} (${how})`;
     for (const [name, doc] of documents) if (doc && name.startsWith("run-")) moveCurves(name, doc);
     drawSlice();
   }
