@@ -4,7 +4,6 @@
   const sliders = payload.sliders;
   const documents = new Map(); // name of a figure -> Bokeh document
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
-  const printing = window.matchMedia("print");
   const coarse = window.matchMedia("(pointer: coarse)").matches;
   const moved = sliders.map(() => 0);
   let last = 0;
@@ -74,7 +73,6 @@
     for (const [name, doc] of documents) if (doc) doc.roots().forEach((root) => paint(root, name));
   }
   dark.addEventListener("change", repaint);
-  printing.addEventListener("change", repaint);
 
   // --- runs ----------------------------------------------------------------------------------------------------------
 
