@@ -247,7 +247,7 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[Run], dict[str, Any]]:
         figures |= {name: part.to_json() for name, part in own.items()}
     always: dict[str, Any] = {}
     sliders: list[Slider] = []
-    if estimate.problem is not None:
+    if estimate.problem is not None and np.isfinite(estimate.cost):
         movable = [place for place in dict.fromkeys(i for e in order for i in places[e]) if _moves(curves, place)]
         sliders = build_sliders(estimate, curves, movable)
         if sliders:

@@ -2,6 +2,7 @@
 (() => {
   const payload = JSON.parse(document.getElementById("payload").textContent);
   const sliders = payload.sliders;
+  const known = (value) => (value === null ? NaN : value); // JSON has no NaN
   const documents = new Map(); // name of a figure -> Bokeh document
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
   const coarse = window.matchMedia("(pointer: coarse)").matches;
@@ -114,8 +115,10 @@
   function quadratic(change) {
     let cost = payload.cost;
     change.forEach((d, i) => {
-      cost += payload.gradient[i] * d;
-      change.forEach((other, j) => { cost += 0.5 * d * payload.hessian[i][j] * other; });
+      if (d !== 0) cost += known(payload.gradient[i]) * d;
+      change.forEach((other, j) => {
+        if (d !== 0 && other !== 0) cost += 0.5 * d * known(payload.hessian[i][j]) * other;
+      });
     });
     return cost;
   }
@@ -158,7 +161,7 @@
   function sliceColumns() {
     const { values, costs, theta } = sliders[last];
     const change = (value) => sliders.map((_, k) => (k === last ? value - theta : 0));
-    const rise = (cost) => (cost === null ? NaN : cost - payload.cost);
+    const rise = (cost) => known(cost) - payload.cost;
     return {
       slice: { x: values, exact: costs.map(rise), quadratic: values.map((value) => rise(quadratic(change(value)))) },
       mark: { x: [theta + moved[last]], y: [rise(interpolate(last, theta + moved[last]))] },
@@ -192,7 +195,7 @@
     const cost = away.length === 0 ? payload.cost : one === null ? quadratic(moved) : one;
     const how = away.length === 0 ? "at the estimate" : one === null ? "by the quadratic approximation" : "evaluated";
     const rise = away.length ? `, ${number(cost - payload.cost, 3)} above the estimate's` : "";
-    document.getElementById("cost").textContent = `J = ${number(cost, 8)}${rise} (${how})`;
+    document.getElementById("cost").textContent = Number.isNaN(cost) ? "J is not known there" : `J = ${number(cost, 8)}${rise} (${how})`;
     for (const [name, doc] of documents) if (doc && name.startsWith("run-")) moveCurves(name, doc);
     drawSlice();
   }
