@@ -231,7 +231,7 @@ def correct_errors(fit: Fit) -> FloatArray:
     ----------
     fit : Fit
     """
-    return np.asarray(widening_factors(fit) * fit.standard_errors)
+    return np.asarray(measure_widening(fit) * fit.standard_errors)
 
 
 def correct_intervals(fit: Fit, level: float = 0.95) -> FloatArray:
@@ -244,7 +244,7 @@ def correct_intervals(fit: Fit, level: float = 0.95) -> FloatArray:
     fit : Fit
     level : float, between 0 and 1
     """
-    factors, found = widening_factors(fit)[:, None], fit.confidence_intervals(level)
+    factors, found = measure_widening(fit)[:, None], fit.confidence_intervals(level)
     theta, log = fit.theta[:, None], np.isin(fit.theta_names, fit.log_scaled)[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         wide = np.where(log, theta * (found / theta) ** factors, theta + factors * (found - theta))
@@ -252,7 +252,7 @@ def correct_intervals(fit: Fit, level: float = 0.95) -> FloatArray:
     return np.stack([np.maximum(wide[:, 0], fit.lower), np.minimum(wide[:, 1], fit.upper)], axis=1)
 
 
-def widening_factors(fit: Fit) -> FloatArray:
+def measure_widening(fit: Fit) -> FloatArray:
     """Return by how much the standard errors of a fit are too small because residuals are correlated: (d,), at least 1.
 
     Those of a transition time by the channels of its own run, of any other unknown by all; the largest factor counts.
