@@ -4,6 +4,7 @@ import base64
 import gzip
 import hashlib
 import html.parser
+import importlib.metadata
 import importlib.util
 import json
 import re
@@ -20,7 +21,6 @@ import switchfit as sf
 from switchfit import cli
 from switchfit.io.problem_file import load_problem
 from switchfit.models import heater_problem
-from switchfit.report.html import page as pages
 from switchfit.report.html.curves import collect_curves, find_plane, list_places
 from switchfit.report.html.inputs import collect_inputs
 from switchfit.report.html.sliders import LARGEST_GAP, build_sliders, evaluate_moved
@@ -29,6 +29,7 @@ from switchfit.runtime.presentation import format_page
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals
 
 pytest.importorskip("bokeh", reason="needs the extra report: pip install 'switchfit[report]'")
+pages = importlib.import_module("switchfit.report.html.page")
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 TOSS = EXAMPLES / "toss" / "problem.toml"

@@ -4,7 +4,6 @@ Its modules register how each kind of result is written and drawn (`switchfit.ru
 `switchfit` imports all of them. Imports `batch` and the rooms before it.
 """
 
-from switchfit.report import batch, plot, sentences, text, uncertainty, verdict
-from switchfit.report.html import page
+from switchfit.report import batch, html, plot, sentences, text, uncertainty, verdict
 
-__all__ = ["batch", "page", "plot", "sentences", "text", "uncertainty", "verdict"]
+__all__ = ["batch", "html", "plot", "sentences", "text", "uncertainty", "verdict"]

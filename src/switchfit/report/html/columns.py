@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import scipy.special
+from bokeh.core.serialization import Serializer
 
 from switchfit.report.html.curves import Curves, find_plane
 from switchfit.uncertainty.residuals import ChannelResiduals
@@ -89,8 +90,6 @@ class FigureData:
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON, the columns as Bokeh writes those of its own sources."""
-        from bokeh.core.serialization import Serializer
-
         sources = {
             name: Serializer(deferred=False).serialize(columns).content for name, columns in self.sources.items()
         }

@@ -1,24 +1,36 @@
-"""The page: what the templates show, and the JSON that the page's script turns into figures."""
+"""The page: what the templates show, and the JSON that the page's script turns into figures.
+
+Import this only where Bokeh and Jinja2 are installed.
+"""
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jinja2
 import numpy as np
+from bokeh.embed import json_item
+from bokeh.resources import Resources
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.report.html.columns import FigureData, ModeSpan, TransitionLine, collect_diagnostics, collect_run
 from switchfit.report.html.curves import Curves, choose_points, collect_curves, list_places
+from switchfit.report.html.figures import (
+    describe_layout,
+    draw_convergence,
+    draw_correlation,
+    draw_diagnostics,
+    draw_run,
+    draw_slice,
+)
 from switchfit.report.html.inputs import collect_inputs
 from switchfit.report.html.sliders import Slider, build_sliders
 from switchfit.report.numbers import format_rounded, format_unit
-from switchfit.report.sentences import join_words
 from switchfit.report.tables import Table
 from switchfit.report.text import (
     format_end,
@@ -33,15 +45,11 @@ from switchfit.report.text import (
 )
 from switchfit.report.uncertainty import tabulate_certificate, tabulate_diagnostics, write_direction
 from switchfit.report.verdict import format_share, write_reason, write_step
-from switchfit.runtime.errors import MissingExtraError
-from switchfit.runtime.presentation import format_page
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.issues import find_issues
 from switchfit.uncertainty.quality import explain_channel
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals, diagnose
 
-LIBRARIES = ("bokeh", "jinja2")
-"""What the extra ``report`` installs."""
 MODE_COLOURS = ("#3b82c4", "#e08a1e", "#3f9b4b", "#9b5fb5", "#b8a400", "#1f9aa0", "#8a8a8a", "#a0643c")
 """Drawn so thin that they can be told apart on white and on black."""
 MOST_RUNS = 12
@@ -91,33 +99,15 @@ class Run:
     notes: tuple[str, ...]
 
 
-@format_page.register(Estimate)
-def build_page(
-    estimate: Estimate, *, problem_file: Path | None = None, options: Mapping[str, object] | None = None
-) -> str:
+def build_page(estimate: Estimate, problem_file: Path | None, options: Mapping[str, object] | None) -> str:
     """Return the report of an estimate as one HTML page.
 
     Parameters
     ----------
     estimate : Estimate
-    problem_file : Path, optional
-        Whose text is shown, with the hashes of the files that it names.
-    options : mapping of str to object, optional
-        What `estimate` was given.
-
-    Raises
-    ------
-    MissingExtraError
-        If Bokeh or Jinja2 are not installed.
+    problem_file : Path or None
+    options : mapping of str to object, or None
     """
-    missing = [name for name in LIBRARIES if importlib.util.find_spec(name) is None]
-    if missing:
-        raise MissingExtraError(
-            f"an HTML report needs {join_words(missing)}, not installed here: pip install 'switchfit[report]'"
-        )
-    import jinja2
-    from bokeh.resources import Resources
-
     folder = jinja2.PackageLoader("switchfit.report.html", "templates")
     environment = jinja2.Environment(
         loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
@@ -205,17 +195,6 @@ def _list_correlated(fit: Fit) -> list[int]:
 
 def _prepare_figures(estimate: Estimate) -> tuple[list[Run], dict[str, Any]]:
     """Return the runs that are shown, the one that is explained worst first, and the JSON of all figures."""
-    from bokeh.embed import json_item
-
-    from switchfit.report.html.figures import (
-        describe_layout,
-        draw_convergence,
-        draw_correlation,
-        draw_diagnostics,
-        draw_run,
-        draw_slice,
-    )
-
     order = _rank_runs(estimate)[:MOST_RUNS]
     places = {e: list_places(estimate, e)[:MOST_SLIDERS] for e in order}
     points = choose_points(estimate, order, max((len(own) for own in places.values()), default=0))
