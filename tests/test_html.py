@@ -214,6 +214,19 @@ def test_curves_and_samples_in_the_page_are_those_of_the_fit(toss, toss_page):
     assert np.isnan(times).sum() == 1, "broken at the transition"
 
 
+def test_residuals_in_the_page_move_against_the_fit(toss, toss_page):
+    sources = payload_of(toss_page)["figures"]["run-0"]["sources"]
+    evaluator = toss.evaluator_at_solution()
+    for place in (toss.theta_names.index("mu"), toss.theta_names.index("vx0")):
+        theta = toss.theta.copy()
+        theta[place] += 1e-4
+        moved, now = (evaluator.simulate(at)[0].seen[0][:, 0] for at in (theta, toss.theta))
+        slopes = array_of(sources, "samples-0", f"d{place}_0")
+        count = len(slopes)
+        np.testing.assert_allclose(slopes, (now - moved)[:count] / 1e-4, atol=2e-3 * np.abs(slopes).max())
+        assert np.abs(slopes).max() > 0.01
+
+
 def test_the_inputs_are_there_to_run_it_again(toss_page):
     reader = Reader(toss_page)
     assert " ".join(TOSS.read_text().split()) in reader.words
@@ -324,7 +337,7 @@ def test_curves_follow_an_unknown_to_first_order(toss):
 
 
 def test_a_delay_moves_the_samples_as_the_curve_in_time():
-    fit = sf.estimate(late_problem())
+    fit = sf.estimate(late_problem(), strategy="local")
     place = fit.theta_names.index("late")
     (own, *_) = collect_curves(fit, 0, list_places(fit, 0), 800)
     assert own.delay == place
@@ -333,6 +346,7 @@ def test_a_delay_moves_the_samples_as_the_curve_in_time():
     evaluator = fit.evaluator_at_solution()
     moved = evaluator.simulate(theta)[0].seen[0][: len(own.sample_times), 0]
     before = evaluator.simulate(fit.theta)[0].seen[0][: len(own.sample_times), 0]
+    assert f"x is late by {fit.theta[place]:.6g} s" in Reader(format_page(fit)).words
     away = np.abs(own.sample_times - fit.transition_times[0][0] - fit.theta[place]) > 0.2
     np.testing.assert_allclose(own.sample_tangents[place][away, 0], (moved - before)[away] / 1e-3, atol=1e-2)
 
@@ -410,16 +424,20 @@ def test_names_do_no_harm():
 
 
 def test_many_runs_stay_small_and_the_worst_come_first():
-    fit = sf.estimate(sf.Problem(RAMP, ramps(30, sigma=0.02), {"v": 0.9}))
+    fit = sf.estimate(sf.Problem(RAMP, ramps(45, sigma=0.02), {"v": 0.9}))
     text = format_page(fit)
     reader = check_alone(text)
     payload = payload_of(text)
     assert len(payload["groups"]) == pages.MOST_RUNS
-    assert f"The {pages.MOST_RUNS} of 30 runs that are explained worst" in reader.words
+    assert f"The {pages.MOST_RUNS} of 45 runs that are explained worst" in reader.words
     options = re.findall(r'<option value="\d+">\s*(\S+):', text)
     assert options[0] == fit.run_names[-1]
     assert len([name for name in payload["templates"] if name.startswith("run-")]) == 1, "all runs share a drawing"
     assert len(text) < 2_500_000
+    first, everything = (table for table in reader.tables if table[0][1] == "value")
+    assert len(first) < len(everything)
+    assert [row[0] for row in everything[1:]] == list(fit.theta_names)
+    assert "v" in [row[0] for row in first], "parameters before transition times"
 
 
 def test_save_report_writes_whole_or_not_at_all(heater, tmp_path):
@@ -632,7 +650,7 @@ def test_runs_are_chosen_and_shown_together(browser, tmp_path):
     ids=["hostile names", "delay, outliers", "no data", "sigma unknown"],
 )
 def test_every_kind_of_problem_is_shown_without_an_error(browser, tmp_path, make):
-    text = format_page(sf.estimate(make()))
+    text = format_page(sf.estimate(make(), strategy="local"))
     check_alone(text)
     browser.open(write(tmp_path, text))
     for k in range(len(payload_of(text)["sliders"])):

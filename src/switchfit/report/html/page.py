@@ -6,7 +6,7 @@ Import this only where Bokeh and Jinja2 are installed.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from bokeh.resources import Resources
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
+from switchfit.problem.parameter import unit_suffix
 from switchfit.report.html.columns import FigureData, ModeSpan, TransitionLine, collect_diagnostics, collect_run
 from switchfit.report.html.curves import Curves, choose_points, collect_curves, list_places
 from switchfit.report.html.figures import (
@@ -31,6 +32,7 @@ from switchfit.report.html.figures import (
 from switchfit.report.html.inputs import collect_inputs
 from switchfit.report.html.sliders import Slider, build_sliders
 from switchfit.report.numbers import format_rounded, format_unit
+from switchfit.report.sentences import join_words
 from switchfit.report.tables import Table
 from switchfit.report.text import (
     format_end,
@@ -60,6 +62,8 @@ MOST_DIAGNOSED = 8
 """Channels of a run whose residuals have figures."""
 MOST_SLIDERS = 24
 """Sliders of one run."""
+FIRST_ROWS = 40
+"""Unknowns that are listed first: those at a bound or a kink, parameters, transition times; all are behind them."""
 MOST_ROWS = 300
 """Rows of a table; what is left out is counted."""
 MOST_CORRELATED = 60
@@ -136,8 +140,10 @@ def _write_json(value: Any) -> str:
 def _collect_content(estimate: Estimate) -> dict[str, Any]:
     """Return what the template shows as text; the sentences are those of the report as text."""
     verdict, found, diagnostics = estimate.verdict, estimate.identifiability, diagnose(estimate)
-    shown = select_unknowns(estimate, MOST_ROWS)
-    unknowns, note = tabulate_unknowns(estimate, shown, ends=True)
+    listed = select_unknowns(estimate, MOST_ROWS)
+    everything, note = tabulate_unknowns(estimate, listed, ends=True)
+    first = set(select_unknowns(estimate, FIRST_ROWS))
+    rows = [row for i, row in zip(listed, everything.rows[1:], strict=True) if i in first]
     channels, shares = tabulate_channels(estimate)
     worst = [0, *(1 + k for k in np.argsort(shares, kind="stable").tolist())][: MOST_ROWS + 1]
     certificate = estimate.known_certificate or certify(estimate, None)
@@ -149,8 +155,9 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
         "reasons": [write_reason(reason) for reason in verdict.reasons],
         "steps": [write_step(step) for step in verdict.next_steps],
         "warnings": [str(issue) for issue in find_issues(estimate)],
-        "unknowns": unknowns,
-        "more_unknowns": len(estimate.theta) - len(shown),
+        "unknowns": everything._replace(rows=[everything.rows[0], *rows]),
+        "all_unknowns": everything,
+        "more_unknowns": len(estimate.theta) - len(listed),
         "unknowns_note": note,
         "fixed": Table(tabulate_fixed(estimate).rows[:MOST_ROWS], "<<<<"),
         "experiments": list_experiments(estimate, MOST_ROWS, full=True),
@@ -294,8 +301,6 @@ def _describe_run(
     )
     first = set(worst_first[:MOST_CHANNELS].tolist())
     shown = [k in first and not (state and measured) for k, (_, state, _, _) in enumerate(labels)]
-    left_out = sum(own.left_out for own in curves)
-    notes = (f"Of the samples {left_out} are not drawn: the figures show every n-th.",) if left_out else ()
     return Run(
         number=number,
         e=e,
@@ -304,8 +309,24 @@ def _describe_run(
         modes=tuple(modes),
         channels=tuple((label, show) for (label, *_), show in zip(labels, shown, strict=True)),
         diagnosed=diagnosed,
-        notes=notes,
+        notes=tuple(_list_notes(fit, e, curves)),
     )
+
+
+def _list_notes(fit: Fit, e: int, curves: Sequence[Curves]) -> Iterator[str]:
+    """Yield what is not to be seen in the figures of a run: samples that are not drawn, sensors that are late."""
+    unit = unit_suffix(fit.trajectories[e].time_unit)
+    for own in curves:
+        channels = join_words(list(own.names))
+        if own.left_out:
+            drawn = len(own.sample_times)
+            yield f"Of {channels} {drawn} of {drawn + own.left_out} samples are drawn."
+        late = own.times[0] - fit.trajectories[e].times[0]
+        if late != 0:
+            yield (
+                f"{channels} is late by {late:.6g}{unit}: its curve stands at the times of the sensor, the modes and "
+                "transitions at those of the model."
+            )
 
 
 def _list_spans(fit: Fit, e: int, colours: Mapping[str, str]) -> list[ModeSpan]:
