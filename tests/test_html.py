@@ -6,6 +6,7 @@ import hashlib
 import html.parser
 import importlib.metadata
 import importlib.util
+import io
 import json
 import re
 import runpy
@@ -103,12 +104,12 @@ def heater():
     return sf.estimate(heater_problem())
 
 
-def hostile_problem():
+def hostile_problem(name=HOSTILE):
     """Names of everything that a user names, made to do harm; positions x and y among the names."""
     system = sf.HybridSystem(
-        {HOSTILE: lambda t, x, p: p["$$k$$"] * jnp.ones(2), "b": lambda t, x, p: jnp.zeros(2)},
+        {name: lambda t, x, p: p["$$k$$"] * jnp.ones(2), "b": lambda t, x, p: jnp.zeros(2)},
         [0.0, 0.0],
-        state_names=(HOSTILE, "@{t}{safe} $$y$$"),
+        state_names=(name, "@{t}{safe} $$y$$"),
         state_units=("</script>", "m"),
     )
     times = np.linspace(0.1, 4.0, 30)
@@ -116,8 +117,8 @@ def hostile_problem():
     values = np.minimum(times, 2.2)[:, None] * [1.0, 1.0] + noise
     data = sf.Measurements(times, values, sigma=0.05)
     runs = [
-        sf.Experiment(data, (HOSTILE, "b"), (2.0,), 0.0, 4.0, name=name, time_unit="</script>")
-        for name in ("<b>run</b>", "<i>run</i>")
+        sf.Experiment(data, (name, "b"), (2.0,), 0.0, 4.0, name=run, time_unit="</script>")
+        for run in ("<b>run</b>", "<i>run</i>")
     ]
     return sf.Problem(system, runs, {"$$k$$": sf.Parameter(0.9, unit="<i>")})
 
@@ -477,6 +478,62 @@ def test_no_module_makes_a_page_of_other_things():
         format_page(1)
 
 
+# --- in a notebook ----------------------------------------------------------------------------------------------------
+
+
+def notebook(result):
+    """What a notebook shows of a result: well-formed, without scripts, and pictures that are pictures."""
+    reader = Reader(result._repr_html_())
+    for tag, attributes in reader.elements:
+        assert tag in {"div", "p", "pre", "table", "thead", "tbody", "tr", "th", "td", "img"}
+        if tag == "img":
+            kind, _, content = attributes["src"].partition(",")
+            assert kind == "data:image/png;base64"
+            assert pixels_of(base64.b64decode(content)).std() > 5
+            assert attributes["alt"]
+    return reader
+
+
+def test_a_notebook_shows_the_verdict_the_numbers_and_a_figure(toss):
+    reader = notebook(toss)
+    assert str(toss.verdict) in reader.words
+    rows, _ = tabulate_unknowns(toss, range(len(toss.theta)))
+    assert reader.tables == [[[row[k] for k in rows.columns] for row in rows.rows]]
+    assert [tag for tag, _ in reader.elements].count("img") == 1
+    assert len(toss._repr_html_()) < 150_000
+
+
+def test_a_notebook_shows_a_problem_before_it_is_fitted():
+    runs, unknowns = notebook(heater_problem()).tables
+    assert runs[1] == ["1", "on → off", "0 to 6", "h", "24"]
+    assert unknowns[1][:2] == ["tau_1", "2"]
+    assert unknowns[2][:5] == ["k", "0.5", "0.01", "5", "1/h"]
+
+
+def test_a_notebook_shows_a_profile_and_many_fits(heater):
+    profile = heater.profile("k")
+    assert " ".join(str(profile).split()) in notebook(profile).words
+    fits = sf.multistart(heater_problem(), 4)
+    assert " ".join(str(fits).split()) in notebook(fits).words
+
+
+def test_names_do_no_harm_in_a_notebook():
+    problem = hostile_problem("<b>$$x")
+    assert "<b>$$x → b" in notebook(problem).words
+    fit = sf.estimate(problem)
+    assert "<b>run</b>.tau_1" in notebook(fit).words
+    assert "Profile of $$k$$" in notebook(fit.profile("$$k$$")).words
+    fit.plot_residuals().savefig(io.BytesIO())
+
+
+def test_a_notebook_shows_no_figure_of_many_runs():
+    problem = sf.Problem(RAMP, ramps(12, sigma=0.02), {"v": 0.9})
+    assert "And 2 more." in notebook(problem).words
+    reader = notebook(sf.estimate(problem, strategy="local"))
+    assert "img" not in [tag for tag, _ in reader.elements]
+    assert "And 5 more unknowns." in reader.words
+
+
 # --- in a browser -----------------------------------------------------------------------------------------------------
 
 
@@ -673,8 +730,6 @@ def test_the_paper_s_vehicle_has_a_path(browser, tmp_path):
 
 def pixels_of(picture):
     """A PNG as an array."""
-    import io
-
     import matplotlib.image
 
     return (255 * matplotlib.image.imread(io.BytesIO(picture), format="png")[..., :3]).astype(np.uint8)

@@ -36,7 +36,7 @@ from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_choice, as_count, as_flag, as_instance, as_path, as_positive
 from switchfit.runtime.files import write_atomically
-from switchfit.runtime.presentation import draw_figure, format_page, format_text
+from switchfit.runtime.presentation import draw_figure, format_html, format_page, format_text
 from switchfit.runtime.progress import Progress
 from switchfit.uncertainty.certificate import Certificate, certify
 from switchfit.uncertainty.identification import Identifiability, identifiability
@@ -331,6 +331,9 @@ class Estimate(Fit):
 
     def __str__(self) -> str:
         return format_text(self)
+
+    def _repr_html_(self) -> str:
+        return format_html(self)
 
     def plot(self, *, bands: bool = True, level: float = 0.95) -> Any:
         """Draw measured against fitted over time with the modes shaded, as a matplotlib Figure.

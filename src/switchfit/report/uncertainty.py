@@ -10,6 +10,7 @@ import scipy.special
 
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report.numbers import format_rounded, label_time
+from switchfit.report.plot import turn_off_formulas
 from switchfit.report.sentences import join_words
 from switchfit.report.tables import Table, format_table
 from switchfit.runtime.presentation import draw_figure, format_text
@@ -350,7 +351,7 @@ def plot_profile(profile: Profile) -> Figure:
 
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     draw_profile(profile, figure.subplots())
-    return figure
+    return turn_off_formulas(figure)
 
 
 def draw_profile(profile: Profile, ax: Axes) -> Axes:
@@ -447,7 +448,7 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics) -> Figure:
             ax.set_xlabel(label_time(unit))
     for ax, label in zip(axes[-1, 1:], ("lag (samples)", "normal quantile"), strict=True):
         ax.set_xlabel(label)
-    return figure
+    return turn_off_formulas(figure)
 
 
 def draw_in_time(channel: ChannelResiduals, ax: Axes) -> Axes:

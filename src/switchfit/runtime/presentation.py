@@ -51,3 +51,15 @@ def format_page(result: Any, **settings: Any) -> str:
         What that kind of page can be given.
     """
     raise TypeError(f"no module of switchfit.report makes a page of a {type(result).__name__}; register one.")
+
+
+@singledispatch
+def format_html(result: Any) -> str:
+    """Return a result as a few lines of HTML, as a notebook shows it.
+
+    Parameters
+    ----------
+    result : object
+        Of a kind that a module of `switchfit.report` has registered.
+    """
+    raise TypeError(f"no module of switchfit.report shows a {type(result).__name__} in a notebook; register one.")
