@@ -21,10 +21,13 @@ PLACES = {2.0: "on a sample", 2.01: "0.01 s beside it", 2.05: "between two sampl
 
 
 class Coverage(NamedTuple):
-    """Parts of the intervals that hold the truth, and of the fits that end at a kink."""
+    """Parts of the intervals that hold the truth, of single fits and of `estimate_many`, and of the fits that end at a
+    kink.
+    """
 
     quadratic: float
     piecewise: float
+    many: float
     at_kink: float
 
 
@@ -50,19 +53,22 @@ def measure_coverage(tau: float, runs: int, *, rate_known: bool, seed: int = 5) 
     """Fit `runs` logs with noise and count the intervals that hold tau."""
     rng = np.random.default_rng(seed)
     clean = np.where(tau < TIMES, 1 - np.exp(-RATE * (TIMES - tau)), 0.0)
-    counts = np.zeros(3)
-    for _ in range(runs):
-        values = clean + SIGMA * rng.standard_normal(len(TIMES))
-        fit = sf.estimate(build_problem(values[:, None], tau, rate_known=rate_known), strategy="local")
+    logs = [(clean + SIGMA * rng.standard_normal(len(TIMES)))[:, None] for _ in range(runs)]
+    problems = [build_problem(values, tau, rate_known=rate_known) for values in logs]
+    counts = np.zeros(4)
+    together = sf.estimate_many(problems).confidence_intervals()[:, 0]
+    for problem, (least, most) in zip(problems, together, strict=True):
+        fit = sf.estimate(problem, strategy="local")
         (low, high), (lower, upper) = Fit.confidence_intervals(fit)[0], fit.confidence_intervals()[0]
-        counts += low <= tau <= high, lower <= tau <= upper, bool(fit.kinks)
+        counts += low <= tau <= high, lower <= tau <= upper, least <= tau <= most, bool(fit.kinks)
     return Coverage(*(counts / runs))
 
 
 def main(runs: int = RUNS) -> None:
     """Print the table."""
-    print("| true transition time | rate | theta ± quantile x standard error | piecewise | fits at a kink |")
-    print("|---|---|---|---|---|")
+    kinds = "theta ± quantile x standard error | piecewise | of `estimate_many`"
+    print(f"| true transition time | rate | {kinds} | fits at a kink |")
+    print("|---|---|---|---|---|---|")
     for tau, place in PLACES.items():
         for known in (True, False):
             found = measure_coverage(tau, runs, rate_known=known)

@@ -5,7 +5,8 @@ from importlib.metadata import version as installed_version
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
-import covid_figures  # these stand beside this file
+import ball_figures  # these stand beside this file
+import covid_figures
 import heaters_figures
 import paper_figures
 import speed_figures
@@ -14,6 +15,7 @@ import tosses_figures
 import uncertainty_figures
 
 DRAWN_HERE = (
+    ball_figures,
     covid_figures,
     heaters_figures,
     paper_figures,

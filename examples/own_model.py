@@ -20,7 +20,7 @@ heated = 25.0 * (1.0 - np.exp(-0.02 * np.minimum(minutes, 43.0)))
 exact = 15.0 + heated * np.exp(-0.02 * np.maximum(minutes - 43.0, 0.0))
 log = sf.Measurements(minutes, exact + 0.1 * np.random.default_rng(1).standard_normal(len(minutes)), sigma=0.1)
 
-run = sf.Experiment(log, mode_sequence=("on", "off"), transition_times=(30.0,), t0=0.0, tf=120.0, time_unit="min")
+run = sf.Experiment(log, mode_sequence=("on", "off"), transition_times=(30.0,), time_unit="min")
 rates = {"heating": sf.Parameter(0.3, unit="°C/min"), "cooling": sf.Parameter(0.05, unit="1/min")}
 problem = sf.Problem(room, run, parameters=rates)
 

@@ -17,7 +17,8 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "switchfit"
 
 PAPER, ROWS = "paper_adjoint.py", "discretization/rows.py"
-ALGEBRA = "optimize/algebra.py"
+ALGEBRA, COMPOSITE, MERIT = (f"optimize/{name}.py" for name in ("algebra", "composite", "merit"))
+DIRECTION, POINT, STATE = (f"optimize/{name}.py" for name in ("direction", "point", "state"))
 MODEL, STRUCTURE = "discretization/model.py", "problem/structure.py"
 KERNELS, SEGMENTS, SAMPLE_LOOPS, TEMPLATES = (
     f"engine/native/{name}.py" for name in ("kernels", "segments", "sample_loops", "templates")
@@ -30,6 +31,7 @@ TESTS = {
     "rows": [SYSTEMS],
     "native": [SYSTEMS, PROTOCOL],
     "sqp": [["tests/test_sqp.py", "tests/test_qp.py"]],
+    "equalities": [["tests/test_equalities.py"]],
     "final time": [["tests/test_final_time.py", "-k", "closed_form or engines or every_check"]],
 }
 """What must notice the mistakes of each part, one after the other until something does."""
@@ -142,6 +144,37 @@ IN_SQP: dict[str, tuple[str, Replacements]] = {
     ),
 }
 
+IN_EQUALITIES: dict[str, tuple[str, Replacements]] = {
+    "second-order correction": (MERIT, [("if found is not None or not corrects:", "if True:")]),
+    "the penalty is raised": (
+        MERIT,
+        [("return penalty if penalty >= needed else RAISED * needed", "return penalty")],
+    ),
+    "a stationary violation ends it": (
+        MERIT,
+        [("return violation - equalities.predict(normal) <= STATIONARY * violation", "return False")],
+    ),
+    "the constraints in the Hessian of the Lagrangian": (POINT, [("self.multipliers / units)", "0.0 * units)")]),
+    "bounds of the normal step": (
+        COMPOSITE,
+        [("if (np.abs(shortest) <= radius).all() and (normals @ shortest >= offsets).all():", "if True:")],
+    ),
+    "dependent rows": (COMPOSITE, [("self.triangular[:k] if self.rank == k else None", "self.triangular[:k]")]),
+    "curvature along the constraints alone": (
+        STATE,
+        [
+            (
+                "np.vstack([constraints.rows(rows), point.equalities(point.reported_sides).jacobian])",
+                "constraints.rows(rows)",
+            )
+        ],
+    ),
+    "kinks that keep constraints from being met": (
+        DIRECTION,
+        [("if best.left > max(HALF * point.violation, MET):", "if False:")],
+    ),
+}
+
 IN_FINAL_TIME: dict[str, tuple[str, Replacements]] = {
     "the running cost at tf": (MODEL, [("if self.structure.is_rest(mode):", "if False:")]),
     "rest after tf": (STRUCTURE, [("return jnp.zeros_like(x)", "return 0.1 * x")]),
@@ -158,6 +191,7 @@ MISTAKES: dict[tuple[str, str], tuple[str, Replacements]] = {
     **{("rows", name): (ROWS, replacements) for name, replacements in IN_ROWS.items()},
     **{("native", name): mistake for name, mistake in IN_NATIVE.items()},
     **{("sqp", name): mistake for name, mistake in IN_SQP.items()},
+    **{("equalities", name): mistake for name, mistake in IN_EQUALITIES.items()},
     **{("final time", name): mistake for name, mistake in IN_FINAL_TIME.items()},
 }
 """All mistakes by part and name: the file, and what is replaced in it."""

@@ -443,6 +443,24 @@ def test_many_logs_are_the_same_as_single_estimates():
     assert "5 fits" in str(fits)
 
 
+def test_logs_whose_horizon_is_the_span_of_their_own_data():
+    """x begins at x(t0) = 0.2 with the first sample of each log, whenever that is."""
+
+    def log_of(times, switch, k=0.8):
+        heated = 1 / k + (0.2 - 1 / k) * np.exp(-k * (np.minimum(times, switch) - times[0]))
+        values = heated * np.exp(-k * np.maximum(times - switch, 0.0))
+        run = sf.Experiment(sf.Measurements(times, values, sigma=0.01), ("on", "off"), (switch - 0.3,))
+        return sf.Problem(ROOM, run, {"k": sf.Parameter(1.0, lower=0.1, upper=5.0)})
+
+    spans = [(0.0, 6.0), (100.0, 106.0), (1.0, 4.5)]
+    switches = [2.1, 103.3, 2.6]
+    logs = [log_of(np.linspace(*span, 24), switch) for span, switch in zip(spans, switches, strict=True)]
+    assert [(log.experiments[0].t0, log.experiments[0].tf) for log in logs] == spans
+    fits = sf.estimate_many(logs)
+    assert fits.success.all()
+    np.testing.assert_allclose(fits.theta, [[switch, 0.8] for switch in switches], atol=1e-6)
+
+
 def test_a_log_that_needs_a_finer_mesh_is_done_again_by_itself():
     """The guess is slow and the truth fast: the mesh of the guess is too coarse for one of the logs."""
 
@@ -777,6 +795,30 @@ def test_a_log_that_raises_an_error_is_listed(limit, tmp_path):
     np.testing.assert_array_equal(fits.start[1], [1.7, 5.0])
     first = sf.estimate_many([failing_room(measured_room(1), (1.7, 5.0)), problems[0]])
     assert first.status.tolist() == ["ERROR", "CONVERGED"]
+
+
+def test_an_error_of_the_program_itself_is_said(monkeypatch):
+    """It must not pass silently for a model that cannot be evaluated: all fits would take many times as long."""
+    from switchfit.batch import program
+
+    def fail(*given, layout):
+        raise TypeError("unhashable layout")
+
+    monkeypatch.setattr(program, "_fits", fail)
+    settings = {"theta": TRUTH, "seed": 1}
+    with pytest.warns(RuntimeWarning, match=r"failed \(TypeError: unhashable layout\); they are done one by one"):
+        study = sf.monte_carlo(room(), 3, **settings)
+    monkeypatch.undo()
+    np.testing.assert_allclose(study.theta, sf.monte_carlo(room(), 3, **settings).theta, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["loss", "leak"])
+def test_models_with_the_same_machine_code_share_an_operation(name):
+    """The second differs from the first in the name of a parameter alone; XLA takes the name of an operation once."""
+    system = sf.HybridSystem({"on": lambda t, x, p: 1.5 - p[name] * x, "off": lambda t, x, p: -1.0 * x}, [0.2])
+    run = sf.Experiment(sf.Measurements(TIMES, np.zeros(24), sigma=0.01), ("on", "off"), (1.7,), 0.0, 6.0)
+    problem = sf.Problem(system, run, {name: sf.Parameter(1.0, lower=0.1, upper=5.0)})
+    assert sf.monte_carlo(problem, 3, theta=TRUTH).success.all()  # a warning would be an error
 
 
 # Budgets, and fits that crawl

@@ -342,7 +342,7 @@ def test_folder_that_cannot_be_made(folder, tmp_path):
     (tmp_path / "file").write_text("")
     result = run("fit", folder / "problem.toml", "--out", tmp_path / "file")
     assert result.exit_code == 2
-    assert f"the folder {tmp_path / 'file'} cannot be made" in result.stderr
+    assert f"the folder {tmp_path / 'file'} cannot be created" in result.stderr
 
 
 def test_file_that_cannot_be_written(folder, tmp_path):
@@ -370,18 +370,20 @@ def test_a_full_disk_leaves_the_old_file_and_says_so(folder, tmp_path, monkeypat
 # --- progress, and all of it ------------------------------------------------------------------------------------------
 
 
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
+def test_ctrl_c_during_a_strategy_keeps_the_best(folder, tmp_path, monkeypatch):
+    """Nobody asks the callback there: the first Ctrl-C must be heard all the same."""
+    from switchfit.strategy import choice
 
+    def scan(problem, theta):
+        signal.raise_signal(signal.SIGINT)
+        raise AssertionError("not heard")
 
-def test_progress_only_on_a_terminal(monkeypatch):
-    record = sf.optimize.IterationRecord(3, 1.5, 2e-4, 0.5, np.zeros(1), 4)
-    for stream, shown in ((Terminal(), True), (io.StringIO(), False)):
-        monkeypatch.setattr(sys, "stderr", stream)
-        with cli._show_progress() as show:
-            show(record)
-        assert ("iteration   3   cost 1.5   optimality 2.00e-04   step 0.5" in stream.getvalue()) == shown
+    monkeypatch.setattr(choice, "scan_intervals", scan)
+    real = sf.estimate
+    monkeypatch.setattr(sf, "estimate", lambda problem, **options: real(problem, **options, strategy="thorough"))
+    result = run("fit", folder / "problem.toml", "--out", tmp_path, "--no-figures")
+    assert result.exit_code == 0, result.stderr
+    assert sf.Estimate.load(tmp_path / "estimate.json").steps[-1].strategy == "interrupted"
 
 
 @pytest.mark.parametrize("name", ["toss"])

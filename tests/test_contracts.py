@@ -20,7 +20,7 @@ import switchfit as sf
 from switchfit.discretization.mesh import pad_length
 from switchfit.engine.adaptive import initial_state
 from switchfit.engine.jax.programs import derivatives
-from switchfit.engine.jax.simulation import _block, _terminal
+from switchfit.engine.jax.simulation import _compute_terminal_cost, _simulate_block
 from switchfit.engine.native.program import _program_of
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.problem import functions
@@ -108,7 +108,7 @@ def test_nothing_is_traced_in_a_second_fit(compiled):
     assert traces_of(lambda: sf.estimate(other)) == 0
 
 
-PROGRAMS = (derivatives, _block, _terminal, initial_state)
+PROGRAMS = (derivatives, _simulate_block, _compute_terminal_cost, initial_state)
 """What JAX compiles where there is no machine code."""
 
 

@@ -1,5 +1,6 @@
 """Inputs, reference signals and measurements: what they add to the cost, in closed form."""
 
+from dataclasses import replace
 from functools import cache
 
 import jax
@@ -351,3 +352,56 @@ def test_costs_of_several_data_add_up():
     slopes = [100 * c, 6, 100 * c + 10 * (10 * c - 1), 7, 22 * (c - 1), 2 * (c + 2)]
     assert found.cost == pytest.approx(sum(parts), rel=1e-13)
     assert found.gradient[0] == pytest.approx(sum(slopes), rel=1e-13)
+
+
+# The horizon where t0 or tf is left out
+
+
+def ones(times, **settings):
+    return sf.Measurements(times, np.ones(len(times)), **settings)
+
+
+def reference_over(*times):
+    return sf.ReferenceSignal.from_samples(times, np.ones(len(times)))
+
+
+@pytest.mark.parametrize(
+    ("data", "given", "horizon"),
+    [
+        (ones([1.0, 2.0, 3.0]), {}, (1.0, 3.0)),
+        (ones([1.0, 2.0, 3.0]), {"t0": 0.5}, (0.5, 3.0)),
+        (ones([1.0, 2.0, 3.0]), {"tf": 7.0}, (1.0, 7.0)),
+        (ones([1.0, 2.0, 3.0]), {"t0": None, "tf": None}, (1.0, 3.0)),
+        (ones([1.0, 2.0, 3.0], delay=0.25), {}, (0.75, 2.75)),
+        (reference_over(-1.0, 0.0, 1.0, 4.0), {}, (-1.0, 4.0)),
+        ([ones([1.0, 2.0]), sf.TerminalCost(final_state), ones([1.5, 2.5])], {}, (1.0, 2.5)),
+        ([ones([0.5, 2.0]), reference_over(0.0, 1.0, 2.0, 3.0)], {}, (0.0, 3.0)),
+    ],
+)
+def test_a_horizon_that_is_left_out_is_the_span_of_the_data(data, given, horizon):
+    run = sf.Experiment(data, ("a", "b"), (1.75,), **given)
+    assert (run.t0, run.tf) == horizon
+    assert run.taken_from_data == tuple(name for name in ("t0", "tf") if given.get(name) is None)
+    assert sf.Experiment(data, ("a", "b"), None, **given).initial_times[0] == pytest.approx(np.mean(horizon))
+
+
+def test_a_horizon_from_the_data_is_the_same_as_the_one_given():
+    """x' = -x from x(t0) = 1, t0 being the first sample; a free tf keeps its own end."""
+    data = ones([1.0, 2.0, 3.0])
+    system = sf.HybridSystem({"a": decay}, [1.0])
+    found = sf.evaluate(sf.Problem(system, sf.Experiment(data, ("a",), ()), {"k": 1.0}))
+    assert found.cost == pytest.approx(0.5 * ((1 - np.exp(-1)) ** 2 + (1 - np.exp(-2)) ** 2), rel=1e-8)
+    given = sf.evaluate(sf.Problem(system, sf.Experiment(data, ("a",), (), 1.0, 3.0), {"k": 1.0}))
+    np.testing.assert_array_equal(found.gradient, given.gradient)
+    trajectory = sf.simulate(sf.Problem(system, sf.Experiment(data, ("a",), ()), {"k": 1.0}))
+    assert (trajectory.times[0], trajectory.times[-1]) == (1.0, 3.0)
+    run = sf.Experiment(data, ("a",), (), tf=sf.Parameter(4.0, lower=3.0, upper=5.0))
+    assert (run.t0, run.end, run.taken_from_data) == (1.0, 5.0, ("t0",))
+
+
+def test_a_copy_with_other_data_keeps_the_horizon_unless_it_is_left_out_again():
+    run = sf.Experiment(ones([1.0, 2.0, 3.0]), ("a",), ())
+    kept = replace(run, data=ones([1.5, 2.0]))
+    assert (kept.t0, kept.tf, kept.taken_from_data) == (1.0, 3.0, ())
+    anew = replace(run, data=ones([1.5, 2.0]), t0=None, tf=None)
+    assert (anew.t0, anew.tf) == (1.5, 2.0)

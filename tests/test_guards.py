@@ -157,6 +157,45 @@ def test_a_fit_with_guards_and_noise_is_where_the_closed_form_has_its_minimum():
         assert cost(inflow + step[0], rim + step[1]) > fit.cost
 
 
+@pytest.mark.parametrize("count", [2, 17])
+def test_many_guarded_runs_are_fitted_jointly(count):
+    """Tanks with one rim, each with an inflow of its own; 16 runs or more have another shape without guards."""
+    one = tank()
+    rng = np.random.default_rng(3)
+    inflows, times = rng.uniform(0.4, 0.8, count), np.linspace(0.25, 10.0, 40)
+    runs = [
+        sf.Experiment(
+            sf.Measurements(times, level(inflow, 2.2, times), sigma=0.02),
+            ("fills", "overflows"),
+            (4.0,),
+            0.0,
+            10.0,
+            parameter_map={"inflow": f"inflow_{i}"},
+        )
+        for i, inflow in enumerate(inflows)
+    ]
+    own = {f"inflow_{i}": 0.7 for i in range(count)}
+    fit = sf.estimate(sf.Problem(one.system, runs, {"rim": sf.Parameter(1.5, lower=0.0), **own}), strategy="local")
+    assert fit.success
+    assert len(fit.constraints) == count
+    np.testing.assert_allclose(fit.parameters["rim"], 2.2, rtol=0, atol=1e-8)
+    np.testing.assert_allclose([fit.parameters[f"inflow_{i}"] for i in range(count)], inflows, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(np.concatenate(fit.transition_times), -10 * np.log(1 - 0.22 / inflows), atol=1e-7)
+
+
+def test_unknowns_on_a_logarithmic_scale_are_fitted_beside_guards():
+    """The optimiser works in their logarithms: the end, the multiplier and the covariance are those of the unknowns."""
+    plain = tank(rng=np.random.default_rng(4))
+    logarithmic = {"inflow": sf.Parameter(0.8, scale="log"), "rim": sf.Parameter(1.5, scale="log")}
+    one = sf.estimate(plain)
+    other = sf.estimate(sf.Problem(plain.system, plain.experiments, logarithmic))
+    assert other.success
+    np.testing.assert_allclose(other.theta, one.theta, rtol=1e-7)
+    np.testing.assert_allclose(other.hessian, one.hessian, rtol=1e-6, atol=1e-6 * np.abs(one.hessian).max())
+    np.testing.assert_allclose(other.covariance, one.covariance, rtol=1e-5, atol=1e-12)
+    assert other.constraints[0][2] == pytest.approx(one.constraints[0][2], rel=1e-5, abs=1e-6)
+
+
 def test_priors_count_beside_guards():
     """They are part of J and of the Lagrangian, and pull a fit whose data say less."""
     plain = tank()

@@ -65,7 +65,7 @@ def test_names_and_positions_agree_to_the_bit(engine, kind):
 
 def test_a_fit_and_all_that_follows(tmp_path):
     named, plain = both()
-    one, other = sf.estimate(named), sf.estimate(plain)
+    one, other = (sf.estimate(problem, strategy="local") for problem in (named, plain))
     np.testing.assert_array_equal(one.theta, other.theta)
     np.testing.assert_array_equal(one.covariance, other.covariance)
     assert one.engine.name == "native"
@@ -229,9 +229,9 @@ def test_bad_values(values, error, message):
 @pytest.mark.parametrize(
     ("left", "values", "message"),
     [
-        ("lef", NAMED, r"mode 'pull' asks for 'lef', which is neither a parameter \(k\) nor an input \(left, right\)"),
-        ("k", NAMED, "mode 'pull' asks for the input 'k', which the experiment lacks; it has left, right"),
-        (0, NAMED, r"asks for 0, which is neither a parameter \(k\) nor an input \(left, right\)"),
+        ("lef", NAMED, r"mode 'pull' reads 'lef', which is neither a parameter \(k\) nor an input \(left, right\)"),
+        ("k", NAMED, "mode 'pull' reads the input 'k', which the experiment lacks; it has left, right"),
+        (0, NAMED, r"reads 0, which is neither a parameter \(k\) nor an input \(left, right\)"),
         ("left", np.ones((7, 2)), r"mode 'pull'.* u has no names: give sf.Input a dict of name -> samples"),
     ],
 )
@@ -245,7 +245,7 @@ def test_an_input_that_is_asked_for_as_a_parameter():
     run = sf.Experiment(
         sf.TerminalCost(lambda x, p: x[0]), ("on",), (), 0.0, 1.0, inputs=sf.Input([0.0], {"left": [1]})
     )
-    with pytest.raises(ValueError, match="asks for the parameter 'left', which the problem lacks; it has k"):
+    with pytest.raises(ValueError, match="reads the parameter 'left', which the problem lacks; it has k"):
         sf.Problem(system, run, {"k": 1.0})
 
 
@@ -305,7 +305,7 @@ def test_names_in_a_problem_file(folder):
         (
             'right = "wheel 2"',
             'rigth = "wheel 2"',
-            r"asks for 'right', which is neither .* nor an input \(left, rigth\)",
+            r"reads 'right', which is neither .* nor an input \(left, rigth\)",
         ),
         ('right = "wheel 2"', "right = 2", "'experiments.1..inputs.columns' must be a string; got 2"),
         (

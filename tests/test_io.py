@@ -193,6 +193,7 @@ def test_short_forms_and_defaults(folder):
     )
     experiment = loaded.problem.experiments[0]
     assert (experiment.t0, experiment.tf) == (0.0, 6.0)
+    assert "on -> off on [0, 6] s (t0 and tf from the data), at 3 s" in describe(loaded.problem)
     assert experiment.data[0].sigma is None
     assert experiment.data[0].observe is None
     assert loaded.options == {}
@@ -204,6 +205,12 @@ def test_fixed_values_stay_out_of_theta(folder):
         folder, ("cooling = 0.05", "cooling = { value = 0.05, fixed = true }"), ("upper = 5.0 }", "fixed = true }")
     )
     assert loaded.problem.theta_names == ("heating",)
+
+
+def test_a_horizon_of_which_one_end_is_left_out(folder):
+    problem = changed(folder, ("t0 = 0.0\ntf = 6.0\n", "tf = 7.5\n"), ("sigma = 0.1\n", "delay = 0.25\n")).problem
+    assert (problem.experiments[0].t0, problem.experiments[0].tf) == (-0.25, 7.5)
+    assert "on [-0.25, 7.5] s (t0 from the data)" in describe(problem)
 
 
 def test_window_offset_and_scale(folder):
@@ -334,7 +341,7 @@ def test_examples_load(path):
         ("value = 0.3, lower = 0.0", "value = 0.3, lower = 0.4", r"parameters\.heating: .* lies outside its bounds"),
         ("cooling = 0.05", 'cooling = "little"', r"'parameters\.cooling' must be a table; got 'little' \(a parameter"),
         ("cooling = 0.05", "cooling = { val = 1 }", r"unknown key 'parameters\.cooling\.val'; did you mean 'value'\?"),
-        ("cooling = 0.05", "", r"asks for the parameter 'cooling', which the problem lacks"),
+        ("cooling = 0.05", "", r"reads the parameter 'cooling', which the problem lacks"),
         ('columns = ["T"]', 'columns = ["temp"]', r"log\.csv has no column 'temp'; its columns are t, T, sd, u"),
         ('"log.csv"', '"lgo.csv"', r"There is no file .*lgo\.csv"),
         ('time = "t"', 'time = "T"', r"log\.csv, column 'T': the time of sample 3 is missing"),
@@ -370,7 +377,7 @@ def test_examples_load(path):
         ("room.py:room", "room.py:seven", r"model 'room\.py:seven' must be an sf\.HybridSystem or a .*got int"),
         ("room.py:room", "room.py:broken_factory", r"failed: .*room\.py, line 20, in broken_factory: RuntimeError: no"),
         ("room.py:room", "room.py:broken", r"room\.py, line 23, in broken_mode: mode 'on': .* NameError: name 'undef"),
-        ("room.py:room", "room.py:nameless", r"observe names states, but the model has no state_names; give it some"),
+        ("room.py:room", "room.py:nameless", r"observe names states, but the model has no state_names; add them"),
         ('"room.py:room"', '{ name = "room.py:room", arguments = { a = 1 } }', "is not a function; leave out its arg"),
         ('"room.py:room"', '{ name = "room.py:make", arguments = { a = 1 } }', "argument 'a'; it takes start"),
         ('"room.py:room"', '{ name = "skid_steer", arguments = { restick = "x" } }', "failed: ValueError: restick"),

@@ -238,7 +238,7 @@ def test_a_damaged_part_is_named_set_aside_and_computed_again(tmp_path, monkeypa
     assert sorted(path.name for path in tmp_path.iterdir()) == ["results.json", "table.md"]
     # What stood in damaged results is not lost in silence when one part is done again.
     (tmp_path / "results.json").write_text('{"noise": {"quick": true}}')
-    with pytest.warns(UserWarning, match=r"results\.json is damaged: 'noise' is no part with its results"):
+    with pytest.warns(UserWarning, match=r"results\.json is damaged: 'noise' is not a part with its results"):
         assert list(run(tmp_path, quick=True, only="lti")) == ["lti"]
     assert (tmp_path / "results.json.damaged").read_text() == '{"noise": {"quick": true}}'
     # A run that was killed while it tidied up.

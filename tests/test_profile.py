@@ -267,7 +267,7 @@ def test_it_can_be_stopped():
 
 def test_what_cannot_be_profiled():
     fit = ramp(np.minimum(TIMES, 2.05) + noise(3))
-    with pytest.raises(ValueError, match="there is no unknown 'mu'; there are tau_1, v"):
+    with pytest.raises(ValueError, match="there is no unknown 'mu'; the unknowns are tau_1, v"):
         fit.profile("mu")
     with pytest.raises(ValueError, match="level must lie between 0 and 1; got 1"):
         fit.profile("v", level=1)
@@ -278,7 +278,7 @@ def test_what_cannot_be_profiled():
     cost = sf.TerminalCost(lambda x, p: (x[0] - 1.0) ** 2)
     run = sf.Experiment(cost, ("up", "rest"), (1.9,), 0.0, 4.0)
     without = sf.estimate(sf.Problem(RAMP, run, {"v": sf.Parameter(1.0, fixed=True)}))
-    with pytest.raises(ValueError, match="a profile needs a noise model: a cost made of Measurements alone"):
+    with pytest.raises(ValueError, match="a profile needs a noise model: a cost of Measurements alone"):
         without.profile("tau_1")
     few = observed(parabola, np.array([1.0, 2.0, 2.5]), {"c": [0.0, 0.0, 0.0]}, None, TIMES[:3])
     with pytest.raises(ValueError, match="sigma is unknown and 3 values are too few"):

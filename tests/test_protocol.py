@@ -139,7 +139,7 @@ def test_the_cost_of_transitions_in_closed_form():
 
 def test_what_the_papers_equations_do_not_know_is_not_compared_with_them():
     given = problem(DATA["transitions, end"])
-    with pytest.raises(ValueError, match="the paper's equations know no TransitionCost: take another method"):
+    with pytest.raises(ValueError, match="the paper's equations have no TransitionCost: choose another method"):
         sf.evaluate(given, method="adjoint")
     check = sf.check_derivatives(given)
     assert check.passed
@@ -275,14 +275,14 @@ def test_room_for_fewer_transitions_than_there_are_is_refused():
 def test_the_problem_says_which_engine_it_wants():
     given = problem(samples())
     assert evaluator_of(given).engine == evaluator_of(replace(given, engine="native")).engine
-    assert str(evaluator_of(replace(given, engine="jax")).engine) == "Evaluated by JAX: engine='jax' asks for it."
+    assert str(evaluator_of(replace(given, engine="jax")).engine) == "Evaluated by JAX: engine='jax' is set."
     with pytest.raises(ValueError, match=r"engine must be one of auto, native, jax|engine"):
         problem(samples(), engine="gpu")
 
 
 def test_machine_code_that_is_insisted_on_is_refused_with_the_reason():
     given = problem(samples(), engine="native", solver="stiff")
-    with pytest.raises(ValueError, match="engine='native' asks for machine code, but solver='stiff' takes implicit"):
+    with pytest.raises(ValueError, match="engine='native' requires machine code, but solver='stiff' takes implicit"):
         sf.estimate(given)
 
 

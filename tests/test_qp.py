@@ -6,7 +6,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from switchfit.optimize import LinearConstraints, kkt, qp, solve_qp
-from switchfit.optimize.dense import Dense, _solve_in_bounds, convexify, split_space
+from switchfit.optimize.dense import Dense, convexify, solve_in_bounds, split_space
 from switchfit.optimize.kkt import kkt_residual
 from switchfit.optimize.matrix import diagonal_scaling
 
@@ -249,7 +249,7 @@ def test_programmes_with_bounds_alone_are_solved_as_by_the_general_method(d):
         normals = np.vstack([random.standard_normal((1, d)), np.eye(d), -np.eye(d)])
         offsets = -random.uniform(0.0, 1.0, 2 * d + 1)
         newton = -np.linalg.solve(convex, gradient)
-        found = _solve_in_bounds(gradient, convex, newton, normals, offsets)
+        found = solve_in_bounds(gradient, convex, newton, normals, offsets)
         expected = solve_qp(gradient, convex, normals, offsets)
         if found is None:
             refused += 1

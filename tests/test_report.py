@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from models import heated_room, temperature
 
 import switchfit as sf
-from switchfit.fit.result import Fit
+from switchfit.fit.result import Fit, Step
 from switchfit.fit.termination import Kink, Termination
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord, Status
@@ -194,6 +194,31 @@ def test_rounding_loses_less_than_a_tenth_of_the_error(value, error):
     text, spread, _ = format_rounded(value, error)
     assert abs(float(text) - value) <= 0.1 * error
     assert float(spread.removeprefix("± ")) == pytest.approx(error, rel=0.06)
+
+
+def test_a_single_unknown_that_is_not_determined_is_to_be_fixed():
+    fit = made(hessian=np.diag([1.0, 0.0, 1.0]), status=Status.SINGULAR)
+    assert report(fit).splitlines()[0] == "Doubtful: the data hardly determine tau_2: fix it or add data."
+
+
+def test_after_strategies_the_first_guess_is_that_of_the_user():
+    steps = (Step("local", 120.0, 40, 0.5), Step("many starts", 28.0, 300, 2.0, "settled"))
+    fit = made(steps=steps, starts=(23, 0, 5), initial_cost=15087.7, evaluations=340)
+    text = report(fit)
+    assert line_with(text, "effort") == "effort 340 evaluations, 1.25 s in all, 2 iterations in the last fit"
+    assert line_with(text, "cost J") == "cost J 28 (first guess: 15087.7)"
+    assert line_with(text, "tried") == "tried local: J = 120 (0.5 s); many starts: J = 28 (2 s)"
+    found = "starts the lowest J was found from 5 of 23 other starts; no further minimum is likely"
+    assert line_with(text, "starts") == found
+    for ended, words in {"time": "ended by time_budget", "most": "there may be further minima"}.items():
+        again = made(steps=(steps[0], replace(steps[1], ended=ended)), starts=(23, 0, 5), initial_cost=15087.7)
+        assert f"5 of 23 other starts; {words}" in line_with(report(again), "starts")
+
+
+def test_a_first_guess_that_cannot_be_integrated_has_no_cost():
+    fit = made(steps=(Step("local", np.inf, 0, 0.1), Step("growing horizon", 28.0, 300, 2.0)))
+    assert line_with(report(fit), "cost J") == "cost J 28 (first guess: not integrable)"
+    assert line_with(report(fit), "tried") == "tried local: failed (0.1 s); growing horizon: J = 28 (2 s)"
 
 
 def test_what_failed_is_said_first():

@@ -292,7 +292,7 @@ def test_a_map_to_a_parameter_that_does_not_exist():
 
 def test_a_parameter_that_neither_map_nor_problem_has():
     lacking = {name: value for name, value in GUESS.items() if name != "b"}
-    with pytest.raises(ValueError, match="mode 'sway' asks for the parameter 'b', which the problem lacks; it has k"):
+    with pytest.raises(ValueError, match="mode 'sway' reads the parameter 'b', which the problem lacks; it has k"):
         sf.Problem(SWING, run(parameter_map={"k": "k_2"}), lacking)
 
 

@@ -182,6 +182,18 @@ def test_a_real_fit_comes_back(tmp_path):
     np.testing.assert_array_equal(loaded.standard_errors, estimate.standard_errors)
 
 
+def test_the_fit_of_a_horizon_from_the_data_comes_back(tmp_path):
+    times = np.linspace(0.05, 1.95, 20)
+    data = sf.Measurements(times, 3.0 * np.minimum(times, 1.23) - 0.15 + 0.01 * np.cos(40 * times))
+    problem = sf.Problem(RAMP, sf.Experiment(data, ("up", "rest"), (1.0,)), {"v": 2.0})
+    estimate = sf.estimate(problem)
+    estimate.save(tmp_path / "fit.json")
+    loaded = sf.Estimate.load(tmp_path / "fit.json", problem=problem)
+    assert (loaded.trajectories[0].times[0], loaded.trajectories[0].times[-1]) == (times[0], times[-1])
+    np.testing.assert_array_equal(loaded.theta, estimate.theta)
+    np.testing.assert_allclose(loaded.predict([1.0]).outputs, estimate.predict([1.0]).outputs, rtol=1e-9)
+
+
 # --- files of earlier versions ----------------------------------------------------------------------------------------
 
 EARLIER = Path(__file__).parent / "saved" / "version_3.json"
@@ -259,10 +271,10 @@ def test_a_file_of_an_earlier_version_is_saved_as_one_of_this(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"active": ["area at its upper bound 0.78"]}, "fit.active[0] is no constraint of this fit; got"),
-        ({"active": [["q"]]}, "it is not what version 3 holds (TypeError: unhashable type: 'list')"),
-        ({"kinks": [["tau", 1.0, 2.0]]}, "fit.kinks has the name 'tau', which is none of fit.theta_names"),
-        ({"theta_names": None}, "it is not what version 3 holds (TypeError: "),
+        ({"active": ["area at its upper bound 0.78"]}, "fit.active[0] is not a constraint of this fit; got"),
+        ({"active": [["q"]]}, "it does not match the format of version 3 (TypeError: unhashable type: 'list')"),
+        ({"kinks": [["tau", 1.0, 2.0]]}, "fit.kinks has the name 'tau', which is not in fit.theta_names"),
+        ({"theta_names": None}, "it does not match the format of version 3 (TypeError: "),
         ({"colour": "red"}, "fit has the unknown entry 'colour'"),
         ({"message": 3}, "fit.reason.subjects[0] must be a string; got 3"),
     ],
@@ -329,19 +341,25 @@ def test_a_missing_file(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (b"", "no valid JSON"),
-        (b"PK\x03\x04\xff\xfe", "no valid JSON"),
-        (b'{"format": "switchfit fit", "version": 4, "fit"', "no valid JSON"),
-        (b'{"format": "switchfit fit", "version": NaN}', "no valid JSON \\(it contains NaN\\)"),
-        (b"[" * 100_000, "no valid JSON"),
+        (b"", "not valid JSON"),
+        (b"PK\x03\x04\xff\xfe", "not valid JSON"),
+        (b'{"format": "switchfit fit", "version": 4, "fit"', "not valid JSON"),
+        (b'{"format": "switchfit fit", "version": NaN}', "not valid JSON \\(it contains NaN\\)"),
+        (b"[" * 100_000, "not valid JSON"),
         (b'{"format": "switchfit fit", "version": 2, "version": 2}', "it has the entry 'version' twice"),
         (b"[1, 2]", 'no entry "format": "switchfit fit"'),
         (b'{"theta": [1.0]}', 'no entry "format": "switchfit fit"'),
         (b'{"format": "switchfit fit"}', "of version None; this switchfit reads the versions 2, 3, 4 and 5"),
         (b'{"format": "switchfit fit", "version": 1}', "of version 1; this switchfit reads the versions 2, 3, 4 and 5"),
         (b'{"format": "switchfit fit", "version": 5}', "is damaged: fit must be an object; got null"),
-        (b'{"format": "switchfit fit", "version": 3}', "is damaged: it is not what version 3 holds .KeyError: 'fit'"),
-        (b'{"format": "switchfit fit", "version": 3, "fit": [], "certificate": {}}', "is not what version 3 holds"),
+        (
+            b'{"format": "switchfit fit", "version": 3}',
+            "is damaged: it does not match the format of version 3 .KeyError: 'fit'",
+        ),
+        (
+            b'{"format": "switchfit fit", "version": 3, "fit": [], "certificate": {}}',
+            "does not match the format of version 3",
+        ),
         (b'{"format": "switchfit fit", "version": true}', "of version True; this switchfit reads"),
     ],
 )
@@ -361,18 +379,18 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
         (("fit", "cost"), 10**400, "int too large to convert to float"),
         (("fit", "theta"), [1.0, None], "fit.theta must be a number"),
         (("fit", "theta"), "abc", "fit.theta must be a number"),
-        (("fit", "hessian"), [[1.0], [2.0, 3.0]], "fit.hessian is no array of float64"),
+        (("fit", "hessian"), [[1.0], [2.0, 3.0]], "fit.hessian is not an array of float64"),
         (("fit", "theta"), {"values": []}, "fit.theta must be an array"),
         (("fit", "theta"), {"dtype": "f9", "shape": [0], "values": []}, "fit.theta has the unknown dtype 'f9'"),
         (
             ("fit", "theta"),
             {"dtype": "a", "shape": [0], "values": []},
-            "fit.theta has the dtype 'a', which is neither",
+            "fit.theta has the dtype 'a', which is not a dtype",
         ),
         (
             ("fit", "theta"),
             {"dtype": "O", "shape": [0], "values": []},
-            "fit.theta has the dtype 'O', which is neither",
+            "fit.theta has the dtype 'O', which is not a dtype",
         ),
         (("fit", "theta"), {"dtype": "<f8", "shape": [2], "values": []}, "has the shape (2,) but 0 values"),
         (
@@ -424,7 +442,7 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
         (
             ("fit", "kinks"),
             [{"unknown": "nu", "value": 0, "left": -1, "right": 1}],
-            "fit.kinks has the name 'nu', which is none of fit.theta_names",
+            "fit.kinks has the name 'nu', which is not in fit.theta_names",
         ),
         (("fit", "trajectories"), [], "fit.trajectories must have one entry or more; got none"),
         (("fit", "comparisons"), [], "fit.comparisons must have the shape (1,), since fit.trajectories has 1 entries"),
@@ -444,8 +462,8 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
         (("fit", "transition_places", 0, "values"), [0, 3], "fit.transition_places[0] must lie between -1 and 2"),
         (("fit", "transition_places"), [{"dtype": "<i8", "shape": [1], "values": [0]}], "as fit.transition_times[0]"),
         (("fit", "parameter_units"), {"mu": "1"}, "fit.parameter_units lacks the parameter 'g'"),
-        (("fit", "fixed"), ["h"], "fit.fixed has the name 'h', which is none of fit.parameters"),
-        (("fit", "idle"), ["h"], "fit.idle has the name 'h', which is none of fit.theta_names"),
+        (("fit", "fixed"), ["h"], "fit.fixed has the name 'h', which is not in fit.parameters"),
+        (("fit", "idle"), ["h"], "fit.idle has the name 'h', which is not in fit.theta_names"),
         (("fit", "active"), [{"kind": "bound"}], "fit.active[0].kind must be 'collapsed', "),
         (("fit", "reason"), {"kind": "jump", "subjects": "mu", "figures": {}}, "fit.reason.subjects must be a list"),
         (("fit", "reason"), {"kind": "jump", "subjects": [], "figures": {"at": "a"}}, "fit.reason.figures.at"),

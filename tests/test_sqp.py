@@ -794,6 +794,19 @@ def test_the_limit_of_precision_is_a_success():
     assert result.iterations < 100
 
 
+def test_a_step_back_to_the_point_itself_is_no_progress():
+    """Past the iterations after which a failed step may be followed by another one, at the limit of precision."""
+
+    def noisy(theta):
+        J, g, H = rosenbrock(theta)
+        error = np.random.default_rng(np.frombuffer(theta.tobytes(), np.uint8)).normal(size=2)
+        return 1e4 + J, np.asarray(g) + 1e-9 * error, H
+
+    result = minimize(smooth(noisy), [-1.2, 1.0], constraints=free(2), hessian="auto", tolerance=1e-12)
+    assert result.status is Status.CONVERGED_PRECISION, result.status
+    assert 15 < result.iterations < 60
+
+
 def test_interrupt_in_evaluate_and_in_callback():
     calls = []
 

@@ -451,7 +451,7 @@ def test_lists_of_names_are_short():
         (
             lambda: sf.ReferenceSignal.from_samples(**REFERENCE, lowpass_hz=1e308),
             ValueError,
-            "lowpass_hz must not ask for more than 10000000 points, .*; got 1e.308 Hz",
+            "lowpass_hz must not need more than 10000000 points, .*; got 1e.308 Hz",
         ),
         (
             lambda: sf.ReferenceSignal.from_samples(**REFERENCE, lowpass_hz=1e-12),

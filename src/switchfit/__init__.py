@@ -5,6 +5,7 @@ from switchfit.batch.logs import estimate_many
 from switchfit.batch.resampling import Bootstrap, bootstrap
 from switchfit.batch.simulated import MonteCarlo, monte_carlo
 from switchfit.batch.starts import Multistart, multistart
+from switchfit.discretization.mesh import Stiffness
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluation, evaluate
 from switchfit.fit.guards import GuardedEvaluation, evaluate_on_guards
@@ -39,8 +40,8 @@ from switchfit.uncertainty.verdict import Verdict
 
 compile_small_loops_whole()
 
-# The modules of this room register how results are written and drawn. The import comes last: a few levels deeper, as
-# they would be if this was the first, all other imports together take a tenth longer.
+# The report registers functions that write and draw results. It is imported last: if it came first, all other modules
+# would be imported a few levels deeper, which takes a tenth longer.
 from switchfit import report as _report  # noqa: E402, F401
 
 __version__ = "0.1.0"
@@ -77,6 +78,7 @@ __all__ = [
     "RunningCost",
     "Status",
     "Step",
+    "Stiffness",
     "TerminalConstraint",
     "TerminalCost",
     "Termination",
@@ -99,5 +101,5 @@ __all__ = [
 
 
 def __dir__() -> list[str]:
-    """What is public, and nothing else: rooms are reached by their full names."""
+    """Return the public names only; rooms are imported by their full names."""
     return sorted([*__all__, "__version__"])

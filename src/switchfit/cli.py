@@ -1,8 +1,8 @@
 """The command line: ``switchfit fit | check | simulate | paper``.
 
-Exit codes: 0 converged, 1 not converged (what was found is still written), 2 a problem with what was given,
-3 an error of switchfit itself, 130 interrupted by Ctrl-C. Only typer is imported here; the numerical parts load when a
-command needs them, so that ``--help`` is quick.
+Exit codes: 0 converged and the verdict is good or doubtful, 1 not converged or bad (the result is still written),
+2 wrong input, 3 an error of switchfit itself, 130 interrupted by Ctrl-C. Only typer is imported here; the numerical
+parts are imported when a command needs them, so that ``--help`` is fast.
 """
 
 from __future__ import annotations
@@ -67,18 +67,21 @@ def fit(
     problem: ProblemPath,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder for report.html, report.txt, estimate.json, fit.png.", show_default=False),
+        typer.Option(
+            help="Folder for report.html, report.txt, estimate.json, fit.png; runs.csv, unknowns.csv for many.",
+            show_default=False,
+        ),
     ] = None,
     strategy: Annotated[
         Literal["local", "auto", "thorough"] | None,
-        typer.Option(help="One fit, more where its verdict is not good, or all.", show_default="auto"),
+        typer.Option(help="One fit, more if its verdict is not good, or all strategies.", show_default="auto"),
     ] = None,
     time_budget: Annotated[
         float | None, typer.Option(min=0.0, help="Seconds after which no further strategy begins.", show_default="none")
     ] = None,
     hessian: Annotated[
         Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"] | None,
-        typer.Option(help="Quadratic term of the optimiser.", show_default="auto"),
+        typer.Option(help="Quadratic term of the optimizer.", show_default="auto"),
     ] = None,
     tolerance: Annotated[
         float | None, typer.Option(min=0.0, help="Optimality at which to stop.", show_default="the library's")
@@ -90,7 +93,7 @@ def fit(
         bool, typer.Option("--no-figures", help="Write no figures: neither fit.png nor report.html.")
     ] = False,
     certificate: Annotated[
-        bool, typer.Option("--certificate", help="Check with the paper's equations too, and print how.")
+        bool, typer.Option("--certificate", help="Check with the paper's equations too, and print the checks.")
     ] = False,
     full: Annotated[
         bool, typer.Option("--full", help="Report all runs, channels, unknowns and warnings, not one screen.")
@@ -99,9 +102,9 @@ def fit(
 ) -> None:
     """Estimate transition times and parameters; report on the terminal, report and figure in --out.
 
-    Options given here win over those in the problem file. Ctrl-C stops after the iteration that is under way and
-    reports what was found. Exit code 0: converged, the verdict is good or doubtful; 1: not converged or bad, what was
-    found is still written; 2: something is wrong with what was given.
+    Options given here override those in the problem file. Ctrl-C stops after the current iteration and reports the
+    result so far. Exit code 0: converged, the verdict is good or doubtful; 1: not converged or bad, the result is still
+    written; 2: the input is wrong.
     """
     given = {
         "strategy": strategy,
@@ -118,10 +121,12 @@ def fit(
             _make_folder(out)
         estimate = _estimate(loaded, options, prepare_figures=figures)
         checked = f"\n\nCertificate\n{estimate.certificate}" if certificate else ""
-        report = estimate.report(full=full) + checked  # after the certificate, which counts in the verdict
+        tables = _choose_tables(estimate, out)
+        report = _write_report(estimate, full, tables) + checked  # after the certificate, which is part of the verdict
         _print(report)
         if out is not None:
             _write(out / "report.txt", report + "\n")
+            _write_tables(estimate, tables)
             with _explain_write_errors(out / "estimate.json") as path:
                 _save(estimate, path, complete=certificate)
             if figures:
@@ -144,9 +149,9 @@ def check(
     ] = False,
     debug: Debug = False,
 ) -> None:
-    """Check a problem without fitting it: data, derivatives, what the data can tell at the first guess.
+    """Check a problem without fitting it: data, derivatives, identifiability at the first guess.
 
-    Exit code 0: the derivatives are right; 1: they are not; 2: something is wrong with what was given.
+    Exit code 0: the derivatives are right; 1: they are not; 2: the input is wrong.
     """
     if no_run:
         with _report_errors(debug):
@@ -155,9 +160,10 @@ def check(
     with _report_errors(debug):
         loaded = _load(problem)
         import switchfit as sf
-        from switchfit.io.summary import describe
+        from switchfit.io.summary import describe, describe_steps
 
         _print(f"{describe(loaded.problem)}\n")
+        _print(f"{describe_steps(loaded.problem)}\n")
         derivatives = sf.check_derivatives(loaded.problem)
         _print(f"{derivatives}\n")
         _print(sf.identifiability(loaded.problem))
@@ -173,7 +179,7 @@ def simulate(
 ) -> None:
     """Integrate the model at the first guess and write time, mode and states as CSV.
 
-    The column of times is called t, or "t (min)" where the experiments' time_unit is "min" and not "s".
+    The column of times is named t, or for example "t (min)" if the experiments' time_unit is "min" instead of "s".
     """
     with _report_errors(debug):
         loaded = _load(problem)
@@ -215,9 +221,9 @@ def paper(
     ] = None,
     debug: Debug = False,
 ) -> None:
-    """Do every experiment and figure of Miller and Murphey's paper, and set its numbers beside ours.
+    """Reproduce every experiment and figure of Miller and Murphey's paper, and compare its numbers with ours.
 
-    An interrupted run goes on where it stopped when the same command is given again.
+    An interrupted run resumes when the same command is run again.
     """
     os.environ.setdefault("MPLBACKEND", "Agg")
     with _report_errors(debug):
@@ -229,7 +235,7 @@ def paper(
         try:
             run(out, quick=quick, only=only, say=lambda text: _print(text, err=True))
         except KeyboardInterrupt:
-            _fail("interrupted; the same command goes on from here.", INTERRUPTED)
+            _fail("interrupted; run the same command again to resume.", INTERRUPTED)
         except OSError as error:
             raise InputError(f"{out} cannot be written: {error.strerror}; name another with --out.") from error
         _print((out / TABLE).read_text(encoding="utf-8"))
@@ -240,16 +246,16 @@ def paper(
 
 
 def _print(text: object, *, err: bool = False) -> None:
-    """Print to stdout or stderr; if its reader is gone, as ``head`` after its lines, print nothing from then on.
+    """Print to stdout or stderr; if its reader has closed it, as ``head`` does, print nothing from then on.
 
-    The command goes on: what it writes to files and its exit code do not depend on who reads along.
+    The command continues: its files and its exit code do not depend on a reader.
     """
     try:
         typer.echo(text, err=err)
     except BrokenPipeError:
         stream = sys.stderr if err else sys.stdout
         nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, stream.fileno())  # what is buffered is flushed there, at the latest when Python exits
+        os.dup2(nowhere, stream.fileno())  # buffered text is flushed there, at the latest when Python exits
         os.close(nowhere)
 
 
@@ -266,7 +272,7 @@ def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
 
 @contextlib.contextmanager
 def _report_errors(debug: bool) -> Iterator[None]:
-    """Turn exceptions into a sentence on stderr and an exit code, those of model files whatever they are."""
+    """Turn exceptions into a sentence on stderr and an exit code, including any exception of a model file."""
     try:
         with _handle_interrupt(_interrupt):
             yield
@@ -286,7 +292,7 @@ def _report_errors(debug: bool) -> Iterator[None]:
 
 
 def _explain(error: BaseException, *, users: bool, debug: bool) -> NoReturn:
-    """Say what is wrong; `users`: it was raised in a file of the user's."""
+    """Print the error and exit; `users` is whether it was raised in a file of the user."""
     from switchfit.io.python_file import describe_error
     from switchfit.runtime.errors import InputError
 
@@ -303,8 +309,8 @@ def _explain(error: BaseException, *, users: bool, debug: bool) -> NoReturn:
 
 @contextlib.contextmanager
 def _handle_interrupt(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-    """Return a context in which Ctrl-C calls a handler; not where it is ignored, nor outside the main thread, which has
-    them.
+    """Return a context in which Ctrl-C calls a handler; without effect if SIGINT is ignored, or outside the main
+    thread, which alone has signal handlers.
     """
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or before in (signal.SIG_IGN, None):
@@ -332,7 +338,7 @@ def _load(problem: Path) -> ProblemFile:
 
 
 def _check_files(problem: Path) -> None:
-    """Print what can be known of a problem without running a Python file."""
+    """Print the parts of a problem that are known without running a Python file."""
     from switchfit.io.problem_file import read_experiments
     from switchfit.io.summary import describe_experiments
 
@@ -343,19 +349,37 @@ def _check_files(problem: Path) -> None:
 
 
 def _estimate(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: bool) -> Any:
-    """Call `switchfit.estimate` with a live line on stderr; Ctrl-C ends it after the iteration under way."""
+    """Call `switchfit.estimate`, which shows a line on a terminal; Ctrl-C ends a fit after the current iteration."""
     import switchfit as sf
 
     if prepare_figures:  # matplotlib, which must not look for a display, loads while XLA compiles
         os.environ.setdefault("MPLBACKEND", "Agg")
         threading.Thread(target=_import_figures, daemon=True).start()
-    with _stop_on_interrupt() as stopped, _show_progress() as show:
+    with _stop_on_interrupt() as stopped:
+        return sf.estimate(loaded.problem, callback=lambda record: stopped(), **options)
 
-        def callback(record: Any) -> bool:
-            show(record)
-            return stopped()
 
-        return sf.estimate(loaded.problem, callback=callback, **options)
+def _choose_tables(estimate: Any, out: Path | None) -> dict[str, Path]:
+    """Return the CSV files for what a screen of the report has no room for."""
+    from switchfit.report.text import SCREEN
+
+    counts = {"runs": len(estimate.run_names), "unknowns": len(estimate.theta)}
+    most = {"runs": SCREEN.experiments, "unknowns": SCREEN.unknowns}
+    return {} if out is None else {name: out / f"{name}.csv" for name in counts if counts[name] > most[name]}
+
+
+def _write_tables(estimate: Any, tables: dict[str, Path]) -> None:
+    from switchfit.io.result_tables import write_runs, write_unknowns
+
+    writers = {"runs": write_runs, "unknowns": write_unknowns}
+    for name, path in tables.items():
+        _write(path, writers[name](estimate))
+
+
+def _write_report(estimate: Any, full: bool, tables: dict[str, Path]) -> str:
+    from switchfit.runtime.presentation import format_text
+
+    return str(format_text(estimate, full=full, files={name: str(path) for name, path in tables.items()}))
 
 
 def _import_figures() -> None:
@@ -365,7 +389,7 @@ def _import_figures() -> None:
 
 
 def _save(estimate: Any, path: Path, *, complete: bool) -> None:
-    """Save an estimate; not `complete` leaves the paper's equations out of its certificate, which take seconds."""
+    """Save an estimate; unless `complete`, its certificate omits the paper's equations, which take seconds."""
     from switchfit.estimation.saved import save_fit
     from switchfit.uncertainty.certificate import certify
 
@@ -387,40 +411,23 @@ def _write_page(estimate: Any, loaded: ProblemFile, options: dict[str, Any], pat
 
 @contextlib.contextmanager
 def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Return a context in which the first Ctrl-C only asks to stop; the second is a KeyboardInterrupt."""
-    asked = threading.Event()
+    """Return a context in which the first Ctrl-C requests a stop, and the second raises KeyboardInterrupt.
 
-    def ask(number: int, frame: FrameType | None) -> None:
-        if asked.is_set():
+    During a search with strategies, which no callback can stop, the first one raises it: the search keeps its best fit.
+    """
+    from switchfit.strategy.choice import is_searching
+
+    requested = threading.Event()
+
+    def request(number: int, frame: FrameType | None) -> None:
+        if requested.is_set() or is_searching():
+            requested.set()
             raise _CtrlC
-        asked.set()
+        requested.set()
         _print("stopping after this iteration; Ctrl-C again to stop at once", err=True)
 
-    with _handle_interrupt(ask):
-        yield asked.is_set
-
-
-@contextlib.contextmanager
-def _show_progress() -> Iterator[Callable[[Any], None]]:
-    """Return a context that yields what shows a record in a live line on stderr; nothing if that is no terminal."""
-    if not sys.stderr.isatty():
-        yield lambda record: None
-        return
-    from rich.console import Console
-    from rich.live import Live
-    from rich.spinner import Spinner
-    from rich.text import Text
-
-    waiting = Spinner("dots", "compiling (only the first time)")
-    with Live(waiting, console=Console(stderr=True), transient=True, refresh_per_second=12) as live:
-        yield lambda record: live.update(Text(_format_record(record)))
-
-
-def _format_record(record: Any) -> str:
-    return (
-        f"iteration {record.iteration:3d}   cost {record.cost:.8g}   optimality {record.optimality:.2e}   "
-        f"step {record.step:.2g}"
-    )
+    with _handle_interrupt(request):
+        yield requested.is_set
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
@@ -432,12 +439,14 @@ def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"the folder {folder} cannot be made: {error.strerror}; name another with --out.") from error
+        raise InputError(
+            f"the folder {folder} cannot be created: {error.strerror}; name another with --out."
+        ) from error
 
 
 @contextlib.contextmanager
 def _explain_write_errors(path: Path) -> Iterator[Path]:
-    """Return a context that says in an InputError which file cannot be written, and why."""
+    """Return a context that turns an OSError into an InputError with the name of the file and the reason."""
     from switchfit.runtime.errors import InputError
 
     try:
@@ -447,7 +456,7 @@ def _explain_write_errors(path: Path) -> Iterator[Path]:
 
 
 def _write(path: Path, content: str | bytes) -> None:
-    """Write a file whole or not at all."""
+    """Write a file atomically."""
     from switchfit.runtime.files import write_atomically
 
     with _explain_write_errors(path):

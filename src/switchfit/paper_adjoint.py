@@ -1,13 +1,13 @@
-r"""The paper's derivatives, equations (6)-(17): optimise, then discretise.
+r"""The paper's derivatives, equations (6)-(17): optimize, then discretize.
 
 Reference: L. M. Miller and T. D. Murphey, sections III and IV. Equation numbers at the lines are the paper's, and so
 are the names: ``f``, ``X`` (the jump X^i of the vector field), ``psi``, ``Omega``, ``Omega_p``, ``Phi``, ``Dp_x``,
 ``X_ii``, ``X_ij``, ``X_taup``; ``D1`` is the derivative in x, ``D2`` that in t, ``Dp`` that in p; ``f_im1`` is f_{i-1}.
 The paper has J = int ell(t, x) dt and a continuous x. The formulas here are extended as follows, and reduce to the
-paper's where an extension is absent. Misprints of the paper are corrected, and named where that happens.
+paper's without these extensions. Misprints of the paper are corrected, with a comment at the line.
 
 **Costs.** ell(t, x, p) may depend on p, which adds D_p ell to (9), D_pD_1 ell to (15) and the derivatives of D_p ell to
-(14). A sample ell_k(x(t_k), p) makes the adjoints jump, and the terminal cost phi(x, p) is where they start:
+(14). At a sample ell_k(x(t_k), p) the adjoints jump, and the terminal cost phi(x, p) gives their values at tf:
 
     psi- = psi+ + D ell_k,    Omega- = Omega+ + D^2 ell_k,    Omega_p- = Omega_p+ + D^2 ell_k D_p x + D_pD_1 ell_k.
 
@@ -18,7 +18,7 @@ paper's where an extension is absent. Misprints of the paper are corrected, and 
     F_{i-1}(t, x, p) = D_t R + D_x R f_{i-1}(t, x, p)              the velocity f_{i-1} carried through R,
     Lambda(t, x, p)  = ell(t, x, p) - ell(t, R(t, x, p), p)        the jump of ell, 0 without a reset map,
 
-so that x(tau_i+) moves with F_{i-1} as tau_i moves, and X^i = F_{i-1}(x-) - f_i(x+). With V the cost to go of mode i,
+so that x(tau_i+) moves with F_{i-1} as tau_i moves, and X^i = F_{i-1}(x-) - f_i(x+). For V, the cost to go of mode i,
 psi = D_x V and D_t V + ell + psi f_i = 0, the derivative of ``V(tau, R(tau, x-, p), p)`` and of the cost up to tau is
 
     D_{tau_i} J = Lambda + psi(tau_i+) X^i.
@@ -34,18 +34,18 @@ psi_dot being (7) (the paper's step from (6) to (11)), with tau_j, j < i, by Ome
     p, p  :  D_p R' Omega_p + psi . [D_p^2 R + D_1 D_p R D_p x-]  at each transition, added to (14).
 
 All of f_i, D ell, psi, Omega, Omega_p are at (tau_i, x(tau_i+)). Thus (11), (13), (16) and (17) hold as they are
-printed once f_{i-1} is read as F_{i-1}. Through the map itself
+printed, with F_{i-1} in place of f_{i-1}. Through the map itself
 
     D_p x+ = D_x R D_p x- + D_p R,      psi- = psi+ D_x R,      Omega- = D_x R' Omega+ D_x R + psi+ . D_x^2 R,
     Omega_p- = D_x R' Omega_p+ + psi+ . [D_x^2 R D_p x- + D_p D_x R],      and (9) gains psi+ D_p R.
 
-**A free tf** is the transition to a mode with f = 0 and ell = 0, so that x stays x(tf) until the end of the mesh. All
-of the above holds for it, with Lambda = ell(tf, x, p) and X = f_N: D_tf J = ell + psi f_N, psi being D phi there.
+**A free tf** is the transition to a mode with f = 0 and ell = 0, so that x remains x(tf) until the end of the mesh. All
+of the above holds for it, with Lambda = ell(tf, x, p) and X = f_N: D_tf J = ell + psi f_N, where psi is D phi.
 
 **Integration.** Forward and backward with the same Runge-Kutta method over the same rows of the mesh. In the backward
 sweep x(t) comes from quintic Hermite interpolation, since integrating x backward would blow up stiff modes.
-The result differs from the derivatives of the discretised cost (`switchfit.engine.jax.second_order`), which the
-optimiser uses, by the integrator's error; that the gap closes at the integrator's order is what this module is for.
+The result differs from the derivatives of the discretized cost (`switchfit.engine.jax.second_order`), which the
+optimizer uses, by the integration error. This module serves to verify that the gap closes at the integrator's order.
 """
 
 from __future__ import annotations
@@ -79,14 +79,14 @@ Array = jax.Array
 
 
 class Sensitivities(NamedTuple):
-    """What the forward sweep carries beside x: Phi(t, tau_j) X^j, (n, N), and D_p x, (n, M)."""
+    """Quantities that the forward sweep integrates in addition to x: Phi(t, tau_j) X^j, (n, N), and D_p x, (n, M)."""
 
     Phi_X: Array
     Dp_x: Array
 
 
 class Adjoints(NamedTuple):
-    """What the backward sweep carries: psi (n,), Omega (n, n) and Omega^p (n, M), one column a parameter."""
+    """Quantities that the backward sweep integrates: psi (n,), Omega (n, n) and Omega^p (n, M)."""
 
     psi: Array
     Omega: Array
@@ -94,14 +94,14 @@ class Adjoints(NamedTuple):
 
 
 class Quadratures(NamedTuple):
-    """What adds up over time: D_p J (M,), equation (9), and D_p D_p J (M, M), equation (14)."""
+    """Integrals over time: D_p J (M,), equation (9), and D_p D_p J (M, M), equation (14)."""
 
     Dp_J: Array
     DpDp_J: Array
 
 
 class Along(NamedTuple):
-    """Derivatives of f and ell on the trajectory at one time, beside D_p x there.
+    """Derivatives of f and ell on the trajectory at one time, and D_p x there.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class Along(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """Everything at one transition time tau_i that needs only x: before (x-) and after (x+) the reset map.
+    """All quantities at one transition time tau_i that need only x: before (x-) and after (x+) the reset map.
 
     Attributes
     ----------
@@ -177,7 +177,7 @@ def compute_paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -
     p : (M,)
         Free parameters.
     side : ()
-        +1 or -1: which one-sided derivative is meant where a transition time equals a node of the mesh.
+        +1 or -1: which one-sided derivative to return at a transition time that equals a node of the mesh.
 
     Returns
     -------
@@ -186,11 +186,11 @@ def compute_paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -
         D_tau J, equation (6), and D_p J, equation (9).
     hessian : (N + M, N + M)
         Equation (3), from (11), (14) and (16). The tau block is computed for i >= j and mirrored, the cross block
-        computed once; the p block is as (14) gives it, symmetric up to the integrator's error.
+        computed once; the p block is that of (14), symmetric up to the integration error.
 
     Notes
     -----
-    With the stiff solver each row takes a dense solve of 3 (n + n^2 + n M) unknowns: a reference for small n.
+    With the stiff solver, each row takes a dense solve of 3 (n + n^2 + n M) unknowns: use it for small n only.
     """
     path = propagate(model, tau, p, side)
     transitions = [evaluate_transition(model, path, i, tau[i], p) for i in range(model.structure.N)]
@@ -361,13 +361,14 @@ def evaluate_adjoint_rate(d: Along, adjoints: Adjoints) -> Adjoints:
     Omega_dot = -d.D1D1ell - contract(psi, d.D1D1f) - d.D1f.T @ Omega - Omega @ d.D1f  # (12)
     Omega_p_dot = (
         -d.D1D1ell @ d.Dp_x - d.DpD1ell - d.D1f.T @ Omega_p - contract(psi, d.D1D1f @ d.Dp_x + d.DpD1f)
-    )  # (15); D_pD_1 ell is ours
+    )  # (15), extended by D_pD_1 ell
     return Adjoints(psi_dot, Omega_dot, Omega_p_dot)
 
 
 def evaluate_integrands(d: Along, adjoints: Adjoints) -> Quadratures:
-    """Return integrands of D_p J and D_p D_p J; the terms in ell are ours. (15) is followed by a stray
-    integral sign.
+    """Return integrands of D_p J and D_p D_p J, extended by the terms in ell.
+
+    Misprint: (15) is followed by an integral sign without meaning.
     """
     psi, _, Omega_p = adjoints
     first = psi @ d.Dpf + d.Dpell  # (9)
@@ -380,7 +381,7 @@ def evaluate_integrands(d: Along, adjoints: Adjoints) -> Quadratures:
 def sweep_backward(
     model: Model, path: Path, transitions: list[Transition], Dp_x: Sensitivities, p: Array
 ) -> tuple[Adjoints, Adjoints, Quadratures]:
-    """Return adjoints at t0, the adjoints where each chunk opens (Q, ...; tau_i+ where it opens a segment), and (9),
+    """Return the adjoints at t0, those at the start of each chunk (Q, ...; at tau_i+ if it opens a segment), and (9),
     (14).
 
     `Dp_x` holds D_p x at the start and at the end of each row, two (Q, C, n, M) arrays.
@@ -422,7 +423,7 @@ def differentiate_along_rows(
 
     `values` are x and D_p x at the start and at the end of each row: x_k, x_{k+1}, D_p x_k, D_p x_{k+1}.
     """
-    fractions = 1.0 - jnp.asarray(model.tableau.c)  # stage j of a row that is traversed from its end to its start
+    fractions = 1.0 - jnp.asarray(model.tableau.c)  # stage j of a row, integrated from its end to its start
     directions = jnp.eye(p.shape[0])
 
     def of_mode(mode: int) -> Callable[..., tuple[Array, ...]]:
@@ -476,7 +477,7 @@ def interpolate(f: Field, s: Array, start: Array, end: Array, x_k: Array, x_k1: 
 def add_point_cost(
     cost: Callable[[Array, Array], Array], x: Array, Dp_x: Array, p: Array
 ) -> tuple[Adjoints, Quadratures]:
-    """Return what a cost of x at one time, a sample or the terminal cost, adds to the adjoints there and
+    """Return the contributions of a cost of x at one time, a sample or the terminal cost, to the adjoints there and
     to (9), (14).
     """
     (Dell, Dpell) = jax.grad(cost, argnums=(0, 1))(x, p)
@@ -488,7 +489,7 @@ def add_point_cost(
 def add_sample_jumps(
     model: Model, path: Path, Dp_x_before: Array, Dp_x_after: Array, p: Array
 ) -> tuple[Adjoints, Adjoints, Quadratures]:
-    """Return jumps of the adjoints at t0, those at the end of each row (Q, C, ...), and what samples add
+    """Return the jumps of the adjoints at t0 and at the end of each row (Q, C, ...), and the contributions of samples
     to (9), (14).
     """
     Q, C, n = path.after.shape
@@ -512,11 +513,10 @@ def add_sample_jumps(
 
 
 def add_late_jumps(model: Model, path: Path, Dp_x_before: Array, p: Array) -> tuple[tuple[Adjoints, ...], Quadratures]:
-    """Return jumps of the adjoints at the start of each row by samples that are seen late, and what these add to (9),
-    (14).
+    """Return the jumps of the adjoints at the start of each row by late samples, and their contributions to (9), (14).
 
     A late sample is a cost of the state at the start of the row that holds ``t - delay``. The jumps are one tuple of
-    (Q, C, ...) arrays, or none where nothing is late.
+    (Q, C, ...) arrays, or an empty tuple without late samples.
     """
     Q, C, n = path.before.shape
     M = p.shape[0]
@@ -555,7 +555,7 @@ def pass_reset(
 
 
 def add_reset(here: Transition, adjoints: Adjoints, Dp_x: Array) -> Quadratures:
-    """Return what the reset map's own dependence on p adds to (9) and (14); `Dp_x` is that at tau_i-, (n, M)."""
+    """Return the contributions of the reset map's own dependence on p to (9) and (14); `Dp_x` (n, M) is at tau_i-."""
     psi, _, Omega_p = adjoints
     return Quadratures(
         psi @ here.DpR,
@@ -564,7 +564,7 @@ def add_reset(here: Transition, adjoints: Adjoints, Dp_x: Array) -> Quadratures:
 
 
 def add_initial_state(model: Model, adjoints: Adjoints, p: Array) -> Quadratures:
-    """Return what an initial state x0(p) adds to (9) and (14)."""
+    """Return the contributions of an initial state x0(p) to (9) and (14)."""
     Dp_x0 = jax.jacfwd(model.initial_state)(p)
     DpDp_x0 = jax.jacfwd(jax.jacfwd(model.initial_state))(p)
     psi, _, Omega_p = adjoints
@@ -578,7 +578,7 @@ def step_linear(tableau: Tableau, rate: Callable[[Any, Any], Any], h: Array, giv
     """Return one Runge-Kutta step of ``dy/dt = rate(given, y)``, affine in y: its stage states (s, ...) and y at its
     end.
 
-    `given` holds what varies in time, at the s stages; h < 0 steps backward.
+    `given` has the time-dependent arguments of `rate` at the s stages; h < 0 steps backward.
     """
     flat, unravel = ravel_pytree(y)
     a, b, c = tableau.a, tableau.b, tableau.c
@@ -643,5 +643,5 @@ def pick(values: Any, *index: Any) -> Any:
 def evaluate_paper(
     arguments: Arguments, tau: Array, p: Array, side: Array, *, structure: Structure
 ) -> tuple[Array, Array, Array]:
-    """Return J, its gradient (D,) and its Hessian (D, D) of one experiment, as of `compute_paper_derivatives`."""
+    """Return J, its gradient (D,) and its Hessian (D, D) of one experiment by `compute_paper_derivatives`."""
     return compute_paper_derivatives(Model(structure, arguments), tau, p, side)

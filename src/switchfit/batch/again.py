@@ -1,4 +1,9 @@
-"""Fits that failed on a mesh that many share, done again on meshes of their own."""
+"""Fits that are done again one by one: those that failed on a mesh that many share, and doubtful ones with constraints.
+
+From a far guess guards pull transitions together, and the modes between them collapse. `switchfit.estimate` then
+meets the constraints inside the quadratic programme, and where that does not help it fits with transitions that may
+happen anywhere, and from there on their guards. Here the same is done for each such fit of a batch.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +11,22 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.batch.program import Chunk
+from switchfit.batch.quality import count_priors, count_samples, describe_ends
+from switchfit.batch.verdict import Ends, find_levels, has_converged
 from switchfit.discretization.mesh import Mesh
 from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, Estimate, fit_locally
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import inverse_on
+from switchfit.fit.solution import is_sigma_known
 from switchfit.optimize import Status
+from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
+from switchfit.strategy.choice import without_guards
+from switchfit.strategy.quick import End, fit_briefly
 
 
 def redo_unresolved(
@@ -34,12 +46,10 @@ def redo_unresolved(
     meshes : sequence of Mesh
     tolerance, max_iterations : as of `estimate`
     """
-    converged = [status.name for status in Status if status.successful]
-    failed = np.flatnonzero(~np.isin(chunk.status, [*converged, Status.ERROR.name]))
+    failed = np.flatnonzero(~has_converged(chunk.status) & (chunk.status != Status.ERROR.name))
     if not failed.size:
         return chunk
-    arrays: dict[str, Any] = {name: np.array(value) for name, value in chunk._asdict().items()}
-    arrays |= {name: arrays[name].astype(object) for name in ("status", "message")}
+    arrays = _open(chunk)
     for k in failed.tolist():
         try:
             problem = problem_of(k)
@@ -50,6 +60,93 @@ def redo_unresolved(
             continue
         if again.status.successful:
             adopt(arrays, k, again)
+    return _close(arrays)
+
+
+def redo_doubted(
+    chunk: Chunk,
+    problem_of: Callable[[int], Problem],
+    starts: FloatArray,
+    variation: FloatArray | float,
+    *,
+    tolerance: float,
+    max_iterations: int,
+) -> Chunk:
+    """Return the chunk with fits that did not converge, lost modes or are far from their data replaced by better ones,
+    where there are any; only of problems with guards or terminal constraints, which the compiled program does not take.
+
+    Parameters
+    ----------
+    chunk : Chunk
+    problem_of : callable
+        The problem of the k-th fit of the chunk, with its own data.
+    starts : (R, d)
+        Where each of them begins.
+    variation : float or (R,)
+        As of `describe_ends`.
+    tolerance, max_iterations : as of `estimate`
+    """
+    arrays = _open(chunk)
+    totals = np.broadcast_to(np.asarray(variation, dtype=float), len(starts))
+    for k in range(len(starts)):
+        try:
+            problem = problem_of(k)
+        except Exception:  # whatever it is, it is listed already
+            continue
+        if not problem.constraint_names:
+            continue
+        guarded = any(structure.guarded for structure in problem.structures)
+        for find in (fit_briefly, _fit_free_of_guards) if guarded else (fit_briefly,):
+            if not _is_doubted(problem, arrays, k, float(totals[k])):
+                break
+            try:
+                end = find(problem, starts[k])
+                if end.failed:
+                    continue
+                again = fit_locally(problem, start=end.theta, tolerance=tolerance, max_iterations=max_iterations)
+            except (ValueError, ArithmeticError, np.linalg.LinAlgError):  # nothing better from this start
+                continue
+            before = arrays["cost"][k] if has_converged(arrays["status"][k : k + 1])[0] else np.inf
+            if again.status.successful and again.cost < before:
+                adopt(arrays, k, again)
+    return _close(arrays)
+
+
+def _fit_free_of_guards(problem: Problem, start: FloatArray) -> End:
+    """Return where a fit ends whose transitions may happen anywhere, and one on the guards from there."""
+    free = fit_briefly(without_guards(problem), start)
+    return free if free.failed else fit_briefly(problem, free.theta)
+
+
+def _is_doubted(problem: Problem, arrays: dict[str, Any], k: int, variation: float) -> bool:
+    """Return whether a better end may be elsewhere: not converged, a mode has collapsed, or far from the data."""
+    here = slice(k, k + 1)
+    ends = describe_ends(problem, arrays["theta"][here], arrays["cost"][here], variation)
+    if ends["collapsed"][0] > 0:
+        return True
+    found = Ends(
+        **{name: arrays[name][here] for name in ("cost", "hessian", "free")},
+        status=arrays["status"][here].astype(str),
+        samples=np.array([count_samples(problem)]),
+        sigma_known=is_sigma_known(problem),
+        priors=count_priors(problem),
+        **ends,
+    )
+    return bool(find_levels(found)[0] == "bad")
+
+
+def differ(one: Chunk, other: Chunk) -> NDArray[np.bool_]:
+    """Return which fits ended elsewhere in one chunk than in the other, since they were done again: (R,)."""
+    return np.asarray(np.any(one.theta != other.theta, axis=1))
+
+
+def _open(chunk: Chunk) -> dict[str, Any]:
+    """Return copies of the arrays of a chunk, with text of any length."""
+    arrays: dict[str, Any] = {name: np.array(value) for name, value in chunk._asdict().items()}
+    return arrays | {name: arrays[name].astype(object) for name in ("status", "message")}
+
+
+def _close(arrays: dict[str, Any]) -> Chunk:
     return Chunk(**arrays | {name: arrays[name].astype(str) for name in ("status", "message")})
 
 

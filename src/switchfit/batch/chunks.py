@@ -10,7 +10,6 @@ import functools
 import hashlib
 import io
 import json
-import os
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -22,6 +21,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.runtime.cores import count_cores
 from switchfit.runtime.errors import get_first_line
 from switchfit.runtime.files import PREFIX, SUFFIX, set_aside, write_atomically
 
@@ -114,11 +114,6 @@ def _close_generator(generator: Iterator[Any]) -> Iterator[None]:
         yield
     finally:
         generator.close()  # type: ignore[attr-defined]  # a generator
-
-
-def count_cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _run_in_threads(work: Work, chunks: list[range]) -> Iterator[tuple[range, Arrays]]:

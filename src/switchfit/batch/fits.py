@@ -14,16 +14,22 @@ import scipy.special
 from numpy.typing import NDArray
 
 from switchfit.batch.chunks import Work, run_chunks
+from switchfit.batch.intervals import list_places, replace_intervals
+from switchfit.batch.quality import count_priors
+from switchfit.batch.verdict import find_levels, has_converged, judge_many
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.hidden import refuse_hidden_switches
 from switchfit.fit.result import interval
 from switchfit.fit.solution import is_sigma_known
-from switchfit.optimize import Status
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_path
 from switchfit.runtime.presentation import format_html, format_text
 from switchfit.runtime.progress import show_progress
+from switchfit.uncertainty.verdict import Verdict
+
+CHUNK_FORMAT = "fits 2"
+"""Part of every fingerprint: it changes where the arrays of a chunk do, so that folders of before are not used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +58,25 @@ class Fits:
         As `Estimate.covariance`; NaN where the cost has no noise model.
     samples : (R,) int
         Measured values that are not missing.
+    explained : (R,)
+        Share of the variance of all data together that each explains; NaN where J is not half a sum of squares.
+    collapsed : (R,) int
+        Modes that last no longer than they must.
+    at_bounds : (R,) int
+        Parameters and initial states at a bound.
+    pieces : (R, T, 2, P, 5)
+        Of T transition times with samples within their intervals or at a kink, the profile of J between these samples
+        to both sides: where it starts and stops, by how much it exceeds J, slope, curvature. NaN elsewhere.
+    piece_places : (T,) int
+        Where in theta these transition times stand.
     sigma_known : bool or None
         Whether the noise of the measurements is known; None where the cost has no noise model.
+    priors : int
+        Unknowns with a prior, which counts as a sample.
     log_scaled : tuple of str
         Unknowns that were estimated on a logarithmic scale.
+    log_origins : (d,)
+        From where these logarithms count: t0 for a transition time, otherwise 0.
     seconds : float
         Wall time of all.
 
@@ -68,8 +89,8 @@ class Fits:
     >>> import switchfit as sf
     >>> from switchfit.models import heater_problem
     >>> fits = sf.estimate_many([heater_problem(), heater_problem()])
-    >>> len(fits), fits.success
-    (2, array([ True,  True]))
+    >>> len(fits), fits.success, fits.verdict.level
+    (2, array([ True,  True]), 'good')
     >>> fits.theta.round(3)
     array([[2.462, 0.393],
            [2.462, 0.393]])
@@ -92,8 +113,15 @@ class Fits:
     free: NDArray[np.int64]
     covariance: FloatArray
     samples: NDArray[np.int64]
+    explained: FloatArray
+    collapsed: NDArray[np.int64]
+    at_bounds: NDArray[np.int64]
+    pieces: FloatArray
+    piece_places: NDArray[np.intp]
     sigma_known: bool | None
+    priors: int
     log_scaled: tuple[str, ...]
+    log_origins: FloatArray
     seconds: float
 
     def __len__(self) -> int:
@@ -101,10 +129,23 @@ class Fits:
         return len(self.cost)
 
     @cached_property
+    def verdict(self) -> Verdict:
+        """Whether to believe them: how many are good, doubtful and bad, why, and what to do next. Print it for a line.
+
+        Each fit is judged by how it ended and by chi-square or the share of the variance that it explains; residuals
+        are not tested for correlation, nor channels one by one. `Estimate.verdict` does that for a single fit.
+        """
+        return judge_many(self)
+
+    @cached_property
+    def levels(self) -> NDArray[np.str_]:
+        """The level of each fit, "good", "doubtful" or "bad": (R,)."""
+        return find_levels(self)
+
+    @cached_property
     def success(self) -> NDArray[np.bool_]:
-        """Which of them converged, by `Status.successful`: (R,). Many fits have no verdict, an `Estimate` has."""
-        good = [status.name for status in Status if status.successful]
-        return np.isin(self.status, good)
+        """Which of them converged, by `Status.successful`, however well they fit: (R,). See `levels`."""
+        return has_converged(self.status)
 
     @property
     def failures(self) -> list[tuple[int, str]]:
@@ -120,8 +161,8 @@ class Fits:
     def confidence_intervals(self, level: float = 0.95) -> FloatArray:
         """Return intervals theta +- quantile x standard error of each fit: (R, d, 2).
 
-        They take the cost for one parabola: of a transition time with samples within its interval, and at a kink,
-        where they are NaN, those of a single `Estimate.confidence_intervals` are better.
+        Of a transition time with a few samples within its interval, or at a kink, from one parabola for each stretch
+        between samples, as `Estimate.confidence_intervals`. NaN for any other unknown that is held.
 
         See Also
         --------
@@ -137,10 +178,13 @@ class Fits:
                 [0.38, 0.4 ]]])
         """
         level = as_level(level)
-        freedom, tail = np.maximum(self.samples - self.free, 1), 0.5 + level / 2
+        freedom, tail = np.maximum(self.samples + self.priors - self.free, 1), 0.5 + level / 2
         quantile = scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail)
         half = np.reshape(quantile, (-1, 1)) * self.standard_errors
-        return interval(self.theta, half, np.isin(self.theta_names, self.log_scaled))
+        log = np.isin(self.theta_names, self.log_scaled)
+        found = interval(self.theta, np.where(half > 0, half, np.nan), log, self.log_origins)
+        scale = np.ones(len(self)) if self.sigma_known else 2 * self.cost / freedom
+        return replace_intervals(found, self.pieces, self.piece_places, 0.5 * quantile**2 * scale)
 
     def __str__(self) -> str:
         return format_text(self)
@@ -216,7 +260,8 @@ def _collect_fields(
     """
     known = is_sigma_known(problem)
     samples = arrays["samples"]
-    freedom = samples - arrays["free"]
+    priors = count_priors(problem)
+    freedom = samples + priors - arrays["free"]
     scale = np.ones(len(samples)) if known else np.full(len(samples), np.nan)
     if known is False:
         scale = np.where(freedom > 0, 2 * arrays["cost"] / np.maximum(freedom, 1), np.nan)
@@ -229,12 +274,10 @@ def _collect_fields(
         "requested": requested,
         "runs": runs,
         "sigma_known": known,
+        "priors": priors,
+        "piece_places": list_places(problem),
         "log_scaled": problem.unknowns.log_names,
+        "log_origins": problem.unknowns.origin,
         "seconds": seconds,
         **found,
     }
-
-
-def count_samples(problem: Problem) -> int:
-    """Return the measured values that are not missing."""
-    return sum(item.count for run in problem.experiments for item in run.data if isinstance(item, Measurements))

@@ -5,20 +5,24 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from switchfit.batch.again import adopt, is_resolved
+from switchfit.batch.again import adopt, differ, is_resolved, redo_doubted
 from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.fits import Fits, check_long_run, count_samples, repeat
-from switchfit.batch.program import Varying, chunk_size, error_message, fit_chunk, make_failed_chunk
+from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
+from switchfit.batch.intervals import make_no_pieces, trace_chunk
+from switchfit.batch.program import Chunk, Evaluations, Varying, chunk_size, error_message, fit_chunk, make_failed_chunk
+from switchfit.batch.quality import count_samples, describe_ends, measure_variation
 from switchfit.estimation.estimator import check_settings, fit_locally
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import is_sigma_known
 from switchfit.optimize import Status
+from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_instance, as_sequence, join_names
 
@@ -126,7 +130,7 @@ class _Work:
         stacked = tuple(np.stack([np.asarray(leaf) for leaf in column]) for column in zip(*leaves, strict=True))
         varying = Varying(tuple(range(len(stacked))), stacked)
         starts = np.array([problem.initial_theta for problem in problems])
-        found = fit_chunk(
+        first = found = fit_chunk(
             problems[0],
             evaluator_of(problems[0]).meshes,
             varying,
@@ -134,6 +138,10 @@ class _Work:
             tolerance=self.tolerance,
             max_iterations=self.max_iterations,
         )
+        if problems[0].constraint_names:
+            variation = np.array([measure_variation(problem).sum() for problem in problems])
+            settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
+            found = redo_doubted(found, problems.__getitem__, starts, variation, **settings)
         arrays = {name: np.array(value) for name, value in found._asdict().items()}
         arrays["message"], arrays["status"] = arrays["message"].astype(object), arrays["status"].astype(object)
         for k, problem in enumerate(problems):
@@ -143,6 +151,11 @@ class _Work:
                 except Exception as error:
                     arrays["status"][k], arrays["message"][k] = Status.ERROR.name, error_message(error)
         arrays["message"], arrays["status"] = arrays["message"].astype(str), arrays["status"].astype(str)
+        arrays |= _describe_each(problems, arrays["theta"], arrays["cost"])
+        evaluations = partial(Evaluations, problems[0], evaluator_of(problems[0]).meshes, varying)
+        last = Chunk(**{name: arrays[name] for name in Chunk._fields})
+        of = problems.__getitem__
+        arrays["pieces"] = trace_chunk(last, differ(first, last), of, evaluations, of)
         return {**arrays, "start": starts, "samples": np.array([count_samples(problem) for problem in problems])}
 
     def _list_failed(self, errors: dict[int, Exception]) -> Arrays:
@@ -150,7 +163,9 @@ class _Work:
         starts = np.array([self.problems[k].initial_theta for k in errors])
         found = make_failed_chunk(starts, dict(enumerate(errors.values())))
         samples = np.array([count_samples(self.problems[k]) for k in errors])
-        return {**found._asdict(), "start": starts, "samples": samples}
+        ends = _describe_each([self.problems[k] for k in errors], found.theta, found.cost)
+        ends["pieces"] = make_no_pieces(self.problems[0], len(errors))
+        return {**found._asdict(), **ends, "start": starts, "samples": samples}
 
     def _redo_unresolved(self, problem: Problem, k: int, arrays: Arrays) -> None:
         """Do a fit again by `estimate` if its integration error is too large."""
@@ -163,7 +178,7 @@ class _Work:
             )
 
     def fingerprint(self) -> str:
-        parts: list[Any] = ["logs", len(self.problems), self.tolerance, self.max_iterations]
+        parts: list[Any] = [CHUNK_FORMAT, "logs", len(self.problems), self.tolerance, self.max_iterations]
         for problem in self.problems:
             parts += [problem.theta_names, problem.initial_theta, *problem.unknowns.priors, problem.digests]
             try:
@@ -175,6 +190,15 @@ class _Work:
         return compute_fingerprint(*parts)
 
 
+def _describe_each(problems: Sequence[Problem], theta: FloatArray, cost: FloatArray) -> Arrays:
+    """Return how well each problem's fit explains its data, and where it ended, as `describe_ends` does."""
+    each = [
+        describe_ends(problem, theta[k : k + 1], cost[k : k + 1], measure_variation(problem).sum())
+        for k, problem in enumerate(problems)
+    ]
+    return {name: np.concatenate([one[name] for one in each]) for name in each[0]}
+
+
 def _get_kind(problem: Problem) -> Any:
     """Return a key that is equal for problems that one program can fit with one set of constraints."""
     evaluator = evaluator_of(problem)
@@ -184,4 +208,4 @@ def _get_kind(problem: Problem) -> Any:
     numbers += [*unknowns.priors, *unknowns.variables]
     times = [experiment.initial_times for experiment in problem.experiments]
     fixed = [np.where(where < 0, t, 0.0) for where, t in zip(unknowns.times, times, strict=True)]
-    return problem.structures, shapes, tuple(np.asarray(a).tobytes() for a in (*numbers, *fixed))
+    return evaluator.structures, shapes, tuple(np.asarray(a).tobytes() for a in (*numbers, *fixed))

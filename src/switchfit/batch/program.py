@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 import threading
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -29,9 +30,8 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.engine.choice import derivatives_inside_program, runs_natively
 from switchfit.engine.native.experiment import places_in_library
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.guards import place_on_near_guards
 from switchfit.fit.result import inverse_on
-from switchfit.fit.solution import constraints_of, minimize_cost, minimize_with_constraints
+from switchfit.fit.solution import constraints_of, minimize_cost
 from switchfit.fit.termination import Kink, Termination, termination_of
 from switchfit.optimize import Status
 from switchfit.optimize.qp import nearest_feasible
@@ -50,6 +50,8 @@ CHUNK = 32
 CHUNK_IN_LOCKSTEP = 1024
 """The same on a GPU, where they go in lockstep."""
 
+EVALUATIONS = 64
+"""Evaluations that one call of `Evaluations` takes; padded to so many, which costs nothing."""
 
 LONGEST_ERROR = 500
 """Characters of an error that are listed."""
@@ -171,15 +173,15 @@ def fit_chunk(
     lockstep : bool, optional
         Whether to run all fits in lockstep; decided by the device if left out.
     """
-    if problem.constraint_names:  # which the program does not know
+    if problem.constraint_names or problem.unknowns.log_times.any():  # which the program does not know
         evaluator = Evaluator(problem, meshes=meshes)
         outcome = _leave_all(np.asarray(starts, dtype=float))
         return _finish_rest(problem, evaluator, varying, outcome, tolerance, max_iterations)
     unknowns = problem.unknowns
     lockstep = in_lockstep() if lockstep is None else lockstep
     evaluator = Evaluator(problem, meshes=meshes)
-    natively = not lockstep and problem.engine != "jax" and runs_natively(problem.structures, evaluator.arguments)
-    structures = problem.structures
+    natively = not lockstep and problem.engine != "jax" and runs_natively(evaluator.structures, evaluator.arguments)
+    structures = evaluator.structures
     layout = Layout(
         tuple(structure.library for structure in structures) if natively else structures,
         tuple(structure.N for structure in structures),
@@ -209,9 +211,20 @@ def fit_chunk(
         try:
             with _compile_once(layout, given):
                 outcome = jax.tree.map(lambda a: np.asarray(a)[:count], _fits(*given, layout=layout))
-        except Exception:  # of one fit, as where a function of the model calls back into Python: each by itself, then
+        except Exception as error:
+            # A function of the model that calls back into Python may raise for one fit and ends the whole program: the
+            # fits are then done one by one, and that one is listed. Any other error is a defect of the program.
+            if not _is_raised_in_callback(error):
+                warnings.warn(_NO_PROGRAM.format(error=describe_error(error)), RuntimeWarning, stacklevel=2)
             outcome = _leave_all(np.asarray(starts, dtype=float))
     return _finish_rest(problem, evaluator, varying, outcome, tolerance, max_iterations)
+
+
+def give_data(evaluator: Evaluator, base: tuple[Arguments, ...], varying: Varying, k: int) -> None:
+    """Replace the data of an evaluator by those of the k-th fit; `base` are the arguments of the problem itself."""
+    with use_float64():
+        values = [jnp.asarray(value[k]) for value in varying.values]
+        evaluator.replace_arguments(replace_leaves(base, varying.places, values))
 
 
 def replace_leaves(
@@ -222,6 +235,98 @@ def replace_leaves(
     for place, value in zip(places, values, strict=True):
         leaves[place] = value
     return tuple(jax.tree.unflatten(tree, leaves))
+
+
+class Evaluations:
+    """Cost, gradient and Hessian of any fits of a chunk with their own data, many at a time.
+
+    Attributes
+    ----------
+    quick : bool
+        Whether machine code evaluates them, in one program; otherwise they are evaluated one by one.
+    """
+
+    def __init__(self, problem: Problem, meshes: Sequence[Mesh], varying: Varying) -> None:
+        self.problem, self.varying = problem, varying
+        self.evaluator = Evaluator(problem, meshes=meshes)
+        self.base = tuple(self.evaluator.arguments)
+        self.quick = not in_lockstep() and problem.engine != "jax" and runs_natively(problem.structures, self.base)
+
+    def __call__(
+        self, fits: NDArray[np.intp], thetas: FloatArray, sides: NDArray[np.int64]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return costs (n,), gradients (n, d) and Hessians (n, d, d) at thetas (n, d), to one side (n,) of breakpoints.
+
+        `fits` (n,) says whose data are taken.
+        """
+        if not self.quick:
+            found = []
+            for k, theta, side in zip(fits.tolist(), thetas, sides.tolist(), strict=True):
+                give_data(self.evaluator, self.base, self.varying, k)
+                found.append(self.evaluator(theta, side))
+            return tuple(np.array([getattr(one, name) for one in found]) for name in ("cost", "gradient", "hessian"))  # type: ignore[return-value]
+        parts = [
+            self._run(
+                fits[first : first + EVALUATIONS], thetas[first : first + EVALUATIONS], sides[first:][:EVALUATIONS]
+            )
+            for first in range(0, len(fits), EVALUATIONS)
+        ]
+        J, g, H = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return J, g, H
+
+    def _run(self, fits: Any, thetas: FloatArray, sides: Any) -> tuple[FloatArray, ...]:
+        problem, structures = self.problem, self.problem.structures
+        layout = Layout(
+            tuple(structure.library for structure in structures),
+            tuple(structure.N for structure in structures),
+            tuple(tuple(int(k) for k in places) for places in problem.places),
+            self.varying.places,
+            lockstep=False,
+            natively=True,
+            tolerance=0.0,
+            max_iterations=0,
+        )
+        with use_float64():
+            given = (
+                self.base,
+                tuple(_pad(value, CHUNK) for value in self.varying.values),
+                tuple(experiment.initial_times for experiment in problem.experiments),
+                read_sequences(layout, structures),
+                problem.unknowns.priors,
+                *(_pad(each, EVALUATIONS) for each in (fits, thetas, np.asarray(sides, dtype=float))),
+                len(fits),
+            )
+            with _compile_once(layout, given):
+                found = _evaluations(*given, layout=layout)
+        return tuple(np.asarray(each)[: len(fits)] for each in found)
+
+
+@partial(jax.jit, static_argnames=("layout",))
+def _evaluations(
+    arguments: tuple[Arguments, ...],
+    values: tuple[jax.Array, ...],
+    times: tuple[jax.Array, ...],
+    sequences: tuple[dict[str, jax.Array], ...],
+    priors: PriorTerms,
+    fits: jax.Array,
+    thetas: jax.Array,
+    sides: jax.Array,
+    count: jax.Array,
+    *,
+    layout: Layout,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return cost, gradient and Hessian of the first `count` fits at their thetas."""
+    n, d = thetas.shape
+
+    def one(s: jax.Array, found: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        here = replace_leaves(arguments, layout.varying, [value[fits[s]] for value in values])
+        J, g, H = _total(layout, here, times, sequences, thetas[s], sides[s])
+        prior, prior_g, prior_h = priors.evaluate(thetas[s], jnp)
+        new = J + prior, g + prior_g, H + jnp.diag(prior_h)
+        return tuple(all_.at[s].set(each) for all_, each in zip(found, new, strict=True))  # type: ignore[return-value]
+
+    empty = jnp.zeros(n), jnp.zeros((n, d)), jnp.zeros((n, d, d))
+    return lax.fori_loop(0, count, one, empty)
 
 
 _known: set[Any] = set()
@@ -374,15 +479,33 @@ def _group_alike(layout: Layout, arguments: tuple[Arguments, ...]) -> list[list[
     return list(groups.values())
 
 
+_NO_PROGRAM = (
+    "The compiled program of many fits failed ({error}); they are done one by one, which takes much longer. This is an "
+    "error in switchfit itself: please report it."
+)
+
+
+def _is_raised_in_callback(error: BaseException) -> bool:
+    """Return whether a function that a program calls in Python raised it: JAX raises a ValueError or a JaxRuntimeError
+    of its own, with the traceback in its text.
+    """
+    return "error calling callback" in str(error)
+
+
 def error_message(error: BaseException) -> str:
     """Return what to list for a fit that ended with an error, on one line."""
+    return str(Termination.of_error(describe_error(error)))
+
+
+def describe_error(error: BaseException) -> str:
+    """Return kind and text of an error on one line, of one that JAX hands on those of what raised it."""
     text = str(error)
     if "Traceback" in text:  # as JAX hands on what a callback raised: its last line says what it was
         raised = [line.strip() for line in text.splitlines() if RAISED.match(line)]
         text = raised[-1] if raised else text
     else:
         text = f"{type(error).__name__}: {text}"
-    return str(Termination.of_error(" ".join(text.split())[:LONGEST_ERROR]))
+    return " ".join(text.split())[:LONGEST_ERROR]
 
 
 def with_errors(chunk: Chunk, errors: Mapping[int, BaseException]) -> Chunk:
@@ -470,19 +593,10 @@ def _finish_rest(
     constraints = constraints_of(problem)
     for k in np.flatnonzero(~settled):
         try:
-            values = tuple(value[k] for value in varying.values)
-            with use_float64():
-                evaluator.replace_arguments(
-                    replace_leaves(base, varying.places, [jnp.asarray(value) for value in values])
-                )
+            give_data(evaluator, base, varying, int(k))
             left = max_iterations - int(found["iterations"][k])
             start = nearest_feasible(constraints, found["theta"][k])
-            if problem.constraint_names:
-                result, _ = minimize_with_constraints(
-                    evaluator, place_on_near_guards(evaluator, start), tolerance, left
-                )
-            else:
-                result = minimize_cost(evaluator, start, "exact", tolerance, left, constraints=constraints)
+            result = minimize_cost(evaluator, start, "exact", tolerance, left, constraints=constraints)
         except Exception as error:  # whatever it is, it must not end the other fits
             status[k], message[k] = Status.ERROR.name, error_message(error)
             free[k] = 0

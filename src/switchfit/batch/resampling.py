@@ -30,6 +30,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -38,9 +39,12 @@ import numpy as np
 import scipy.special
 
 from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.fits import Fits, check_long_run, count_samples, repeat
+from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
+from switchfit.batch.intervals import make_no_pieces
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
+from switchfit.batch.quality import count_samples, describe_ends, measure_variation
 from switchfit.batch.simulated import fit_simulated
+from switchfit.batch.verdict import judge_study
 from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.estimation.estimator import Estimate, check_settings
@@ -53,6 +57,7 @@ from switchfit.problem.validation import as_choice, as_count, as_level, as_seed
 from switchfit.runtime.presentation import draw_figure
 from switchfit.uncertainty.residuals import compute_autocorrelation
 from switchfit.uncertainty.sensitivity import collect_sample_derivatives
+from switchfit.uncertainty.verdict import Verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -79,6 +84,8 @@ class Bootstrap(Fits):
         How the standard error changes with the estimate, for "bca" intervals.
     resampled : (d,) bool
         Of which unknowns something is said: with "runs" only of those that several runs share.
+    origin : Verdict
+        On the fit that was resampled.
 
     See Also
     --------
@@ -100,6 +107,14 @@ class Bootstrap(Fits):
     block: int
     acceleration: FloatArray
     resampled: np.ndarray[Any, np.dtype[np.bool_]]
+    origin: Verdict
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Whether to believe the spread: how many fits converged, in the same minimum as the others, without collapsed
+        modes, and whether the fit that was resampled is bad. Print it for a line.
+        """
+        return judge_study(self, origin=self.origin, considered=self.resampled)
 
     @property
     def standard_deviation(self) -> FloatArray:
@@ -267,6 +282,7 @@ def bootstrap(
         block=size,
         acceleration=acceleration,
         resampled=resampled,
+        origin=estimate.verdict,
     )
 
 
@@ -390,7 +406,13 @@ class _Runs:
             tolerance=self.tolerance,
             max_iterations=self.max_iterations,
         )
-        return {**found._asdict(), "start": starts, "samples": np.full(len(runs), count_samples(self.problem))}
+        return {
+            **found._asdict(),
+            **describe_ends(self.problem, found.theta, found.cost, weights @ measure_variation(self.problem)),
+            "pieces": make_no_pieces(self.problem, len(runs)),  # of the times of single runs this says nothing
+            "start": starts,
+            "samples": np.full(len(runs), count_samples(self.problem)),
+        }
 
     def _stack_values(self, weights: FloatArray) -> Varying:
         """Return the weights of all samples (R, K, q), times those of their experiments."""
@@ -409,4 +431,5 @@ class _Runs:
         leaves = jax.tree.leaves([build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes)])
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
         model = self.problem.digests
-        return compute_fingerprint("bootstrap of runs", settings, model, self.start, *bounds, *map(np.asarray, leaves))
+        numbers = map(np.asarray, leaves)
+        return compute_fingerprint(CHUNK_FORMAT, "bootstrap of runs", settings, model, self.start, *bounds, *numbers)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,10 +13,13 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.batch.again import redo_unresolved
+from switchfit.batch.again import differ, redo_doubted, redo_unresolved
 from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.fits import Fits, check_long_run, count_samples, repeat
-from switchfit.batch.program import Varying, chunk_size, fit_chunk, with_errors
+from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
+from switchfit.batch.intervals import trace_chunk
+from switchfit.batch.program import Evaluations, Varying, chunk_size, fit_chunk, with_errors
+from switchfit.batch.quality import count_samples, describe_ends, measure_variation
+from switchfit.batch.verdict import LEVEL, judge_study
 from switchfit.discretization.arguments import build_arguments, split_by_cell
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh
@@ -28,6 +32,7 @@ from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_callable, as_count, as_instance, as_seed, shorten
 from switchfit.runtime.presentation import draw_figure
+from switchfit.uncertainty.verdict import Verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,6 +72,14 @@ class MonteCarlo(Fits):
     truth: FloatArray
     integration_error: float
 
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Whether to believe the study: how many fits converged, in the same minimum as the others, whether chi-square
+        confirms them, and whether their 95 % intervals hold the truth. Print it for a line.
+        """
+        intervals = self.confidence_intervals(LEVEL)
+        return judge_study(self, truth=self.truth, intervals=intervals, error=self.integration_error)
+
     @property
     def errors(self) -> FloatArray:
         """Estimate less truth of the fits that converged: (S, d)."""
@@ -84,7 +97,7 @@ class MonteCarlo(Fits):
 
     def coverage(self, level: float = 0.95) -> FloatArray:
         """Return the part of the fits that converged whose interval contains the truth: (d,); NaN without a noise
-        model.
+        model, and for an unknown that is held in all of them.
 
         See Also
         --------
@@ -102,7 +115,7 @@ class MonteCarlo(Fits):
         """
         low, high = np.moveaxis(self.confidence_intervals(level)[self.success], 2, 0)
         inside = (low <= self.truth) & (self.truth <= high)
-        return np.where(np.isnan(low).any(0), np.nan, inside.mean(0))
+        return np.where(np.isnan(low).all(0), np.nan, inside.mean(0))
 
     def plot(self) -> Figure:
         """Draw a histogram of the estimates of each unknown with the truth, as a matplotlib Figure.
@@ -416,7 +429,7 @@ class _Work:
                 errors[place] = error
         varying = self._stack_values({key: np.stack([values[key] for values in noisy]) for key in noisy[0]})
         starts = np.repeat(self.start[None], len(runs), axis=0)
-        found = fit_chunk(
+        first = found = fit_chunk(
             self.problem,
             self.meshes,
             varying,
@@ -427,7 +440,23 @@ class _Work:
         found = with_errors(found, errors) if errors else found
         settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
         found = redo_unresolved(found, lambda k: self.problem_of(runs[k]), self.meshes, **settings)
-        return {**found._asdict(), "start": starts, "samples": np.full(len(runs), count_samples(self.problem))}
+        if self.problem.constraint_names:
+            found = redo_doubted(found, lambda k: self.problem_of(runs[k]), starts, self._variation, **settings)
+        evaluations = partial(Evaluations, self.problem, self.meshes, varying)
+        own, again = lambda k: self.problem_of(runs[k]), differ(first, found)
+        pieces = trace_chunk(found, again, lambda k: self.problem, evaluations, own)
+        return {
+            **found._asdict(),
+            **describe_ends(self.problem, found.theta, found.cost, self._variation),
+            "pieces": pieces,
+            "start": starts,
+            "samples": np.full(len(runs), count_samples(self.problem)),
+        }
+
+    @cached_property
+    def _variation(self) -> float:
+        """J of the data of one run that are met by their means; in the others it differs by noise alone."""
+        return float(measure_variation(self.problem_of(self.sound)).sum())
 
     def _without_noise(self) -> dict[tuple[int, int], FloatArray]:
         """Return what stands for the values of a run that could not be drawn."""
@@ -468,7 +497,7 @@ class _Work:
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
         nodes = [mesh.nodes for mesh in self.meshes]
         return compute_fingerprint(
-            "monte carlo", settings, model, self.truth, self.start, *bounds, *nodes, *data, *drawn
+            CHUNK_FORMAT, "monte carlo", settings, model, self.truth, self.start, *bounds, *nodes, *data, *drawn
         )
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,21 +14,26 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.batch.again import redo_unresolved
+from switchfit.batch.again import differ, redo_doubted, redo_unresolved
 from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.fits import Fits, check_long_run, count_samples, repeat
-from switchfit.batch.program import Varying, chunk_size, error_message, fit_chunk
+from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
+from switchfit.batch.intervals import trace_chunk
+from switchfit.batch.program import Evaluations, Varying, chunk_size, error_message, fit_chunk
+from switchfit.batch.quality import count_samples, describe_ends, measure_variation
+from switchfit.batch.verdict import judge_starts
 from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.estimation.estimator import Estimate, check_settings, fit_locally
-from switchfit.fit.evaluator import evaluator_of
+from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.random_starts import MOST_DRAWN, draw_starts
 from switchfit.fit.solution import constraints_of
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_count, as_instance, as_seed
+from switchfit.runtime.errors import NotIntegrableError
 from switchfit.runtime.presentation import draw_figure
+from switchfit.uncertainty.verdict import Verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -74,6 +81,12 @@ class Multistart(Fits):
 
     clusters: NDArray[np.int64]
     best: Estimate | None
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """That on the best end, and how many of the other starts ended there: most of them may well be bad."""
+        best = self.best
+        return judge_starts(self, None if best is None else best.verdict, None if best is None else best.starts)
 
     def plot(self) -> Figure:
         """Draw a waterfall: the cost at the end of every start, ascending, as a matplotlib Figure.
@@ -132,7 +145,10 @@ def multistart(
 
     Notes
     -----
-    All starts share the mesh that is refined at the initial guess; the best end is fitted again on a mesh of its own.
+    All starts share the mesh that is refined at the initial guess, or at the first start that can be integrated; the
+    best end is fitted again on a mesh of its own. With guards or terminal constraints a start that does not converge,
+    loses a mode or ends far from the data is fitted again with transitions free of their guards first, as `estimate`
+    does.
 
     See Also
     --------
@@ -158,7 +174,7 @@ def multistart(
         points = _check_starts(problem, starts)
     else:
         points = draw_starts(problem, as_count(starts, "starts", at_least=1, at_most=MOST_DRAWN), seed)
-    work = _Work(problem, list(evaluator_of(problem).meshes), points, tolerance, max_iterations)
+    work = _Work(problem, _find_meshes(problem, points), points, tolerance, max_iterations)
     found = repeat(problem, work, len(points), "Multistart", began, client=client, folder=folder, callback=callback)
     best, errors = _find_best(problem, Fits(**found), tolerance, max_iterations)
     if errors:
@@ -170,6 +186,17 @@ def multistart(
     if best is not None:
         best = replace(best, starts=_count_starts(Fits(**found), clusters, best.cost))
     return Multistart(**found, clusters=clusters, best=best)
+
+
+def _find_meshes(problem: Problem, points: FloatArray) -> list[Mesh]:
+    """Return the meshes of the initial guess, or of the first start (S, d) that can be integrated where that cannot."""
+    try:
+        return list(evaluator_of(problem).meshes)
+    except NotIntegrableError:
+        for point in points:
+            with suppress(NotIntegrableError):
+                return list(Evaluator(problem, point).meshes)
+        raise
 
 
 def _count_starts(fits: Fits, clusters: NDArray[np.int64], best: float) -> tuple[int, int, int]:
@@ -209,7 +236,7 @@ class _Work:
 
     def __call__(self, runs: range) -> Arrays:
         starts = self.starts[runs.start : runs.stop]
-        found = fit_chunk(
+        first = found = fit_chunk(
             self.problem,
             self.meshes,
             Varying((), ()),
@@ -218,15 +245,27 @@ class _Work:
             max_iterations=self.max_iterations,
         )
         settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
+        variation = float(measure_variation(self.problem).sum())
         found = redo_unresolved(found, lambda k: self.problem, self.meshes, **settings)
-        return {**found._asdict(), "start": starts, "samples": np.full(len(runs), count_samples(self.problem))}
+        if self.problem.constraint_names:
+            found = redo_doubted(found, lambda k: self.problem, starts, variation, **settings)
+        evaluations = partial(Evaluations, self.problem, self.meshes, Varying((), ()))
+        own, again = lambda k: self.problem, differ(first, found)
+        pieces = trace_chunk(found, again, lambda k: self.problem, evaluations, own)
+        return {
+            **found._asdict(),
+            **describe_ends(self.problem, found.theta, found.cost, variation),
+            "pieces": pieces,
+            "start": starts,
+            "samples": np.full(len(runs), count_samples(self.problem)),
+        }
 
     def fingerprint(self) -> str:
         unknowns = self.problem.unknowns
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
         leaves = jax.tree.leaves([build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes)])
         settings = self.tolerance, self.max_iterations, unknowns.names, self.problem.digests
-        return compute_fingerprint("multistart", settings, self.starts, *bounds, *map(np.asarray, leaves))
+        return compute_fingerprint(CHUNK_FORMAT, "multistart", settings, self.starts, *bounds, *map(np.asarray, leaves))
 
 
 def _check_starts(problem: Problem, starts: Any) -> FloatArray:

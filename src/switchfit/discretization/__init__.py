@@ -1,4 +1,4 @@
-"""The discretised system: tableaus, the mesh and its rows, the arrays of an experiment, the forward pass.
+"""The discretized system: tableaus, the mesh and its rows, the arrays of an experiment, the forward pass.
 
 Imports `runtime` and `problem`. Written in JAX, for one experiment, as pure functions.
 """

@@ -1,4 +1,4 @@
-"""The numbers of an experiment on a mesh, as the arrays that its programs take."""
+"""Arrays that the programs of an experiment on a mesh take as arguments."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Samples(NamedTuple):
 
 
 class Arguments(NamedTuple):
-    """Numbers of a run, none of them estimated.
+    """Numbers of a run that are not estimated.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Arguments(NamedTuple):
         Polynomial of each signal channel in each cell, in powers of time since the cell's first node: the
         references in the order of the data, then the input.
     fixed : values of the fixed parameters, in order
-    initial_state : (n,), zeros where it is a function of the parameters; unknown entries are not looked at
+    initial_state : (n,), zeros where it is a function of the parameters; unknown entries are ignored
     samples : one `Samples` for each `Measurements`
     weights : W of each `ReferenceSignal`, its diagonal (q,) where it is diagonal, else (q, q)
     """
@@ -48,14 +48,14 @@ class Arguments(NamedTuple):
     weights: tuple[Array, ...]
 
     def without_mesh(self) -> Arguments:
-        """Return what the functions of the model need of them: shapes do not depend on the number of
+        """Return the arguments that the functions of the model need: their shapes do not depend on the number of
         nodes or samples.
         """
         return self._replace(nodes=np.zeros(2), signals=np.zeros((1, *self.signals.shape[1:])), samples=())  # type: ignore[arg-type]
 
 
 def build_arguments(problem: Problem, e: int, mesh: Mesh) -> Arguments:
-    """Return the arrays (NumPy's) of experiment e on a mesh that holds all its sample times and knots as nodes."""
+    """Return the NumPy arrays of experiment e on a mesh that has all its sample times and knots as nodes."""
     structure, experiment = problem.structures[e], problem.experiments[e]
     initial = initial_state_of(problem.system, experiment)
     mapped = experiment.parameter_map
@@ -71,8 +71,8 @@ def build_arguments(problem: Problem, e: int, mesh: Mesh) -> Arguments:
 
 
 def _drop_off_diagonal_zeros(W: FloatArray) -> FloatArray:
-    """Return the diagonal of a diagonal matrix: it costs q products instead of q squared at every stage
-    of every step.
+    """Return the diagonal of a diagonal matrix, which takes q products instead of q squared at every stage of every
+    step; any other matrix unchanged.
     """
     diagonal = np.diag(W)
     return diagonal if np.array_equal(W, np.diag(diagonal)) else W

@@ -1,8 +1,8 @@
-"""One row of an implicit Runge-Kutta method: what `switchfit.discretization.rows` has for an explicit one.
+"""One row of an implicit Runge-Kutta method, as `switchfit.discretization.rows` is one row of an explicit method.
 
-The equations are those of `rows`, and so are the arguments and results of the functions. The stages of an implicit
-method depend on each other: they are found by Newton's method, and their derivatives by the coupled stage equations
-``(I - h a_jl D_1 f_j) K' = ...``, transposed for the adjoint. JAX only.
+Equations, arguments and results are those of `rows`. The stages of an implicit method depend on each other: they are
+computed by Newton's method, and their derivatives from the coupled stage equations ``(I - h a_jl D_1 f_j) K' = ...``,
+transposed for the adjoint. JAX only.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, e
 
     Z = lax.custom_root(residual, jnp.zeros((s, n)), newton, tangent_solve)
     X = x[None] + Z
-    # K from Z instead of f(X): the stiff components of f amplify the rounding of X, A^-1 Z does not.
+    # K from Z instead of f(X): the stiff components of f amplify the rounding errors of X, A^-1 Z does not.
     K = (np.linalg.inv(tableau.a) @ Z) / jnp.where(h == 0, 1.0, h)
     K = jnp.where(h == 0, jax.vmap(f)(times, X), K)
     return Stages(list(times), list(X), list(K))
@@ -74,7 +74,7 @@ def tangent(
 
 
 def adjoint(tableau: Tableau, h: Array, psi: Array, pull: Pull) -> Adjoint:
-    """Pull the costate psi (n,) behind a row back to its start."""
+    """Pull the costate psi (n,) after a row back to its start."""
     a, b = jnp.asarray(tableau.a), jnp.asarray(tableau.b)
     s, n = len(b), psi.shape[0]
     # What pull returns is linear in (w, hb): D_1 f at each stage, row by row, and h b_j D_1 ell.

@@ -1,18 +1,18 @@
 """The mesh: fixed nodes, cut by the transition times.
 
 The *nodes* of an experiment are t0, tf, all sample times, the knots of inputs and reference signals and a refinement
-grid. They stay where they are while the optimiser works. The transition times cut the *cells* between them into
-*rows*: one row is one Runge-Kutta step, in one mode, inside one cell. Every moment that matters is thus the end of a
-row, and only the rows beside a transition move with it.
+grid. They are fixed while the optimizer runs. The transition times cut the *cells* between them into *rows*: one row is
+one Runge-Kutta step, in one mode, inside one cell. Samples, knots and transitions are thus always ends of rows, and
+only the two rows at a transition move with it.
 
 Rows are laid out in chunks of `CHUNK` rows of one segment (the time a mode is active), each segment padded to whole
-chunks with rows of length zero, so that a chunk has one mode and all shapes are fixed whatever the transition times.
+chunks with rows of length zero, so that a chunk has one mode and no shape depends on the transition times.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -23,9 +23,54 @@ from numpy.typing import NDArray
 from switchfit.problem.data import FloatArray
 from switchfit.problem.lengths import choose_common_lengths, pad_length
 from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Structure
 
 CHUNK = 16
-"""Rows in a chunk: long enough to fill vector registers (rows times stages), short enough to waste few in padding."""
+"""Rows in a chunk: enough to fill vector registers (rows times stages), few enough to waste little on padding."""
+
+
+@dataclass(frozen=True)
+class Stiffness:
+    """Why ``solver="auto"`` takes implicit steps in an experiment; print it for a sentence.
+
+    Attributes
+    ----------
+    mode : str
+        The stiff mode; that with the most explicit steps if there are several.
+    explicit_steps, implicit_steps : int
+        Steps that either method needs in it, to the same tolerance.
+    stability : float
+        ``|lambda| h`` of the explicit steps, lambda being the largest eigenvalue of the Jacobian whose component
+        decays. An explicit method is unstable above about 3.3.
+
+    See Also
+    --------
+    Problem : takes `solver`.
+    Evaluation, evaluate
+
+    Examples
+    --------
+    >>> import jax.numpy as jnp
+    >>> import switchfit as sf
+    >>> fast = sf.HybridSystem({"relax": lambda t, x, p: -p["rate"] * (x - jnp.cos(t))}, [0.0])
+    >>> run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("relax",), (), 0.0, 10.0)
+    >>> problem = sf.Problem(fast, run, {"rate": 1e5})
+    >>> found = sf.evaluate(problem).stiffness[0]
+    >>> found.mode, found.implicit_steps < found.explicit_steps / 100
+    ('relax', True)
+    """
+
+    mode: str
+    explicit_steps: int
+    implicit_steps: int
+    stability: float
+
+    def __str__(self) -> str:
+        return (
+            f"mode {self.mode!r} is stiff: it takes {self.explicit_steps:,} explicit steps (limited by stability: "
+            f"|lambda| h is about {self.stability:.2g}) or {self.implicit_steps:,} implicit ones; solver='stiff' was "
+            "chosen"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,26 +80,29 @@ class Mesh:
     Attributes
     ----------
     nodes : (G + 1,) array
-        Increasing, from t0 to tf; padded at the end with tf to a length out of `pad_length`, so that
+        Increasing, from t0 to tf; padded at the end with tf to a length from `pad_length`, so that
         experiments of similar size share one compiled program.
     cells : int
-        Cells before the padding.
+        Number of cells without the padding.
+    stiffness : Stiffness or None
+        Why implicit steps are taken on this mesh, if ``solver="auto"`` has chosen them; else None.
     """
 
     nodes: FloatArray
     cells: int
+    stiffness: Stiffness | None = None
 
     @classmethod
-    def from_times(cls, times: FloatArray) -> Mesh:
+    def from_times(cls, times: FloatArray, stiffness: Stiffness | None = None) -> Mesh:
         """Return the mesh whose nodes are `times`, in any order and with repetitions."""
-        return cls.pad(np.unique(times))
+        return cls.pad(np.unique(times), stiffness)
 
     @classmethod
-    def pad(cls, nodes: FloatArray) -> Mesh:
-        """Return the mesh with these nodes, which increase strictly, and padding of a usual length."""
+    def pad(cls, nodes: FloatArray, stiffness: Stiffness | None = None) -> Mesh:
+        """Return the mesh with these strictly increasing nodes, padded to a length from `pad_length`."""
         cells = len(nodes) - 1
         padding = np.full(pad_length(cells) - cells, nodes[-1])
-        return cls(np.concatenate([nodes, padding]), cells)
+        return cls(np.concatenate([nodes, padding]), cells, stiffness)
 
     @property
     def times(self) -> FloatArray:
@@ -62,24 +110,29 @@ class Mesh:
         return self.nodes[: self.cells + 1]
 
     def pad_to(self, cells: int) -> Mesh:
-        """Return the mesh with its padding made so long that it has the given number of cells."""
-        return Mesh(np.append(self.times, np.full(cells - self.cells, self.times[-1])), self.cells)
+        """Return the mesh padded to the given number of cells."""
+        return replace(self, nodes=np.append(self.times, np.full(cells - self.cells, self.times[-1])))
+
+    def insert(self, times: FloatArray) -> Mesh:
+        """Return the mesh with more nodes."""
+        return Mesh.from_times(np.concatenate([self.times, times]), self.stiffness)
 
     def divide(self, parts: int = 2) -> Mesh:
         """Return the mesh with every cell cut into equal parts."""
         nodes = self.times
         inside = nodes[:-1, None] + np.diff(nodes)[:, None] * np.arange(parts) / parts
         divided = np.append(inside, nodes[-1])
-        # Equal parts of a cell as short as rounding may coincide.
-        return Mesh.pad(divided) if (divided[1:] > divided[:-1]).all() else Mesh.from_times(divided)
+        # Parts of a cell that is as short as rounding may coincide.
+        build = Mesh.pad if (divided[1:] > divided[:-1]).all() else Mesh.from_times
+        return build(divided, self.stiffness)
 
     def halve_rows(self, transition_times: FloatArray) -> Mesh:
         """Return the mesh with every row cut in two: every cell, or its parts where transitions (N,) cut it.
 
-        A transition in the second half of a cell has behind it a row that a cut through the cell would leave as it is.
+        Halving cells would not do: after a transition in the second half of a cell, the row would keep its length.
         """
         cuts = np.unique(np.concatenate([self.times, transition_times]))
-        return Mesh.from_times(np.concatenate([self.times, 0.5 * (cuts[:-1] + cuts[1:])]))
+        return self.insert(0.5 * (cuts[:-1] + cuts[1:]))
 
     def cell_ending_at(self, times: FloatArray) -> NDArray[np.intp]:
         """Return the index of the cell that ends at each of `times`, which must be nodes; -1 for t0."""
@@ -87,7 +140,7 @@ class Mesh:
 
 
 def pad_to_common_lengths(problem: Problem, meshes: Sequence[Mesh]) -> list[Mesh]:
-    """Return the meshes of all experiments, those of experiments that are alike padded to common lengths."""
+    """Return the meshes of all experiments; those of experiments with equal structure are padded to common lengths."""
     padded = list(meshes)
     if len(padded) == 1:
         return padded
@@ -98,12 +151,18 @@ def pad_to_common_lengths(problem: Problem, meshes: Sequence[Mesh]) -> list[Mesh
     return padded
 
 
+def get_structure_on(problem: Problem, e: int, mesh: Mesh) -> Structure:
+    """Return the structure of experiment e with the method of the steps on a mesh."""
+    structure = problem.structures[e]
+    return structure if mesh.stiffness is None else replace(structure, solver="stiff")
+
+
 class Rows(NamedTuple):
     """The rows of a mesh at given transition times: Q chunks of C rows.
 
     Attributes
     ----------
-    segment : (Q,) int, which entry of the mode sequence
+    segment : (Q,) int, index in the mode sequence
     opens : (Q,) bool, whether the chunk opens a segment other than the first (a transition precedes it)
     cell : (Q, C) int
     start, end : (Q, C) times
@@ -126,9 +185,9 @@ class Rows(NamedTuple):
 
 
 def count_chunks(cells: int, transitions: int) -> int:
-    """Return how many chunks hold all rows wherever the transition times lie.
+    """Return a number of chunks that holds all rows for any transition times.
 
-    The padding wastes at most C - 1 rows a segment.
+    The padding wastes at most C - 1 rows per segment.
     """
     return (cells + transitions + (transitions + 1) * (CHUNK - 1)) // CHUNK
 
@@ -137,12 +196,11 @@ def build_rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
     """Cut the cells between `nodes` (G + 1,) at `tau` (N,).
 
     Where tau_i equals a node, `side` = +1 lets segment i begin in the cell after it, so that derivatives are those
-    for tau_i increasing, and -1 in the cell before it. Computed in the arrays of
-    `xp`, JAX's or NumPy's.
+    for tau_i increasing, and -1 in the cell before it. Arrays are those of `xp`, JAX or NumPy.
     """
     cells, N = nodes.shape[0] - 1, tau.shape[0]
     passed = xp.where(side > 0, nodes[None] <= tau[:, None], nodes[None] < tau[:, None]).sum(1)
-    real_cells = (nodes[1:] > nodes[:-1]).sum()  # without the padding, so that tau = tf stays before what is at tf
+    real_cells = (nodes[1:] > nodes[:-1]).sum()  # without padding: tau = tf stays before the samples and costs at tf
     first_cell = xp.clip(passed - 1, 0, real_cells - 1)
     first_cell = xp.concatenate([xp.zeros(1, first_cell.dtype), first_cell])
     last_cell = xp.concatenate([first_cell[1:], xp.full(1, cells - 1, first_cell.dtype)])

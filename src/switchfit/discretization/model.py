@@ -41,9 +41,9 @@ class Piece(NamedTuple):
 def _polynomial(s: Array, c: Array) -> Array:
     """Return ``c[0] + c[1] s + c[2] s**2 + ...``: (S,).
 
-    Its derivative in s is given as a polynomial too. Differentiated by JAX, Horner's scheme carries a tangent through
-    each of its steps in every direction: with a reference signal a quarter of an evaluation went into that.
-    The coefficients are data and have no derivative.
+    Its derivative in s is defined as a polynomial too. JAX would propagate a tangent in every direction through each
+    step of Horner's scheme, which took a quarter of an evaluation with a reference signal. The coefficients are data
+    and have no derivative.
     """
     value = c[-1]
     for k in reversed(range(c.shape[0] - 1)):
@@ -71,7 +71,7 @@ class Model:
         self.tableau = get_tableau(structure.solver)
 
     def parameters(self, p: Array) -> Mapping[str, Array]:
-        """Return the dict the user's functions get."""
+        """Return the parameters by name, as the user's functions receive them."""
         named: dict[str, Array] = {}
         fixed = iter(self.arguments.fixed)
         position = 0
@@ -133,7 +133,7 @@ class Model:
         return self.observe(self.structure.references[k][0], t, x, p) - piece(t)[channels]
 
     def observe(self, observe: Function | None, t: Array, x: Array, p: Array) -> Array:
-        """Return what a sensor sees: (q,)."""
+        """Return the output of a sensor: (q,)."""
         return x if observe is None else observe(t, x, self.parameters(p))
 
     def sample_residual(self, k: int, sample: Samples, x: Array, p: Array) -> Array:
@@ -143,7 +143,7 @@ class Model:
         return jnp.where(sample.weight > 0, h - sample.value, 0.0)
 
     def correct_delay(self, k: int, sample: Samples, p: Array) -> Samples:
-        """Return a late sample with the time of the state that it is of, ``t - delay``, in place of its own."""
+        """Return a late sample with its time replaced by ``t - delay``, the time of the state that it saw."""
         delay = self.structure.measurements[k].delay
         return sample if delay is None else sample._replace(time=sample.time - self.parameters(p)[delay])
 
@@ -159,7 +159,7 @@ class Model:
     def sample_cost(self, k: int, sample: Samples, x: Array, p: Array) -> Array:
         """Return ``1/2 sum C**2 rho(((h - y) / sigma)**2 / C**2) + sum log sigma`` of one sample.
 
-        Without a robust loss rho is the identity; log sigma is there where sigma is a parameter.
+        Without a robust loss, rho is the identity. The term log sigma is present only where sigma is a parameter.
         """
         sensor = self.structure.measurements[k]
         r = self.sample_residual(k, sample, x, p)
@@ -202,7 +202,7 @@ class Model:
         return lambda t, x, p: function(t, x, self.parameters(p))
 
     def terminal_constraint(self, x: Array, p: Array) -> Array:
-        """Return all terminal constraints in one: (m,)."""
+        """Return all terminal constraints, concatenated: (m,)."""
         parts = [psi(x, self.parameters(p)) for psi in self.structure.terminal_constraints]
         return jnp.concatenate([part.reshape(-1) for part in parts])
 

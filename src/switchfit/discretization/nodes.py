@@ -1,4 +1,4 @@
-"""Nodes: what happens to the state at one moment, and what is paid for it there.
+"""Nodes: maps of the state, costs and constraints at one time.
 
 start        ``x(t0) = x0(p)``
 reset        ``x(tau_i+) = R(tau_i, x(tau_i-), p)``
@@ -7,8 +7,8 @@ sample       a cost of (t, x, p) at the end of a row; of a late sample at the en
 transition   costs of, and constraints on, ``(tau_i, x(tau_i-), p)``
 end          costs of, and constraints on, ``(x(tf), p)``
 
-Engines differentiate what is listed here, and know no kind by its name. All functions take (t, x, p); of a constraint
-engines add ``weight . c`` to the cost, with the weights of a Lagrangian.
+Engines differentiate the functions listed here without distinguishing kinds by name. All functions take (t, x, p). For
+a constraint, engines add ``weight . c`` to the cost, with the weights of a Lagrangian.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class TransitionKind(NamedTuple):
     Attributes
     ----------
     name : str
-        The field of `Structure` that has its function for each transition, None where it has no such function.
+        Field of `Structure` with its function for each transition, None for transitions without one.
     constraint : bool
         Whether its function has to be zero; else it is a cost.
     """
@@ -42,7 +42,7 @@ AT_TRANSITIONS = (TransitionKind("guards", constraint=True), TransitionKind("tra
 
 
 def get_transition_function(model: Model, kind: TransitionKind, i: int) -> NodeFunction | None:
-    """Return the function of transition i (from 0) of a kind, which returns a number; None if it has none."""
+    """Return the scalar function of a kind at transition i (from 0); None if the transition has no such function."""
     function = getattr(model.structure, kind.name)[i]
     return None if function is None else lambda t, x, p: function(t, x, model.parameters(p))
 
@@ -75,7 +75,7 @@ def get_end_cost(model: Model) -> NodeFunction | None:
 
 
 def get_end_constraints(model: Model) -> NodeFunction | None:
-    """Return all terminal constraints in one, which returns (m,); None without any."""
+    """Return all terminal constraints as one function, which returns (m,); None without any."""
     if not model.structure.terminal_constraints:
         return None
     return lambda t, x, p: model.terminal_constraint(x, p)

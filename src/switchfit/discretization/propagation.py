@@ -1,4 +1,4 @@
-"""The forward pass as JAX functions: states at all rows of the mesh, and the cost of the discretised system."""
+"""The forward pass as JAX functions: states at all rows of the mesh, and the cost of the discretized system."""
 
 from __future__ import annotations
 
@@ -56,18 +56,18 @@ class Path(NamedTuple):
 
 
 def flatten_rows(values: Array) -> Array:
-    """Return values (Q, C, ...) as (Q C, ...): one entry a row."""
+    """Return values (Q, C, ...) as (Q C, ...): one entry per row."""
     return values.reshape((values.shape[0] * values.shape[1], *values.shape[2:]))
 
 
 def pick_at_cells(layout: Rows, first: Array, after: Array, cell: Array) -> Array:
-    """Pick from values (Q, C, ...) at the ends of rows those at the ends of cells (K,); `first` for cell -1."""
+    """Pick the values at the ends of cells (K,) from values (Q, C, ...) at the ends of rows; `first` for cell -1."""
     flat = jnp.concatenate([first[None], flatten_rows(after)])
     return flat[find_row_ending_cell(layout, cell) + 1]
 
 
 def switch_mode(model: Model, segment: Array, branch: Callable[[int], Callable[..., Any]], *operands: Any) -> Any:
-    """Call ``branch(mode)(*operands)`` for the mode that is active in a segment, compiling only what is needed."""
+    """Call ``branch(mode)(*operands)`` for the mode that is active in a segment, directly if there is only one."""
     sequence = jnp.asarray(model.structure.mode_of_segment)
     count = len(model.structure.modes)
     if count == 1:
@@ -113,7 +113,7 @@ def apply_reset(model: Model, tau: Array, x: Array, p: Array, segment: Array, op
 
 
 def compute_path_cost(model: Model, path: Path, p: Array) -> Array:
-    """Return the cost J of the discretised system: ()."""
+    """Return the cost J of the discretized system: ()."""
     return (
         integrate_running_cost(model, path, p).sum()
         + add_sample_costs(model, path, p)
@@ -165,7 +165,7 @@ def add_sample_costs(model: Model, path: Path, p: Array) -> Array:
 
 
 def find_late_rows(model: Model, path: Path, k: int, p: Array) -> tuple[Array, Array, Piece, Array, Array]:
-    """Return the rows with ``start < t - delay <= end`` for the samples of the k-th Measurements, which is late.
+    """Return the rows with ``start < t - delay <= end`` for the late samples of the k-th Measurements.
 
     Returns
     -------
@@ -186,7 +186,7 @@ def find_late_rows(model: Model, path: Path, k: int, p: Array) -> tuple[Array, A
 def step_to_late_sample(
     model: Model, k: int, sample: Samples, segment: Array, piece: Piece, start: Array, x: Array, p: Array
 ) -> tuple[Samples, Array]:
-    """Return one late sample with the time of the state that it is of, and that state, one step from `start`: (n,)."""
+    """Return one late sample with the time of the state that it saw, and that state, one step from `start`: (n,)."""
     there = model.correct_delay(k, sample, p)
 
     def through(mode: int) -> Callable[..., Array]:

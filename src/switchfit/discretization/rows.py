@@ -1,8 +1,7 @@
 """One row: one step of an explicit Runge-Kutta method, its derivatives along one direction, and its adjoint.
 
 With the stages ``X_j = x + h sum_l a_jl K_l``, ``K_j = f(t_j, X_j, p)`` at ``t_j = start + c_j h`` a row maps x to
-``x+ = x + h sum_j b_j K_j`` and costs ``L = h sum_j b_j ell(t_j, X_j, p)``. This is all there is to know of it, for
-both engines:
+``x+ = x + h sum_j b_j K_j`` and costs ``L = h sum_j b_j ell(t_j, X_j, p)``. Both engines use these equations:
 
 tangent    along a direction in which x, p, start and end change by x', p', start', end', with ``h' = end' - start'``
            and ``t_j' = start' + c_j h'``,
@@ -15,14 +14,14 @@ adjoint    with the derivative psi of the cost to go in x+,
            ``w_j = h b_j psi + h sum_l a_lj mu_l``,  ``mu_j = D_x (w_j . f + h b_j ell)``,
            ``psi_before = psi + sum_j mu_j``;
 
-second     with Z_j the derivative of (t_j, X_j, p) along theta and V what the length of the row multiplies,
+second     with Z_j the derivative of (t_j, X_j, p) along theta, and V that of the cost to go in h at fixed t_j,
 
            ``D^2 = sum_j Z_j' D^2 (w_j . f + h b_j ell) Z_j + h' x V' + V' x h'``,
            ``V = sum_j b_j (psi . K_j + ell_j) + sum_j mu_j . sum_l a_jl K_l``.
 
-Only rows that open or close a mode have times that depend on theta. Arrays may be those of JAX, which is mapped over
-directions and scanned over rows, or NumPy arrays of the nodes of a graph, whose vectors hold one entry an unknown, so
-that all directions are taken at once.
+Only rows that open or close a mode have times that depend on theta. Arrays are those of JAX, which maps over directions
+and scans over rows, or NumPy arrays of the nodes of a graph, whose vectors hold one entry per unknown, so that all
+directions are treated at once.
 """
 
 from __future__ import annotations
@@ -36,11 +35,11 @@ from switchfit.discretization.tableaus import Tableau
 from switchfit.problem.data import FloatArray
 
 Array = Any
-"""An array of JAX, or a NumPy array of nodes."""
+"""A JAX array, or a NumPy array of nodes."""
 
 
 class Stages(NamedTuple):
-    """Of each stage its time (), state (n,) and slope (n,)."""
+    """Time (), state (n,) and slope (n,) of each stage."""
 
     times: list[Array]
     states: list[Array]
@@ -64,7 +63,7 @@ def stage_state(row: FloatArray, h: Array, x: Array, slopes: Sequence[Array] | F
 
 
 def end_of_row(tableau: Tableau, h: Array, x: Array, slopes: Sequence[Array] | FloatArray) -> Array:
-    """Return the state behind a row: (n,)."""
+    """Return the state after a row: (n,)."""
     return _plus(x, h, combine(tableau.b, slopes))
 
 
@@ -135,7 +134,7 @@ Pull = Callable[[int, Array, Array], tuple[Array, Array, Array]]
 
 
 def adjoint(tableau: Tableau, h: Array, psi: Array, pull: Pull) -> Adjoint:
-    """Pull the costate psi (n,) behind a row back to its start."""
+    """Pull the costate psi (n,) after a row back to its start."""
     a, b = tableau.a.tolist(), tableau.b.tolist()
     s = len(b)
     w: list[Array] = [None] * s
@@ -153,9 +152,9 @@ def adjoint(tableau: Tableau, h: Array, psi: Array, pull: Pull) -> Adjoint:
 def length_factor(
     tableau: Tableau, psi: Array, mu: Sequence[Array], slopes: Sequence[Array], densities: Sequence[Array]
 ) -> Array:
-    """Return what the length of a row multiplies in the cost to go, V: (). Given K_j' and ell_j', its derivative.
+    """Return V, the derivative of the cost to go in the length of a row at fixed times of its stages: ().
 
-    V is linear in the slopes K_j (n,) and the densities ell_j ().
+    V is linear in the slopes K_j (n,) and the densities ell_j (): with K_j' and ell_j' the result is its derivative.
     """
     total: Array = 0.0
     for j, b in enumerate(tableau.b.tolist()):
@@ -174,9 +173,9 @@ def times_derivative(tableau: Tableau, start_d: Array, end_d: Array) -> list[Arr
 
 
 def combine(weights: Sequence[float] | FloatArray, terms: Sequence[Array] | FloatArray) -> Array | None:
-    """Add terms with weights; zero weights cost nothing, and None is the sum of nothing.
+    """Add terms with weights; terms of weight zero are skipped, and the sum of no terms is None.
 
-    Numbers may be one array of NumPy, the terms along its first axis.
+    The terms may be one NumPy array, along its first axis.
     """
     if isinstance(terms, np.ndarray) and terms.dtype != object:
         return np.asarray(weights)[: len(terms)] @ terms
@@ -186,7 +185,7 @@ def combine(weights: Sequence[float] | FloatArray, terms: Sequence[Array] | Floa
 
 
 def times_vector(A: Array, v: Array) -> Array:
-    """Return ``A v`` for small A (m, n) and v (n,): products and a sum, without the overhead of a call to a library."""
+    """Return ``A v`` for small A (m, n) and v (n,) as products and a sum, without the overhead of a library call."""
     return (A * v[None]).sum(-1)
 
 

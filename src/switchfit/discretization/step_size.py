@@ -1,13 +1,13 @@
-"""Step size control of the adaptive solve that chooses the mesh: one description for both engines.
+"""Step size control of the adaptive solve that chooses the mesh, shared by both engines.
 
-A step of the pair of Dormand and Prince (`tableaus.ADAPTIVE`) from y at t, with the stages of `rows`, has the error
-``e = h sum_j e_j K_j``. It is accepted if ``norm = rms(e / (atol + rtol max(|y|, |y+|))) < 1``, and the next length is
-``h min(10, max(0.2, 0.9 norm^(-1/5)))``, not longer than h after a step that was refused. A step after an accepted one
-is never shorter than a few units in the last place of t, and the last one ends at the end exactly. This is the control
-of SciPy's RK45 (Hairer, Norsett and Wanner I, section II.4).
+A step of the Dormand-Prince pair (`tableaus.ADAPTIVE`) from y at t, with the stages of `rows`, has the error
+``e = h sum_j e_j K_j``. It is accepted if ``norm = rms(e / (atol + rtol max(|y|, |y+|))) < 1``. The next step size is
+``h min(10, max(0.2, 0.9 norm^(-1/5)))``, not larger than h after a rejected step. A step after an accepted one is never
+shorter than a few units in the last place of t, and the last step ends at the end time exactly. This is the step size
+control of SciPy's RK45 (Hairer, Norsett and Wanner I, section II.4).
 
-The loop over steps, and the slopes, are each engine's own. Functions of one step take `xp`, the module whose arrays
-they are given: NumPy, or the namespace of a graph of scalars.
+Each engine has its own loop over steps and its own slopes. Functions of one step take `xp`, the module for their
+arrays: NumPy, or the namespace of a graph of scalars.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from switchfit.discretization.tableaus import ADAPTIVE
 from switchfit.problem.data import FloatArray
 
 Array = Any
-"""An array of NumPy, whose entries may be the nodes of a graph."""
+"""A NumPy array, whose entries may be nodes of a graph."""
 
 SAFETY, SMALLEST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
 
@@ -40,14 +40,14 @@ class Tolerances(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """Where an adaptive solve stands.
+    """State of an adaptive solve.
 
     Attributes
     ----------
     t : (), time reached
-    step : (), length of the next step
-    refused : whether the last step was refused
-    stuck : whether the next step would not change t, or is not a number: the solve has failed
+    step : (), size of the next step
+    refused : whether the last step was rejected
+    stuck : whether the next step would not change t, or is NaN: the solve has failed
     """
 
     t: Array
@@ -57,18 +57,18 @@ class Progress(NamedTuple):
 
 
 def error_norm(error: Array, y: Array, after: Array, tolerances: Tolerances, xp: Any = np) -> Array:
-    """Return the root mean square of an error (n,), relative to what the tolerances allow between y and `after`."""
+    """Return the root mean square of an error (n,), relative to the tolerances for a step from y to `after`."""
     relative = error / (tolerances.atol + tolerances.rtol * xp.maximum(xp.abs(y), xp.abs(after)))
     return xp.sqrt((relative * relative).sum() / len(y))
 
 
 def shortest_step(t: Array, xp: Any = np) -> Array:
-    """Return the shortest step that is tried at t: about ten units in the last place."""
+    """Return the shortest step to try at t: about ten units in the last place."""
     return xp.maximum(10.0 * EPS * xp.abs(t), 10.0 * SMALLEST)
 
 
 def limit_step(t: Array, step: Array, end: Array, xp: Any = np) -> Array:
-    """Return the length of a step that does not pass the end."""
+    """Return the step, shortened so that it does not pass the end."""
     return xp.where(end <= t + step, end - t, step)
 
 
@@ -81,19 +81,19 @@ def judge_step(
     slopes: Sequence[Array] | FloatArray,
     xp: Any = np,
 ) -> tuple[Progress, Array]:
-    """Accept or refuse a step, and choose the length of the next one.
+    """Accept or reject a step, and choose the size of the next one.
 
     Parameters
     ----------
-    y, after : (n,), before and behind the step
-    slopes : (s + 1, n), of the stages and behind the step
+    y, after : (n,), before and after the step
+    slopes : (s + 1, n), of the stages and after the step
     """
     norm = error_norm(at.step * combine(ADAPTIVE.error, slopes), y, after, tolerances, xp)
     accepted = norm < 1.0
     largest = xp.where(at.refused, 1.0, LARGEST_FACTOR)
     factor = xp.minimum(xp.maximum(SAFETY * xp.float_power(norm, EXPONENT), SMALLEST_FACTOR), largest)
-    step = at.step * xp.where(norm >= 0.0, factor, SMALLEST_FACTOR)  # a norm that is not a number compares as false
-    # A length that is not a number compares as false: it is stuck, not tried for ever.
+    step = at.step * xp.where(norm >= 0.0, factor, SMALLEST_FACTOR)  # comparisons with a NaN norm are false
+    # Comparisons with a NaN step size are false: the solve is stuck, instead of trying for ever.
     stuck = ~(accepted | (shortest_step(at.t, xp) <= step))
     t = xp.where(accepted, xp.where(end - at.t <= at.step, end, at.t + at.step), at.t)
     step = xp.where(accepted, xp.maximum(step, shortest_step(t, xp)), step)
@@ -109,7 +109,7 @@ def first_step(
     end: float,
     tolerances: Tolerances,
 ) -> float:
-    """Choose the length of the first step from the slope K (n,) at y (n,), and one more (Hairer et al. I, II.4).
+    """Choose the size of the first step from the slope K (n,) at y (n,), and one more slope (Hairer et al. I, II.4).
 
     NaN if a slope is not finite.
     """
@@ -121,7 +121,7 @@ def first_step(
         if not np.isfinite(K).all():
             return np.nan
         of_state, of_slope = size(y), size(K)
-        if not np.isfinite(of_slope):  # too large to be squared: the first step will fail, and say of what
+        if not np.isfinite(of_slope):  # its square overflows: the first step will fail, with a message
             return min(1e-6, end - t)
         guess = min(1e-6 if of_state < 1e-5 or of_slope < 1e-5 else 0.01 * of_state / of_slope, end - t)
         step = 0.0

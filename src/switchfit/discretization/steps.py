@@ -1,4 +1,4 @@
-"""The functions of a row for any method, explicit or implicit, and a whole step."""
+"""Functions of a row for explicit and implicit methods, and a whole step."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = jax.Array
 
 
 class RowFunctions(NamedTuple):
-    """How the stages of a method are found and differentiated: see `switchfit.discretization.rows`."""
+    """Functions that compute and differentiate the stages of a method: see `switchfit.discretization.rows`."""
 
     stages: Callable[..., rows.Stages]
     tangent: Callable[..., rows.Tangent]

@@ -1,4 +1,4 @@
-"""How the discretised system is computed: by machine code of our own (`native`) or by JAX (`jax`), and which of them.
+"""Evaluate the discretized system: in machine code (`native`) or by JAX (`jax`); `choice` decides which.
 
 Imports `runtime`, `problem` and `discretization`. `adaptive` solves with step size control and chooses the mesh.
 """

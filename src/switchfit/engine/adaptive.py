@@ -6,12 +6,15 @@ there anyway; the mesh then stays as it is while theta moves.
 
 Explicit solves run in machine code if there is any: a hundred steps cost less than a tenth of a millisecond there, ten
 milliseconds in Python. The control of the step size is the same (`switchfit.discretization.step_size`). Python solves
-what has no machine code, and says what is wrong where a solve fails. SciPy's Radau solves stiff modes.
+what has no machine code, and says what is wrong where a solve fails. SciPy's Radau solves stiff modes; where the
+problem leaves the choice, the explicit solve is watched (`switchfit.engine.stiffness`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple, TypeVar
@@ -22,7 +25,7 @@ import numpy as np
 import scipy.integrate
 
 from switchfit.discretization.arguments import Arguments, build_arguments
-from switchfit.discretization.mesh import Mesh
+from switchfit.discretization.mesh import Mesh, Stiffness
 from switchfit.discretization.model import Model, Piece
 from switchfit.discretization.rows import end_of_row, stage_state
 from switchfit.discretization.step_size import Progress, Tolerances, first_step, judge_step
@@ -30,6 +33,14 @@ from switchfit.discretization.tableaus import ADAPTIVE
 from switchfit.engine.native.adaptive import Adaptive
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order
+from switchfit.engine.stiffness import (
+    FEWER,
+    FEWER_AFTER_FAILURE,
+    STEPS_BETWEEN_AFTER_FAILURE,
+    TooManyStepsError,
+    Watch,
+    report_stiffness,
+)
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment, list_signals
 from switchfit.problem.functions import use_float64
@@ -74,12 +85,95 @@ def refine_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1.
     ValueError
         If a mode returns a value that is not finite, or the trajectory cannot be integrated to its end.
     """
-    nodes = list_fixed_nodes(problem.experiments[e])
-    coarse = Mesh.from_times(nodes)
-    steps = _Steps.from_solutions([_adaptive_steps(problem, e, theta, coarse) for theta in thetas])
+    coarse = Mesh.from_times(list_fixed_nodes(problem.experiments[e]))
+    return _build_mesh(coarse, *_solve_at(problem, e, thetas, coarse), finer)
+
+
+def refine_if_unstable(problem: Problem, e: int, mesh: Mesh, *thetas: FloatArray) -> Mesh | None:
+    """Return a mesh with implicit steps that meets the tolerances at each of the thetas, if those of `mesh` fail there.
+
+    That is asked where a fit on it has failed, at the last theta, where it ended. None if the steps of the mesh are
+    implicit, or explicit because the problem insists on them; if they are stable; or if implicit ones are no better.
+    """
+    if problem.solver != "auto" or mesh.stiffness is not None:
+        return None
+    coarse, watch = (
+        Mesh.from_times(list_fixed_nodes(problem.experiments[e])),
+        Watch(between=STEPS_BETWEEN_AFTER_FAILURE),
+    )
+    with suppress(NotIntegrableError):
+        _adaptive_steps(problem, problem.structures[e], e, thetas[-1], coarse, watch)
+    unstable = watch.find_unstable(mesh)
+    found = None
+    if unstable is not None:
+        found = _solve_implicitly(problem, e, thetas[::-1], coarse, unstable, watch, watch.total / FEWER_AFTER_FAILURE)
+    return None if found is None else _build_mesh(coarse, *found)
+
+
+def _build_mesh(coarse: Mesh, solutions: list[FloatArray], stiffness: Stiffness | None, finer: float = 1.0) -> Mesh:
+    """Return the mesh with the nodes of `coarse` and between them those that the steps of some solutions need."""
+    nodes, steps = coarse.times, _Steps.from_solutions(solutions)
     pieces = np.maximum(np.ceil(finer * np.diff(steps.up_to(nodes)) - 0.05).astype(int), 1)
     inside = [_grade_nodes(nodes[k : k + 2], steps, int(pieces[k])) for k in np.flatnonzero(pieces > 1)]
-    return Mesh.from_times(np.concatenate([nodes, *inside]))
+    return Mesh.from_times(np.concatenate([nodes, *inside]), stiffness)
+
+
+def _solve_at(
+    problem: Problem, e: int, thetas: Sequence[FloatArray], coarse: Mesh
+) -> tuple[list[FloatArray], Stiffness | None]:
+    """Return the accepted times of an adaptive solve at each theta, by the method that the problem asks for.
+
+    Where it leaves the choice and explicit steps are hopeless at one of the thetas, all are solved by implicit steps;
+    with the reason.
+    """
+    structure = problem.structures[e]
+    if problem.solver != "auto":
+        return [_adaptive_steps(problem, structure, e, theta, coarse) for theta in thetas], None
+    solutions = []
+    for theta in thetas:
+        watch, failure = Watch(), None
+        try:
+            solutions.append(_adaptive_steps(problem, structure, e, theta, coarse, watch))
+        except NotIntegrableError as error:
+            failure = error
+        stiffest = watch.stiffest
+        if stiffest is not None:
+            first = [theta, *(other for other in thetas if other is not theta)]
+            found = _solve_implicitly(problem, e, first, coarse, stiffest, watch, watch.total / FEWER)
+            if found is not None:
+                return found
+        if failure is not None:
+            raise failure
+    return solutions, None
+
+
+def _solve_implicitly(
+    problem: Problem,
+    e: int,
+    thetas: Sequence[FloatArray],
+    coarse: Mesh,
+    stiff: tuple[str, float],
+    explicit: Watch,
+    most: float,
+) -> tuple[list[FloatArray], Stiffness] | None:
+    """Return what `_solve_at` does, by implicit steps; None if they fail, or are more than `most` at the first theta.
+
+    Parameters
+    ----------
+    stiff : (str, float)
+        The mode that is stiff at the first theta, and ``|lambda| h`` of its explicit steps.
+    explicit : Watch
+        Of the explicit solve there.
+    """
+    structure, watch = replace(problem.structures[e], solver="stiff"), Watch(most)
+    try:
+        solutions = [
+            _adaptive_steps(problem, structure, e, theta, coarse, None if k else watch)
+            for k, theta in enumerate(thetas)
+        ]
+    except (NotIntegrableError, TooManyStepsError):
+        return None
+    return solutions, report_stiffness(stiff, explicit, watch)
 
 
 class _Steps(NamedTuple):
@@ -114,9 +208,14 @@ def _grade_nodes(ends: FloatArray, steps: _Steps, pieces: int) -> FloatArray:
     return np.interp(np.linspace(0.0, 1.0, pieces + 1)[1:-1], density, times)
 
 
-def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -> FloatArray:
-    """Return the accepted times of the adaptive solver from t0 to tf, strictly increasing."""
-    experiment, structure = problem.experiments[e], problem.structures[e]
+def _adaptive_steps(
+    problem: Problem, structure: Structure, e: int, theta: FloatArray, coarse: Mesh, watch: Watch | None = None
+) -> FloatArray:
+    """Return the accepted times of the adaptive solver from t0 to tf, strictly increasing.
+
+    The structure says by which method; a watch counts the steps.
+    """
+    experiment = problem.experiments[e]
     whole = build_arguments(problem, e, coarse)
     arguments, signals = whole.without_mesh(), np.asarray(whole.signals)
     tau, p = problem.vectors(theta, e)
@@ -147,10 +246,14 @@ def _adaptive_steps(problem: Problem, e: int, theta: FloatArray, coarse: Mesh) -
         stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
         for start, end in pairwise(stops.tolist()):
             if end > start:
-                found = None if native is None else _solve_natively(problem, native, mode, start, end, x, p)
+                found = None
+                if native is not None:
+                    found = _solve_natively(problem, native, mode, start, end, x, p, unit, watch)
                 if found is None:
                     found = _call_jax(
-                        _solve, problem, structure, arguments, signals, coarse, mode, start, end, x, p, unit
+                        _solve,
+                        *(problem, structure, arguments, signals, coarse, mode, start, end, x, p, unit),
+                        watch if native is None else None,  # machine code has counted its steps
                     )
                 accepted, x = found
                 steps.append(accepted)
@@ -175,10 +278,14 @@ def _solve(
     x: FloatArray,
     p: FloatArray,
     unit: str = "",
+    watch: Watch | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Solve one mode adaptively; return the accepted times after `start` and the final state."""
-    name = structure.mode_names[mode]
-    function = partial(_field_and_density, structure=structure.functions, mode=mode)
+    name, explicit = structure.mode_names[mode], structure.solver == "explicit"
+    fields = (
+        structure.functions if explicit else replace(structure.functions, solver="explicit")
+    )  # one program for both
+    function = partial(_field_and_density, structure=fields, mode=mode)
     last = len(coarse.times) - 2
 
     def right_hand_side(t: float, y: FloatArray) -> FloatArray:
@@ -197,7 +304,7 @@ def _solve(
             )
         return value
 
-    method = ExplicitSolver if problem.solver == "explicit" else scipy.integrate.Radau
+    method = ExplicitSolver if explicit else scipy.integrate.Radau
     with np.errstate(all="ignore"):  # a slope of 1e300 is refused in words
         solver = method(right_hand_side, start, np.append(x, 0.0), end, rtol=problem.rtol, atol=problem.atol)
     accepted = [start]
@@ -206,15 +313,49 @@ def _solve(
             over="ignore", invalid="ignore", divide="ignore"
         ):  # a state that overflows is refused in words
             message = solver.step()
-        if solver.status == "failed" or _has_too_many_steps(accepted, end):
-            remedy = "use solver='stiff', or a better guess" if problem.solver == "explicit" else "use a better guess"
-            reason = message or f"it needs more than {MAX_STEPS} steps"
-            raise NotIntegrableError(
-                f"mode {name!r} cannot be integrated at the guess beyond t = {solver.t:.6g}{unit}, where x = "
-                f"{solver.y[:-1].tolist()} ({reason}): {remedy}."
-            )
+        if solver.status == "failed":
+            raise _stuck(problem, name, solver.t, solver.y, message, unit, explicit)
+        if _has_too_many_steps(accepted, end):
+            raise _too_slow(problem, name, accepted, solver.y, end, unit, watch, explicit)
         accepted.append(float(solver.t))
+        if watch is not None and watch.add(name, 1) and explicit:
+            later = partial(_call_jax, right_hand_side)
+            watch.look(name, accepted[-1] - accepted[-2], later, accepted[-1], solver.y, _scale_of(problem))
     return np.array(accepted[1:]), np.asarray(solver.y[:-1])
+
+
+def _scale_of(problem: Problem) -> float:
+    """Return the size of a state at which the absolute and the relative tolerance count the same."""
+    return problem.atol / problem.rtol
+
+
+def _stuck(
+    problem: Problem, name: str, t: float, y: FloatArray, reason: str | None, unit: str, explicit: bool
+) -> NotIntegrableError:
+    """Return the error of a solve that cannot go on in a mode."""
+    remedy = "use solver='stiff', or a better guess" if explicit else "use a better guess"
+    if problem.solver == "auto":
+        remedy = "use a better guess, or solver='stiff' if the mode is stiff"
+    return NotIntegrableError(
+        f"mode {name!r} cannot be integrated at the guess beyond t = {t:.6g}{unit}, where x = "
+        f"{y[:-1].tolist()} ({reason}): {remedy}."
+    )
+
+
+def _too_slow(
+    problem: Problem,
+    name: str,
+    accepted: Sequence[float] | FloatArray,
+    y: FloatArray,
+    end: float,
+    unit: str,
+    watch: Watch | None,
+    explicit: bool,
+) -> NotIntegrableError:
+    """Return the error of a solve that needs too many steps, and note it in the watch."""
+    if watch is not None:
+        watch.give_up(name, _project_steps(accepted, end))
+    return _stuck(problem, name, accepted[-1], y, f"it needs more than {MAX_STEPS} steps", unit, explicit)
 
 
 class ExplicitSolver(scipy.integrate.OdeSolver):
@@ -260,7 +401,15 @@ STEPS_AT_ONCE = 256
 
 
 def _solve_natively(
-    problem: Problem, native: NativeExperiment, mode: int, start: float, end: float, x: FloatArray, p: FloatArray
+    problem: Problem,
+    native: NativeExperiment,
+    mode: int,
+    start: float,
+    end: float,
+    x: FloatArray,
+    p: FloatArray,
+    unit: str = "",
+    watch: Watch | None = None,
 ) -> tuple[FloatArray, FloatArray] | None:
     """Do what `_solve` does for explicit steps, in machine code; None if it fails: `_solve` then says why."""
     y, at = np.append(x, 0.0), Adaptive()
@@ -272,17 +421,28 @@ def _solve_natively(
         return native.slope(mode, t, y, p)
 
     state[at.step] = first_step(slope, start, y, slope(start, y), end, Tolerances(problem.rtol, problem.atol))
-    accepted = np.array([start])
-    while state[at.t] < end and not state[at.stuck] and not _has_too_many_steps(accepted, end):
-        accepted = np.append(accepted, native.adaptive_steps(mode, state, y, p, STEPS_AT_ONCE))
+    accepted, name = np.array([start]), native.structure.mode_names[mode]
+    while state[at.t] < end and not state[at.stuck]:
+        if _has_too_many_steps(accepted, end):
+            if watch is None or not np.isfinite(y).all():
+                return None
+            raise _too_slow(problem, name, accepted, y, end, unit, watch, explicit=True)
+        at_once = STEPS_AT_ONCE if watch is None else min(STEPS_AT_ONCE, watch.between)
+        more = native.adaptive_steps(mode, state, y, p, at_once)
+        accepted = np.append(accepted, more)
+        if watch is not None and watch.add(name, len(more)) and len(more):
+            watch.look(name, accepted[-1] - accepted[-2], slope, accepted[-1], y, _scale_of(problem))
     return None if state[at.t] < end or not np.isfinite(y).all() else (accepted[1:], y[:-1])
 
 
 def _has_too_many_steps(accepted: Sequence[float] | FloatArray, end: float) -> bool:
     """Return whether more than `MAX_STEPS` have been taken, or will be at the pace of the last `PACE` steps."""
-    if len(accepted) < 5 * PACE:
-        return False
-    return len(accepted) + PACE * (end - accepted[-1]) / (accepted[-1] - accepted[-PACE - 1]) > MAX_STEPS
+    return len(accepted) >= 5 * PACE and _project_steps(accepted, end) > MAX_STEPS
+
+
+def _project_steps(accepted: Sequence[float] | FloatArray, end: float) -> float:
+    """Return how many steps a solve takes to the end at the pace of the last `PACE` steps."""
+    return len(accepted) + PACE * (end - accepted[-1]) / (accepted[-1] - accepted[-PACE - 1])
 
 
 def _not_finite(what: str, state: FloatArray) -> NotIntegrableError:

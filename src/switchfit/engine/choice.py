@@ -1,4 +1,4 @@
-"""Which engine evaluates an experiment: machine code wherever it can, else JAX, and why."""
+"""Choose the engine that evaluates an experiment: machine code if possible, else JAX, with the reason."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from switchfit.discretization.arguments import Arguments
-from switchfit.discretization.mesh import Mesh
+from switchfit.discretization.mesh import Mesh, get_structure_on
 from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.jax.programs import derivatives
 from switchfit.engine.native.engine import NativeEngine
@@ -19,34 +19,38 @@ from switchfit.problem.structure import Structure
 
 
 def engine_of(problem: Problem, e: int, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
-    """Return what evaluates experiment e of a problem on a mesh, as `Problem.engine` asks.
+    """Return the engine of experiment e of a problem on a mesh, chosen by `Problem.engine`.
 
     Raises
     ------
     ValueError
-        If machine code is insisted on, and there is none: with the reason.
+        If ``engine="native"`` and the experiment cannot be compiled; the message gives the reason.
     """
-    structure = problem.structures[e]
+    structure = get_structure_on(problem, e, mesh)
     by_jax = JaxEngine(structure, arguments, mesh)
     if problem.engine == "jax":
+        if mesh.stiffness is not None:
+            by_jax.reason += f"; {mesh.stiffness}"
         return by_jax
-    return _native_or(by_jax, structure, arguments, mesh, insist=problem.engine == "native")
+    return _choose_native(by_jax, structure, arguments, mesh, insist=problem.engine == "native")
 
 
-def _native_or(
+def _choose_native(
     by_jax: JaxEngine, structure: Structure, arguments: Arguments, mesh: Mesh, *, insist: bool
 ) -> ExperimentEngine:
     reason = reason_for_jax(structure, arguments, Order.HESSIAN)
     if reason is None:
         return NativeEngine(structure, arguments, mesh, by_jax)
+    if mesh.stiffness is not None:
+        reason = f"{mesh.stiffness}, which has no machine code"
     if insist:
-        raise ValueError(f"engine='native' asks for machine code, but {reason}. Leave engine out to have JAX do it.")
+        raise ValueError(f"engine='native' requires machine code, but {reason}. Leave engine out to evaluate with JAX.")
     by_jax.reason = reason
     return by_jax
 
 
 def summarize(engines: Sequence[ExperimentEngine], names: Sequence[str]) -> Engine:
-    """Return one record for several experiments: "jax" if any is evaluated by JAX, with a reason that says which."""
+    """Return one record for several experiments: "jax" if any is evaluated by JAX; the reason names these."""
     records = [each.engine for each in engines]
     by_jax = [(name, record) for name, record in zip(names, records, strict=True) if record.name == "jax"]
     if not by_jax or len(by_jax) == len(records):
@@ -56,7 +60,7 @@ def summarize(engines: Sequence[ExperimentEngine], names: Sequence[str]) -> Engi
 
 
 def runs_natively(structures: Sequence[Structure], arguments: Sequence[Arguments]) -> bool:
-    """Return whether machine code evaluates all experiments inside a program of JAX."""
+    """Return whether machine code can evaluate all experiments inside a JAX program."""
     given = zip(structures, arguments, strict=True)
     return all(can_be_foreign(s) and reason_for_jax(s, a, Order.HESSIAN) is None for s, a in given)
 
@@ -71,14 +75,14 @@ def derivatives_inside_program(
     natively: bool,
     places: Mapping[str, Any] | None = None,
 ) -> Any:
-    """Return cost, gradient (D,) and Hessian (D, D) of one experiment inside a program of JAX.
+    """Return cost, gradient (D,) and Hessian (D, D) of one experiment inside a JAX program.
 
-    By machine code, which runs on a CPU, where `runs_natively` says so; else by JAX. `side` is +1 or -1: the right or
-    left derivatives by a transition time that sits on a node. `places` are for machine code alone: given what
-    `places_in_library` returns, the structure may be a library, and one program serves all its sequences.
+    `natively` selects machine code, on a CPU and if `runs_natively`; else JAX computes them. `side` is +1 or -1: the
+    right or left derivative in a transition time that lies on a node. `places` are for machine code only: with the
+    result of `places_in_library`, the structure may be a library, and one program serves all its sequences.
     """
     if natively:
         return foreign_derivatives(structure, arguments, tau, p, side, places)
     if places is not None:
-        raise ValueError("JAX's programs are written for one sequence: give its structure, and no places.")
+        raise ValueError("JAX programs are written for one sequence: pass its structure, and no places.")
     return derivatives(arguments, tau, p, side, structure=structure, method="discrete-adjoint")

@@ -1,4 +1,4 @@
-"""What an engine answers for one experiment on one mesh. Nobody outside this room asks which one it is."""
+"""Interface of an engine for one experiment on one mesh. Code outside `engine` does not depend on which one it is."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 
 Matrix = Literal["exact", "gauss-newton", "none"]
-"""What to return for the Hessian: itself, the Gauss-Newton matrix, or nothing."""
+"""What to return as the Hessian: the exact one, the Gauss-Newton matrix, or NaN."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class Engine:
     name : str
         "native" for machine code, or "jax".
     reason : str or None
-        Why JAX does it: what in the problem has no machine code. A reason that begins with "internal: " is a defect of
-        switchfit, not of the model. None for machine code.
+        Why JAX evaluates: the part of the problem that has no machine code. A reason that begins with "internal: " is
+        a defect of switchfit, not of the model. None for machine code.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Engine:
 
 
 class Derivatives(NamedTuple):
-    """J, its gradient (D,) and its Hessian (D, D), which is NaN where it was not asked for."""
+    """J, its gradient (D,) and its Hessian (D, D), which is NaN if it was not requested."""
 
     cost: float
     gradient: FloatArray
@@ -69,26 +69,27 @@ class Constrained(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """One experiment row by row, R = cells + N rows in the order of time; where tf is free, those up to tf.
+    """One experiment row by row, R = cells + N rows in the order of time; up to tf where it is free.
 
     Attributes
     ----------
     cost : float
         J.
     nodes : (G + 1,)
-        Of the mesh.
+        Nodes of the mesh.
     first_cell : (N + 1,) int
         The cell in which each segment begins; (N,) where tf is free.
     start, end : (R,)
+        Times of each row.
     before, after : (R, n)
         States at the start and at the end of each row.
     y_before, y_after : (R, q)
-        What the reference signals and the Measurements see there, in this order.
-    seen : tuple of (K, q), one a Measurements
-        What each sees at its samples, late ones included.
-    tangents : Simulation or None
-        Where asked for, the derivatives of `before`, `after`, `y_before` and `y_after` in the experiment's unknowns, at
-        fixed times: with D entries more in the last axis.
+        Outputs of the reference signals and the Measurements there, in this order.
+    seen : tuple of (K, q), one per Measurements
+        Its outputs at its samples, late ones included.
+    tangents : Tangents or None
+        If requested, the derivatives of `before`, `after`, `y_before` and `y_after` in the experiment's unknowns at
+        fixed times, along an additional last axis of length D.
     """
 
     cost: float
@@ -111,7 +112,7 @@ class Simulation:
         return [slice(a, b) for a, b in zip(first.tolist(), ends, strict=True)]
 
     def row_ending(self, cells: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Return the last row in each of the cells (K,), which is before a jump there; -1 for cell -1."""
+        """Return the last row that ends in each of the cells (K,), before any jump at its end; -1 for cell -1."""
         segment = (cells[:, None] >= self.first_cell[None, 1:]).sum(1)
         return np.where(cells < 0, -1, cells + segment)
 
@@ -128,7 +129,7 @@ class Tangents(NamedTuple):
 def add_samples(
     simulation: Simulation, structure: Structure, arguments: Arguments, late: Mapping[int, FloatArray]
 ) -> Simulation:
-    """Return the simulation with what each of the Measurements sees at its samples.
+    """Return the simulation with the outputs of each of the Measurements at its samples.
 
     Parameters
     ----------
@@ -136,7 +137,7 @@ def add_samples(
     structure : Structure
     arguments : Arguments
     late : mapping
-        What all sensors see, (L, q), at the samples of each of the Measurements that is late, by its place.
+        Outputs of all sensors, (L, q), at the samples of each late Measurements, by its index.
     """
     seen, first = [], sum(q for _, q in structure.references)
     for k, (samples, sensor) in enumerate(zip(arguments.samples, structure.measurements, strict=True)):
@@ -151,7 +152,7 @@ def add_samples(
 
 
 def cut_at_tf(simulation: Simulation, structure: Structure) -> Simulation:
-    """Return the simulation without the rest after a free tf; the simulation itself where tf is fixed."""
+    """Return the simulation without the rows after a free tf; the simulation itself if tf is fixed."""
     if not structure.has_free_tf:
         return simulation
     rows = slice(0, simulation.segments[-1].start)
@@ -182,7 +183,7 @@ class ExperimentEngine(Protocol):
         ...
 
     def derivatives(self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix) -> Derivatives:
-        """Return J and its derivatives; if a transition is at a node, those to its `side`, +1 or -1."""
+        """Return J and its derivatives; if a transition is at a node, those on its `side`, +1 or -1."""
         ...
 
     def constrained(

@@ -1,4 +1,4 @@
-"""`estimate` and the `Estimate` that it returns, with everything that can be asked of it.
+"""`estimate`, and the `Estimate` that it returns, with its methods for uncertainty, prediction, plots and files.
 
 Imports `uncertainty` and the rooms before it.
 """

@@ -1,4 +1,4 @@
-"""estimate(): a problem in, an `Estimate` out. Puts mesh, derivatives and optimiser together."""
+"""Fit a problem once, and the `Estimate` that results: combines mesh, derivatives and optimizer."""
 
 from __future__ import annotations
 
@@ -12,20 +12,17 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.engine.adaptive import refine_mesh
+from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
 from switchfit.estimation.saved import load_fit, save_fit
 from switchfit.fit.accuracy import worst_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.guards import place_on_near_guards
 from switchfit.fit.hidden import refuse_jumps
 from switchfit.fit.result import CovarianceKind, Fit
 from switchfit.fit.solution import (
-    constraints_of,
     is_least_squares,
     is_plain_least_squares,
     is_sigma_known,
     minimize_cost,
-    minimize_with_constraints,
 )
 from switchfit.fit.termination import termination_of
 from switchfit.fit.trajectory import SimulatedProblem
@@ -55,29 +52,29 @@ from switchfit.uncertainty.verdict import Verdict, judge
 HESSIANS = get_args(HessianKind)
 
 REFINEMENTS = 2
-"""Times the mesh may be refined at the solution and the fit resumed, if the integration error asks for it."""
+"""Largest number of times that the mesh is refined at the solution, and the fit resumed, for the integration error."""
 
 LARGEST_INTEGRATION_ERROR = 1e-8
 """Relative error of J, a guard or a terminal constraint (by halving all steps, see `switchfit.fit.accuracy`) above
 which the mesh is refined again, unless rtol allows more."""
 
 STOPPED = (Status.INTERRUPTED, Status.NONFINITE_START, Status.MAX_ITERATIONS)
-"""Ends after which a fit is not resumed on a finer mesh."""
+"""Statuses after which a fit is not resumed on a finer mesh."""
 
 MOST_SENSITIVITIES = 2**28
-"""Bytes that the derivatives of states and outputs at all nodes may take; beyond, figures have no bands."""
+"""Largest size, in bytes, of the derivatives of states and outputs at all nodes; above it, figures have no bands."""
 
 ORDER = 5
-"""Order of both integrators: what dividing the steps gains."""
+"""Order of both integrators, and of the decrease of their error as steps are divided."""
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate(Fit):
-    """Result of `estimate`: everything in `Fit`, and what can be done with it. Print it for the report.
+    """Result of `estimate`: everything in `Fit`, with methods that need the model. Print it for the report.
 
     See Also
     --------
-    estimate : makes it.
+    estimate : returns it.
     Fits : many fits at once.
 
     Examples
@@ -101,7 +98,7 @@ class Estimate(Fit):
     evaluator: Evaluator | None = None
 
     def simulate_later(self, simulation: SimulatedProblem) -> None:
-        """Take `trajectories` and `comparisons` from a simulation when they are asked for; many fits are not.
+        """Compute `trajectories` and `comparisons` from a simulation at the first access; many fits never need them.
 
         See Also
         --------
@@ -125,7 +122,7 @@ class Estimate(Fit):
         self.__dict__["_simulation"] = simulation
 
     def __getattr__(self, name: str) -> Any:
-        """`trajectories` and `comparisons` at the first access: all other attributes are there."""
+        """Compute `trajectories` or `comparisons` at the first access."""
         simulation = self.__dict__.get("_simulation")
         if simulation is None or name not in ("trajectories", "comparisons"):
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
@@ -136,9 +133,9 @@ class Estimate(Fit):
 
     @cached_property
     def certificate(self) -> Certificate:
-        """How the numbers were checked. The paper's equations are evaluated here, at the first access.
+        """Checks of the numbers. The paper's equations are evaluated for it, at the first access.
 
-        An estimate that was loaded has no model: its certificate is the one that was saved.
+        An estimate that was loaded without its model has the certificate that was saved.
         """
         if self.saved_certificate is not None:
             return self.saved_certificate
@@ -148,7 +145,7 @@ class Estimate(Fit):
     def verdict(self) -> Verdict:
         """Whether to believe the numbers: good, doubtful or bad, why, and what to do next. Print it for one line.
 
-        The derivatives count where the certificate has been asked for, or was loaded.
+        It includes the check of derivatives if the certificate was accessed before, or loaded.
         """
         known = self.known_certificate
         held = self.__dict__.get("_verdict")
@@ -163,11 +160,11 @@ class Estimate(Fit):
 
     @property
     def corrected_standard_errors(self) -> FloatArray:
-        """Standard errors that allow for correlated residuals: (d,); `standard_errors` where there are none.
+        """Standard errors that allow for correlated residuals: (d,); `standard_errors` without such residuals.
 
-        These times sqrt((1 + r) / (1 - r)), r being the correlation of neighbouring residuals, and where sigma is known
-        times the residuals' root mean square in sigmas. Of a transition time by the channels of its own run, of any
-        other unknown by all; the largest factor counts.
+        They are the standard errors times sqrt((1 + r) / (1 - r)), where r is the correlation of neighboring residuals,
+        and if sigma is known times the root mean square of the residuals in sigmas. The largest factor of all channels
+        counts; for a transition time, that of the channels of its own run.
         """
         return correct_errors(self)
 
@@ -198,12 +195,12 @@ class Estimate(Fit):
 
     @property
     def known_certificate(self) -> Certificate | None:
-        """The certificate, if it was loaded or asked for before; None if it would have to be computed."""
+        """The certificate, if it was loaded or computed before; else None."""
         return self.saved_certificate or self.__dict__.get("certificate")
 
     @cached_property
     def gauss_newton(self) -> FloatArray | None:
-        """The Gauss-Newton matrix ``sum (D h / sigma)' (D h / sigma)``: (d, d); None where it is not known."""
+        """The Gauss-Newton matrix ``sum (D h / sigma)' (D h / sigma)``: (d, d); None if it is unknown."""
         if self.saved_gauss_newton is not None or self.sigma_known is None or self.problem is None:
             return self.saved_gauss_newton
         if is_plain_least_squares(self.problem) and self.has_room_for_sensitivities():
@@ -235,7 +232,7 @@ class Estimate(Fit):
 
     @cached_property
     def sensitivities(self) -> tuple[Sensitivity, ...]:
-        """States and outputs with their derivatives in theta, one an experiment, on the meshes of the fit."""
+        """States and outputs with their derivatives in theta, one per experiment, on the meshes of the fit."""
         evaluator = self.evaluator_at_solution()
         meshes = enumerate(evaluator.meshes)
         return tuple(compute_sensitivity(evaluator.problem, e, self.theta, mesh) for e, mesh in meshes)
@@ -271,20 +268,20 @@ class Estimate(Fit):
     def confidence_intervals(self, level: float = 0.95, *, hessian: CovarianceKind = "exact") -> FloatArray:
         """Return intervals of all unknowns, cut off at the bounds: (d, 2).
 
-        ``theta +- quantile x standard error``; of unknowns on a logarithmic scale theta times or by exp(quantile x
-        relative standard error). Of a transition time that is at a kink, or with sample times inside that interval,
-        where 2 (J − J_min) of a piecewise quadratic profile stays below the squared quantile: slope and curvature of
-        the cost jump at every sample time, and the interval is not symmetric then. An estimate that was loaded without
-        its model, one of more than 15 experiments or with guards or terminal constraints knows ``theta +- quantile x
-        standard error`` only, and so do many fits at once (`Fits`).
+        The interval is ``theta +- quantile x standard error``. For unknowns on a logarithmic scale, theta is multiplied
+        and divided by exp(quantile x relative standard error). For a transition time at a kink, or with sample times
+        inside that interval, it is the range in which 2 (J − J_min) of a piecewise quadratic profile stays below the
+        squared quantile: slope and curvature of the cost jump at every sample time, so that this interval is not
+        symmetric. An estimate that was loaded without its model, that has more than 15 experiments, guards or terminal
+        constraints, or that is one of many fits at once (`Fits`), has ``theta +- quantile x standard error`` only.
         NaN for an unknown that is held by a bound, a collapsed mode or, without its model, a kink.
 
         Parameters
         ----------
         level : float, between 0 and 1
-            The quantile is of Student's t where sigma is unknown, of the normal distribution where it is known.
+            The quantile is that of Student's t if sigma is unknown, of the normal distribution if it is known.
         hessian : {"exact", "gauss-newton"}
-            As of `covariance_from`. With "gauss-newton" kinks are not looked at.
+            As in `covariance_from`. With "gauss-newton", kinks are ignored.
 
         See Also
         --------
@@ -341,10 +338,10 @@ class Estimate(Fit):
         Parameters
         ----------
         bands : bool
-            Confidence and prediction bands of what is fitted, where there is a model and a covariance; the first ones
-            of a model are compiled for a second.
+            Whether to draw confidence and prediction bands of the fitted values, which need the model and a covariance.
+            The first ones of a model take a second to compile.
         level : float, between 0 and 1
-            Of the bands.
+            Level of the bands.
 
         See Also
         --------
@@ -477,7 +474,7 @@ class Estimate(Fit):
         write_atomically(format_page(self, problem_file=given), file)
 
     def complete(self) -> Estimate:
-        """Return the same with everything that is saved, which is the Gauss-Newton matrix.
+        """Return the estimate with all fields that are saved: computes the Gauss-Newton matrix.
 
         See Also
         --------
@@ -502,7 +499,7 @@ class Estimate(Fit):
         ----------
         path : path
         problem : Problem, optional
-            The problem that was fitted, where profiles or predictions are wanted: a file does not hold the model.
+            The problem that was fitted, needed for profiles and predictions: a file does not contain the model.
 
         Raises
         ------
@@ -558,9 +555,10 @@ def fit_locally(
     start: ArrayLike | None = None,
     first_cost: float = 0.0,
 ) -> Estimate:
-    """Fit a problem once from one start: what `estimate` does with ``strategy="local"``, with the same arguments.
+    """Fit a problem once from one start, as `estimate` does with ``strategy="local"``, with the same arguments.
 
-    `first_cost` is J where a search began that this fit ends: the integration error is measured by J where it is large.
+    `first_cost` is J at the start of a search that ends with this fit: a large one is the scale of the integration
+    error.
 
     Raises
     ------
@@ -592,11 +590,15 @@ def fit_locally(
         scale = max(first_cost, history[0].cost if history else 0.0)
         fine, simulation, error, output = _judge_meshes(evaluator, result, scale, values, first=not attempt)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
-        if result.status in STOPPED or attempt == REFINEMENTS or not excess > 1:
+        if attempt == REFINEMENTS or result.status is Status.INTERRUPTED:
             break
-        evaluator = _refine(fine, problem.check_theta(start), theta, excess)
+        failed = not result.status.successful or excess > 2**ORDER
+        stable = _stabilize(evaluator, problem.check_theta(start), theta) if failed else None
+        if stable is None and (result.status in STOPPED or not excess > 1):
+            break
+        evaluator = stable or _refine(fine, problem.check_theta(start), theta, excess)
     if excess > 1 and result.status.successful and not problem.constraint_names:
-        refuse_jumps(evaluator, theta)  # the error of steps across a jump does not vanish with their length
+        refuse_jumps(evaluator, theta)  # the error of steps across a jump does not vanish with their size
     found = _estimate(
         problem,
         evaluator,
@@ -611,23 +613,21 @@ def fit_locally(
         integration_error_of=output,
         seconds=time.perf_counter() - began,
         constraints=held,
+        initial_cost=history[0].cost if history else np.nan,
     )
     found.simulate_later(simulation)
     return found
 
 
 def check_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:
-    """Return the two settings of every fit, checked."""
+    """Check and return the two settings that every fit has."""
     return as_positive(tolerance, "tolerance"), as_count(max_iterations, "max_iterations")
 
 
 def _prepare_start(problem: Problem, start: ArrayLike | None) -> tuple[FloatArray, Evaluator]:
-    """Return where a fit begins (d,), guarded transitions on their guards if that is near, and the meshes for it."""
+    """Return the start of a fit (d,) and its meshes."""
     theta = problem.check_theta(start, "start")
     evaluator = evaluator_of(problem) if start is None else Evaluator(problem, theta)
-    placed = place_on_near_guards(evaluator, theta)
-    if not np.array_equal(placed, theta):
-        theta, evaluator = placed, Evaluator(problem, placed)
     return theta, evaluator
 
 
@@ -644,22 +644,19 @@ def _minimize(
     callback: Callable[[IterationRecord], object] | None,
     last: IterationRecord | None,
 ) -> tuple[Result, Held]:
-    """Minimize the cost on the meshes of an evaluator; the callback's records count on from `last`."""
+    """Minimize the cost on the meshes of an evaluator; the callback's records continue the count of `last`."""
     report = None if callback is None else lambda record: callback(record.continue_from(last))
-    problem = evaluator.problem
-    if problem.constraint_names:
-        return minimize_with_constraints(evaluator, theta, tolerance, max_iterations, report)
-    constraints = constraints_of(problem)
-    return minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, report, constraints), ()
+    result = minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, report)
+    return result, result.equalities
 
 
 def _judge_meshes(
     evaluator: Evaluator, result: Result, first_cost: float, constraints: list[float], *, first: bool
 ) -> tuple[Evaluator, SimulatedProblem, float, str]:
-    """Return the problem with its steps halved, its simulation there, and the largest integration error and of what.
+    """Return the problem with its steps halved, its simulation there, and the largest integration error and its output.
 
-    The first meshes are mostly too coarse, as the evaluator with halved cells tells as well, which is kept for the next
-    fit of the same problem.
+    The first meshes are mostly too coarse. Halved cells show this as well as halved rows do, and their evaluator is
+    cached for the next fit of the same problem: they are tried first.
     """
     for halve in (lambda: evaluator.halved, lambda: evaluator.halve_rows(result.theta))[not first :]:
         fine = halve()
@@ -670,11 +667,23 @@ def _judge_meshes(
     return fine, simulation, error, output
 
 
+def _stabilize(evaluator: Evaluator, start: FloatArray, theta: FloatArray) -> Evaluator | None:
+    """Return the problem with implicit steps where the explicit ones are unstable near theta; None if they are not.
+
+    A fit cannot go beyond a theta at which the steps of its mesh become unstable: J is not finite there.
+    """
+    problem = evaluator.problem
+    found = [refine_if_unstable(problem, e, mesh, start, theta) for e, mesh in enumerate(evaluator.meshes)]
+    if not any(found):
+        return None
+    return Evaluator(problem, meshes=[new or mesh for new, mesh in zip(found, evaluator.meshes, strict=True)])
+
+
 def _refine(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:
-    """Return the problem on finer meshes: cells cut in two, or, where that is not enough, refined at the start and at
+    """Return the problem on finer meshes: cells cut in two, or, if that is not enough, refined at the start and at
     theta.
 
-    A mode that has come to be active in another part of the horizon may find cells there that are far too long for it.
+    A mode that has become active in another part of the horizon may meet cells there that are far too long for it.
     """
     problem = fine.problem
     if excess <= 2**ORDER:
@@ -690,7 +699,7 @@ def _estimate(
     hessian: HessianKind,
     **rest: Any,
 ) -> Estimate:
-    """Collect what the optimiser found into an Estimate, with the exact Hessian whatever it worked with."""
+    """Build an Estimate from the optimizer's result, with the exact Hessian even if the optimizer used another one."""
     unknowns = problem.unknowns
     times, parameters = problem.split(result.theta)
     exact = result.hessian

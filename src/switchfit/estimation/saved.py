@@ -1,8 +1,8 @@
-"""Fits as JSON files that can be read without switchfit, and back again without losing a bit.
+"""Save fits as JSON files that can be read without switchfit, and load them without losing a bit.
 
 A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 5, "fit": {...}, "certificate": {...}}`` with
-the fields of `Verdict`, `Fit` and `Certificate` under their own names. The verdict, with its line of text, is there for
-readers of the file; where it is loaded it is judged again from the rest:
+the fields of `Verdict`, `Fit` and `Certificate` under their own names. The verdict, with its line of text, is meant for
+readers of the file; `load` computes it again from the rest.
 
 - numbers are written with as many digits as it takes to read the same float64; JSON has no NaN and no infinities, so
   they are the strings ``"NaN"``, ``"Infinity"`` and ``"-Infinity"``;
@@ -10,9 +10,9 @@ readers of the file; where it is loaded it is judged again from the rest:
   ``{"dtype": ..., "shape": ..., "values": [...]}``;
 - a status is its name; constraints, kinks and issues are objects with their fields.
 
-What is read is checked by pydantic against the types that the fields of the dataclasses declare, and then all sizes and
-names against one another (`_check_fit`): what was loaded can be printed and plotted, and has intervals. Files of
-versions 2 and 3, which held sentences in place of data, and of version 4 are brought to version 5 before that
+When a file is read, pydantic checks it against the types of the dataclasses' fields. Then all sizes and names are
+checked against one another (`_check_fit`), so that a loaded fit can be printed and plotted, and has intervals. Files of
+versions 2 and 3, which hold sentences in place of data, and of version 4 are upgraded to version 5 before that
 (`_upgrade`).
 """
 
@@ -62,7 +62,7 @@ def save_fit(fit: Fit, certificate: Certificate, path: Path) -> None:
     Parameters
     ----------
     fit : Fit
-        Of a subclass only what belongs to `Fit` is written.
+        Only the fields of `Fit` are written, also for a subclass.
     certificate : Certificate
     path : Path
         An existing file is replaced.
@@ -100,14 +100,14 @@ def load_fit(path: Path) -> tuple[Fit, Certificate]:
     OSError
         If there is no such file (FileNotFoundError) or it cannot be read.
     ValueError
-        If it is no JSON, not written by switchfit, of another version, or a field is missing, of a wrong type or of a
-        size that does not fit the others; the message names the file and the field.
+        If it is not valid JSON, not written by switchfit, of another version, or a field is missing, of a wrong type or
+        of a size that does not match the others; the message names the file and the field.
     """
     try:
         text = Path(path).read_bytes().decode()
         content = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_refuse_repetition)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is not a saved estimate: it is no valid JSON ({error}).") from error
+        raise ValueError(f"{path} is not a saved estimate: it is not valid JSON ({error}).") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f'{path} is not a saved estimate: it has no entry "format": "{FORMAT}" at its top.')
     version = content.get("version")
@@ -136,7 +136,7 @@ def load_fit(path: Path) -> tuple[Fit, Certificate]:
 
 def _to_json(record: Any, kind: type) -> Any:
     """Return a dataclass by the fields of `kind` in terms of dict, list, str, int, finite float, bool and None."""
-    from pydantic_core import to_json  # here, since importing it takes longer than a small fit
+    from pydantic_core import to_json  # imported here, since that takes longer than a small fit
 
     values = {f.name: getattr(record, f.name) for f in fields(kind)}
     named = {name: value.name if isinstance(value, Enum) else value for name, value in values.items()}
@@ -172,7 +172,7 @@ def _refuse_constant(name: str) -> NoReturn:
 
 
 def _refuse_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return an object, none of whose names stands there twice."""
+    """Return an object; ValueError if it has a name twice."""
     found = dict(pairs)
     if len(found) < len(pairs):
         names = [name for name, _ in pairs]
@@ -181,7 +181,7 @@ def _refuse_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _from_json(kind: type, content: Any, where: str) -> Any:
-    """Return a dataclass from JSON; ValueError that says which entry is wrong."""
+    """Return a dataclass from JSON; ValueError with the path of a wrong entry."""
     import pydantic
 
     try:
@@ -199,8 +199,8 @@ def _make_adapter(kind: type) -> Any:
 
 
 def _convert_hint(hint: Any) -> Any:
-    """Return the type hint of a field as pydantic is to read it from JSON: arrays, names of statuses,
-    lists for tuples.
+    """Convert the type hint of a field to one with which pydantic reads JSON: arrays, names of statuses, lists for
+    tuples.
     """
     from pydantic import AfterValidator, BeforeValidator, ConfigDict, PlainValidator, Strict, create_model
 
@@ -229,7 +229,7 @@ def _convert_hint(hint: Any) -> Any:
 
 
 def _as_dataclass(kind: type) -> Any:
-    """Return pydantic's step from a model with the fields of a dataclass to that dataclass."""
+    """Return a pydantic validator that converts a model with the fields of a dataclass to that dataclass."""
     from pydantic import AfterValidator
 
     names = [f.name for f in fields(kind)]
@@ -265,8 +265,8 @@ def _read_described_array(value: dict[str, Any]) -> NDArray[Any]:
     if set(value) != {"dtype", "shape", "values"}:
         raise ValueError(f"must be an array; got {_shorten(value)}")
     name = _require_type(value["dtype"], str)
-    if not DTYPES.fullmatch(name):  # NumPy knows others, some of which it only warns of
-        raise ValueError(f"has the dtype {name!r}, which is neither of numbers nor of text")
+    if not DTYPES.fullmatch(name):  # NumPy accepts more names, some of them with a warning
+        raise ValueError(f"has the dtype {name!r}, which is not a dtype of numbers or text")
     try:
         dtype = np.dtype(name)
     except TypeError as error:
@@ -288,7 +288,7 @@ def _build_array(values: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
     try:
         return np.array(values, dtype=dtype)
     except (TypeError, ValueError, OverflowError, MemoryError) as error:
-        raise ValueError(f"is no array of {dtype}: {error}") from error
+        raise ValueError(f"is not an array of {dtype}: {error}") from error
 
 
 def _read_numbers(value: Any) -> Any:
@@ -306,7 +306,7 @@ def _read_number(value: Any) -> float:
 
 
 def _require_type(value: Any, kind: type) -> Any:
-    """Return `value`, which has to be exactly of a JSON type."""
+    """Return `value`; ValueError unless its type is exactly `kind`."""
     if type(value) is not kind:
         words = {list: "a list", str: "a string", int: "an integer", bool: "true or false"}
         raise ValueError(f"must be {words[kind]}; got {_shorten(value)}")
@@ -314,7 +314,7 @@ def _require_type(value: Any, kind: type) -> Any:
 
 
 def _check_text(value: str) -> str:
-    """Return `value`; ValueError for half of a surrogate pair, which can be written as JSON, but is no text."""
+    """Return `value`; ValueError for half of a surrogate pair, which JSON can hold, but UTF-8 cannot."""
     value.encode()
     return value
 
@@ -332,7 +332,7 @@ WORDS = {
     "int_type": "an integer",
     "bool_type": "true or false",
 }
-"""What pydantic's errors ask for, in the words of JSON."""
+"""JSON's names for the types in pydantic's errors."""
 
 
 def _describe_error(error: Mapping[str, Any], content: Any, top: str) -> str:
@@ -353,7 +353,7 @@ def _describe_error(error: Mapping[str, Any], content: Any, top: str) -> str:
 
 
 def _describe_place(loc: Iterable[Any], content: Any, top: str) -> str:
-    """Return the path of an entry, as in ``fit.history[1].cost``; what pydantic adds to a path is left out."""
+    """Return the path of an entry, as in ``fit.history[1].cost``, without what pydantic adds to it."""
     where, value = top, content
     for step in loc:
         if isinstance(value, list) and isinstance(step, int):
@@ -367,17 +367,25 @@ def _describe_place(loc: Iterable[Any], content: Any, top: str) -> str:
 
 
 def _upgrade(content: dict[str, Any], version: int) -> None:
-    """Bring the content of a file of an earlier version to version 5, in place."""
+    """Upgrade the content of a file of an earlier version to version 5, in place."""
     try:
         if version < DATA:
             _upgrade_fit(content["fit"])
             _upgrade_certificate(content["certificate"], content["fit"])
         content["fit"].setdefault("starts", None)
         content["fit"].setdefault("steps", [])
+        content["fit"].setdefault("initial_cost", _read_first_cost(content["fit"]["history"]))
         for comparison in (comparison for run in content["fit"]["comparisons"] for comparison in run):
             comparison.setdefault("weights", None)
     except (LookupError, TypeError, AttributeError) as error:
-        raise ValueError(f"it is not what version {content['version']} holds ({get_first_line(error)})") from error
+        raise ValueError(
+            f"it does not match the format of version {content['version']} ({get_first_line(error)})"
+        ) from error
+
+
+def _read_first_cost(history: list[dict[str, Any]]) -> Any:
+    """Return J at the first guess: before there were strategies, every history began there."""
+    return history[0]["cost"] if history else "NaN"
 
 
 def _upgrade_fit(fit: dict[str, Any]) -> None:
@@ -396,7 +404,7 @@ def _upgrade_fit(fit: dict[str, Any]) -> None:
     known = _list_possible_constraints(fit)
     for k, text in enumerate(fit["active"]):
         if text not in known:
-            raise ValueError(f"fit.active[{k}] is no constraint of this fit; got {_shorten(text)}")
+            raise ValueError(f"fit.active[{k}] is not a constraint of this fit; got {_shorten(text)}")
     fit["active"] = [known[text] for text in fit["active"]]
     fit["reason"] = {"kind": "message", "subjects": [fit.pop("message")], "figures": {}}
     fit |= {"earlier_iterations": 0, "smallest_eigenvalue": "NaN", "flat_direction": [], "violated": []}
@@ -410,9 +418,9 @@ def _upgrade_certificate(certificate: dict[str, Any], fit: dict[str, Any]) -> No
 
 
 def _find_transitions(fit: dict[str, Any]) -> tuple[list[str], list[Any]]:
-    """Return names of the runs, and where the transition times stand in theta, from the names of the unknowns.
+    """Return the names of the runs and the indices of transition times in theta, from the names of the unknowns.
 
-    The free ones stand first, in their order, called ``tau_i`` or ``run.tau_i``.
+    Free transition times come first in theta, in order, with names ``tau_i`` or ``run.tau_i``.
     """
     names, theta, all_times = fit["theta_names"], fit["theta"], fit["transition_times"]
     runs, all_places, place = [], [], 0
@@ -432,7 +440,7 @@ def _find_transitions(fit: dict[str, Any]) -> tuple[list[str], list[Any]]:
 
 
 def _list_possible_constraints(fit: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return every linear constraint that may be active, by the sentence that stands for it in version 3."""
+    """Return every linear constraint that may be active, by its sentence in version 3."""
     found = {}
     for name, low, high in zip(fit["theta_names"], fit["lower"], fit["upper"], strict=False):
         for side, value in (("lower", low), ("upper", high)):
@@ -453,7 +461,7 @@ def _list_possible_constraints(fit: dict[str, Any]) -> dict[str, dict[str, Any]]
 
 
 def _check_fit(fit: Fit) -> None:
-    """Raise ValueError if sizes, names or times do not fit one another."""
+    """Raise ValueError if sizes, names or times do not match one another."""
     d, experiments = len(fit.theta_names), len(fit.trajectories)
     unknowns = f"since fit.theta_names has {d} entries"
     _check_size("fit.theta_units", fit.theta_units, (d,), unknowns)
@@ -475,7 +483,7 @@ def _check_fit(fit: Fit) -> None:
             raise ValueError(f"fit.parameter_units lacks the parameter {name!r}")
     for name in fit.fixed:
         if name not in fit.parameters:
-            raise ValueError(f"fit.fixed has the name {name!r}, which is none of fit.parameters")
+            raise ValueError(f"fit.fixed has the name {name!r}, which is not in fit.parameters")
     if experiments == 0:
         raise ValueError("fit.trajectories must have one entry or more; got none")
     runs = f"since fit.trajectories has {experiments} entries"
@@ -531,7 +539,7 @@ def _check_size(where: str, value: Any, shape: tuple[int, ...], reason: str) -> 
 
 
 def _check_times(where: str, times: FloatArray) -> None:
-    """Raise ValueError for times above 1e100 in size, beyond which no axis can be drawn."""
+    """Raise ValueError for times above 1e100 in size, for which no axis can be drawn."""
     if times.ndim != 1 or not (np.abs(times) < 1e100).all() or np.any(np.diff(times) < 0):
         raise ValueError(f"{where} must be a list of finite numbers (below 1e100) that do not decrease")
 
@@ -547,4 +555,4 @@ def _check_basis(basis: FloatArray, d: int) -> None:
 def _check_names(where: str, given: Iterable[str], known: tuple[str, ...]) -> None:
     for name in given:
         if name not in known:
-            raise ValueError(f"{where} has the name {name!r}, which is none of fit.theta_names")
+            raise ValueError(f"{where} has the name {name!r}, which is not in fit.theta_names")

@@ -1,4 +1,4 @@
-"""One fit: the evaluator, which puts experiments together; one run of the optimiser; what it found, as data.
+"""One fit: the evaluator, which combines experiments; one run of the optimizer; its result as data.
 
 Imports all rooms before it: `runtime`, `problem`, `discretization`, `engine`, `paper_adjoint`, `optimize`.
 """

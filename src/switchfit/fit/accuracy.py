@@ -1,14 +1,14 @@
 """Integration error of a fit: what halving all steps changes in J, in the guards and in the terminal constraints.
 
-Each output is compared at the same theta on the meshes of the fit and on meshes with every step halved, and the change
-is put in relation to a size of that output:
+Each output is compared at the same theta on the meshes of the fit and on meshes with every step halved. The change is
+divided by a scale of that output:
 
-- J: to J itself, or to 1e-3 of its first value where that is more (a cost that vanishes has no relative error).
-- A guard or terminal constraint c is zero at the solution, so its own value is no scale. The integrator's error enters
-  it through the states, and its scale is what these make of it: ``sum_j |D_j c| range_j``, where range_j is the
-  difference between the largest and the smallest value of state j in the run. An error of 1e-8 thus is one of 1e-8 of
-  the way that the states go, wherever the origins of time and of the states are, and however long the run goes on after
-  everything has happened. A constraint in which no state moves is measured in its own unit.
+- J: J itself, or 1e-3 of its first value if that is more (a cost that vanishes has no relative error).
+- A guard or terminal constraint c is zero at the solution, so that its own value is no scale. The integration error
+  enters it through the states. Its scale is therefore ``sum_j |D_j c| range_j``, where range_j is the difference
+  between the largest and the smallest value of state j in the run. This scale depends neither on the origins of time
+  and of the states, nor on how long the run continues after the states have settled. A constraint in which no state
+  varies has an absolute error.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from switchfit.problem.structure import Structure
 from switchfit.runtime.cache import use_compilation_cache
 
 PERFECT_FIT = 1e-3
-"""Where J has fallen to less than this part of its first value, the integration error is measured against that part:
-the relative error of a cost that vanishes says nothing."""
+"""If J has fallen below this part of its first value, the integration error is relative to that part, since a cost that
+vanishes has no relative error."""
 
 COST = "J"
 """Name of the cost among the outputs."""
@@ -75,7 +75,7 @@ def worst_error(
     Returns
     -------
     IntegrationError
-        An error that is not a number counts as the largest.
+        NaN counts as the largest error.
     """
     problem = fine.evaluator.problem
     errors = [IntegrationError(cost_error(problem, fine.cost, cost, first_cost), COST)]
@@ -91,7 +91,7 @@ def constraint_values(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the guards and terminal constraints of a simulation and their scales: (m,) each.
 
-    They follow from the states alone, so that nothing is compiled for the meshes of `evaluator`.
+    They are computed from the states alone, so that nothing is compiled for the meshes of `evaluator`.
     """
     problem = evaluator.problem
     values, scales = [np.zeros(0)], [np.zeros(0)]
@@ -102,14 +102,14 @@ def constraint_values(
             ends = np.stack([simulation.after[rows][-1] for rows in simulation.segments])
             states = np.concatenate([simulation.before, simulation.after])
             with use_float64(), use_compilation_cache():
-                found = _constraint_values(arguments.without_mesh(), tau, ends, p, structure=structure)
+                found = _evaluate_constraints(arguments.without_mesh(), tau, ends, p, structure=structure)
             values.append(np.asarray(found[0]))
             scales.append(np.abs(found[1]) @ np.ptp(states, axis=0))
     return np.concatenate(values), np.concatenate(scales)
 
 
 @partial(jax.jit, static_argnames=("structure",))
-def _constraint_values(
+def _evaluate_constraints(
     arguments: Arguments, tau: jax.Array, ends: jax.Array, p: jax.Array, *, structure: Structure
 ) -> tuple[jax.Array, jax.Array]:
     """Return guards, then terminal constraints c (m,) at the ends (N + 1, n) of the segments; and D c, (m, n)."""

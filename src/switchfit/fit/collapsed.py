@@ -1,9 +1,9 @@
-"""Modes that have collapsed: whose two transition times are equal, so that they last no time at all.
+"""Collapsed modes: modes of zero duration, whose two transition times are equal.
 
-Where a mode of no duration stands between two stretches of the same mode, as B in (A, B, A), the cost does not depend
-on where that is: to the integration error J is constant as its two transition times move together. Nor does the cost
-depend on a parameter that acts in collapsed modes alone. Such unknowns are *idle*: no data determine them, and the
-curvature of J along them is that of the integration error, of either sign.
+If a collapsed mode lies between two intervals of the same mode, as B in (A, B, A), the cost does not depend on its
+position: to the integration error, J is constant as its two transition times move together. Nor does the cost depend on
+a parameter that acts in collapsed modes alone. Such unknowns are *idle*: no data determine them, and the curvature of J
+along them is that of the integration error, of either sign.
 """
 
 from __future__ import annotations
@@ -20,59 +20,59 @@ from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
 
 CHANGES = (0.1, -0.1)
-"""Parts of a parameter, or of the range between its bounds where it is 0, by which it is changed to see its effect."""
+"""Relative changes of a parameter to test its effect; if it is 0, relative to the range between its bounds."""
 
 NO_EFFECT = 1e-12
-"""Part of the cost that is rounding: a parameter that changes it by less has no effect."""
+"""Relative change of the cost that may be rounding: a parameter that changes it by less has no effect."""
 
 OPENED = 1e-3
-"""Part of the horizon for which collapsed modes last where a parameter's effect in them is looked for."""
+"""Duration of collapsed modes, as a part of the horizon, when the effect of a parameter in them is tested."""
 
 
 def idle_unknowns(evaluator: Evaluator, theta: FloatArray, parameters: bool) -> NDArray[np.bool_]:
-    """Return which unknowns may be held, as J does not depend on them while the collapsed modes stay so: (d,).
+    """Return which unknowns may be fixed, as J does not depend on them while collapsed modes remain collapsed: (d,).
 
     Parameters
     ----------
     evaluator : Evaluator
     theta : (d,)
     parameters : bool
-        Whether to look for parameters as well, with a few evaluations of J for each. Without them it is the first of
-        the transition times that coincide, which leaves the others free to move away from it.
+        Whether to test parameters too, with a few evaluations of J for each. Of transition times that coincide, only
+        the first is returned, which leaves the others free to move away from it.
     """
     problem = evaluator.problem
     idle = np.zeros(len(theta), dtype=bool)
-    for group in _idle_groups(problem, theta):
+    for group in _list_idle_groups(problem, theta):
         idle[group[0]] = True
     opened = _open_modes(problem, theta) if parameters else theta
     if not np.array_equal(opened, theta):
-        for i in _parameters(problem):
+        for i in _list_parameters(problem):
             idle[i] = _is_idle(evaluator, theta, opened, i)
     return idle
 
 
-def _idle_groups(problem: Problem, theta: FloatArray) -> Iterator[NDArray[np.intp]]:
-    """Return the places in theta of transitions that coincide and may move together without an effect.
+def _list_idle_groups(problem: Problem, theta: FloatArray) -> Iterator[NDArray[np.intp]]:
+    """Yield the indices in theta of transitions that coincide and may move together without effect.
 
-    None of them is fixed or at an end of the horizon, the mode before them is the mode after them, and no reset map
-    or guard stands between.
+    No transition among them is fixed or at an end of the horizon, the modes before and after them are the same, and no
+    reset map or guard lies in between.
     """
     system = problem.system
     for e, experiment in enumerate(problem.experiments):
         sequence, where = experiment.mode_sequence, problem.unknowns.times[e]
-        for first, last in _coincident(problem, theta, e):
+        for first, last in _list_coincident(problem, theta, e):
             passed = [*zip(sequence[first : last + 1], sequence[first + 1 : last + 2], strict=True)]
             smooth = all(system.reset_map(*pair) is None and system.guard(*pair) is None for pair in passed)
             if smooth and sequence[first] == sequence[last + 1] and np.all(where[first : last + 1] >= 0):
                 yield where[first : last + 1]
 
 
-def _coincident(problem: Problem, theta: FloatArray, e: int) -> Iterator[tuple[int, int]]:
-    """Return the first and last of two or more transitions that coincide strictly inside the horizon."""
+def _list_coincident(problem: Problem, theta: FloatArray, e: int) -> Iterator[tuple[int, int]]:
+    """Yield the first and last of two or more transitions that coincide strictly inside the horizon."""
     experiment, times = problem.experiments[e], problem.vectors(theta, e)[0]
-    if not np.any(times[1:] - times[:-1] <= _estimate_rounding(experiment)):  # the rule, and asked at every step
+    if not np.any(times[1:] - times[:-1] <= _estimate_rounding(experiment)):  # the usual case: tested at every step
         return
-    short, room = _lengths(problem, theta, e)
+    short, room = _find_collapsed(problem, theta, e)
     first = 0
     for i in range(1, len(times) + 1):
         if i < len(times) and short[i]:
@@ -86,7 +86,7 @@ def _open_modes(problem: Problem, theta: FloatArray) -> FloatArray:
     """Return theta with transition times moved so that every collapsed mode lasts a little, if there is room."""
     opened = theta.copy()
     for e, (experiment, where) in enumerate(zip(problem.experiments, problem.unknowns.times, strict=True)):
-        times, short = problem.vectors(theta, e)[0], _lengths(problem, theta, e)[0]
+        times, short = problem.vectors(theta, e)[0], _find_collapsed(problem, theta, e)[0]
         if not short.any():
             continue
         gap = OPENED * experiment.initial_length * short
@@ -99,7 +99,7 @@ def _open_modes(problem: Problem, theta: FloatArray) -> FloatArray:
     return opened
 
 
-def _lengths(problem: Problem, theta: FloatArray, e: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _find_collapsed(problem: Problem, theta: FloatArray, e: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which modes of experiment e have no duration (N + 1,), and which transitions are at an end of it (N,).
 
     A free tf counts as a transition at the end, to a mode that lasts.
@@ -117,8 +117,8 @@ def _estimate_rounding(experiment: Experiment) -> float:
     return 32 * EPS * max(experiment.end - experiment.t0, abs(experiment.t0), abs(experiment.end))
 
 
-def _parameters(problem: Problem) -> list[int]:
-    """Return the places in theta of the model's parameters."""
+def _list_parameters(problem: Problem) -> list[int]:
+    """Return the indices in theta of the model's parameters."""
     return [i for span in problem.unknowns.parameters.values() for i in range(span.start, span.stop)]
 
 
@@ -128,7 +128,7 @@ def _is_idle(evaluator: Evaluator, theta: FloatArray, opened: FloatArray, i: int
     low, high = unknowns.lower[i], unknowns.upper[i]
     size = abs(theta[i]) or (high - low if np.isfinite(high - low) else 1.0)
 
-    def acts(at: FloatArray) -> bool:
+    def has_effect(at: FloatArray) -> bool:
         base = evaluator.cost(at)
         for change in CHANGES:
             moved = at.copy()
@@ -137,4 +137,4 @@ def _is_idle(evaluator: Evaluator, theta: FloatArray, opened: FloatArray, i: int
                 return True
         return False
 
-    return not acts(theta) and acts(opened)
+    return not has_effect(theta) and has_effect(opened)

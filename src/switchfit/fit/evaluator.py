@@ -1,9 +1,9 @@
-"""The cost of a problem and its exact derivatives at any theta, on a mesh that stays the same."""
+"""The cost of a problem and its exact derivatives at any theta, on a fixed mesh."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.discretization.arguments import Arguments, build_arguments
-from switchfit.discretization.mesh import Mesh, pad_to_common_lengths
+from switchfit.discretization.mesh import Mesh, Stiffness, get_structure_on, pad_to_common_lengths
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import engine_of, summarize
 from switchfit.engine.jax.engine import JaxEngine
@@ -22,6 +22,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Structure
 from switchfit.problem.validation import as_choice, as_instance
 from switchfit.runtime.cache import use_compilation_cache
 
@@ -38,6 +39,8 @@ class Evaluation:
     cost : J
     gradient : (d,), J's derivative in theta
     hessian : (d, d)
+    stiffness : tuple of Stiffness
+        From `evaluate`: of each experiment in which ``solver="auto"`` chose implicit steps, why; empty if in none.
 
     See Also
     --------
@@ -57,11 +60,12 @@ class Evaluation:
     cost: float
     gradient: FloatArray
     hessian: FloatArray
+    stiffness: tuple[Stiffness, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class ArrowEvaluation:
-    """Cost and derivatives of many runs: as `Evaluation`, with the Hessian in the shape of an arrow."""
+    """Cost and derivatives of many runs: like `Evaluation`, with an arrow-shaped Hessian."""
 
     cost: float
     gradient: FloatArray
@@ -91,13 +95,13 @@ class ConstrainedEvaluation:
 
 
 class Evaluator:
-    """A problem on fixed meshes, one an experiment: cost, gradient and Hessian as functions of theta alone.
+    """A problem on fixed meshes, one per experiment: cost, gradient and Hessian as functions of theta alone.
 
     Parameters
     ----------
     problem : Problem
     theta : (d,) array, optional
-        Where the meshes are refined; the problem's initial guess if left out.
+        Point at which the meshes are refined; the problem's initial guess if left out.
     meshes : sequence of Mesh, optional
         Meshes to use instead of refined ones.
     """
@@ -107,6 +111,7 @@ class Evaluator:
         indices = range(len(problem.experiments))
         at = problem.initial_theta if theta is None else theta
         given = list(meshes) if meshes is not None else [refine_mesh(problem, e, at) for e in indices]
+        self.meshes = given
         self.replace_arguments(
             [build_arguments(problem, e, m) for e, m in enumerate(pad_to_common_lengths(problem, given))]
         )
@@ -122,7 +127,7 @@ class Evaluator:
         return self.divide(2)
 
     def halve_rows(self, theta: FloatArray) -> Evaluator:
-        """Return the same problem with every step cut in two that it takes at theta, to judge the integration error."""
+        """Return the same problem with every step at theta cut in two, to estimate the integration error."""
         times = [self.problem.vectors(theta, e)[0] for e in range(len(self.meshes))]
         meshes = [mesh.halve_rows(tau) for mesh, tau in zip(self.meshes, times, strict=True)]
         return Evaluator(self.problem, meshes=meshes)
@@ -130,19 +135,19 @@ class Evaluator:
     def __call__(
         self, theta: FloatArray, side: int = 1, method: Method = "auto", matrix: Matrix = "exact"
     ) -> Evaluation:
-        """Return the cost, gradient and Hessian; where a transition time sits on a node, the derivatives to its `side`.
+        """Return the cost, gradient and Hessian; for a transition time on a node, the derivatives on its `side`.
 
-        `matrix` asks for the Gauss-Newton matrix in place of the Hessian, or for none (it is NaN then).
+        `matrix` selects the Hessian, the Gauss-Newton matrix in its place, or neither (NaN).
         """
         d = len(theta)
-        results = self._results(theta, side, method, matrix)
+        results = self._evaluate_experiments(theta, side, method, matrix)
         if self.problem.one_to_one:
             total, gradient, hessian = float(results[0][0]), results[0][1], results[0][2]
         else:
             total, gradient, hessian = 0.0, np.zeros(d), np.zeros((d, d))
             for (J, g, H), (own, mine) in zip(results, self.problem.own_places, strict=True):
                 total += float(J)
-                # Two names of the model may mean one parameter: its place then stands twice, and both count.
+                # Two names of the model may refer to one parameter: its index then occurs twice, and both count.
                 np.add.at(gradient, mine, g[own])
                 np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
         if self._priors is not None:
@@ -155,7 +160,7 @@ class Evaluator:
     ) -> ConstrainedEvaluation:
         """Return cost, constraints and the augmented Lagrangian with multipliers and penalties, (m,) or ()."""
         d, count = len(theta), len(self.problem.constraint_names)
-        multipliers, penalty = (np.broadcast_to(np.asarray(a, float), count) for a in (multipliers, penalty))
+        multipliers, penalty = np.full(count, multipliers, dtype=float), np.full(count, penalty, dtype=float)
         cost, value, gradient, slope, hessian = 0.0, 0.0, np.zeros(d), np.zeros(d), np.zeros((d, d))
         jacobian, c = np.zeros((count, d)), np.zeros(count)
         last = 0
@@ -163,10 +168,15 @@ class Evaluator:
             here = slice(last, last := last + self.problem.constraint_counts[e])
             at = self.problem.vectors(theta, e)
             J, L_d, H, c_e, A = self.engines[e].constrained(*at, side, multipliers[here], penalty[here])
-            H = H + (A.T * penalty[here]) @ A
+            weights = multipliers[here] + penalty[here] * c_e
+            if penalty.any():
+                H = H + (A.T * penalty[here]) @ A
             cost += J
             value += J + float(multipliers[here] @ c_e + 0.5 * penalty[here] @ c_e**2)
-            np.add.at(gradient, mine, (L_d - (multipliers[here] + penalty[here] * c_e) @ A)[own])
+            if self.problem.one_to_one:
+                gradient, slope, hessian, jacobian, c = L_d - weights @ A, L_d, H, A, c_e
+                break
+            np.add.at(gradient, mine, (L_d - weights @ A)[own])
             np.add.at(slope, mine, L_d[own])
             np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
             np.add.at(jacobian[here].T, mine, A[:, own].T)
@@ -178,10 +188,10 @@ class Evaluator:
         return ConstrainedEvaluation(cost, gradient, value, slope, hessian, c, jacobian)
 
     def arrow(self, theta: FloatArray, side: int = 1, matrix: Matrix = "exact") -> ArrowEvaluation:
-        """Evaluate the same by the method "auto", in time and memory that are linear in the number of experiments."""
+        """Evaluate by the method "auto", in time and memory that are linear in the number of experiments."""
         total, gradient, parts = 0.0, np.zeros(len(theta)), []
         size = self.layout.own.shape[1] + len(self.layout.shared)
-        results = self._results(theta, side, "auto", matrix)
+        results = self._evaluate_experiments(theta, side, "auto", matrix)
         for (J, g, H), (own, mine), slots in zip(results, self.problem.own_places, self._slots, strict=True):
             total += float(J)
             np.add.at(gradient, mine, g[own])
@@ -196,18 +206,35 @@ class Evaluator:
 
     @cached_property
     def layout(self) -> ArrowLayout:
-        """Which unknowns are whose."""
+        """Layout of the arrow-shaped Hessian: the unknowns of each experiment, and shared ones."""
         return ArrowLayout.of(len(self.problem.theta_names), self.problem.places)
 
     @cached_property
     def _slots(self) -> list[NDArray[np.intp]]:
         return [self.layout.slots(e, mine) for e, (_, mine) in enumerate(self.problem.own_places)]
 
+    @cached_property
+    def structures(self) -> tuple[Structure, ...]:
+        """The structure of each experiment, with the method of the steps on its mesh."""
+        return tuple(get_structure_on(self.problem, e, mesh) for e, mesh in enumerate(self.meshes))
+
+    @property
+    def stiffness(self) -> tuple[Stiffness, ...]:
+        """Why implicit steps are taken in each experiment in which ``solver="auto"`` has chosen them."""
+        return tuple(mesh.stiffness for mesh in self.meshes if mesh.stiffness is not None)
+
+    @property
+    def takes_implicit_steps(self) -> bool:
+        """Whether an experiment is integrated by implicit steps."""
+        return any(structure.solver == "stiff" for structure in self.structures)
+
     def replace_arguments(self, arguments: Sequence[Arguments]) -> None:
         """Replace data and constants; the meshes are those of the new nodes."""
         self.__dict__.pop("halved", None)
         self.arguments = list(arguments)
-        self.meshes = [Mesh.from_times(np.asarray(own.nodes)) for own in arguments]
+        before = zip(self.meshes, arguments, strict=True)
+        self.meshes = [Mesh.from_times(np.asarray(own.nodes), mesh.stiffness) for mesh, own in before]
+        self.__dict__.pop("structures", None)
         given = enumerate(zip(self.arguments, self.meshes, strict=True))
         self.engines = [engine_of(self.problem, e, own, mesh) for e, (own, mesh) in given]
 
@@ -218,24 +245,24 @@ class Evaluator:
 
     @property
     def engine(self) -> Engine:
-        """What evaluates cost, gradient and exact Hessian by the method "auto": machine code, or JAX and why."""
+        """Engine of cost, gradient and exact Hessian by the method "auto": machine code, or JAX with the reason."""
         return summarize(self.engines, name_runs(self.problem.experiments))
 
     def simulate(self, theta: FloatArray, *, tangents: bool = False) -> list[Simulation]:
-        """Simulate all experiments row by row, with their derivatives in their own unknowns if asked for."""
+        """Simulate all experiments row by row, with derivatives in their own unknowns if `tangents`."""
         vectors = (self.problem.vectors(theta, e) for e in range(len(self.engines)))
         return [engine.simulate(*at, tangents=tangents) for engine, at in zip(self.engines, vectors, strict=True)]
 
-    def _results(self, theta: FloatArray, side: int, method: Method, matrix: Matrix) -> list[Derivatives]:
+    def _evaluate_experiments(self, theta: FloatArray, side: int, method: Method, matrix: Matrix) -> list[Derivatives]:
         """Return the cost, gradient and Hessian of each experiment in its own unknowns."""
         theta = np.asarray(theta, dtype=np.float64)
         vectors = [self.problem.vectors(theta, e) for e in range(len(self.engines))]
         if method == "auto":
             return [engine.derivatives(*at, side, matrix) for engine, at in zip(self.engines, vectors, strict=True)]
-        given = list(zip(self.problem.structures, self.arguments, self.meshes, vectors, strict=True))
+        given = list(zip(self.structures, self.arguments, self.meshes, vectors, strict=True))
         if method == "adjoint":
-            if not knows_paper(self.problem):
-                raise ValueError("the paper's equations know no TransitionCost: take another method.")
+            if not is_covered_by_paper(self.problem):
+                raise ValueError("the paper's equations have no TransitionCost: choose another method.")
             with use_float64(), use_compilation_cache():
                 found = [evaluate_paper(a, *at, float(side), structure=s) for s, a, _, at in given]
             return [Derivatives(float(J), np.array(g), np.array(H)) for J, g, H in found]
@@ -251,13 +278,13 @@ class Evaluator:
         return points
 
 
-def knows_paper(problem: Problem) -> bool:
-    """Return whether the paper's equations know all that the cost consists of."""
+def is_covered_by_paper(problem: Problem) -> bool:
+    """Return whether the paper's equations cover all terms of the cost."""
     return not any(any(f is not None for f in s.transition_costs) for s in problem.structures)
 
 
 def evaluator_of(problem: Problem) -> Evaluator:
-    """Return the problem's own evaluator, made once and kept with it; its meshes are refined at the initial guess."""
+    """Return the problem's own evaluator, built once and cached; its meshes are refined at the initial guess."""
     if "evaluator" not in problem.__dict__:
         object.__setattr__(problem, "evaluator", Evaluator(problem))
     own: Evaluator = problem.__dict__["evaluator"]
@@ -273,11 +300,11 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     theta : (d,) array_like, optional
         In the order of ``problem.theta_names``; the initial guess if left out.
     method : {"auto", "forward", "discrete-adjoint", "adjoint", "autodiff"}
-        "forward" and "discrete-adjoint" are exact for the discretised cost, second order forward and backward, in JAX.
-        "auto" is the latter in machine code of its own, which takes a tenth of the time, and in JAX where a function
-        of the model cannot be written as a straight line of scalars, or steps are implicit. "adjoint" evaluates the
-        paper's equations (6)-(17), which agree with them to the integration error. "autodiff" leaves everything to
-        JAX; slow, an independent check.
+        "forward" and "discrete-adjoint" are exact for the discretized cost, second order forward and backward, in JAX.
+        "auto" is the latter in machine code, which takes a tenth of the time; JAX evaluates where a function of the
+        model cannot be compiled as straight-line code, or steps are implicit. "adjoint" evaluates the paper's
+        equations (6)-(17), which agree with the others to the integration error. "autodiff" differentiates by JAX
+        alone: slow, an independent check.
 
     Returns
     -------
@@ -293,8 +320,8 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
 
     Notes
     -----
-    The mesh is refined once, at the initial guess, so that J is one smooth function of theta. Where a transition
-    time sits exactly on a sample time the derivatives are those for increasing it.
+    The mesh is refined once, at the initial guess, so that J is one smooth function of theta. If a transition time
+    equals a sample time, the derivatives are those for increasing it.
 
     See Also
     --------
@@ -312,4 +339,6 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     method = as_choice(method, "method", METHODS)
-    return evaluator_of(problem)(problem.check_theta(theta), method=method)
+    evaluator = evaluator_of(problem)
+    found = evaluator(problem.check_theta(theta), method=method)
+    return replace(found, stiffness=evaluator.stiffness) if evaluator.stiffness else found

@@ -1,9 +1,9 @@
 """Switches hidden inside a function: a parameter that changes the cost while its derivative is zero everywhere.
 
-``jnp.where(t < p["t_on"], a, b)`` makes the cost jump, from one step of the integrator to the next, as ``t_on`` passes;
-between the jumps it is constant, and so the derivative, which is right, says nothing. An optimiser would leave such a
-parameter where it is, without a word. Where the parameter has another effect besides, its derivative is that effect's
-alone: the optimiser then walks until a jump stands in its way. Jumps are looked for where a line search has failed.
+``jnp.where(t < p["t_on"], a, b)`` makes the cost jump each time ``t_on`` passes a stage of the integrator. Between the
+jumps the cost is constant, so that its derivative is zero, correctly. An optimizer would leave such a parameter at its
+guess without any warning. If the parameter has another effect too, its derivative is that of the other effect alone,
+and the line search fails at a jump. Jumps are therefore looked for after a line search has failed.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from switchfit.optimize.diagnosis import Finding, find_jump
 from switchfit.problem.data import FloatArray
 
 CHANGES = (1e-3, 1e-2, 0.1, 0.5, -1e-3, -1e-2, -0.1, -0.5)
-"""Parts of a parameter, or of the range between its bounds where it is 0, by which it is changed."""
+"""Relative changes of a parameter that are tried; if it is 0, relative to the range between its bounds."""
 
 KEPT = 0.02
-"""Part of a jump that there must still be on meshes with cells of a quarter of the length."""
+"""Part of a jump that must remain on meshes with cells of a quarter of the length."""
 
 SMALLEST_JUMP = 1e-5
-"""Part of the cost that a jump has at least: far from the data, where trajectories are unstable, J is steep enough to
-seem to jump by less."""
+"""Smallest jump, relative to the cost: far from the data, where trajectories are unstable, J is so steep that it seems
+to jump by less."""
 
 CHANGED = 1e-9
-"""Part of the cost that is no rounding."""
+"""Smallest relative change of the cost that is not rounding."""
 
 
 def refuse_hidden_switches(evaluator: Evaluator, theta: FloatArray, gradient: FloatArray) -> None:
@@ -36,7 +36,7 @@ def refuse_hidden_switches(evaluator: Evaluator, theta: FloatArray, gradient: Fl
     evaluator : Evaluator
     theta : (d,)
     gradient : (d,)
-        At theta. Nothing is evaluated where no entry is 0.
+        Gradient at theta. If no entry is 0, nothing is evaluated.
     """
     if gradient.all():
         return
@@ -51,43 +51,43 @@ def refuse_hidden_switches(evaluator: Evaluator, theta: FloatArray, gradient: Fl
         name = next((name for name, span in spans if span.start <= hidden[0] < span.stop), unknowns.names[hidden[0]])
         shown = ", ".join(unknowns.names[i] for i in hidden)
         raise ValueError(
-            f"the cost changes with {shown}, but its derivative is zero wherever it was tried: {_advice(name)}"
+            f"the cost changes with {shown}, but its derivative is zero at all points tried: {_write_advice(name)}"
         )
 
 
 def refuse_jumps(evaluator: Evaluator, theta: FloatArray) -> None:
-    """Raise ValueError for a parameter at which the cost jumps although its derivative is right in between.
+    """Raise ValueError for a parameter in which the cost jumps, although its derivative is correct between the jumps.
 
     Parameters
     ----------
     evaluator : Evaluator
     theta : (d,)
-        Where a line search has failed.
+        Point at which a line search has failed.
     """
     unknowns = evaluator.problem.unknowns
     for name, span in unknowns.parameters.items():
         for i in range(span.start, span.stop):
-            jump = _jump(evaluator, theta, i)
-            if jump is not None and _stays_on_a_finer_mesh(evaluator, theta, i, jump[1]):
+            jump = _find_jump(evaluator, theta, i)
+            if jump is not None and _is_jump_of_model(evaluator, theta, i, jump[1]):
                 place, finding = jump
                 raise ValueError(
                     f"the cost jumps from {finding.before:.8g} to {finding.after:.8g} where {unknowns.names[i]} passes "
-                    f"{place:.8g}, which its derivative knows nothing of: {_advice(name)}"
+                    f"{place:.8g}, which its derivative does not show: {_write_advice(name)}"
                 )
 
 
-def _advice(name: str) -> str:
-    """Return what a function does with such a parameter, and what to write instead."""
+def _write_advice(name: str) -> str:
+    """Return how a function uses such a parameter, and what to write instead."""
     return (
-        f'a function decides by comparing with it, as in jnp.where(t < p["{name}"], a, b), and derivatives do not see '
-        "where such a switch happens. If it is a moment, make it a transition time: a mode for a and a mode for b, "
-        "both in mode_sequence, and its guess in transition_times; what else it does keeps a parameter of its own. "
-        "Otherwise use something smooth, or fix it."
+        f'a function switches by comparing with it, as in jnp.where(t < p["{name}"], a, b), and derivatives do not '
+        "include such a switch. If it is a time, make it a transition time: a mode for a and a mode for b, both in "
+        "mode_sequence, and its guess in transition_times; for its other effects, keep a parameter of its own. "
+        "Otherwise use a smooth function, or fix the parameter."
     )
 
 
-def _jump(evaluator: Evaluator, theta: FloatArray, i: int) -> tuple[float, Finding] | None:
-    """Find where the cost jumps as unknown i changes, and from what to what; None if no jump was seen."""
+def _find_jump(evaluator: Evaluator, theta: FloatArray, i: int) -> tuple[float, Finding] | None:
+    """Find where the cost jumps as unknown i changes, with the costs on both sides; None without a jump."""
     lower, upper = evaluator.problem.unknowns.lower[i], evaluator.problem.unknowns.upper[i]
 
     def line(value: float) -> tuple[float, float] | None:
@@ -104,7 +104,7 @@ def _jump(evaluator: Evaluator, theta: FloatArray, i: int) -> tuple[float, Findi
         if end != theta[i] and here is not None:
             low, high = min(end, float(theta[i])), max(end, float(theta[i]))
             there = line(end)
-            # Measured by the larger of the two: where the fit is perfect, J itself is rounding.
+            # Relative to the larger of the two costs: at a perfect fit, J itself is rounding.
             noise = CHANGED * max(abs(here[0]), 0.0 if there is None else abs(there[0]))
             finding = find_jump(line, low, high, noise)
             if finding is not None:
@@ -112,20 +112,20 @@ def _jump(evaluator: Evaluator, theta: FloatArray, i: int) -> tuple[float, Findi
     return None
 
 
-def _stays_on_a_finer_mesh(evaluator: Evaluator, theta: FloatArray, i: int, finding: Finding) -> bool:
-    """Return whether a jump is one of the model: where the mesh is too coarse J may be steeper than its derivative.
+def _is_jump_of_model(evaluator: Evaluator, theta: FloatArray, i: int, finding: Finding) -> bool:
+    """Return whether a jump is that of the model, and not of a mesh so coarse that J is steeper than its derivative.
 
-    On meshes with four times as many steps the model jumps elsewhere, from step to step, and by about a quarter.
+    On meshes with four times as many steps, a model with a hidden switch jumps at other points, and by about a quarter.
     """
     size = abs(finding.after - finding.before)
     if size < SMALLEST_JUMP * max(abs(finding.before), abs(finding.after)):
         return False
-    again = _jump(evaluator.divide(4), theta, i)
+    again = _find_jump(evaluator.divide(4), theta, i)
     return again is not None and abs(again[1].after - again[1].before) >= KEPT * size
 
 
 def _is_hidden(evaluator: Evaluator, theta: FloatArray, i: int, base: float) -> bool:
-    """Return whether the cost differs where unknown i is changed, its derivative being 0 there too."""
+    """Return whether the cost changes with unknown i while its derivative is 0 at the changed values too."""
     unknowns = evaluator.problem.unknowns
     lower, upper = unknowns.lower[i], unknowns.upper[i]
     size = abs(theta[i]) or (upper - lower if np.isfinite(upper - lower) else 1.0)

@@ -1,4 +1,4 @@
-"""Starts all over what bounds, order and minimum durations allow."""
+"""Random starts all over the feasible set of bounds, order and minimum durations."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 
 MOST_DRAWN = 2**30
-"""Points that SciPy's Sobol sequences have."""
+"""Length of SciPy's Sobol sequences."""
 
 FACTOR = 10.0
-"""Where a bound is missing: an unknown with a positive guess is drawn between the guess divided and multiplied by this,
-and on a logarithmic scale; any other within its guess, plus or minus so many times its size."""
+"""Range of an unknown without bounds: a positive guess is divided and multiplied by this factor, on a logarithmic
+scale; any other guess varies by plus or minus so many times its size. Times on a logarithmic scale are drawn on that
+scale, from the time since t0 of the first guess divided by this factor to the end of the horizon."""
 
 
 def draw_starts(problem: Problem, count: int, seed: int) -> FloatArray:
@@ -35,21 +36,26 @@ def draw_starts(problem: Problem, count: int, seed: int) -> FloatArray:
     unknowns = problem.unknowns
     sobol = qmc.Sobol(len(unknowns.names), seed=seed)
     cube = sobol.random(1 << max(count - 1, 0).bit_length())[:count]
-    low, high, log = _ranges(problem)
+    low, high, log = _compute_ranges(problem)
     points = low + cube * (high - low)
     points[:, log] = low[log] * (high[log] / low[log]) ** cube[:, log]
     for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
         for begin, end, group in _list_stretches(experiment, where):
-            # Sorted uniform numbers are uniform over all ordered times; the room that minimum durations take is added.
+            # Sorted uniform numbers are uniform over all ordered times; minimum durations are added to their gaps.
             room = end - begin - (len(group) + 1) * problem.min_duration
             ordered = np.sort(cube[:, group], axis=1)
+            if unknowns.log[group].all():
+                first = unknowns.initial[group[0]] - experiment.t0
+                low, high = max(begin - experiment.t0, first / FACTOR), end - experiment.t0
+                points[:, group] = experiment.t0 + low * (high / low) ** ordered
+                continue
             points[:, group] = begin + max(room, 0.0) * ordered + problem.min_duration * np.arange(1, len(group) + 1)
     points[0] = unknowns.initial
     return np.array([find_nearest_feasible(problem, point) for point in points])
 
 
-def _ranges(problem: Problem) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Return between what each unknown is drawn, (d,) and (d,), and whether on a logarithmic scale, (d,)."""
+def _compute_ranges(problem: Problem) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Return the range of each unknown, (d,) and (d,), and whether it is drawn on a logarithmic scale, (d,)."""
     unknowns = problem.unknowns
     guess, is_time = unknowns.initial, unknowns.is_time
     size = np.where(guess != 0, np.abs(guess), 1.0)
@@ -72,7 +78,7 @@ def _list_stretches(experiment: Any, where: NDArray[np.intp]) -> list[tuple[floa
 
 
 def find_nearest_feasible(problem: Problem, point: FloatArray) -> FloatArray:
-    """Return the feasible point nearest to `point`, each unknown measured by its own range."""
+    """Return the feasible point nearest to `point`, each unknown scaled by its distance from the initial guess."""
     constraints = constraints_of(problem)
     inside = problem.initial_theta
     if np.all(constraints.slack(point) >= 0):

@@ -31,16 +31,16 @@ class Transition:
     ----------
     experiment : int, from 0
     run : str
-        The experiment's name; empty where there is only one.
+        The experiment's name; empty if there is only one.
     name : str
         As in `Fit.theta_names`.
     time : float
     unit : str
         That of the experiment's times.
     before, after : str
-        The modes that it joins.
+        Modes before and after it.
     index : int or None
-        Its place in theta; None where it is fixed.
+        Its index in theta; None if it is fixed.
     """
 
     experiment: int
@@ -55,16 +55,19 @@ class Transition:
 
 @dataclass(frozen=True)
 class Step:
-    """One strategy of a fit: what it brought and what it cost.
+    """One strategy of a fit: the cost it reached and the work it took.
 
     Attributes
     ----------
     strategy : str
         "local", the fit from the first guess, or the name of another; "interrupted".
     cost : float
-        The lowest J after it.
+        The lowest J after it; infinite as long as the model could not be integrated, or constraints are not met.
     evaluations : int
     seconds : float
+    ended : str
+        Why the many starts ended: "settled", no further minimum was likely; "most", as many as are tried at most;
+        "time" or "interrupted". Empty for other strategies.
 
     See Also
     --------
@@ -82,21 +85,22 @@ class Step:
     cost: float
     evaluations: int
     seconds: float
+    ended: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What an estimation found; d unknowns in the order of `theta_names`.
+    """Result of an estimation; d unknowns in the order of `theta_names`.
 
     Attributes
     ----------
     theta_names, theta_units : tuple of str
     initial_theta, theta, lower, upper : (d,)
-    run_names : tuple of str, one an experiment
+    run_names : tuple of str, one per experiment
         Its name, or run1, run2, ...
-    transition_times : tuple of (N,) arrays, one an experiment, fixed ones included
-    transition_places : tuple of (N,) int arrays, one an experiment
-        Where in theta each transition time stands; -1 where it is fixed.
+    transition_times : tuple of (N,) arrays, one per experiment, fixed ones included
+    transition_places : tuple of (N,) int arrays, one per experiment
+        Index in theta of each transition time; -1 if it is fixed.
     parameters : dict of name -> array, fixed ones included
     parameter_units : dict of name -> str, fixed ones included
     fixed : tuple of str
@@ -104,60 +108,66 @@ class Fit:
     cost : float
     gradient, hessian : (d,), (d, d), exact at theta
     optimality : float
-        KKT residual; the norm of the gradient where no constraint is active.
+        KKT residual; the norm of the gradient if no constraint is active.
     iterations, evaluations : int
+        Iterations of the fit that found theta; evaluations of everything that was tried.
     status : Status
     history : tuple of IterationRecord
+        Of the fit that found theta. Where strategies were tried, it begins where one of them ended.
     active : tuple of ActiveConstraint
         Bounds, and shortest durations of modes, that hold with equality.
     kinks : tuple of Kink
         Unknowns that ended where the derivative jumps through zero.
     free_basis : (d, k)
         Orthonormal basis of the directions that constraints and kinks leave free.
-    trajectories : tuple of Trajectory, one an experiment
-    comparisons : tuple of tuples of Comparison, one tuple an experiment
+    trajectories : tuple of Trajectory, one per experiment
+    comparisons : tuple of tuples of Comparison, one tuple per experiment
     sigma_known : bool or None
-        Whether the noise of the measurements is known; None where the cost has no noise model.
+        Whether the noise of the measurements is known; None if the cost has no noise model.
     integration_error : float
         Largest relative change by halving all steps of J, the guards and the terminal constraints; see
         `Certificate.integration_error`.
     hessian_kind : str
     tolerance : float
     seconds : float
-        Wall time of the estimation, in seconds whatever the unit of the experiments' times is.
+        Wall time of the estimation, always in seconds.
     constraints : tuple of (name, value, multiplier)
         Guards and terminal constraints. With them the Hessian is that of J plus multipliers times constraints.
     saved_gauss_newton : (d, d) or None
-        The Gauss-Newton matrix of the samples, where it has been evaluated.
+        The Gauss-Newton matrix of the samples, if it has been evaluated.
     priors : dict of name -> str
         The prior of each unknown that has one, in words.
     log_scaled : tuple of str
         Unknowns that were estimated on a logarithmic scale.
     least_squares : bool
-        Whether what measurements and priors add to J is half a sum of squares: no sigma is a parameter, no loss robust.
+        Whether the terms of measurements and priors in J are half a sum of squares: no sigma is a parameter, no loss is
+        robust.
     engine : Engine or None
-        What evaluated cost and derivatives: machine code, or JAX and why. None where that is not known.
+        Engine of cost and derivatives: machine code, or JAX with the reason. None if it is unknown.
     integration_error_of : str
         The output that has the `integration_error`: "J", or the name of a guard or terminal constraint.
     idle : tuple of str
-        Unknowns on which J does not depend because modes have collapsed: the transition times of a mode of no duration
-        between two stretches of the same mode, and parameters that act in collapsed modes alone. Their values say
-        nothing, and they are not in `free_basis`.
+        Unknowns on which J does not depend because modes have collapsed: the transition times of a mode of zero
+        duration between two intervals of the same mode, and parameters that act in collapsed modes alone. Their values
+        are arbitrary, and they are not in `free_basis`.
     earlier_iterations : int
-        Iterations before the mesh was refined for the last time.
+        Iterations before the last refinement of the mesh.
     smallest_eigenvalue : float
-        Of the Hessian on the free directions, each unknown scaled to unit curvature, as the optimiser found it.
+        Smallest eigenvalue of the Hessian on the free directions, each unknown scaled to unit curvature, as found by
+        the optimizer.
     flat_direction : tuple of (str, float)
-        The unknowns that its eigenvector mostly consists of, and their parts in it.
+        Unknowns with the largest components of its eigenvector, and these components.
     violated : tuple of (str, float)
-        Guards and terminal constraints that are not met, and their values.
+        Guards and terminal constraints that are violated, and their values.
     reason : Issue or None
         Why the line search failed, or the error with which the fit ended.
     starts : (tried, better, agreeing) or None
-        How many other starts were fitted, how many of them ended lower, and how many in the same minimum; None where
-        none were.
+        Numbers of other starts that were fitted, that ended lower than this fit, and that ended at its J; None without
+        other starts.
     steps : tuple of Step
-        The strategies that were tried, in their order; empty where the first fit was enough.
+        The strategies that were tried, in order; empty if the first fit was enough.
+    initial_cost : float
+        J at `initial_theta`; NaN if it is unknown or cannot be evaluated there.
     """
 
     theta_names: tuple[str, ...]
@@ -205,15 +215,16 @@ class Fit:
     reason: Issue | None = None
     starts: tuple[int, int, int] | None = None
     steps: tuple[Step, ...] = ()
+    initial_cost: float = np.nan
 
     @property
     def termination(self) -> Termination:
-        """How the fit ended: what its message is made of."""
+        """How the fit ended, as data."""
         return Termination(**{f.name: getattr(self, f.name) for f in fields(Termination)})
 
     @property
     def message(self) -> str:
-        """How the fit ended as a sentence or two, with what to do."""
+        """How the fit ended, in a sentence or two, and what to do next."""
         return str(self.termination)
 
     @property
@@ -223,10 +234,21 @@ class Fit:
 
     @property
     def final_places(self) -> tuple[int, ...]:
-        """Where in theta the tf of each experiment stands; -1 where it is fixed."""
+        """Index in theta of the tf of each experiment; -1 if it is fixed."""
         names = ["tf"] if len(self.run_names) == 1 else [f"{run}.tf" for run in self.run_names]
         free = [name in self.theta_names and name not in self.parameters for name in names]  # a parameter may be "tf"
         return tuple(self.theta_names.index(name) if own else -1 for name, own in zip(names, free, strict=True))
+
+    @property
+    def log_origins(self) -> FloatArray:
+        """From where the logarithms of `log_scaled` unknowns count, (d,): t0 for a transition time, otherwise 0."""
+        origins = np.zeros(len(self.theta_names))
+        if not self.is_time[np.isin(self.theta_names, self.log_scaled)].any():
+            return origins
+        for e, trajectory in enumerate(self.trajectories):
+            places = np.append(self.transition_places[e], self.final_places[e])
+            origins[places[places >= 0]] = trajectory.times[0]
+        return origins
 
     @property
     def is_time(self) -> NDArray[np.bool_]:
@@ -261,26 +283,26 @@ class Fit:
 
     @property
     def trajectory(self) -> Trajectory:
-        """The fitted trajectory of the only experiment; with several use `trajectories`."""
+        """The fitted trajectory of the only experiment; with several experiments, use `trajectories`."""
         if len(self.trajectories) > 1:
             raise ValueError(f"There are {len(self.trajectories)} experiments: use .trajectories[e].")
         return self.trajectories[0]
 
     @property
     def initial_state(self) -> tuple[FloatArray, ...]:
-        """The state at t0 of each experiment, its estimated entries and those that are known: (n,) arrays."""
+        """The state at t0 of each experiment, with estimated and known entries: (n,) arrays."""
         return tuple(trajectory.states[0] for trajectory in self.trajectories)
 
     @property
     def samples(self) -> int:
         """Number of measured values that are not missing."""
-        return sum(int(np.isfinite(c.measured).sum()) for run in self.comparisons for c in run if _discrete(c))
+        return sum(int(np.isfinite(c.measured).sum()) for run in self.comparisons for c in run if _is_discrete(c))
 
     @property
     def residual_variance(self) -> float:
-        """``2 J / (samples + priors - free unknowns)``: near 1 where sigma is right.
+        """``2 J / (samples + priors - free unknowns)``: near 1 if sigma is right.
 
-        NaN without measurements, and where J is no sum of squares (`least_squares`).
+        NaN without measurements, and if J is not a sum of squares (`least_squares`).
         """
         freedom = self.freedom
         judged = self.sigma_known is not None and self.least_squares and freedom > 0
@@ -288,23 +310,23 @@ class Fit:
 
     @property
     def freedom(self) -> int:
-        """Degrees of freedom: measured values, and priors, which count as such, less free unknowns."""
+        """Degrees of freedom: number of measured values and priors minus number of free unknowns."""
         return self.samples + len(self.priors) - self.free_basis.shape[1]
 
     @property
     def gauss_newton(self) -> FloatArray | None:
-        """The Gauss-Newton matrix of the samples and priors: (d, d); None where it is not known."""
+        """The Gauss-Newton matrix of the samples and priors: (d, d); None if it is unknown."""
         return self.saved_gauss_newton
 
     @cached_property
     def covariance(self) -> FloatArray:
         """Covariance of theta from the exact Hessian on the free directions: (d, d).
 
-        ``Z (Z' H Z)^-1 Z'``, times the residual variance where sigma is unknown. With priors it is the covariance of
-        the posterior (Laplace's approximation); with a robust loss, that of noise whose negative log-likelihood the
-        loss is; a sigma that is a parameter is an unknown like others. An unknown held by a bound, a
-        collapsed mode or a kink has variance 0 here. NaN where the cost has no noise model (anything but
-        `Measurements`) or there are too few samples, and for the unknowns that have a part in a direction along which
+        ``Z (Z' H Z)^-1 Z'``, times the residual variance if sigma is unknown. With priors it is the covariance of the
+        posterior (Laplace's approximation). With a robust loss it is valid for noise with the loss as negative
+        log-likelihood. A sigma that is a parameter is an unknown like others. An unknown held by a bound, a
+        collapsed mode or a kink has variance 0 here. NaN if the cost has no noise model (anything but
+        `Measurements`) or there are too few samples, and for unknowns with a component in a direction along which
         the Hessian is not positive; the others keep their variances.
         """
         return self.covariance_from("exact")
@@ -315,15 +337,15 @@ class Fit:
         Parameters
         ----------
         hessian : {"exact", "gauss-newton"}
-            "exact", the observed information, is what `covariance` and everything else here uses. The Gauss-Newton
-            matrix, the expected information, leaves ``sum r D^2 h / sigma^2`` out: it is positive semi-definite
-            whatever the residuals are, and sees the model as linear.
+            "exact", the observed information, is used by `covariance` and everything else here. The Gauss-Newton
+            matrix, the expected information, omits ``sum r D^2 h / sigma^2``: it is positive semi-definite for any
+            residuals, and treats the model as linear.
 
         Raises
         ------
         ValueError
-            For another kind, or where the Gauss-Newton matrix is not known: the cost is not made of Measurements
-            alone, or the estimate was loaded without its problem from a file that lacks it.
+            For another kind, or if the Gauss-Newton matrix is unknown: the cost does not consist of Measurements
+            alone, or the estimate was loaded without its problem from a file that lacks the matrix.
 
         See Also
         --------
@@ -342,8 +364,8 @@ class Fit:
         matrix = self.hessian if hessian == "exact" else self.gauss_newton
         if matrix is None:
             raise ValueError(
-                "The Gauss-Newton matrix of this fit is not known: it needs a cost made of Measurements alone, and the "
-                "problem. Take hessian='exact'."
+                "The Gauss-Newton matrix of this fit is not known: it needs a cost of Measurements alone, and the "
+                "problem. Use hessian='exact'."
             )
         scale = self.residual_variance if self.sigma_known is False else 1.0
         return (np.nan if self.sigma_known is None else scale) * inverse_on(self.free_basis, matrix)
@@ -359,7 +381,7 @@ class Fit:
         return correlation_of(self.covariance)
 
     def quantile(self, level: float) -> float:
-        """Return the two-sided quantile: of Student's t where sigma is unknown, of the normal distribution else.
+        """Return the two-sided quantile: of Student's t if sigma is unknown, else of the normal distribution.
 
         See Also
         --------
@@ -382,16 +404,16 @@ class Fit:
     def confidence_intervals(self, level: float = 0.95, *, hessian: CovarianceKind = "exact") -> FloatArray:
         """Return the intervals theta +- quantile x standard error, cut off at the bounds: (d, 2).
 
-        Of unknowns on a logarithmic scale theta times or by exp(quantile x relative standard error).
-        NaN for an unknown that is held by a bound, a collapsed mode or a kink: the quadratic approximation knows no
-        interval there. `profile` does, and at a kink an `Estimate` with its model.
+        For unknowns on a logarithmic scale, theta is multiplied and divided by exp(quantile x relative standard
+        error). NaN for an unknown that is held by a bound, a collapsed mode or a kink: the quadratic approximation has
+        no interval there. Use `profile`, or at a kink an `Estimate` with its model.
 
         Parameters
         ----------
         level : float, between 0 and 1
-            The quantile is of Student's t where sigma is unknown, of the normal distribution where it is known.
+            The quantile is that of Student's t if sigma is unknown, of the normal distribution if it is known.
         hessian : {"exact", "gauss-newton"}
-            As of `covariance_from`.
+            As in `covariance_from`.
 
         See Also
         --------
@@ -409,24 +431,24 @@ class Fit:
         """
         half = self.quantile(level) * np.sqrt(np.diag(self.covariance_from(hessian)))
         log = np.isin(self.theta_names, self.log_scaled)
-        low, high = interval(self.theta, np.where(half > 0, half, np.nan), log).T
+        low, high = interval(self.theta, np.where(half > 0, half, np.nan), log, self.log_origins).T
         return np.stack([np.maximum(low, self.lower), np.minimum(high, self.upper)], axis=1)
 
 
 def correlation_of(covariance: FloatArray) -> FloatArray:
-    """Return the correlations (d, d) from covariances; NaN where a variance is 0."""
+    """Return the correlations (d, d) from covariances; NaN if a variance is 0."""
     errors = np.sqrt(np.diag(covariance))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(covariance / np.outer(errors, errors))
 
 
 class Disagreement(NamedTuple):
-    """How far the standard errors from the exact Hessian and from the Gauss-Newton matrix lie apart.
+    """Difference between the standard errors from the exact Hessian and from the Gauss-Newton matrix.
 
     Attributes
     ----------
     factor : float
-        Largest ratio of the two, one way or the other, of any linear combination of the unknowns.
+        Largest ratio of the larger to the smaller one, over all linear combinations of the unknowns.
     name : str
         The unknown whose own standard errors differ the most.
     exact, gauss_newton : float
@@ -440,7 +462,7 @@ class Disagreement(NamedTuple):
 
 
 def disagreement(fit: Fit) -> Disagreement | None:
-    """Compare the two covariances of a fit; None where one of them is not known.
+    """Compare the two covariances of a fit; None if one of them is unknown.
 
     The ratios of the two variances over all linear combinations of the unknowns lie between the smallest and the
     largest eigenvalue of ``A v = lambda H v`` on the free directions, A being the Gauss-Newton matrix.
@@ -463,25 +485,26 @@ def disagreement(fit: Fit) -> Disagreement | None:
     return Disagreement(factor, fit.theta_names[k], float(errors[0][k]), float(errors[1][k]))
 
 
-def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_]) -> FloatArray:
-    """Return ``theta -+ half``, or where `log` ``theta exp(-+ half / theta)``: (..., 2)."""
-    size = np.where(log, theta, 1.0)
-    factor = np.exp(np.where(log, half / size, 0.0))
-    return np.stack([np.where(log, theta / factor, theta - half), np.where(log, theta * factor, theta + half)], axis=-1)
+def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_], origin: FloatArray) -> FloatArray:
+    """Return ``theta -+ half``, or if `log` ``o + (theta - o) exp(-+ half / (theta - o))``, o the origin: (..., 2)."""
+    away = theta - origin
+    factor = np.exp(np.where(log, half / np.where(log, away, 1.0), 0.0))
+    low, high = (np.where(log, origin + end, theta) for end in (away / factor, away * factor))
+    return np.stack([np.where(log, low, theta - half), np.where(log, high, theta + half)], axis=-1)
 
 
 UNDETERMINED = 1e-14
 """Eigenvalue of the Hessian, scaled to a diagonal of one, up to which a direction is not determined."""
 
 PART = 1e-6
-"""Part of an unknown in such a direction from which it has no standard error."""
+"""Component of an unknown in such a direction from which it has no standard error."""
 
 
 def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:
-    """Return ``Z (Z' H Z)^-1 Z'``: (d, d); NaN where H is not finite, or not positive definite on Z (d, k).
+    """Return ``Z (Z' H Z)^-1 Z'``: (d, d); NaN if H is not finite, or not positive definite on Z (d, k).
 
-    Where it is not, in some directions, only the unknowns that have a part in these are NaN: of the others the
-    pseudo-inverse says what there is to say, as of the other runs where one of many is not determined.
+    If it is not positive definite in some directions, only unknowns with a component in these are NaN. For the others
+    the pseudo-inverse is used: if one of many runs is not determined, the other runs keep their variances.
     """
     nothing = np.full(hessian.shape, np.nan)
     if not np.isfinite(hessian).all():
@@ -515,7 +538,7 @@ class FreeCurvature(NamedTuple):
     scaled : (k,)
         Eigenvalues, ascending, with the unknowns scaled to unit curvature each.
     weakest : tuple of str
-        The unknowns that the direction of the smallest of them mostly consists of.
+        Unknowns with the largest components in the direction of the smallest of them.
     """
 
     smallest: float
@@ -555,5 +578,5 @@ def compute_scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> ScaledSpectru
     return ScaledSpectrum(values, basis @ vectors, size)
 
 
-def _discrete(comparison: Comparison) -> bool:
+def _is_discrete(comparison: Comparison) -> bool:
     return comparison.kind == "measurements"

@@ -1,19 +1,19 @@
-"""One run of the optimiser on a problem whose meshes are given: what fits, profiles and many fits have in common."""
+"""One run of the optimizer on a problem with given meshes, for fits, profiles and many fits."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.fit.collapsed import idle_unknowns
-from switchfit.fit.evaluator import ArrowEvaluation, Evaluation, Evaluator
+from switchfit.fit.evaluator import ArrowEvaluation, ConstrainedEvaluation, Evaluation, Evaluator
 from switchfit.fit.hidden import refuse_hidden_switches, refuse_jumps
 from switchfit.fit.termination import linear_constraints_of
-from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize, minimize_constrained
+from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
 from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.diagnosis import Finding
 from switchfit.optimize.problem import REACH, HessianKind
@@ -22,19 +22,19 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.variables import Variables
 
 MANY_RUNS = 16
-"""Experiments from which on the Hessian's shape of an arrow is made use of; with fewer, the algebra of full matrices
+"""Number of experiments from which the arrow shape of the Hessian is used; with fewer, the algebra of full matrices
 takes no longer (the runs part of the benchmarks)."""
 
 PERFECT_RESIDUAL = 1e-8
-"""Part of the samples that a residual is where a fit is perfect."""
+"""Residual of a perfect fit, as a part of the sample."""
 
 TIME_REACH = 0.01
-"""Part of the horizon by which a transition time may move in the first step inside a trust region."""
+"""Largest change of a transition time in the first trust-region step, as a part of the horizon."""
 
 
 @dataclass(frozen=True, eq=False)
 class CostAndGradient:
-    """All that steepest descent is given."""
+    """Evaluation without Hessian, for steepest descent."""
 
     cost: float
     gradient: FloatArray
@@ -42,7 +42,7 @@ class CostAndGradient:
 
 
 def constraints_of(problem: Problem) -> LinearConstraints:
-    """Return the ordering, minimum durations and bounds of a problem as the optimiser takes them."""
+    """Return the ordering, minimum durations and bounds of a problem in the optimizer's form."""
     unknowns = problem.unknowns
     return LinearConstraints(unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, linear_constraints_of(problem))
 
@@ -57,20 +57,21 @@ def minimize_cost(
     constraints: LinearConstraints | None = None,
     by_blocks: bool | None = None,
 ) -> Result:
-    """Run the optimiser once on the evaluator's meshes; arguments as of `estimate`.
+    """Run the optimizer once on the evaluator's meshes; arguments as in `estimate`.
 
-    The problem's own constraints hold unless others are given. `by_blocks` says whether to use the shape that the
-    Hessian of several runs has; left out, where it pays.
+    `constraints` are by default those of the problem. `by_blocks` is whether to use the arrow shape of the Hessian of
+    several runs; by default, it is used where that is faster, and never with guards or terminal constraints.
     """
     problem = evaluator.problem
-
+    names = problem.constraint_names
     unknowns = problem.unknowns
     matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
     if by_blocks is None:
-        by_blocks = len(problem.experiments) >= MANY_RUNS and 2 * len(evaluator.layout.shared) < len(theta)
-    variables = unknowns.variables
+        many = len(problem.experiments) >= MANY_RUNS and not names
+        by_blocks = many and 2 * len(evaluator.layout.shared) < len(theta)
     constraints = constraints_of(problem) if constraints is None else constraints
-    identity = variables.identity
+    change = _Change.of(problem, constraints, evaluator.breakpoints())
+    identity = unknowns.variables.identity
     seen: list[bool] = []
 
     def evaluate_theta(theta: Any, side: int) -> Evaluation | ArrowEvaluation | CostAndGradient:
@@ -79,73 +80,51 @@ def minimize_cost(
         here = evaluator(theta, side, matrix=matrix)
         return CostAndGradient(here.cost, here.gradient) if hessian == "none" else here
 
-    def evaluate(z: Any, side: int) -> Any:
-        theta = z if identity else _to_theta(variables, constraints, z)
+    def evaluate(z: Any, side: int, multipliers: FloatArray | None = None) -> Any:
+        theta = z if identity else change.to_theta(z)
+        if multipliers is not None:
+            held = evaluator.constrained(theta, side, multipliers)
+            return held if identity else _to_constrained(change.variables, theta, held, multipliers)
         here = evaluate_theta(theta, side)
         if not seen:
             seen.append(True)
             refuse_hidden_switches(evaluator, theta, here.gradient)
-        return here if identity else _to_variables(variables, theta, here)
+        return here if identity else _to_variables(change.variables, theta, here)
 
     def idle(z: FloatArray, everything: bool) -> NDArray[np.bool_]:
-        return idle_unknowns(evaluator, z if identity else _to_theta(variables, constraints, z), everything)
+        return idle_unknowns(evaluator, z if identity else change.to_theta(z), everything)
 
-    told = callback
+    report = callback
     if callback is not None and not identity:
-        told = lambda record: callback(_convert_record(variables, constraints, record))  # noqa: E731
+        report = lambda record: callback(change.convert_record(record))  # noqa: E731
     result = minimize(
         evaluate,
-        theta if identity else variables.inward(np.asarray(theta)),
-        constraints=constraints if identity else _convert_constraints(variables, constraints),
-        breakpoints=evaluator.breakpoints(),
-        hessian="exact" if by_blocks and hessian == "auto" else hessian,  # one radius for many runs would serve none
+        theta if identity else change.variables.inward(np.asarray(theta)),
+        constraints=constraints if identity else change.convert_constraints(problem.sizes),
+        breakpoints=change.points,
+        hessian="exact" if by_blocks and hessian == "auto" else hessian,  # a trust region's one radius suits no run
         blocks=unknowns.is_time.astype(int),
         tolerance=tolerance,
         max_iterations=max_iterations,
-        callback=told,
-        size=problem.sizes if identity else variables.sizes_inward(problem.sizes),
-        idle=idle,
-        reach=_reach_of(problem),
+        callback=report,
+        size=problem.sizes if identity else change.variables.sizes_inward(problem.sizes),
+        idle=None if names else idle,
+        reach=_compute_reach(problem),
+        equalities=names,
     )
-    if result.status is Status.LINE_SEARCH_FAILED:
-        refuse_jumps(evaluator, result.theta if identity else _to_theta(variables, constraints, result.theta))
-    return result if identity else _convert_result(variables, constraints, result)
+    if result.status is Status.LINE_SEARCH_FAILED and not names:
+        refuse_jumps(evaluator, result.theta if identity else change.to_theta(result.theta))
+    if identity:
+        return result
+    converted = change.convert_result(result)
+    return converted if not names else _convert_constrained(evaluator, converted)
 
 
-def minimize_with_constraints(
-    evaluator: Evaluator,
-    theta: FloatArray,
-    tolerance: float,
-    max_iterations: int,
-    callback: Callable[[IterationRecord], object] | None = None,
-) -> tuple[Result, tuple[tuple[str, float, float], ...]]:
-    """Run the optimiser once with guards and terminal constraints; arguments as of `estimate`.
+def _compute_reach(problem: Problem) -> FloatArray:
+    """Return how far each variable may move in the optimizer's first trust-region step: (d,).
 
-    Returns its result, and each constraint with its value and its multiplier.
-    """
-    problem = evaluator.problem
-    names = problem.constraint_names
-    found = minimize_constrained(
-        evaluator.constrained,
-        theta,
-        names,
-        tolerance=tolerance,
-        max_iterations=max_iterations,
-        callback=callback,
-        constraints=constraints_of(problem),
-        breakpoints=evaluator.breakpoints(),
-        size=problem.sizes,
-        scale=problem.measure_from_start(theta),
-    )
-    values, multipliers = found.constraints.tolist(), found.multipliers.tolist()
-    return found.result, tuple(zip(names, values, multipliers, strict=True))
-
-
-def _reach_of(problem: Problem) -> FloatArray:
-    """Return how far each variable may move in the first step inside the optimiser's trust region: (d,).
-
-    A transition time a part of the horizon, any other unknown a part of its first guess, or of the way between its
-    bounds where that is zero.
+    This is a part of the horizon for a transition time, and a part of the first guess for any other unknown; if the
+    guess is zero, of the range between its bounds.
     """
     unknowns = problem.unknowns
     width = unknowns.upper - unknowns.lower
@@ -156,13 +135,8 @@ def _reach_of(problem: Problem) -> FloatArray:
     return np.where(unknowns.variables.log, REACH, reach / unknowns.variables.size)
 
 
-def _to_theta(variables: Variables, constraints: LinearConstraints, z: FloatArray) -> FloatArray:
-    """Return theta at z, inside its bounds whatever the rounding."""
-    return np.asarray(np.clip(variables.outward(z), constraints.lower, constraints.upper))
-
-
 def _to_variables(variables: Variables, theta: FloatArray, here: Any) -> Any:
-    """Return an evaluation at theta as one of the optimiser's variables."""
+    """Convert an evaluation at theta to the optimizer's variables."""
     if here.hessian is None:
         return CostAndGradient(here.cost, variables.slopes(theta)[0] * here.gradient)
     if isinstance(here.hessian, Arrow):
@@ -172,51 +146,135 @@ def _to_variables(variables: Variables, theta: FloatArray, here: Any) -> Any:
     return Evaluation(here.cost, *variables.derivatives_inward(theta, here.gradient, here.hessian))
 
 
-def _convert_constraints(variables: Variables, constraints: LinearConstraints) -> LinearConstraints:
-    """Return the bounds of the optimiser's variables; the rows join transition times alone, which are not changed."""
-    lower, upper = variables.inward(constraints.lower), variables.inward(constraints.upper)
-    return replace(constraints, lower=lower, upper=upper)
+def _to_constrained(
+    variables: Variables, theta: FloatArray, here: ConstrainedEvaluation, multipliers: FloatArray
+) -> ConstrainedEvaluation:
+    """Return an evaluation with constraints at theta in the optimizer's variables."""
+    D, _ = variables.slopes(theta)
+    slope = here.gradient + multipliers @ here.jacobian
+    hessian = variables.derivatives_inward(theta, slope, here.hessian)[1]
+    return replace(here, gradient=D * here.gradient, hessian=hessian, jacobian=here.jacobian * D)
 
 
-def _convert_record(variables: Variables, constraints: LinearConstraints, record: IterationRecord) -> IterationRecord:
-    """Return a record of the optimiser's with theta in place of its own variables."""
-    return replace(record, theta=_to_theta(variables, constraints, record.theta))
+class _Change(NamedTuple):
+    """The change between theta and the optimizer's variables z in one problem.
+
+    Attributes
+    ----------
+    variables : Variables
+    constraints : LinearConstraints
+        Of theta.
+    points : list of (K,) arrays
+        Breakpoints of each variable.
+    nodes : dict of int -> (K,) array
+        What these are in theta, for times on a logarithmic scale: a transition is at a node where z is at its
+        breakpoint, and not beside it by the rounding of a logarithm.
+    log_rows : list of (row, (d,))
+        Rows of the constraints that join times on a logarithmic scale, and which.
+    """
+
+    variables: Variables
+    constraints: LinearConstraints
+    points: list[FloatArray]
+    nodes: dict[int, FloatArray]
+    log_rows: list[tuple[int, NDArray[np.intp]]]
+
+    @classmethod
+    def of(cls, problem: Problem, constraints: LinearConstraints, points: Sequence[FloatArray]) -> _Change:
+        """Return the change of a problem's variables, given the breakpoints of each unknown."""
+        variables, log_times = problem.unknowns.variables, problem.unknowns.log_times
+        points, nodes, rows = list(points), {}, []
+        if log_times.any():
+            for i in np.flatnonzero(log_times).tolist():
+                away = points[i] - variables.origin[i]
+                logs, first = np.unique(np.log(away[away > 0]), return_index=True)
+                points[i], nodes[i] = logs, points[i][away > 0][first]
+            for k, row in enumerate(constraints.A):
+                where = np.flatnonzero((row != 0) & log_times)
+                if where.size:
+                    rows.append((k, where))
+        return cls(variables, constraints, points, nodes, rows)
+
+    def to_theta(self, z: FloatArray) -> FloatArray:
+        """Return theta at z, inside its bounds whatever the rounding, and on the nodes that z is on."""
+        theta = np.asarray(np.clip(self.variables.outward(z), self.constraints.lower, self.constraints.upper))
+        for i, nodes in self.nodes.items():
+            k = int(np.searchsorted(self.points[i], z[i]))
+            if k < len(nodes) and self.points[i][k] == z[i]:
+                theta[i] = nodes[k]
+        return theta
+
+    def convert_constraints(self, sizes: FloatArray) -> LinearConstraints:
+        """Return the constraints on z, which are linear too.
+
+        The order of two times is that of their logarithms. A time that comes after or before a fixed one has a bound;
+        behind t0, whose logarithm is minus infinity, it is at least what rounding leaves of the clock, a part of its
+        size (d,).
+        """
+        given = self.constraints
+        lower, upper = self.variables.inward(given.lower), self.variables.inward(given.upper)
+        b = given.b.copy()
+        for k, where in self.log_rows:
+            if len(where) == 1:
+                i, sign = int(where[0]), float(given.A[k, where[0]])
+                rounding = float(np.finfo(float).eps * sizes[i])
+                b[k] = sign * np.log(max(sign * given.b[k] - self.variables.origin[i], rounding))
+        return replace(given, b=b, lower=lower, upper=upper)
+
+    def convert_record(self, record: IterationRecord) -> IterationRecord:
+        """Return a record of the optimizer's with theta in place of its own variables."""
+        return replace(record, theta=self.to_theta(record.theta))
+
+    def convert_result(self, result: Result) -> Result:
+        """Return the optimizer's result in theta; its optimality and its eigenvalues stay those of its own variables.
+
+        Of times that are joined by a row that holds with equality, all are equal, and so are their slopes.
+        """
+        theta = self.to_theta(result.theta)
+        slopes = self.variables.slopes(theta)[0]
+        rows = np.ones(len(self.constraints.b))
+        for k, where in self.log_rows:
+            rows[k] = slopes[where[0]]
+        gradient, hessian = self.variables.derivatives_outward(theta, result.gradient, result.hessian)
+        history = tuple(self.convert_record(record) for record in result.history)
+        return replace(
+            result,
+            theta=theta,
+            gradient=gradient,
+            hessian=hessian,
+            history=history,
+            multipliers=result.multipliers / np.concatenate([rows, slopes, slopes]),
+            kinks=tuple((i, left / float(slopes[i]), right / float(slopes[i])) for i, left, right in result.kinks),
+            reason=None if result.reason is None else self._convert_reason(result.theta, slopes, result.reason),
+        )
+
+    def _convert_reason(self, z: FloatArray, slopes: FloatArray, found: Finding) -> Finding:
+        """Return why the line search failed, in theta instead of the variables z (d,); `slopes`: dtheta/dz (d,)."""
+        places = []
+        for i, value in found.places:
+            there = z.copy()
+            there[i] = value
+            places.append((i, float(self.variables.outward(there)[i])))
+        entries = [(i, stated / float(slopes[i]), measured / float(slopes[i])) for i, stated, measured in found.entries]
+        return replace(found, places=tuple(places), entries=tuple(entries))
 
 
-def _convert_result(variables: Variables, constraints: LinearConstraints, result: Result) -> Result:
-    """Return the optimiser's result in theta; its optimality and its eigenvalues stay those of its own variables."""
-    theta = _to_theta(variables, constraints, result.theta)
-    slopes = variables.slopes(theta)[0]
-    rows = np.ones(len(constraints.b))  # these join transition times alone, which are not changed
-    gradient, hessian = variables.derivatives_outward(theta, result.gradient, result.hessian)
-    history = tuple(_convert_record(variables, constraints, record) for record in result.history)
-    return replace(
-        result,
-        theta=theta,
-        gradient=gradient,
-        hessian=hessian,
-        history=history,
-        multipliers=result.multipliers / np.concatenate([rows, slopes, slopes]),
-        reason=None if result.reason is None else _convert_reason(variables, result.theta, slopes, result.reason),
-    )
+def _convert_constrained(evaluator: Evaluator, result: Result) -> Result:
+    """Return a result of the optimizer's variables with the Hessian and the free directions that it has in theta.
 
-
-def _convert_reason(variables: Variables, z: FloatArray, slopes: FloatArray, found: Finding) -> Finding:
-    """Return why the line search failed, in theta instead of the variables z (d,); `slopes`: dtheta/dz (d,)."""
-    places = []
-    for i, value in found.places:
-        there = z.copy()
-        there[i] = value
-        places.append((i, float(variables.outward(there)[i])))
-    entries = [(i, stated / float(slopes[i]), measured / float(slopes[i])) for i, stated, measured in found.entries]
-    return replace(found, places=tuple(places), entries=tuple(entries))
+    Both mix what bends the change of variables with what bends the constraints.
+    """
+    here = evaluator.constrained(result.theta, 1, [multiplier for _, _, multiplier in result.equalities])
+    slopes = evaluator.problem.unknowns.variables.slopes(result.theta)[0]
+    basis = np.linalg.qr(slopes[:, None] * result.free_basis)[0]
+    return replace(result, hessian=here.hessian, curvature=replace(result.curvature, basis=basis))
 
 
 def smallest_cost(problem: Problem) -> float:
-    """Return a cost below which an error is not measured against it.
+    """Return the cost below which errors are not measured relative to the cost itself.
 
-    Half a sum of squares: that of residuals of 1e-8 of the samples. The negative logarithm of a likelihood may be
-    anything, 0 too; its parts are of the size of half the samples.
+    For half a sum of squares it is the cost of a perfect fit, with residuals of 1e-8 of the samples. A negative log
+    likelihood may have any value, 0 too; its terms are of the size of half the number of samples.
     """
     items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
     if not is_least_squares(problem):
@@ -233,16 +291,16 @@ def is_least_squares(problem: Problem) -> bool:
 
 
 def is_plain_least_squares(problem: Problem) -> bool:
-    """Return whether J is half a sum of squares of the samples alone, each of the moment at which it was taken."""
+    """Return whether J is half a sum of squares of samples alone, without priors and delays that are parameters."""
     items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
     delayed = any(isinstance(item.delay, str) for item in items)
     return is_least_squares(problem) and not problem.unknowns.priors.any and not delayed
 
 
 def is_sigma_known(problem: Problem) -> bool | None:
-    """Return whether sigma is known for all measurements, as a number or as a parameter beside the others.
+    """Return whether sigma is given for all measurements, as a number or as a parameter.
 
-    None where the cost is not made of measurements alone.
+    None if the cost has other terms than measurements and terminal constraints.
     """
     items = [item for run in problem.experiments for item in run.data if not isinstance(item, TerminalConstraint)]
     if not items or not all(isinstance(item, Measurements) for item in items):

@@ -1,4 +1,4 @@
-"""How a fit ended, as data: what the report makes its message of."""
+"""How a fit ended, as data from which the report writes its message."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text
 
 NAMED = 4
-"""Unknowns of a flat direction that are named."""
+"""Largest number of unknowns named for a flat direction."""
 
 SMALL_WEIGHT = 0.1
 """Unknowns with a weight below this in a direction of unit length are not named."""
@@ -30,9 +30,9 @@ class Kink:
     ----------
     unknown : str
     value : float
-        Where the kink is.
+        Value of the unknown at the kink.
     left, right : float
-        The derivatives of J on both sides of it.
+        Derivatives of J on both sides of it.
 
     See Also
     --------
@@ -64,17 +64,17 @@ class Termination:
     status : Status
     cost, optimality, tolerance : float
     iterations, earlier_iterations : int
-        All of them, and those before the mesh was refined for the last time.
+        All iterations, and those before the last refinement of the mesh.
     active : tuple of ActiveConstraint
     kinks : tuple of Kink
     idle : tuple of str
     smallest_eigenvalue : float
-        Of the Hessian on the free directions, each unknown scaled to unit curvature, where the status is SADDLE or
-        SINGULAR; else NaN.
+        Smallest eigenvalue of the Hessian on the free directions, each unknown scaled to unit curvature, if the status
+        is SADDLE or SINGULAR; else NaN.
     flat_direction : tuple of (str, float)
-        The unknowns that the eigenvector of it mostly consists of, and their parts in it.
+        Unknowns with the largest components of its eigenvector, and these components.
     violated : tuple of (str, float)
-        Guards and terminal constraints that are not met, and their values.
+        Guards and terminal constraints that are violated, and their values.
     reason : Issue or None
         Why the line search failed, or the error with which the fit ended.
 
@@ -110,7 +110,7 @@ class Termination:
 
     @classmethod
     def of_error(cls, text: str) -> Termination:
-        """Describe a fit that an error ended; `text` says which.
+        """Return the termination of a fit that ended with an error, whose message is `text`.
 
         See Also
         --------
@@ -129,17 +129,17 @@ class Termination:
 
 
 def termination_of(result: Result, problem: Problem) -> Termination:
-    """Return how a fit ended, from what the optimiser found.
+    """Return how a fit ended, from the optimizer's result.
 
     Parameters
     ----------
     result : Result
-        In theta, its constraints called by the problem's.
+        In theta; its constraints are those of `linear_constraints_of`.
     problem : Problem
     """
     names = problem.unknowns.names
     smallest, direction = np.nan, np.zeros(len(names))
-    if result.status in (Status.SADDLE, Status.SINGULAR):  # eigenvalues take time, and no other status asks for them
+    if result.status in (Status.SADDLE, Status.SINGULAR):  # eigenvalues take time, and no other status needs them
         smallest, direction = result.smallest_eigenvalue, result.flat_direction
     parts = np.abs(direction)
     largest = [i for i in np.argsort(-parts, kind="stable").tolist() if parts[i] > SMALL_WEIGHT][:NAMED]
@@ -150,13 +150,13 @@ def termination_of(result: Result, problem: Problem) -> Termination:
         tolerance=result.tolerance,
         iterations=result.iterations,
         earlier_iterations=result.earlier,
-        active=_active(result, problem),
+        active=_list_active(result, problem),
         kinks=tuple(Kink(names[i], float(result.theta[i]), left, right) for i, left, right in result.kinks),
         idle=tuple(names[i] for i in result.idle),
         smallest_eigenvalue=smallest,
         flat_direction=tuple((names[i], float(direction[i])) for i in largest),
         violated=result.violated,
-        reason=None if result.reason is None else _reason(result.reason, problem),
+        reason=None if result.reason is None else _describe_failure(result.reason, problem),
     )
 
 
@@ -168,7 +168,7 @@ def linear_constraints_of(problem: Problem) -> tuple[Constraint, ...]:
     return *unknowns.rows, *lower, *upper
 
 
-def _active(result: Result, problem: Problem) -> tuple[ActiveConstraint, ...]:
+def _list_active(result: Result, problem: Problem) -> tuple[ActiveConstraint, ...]:
     if not result.active:
         return ()
     multipliers = dict(zip(linear_constraints_of(problem), result.multipliers.tolist(), strict=True))
@@ -176,8 +176,8 @@ def _active(result: Result, problem: Problem) -> tuple[ActiveConstraint, ...]:
     return tuple(ActiveConstraint(**vars(constraint), multiplier=multipliers[constraint]) for constraint in found)
 
 
-def _reason(found: Finding, problem: Problem) -> Issue:
-    """Return why the line search failed, with the unknowns called by their names."""
+def _describe_failure(found: Finding, problem: Problem) -> Issue:
+    """Return why the line search failed, with the names of the unknowns."""
     names = problem.unknowns.names
     figures: dict[str, float | tuple[float, ...]] = {}
     subjects: tuple[str, ...] = ()

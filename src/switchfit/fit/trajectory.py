@@ -26,7 +26,7 @@ class Trajectory:
     Attributes
     ----------
     times : (K,) array
-        All nodes, in `time_unit`; each transition time stands twice, with the state before and after it.
+        All nodes, in `time_unit`; each transition time occurs twice, with the state before and after it.
     states : (K, n) array
     modes : (K,) array of str
         The mode that is active.
@@ -34,7 +34,7 @@ class Trajectory:
         Entries ``segments[i]:segments[i + 1]`` belong to the i-th entry of the mode sequence.
     state_names, state_units : tuple of str
     time_unit : str
-        That of the experiment.
+        Unit of the experiment's times.
 
     See Also
     --------
@@ -63,7 +63,7 @@ class Trajectory:
 
     @property
     def mode_spans(self) -> list[tuple[str, float, float]]:
-        """Each mode in turn with the times at which it begins and ends."""
+        """Each mode of the sequence with the times at which it begins and ends."""
         return [
             (str(self.modes[a]), float(self.times[a]), float(self.times[b - 1]))
             for a, b in zip(self.segments[:-1], self.segments[1:], strict=True)
@@ -72,21 +72,21 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Measured against fitted, for one of the data of one experiment.
+    """Measured and fitted values, for one of the data of one experiment.
 
     Attributes
     ----------
     kind : "measurements" or "reference"
-    names : tuple of str, one a channel
+    names : tuple of str, one per channel
     times, measured, fitted : (K,), (K, q), (K, q)
         At the sample times; for a reference signal at the nodes of the mesh. NaN where a sample is missing.
     sigma : (K, q) or None where unknown
     curve_times, curve : (L,), (L, q)
         The fitted output at all nodes, for plots.
     downweighted : (K, q) of bool, or None
-        Where a robust loss counts a residual as an outlier, one larger than its `loss_scale`; None without such a loss.
+        Which residuals a robust loss treats as outliers: those larger than its `loss_scale`; None without such a loss.
     weights : (q,) or None
-        Of the channels of a reference signal, the diagonal of its weight matrix; None for measurements.
+        Weights of the channels of a reference signal, the diagonal of its weight matrix; None for measurements.
 
     See Also
     --------
@@ -118,12 +118,12 @@ class Comparison:
 
     @property
     def residuals(self) -> FloatArray:
-        """Measured less fitted: (K, q)."""
+        """Measured minus fitted: (K, q)."""
         return self.measured - self.fitted
 
     @property
     def rmse(self) -> FloatArray:
-        """Root mean square of the residuals of each channel: (q,); NaN where there is no sample."""
+        """Root mean square of the residuals of each channel: (q,); NaN without samples."""
         known = np.isfinite(self.measured)
         squares = np.where(known, self.residuals, 0.0) ** 2
         return np.sqrt(squares.sum(0) / np.where(known.any(0), known.sum(0), np.nan))
@@ -138,7 +138,7 @@ def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: in
     theta : (d,) array_like, optional
         In the order of ``problem.theta_names``; the initial guess if left out.
     experiment : int, optional
-        Which experiment, from 0.
+        Index of the experiment, from 0.
 
     Returns
     -------
@@ -172,16 +172,16 @@ def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: in
     mesh = refine_mesh(problem, experiment, checked)
     engine = engine_of(problem, experiment, build_arguments(problem, experiment, mesh), mesh)
     simulation = engine.simulate(*problem.vectors(checked, experiment), tangents=False)
-    return _trajectory(problem, experiment, simulation)
+    return _build_trajectory(problem, experiment, simulation)
 
 
 class SimulatedProblem:
-    """A problem simulated at one theta, as far as it has been asked for: J alone takes half of a trajectory's time.
+    """A problem at one theta, simulated when first accessed: J alone takes half of a trajectory's time.
 
     Parameters
     ----------
     evaluator : Evaluator
-        Whose meshes are taken.
+        Its meshes are used.
     theta : (d,)
     """
 
@@ -197,11 +197,11 @@ class SimulatedProblem:
 
     @cached_property
     def simulations(self) -> list[Simulation]:
-        """All states and outputs, one an experiment."""
+        """States and outputs of each experiment."""
         return self.evaluator.simulate(self.theta)
 
     def compare(self) -> tuple[tuple[Trajectory, ...], tuple[tuple[Comparison, ...], ...]]:
-        """Return the trajectories and measured against fitted of all experiments."""
+        """Return the trajectories and comparisons of all experiments."""
         return compare(self.evaluator.problem, self.theta, self.simulations)
 
 
@@ -215,16 +215,16 @@ def cost_of(problem: Problem, theta: FloatArray, simulations: Sequence[Simulatio
 def compare(
     problem: Problem, theta: FloatArray, simulations: Sequence[Simulation]
 ) -> tuple[tuple[Trajectory, ...], tuple[tuple[Comparison, ...], ...]]:
-    """Return the trajectories and measured against fitted of all experiments."""
-    trajectories = tuple(_trajectory(problem, e, simulation) for e, simulation in enumerate(simulations))
+    """Return the trajectories and comparisons of all experiments."""
+    trajectories = tuple(_build_trajectory(problem, e, simulation) for e, simulation in enumerate(simulations))
     pairs = enumerate(zip(simulations, trajectories, strict=True))
-    return trajectories, tuple(_comparisons(problem, e, theta, *pair) for e, pair in pairs)
+    return trajectories, tuple(_build_comparisons(problem, e, theta, *pair) for e, pair in pairs)
 
 
 def select_visible(simulation: Simulation, before: FloatArray, after: FloatArray) -> FloatArray:
-    """Select what a trajectory shows of the values at the starts and ends of all rows.
+    """Select the entries of a trajectory from the values at the starts and ends of all rows.
 
-    The start of every segment, and the ends of all its rows that are not empty.
+    These are the start of every segment, and the ends of all its rows that are not empty.
     """
     parts = []
     for rows in simulation.segments:
@@ -232,7 +232,7 @@ def select_visible(simulation: Simulation, before: FloatArray, after: FloatArray
     return np.concatenate(parts)
 
 
-def _trajectory(problem: Problem, e: int, simulation: Simulation) -> Trajectory:
+def _build_trajectory(problem: Problem, e: int, simulation: Simulation) -> Trajectory:
     structure, system = problem.structures[e], problem.system
     moving = simulation.end > simulation.start
     counts = [1 + int(moving[rows].sum()) for rows in simulation.segments]
@@ -250,7 +250,7 @@ def _trajectory(problem: Problem, e: int, simulation: Simulation) -> Trajectory:
     )
 
 
-def _comparisons(
+def _build_comparisons(
     problem: Problem, e: int, theta: FloatArray, simulation: Simulation, trajectory: Trajectory
 ) -> tuple[Comparison, ...]:
     """Compare measured with fitted for each reference signal and each Measurements."""
@@ -278,7 +278,7 @@ def _comparisons(
             beyond = None
             if item.loss != "linear" and sigma is not None:
                 beyond = np.abs(np.nan_to_num(item.values - fitted)) > item.loss_scale * sigma
-            moments = times + delay  # as the sensor says it
+            moments = times + delay  # time stamps of the sensor
             here = Comparison("measurements", label, item.times, item.values, fitted, sigma, moments, curve, beyond)
         comparisons.append(here)
     return tuple(comparisons)

@@ -1,1 +1,1 @@
-"""Files: tables of measurements, models in Python files, problem files, saved estimates."""
+"""Read files: tables of measurements, models in Python files, problem files."""

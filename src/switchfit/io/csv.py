@@ -1,4 +1,4 @@
-"""Columns of numbers out of CSV files."""
+"""Read columns of numbers from CSV files."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from switchfit.runtime.files import is_device
 def read_columns(path: str | Path, columns: Sequence[str]) -> FloatArray:
     """Read some columns of a CSV file that has one header line.
 
-    Fields are separated by commas, semicolons or tabs, whichever the header has most of. Lines that are empty or
-    start with ``#`` are skipped. Spaces around names and numbers do not count.
+    Fields are separated by commas, semicolons or tabs, whichever is most frequent in the header. Lines that are empty
+    or start with ``#`` are skipped. Spaces around names and numbers are ignored.
 
     Parameters
     ----------
@@ -33,14 +33,14 @@ def read_columns(path: str | Path, columns: Sequence[str]) -> FloatArray:
     Raises
     ------
     InputError
-        If the file cannot be read or has no rows, a column is missing or there twice, a line has fewer or more
+        If the file cannot be read or has no rows, a column is missing or occurs twice, a line has fewer or more
         fields than the header, or a cell is not a number.
     """
     path = Path(path)
     rows = _read_rows(path)
     header = next(rows, None)
     if header is None:
-        raise InputError(f"{path} is empty; it needs a line with the names of the columns and one line a sample.")
+        raise InputError(f"{path} is empty; it needs a line with the names of the columns and one line per sample.")
     names = header[1]
     where = [_find_column(path, names, column) for column in columns]
     table = []
@@ -71,7 +71,7 @@ def _read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not a text file in UTF-8 (byte {error.start}); export it as CSV.") from error
     except ValueError as error:
-        raise InputError(f"{str(path)!r} is no name of a file: {error}.") from error
+        raise InputError(f"{str(path)!r} is not a file name: {error}.") from error
     kept = [(k, line) for k, line in enumerate(lines, start=1) if line.strip() and not line.lstrip().startswith("#")]
     if not kept:
         return
@@ -79,7 +79,7 @@ def _read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     cells_of_lines = csv.reader((line for _, line in kept), delimiter=delimiter, skipinitialspace=True)
     try:
         for cells in cells_of_lines:
-            # Quotes may join lines; then the last one counts.
+            # A quoted cell may span lines; the line number is then that of the last one.
             yield kept[cells_of_lines.line_num - 1][0], [cell.strip() for cell in cells]
     except csv.Error as error:
         line = kept[min(cells_of_lines.line_num, len(kept)) - 1][0]

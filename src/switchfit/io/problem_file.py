@@ -1,7 +1,7 @@
 """Problem files: a model, its data, guesses and bounds, in TOML.
 
-The `pydantic` models below are the format: their fields are the keys, a field's description says what the key is
-for, in the reference page and in error messages. ``docs/problem-file.md`` shows it by example.
+The `pydantic` models below define the format. Their fields are the keys; the description of a field is used in error
+messages. ``docs/problem-file.md`` shows the format by example.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ HessianKind = Literal["auto", "exact", "descent-first", "block-diagonal", "gauss
 
 @dataclass(frozen=True)
 class ProblemFile:
-    """What a problem file says.
+    """Contents of a problem file.
 
     Attributes
     ----------
     path : Path
     problem : Problem
     options : dict
-        Keyword arguments for `switchfit.estimate`, as far as the file gives them.
+        Keyword arguments for `switchfit.estimate` that the file sets.
     """
 
     path: Path
@@ -61,7 +61,7 @@ def load_problem(path: str | Path) -> ProblemFile:
     Parameters
     ----------
     path : str or Path
-        A TOML file. Files it names are looked for in its folder.
+        A TOML file. Paths in it are relative to its folder.
 
     Returns
     -------
@@ -70,8 +70,8 @@ def load_problem(path: str | Path) -> ProblemFile:
     Raises
     ------
     InputError
-        For anything wrong with the file or with what it names: one sentence with the file, the key, what was given
-        and what to do.
+        For any error in the file or in the files that it names; the message has the file, the key, the value that was
+        given, and what to do.
     """
     path = Path(path)
     contents = _validate(path, _parse(path))
@@ -90,12 +90,12 @@ def read_experiments(path: str | Path) -> tuple[Experiment, ...]:
     Returns
     -------
     tuple of Experiment
-        With data and horizon, but without functions for what is observed; none if the whole problem is made in Python.
+        With data and horizon, but without observation functions; empty if the whole problem is built in Python.
 
     Raises
     ------
     InputError
-        As of `load_problem`.
+        As in `load_problem`.
     """
     path = Path(path)
     contents = _validate(path, _parse(path))
@@ -123,12 +123,12 @@ def _number_as_table(given: Any) -> Any:
 
 
 def _known_as_table(given: Any) -> Any:
-    """Return ``{ value = 0.5, fixed = true }`` for ``0.5``: a state at t0 that is given as a number is known."""
+    """Return ``{ value = 0.5, fixed = true }`` for ``0.5``: a state at t0 given as a number is known."""
     return {"value": given, "fixed": True} if isinstance(given, (int, float)) and not isinstance(given, bool) else given
 
 
 def _end_as_table(given: Any) -> Any:
-    """Return ``{ value = 6.0, fixed = true }`` for ``6.0``: a tf that is given as a number is known."""
+    """Return ``{ value = 6.0, fixed = true }`` for ``6.0``: a tf given as a number is known."""
     if given is not None and not isinstance(given, dict) and _known_as_table(given) is given:
         raise PydanticCustomError("float_type", "Input should be a valid number")
     return _known_as_table(given)
@@ -140,12 +140,12 @@ def _name_as_table(given: Any) -> Any:
 
 
 def _table_as_list(given: Any) -> Any:
-    """Return a list of tables, of one table a list of one."""
+    """Return a list of tables; a single table becomes a list of one."""
     return [given] if isinstance(given, dict) else given
 
 
 class PriorTable(_Table):
-    """What is known of an unknown: normal with mean and sd, or log-normal with median and log_sd."""
+    """A prior: normal with mean and sd, or log-normal with median and log_sd."""
 
     mean: float | None = Field(default=None, description="mean of a normal prior")
     sd: float | None = Field(default=None, description="standard deviation of a normal prior")
@@ -156,7 +156,7 @@ class PriorTable(_Table):
 
 
 class ParameterTable(_Table):
-    """A guess and what is known about it; a bare number is a guess without bounds."""
+    """A guess with bounds, unit and prior; a bare number is a guess without bounds."""
 
     value: float | list[float] = Field(description="first guess, or the value itself where fixed")
     lower: float = Field(default=-np.inf, description="lower bound")
@@ -170,7 +170,7 @@ class ParameterTable(_Table):
 
 
 class TransitionTable(_Table):
-    """First guess of a transition time, or of tf, with bounds of its own."""
+    """First guess of a transition time, or of tf, with bounds."""
 
     value: float = Field(description="first guess of the transition time, in the experiment's time_unit")
     lower: float = Field(default=-np.inf, description="earliest time")
@@ -180,10 +180,13 @@ class TransitionTable(_Table):
     prior: PriorTable | None = Field(
         default=None, description="what is known of it: { mean, sd } or { median, log_sd }"
     )
+    scale: Literal["linear", "log"] = Field(
+        default="linear", description="'log': estimated as the logarithm of the time since t0"
+    )
 
 
 class StateTable(_Table):
-    """An entry of the initial state that is not known, or a guess of it."""
+    """An entry of the initial state: a guess, or a known value."""
 
     value: float = Field(description="first guess of the state at t0, or the value itself where fixed")
     lower: float = Field(default=-np.inf, description="lower bound")
@@ -209,7 +212,7 @@ class LogTable(_Table):
 
 
 class DataTable(LogTable):
-    """What the model is compared with."""
+    """Data to which the model is fitted."""
 
     columns: list[str] = Field(min_length=1, description="names of the columns with the values")
     kind: Literal["measurements", "reference"] = Field(
@@ -222,16 +225,16 @@ class DataTable(LogTable):
     )
     sigma: float | str | list[float | str] | None = Field(
         default=None,
-        description="standard deviation of the noise: a number, one a column, the names of columns that hold it, or "
+        description="standard deviation of the noise: a number, one per column, the names of columns that hold it, or "
         "of parameters that it is; left out, it is unknown (measurements only)",
     )
     loss: Literal["linear", "soft_l1", "huber", "cauchy"] = Field(
-        default="linear", description="what outliers cost (measurements only)"
+        default="linear", description="loss of the residuals, for outliers (measurements only)"
     )
-    loss_scale: float = Field(default=1.0, gt=0, description="size of a residual, in sigmas, beyond which it is one")
+    loss_scale: float = Field(default=1.0, gt=0, description="residual, in sigmas, above which it counts as an outlier")
     delay: float | str = Field(
         default=0.0,
-        description="by how much the sensor is late, in the experiment's time_unit, or the parameter that it is "
+        description="delay of the sensor, in the experiment's time_unit, or the name of the parameter that it is "
         "(measurements only)",
     )
     lowpass_hz: float | None = Field(
@@ -244,7 +247,7 @@ class DataTable(LogTable):
 
 
 class InputTable(LogTable):
-    """A known input u(t); modes are then called as f(t, x, p, u)."""
+    """A known input u(t); the modes are then functions f(t, x, p, u)."""
 
     columns: Annotated[
         Annotated[list[str], Field(min_length=1), pydantic.Tag("list")]
@@ -253,7 +256,7 @@ class InputTable(LogTable):
     ] = Field(
         description="names of the columns with the values, or { name in the model = column }, with which u is a dict"
     )
-    kind: Literal["hold", "linear", "cubic"] = Field(default="hold", description="what happens between samples")
+    kind: Literal["hold", "linear", "cubic"] = Field(default="hold", description="interpolation between samples")
 
 
 class ExperimentTable(_Table):
@@ -262,31 +265,31 @@ class ExperimentTable(_Table):
     mode_sequence: list[str] = Field(min_length=1, description="names of the modes in the order of their activity")
     transition_times: list[Annotated[TransitionTable, pydantic.BeforeValidator(_number_as_table)]] | None = Field(
         default=None,
-        description="first guess of each transition time, in time_unit, one fewer than modes; left out, they are "
-        "looked for all over the log",
+        description="first guess of each transition time, in time_unit, one fewer than modes; if left out, all of the "
+        "log is searched",
     )
     time_unit: str = Field(
         default="s", min_length=1, description="unit of all times of the run, for the report; nothing is converted"
     )
     data: Annotated[list[DataTable], pydantic.BeforeValidator(_table_as_list)] = Field(
-        min_length=1, description="what the model is compared with; several tables add up"
+        min_length=1, description="data to which the model is fitted; the costs of several tables are added"
     )
     t0: float | None = Field(default=None, description="start of the horizon; left out, the first sample")
     tf: Annotated[TransitionTable | None, pydantic.BeforeValidator(_end_as_table)] = Field(
         default=None,
         description="end of the horizon; left out, the last sample. A number, or a table with value, lower and upper "
-        "where it is to be estimated",
+        "if it is to be estimated",
     )
     initial_state: list[Annotated[StateTable, pydantic.BeforeValidator(_known_as_table)]] | None = Field(
         default=None,
-        description="state at t0, instead of the model's: a number, or a table where it is to be estimated",
+        description="state at t0, instead of the model's: a number, or a table if it is to be estimated",
     )
     parameter_map: dict[str, str] = Field(
         default_factory=dict,
-        description="the model's name of a parameter = the name under [parameters] of what this run has for it",
+        description="the model's name of a parameter = the name under [parameters] that this run uses for it",
     )
     inputs: InputTable | None = Field(default=None, description="a known input")
-    name: str | None = Field(default=None, description="used in the report where there are several experiments")
+    name: str | None = Field(default=None, description="used in the report if there are several experiments")
 
 
 class ModelTable(_Table):
@@ -297,19 +300,21 @@ class ModelTable(_Table):
 
 
 class OptionsTable(_Table):
-    """How to solve; what is left out has the library's default."""
+    """Options of the fit; options that are left out have the library's defaults."""
 
     min_duration: float | None = Field(
         default=None, ge=0, description="shortest time a mode may last, in the time_unit of the experiments"
     )
-    solver: Literal["explicit", "stiff"] | None = Field(default=None, description="integrator")
+    solver: Literal["auto", "explicit", "stiff"] | None = Field(
+        default=None, description="steps of the integrator; 'stiff' takes implicit ones, 'auto' where they are needed"
+    )
     rtol: float | None = Field(default=None, gt=0, description="relative tolerance of the integrator")
     atol: float | None = Field(default=None, gt=0, description="absolute tolerance of the integrator")
     strategy: Literal["local", "auto", "thorough"] | None = Field(
-        default=None, description="one fit, more where its verdict is not good, or all that can be tried"
+        default=None, description="one fit, more if its verdict is not good, or all strategies"
     )
     time_budget: float | None = Field(default=None, gt=0, description="seconds after which no further strategy begins")
-    hessian: HessianKind | None = Field(default=None, description="quadratic term of the optimiser")
+    hessian: HessianKind | None = Field(default=None, description="quadratic term of the optimizer")
     tolerance: float | None = Field(default=None, gt=0, description="optimality at which to stop")
     max_iterations: int | None = Field(default=None, ge=0, description="most iterations")
 
@@ -348,7 +353,7 @@ def _parse(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
     except RecursionError as error:
         raise InputError(f"{path} is not valid TOML: brackets are nested too deep.") from error
-    except ValueError as error:  # of TOML, of UTF-8, of a number with thousands of digits
+    except ValueError as error:  # invalid TOML, invalid UTF-8, or a number with thousands of digits
         raise InputError(f"{path} is not valid TOML: {error}.") from error
 
 
@@ -360,7 +365,7 @@ def _validate(path: Path, given: dict[str, Any]) -> Contents:
     if contents.problem is not None:
         others = [key for key in ("model", "parameters", "experiments") if key in given]
         if others:
-            raise InputError(f"{path}: 'problem' stands for everything but options; leave out {' and '.join(others)}.")
+            raise InputError(f"{path}: 'problem' replaces everything but options; leave out {' and '.join(others)}.")
     elif contents.model is None:
         raise InputError(f"{path}: the key 'model' is missing; name one of {', '.join(BUILT_IN)} or 'file.py:object'.")
     elif not contents.experiments:
@@ -369,7 +374,7 @@ def _validate(path: Path, given: dict[str, Any]) -> Contents:
 
 
 def _describe_error(error: pydantic.ValidationError) -> str:
-    """Return the first thing that is wrong, in words."""
+    """Return the first error as a sentence."""
     errors = sorted(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
     first = errors[0]
     table, steps = _follow_location(first["loc"])
@@ -409,7 +414,7 @@ def _follow_location(location: Sequence[str | int]) -> tuple[type[_Table] | None
 
 
 class _ParameterNames(_Table):
-    """Stands for [parameters], whose keys are free."""
+    """Placeholder for [parameters], whose keys are chosen by the user."""
 
 
 def _find_table(annotation: Any) -> type[_Table] | None:
@@ -489,7 +494,7 @@ def _build_experiments(path: Path, contents: Contents, system: HybridSystem | No
 
 
 def _build_at(where: str, build: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-    """Build something; what it says is wrong is said with the place in the problem file."""
+    """Build something; add the place in the problem file to its error messages."""
     try:
         return build(*arguments, **named)
     except (InputError, KeyboardInterrupt):
@@ -524,8 +529,8 @@ def _build_system(path: Path, table: ModelTable) -> HybridSystem:
 def _check_model_name(what: str, table: ModelTable) -> None:
     if ".py" not in table.name:
         raise InputError(
-            f"{what} {table.name!r} is not known; the built-in models are {', '.join(BUILT_IN)}, your own is given as "
-            "'file.py:object'."
+            f"{what} {table.name!r} is not known; the built-in models are {', '.join(BUILT_IN)}. Give a model of your "
+            "own as 'file.py:object'."
         )
 
 
@@ -563,13 +568,12 @@ def _build_experiment(
         for place, item in zip(places, table.data, strict=True)
     ]
     times = table.transition_times
-    spans = [item.seen_times if isinstance(item, Measurements) else item.signal.knots for item in data]
     return Experiment(
         data=data,
         mode_sequence=tuple(table.mode_sequence),
         transition_times=None if times is None else tuple(map(_build_parameter, times)),  # type: ignore[arg-type]
-        t0=min(span[0] for span in spans) if table.t0 is None else table.t0,
-        tf=_build_final_time(table, spans),
+        t0=table.t0,  # type: ignore[arg-type]  # None: from the data
+        tf=None if table.tf is None else _build_parameter(table.tf),  # type: ignore[arg-type]
         inputs=None if table.inputs is None else _build_at(f"{where}.inputs", _build_input, folder, table.inputs),
         initial_state=_build_initial_state(table),
         parameter_map=table.parameter_map,
@@ -578,13 +582,8 @@ def _build_experiment(
     )
 
 
-def _build_final_time(table: ExperimentTable, spans: list[Any]) -> float | Parameter:
-    """Return tf, of which a table makes an unknown; left out, it is where the data end."""
-    return float(max(span[-1] for span in spans)) if table.tf is None else _build_parameter(table.tf)
-
-
 def _build_initial_state(table: ExperimentTable) -> list[Parameter] | list[float] | None:
-    """Return the state at t0 for an Experiment: plain numbers where all of it is known."""
+    """Return the state at t0 for an Experiment: numbers if all of it is known."""
     if table.initial_state is None:
         return None
     if all(entry.fixed for entry in table.initial_state):
@@ -627,7 +626,7 @@ def _build_data(
 
 
 def _find_sigma_columns(table: DataTable, parameters: frozenset[str]) -> list[str]:
-    """Return the columns that hold sigma; none where it is numbers, or names of parameters."""
+    """Return the columns that hold sigma; an empty list if it is numbers, or names of parameters."""
     given = table.sigma if isinstance(table.sigma, list) else []
     named = [entry for entry in given if isinstance(entry, str)]
     if not named or all(name in parameters for name in named):
@@ -670,7 +669,7 @@ def _read_log(folder: Path, table: LogTable, columns: Sequence[str]) -> tuple[Fl
 def _build_observe(
     folder: Path, table: DataTable, system: HybridSystem | None, where: str
 ) -> Callable[..., Any] | None:
-    """Return the observation h(t, x, p), or None for the whole state, and where there is no system to observe."""
+    """Return the observation h(t, x, p); None for the whole state, or without a system."""
     if table.observe is None:
         return None
     if isinstance(table.observe, str):
@@ -688,7 +687,7 @@ def _build_observe(
     if system is None:
         return None
     if system.state_names is None:
-        raise ValueError("observe names states, but the model has no state_names; give it some.")
+        raise ValueError("observe names states, but the model has no state_names; add them to it.")
     unknown = [name for name in table.observe if name not in system.state_names]
     if unknown:
         raise ValueError(
@@ -699,7 +698,7 @@ def _build_observe(
 
 @functools.cache
 def select_states(indices: tuple[int, ...]) -> Callable[..., Any]:
-    """Return the observation ``h(t, x, p) = x[indices]``; the same function for the same indices, so it compiles once.
+    """Return the observation ``h(t, x, p) = x[indices]``, cached by indices so that it compiles once.
 
     Parameters
     ----------

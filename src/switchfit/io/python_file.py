@@ -1,4 +1,4 @@
-"""Objects out of Python files that users write, and where in them an error came from."""
+"""Load objects from users' Python files, and locate errors in these files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def load_object(reference: str, folder: Path, what: str) -> Any:
     reference : str
         Path of a Python file, relative to `folder`, and the name of an object in it.
     folder : Path
-        While the file runs it can also import its neighbours in its own folder.
+        While the file runs, it can import other files of its own folder.
     what : str
         What the object is for, used in messages.
 
@@ -38,16 +38,16 @@ def load_object(reference: str, folder: Path, what: str) -> Any:
 
 
 def find_object(reference: str, folder: Path, what: str) -> tuple[Path, str]:
-    """Return the file and the name that ``"file.py:object"`` stands for; the file is not run.
+    """Return the file and the name in ``"file.py:object"``; the file is not run.
 
     Parameters
     ----------
-    reference, folder, what : as of `load_object`
+    reference, folder, what : as in `load_object`
 
     Raises
     ------
     InputError
-        If it is written in another way, or the file is missing.
+        If it has another form, or the file is missing.
     """
     file, colon, name = reference.rpartition(":")
     if not colon or not file.endswith(".py") or not name.isidentifier():
@@ -59,18 +59,18 @@ def find_object(reference: str, folder: Path, what: str) -> tuple[Path, str]:
 
 
 def call(function: Any, what: str, **arguments: Any) -> Any:
-    """Call a user's factory; InputError says where it failed."""
+    """Call a user's factory; raise InputError with the place if it fails."""
     try:
         with _use_double_precision():
             return function(**arguments)
     except (InputError, KeyboardInterrupt):
         raise
-    except BaseException as error:  # whatever a user's file raises, SystemExit among it
+    except BaseException as error:  # any exception of a user's file, including SystemExit
         raise InputError(f"{what} failed: {describe_error(error)}.") from error
 
 
 def describe_error(error: BaseException) -> str:
-    """Return an exception with the place in a user's file it came from, as far as it has one."""
+    """Return an exception as text, with its place in a user's file if it has one."""
     explained = error.__cause__ is not None and isinstance(error, ValueError)
     place, what = find_user_place(error), (str(error) if explained else get_first_line(error)).rstrip(".")
     return f"{place}: {what}" if place else what
@@ -79,7 +79,7 @@ def describe_error(error: BaseException) -> str:
 def find_user_place(error: BaseException | None) -> str | None:
     """Return ``"file.py, line 3, in slip"`` for the innermost frame that is in a file loaded by `load_object`.
 
-    The exception that caused this one goes first: it was raised further inside.
+    The exception that caused this one is searched first: it was raised further inside.
     """
     if error is None:
         return None
@@ -97,21 +97,21 @@ def find_user_place(error: BaseException | None) -> str | None:
 
 
 def _use_double_precision() -> Any:
-    """Return a context in which what a file makes with jax.numpy is as precise as what it computes with later."""
-    import jax  # here, since a file that is only read needs none of it
+    """Return a context in which arrays that a file makes with jax.numpy have float64, as in later computations."""
+    import jax  # imported here, since files that are not run do not need it
 
     return jax.enable_x64(True)
 
 
-#: Every file that was run, absolute -> as the user named it.
+#: Files that were run: absolute path -> path as the user wrote it.
 _files: dict[str | None, Path] = {}
 
-#: The modules of those that ran through, with the time of their last change (ns).
+#: Modules of the files that ran without error, with the time of their last change (ns).
 _modules: dict[str, tuple[int, Any]] = {}
 
 
 def _run(path: Path) -> Any:
-    """Return the module that a file makes; a file that several keys name runs once while it does not change."""
+    """Return the module of a file; a file that several keys name runs once unless it changes."""
     key = str(path.resolve())
     stamp = path.stat().st_mtime_ns
     if key in _modules and _modules[key][0] == stamp:

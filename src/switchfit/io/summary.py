@@ -1,4 +1,4 @@
-"""What `switchfit check` says about a problem before any fit: its data and its unknowns."""
+"""Summary of a problem for `switchfit check`: its data and its unknowns."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from switchfit.fit.evaluator import evaluator_of
 from switchfit.problem.data import Measurements, ReferenceSignal
-from switchfit.problem.experiment import Experiment
+from switchfit.problem.experiment import Experiment, name_runs
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.report.tables import format_table
@@ -46,6 +47,29 @@ def describe_experiments(experiments: Sequence[Experiment]) -> str:
     return "\n".join(lines)
 
 
+def describe_steps(problem: Problem) -> str:
+    """Return which steps the integrator takes in each experiment at the first guess, how many, and why, as text.
+
+    Parameters
+    ----------
+    problem : Problem
+
+    Raises
+    ------
+    ValueError
+        If the model cannot be integrated at the guess.
+    """
+    evaluator = evaluator_of(problem)
+    rows = []
+    given = zip(name_runs(problem.experiments), evaluator.structures, evaluator.meshes, strict=True)
+    for name, structure, mesh in given:
+        kind = "implicit" if structure.solver == "stiff" else "explicit"
+        reason = "" if mesh.stiffness is None else f"; {mesh.stiffness}"
+        run = "" if len(problem.experiments) == 1 else f"{name}: "
+        rows.append(f"  {run}{mesh.cells:,} {kind} steps{reason}")
+    return "\n".join(["Integration at the first guess", *rows])
+
+
 def _describe_experiment(experiment: Experiment) -> list[str]:
     unit = unit_suffix(experiment.time_unit)
     ends = experiment.ends_of_modes(experiment.initial_times)
@@ -53,6 +77,8 @@ def _describe_experiment(experiment: Experiment) -> list[str]:
     sequence, horizon = " -> ".join(experiment.mode_sequence), f"[{ends[0]:.6g}, {ends[-1]:.6g}]{unit}"
     if experiment.has_free_tf:
         horizon += " (tf is estimated)"
+    if experiment.taken_from_data:
+        horizon += f" ({' and '.join(experiment.taken_from_data)} from the data)"
     lines = [f"{sequence} on {horizon}, at {times}{unit}" if times else f"{sequence} on {horizon}"]
     for item in experiment.data:
         if isinstance(item, Measurements):
@@ -73,7 +99,7 @@ def _describe_experiment(experiment: Experiment) -> list[str]:
 
 
 def _describe_sensor(item: Measurements, unit: str) -> str:
-    """Return what is to be said of delay, noise and loss, where there is anything."""
+    """Return a description of delay, noise and loss, empty for a sensor without these."""
     named = sorted({name for name in item.sigma_names if name})
     said = [
         f"late by {item.delay}{'' if isinstance(item.delay, str) else unit}" if item.delay else "",

@@ -1,4 +1,4 @@
-"""Ready models, by the name that a problem file gives them."""
+"""Built-in models, by their names in problem files."""
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType

@@ -1,4 +1,4 @@
-"""A heater that is switched off: the smallest problem with a transition, to try things out with."""
+"""A heater that is switched off: the smallest problem with a transition, for examples."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
 
 OFF, LOSS, NOISE = 2.5, 0.4, 0.2
-"""What the log was made with: when the heater is switched off (h), rate of the loss (1/h), noise (K)."""
+"""True values of the simulated log: time at which the heater is switched off (h), loss rate (1/h), noise (K)."""
 
 
 def heater_problem() -> Problem:
-    """Return a small problem with made-up data: when was the heater switched off, and how fast does the heat leave?
+    """Return a small problem with simulated data: when was the heater switched off, and how fast does it cool?
 
-    The state is the temperature above that of the room (K), 0 at first:
+    The state is the temperature above that of the room (K), initially 0:
 
     on: ``dT/dt = power - k T``; off: ``dT/dt = -k T``.
 
@@ -27,7 +27,7 @@ def heater_problem() -> Problem:
     -------
     Problem
         Its unknowns are ``tau_1`` (h), first guess 2, and ``k`` (1/h), first guess 0.5; ``power`` is known, 10 K/h.
-        The 24 measurements, one every quarter of an hour, were made with tau_1 = 2.5 h and k = 0.4/h, and noise of
+        The 24 measurements, one every quarter of an hour, were simulated with tau_1 = 2.5 h, k = 0.4/h and noise of
         0.2 K.
 
     See Also

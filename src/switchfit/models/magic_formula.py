@@ -21,9 +21,9 @@ MAGIC_FORMULA: Mapping[str, float] = MappingProxyType(
     }
 )
 
-#: Shape factors C, which are no coefficients of the fit.
+#: Shape factors C, which are not among the fitted coefficients.
 C_X, C_Y = 1.65, 1.30
-#: Slip below which a wheel's force is linear in it: the direction of the slip is not defined at zero.
+#: Slip below which a wheel's force is linear in the slip: at zero, the direction of the slip is undefined.
 SMALL_SLIP = 1e-3
 
 
@@ -73,20 +73,20 @@ def magic_formula(
         (s_x, s_y) = (R w − V_x, −V_y) / V,    V² = (V_x² + (R w)²)/2 + low_speed²,
 
     for small slip the slip ratio and the tangent of the slip angle, and finite at standstill. The force has the
-    direction of the slip s; its longitudinal part is that of the Magic Formula at the slip ratio ‖s‖, its lateral
-    part that at the slip angle atan ‖s‖ (each times its share of s), so that both together stay about inside the
-    circle of friction. The load of a wheel is the static one, g (m_b + 4 m_w)/4.
+    direction of the slip s. Its longitudinal part is that of the Magic Formula at the slip ratio ‖s‖, its lateral
+    part that at the slip angle atan ‖s‖ (each times its share of s), so that their sum is about inside the circle of
+    friction. The load of a wheel is the static one, g (m_b + 4 m_w)/4.
 
     Parameters
     ----------
     wheel_radius : float, optional
         R (m).
     low_speed : float, optional
-        Speed (m/s) below which slip turns into viscous friction, force in proportion to velocity.
+        Speed (m/s) below which slip becomes viscous friction, with a force proportional to velocity.
     initial_state : (6,) array_like, optional
         ``(X, dX, Y, dY, theta, dtheta)`` at t0 (m, m/s, m, m/s, rad, rad/s).
     m_b, m_w, B_l, B_w, a, b, g : float, optional
-        As of `skid_steer`. The wheels are point masses at (±a, ±b), as in equation (18).
+        As in `skid_steer`. The wheels are point masses at (±a, ±b), as in equation (18).
 
     Returns
     -------
@@ -100,8 +100,8 @@ def magic_formula(
 
     Notes
     -----
-    The published coefficients were fitted to loads of 2 to 8 kN a tyre; at this vehicle's 0.2 kN they extrapolate. At
-    a velocity V slip decays at the rate 230 V⁻¹ m/s²: use ``sf.Problem(..., solver="stiff")``.
+    The published coefficients were fitted to loads of 2 to 8 kN per tyre; at this vehicle's 0.2 kN they extrapolate. At
+    a velocity V, slip decays at the rate 230 V⁻¹ m/s², so that the model is stiff at low speeds.
 
     References
     ----------
@@ -130,7 +130,7 @@ def _drive(
     b: float,
     g: float,
 ) -> Callable[..., Any]:
-    """Return the vector field; the same function for the same constants, so that nothing is compiled twice."""
+    """Return the vector field, cached by the constants so that nothing is compiled twice."""
     m = m_b + 4 * m_w
     inertia = m_b * (B_l**2 + B_w**2) / 12 + 4 * m_w * (a**2 + b**2)
     load = 1e-3 * g * m / 4

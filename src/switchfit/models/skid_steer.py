@@ -47,9 +47,9 @@ def skid_steer(
     stick_forces, slip_forces : (float, float, float, float), optional
         Driving force of each wheel in each mode (N), in the paper's order F1 to F4.
     restick : {"continuous", "reset"}, optional
-        What happens at a transition from slip to stick. ``"continuous"``, the paper's model taken literally: the
-        state goes on as it is, so the yaw rate stays constant from there on. ``"reset"``: a reset map puts yaw
-        rate and lateral velocity to zero, the velocity along the body stays.
+        Behavior at a transition from slip to stick. ``"continuous"``, the paper's model taken literally: the state is
+        continuous, so that the yaw rate is constant from there on. ``"reset"``: a reset map sets yaw rate and lateral
+        velocity to zero and keeps the velocity along the body.
     initial_state : (6,) array_like, optional
         ``(X, dX, Y, dY, theta, dtheta)`` at t0 (m, m/s, m, m/s, rad, rad/s).
     m_b, m_w : float, optional
@@ -57,7 +57,7 @@ def skid_steer(
     B_l, B_w : float, optional
         Length and width of the body (m).
     a, b : float, optional
-        Distance of the wheels from the centre of mass along and across the vehicle (m).
+        Distance of the wheels from the center of mass along and across the vehicle (m).
     c_1, c_2 : float, optional
         Viscous drag in stick and in slip (kg/s).
     g : float, optional
@@ -71,7 +71,7 @@ def skid_steer(
     Raises
     ------
     ValueError
-        For another `restick`, or forces that are not four.
+        For an unknown `restick`, or if there are not four forces.
 
     References
     ----------
@@ -108,9 +108,7 @@ def _functions(
     c_2: float,
     g: float,
 ) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
-    """Return vector fields and reset map; the same functions for the same constants, so that nothing is
-    compiled twice.
-    """
+    """Return vector fields and reset map, cached by the constants so that nothing is compiled twice."""
     m = m_b + 4 * m_w
     inertia = 4 * m_w * (12 * a**2 + 12 * b**2) + m_b * (B_l**2 + B_w**2)
     total_stick, total_slip = sum(stick_forces), sum(slip_forces)

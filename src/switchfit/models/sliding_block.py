@@ -14,13 +14,13 @@ from switchfit.problem.system import HybridSystem
 def sliding_block(*, g: float = 9.81) -> HybridSystem:
     r"""Return a body sliding on a level plane, modes ``"slide"`` and ``"stick"``, state ``(x, y, vx, vy)``.
 
-    Friction acts against the velocity and so along it: the body stays on a straight line. With ``e`` the unit
-    vector along the initial velocity ``(vx0, vy0)``,
+    Friction acts opposite to the velocity, so that the body moves on a straight line. With ``e`` the unit vector along
+    the initial velocity ``(vx0, vy0)``,
 
     slide: ``d(vx, vy)/dt = -mu g e``; stick: ``d(x, y, vx, vy)/dt = 0``.
 
-    Written with the constant ``e`` instead of ``v/|v|`` the field is smooth where the velocity passes zero, so that
-    a transition time that is tried too late gives a body that has turned back, not a division by zero.
+    With the constant ``e`` instead of ``v/|v|``, the field is smooth where the velocity passes zero: if the optimizer
+    tries a transition time that is too late, the body turns back, and there is no division by zero.
 
     Parameters
     ----------
@@ -35,9 +35,9 @@ def sliding_block(*, g: float = 9.81) -> HybridSystem:
 
     Notes
     -----
-    In ``"stick"`` the velocity is held, not set to zero: a body sticks when it has come to rest, and a velocity left
-    over at the transition is a misfit that measured velocities see. Positions alone determine the moment of sticking
-    badly: the rest position is stationary in it exactly where the body comes to rest by itself.
+    In ``"stick"`` the velocity is constant, not set to zero: a body sticks when it has come to rest, and a remaining
+    velocity at the transition is a misfit to measured velocities. Positions alone determine the time of sticking badly:
+    the rest position is stationary in it exactly where the body comes to rest by itself.
     """
 
     slide, stick, initial_state = _functions(g)
@@ -51,7 +51,7 @@ def sliding_block(*, g: float = 9.81) -> HybridSystem:
 
 @cache
 def _functions(g: float) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
-    """Return vector fields and initial state; the same functions for the same g, so that nothing is compiled twice."""
+    """Return vector fields and initial state, cached by g so that nothing is compiled twice."""
 
     def slide(t: Any, x: Any, p: Any) -> Any:
         speed = jnp.sqrt(p["vx0"] ** 2 + p["vy0"] ** 2)

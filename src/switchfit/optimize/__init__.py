@@ -1,6 +1,5 @@
-"""Minimisation of a piecewise smooth cost under linear constraints; knows nothing of differential equations."""
+"""Minimisation of a piecewise smooth cost under linear constraints and equalities; knows no differential equation."""
 
-from switchfit.optimize.augmented import ConstrainedResult, minimize_constrained
 from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.problem import Evaluation, HessianKind
 from switchfit.optimize.qp import QPSolution, solve_qp
@@ -8,7 +7,6 @@ from switchfit.optimize.sqp import minimize
 from switchfit.optimize.status import IterationRecord, Result, Status
 
 __all__ = [
-    "ConstrainedResult",
     "Evaluation",
     "HessianKind",
     "IterationRecord",
@@ -17,6 +15,5 @@ __all__ = [
     "Result",
     "Status",
     "minimize",
-    "minimize_constrained",
     "solve_qp",
 ]

@@ -21,6 +21,9 @@ from switchfit.optimize.problem import Problem
 
 #: Radius of the first box.
 FIRST_RADIUS = 1.0
+#: The same where there are equality constraints, with which there always is one. The bed of poor starts is indifferent
+#: to it between 5 and 40.
+FIRST_CONSTRAINED_RADIUS = 5.0
 #: Factors by which the radius falls after a step that the model misjudged, and grows after one that it judged well.
 SHRINK, GROW = 0.25, 2.0
 #: Ratios of the actual to the predicted reduction below and above which it does so.

@@ -132,11 +132,15 @@ class Dense:
         self, constraints: LinearConstraints, rows: NDArray[np.intp], held: NDArray[np.bool_], flat: FloatArray
     ) -> Curvature:
         """Return the curvature in the null space of constraints; see `switchfit.optimize.matrix.SymmetricMatrix`."""
+        return self.curvature_across(constraints.rows(rows), held, flat)
+
+    def curvature_across(self, normals: FloatArray, held: NDArray[np.bool_], flat: FloatArray) -> Curvature:
+        """Return the curvature in the null space of normals (k, d), without the coordinates held (d,)."""
         d = len(self.array)
         free = np.flatnonzero(~held)
-        if free.size == d and rows.size == 0:
+        if free.size == d and len(normals) == 0:
             return Curvature(np.eye(d), partial(_spectrum, self.array, flat))
-        normals = constraints.rows(rows)[:, free]
+        normals = normals[:, free]
         null = null_space(normals) if free.size else np.zeros((0, 0))
         basis = np.zeros((d, null.shape[1]))
         basis[free] = null
@@ -194,7 +198,7 @@ def _minimize(
         return ModelStep(step, convex @ step, None, convex is hessian)
     d = gradient.size
     if box is not None:
-        inside = _solve_in_bounds(gradient, convex, step, normals, offsets)
+        inside = solve_in_bounds(gradient, convex, step, normals, offsets)
         if inside is not None:
             return ModelStep(inside[0], convex @ inside[0], inside[1], convex is hessian)
     step, multipliers = solve_whitened(gradient, convex, factor, normals, offsets)
@@ -202,7 +206,7 @@ def _minimize(
     return ModelStep(step, convex @ step, multipliers, convex is hessian)
 
 
-def _solve_in_bounds(
+def solve_in_bounds(
     gradient: FloatArray, convex: FloatArray, newton: FloatArray, normals: FloatArray, offsets: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
     """Return the step (d,) and the multipliers (m + 2 d,) of a programme in which nothing but bounds is active.
@@ -314,7 +318,7 @@ def _convex(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None, 
     """Return B for a matrix that is not positive definite, or was not found to be with Jacobi's scaling."""
     if reach is not None:
         weight = 1.0 / (reach[:, None] * reach)
-        return _convex_on_face(hessian / weight, normals * reach, _raise) * weight
+        return _convex_on_face(hessian / weight, normals * reach, make_positive) * weight
     scaling = diagonal_scaling(Dense(hessian), floor)
     weight = scaling[:, None] * scaling
     scaled = hessian / weight
@@ -343,11 +347,11 @@ def _convex_on_face(
     return np.asarray(0.5 * (convex + convex.T))
 
 
-def _raise(matrix: FloatArray) -> FloatArray:
-    """Return the matrix with all eigenvalues raised until the smallest is positive; itself if it is."""
+def make_positive(matrix: FloatArray, least: float = 0.0) -> FloatArray:
+    """Return the matrix with all eigenvalues raised until the smallest is positive, or `least`; itself if it is."""
     symmetric = 0.5 * (matrix + matrix.T)
     values = np.linalg.eigvalsh(symmetric)
-    margin = EIGENVALUE_FLOOR * float(np.max(np.abs(values), initial=0.0))
+    margin = max(EIGENVALUE_FLOOR * float(np.max(np.abs(values), initial=0.0)), least)
     if values.size == 0 or values[0] > margin:
         return symmetric
     return np.asarray(symmetric + (margin - RAISED * values[0]) * np.eye(len(values)))

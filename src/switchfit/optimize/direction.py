@@ -13,21 +13,27 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import FloatArray
-from switchfit.optimize.box import FIRST_RADIUS
+from switchfit.optimize.algebra import FloatArray, press_on_bounds
+from switchfit.optimize.box import FIRST_CONSTRAINED_RADIUS, FIRST_RADIUS
+from switchfit.optimize.composite import Equalities, find_normal_step, solve_composite
 from switchfit.optimize.constraints import NONE
 from switchfit.optimize.dense import Dense
 from switchfit.optimize.kinks import release
 from switchfit.optimize.matrix import Box, Room, SymmetricMatrix
+from switchfit.optimize.point import MET
 from switchfit.optimize.problem import Problem
 from switchfit.optimize.state import State
+
+HALF = 0.5
+"""Part of the violation of equality constraints that a step may leave while coordinates are held at kinks."""
 
 
 class Direction(NamedTuple):
     """Step d (d,) of the quadratic programme with its slope gᵀd and its predicted reduction −(gᵀd + ½dᵀBd).
 
     `regular`: no constraint is active, no coordinate is held or at a kink, and H is positive definite. `radius` is that
-    of the trust region that it was found in.
+    of the trust region that it was found in. With equality constraints, `multipliers` are theirs, (k,), and `left` is
+    what their linearisation leaves of their violation.
     """
 
     step: FloatArray
@@ -36,6 +42,8 @@ class Direction(NamedTuple):
     regular: bool
     radius: float = np.inf
     descends: bool = False
+    multipliers: FloatArray | None = None
+    left: float = 0.0
 
 
 def find_direction(problem: Problem, state: State, piece: tuple[FloatArray, FloatArray] | None = None) -> Direction:
@@ -57,6 +65,10 @@ def find_direction(problem: Problem, state: State, piece: tuple[FloatArray, Floa
     best, force = _solve_on_sides(problem, state, sides, piece)
     if point.kink is None:
         return best
+    if best.left > max(HALF * point.violation, MET):
+        # The equality constraints cannot be met while these coordinates are held, or kept to one side.
+        sides = _open_kinks(problem, state, sides, piece)
+        best, force = _solve_on_sides(problem, state, sides, piece)
     for _ in range(2 * int(point.kink.sum())):
         left, right = point.minus.gradient, point.plus.gradient
         released = release(sides, point.kink, left, right, best.step, force, state.scale)
@@ -80,6 +92,8 @@ def _solve_on_sides(
     point, constraints = state.point, problem.constraints
     gradient, hessian = point.derivatives(sides)
     room = _room(problem, state, sides, piece)
+    if problem.equalities:
+        return _solve_constrained(problem, state, sides, room, gradient, hessian)
     matrix, floor = _model(problem, state, hessian, room.free)
     pressing = (point.multipliers > 0.0).nonzero()[0] if point.active.size else NONE
     pressed = constraints.rows(pressing)
@@ -93,6 +107,54 @@ def _solve_on_sides(
     radius = np.inf if box is None else box.radius_for(found.definite)
     reduction = -(slope + 0.5 * float(found.step @ found.product))
     return Direction(found.step, slope, reduction, regular, radius, _descends(problem, hessian, room.free)), force
+
+
+def _solve_constrained(
+    problem: Problem,
+    state: State,
+    sides: NDArray[np.int_],
+    room: Room,
+    gradient: FloatArray,
+    hessian: SymmetricMatrix,
+) -> tuple[Direction, FloatArray]:
+    """Do the work of `_solve_on_sides` where there are equality constraints."""
+    equalities = state.point.equalities(sides)
+    radius = FIRST_CONSTRAINED_RADIUS if state.radius == np.inf else state.radius
+    d = gradient.size
+    part = np.arange(d) if room.free is None else np.flatnonzero(room.free)
+    full = np.diag(np.abs(hessian.diagonal())) if state.careful else hessian.dense()
+    step = np.zeros(d)
+    found = solve_composite(
+        gradient[part],
+        full[np.ix_(part, part)],
+        Equalities(equalities.values, equalities.jacobian[:, part]),
+        problem.constraints.normals[:, part],
+        room.offsets,
+        problem.reach[part],
+        radius,
+    )
+    step[part] = found.step
+    step = press_on_bounds(step, *room.bounds, found.inequalities)
+    product = full @ step
+    slope = float(gradient @ step)
+    pull = problem.constraints.A.T @ found.inequalities[: problem.constraints.b.size]
+    force = pull - product - equalities.jacobian.T @ found.multipliers
+    reduction = -(slope + 0.5 * float(step @ product))
+    left = equalities.predict(step)
+    return Direction(step, slope, reduction, False, radius, False, found.multipliers, left), force
+
+
+def _open_kinks(
+    problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[FloatArray, FloatArray] | None
+) -> NDArray[np.int_]:
+    """Return the sides (d,) with all coordinates at kinks released to where the normal step takes them."""
+    point = state.point
+    if point.kink is None:
+        return sides
+    room = _room(problem, state, np.where(point.kink, 0, sides), piece)
+    normal = find_normal_step(point.equalities(sides), problem.constraints.normals, room.offsets, problem.reach, np.inf)
+    opened = np.where(normal > 0.0, 1, -1)
+    return np.where(point.kink, opened, sides)
 
 
 def _room(problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[FloatArray, FloatArray] | None) -> Room:

@@ -9,7 +9,7 @@ import numpy as np
 from switchfit.optimize.algebra import NOISE, FloatArray
 from switchfit.optimize.diagnosis import Finding, find_reason, wrong_slope
 from switchfit.optimize.direction import Direction
-from switchfit.optimize.point import Oracle
+from switchfit.optimize.point import Oracle, Sample
 from switchfit.optimize.state import State, curvature_at
 
 
@@ -19,10 +19,10 @@ def explain_failure(oracle: Oracle, state: State, direction: Direction) -> Findi
     noise = NOISE * max(abs(state.point.cost), 0.01 * state.cost_scale)
 
     def line(fraction: float) -> tuple[float, float] | None:
-        if fraction == 0.0:
+        if fraction == 0.0 and not problem.equalities:
             return state.point.cost, direction.slope
         sample = oracle.sample(theta + fraction * direction.step, 1)
-        return None if sample is None else (sample.cost, float(sample.gradient @ direction.step))
+        return None if sample is None else _along(sample, state, direction.step)
 
     found = find_reason(line, noise, min(problem.breakpoints.next_on(theta, direction.step), 1.0))
     at = theta + found.at * direction.step
@@ -40,6 +40,12 @@ def explain_failure(oracle: Oracle, state: State, direction: Direction) -> Findi
     return replace(found, condition=float(curvature[-1] / curvature[0]) if positive else np.inf)
 
 
+def _along(sample: Sample, state: State, step: FloatArray) -> tuple[float, float]:
+    """Return J and its slope along a step (d,); those of the Lagrangian where there are equality constraints."""
+    cost, gradient = sample.lagrangian(state.point.forces)
+    return cost, float(gradient @ step)
+
+
 def _wrong_entries(oracle: Oracle, state: State, noise: float) -> tuple[tuple[int, float, float], ...]:
     """Find up to four coordinates whose derivative is not that of J: (coordinate, derivative, difference quotient)."""
     theta, problem = state.point.theta, oracle.problem
@@ -51,7 +57,7 @@ def _wrong_entries(oracle: Oracle, state: State, noise: float) -> tuple[tuple[in
 
             def line(fraction: float, unit: FloatArray = unit) -> tuple[float, float] | None:
                 sample = oracle.sample(theta + fraction * unit, 1)
-                return None if sample is None else (sample.cost, float(sample.gradient @ unit))
+                return None if sample is None else _along(sample, state, unit)
 
             smooth = min(problem.breakpoints.next_on(theta, unit), 1.0)
             measured = wrong_slope(line, noise, smooth)

@@ -116,7 +116,11 @@ def _step_back(oracle: Oracle, state: State, direction: Direction) -> Accepted |
     ):
         return None
     end = oracle.complete(back, first, state.scale)
-    return None if end is None else Accepted(end, 1.0, direction.radius)
+    if end is None or not optimality_allows(
+        end.optimality, point.optimality, end.cost, state.lowest_cost, -direction.slope, noise
+    ):
+        return None  # not even where it has led back to the point itself
+    return Accepted(end, 1.0, direction.radius)
 
 
 def _backtrack(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:

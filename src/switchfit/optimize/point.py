@@ -9,30 +9,49 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import FloatArray
+from switchfit.optimize.algebra import FloatArray, unit_rows
 from switchfit.optimize.arrow import Arrow
+from switchfit.optimize.composite import Equalities, Rows
 from switchfit.optimize.constraints import NONE
 from switchfit.optimize.dense import Dense
 from switchfit.optimize.feasibility import Trial
 from switchfit.optimize.kinks import steepest_descent
+from switchfit.optimize.kkt import kkt_residual
 from switchfit.optimize.matrix import Curvature, SymmetricMatrix
 from switchfit.optimize.problem import Problem
 
+#: Equality constraints count as met where they are below this, in their units.
+MET = 1e-8
 #: Jumps of a derivative above this part of the largest derivative are no errors of the integration.
 LARGE_JUMP = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One evaluation: cost, gradient, shape (d,), and Hessian, symmetric."""
+    """One evaluation: cost, gradient, shape (d,), and Hessian, symmetric.
+
+    If there are equality constraints, the Hessian is that of the Lagrangian with these multipliers, shape (k,).
+    """
 
     cost: float
     gradient: FloatArray
     hessian: SymmetricMatrix
+    equalities: Equalities | None = None
+    multipliers: FloatArray | None = None
+
+    def lagrangian(self, multipliers: FloatArray) -> tuple[float, FloatArray]:
+        """Return ``J + lam . c`` and its gradient (d,); J and its own where there are no equality constraints."""
+        if self.equalities is None:
+            return self.cost, self.gradient
+        return (
+            self.cost + float(multipliers @ self.equalities.values),
+            self.gradient + self.equalities.jacobian.T @ multipliers,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +77,8 @@ class Point:
         Like side, and for each kink the side to descend to, 0 to hold it.
     idle : array of bool, shape (d,), or None
         Coordinates that are held because J does not depend on them; None if there are none.
+    forces : array, shape (k,)
+        Multipliers of the equality constraints, by least squares.
     curvatures : dict
         Curvatures found already, by the constraints' places.
     """
@@ -73,12 +94,22 @@ class Point:
     multipliers: FloatArray
     downhill: NDArray[np.int_]
     idle: NDArray[np.bool_] | None
+    forces: FloatArray = field(default_factory=lambda: np.zeros(0))
     curvatures: dict[bytes, Curvature] = field(default_factory=dict)
 
     @property
     def cost(self) -> float:
         """J, which is the same on all sides."""
         return self.plus.cost
+
+    @property
+    def violation(self) -> float:
+        """‖c‖₂ of the equality constraints in the units of `Oracle.units`; 0 where there are none."""
+        return 0.0 if self.plus.equalities is None else self.plus.equalities.violation
+
+    def is_stationary(self, tolerance: float) -> bool:
+        """Return whether the optimality is below a tolerance, and the equality constraints are met."""
+        return self.optimality <= tolerance and self.violation <= MET
 
     @property
     def is_interior(self) -> bool:
@@ -115,17 +146,40 @@ class Point:
         plus, minus = self.plus, self.minus
         if plus is minus:
             return plus.gradient, plus.hessian
-        gradient = np.where(sides > 0, plus.gradient, minus.gradient)
-        gradient = np.where(sides == 0, 0.5 * (plus.gradient + minus.gradient), gradient)
+        gradient = _mix(plus.gradient, minus.gradient, sides)
         return gradient, plus.hessian.mix_sides(minus.hessian, sides.astype(float))
+
+    def equalities(self, sides: NDArray[np.int_]) -> Equalities:
+        """Return the equality constraints with their derivatives on the given sides."""
+        right, left = self.plus.equalities, self.minus.equalities
+        if right is None or left is None:
+            raise ValueError("there are no equality constraints")
+        return right if right is left else Equalities(right.values, _mix(right.jacobian, left.jacobian, sides))
+
+
+def _mix(right: FloatArray, left: FloatArray, sides: NDArray[np.int_]) -> FloatArray:
+    """Return derivatives (..., d) on the given sides: +1, -1, 0 for the mean."""
+    return np.where(sides > 0, right, np.where(sides < 0, left, 0.5 * (right + left)))
 
 
 class Oracle:
-    """The caller's function with a counter; turns unknowns into points and refuses what is not finite."""
+    """The caller's function with a counter; turns unknowns into points and refuses what is not finite.
+
+    Attributes
+    ----------
+    evaluations : int
+    multipliers : array, shape (k,)
+        Of the equality constraints, with which the Hessian of the Lagrangian is evaluated next.
+    units : array, shape (k,), or None
+        What the equality constraints are measured by: the lengths of their gradients, over `Problem.reach`, at the
+        first point. Constraints and multipliers are in these units everywhere but in the caller's function.
+    """
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self.evaluations = 0
+        self.multipliers = np.zeros(len(problem.equalities))
+        self.units: FloatArray | None = None
         d = problem.constraints.size
         self._no_side: NDArray[np.int_] = np.zeros(d, dtype=int)
         self._no_multipliers = np.zeros(len(problem.constraints.names))
@@ -133,8 +187,16 @@ class Oracle:
     def sample(self, theta: FloatArray, side: int) -> Sample | None:
         """Evaluate once; None if the cost or a derivative that is needed is not finite."""
         self.evaluations += 1
-        value = self.problem.evaluate(theta.copy(), side)
         d = theta.size
+        equalities = None
+        if not self.problem.equalities:
+            value = self.problem.evaluate(theta.copy(), side)
+        else:
+            units = 1.0 if self.units is None else self.units
+            value = self.problem.evaluate(theta.copy(), side, self.multipliers / units)
+            equalities = self._scale(value)
+            if equalities is None:
+                return None
         cost, gradient = float(value.cost), np.asarray(value.gradient, dtype=float).reshape(d)
         given = np.full((d, d), np.nan) if value.hessian is None else value.hessian
         hessian: SymmetricMatrix = given if isinstance(given, Arrow) else Dense.of(given, d)
@@ -142,7 +204,16 @@ class Oracle:
             return None
         if self.problem.uses_hessian and not hessian.finite:
             return None
-        return Sample(cost, gradient, hessian)
+        return Sample(cost, gradient, hessian, equalities, self.multipliers)
+
+    def _scale(self, value: Any) -> Equalities | None:
+        """Return the equality constraints of an evaluation in their units; None if they are not finite."""
+        c, A = np.asarray(value.constraints, dtype=float), np.asarray(value.jacobian, dtype=float)
+        if not (np.isfinite(c).all() and np.isfinite(A).all()):
+            return None
+        if self.units is None:
+            self.units = unit_rows(A * self.problem.reach)[1]
+        return Equalities(c / self.units, A / self.units[:, None])
 
     def first(self, trial: Trial) -> Sample | None:
         """Do the evaluation that suffices to judge the cost."""
@@ -171,6 +242,8 @@ class Oracle:
                 return None
             minus = other
         left, right = minus.gradient, plus.gradient
+        if plus.equalities is not None:
+            return self._complete_constrained(theta, plus, minus, kink, side, slack, active)
         if active.size == 0 and plus is minus:
             optimality, multipliers, downhill = math.sqrt(right.dot(right)), self._no_multipliers, side
         else:
@@ -179,6 +252,44 @@ class Oracle:
             multipliers = np.zeros(len(constraints.names))
             multipliers[active] = values
         return Point(theta, plus, minus, kink, side, slack, active, optimality, multipliers, downhill, idle)
+
+    def _complete_constrained(
+        self,
+        theta: FloatArray,
+        plus: Sample,
+        minus: Sample,
+        kink: NDArray[np.bool_] | None,
+        side: NDArray[np.int_],
+        slack: FloatArray,
+        active: NDArray[np.intp],
+    ) -> Point:
+        """Complete a point with equality constraints, whose multipliers may have either sign."""
+        both = plus.equalities
+        if both is None:
+            raise ValueError("there are no equality constraints")
+        A, normals = both.jacobian, self.problem.constraints.rows(active)
+        multipliers = np.zeros(len(self.problem.constraints.names))
+        rows = Rows.of(A)
+        if plus is minus:
+            # The distance from the cone of the inequalities and the span of A is one within the null space of A.
+            null = rows.null
+            reduced, force, downhill = plus.gradient @ null, plus.gradient, side
+            if active.size:
+                optimality, values = kkt_residual(reduced, reduced, normals @ null)
+                multipliers[active] = values
+                force = force - normals.T @ values
+            else:
+                optimality = math.sqrt(reduced @ reduced)
+            forces = rows.multipliers(force)
+        else:
+            stacked = np.vstack([normals, A, -A])
+            optimality, values, downhill = steepest_descent(minus.gradient, plus.gradient, kink, side, stacked, None)
+            count, k = len(normals), len(A)
+            multipliers[active] = values[:count]
+            forces = values[count + k :] - values[count : count + k]
+        return Point(
+            theta, plus, minus, kink, side, slack, active, optimality, multipliers, downhill, None, forces=forces
+        )
 
     def point(self, trial: Trial, scale: FloatArray) -> Point | None:
         """Return the point at a trial, evaluated; None if J is not finite there."""

@@ -33,8 +33,17 @@ class Evaluation(Protocol):
     def hessian(self) -> FloatArray | Arrow | None: ...
 
 
-Evaluate = Callable[[FloatArray, int], Evaluation]
-"""``evaluate(theta, side)``, see `switchfit.optimize.minimize`."""
+class ConstrainedEvaluation(Evaluation, Protocol):
+    """With equality constraints c, (k,): they, their derivatives, (k, d), and the Hessian of ``J + lam . c``."""
+
+    @property
+    def constraints(self) -> FloatArray: ...
+    @property
+    def jacobian(self) -> FloatArray: ...
+
+
+Evaluate = Callable[..., Evaluation]
+"""``evaluate(theta, side)`` or ``evaluate(theta, side, multipliers)``, see `switchfit.optimize.minimize`."""
 Idle = Callable[[FloatArray, bool], NDArray[np.bool_]]
 """``idle(theta, everything)``, see `switchfit.optimize.minimize`."""
 
@@ -57,6 +66,8 @@ class Problem:
     idle : callable or None
     reach : array, shape (d,)
         How far each coordinate may go in the first step inside a trust region.
+    equalities : tuple of str
+        Names of the equality constraints; empty if there are none.
     """
 
     evaluate: Evaluate
@@ -69,6 +80,7 @@ class Problem:
     size: FloatArray
     idle: Idle | None
     reach: FloatArray
+    equalities: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -84,6 +96,7 @@ class Problem:
         size: ArrayLike | None,
         idle: Idle | None,
         reach: ArrayLike | None = None,
+        equalities: Sequence[str] = (),
     ) -> Problem:
         """The arguments of `switchfit.optimize.minimize`, checked."""
         d = constraints.size
@@ -93,6 +106,8 @@ class Problem:
             raise ValueError("there is nothing to minimise over: theta0 is empty")
         if hessian not in get_args(HessianKind):
             raise ValueError(f"hessian is {hessian!r}; choose one of {', '.join(get_args(HessianKind))}")
+        if equalities and hessian not in ("auto", "exact"):
+            raise ValueError(f"equality constraints need the exact Hessian: hessian 'auto' or 'exact'; got {hessian!r}")
         if not tolerance >= 0.0 or max_iterations < 0:
             raise ValueError(f"tolerance {tolerance} and max_iterations {max_iterations} must not be negative")
         return cls(
@@ -106,6 +121,7 @@ class Problem:
             size=np.zeros(d) if size is None else np.broadcast_to(np.asarray(size, dtype=float), (d,)),
             idle=idle,
             reach=typical_reach(theta) if reach is None else np.broadcast_to(np.asarray(reach, dtype=float), (d,)),
+            equalities=tuple(equalities),
         )
 
     @cached_property

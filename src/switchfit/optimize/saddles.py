@@ -7,7 +7,8 @@ import numpy as np
 from switchfit.optimize.algebra import ARMIJO, NEGLIGIBLE_STEP, NOISE, FloatArray, is_negligible
 from switchfit.optimize.direction import find_direction
 from switchfit.optimize.feasibility import Trial, move, snap_to_rows
-from switchfit.optimize.point import Oracle
+from switchfit.optimize.merit import correct
+from switchfit.optimize.point import MET, Oracle, Sample
 from switchfit.optimize.state import Accepted, State, curvature_at
 
 #: Eigenvalues of the scaled Hessian below this are negative curvature, not rounding.
@@ -27,7 +28,7 @@ def close_gaps(oracle: Oracle, state: State) -> State:
     if np.array_equal(theta, point.theta):
         return state
     closed = oracle.point(Trial.at(problem.constraints, theta), state.scale)
-    if closed is None or closed.cost > point.cost + NOISE * state.cost_scale:
+    if closed is None or closed.cost > point.cost + NOISE * state.cost_scale or closed.violation > MET:
         return state
     after = state.advance(Accepted(closed, 1.0), problem.tolerance)
     if closed.optimality <= max(problem.tolerance, point.optimality):
@@ -54,6 +55,11 @@ def escape(oracle: Oracle, state: State) -> Accepted | None:
     return None
 
 
+def _merit(sample: Sample, state: State) -> float:
+    """Return J, with the penalty of the equality constraints if there are any."""
+    return sample.cost if sample.equalities is None else sample.cost + state.penalty * sample.equalities.violation
+
+
 def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | None:
     """Backtrack on the quadratic decrease ½ t² rayᵀH ray, starting at a tenth of the size of the unknowns."""
     problem, point = oracle.problem, state.point
@@ -73,7 +79,11 @@ def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | 
             return None
         there = move(problem, point.theta, length * ray, state.scale)
         first = oracle.first(there)
-        if first is not None and first.cost < point.cost - ARMIJO * decrease:
+        if first is not None and problem.equalities:
+            # The ray is tangential to the equality constraints, which bend.
+            moved = correct(oracle, there, first, state.scale, np.inf)
+            there, first = (there, first) if moved is None else (moved, oracle.first(moved))
+        if first is not None and _merit(first, state) < _merit(point.plus, state) - ARMIJO * decrease:
             trial = oracle.complete(there, first, state.scale)
             if trial is not None:
                 return Accepted(trial, length)

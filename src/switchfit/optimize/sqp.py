@@ -1,15 +1,17 @@
-"""Sequential quadratic programming for a piecewise smooth cost under linear constraints.
+"""Sequential quadratic programming for a piecewise smooth cost under linear constraints and equalities.
 
 The problem is to minimise J(theta) subject to A theta >= b and lower <= theta <= upper, where J is continuous and
 smooth except where a coordinate passes one of its breakpoints: there its derivatives jump. (A transition time that
-passes a sample time is such a coordinate.) All constraints are linear, so every iterate is feasible, and the line
-search looks at J alone.
+passes a sample time is such a coordinate.) These constraints are linear, so every iterate satisfies them, and the line
+search looks at J alone. Beside them there may be nonlinear equality constraints c(theta) = 0, which are met in the end.
 
 One iteration, `_step`, maps a state (`state`) at a point (`point`) to the next state:
 
-1. *direction* (`direction`): a convex quadratic programme (`qp`, with the matrices of `dense` or `arrow`);
+1. *direction* (`direction`): a convex quadratic programme (`qp`, with the matrices of `dense` or `arrow`), or with
+   equality constraints a step composed of the solutions of two (`composite`);
 2. *line search* (`line_search`): the full step first, even across breakpoints, then inside the present smooth piece;
-   by default in a trust region that shrinks (`box`); every trial is made feasible (`feasibility`);
+   by default in a trust region that shrinks (`box`); with equality constraints it looks at a merit function (`merit`);
+   every trial is made feasible (`feasibility`);
 3. *kinks* (`kinks`): coordinates that sit on a breakpoint are held, or released to one side.
 
 At a stationary point the curvature tells a minimum from a saddle, which is left along negative curvature (`saddles`);
@@ -35,7 +37,8 @@ from switchfit.optimize.failure import explain_failure
 from switchfit.optimize.feasibility import Trial, feasible_start
 from switchfit.optimize.line_search import search
 from switchfit.optimize.matrix import Curvature, Spectrum
-from switchfit.optimize.point import Oracle
+from switchfit.optimize.merit import is_stuck, search_merit
+from switchfit.optimize.point import MET, Oracle, Point
 from switchfit.optimize.problem import Evaluate, HessianKind, Idle, Problem
 from switchfit.optimize.saddles import NEGATIVE_CURVATURE, close_gaps, escape
 from switchfit.optimize.state import State, curvature_at, idle_coordinates
@@ -43,6 +46,9 @@ from switchfit.optimize.status import Callback, IterationRecord, Result, Status
 
 #: Times a minimisation begins anew from where its line search has failed.
 RESTARTS = 3
+
+#: Relative change of the multipliers of equality constraints that is not worth another evaluation of the Hessian.
+SAME_MULTIPLIERS = 1e-9
 
 
 def minimize(
@@ -59,8 +65,9 @@ def minimize(
     size: ArrayLike | None = None,
     idle: Idle | None = None,
     reach: ArrayLike | None = None,
+    equalities: Sequence[str] = (),
 ) -> Result:
-    """Minimise a piecewise smooth cost under linear constraints; every iterate is feasible.
+    """Minimise a piecewise smooth cost under linear constraints, whose iterates all are feasible, and equalities.
 
     Parameters
     ----------
@@ -68,7 +75,9 @@ def minimize(
         ``evaluate(theta, side)`` returns cost, gradient, shape (d,), and Hessian, shape (d, d), or a
         `switchfit.optimize.arrow.Arrow`, with which the cost of an iteration is linear in d. `side` is +1 or -1: which
         one-sided derivatives to return for coordinates that sit exactly on a breakpoint. A cost or derivative that is
-        not finite marks a point as unacceptable.
+        not finite marks a point as unacceptable. With equality constraints ``evaluate(theta, side, multipliers)``
+        returns ``constraints`` c, shape (k,), and ``jacobian``, shape (k, d), too, and the Hessian of
+        ``J + multipliers . c``.
     theta0 : array, shape (d,)
         Start, feasible up to rounding.
     constraints : LinearConstraints
@@ -99,6 +108,8 @@ def minimize(
     reach : array, shape (d,), optional
         How far each unknown may move in the first step inside a trust region ("auto"); a tenth of its value if left
         out.
+    equalities : sequence of str, optional
+        Names of the equality constraints c(theta) = 0, which the start need not meet.
 
     Returns
     -------
@@ -128,10 +139,14 @@ def minimize(
         size,
         idle,
         reach,
+        equalities,
     )
     trial = feasible_start(problem, start)
     oracle = Oracle(problem)
     point = oracle.point(trial, np.abs(trial.theta))
+    if point is not None and problem.equalities:
+        oracle.multipliers = point.forces  # the Hessian is to be that of the Lagrangian
+        point = oracle.point(trial, np.abs(trial.theta))
     if point is None:
         return _nonfinite_start(oracle, trial.theta)
     state = State.at(point)
@@ -157,7 +172,9 @@ def _step(oracle: Oracle, state: State) -> State:
         return _finish(oracle, state, direction, Status.CONVERGED)
     if state.iteration >= problem.max_iterations:
         return replace(state, status=Status.MAX_ITERATIONS)
-    accepted = search(oracle, state, direction)
+    if problem.equalities and is_stuck(oracle, state, direction):
+        return replace(state, status=Status.INFEASIBLE)
+    accepted = (search_merit if problem.equalities else search)(oracle, state, direction)
     if accepted is None:
         return _handle_stall(oracle, state, direction)
     return state.advance(accepted, problem.tolerance)
@@ -165,7 +182,7 @@ def _step(oracle: Oracle, state: State) -> State:
 
 def _is_settled(problem: Problem, state: State, direction: Direction) -> bool:
     """Return whether the optimality is below the tolerance and, as J may be badly scaled, the next step negligible."""
-    if state.point.optimality > problem.tolerance:
+    if not state.point.is_stationary(problem.tolerance):
         return False
     if not problem.uses_hessian or state.settled >= EXTRA_ITERATIONS:
         return True
@@ -174,8 +191,10 @@ def _is_settled(problem: Problem, state: State, direction: Direction) -> bool:
 
 def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
     """Tell convergence and the limit of precision from failure where the line search found nothing."""
-    if state.point.optimality <= oracle.problem.tolerance:
+    if state.point.is_stationary(oracle.problem.tolerance):
         return _finish(oracle, state, direction, Status.CONVERGED)
+    if state.point.violation > MET:
+        return replace(state, status=Status.INFEASIBLE)
     floor = state.gradient_scale
     if oracle.problem.uses_hessian:
         floor = max(floor, float(np.max(abs(state.point.plus.hessian) @ state.scale)))
@@ -231,7 +250,9 @@ def _record(oracle: Oracle, state: State) -> IterationRecord:
 
 def _result(oracle: Oracle, state: State, status: Status, history: tuple[IterationRecord, ...]) -> Result:
     """Return the result at the state's point."""
-    problem, point = oracle.problem, state.point
+    problem = oracle.problem
+    state = _with_own_multipliers(oracle, state)
+    point = state.point
     gradient, hessian = point.derivatives(point.reported_sides)
     curvature = curvature_at(problem, state, point.active)
     held = () if point.kink is None else np.flatnonzero(state.genuine_kinks)
@@ -250,9 +271,44 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
         curvature=curvature,
         tolerance=problem.tolerance,
         history=history,
+        violated=_list_violated(oracle, point),
         idle=idle_coordinates(problem, state),
         reason=state.reason,
+        equalities=_list_equalities(oracle, point),
     )
+
+
+def _with_own_multipliers(oracle: Oracle, state: State) -> State:
+    """Return the state with the Hessian of the Lagrangian at its own multipliers; itself without equalities."""
+    point = state.point
+    used = point.plus.multipliers
+    if (
+        used is None
+        or not oracle.problem.equalities
+        or np.allclose(used, point.forces, rtol=SAME_MULTIPLIERS, atol=0.0)
+    ):
+        return state
+    oracle.multipliers = point.forces
+    again = oracle.point(Trial.at(oracle.problem.constraints, point.theta), state.scale)
+    return state if again is None else replace(state, point=again)
+
+
+def _list_violated(oracle: Oracle, point: Point) -> tuple[tuple[str, float], ...]:
+    """Return the name and value of each equality constraint that is not met."""
+    if point.violation <= MET or point.plus.equalities is None:
+        return ()
+    missed = np.abs(point.plus.equalities.values) > MET / np.sqrt(len(oracle.problem.equalities))
+    found = zip(_list_equalities(oracle, point), missed.tolist(), strict=True)
+    return tuple((name, value) for (name, value, _), violated in found if violated)
+
+
+def _list_equalities(oracle: Oracle, point: Point) -> tuple[tuple[str, float, float], ...]:
+    """Return the name, value and multiplier of each equality constraint, in the caller's units."""
+    held = point.plus.equalities
+    if held is None or oracle.units is None:
+        return ()
+    values, multipliers = held.values * oracle.units, point.forces / oracle.units
+    return tuple(zip(oracle.problem.equalities, values.tolist(), multipliers.tolist(), strict=True))
 
 
 def _nonfinite_start(oracle: Oracle, theta: FloatArray) -> Result:

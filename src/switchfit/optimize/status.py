@@ -141,6 +141,8 @@ class Result:
         tie to them; they are not in `free_basis`.
     reason : Finding or None
         What was seen where the line search failed; None where it did not.
+    equalities : tuple of (str, float, float)
+        Name, value and multiplier of each equality constraint; the Hessian is that of ``J + multipliers . c``.
     earlier : int
         How many of the iterations belong to minimisations before, which this one resumed.
     """
@@ -162,6 +164,7 @@ class Result:
     violated: tuple[tuple[str, float], ...] = ()
     idle: tuple[int, ...] = ()
     reason: Finding | None = None
+    equalities: tuple[tuple[str, float, float], ...] = ()
     earlier: int = 0
 
     @property

@@ -1,7 +1,7 @@
-"""Every experiment and figure of Section V of the paper, with the paper's numbers beside those found here.
+"""Every experiment and figure of Section V of the paper, with its numbers compared to ours.
 
-One module a part; each has ``compute(quick, folder, say)``, which returns what it found as plain numbers and lists,
-``draw(found)``, which makes figures from that alone, and ``rows(found)``, lines of the table. `run` does them all.
+One module per part. Each has ``compute(quick, folder, say)``, which returns results as plain numbers and lists,
+``draw(found)``, which draws figures from these alone, and ``rows(found)``, lines of the table. `run` runs all parts.
 
 References
 ----------

@@ -24,12 +24,12 @@ LOOKS: dict[str, dict[str, Any]] = {
     "exact": {"label": "SQP: exact Hessian", "color": RED, "linestyle": "-", "marker": "o", "markersize": 3},
     "descent-first": {"label": "paper's: descent, then exact", "color": DARK, "linestyle": ":"},
 }
-#: Points of a history that are kept.
+#: Largest number of points of a history that are stored.
 KEPT = 300
 
 
 def thin(fit: Estimate) -> list[list[Any]]:
-    """Return iterations and norms of the gradient; of a long history those evenly spaced in the logarithm."""
+    """Return iterations and norms of the gradient; a long history is thinned evenly in the logarithm."""
     norms = [record.optimality for record in fit.history]
     last = len(norms) - 1
     kept = np.arange(last + 1) if last < KEPT else np.unique(np.geomspace(1, last + 1, KEPT).astype(int)) - 1

@@ -37,7 +37,7 @@ def draw(found: Found) -> dict[str, Figure]:
 
 
 def draw_vehicle(ax: Axes, found: Found) -> Axes:
-    """Draw body, wheels, the force of each and the friction that slip puts against the lateral speed."""
+    """Draw the body, the wheels with their forces, and the friction in slip, which opposes the lateral speed."""
     from matplotlib.patches import Rectangle
     from matplotlib.transforms import Affine2D
 
@@ -52,7 +52,7 @@ def draw_vehicle(ax: Axes, found: Found) -> Axes:
         ax.add_patch(Rectangle(corner, *WHEEL, facecolor=LIGHT, edgecolor=DARK, linewidth=0.7, transform=turn))
         if force > 0:
             ax.arrow(x, y, LONGEST * force / largest, 0.0, color=RED, **arrow)
-        friction = 0.07 if x > 0 else 0.14  # the centre of mass slides outwards: more at the rear
+        friction = 0.07 if x > 0 else 0.14  # the center of mass slides outwards: more at the rear
         ax.arrow(x, y, 0.0, -friction if x > 0 else friction, color=BLUE, **arrow)
         below = -0.09 if x > 0 and y > 0 else 0.1
         label = rf"$F_{number}$ = {force:g} N"

@@ -1,8 +1,8 @@
-"""How the end of the horizon matters, which the paper leaves for further analysis.
+"""Effect of the end of the horizon, which the paper leaves for further analysis.
 
-Accuracy, conditioning and the region of starts from which the optimum is reached. A horizon that ends during slip has
-no second transition; tau_1 and mu are estimated alone there. Where the horizon begins does not matter as long as the
-state there is known: nothing in stick depends on the unknowns.
+The effect on accuracy, on conditioning, and on the region of starts from which the optimum is reached. A horizon that
+ends during slip has no second transition: only tau_1 and mu are estimated. The start of the horizon does not matter as
+long as the state there is known: nothing in stick depends on the unknowns.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ ENDS = (7.0, 8.0, 9.0, 10.0, 10.5, 11.0, 12.0, 13.0, 15.0, 18.0, 22.0, 26.0, 30.
 QUICK_ENDS = (8.0, 10.5, 15.0, 26.0)
 RUNS, QUICK_RUNS = 400, 32
 STARTS, QUICK_STARTS = 512, 32
-#: Noise of the positions (m), ten a second.
+#: Noise of the positions (m), ten per second.
 SIGMA, RATE = 0.1, 10
-#: An estimate belongs to the optimum if it is this near to the truth, in units of it.
+#: Largest relative distance to the truth at which an estimate counts as the optimum.
 NEAR = 1e-4
 
 
 def compute(quick: bool, folder: Path, say: Say) -> Found:
-    """Do the same fit on horizons of different lengths."""
+    """Fit the same problem on horizons of different lengths."""
     runs, starts = (QUICK_RUNS, QUICK_STARTS) if quick else (RUNS, STARTS)
     found: Found = {"runs": runs, "starts": starts, "horizons": []}
     for tf in QUICK_ENDS if quick else ENDS:
@@ -46,7 +46,7 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
 
 
 def _sample_sets() -> list[Found]:
-    """Return the standard error of mu from 1 Hz positions over several horizons, and without those taken in slip."""
+    """Return the standard error of mu from 1 Hz positions over several horizons, and without positions in slip."""
     path = simulate_drive(tf=ENDS[-1])
     begin, end = TRUTH[:2]
     sets = [(f"0 to {tf:g} s", tf, np.arange(tf + 1)) for tf in (end, 11.0, 12.0, 13.0, HORIZON, 20.0, 30.0)]
@@ -91,8 +91,8 @@ def _horizon(tf: float, runs: int, starts: int, folder: Path) -> Found:
 
 
 def _starts(d: int, tf: float, count: int) -> FloatArray:
-    """Return ordered transition times all over the horizon and mu from 0.2 to 2, as a Sobol sequence spreads them."""
-    from scipy.stats import qmc  # here, since it takes long to import
+    """Return ordered transition times all over the horizon and mu from 0.2 to 2, from a Sobol sequence."""
+    from scipy.stats import qmc  # imported here, since that takes long
 
     cube = qmc.Sobol(d, seed=0).random(count)
     times = np.sort(tf * (0.005 + 0.99 * cube[:, :-1]), axis=1)

@@ -1,6 +1,6 @@
 """The linear time-invariant example that the introduction names: an oscillator whose brake closes at an unknown time.
 
-The answers are known from matrix exponentials: with z = (x, x_m) the model beside the truth, z' = G z with G constant
+The results are known from matrix exponentials: with z = (x, x_m), the states of model and truth, z' = G z, G constant
 between transitions, so that J = ½ ∫ ‖x − x_m‖² dt is a sum of quadratic forms (C. F. Van Loan, Computing integrals
 involving the matrix exponential, IEEE Trans. Automat. Control 23 (1978) 395-404), which JAX differentiates.
 """
@@ -39,8 +39,8 @@ KINDS: tuple[HessianKind, ...] = ("none", "block-diagonal", "exact")
 
 
 def problem(start: tuple[float, float, float] = START) -> Problem:
-    """Return tau, k and c from the whole state; the reference is a spline through exact samples, broken
-    at its switch.
+    """Return the problem of tau, k and c, measured by the whole state; the reference is a spline through exact samples,
+    broken at its switch.
     """
     system = HybridSystem(
         modes={
@@ -79,7 +79,7 @@ def _matrix(k: Any, c: Any) -> Any:
 
 
 def exact(theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-    """Return J, its gradient and its Hessian from matrix exponentials, at tau before or at that of the truth."""
+    """Return J, its gradient and its Hessian from matrix exponentials, for tau not after that of the truth."""
     with use_float64():
         cost, gradient, hessian = _exact(jnp.asarray(theta))
         return float(cost), np.asarray(gradient), np.asarray(hessian)

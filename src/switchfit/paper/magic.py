@@ -1,4 +1,4 @@
-"""Figure 3: a reference from the Magic Formula, fitted with the stick-slip model; and why not with 16 coefficients."""
+"""Figure 3: a reference from the Magic Formula, fitted with the stick-slip model; why not with 16 coefficients."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ TITLE = "Magic Formula reference (Fig. 3)"
 START = (5.0, 10.0, 0.8)
 PAPER = {"tau_1": 5.0, "tau_2": 11.7, "mu": 0.676}
 SECONDS = np.arange(16.0)
-#: Eigenvalues below this part of the largest are rounding.
+#: Eigenvalues below this part of the largest one are rounding.
 ROUNDING = 1e-15
-#: Times (s) in which the wheels take up and lose their difference of speed, of which the paper prints none.
+#: Times (s) in which the wheels reach and lose their difference of speed, which the paper does not print.
 RAMPS = ((0.6, 0.6), (0.6, 1.5), (0.6, 2.5), (0.6, 3.4), (1.5, 3.4), (3.4, 3.4), (3.4, 0.6))
 #: Static load of a wheel (kN), and the part of it by which load transfer changes it in the comparison.
 LOAD, TRANSFER = 0.1962, 0.2
 
 
 def compute(quick: bool, folder: Path, say: Say) -> Found:
-    """Return the log, both fits of it, the Hessian in the 16 coefficients at the truth."""
+    """Return the log, both fits of it, and the Hessian in the 16 coefficients at the truth."""
     say("simulating the vehicle on tyres")
     speeds = wheel_speeds()
     positions, path = log_on_tyres(SECONDS, speeds)
@@ -78,7 +78,7 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
 
 
 def _ramps(say: Say) -> list[Found]:
-    """Return what stick-slip finds where the wheels follow their command at other rates."""
+    """Return the fits of stick-slip if the wheels follow their command at other rates."""
     lines: list[Found] = []
     for rise, fall in RAMPS:
         say(f"ramp of {rise:g} s up and {fall:g} s down")
@@ -93,9 +93,9 @@ def _transfer_load() -> tuple[float, ...]:
 
 
 def _force_spectrum(loads: tuple[float, ...]) -> list[float]:
-    """Return the singular values of the tyre forces' derivatives in the 16 coefficients, in units of their values.
+    """Return the singular values of the tyre forces' derivatives in the 16 coefficients, relative to their values.
 
-    A force at one load depends on the coefficients through D, BCD and E alone: three numbers a direction, six in all.
+    A force at one load depends on the coefficients through D, BCD and E alone: three numbers per direction, six in all.
     """
     names = list(MAGIC_FORMULA)
     with use_float64():
@@ -118,7 +118,7 @@ def rank(singular_values: list[float]) -> int:
 
 
 def _coefficients(speeds: Any, say: Say) -> Found:
-    """Return the Hessian in the 16 coefficients at their true values, each in units of its own value."""
+    """Return the Hessian in the 16 coefficients at their true values, each relative to its own value."""
     say("Hessian in the 16 coefficients")
     times = np.linspace(0.0, 15.0, 151)
     exact, _ = log_on_tyres(times, speeds)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TITLE = "Measurement noise (Fig. 5)"
-#: Standard deviations (m): as variances 0 to 0.25 m², and densely up to 0.25 m, the other reading of the paper's unit.
+#: Standard deviations (m): variances of 0 to 0.25 m², more densely up to 0.25 m, the other reading of the paper's unit.
 LEVELS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)
 QUICK_LEVELS = (0.0, 0.1, 0.25, 0.5)
 RUNS, QUICK_RUNS = 500, 50
@@ -42,7 +42,7 @@ FILTERED, DIRECT = "interpolated and filtered", "samples fitted directly"
 
 
 def problems() -> dict[str, Problem]:
-    """Return the problems of the two ways to fit the same samples."""
+    """Return the problems of the two methods to fit the same samples."""
     clean = states_at(simulate_drive(step=1.0), TIMES)[:, [0, 2]]
     return {
         FILTERED: stick_slip(gps_reference(TIMES, clean)),
@@ -51,7 +51,7 @@ def problems() -> dict[str, Problem]:
 
 
 def set_sigma(problem: Problem, sigma: float) -> Problem:
-    """Return the problem with another known noise; a reference signal has none."""
+    """Return the problem with another known sigma; a reference signal has no sigma and is unchanged."""
     (run,) = problem.experiments
     (data,) = run.data
     if not isinstance(data, Measurements) or sigma == 0:
@@ -60,13 +60,13 @@ def set_sigma(problem: Problem, sigma: float) -> Problem:
 
 
 def compute(quick: bool, folder: Path, say: Say) -> Found:
-    """Do a Monte Carlo study at every level of noise, in both ways, from the paper's start."""
+    """Run a Monte Carlo study at every level of noise, with both methods, from the paper's start."""
     levels, runs = (QUICK_LEVELS, QUICK_RUNS) if quick else (LEVELS, RUNS)
     found: Found = {"sigma": list(levels), "runs": runs, "ways": {}}
-    for way, problem in problems().items():
+    for method, problem in problems().items():
         rows: list[Found] = []
         for level, sigma in enumerate(levels):
-            say(f"{way}: sigma {sigma:g} m")
+            say(f"{method}: sigma {sigma:g} m")
             study = complete(
                 monte_carlo(
                     set_sigma(problem, sigma),
@@ -75,11 +75,11 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
                     start=problem.initial_theta,
                     noise=sigma,
                     seed=level,
-                    folder=folder / f"{way.split()[0]}-{sigma:g}",
+                    folder=folder / f"{method.split()[0]}-{sigma:g}",
                 )
             )
             rows.append(_level(study, sigma, np.array(rows[0]["median"] if rows else TRUTH)))
-        found["ways"][way] = rows
+        found["ways"][method] = rows
     return found
 
 
@@ -99,10 +99,10 @@ def _level(study: MonteCarlo, sigma: float, noise_free: FloatArray) -> Found:
 
 
 def _coverage(study: MonteCarlo, sigma: float) -> FloatArray:
-    """Return the part of the 95 % intervals that hold the truth: (3,).
+    """Return the part of the 95 % intervals that contain the truth: (3,).
 
-    A reference signal has no noise model. What one would take for it: the integral is a sum over samples one second
-    apart, so that J / sigma² times 1/s is minus the logarithm of a likelihood, and the covariance sigma² (1 s) H⁻¹.
+    A reference signal has no noise model. A plausible one treats the integral as a sum over samples one second apart:
+    J / sigma² times 1/s is then a negative log-likelihood, and the covariance is sigma² (1 s) H⁻¹.
     """
     if study.sigma_known is not None:
         return study.coverage()
@@ -125,17 +125,23 @@ def draw(found: Found) -> dict[str, Figure]:
     }
     for k, name in enumerate(NAMES):
         errors, coverage = axes[:, k]
-        for way, levels in found["ways"].items():
-            look = looks[way]
+        for method, levels in found["ways"].items():
+            look = looks[method]
             bands = 100 * np.array([level["percentiles"][k] for level in levels]).T
-            if way == DIRECT:
+            if method == DIRECT:
                 errors.fill_between(
-                    variance, bands[0], bands[4], color=look["color"], alpha=0.3, linewidth=0, label=f"5 to 95 %, {way}"
+                    variance,
+                    bands[0],
+                    bands[4],
+                    color=look["color"],
+                    alpha=0.3,
+                    linewidth=0,
+                    label=f"5 to 95 %, {method}",
                 )
             else:
-                errors.plot(variance, bands[0], ":", color=look["color"], linewidth=1.2, label=f"5 and 95 %, {way}")
+                errors.plot(variance, bands[0], ":", color=look["color"], linewidth=1.2, label=f"5 and 95 %, {method}")
                 errors.plot(variance, bands[4], ":", color=look["color"], linewidth=1.2)
-            errors.plot(variance, bands[2], **look, label=f"median, {way}")
+            errors.plot(variance, bands[2], **look, label=f"median, {method}")
             inside = [100 * level["coverage"][k] for level in levels[1:]]
             coverage.plot(variance[1:], inside, **look)
         errors.axhline(0.0, color=RED, linewidth=0.8)

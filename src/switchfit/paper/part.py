@@ -1,4 +1,4 @@
-"""What the parts share: lines of the table, and how figures look."""
+"""Shared by all parts: lines of the table, and the style of figures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Say = Callable[[str], None]
 
 #: Width of a figure over one and over two columns (inches).
 COLUMN, PAGE = 3.5, 7.16
-#: Dark, middle and light, so that they differ in grey too; lines differ in their dashes besides.
+#: Dark, middle and light, so that they differ in gray too; lines also differ in their dashes.
 DARK, RED, BLUE, LIGHT = "#222222", "#b2182b", "#4a7fb5", "#b5b5b5"
 SYMBOLS = {"tau_1": r"$\tau_1$", "tau_2": r"$\tau_2$", "mu": r"$\mu$"}
 
@@ -30,16 +30,16 @@ class Row(NamedTuple):
 
 
 class Part(Protocol):
-    """A module that does one part."""
+    """A module that reproduces one part of the paper."""
 
     TITLE: str
 
     def compute(self, quick: bool, folder: Path, say: Say) -> Found:
-        """Return what there is to find, as it is written to JSON; long studies keep what is done in `folder`."""
+        """Return the results, as they are written to JSON; long studies store finished runs in `folder`."""
         ...
 
     def draw(self, found: Found) -> dict[str, Figure]:
-        """Return figures by the name of their file."""
+        """Return the figures by file name."""
         ...
 
     def rows(self, found: Found) -> list[Row]:
@@ -55,7 +55,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def tidy(ax: Axes, xlabel: str, ylabel: str, *, letter: str = "") -> Axes:
-    """Set labels at a size for a column, thin frame, panel's letter."""
+    """Set labels at a size for one column, a thin frame, and the letter of the panel."""
     ax.set_xlabel(xlabel, fontsize=8)
     ax.set_ylabel(ylabel, fontsize=8)
     ax.tick_params(labelsize=7)

@@ -1,4 +1,4 @@
-"""All parts in turn: figures, ``results.json`` and the table of the paper's numbers beside ours."""
+"""Run all parts: figures, ``results.json``, and the table that compares the paper's numbers with ours."""
 
 from __future__ import annotations
 
@@ -34,22 +34,22 @@ PARTS: Mapping[str, Part] = MappingProxyType(
 )
 RESULTS, TABLE = "results.json", "table.md"
 FINISHED = ".finished-"
-"""How the name of the hidden folder begins when nothing in it is needed any more."""
+"""Prefix of the name of the hidden folder when it is no longer needed."""
 
 
 def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say | None = None) -> dict[str, Any]:
-    """Do every part of the paper, or one, and write what comes of it.
+    """Run every part of the paper, or one, and write the results.
 
     Parameters
     ----------
     out : Path
-        Folder for the figures (PDF and PNG), ``results.json`` and ``table.md``; made if it does not exist.
+        Folder for the figures (PDF and PNG), ``results.json`` and ``table.md``; created if it does not exist.
     quick : bool
         Fewer repetitions of the statistics; everything else is the same.
     only : str, optional
-        One name of `PARTS`; in ``results.json`` and the table the other parts stay as they are.
+        One name of `PARTS`; the other parts in ``results.json`` and the table are unchanged.
     say : callable, optional
-        Called with a line of text whenever something new begins.
+        Called with a line of text for progress.
 
     Returns
     -------
@@ -61,20 +61,20 @@ def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say | N
     ValueError
         For an unknown part.
     OSError
-        If something cannot be written.
+        If a file cannot be written.
 
     Notes
     -----
-    What is done is kept in a hidden folder in `out` until the run is complete. After an interruption (the exception is
-    KeyboardInterrupt then) the same call goes on from there. A file in it that is damaged is renamed, which is said in
-    a warning, and its part is computed again.
+    Finished parts are stored in a hidden folder in `out` until the run is complete. After an interruption (by
+    KeyboardInterrupt), the same call resumes. If a file in that folder is damaged, it is renamed with a warning, and
+    its part is computed again.
     """
     if only is not None and only not in PARTS:
         raise ValueError(f"there is no part {only!r}; the parts are {', '.join(PARTS)}.")
     tell = say or (lambda text: None)
     names = list(PARTS) if only is None else [only]
     unfinished = out / f".unfinished-{version('switchfit')}-{'quick' if quick else 'full'}-{only or 'all'}"
-    for left in out.glob(f"{FINISHED}*"):  # by a run that was killed while it tidied up
+    for left in out.glob(f"{FINISHED}*"):  # left by a run that was killed while it removed its folder
         shutil.rmtree(left, ignore_errors=True)
     unfinished.mkdir(parents=True, exist_ok=True)
     results = _earlier(out / RESULTS) if only is not None else {}
@@ -96,13 +96,13 @@ def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say | N
     results = {name: results[name] for name in PARTS if name in results}
     write_atomically(_lines(results), out / RESULTS)
     write_atomically(table(results), out / TABLE)
-    finished = unfinished.rename(out / f"{FINISHED}{secrets.token_hex(4)}")  # whole or not at all
+    finished = unfinished.rename(out / f"{FINISHED}{secrets.token_hex(4)}")  # atomically
     shutil.rmtree(finished)
     return results
 
 
 def table(results: Mapping[str, Found]) -> str:
-    """Return the paper's numbers beside ours as Markdown, from the content of ``results.json``."""
+    """Return a Markdown table of the paper's numbers and ours, from the content of ``results.json``."""
     lines = ["| claim | paper | switchfit | remark |", "|---|---|---|---|"]
     for name, entry in results.items():
         lines += [_line(row) for row in PARTS[name].rows(entry["found"])]
@@ -124,7 +124,7 @@ def _line(row: Row) -> str:
 
 
 def _read_kept(path: Path) -> dict[str, Any] | None:
-    """Return the entry of a part that was done before; None if it is missing, or damaged and set aside."""
+    """Return the stored entry of a finished part; None if it is missing, or damaged and set aside."""
     try:
         content = path.read_bytes()
     except FileNotFoundError:
@@ -134,7 +134,7 @@ def _read_kept(path: Path) -> dict[str, Any] | None:
         entry: dict[str, Any] = kept["entry"]
         if kept["digest"] == _digest(entry):
             return entry
-        reason = "its content is not what was written"
+        reason = "its content does not match its digest"
     except (ValueError, LookupError, TypeError, RecursionError) as error:
         reason = f"it cannot be read ({get_first_line(error)})"
     set_aside(path, reason, "This part is computed again.")
@@ -146,18 +146,18 @@ def _digest(entry: dict[str, Any]) -> str:
 
 
 def _earlier(path: Path) -> dict[str, Any]:
-    """Return results of parts that were run before; none if the file is missing, or damaged and therefore set aside."""
+    """Return results of parts that were run before; empty if the file is missing, or damaged and set aside."""
     try:
         earlier = json.loads(path.read_bytes())
     except FileNotFoundError:
         return {}
     except (ValueError, RecursionError) as error:
-        set_aside(path, f"it is no valid JSON ({get_first_line(error)})", "The other parts have to be computed again.")
+        set_aside(path, f"it is not valid JSON ({get_first_line(error)})", "The other parts have to be computed again.")
         return {}
     fields = {"quick": bool, "seconds": float, "found": dict}
     for name, entry in earlier.items() if isinstance(earlier, dict) else [("", None)]:
         if name not in PARTS or not isinstance(entry, dict) or {k: type(v) for k, v in entry.items()} != fields:
-            set_aside(path, f"{name!r} is no part with its results", "The other parts have to be computed again.")
+            set_aside(path, f"{name!r} is not a part with its results", "The other parts have to be computed again.")
             return {}
     return earlier
 

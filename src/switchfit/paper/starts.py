@@ -1,4 +1,4 @@
-"""Where estimates end that begin anywhere within the bounds: the paper holds that they would generally agree."""
+"""Estimates from starts anywhere within the bounds, which according to the paper would generally agree."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate, fit_locally
-from switchfit.optimize import Status
 from switchfit.paper.part import Found, Row, Say
 from switchfit.paper.vehicle import HORIZON, build_simulated_problem
 from switchfit.problem.data import FloatArray
 from switchfit.runtime.errors import NotIntegrableError
-from switchfit.strategy.choice import estimate
+from switchfit.strategy.choice import estimate, was_interrupted
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,25 +22,25 @@ if TYPE_CHECKING:
 TITLE = "Starts"
 COUNT, QUICK_COUNT = 1000, 30
 LOWER_MU, UPPER_MU = 0.05, 2.0
-#: Ends that agree to this part of the horizon, or of mu, are one.
+#: Estimates that agree to this part of the horizon, or to this difference of mu, count as one.
 SAME = 1e-3
-#: Ends of the table, the most frequent ones.
+#: Number of estimates in the table, the most frequent ones.
 SHOWN = 4
-WAYS = {"exact": "one fit, exact Hessian", "local": "one fit, trust region", "auto": 'strategy "auto"'}
+METHODS = {"exact": "one fit, exact Hessian", "local": "one fit, trust region", "auto": 'strategy "auto"'}
 
 
 def compute(quick: bool, folder: Path, say: Say) -> Found:
-    """Fit from starts all over the bounds, in three ways."""
+    """Fit from starts all over the bounds, with three methods."""
     problem = build_simulated_problem()
     starts = draw_starts(QUICK_COUNT if quick else COUNT)
     found: Found = {"starts": len(starts), "ways": {}}
-    for way, label in WAYS.items():
+    for method, label in METHODS.items():
         ends: list[Found] = []
         for k, start in enumerate(starts):
             if k % 100 == 0:
                 say(f"{label}: start {k} of {len(starts)}")
-            _count(ends, _fit(problem, way, start))
-        found["ways"][way] = sorted(ends, key=lambda end: -end["count"])
+            _count(ends, _fit(problem, method, start))
+        found["ways"][method] = sorted(ends, key=lambda end: -end["count"])
     return found
 
 
@@ -52,22 +51,22 @@ def draw_starts(count: int) -> FloatArray:
     return np.column_stack([times, rng.uniform(LOWER_MU, UPPER_MU, count)])
 
 
-def _fit(problem: Problem, way: str, start: FloatArray) -> Estimate | None:
-    """Return the estimate; None where it cannot be computed at the start."""
+def _fit(problem: Problem, method: str, start: FloatArray) -> Estimate | None:
+    """Return the estimate; None if the model cannot be integrated at the start."""
     try:
-        if way == "exact":
+        if method == "exact":
             fit = fit_locally(problem, hessian="exact", start=start)
         else:
-            fit = estimate(problem, strategy="local" if way == "local" else "auto", start=start)
+            fit = estimate(problem, strategy="local" if method == "local" else "auto", start=start)
     except NotIntegrableError:
         return None
-    if fit.status is Status.INTERRUPTED:
+    if was_interrupted(fit):
         raise KeyboardInterrupt
     return fit
 
 
 def _count(ends: list[Found], fit: Estimate | None) -> None:
-    """Count an end with those that it agrees with."""
+    """Add an estimate to the count of those with which it agrees."""
     if fit is None or not fit.status.successful:
         theta, cost = None, None
         fitting = [end for end in ends if end["theta"] is None]
@@ -86,20 +85,20 @@ def _count(ends: list[Found], fit: Estimate | None) -> None:
 
 
 def draw(found: Found) -> dict[str, Figure]:
-    """Draw nothing: the table says it."""
+    """Return no figures: the table has the results."""
     return {}
 
 
 def rows(found: Found) -> list[Row]:
-    """Return a line for each way to fit."""
+    """Return a line for each method."""
     return [
         Row(
-            f"V-B: {found['starts']} starts all over the bounds, {WAYS[way]}",
+            f"V-B: {found['starts']} starts all over the bounds, {METHODS[method]}",
             "would generally lead to the same estimate",
             "; ".join(_name(end) for end in ends[:SHOWN]),
             _rest(ends[SHOWN:]),
         )
-        for way, ends in found["ways"].items()
+        for method, ends in found["ways"].items()
     ]
 
 

@@ -1,4 +1,4 @@
-"""Figure 6: five trials with the paper's torques, from simulated logs: the original ones were not published."""
+"""Figure 6: five trials with the paper's torques, with simulated logs, since the original ones were not published."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ START = (5.0, 10.0, 0.8)
 SECONDS = np.arange(16.0)
 #: Standard deviation of GPS positions (m).
 GPS_SIGMA = 0.1
-#: Drive force of each wheel in stick (N), as in the paper, and the treads' difference of speed (m/s), which the
-#: simulated vehicle's drive does not hold exactly from one trial to the next.
+#: Drive force of each wheel in stick (N), as in the paper, and the treads' difference of speed (m/s), which varies
+#: between the trials of the simulated vehicle.
 TRIALS = ((12.0, 0.170), (12.0, 0.166), (12.0, 0.178), (15.0, 0.172), (15.0, 0.160))
 #: Distance (m) between trials in the figure.
 SHIFT = 20.0
@@ -34,7 +34,7 @@ LABELS = {
 
 
 def compute(quick: bool, folder: Path, say: Say) -> Found:
-    """Fit five logs, each with both models of re-stick."""
+    """Fit five logs, each with both restick models."""
     found: Found = {"trials": []}
     for number, (force, differential) in enumerate(TRIALS, start=1):
         say(f"trial {number}")

@@ -1,4 +1,4 @@
-"""The vehicle of Section V: its simulated problem, and logs of one that runs on tyres of the Magic Formula."""
+"""The vehicle of Section V: its simulated problem, and logs of a vehicle on tyres of the Magic Formula."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ HORIZON = 15.0
 #: Cut-off (Hz) of the low-pass filter of 1 Hz positions; the paper gives none.
 LOWPASS_HZ = 0.3
 
-#: When the wheels of the Magic Formula vehicle are commanded to turn it and to stop turning (s), as in the paper.
+#: Times (s) of the commands to the wheels of the Magic Formula vehicle to turn and to stop turning, as in the paper.
 COMMANDED = (5.0, 10.0)
-#: Time (s) in which the wheels take up a commanded difference of speed.
+#: Time (s) in which the wheels reach a commanded difference of speed.
 RISE = 0.6
 #: Speed (m/s) of the treads on one side above and on the other below the mean while it turns.
 DIFFERENTIAL = 0.17
@@ -39,7 +39,7 @@ Restick = Literal["continuous", "reset"]
 
 
 def position(t: Any, x: Any, p: Any) -> Any:
-    """Return what GPS sees: (X, Y)."""
+    """Return the position that GPS measures: (X, Y)."""
     return x[jnp.array([0, 2])]
 
 
@@ -51,9 +51,7 @@ def stick_slip(
     stick_force: float = 15.0,
     restick: Restick = "continuous",
 ) -> Problem:
-    """Return the estimation problem of equation (18): the transition times and mu from `data`, in this order in
-    `start`.
-    """
+    """Return the estimation problem of equation (18): transition times and mu from `data`; `start` has this order."""
     system = skid_steer(stick_forces=(stick_force,) * 4, restick=restick)
     run = Experiment(data, SEQUENCE[: len(start)], start[:-1], 0.0, tf)
     return Problem(system, run, {"mu": Parameter(start[-1], lower=0.05, upper=2.0, unit="1")})
@@ -67,7 +65,7 @@ def simulate_drive(
     restick: Restick = "continuous",
     step: float = 0.1,
 ) -> Trajectory:
-    """Return what equation (18) does at given transition times and mu, with a node every `step` seconds."""
+    """Simulate equation (18) at given transition times and mu, with a node every `step` seconds."""
     times = step * np.arange(round(tf / step) + 1)
     nothing = Measurements(times, np.zeros((len(times), 6)))
     return simulate(stick_slip(nothing, theta, tf=tf, stick_force=stick_force, restick=restick))
@@ -82,12 +80,11 @@ def build_simulated_problem(start: tuple[float, float, float] = START, tf: float
 def wheel_speeds(
     differential: float = DIFFERENTIAL, stick_force: float = 15.0, *, rise: float = RISE, fall: float = RISE
 ) -> Input:
-    """Return wheel speeds of the Magic Formula vehicle (rad/s): the paper does not print its own, so these are a
-    choice.
+    """Return wheel speeds of the Magic Formula vehicle (rad/s), which are a choice: the paper does not print its own.
 
-    The mean speed of the treads is the forward speed that (18) has with the paper's torques, mu = 0.7 and slip from 5
-    to 10 s (with reset at re-stick, so that it drives straight on). From 5 to 10 s wheels 1 and 4 are `differential`
-    faster and 2 and 3 as much slower, which they become within `rise` and cease to be within `fall` (s).
+    The mean speed of the treads is the forward speed of (18) with the paper's torques, mu = 0.7 and slip from 5 to 10 s
+    (with reset at re-stick, so that it drives straight on). From 5 to 10 s, wheels 1 and 4 are faster by `differential`
+    and 2 and 3 slower; the difference rises within `rise` and falls within `fall` (s).
     """
     path = simulate_drive((*COMMANDED, TRUTH[2]), stick_force=stick_force, restick="reset")
     theta = path.states[:, 4]
@@ -101,8 +98,8 @@ def wheel_speeds(
 
 
 def on_tyres(data: Data, speeds: Input, parameters: dict[str, Any] | None = None) -> Problem:
-    """Return the Magic Formula vehicle under given wheel speeds; `parameters` are its coefficients, published if left
-    out.
+    """Return the Magic Formula vehicle under given wheel speeds; `parameters` are its coefficients, by default the
+    published ones.
     """
     run = Experiment(data, ("drive",), (), 0.0, HORIZON, inputs=speeds)
     coefficients = dict(MAGIC_FORMULA) if parameters is None else parameters
@@ -119,7 +116,7 @@ def states_at(path: Trajectory, times: FloatArray) -> FloatArray:
     """Return states (K, n) at times that are nodes of the trajectory."""
     nodes = np.searchsorted(path.times, np.asarray(times) - 1e-9)
     if not np.allclose(path.times[nodes], times, rtol=0, atol=1e-9):
-        raise ValueError("these times are no nodes of the trajectory.")
+        raise ValueError("these times are not nodes of the trajectory.")
     return path.states[nodes]
 
 
@@ -145,7 +142,7 @@ def complete(study: Study) -> Study:
 
 
 def summary(fit: Estimate) -> dict[str, Any]:
-    """Return what a fit found, with the second-order sufficient conditions, as plain numbers."""
+    """Return the result of a fit, with the second-order sufficient conditions, as plain numbers."""
     if fit.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
     curvature = free_curvature(fit)

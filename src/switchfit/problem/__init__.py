@@ -1,4 +1,4 @@
-"""What is estimated: systems, data, experiments, parameters; the user's functions, traced; theta and its constraints.
+"""Estimation problems: systems, data, experiments, parameters; the user's traced functions; theta and its constraints.
 
-Imports `runtime` alone. Knows no mesh and no integrator.
+Imports `runtime` alone, and is independent of meshes and integrators.
 """

@@ -12,12 +12,12 @@ ConstraintKind = Literal["collapsed", "minimum duration", "lower bound", "upper 
 
 @dataclass(frozen=True)
 class Constraint:
-    """A linear constraint; print it for what it says when it is active.
+    """A linear constraint; print it for a sentence about it when it is active.
 
     Attributes
     ----------
     kind : {"collapsed", "minimum duration", "lower bound", "upper bound"}
-        "collapsed" is a minimum duration of 0: the mode lasts no time where it is active.
+        "collapsed" is a minimum duration of 0: when it is active, the mode has zero duration.
     value : float
         The minimum duration in the time unit of the run, or the bound in the unit of the unknown.
     unknown : str
@@ -25,9 +25,9 @@ class Constraint:
     mode : str
         Name of the mode that has the duration; empty for a bound.
     position : int or None
-        Where in the mode sequence that mode stands, from 0; None for a bound.
+        Index of that mode in the mode sequence, from 0; None for a bound.
     run : str
-        Name of the experiment that has the mode; empty for a bound, and where there is one experiment.
+        Name of the experiment that has the mode; empty for a bound, and if there is only one experiment.
     """
 
     kind: ConstraintKind
@@ -47,10 +47,10 @@ class ActiveConstraint(Constraint):
 
     Attributes
     ----------
-    kind, value, unknown, mode, position, run : as of `Constraint`
+    kind, value, unknown, mode, position, run : as in `Constraint`
     multiplier : float
-        Its Lagrange multiplier, 0 or more: by how much J falls per unit by which the constraint is relaxed. NaN
-        in a fit that was loaded from a file of an earlier version, which does not hold it.
+        Its Lagrange multiplier, 0 or more: the decrease of J per unit by which the constraint is relaxed. NaN
+        in a fit that was loaded from a file of an earlier version, which does not have it.
 
     See Also
     --------

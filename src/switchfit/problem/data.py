@@ -1,7 +1,7 @@
-"""What the model is compared with: measurements, reference signals, other costs; and known inputs.
+"""Data and costs: measurements, reference signals, other costs, constraints; and known inputs.
 
-Every signal in time (an input, a reference) becomes a `PiecewisePolynomial`: its knots are nodes of the mesh,
-so that the integrator never steps across one and inside a step the signal is one polynomial.
+Every signal in time (an input, a reference) becomes a `PiecewisePolynomial`. Its knots are nodes of the mesh, so that
+the integrator never steps across one, and the signal is one polynomial inside a step.
 """
 
 from __future__ import annotations
@@ -29,16 +29,17 @@ from switchfit.problem.validation import (
 
 FloatArray = NDArray[np.float64]
 MOST_FILTERED = 10**7
-"""Points at which a signal may be filtered."""
+"""Largest number of points at which a signal is filtered."""
 OVERFLOW = (
     "The signal between the samples of an Input or a ReferenceSignal overflows: values must be smaller, or times "
     "further apart."
 )
 LOWEST_CUTOFF = 1e-6
-"""Smallest cut-off of a low-pass filter in cycles a point. At 1e-8 its output is off by 3 %, below that by anything."""
+"""Smallest cut-off of a low-pass filter, in cycles per point. At 1e-8 its output is off by 3 %; below, errors are
+unbounded."""
 
 Observe = Callable[..., Any]
-"""``h(t, x, p) -> (q,)``: what a sensor sees of the state."""
+"""``h(t, x, p) -> (q,)``: the output of a sensor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +65,7 @@ class PiecewisePolynomial:
         return int(self.coefficients.shape[2])
 
     def interval(self, times: FloatArray) -> NDArray[np.intp]:
-        """Return the index of the knot interval that holds each of `times`; beyond the ends the first or
-        the last one.
-        """
+        """Return the index of the knot interval that holds each of `times`; beyond the ends, the first or the last."""
         return np.clip(np.searchsorted(self.knots, times, side="right") - 1, 0, len(self.knots) - 2)
 
     def __call__(self, times: ArrayLike) -> FloatArray:
@@ -80,18 +79,18 @@ class PiecewisePolynomial:
 
 @dataclass(frozen=True, eq=False)
 class Input:
-    """A known input ``u(t)``, given by samples; modes are then called as ``f(t, x, p, u)``.
+    """A known input ``u(t)``, given by samples; the modes are then functions ``f(t, x, p, u)``.
 
     Parameters
     ----------
     times : (K,) array_like
-        Increasing times in the experiment's time unit. They must reach over its ``[t0, tf]``; a held input only has to
-        start by t0, its last value is kept.
+        Increasing times in the experiment's time unit. They must cover its ``[t0, tf]``; for a held input it is enough
+        to start by t0, as its last value is held.
     values : (K,) or (K, q) array_like, or mapping of str to (K,) array_like
         The modes get a scalar u, or a ``(q,)`` array. With samples by name they get a dict of scalars, ``u["left"]``;
-        so they do with a DataFrame whose columns all have names (strings).
+        likewise with a DataFrame whose columns all have names (strings).
     kind : {"hold", "linear", "cubic"}
-        Between samples: the last value is held, straight lines, or a cubic spline.
+        Interpolation between samples: hold the last value, straight lines, or a cubic spline.
 
     Raises
     ------
@@ -99,12 +98,12 @@ class Input:
         For times that do not increase, values that are not finite or differ in length from times, too few
         samples, no name or an empty one, or an unknown kind.
     TypeError
-        If times or values are not numbers, dates among them, or a name is not a string.
+        If times or values are not numbers (dates are not), or a name is not a string.
 
     See Also
     --------
     Experiment : takes it as `inputs`.
-    ReferenceSignal : a measured signal that the model is compared with.
+    ReferenceSignal : a measured signal to which the model is fitted.
 
     Examples
     --------
@@ -114,7 +113,7 @@ class Input:
     >>> wheels.names
     ('left', 'right')
 
-    A mode of an experiment with ``inputs=wheels`` finds each of them by its name:
+    A mode of an experiment with ``inputs=wheels`` reads each of them by its name:
 
     >>> def drive(t, x, p, u):
     ...     return p["r"] * np.array([0.5, 0.5]) @ [u["left"], u["right"]]
@@ -133,7 +132,7 @@ class Input:
             times, values = _check_samples(self.times, self.values, "Input", at_least=at_least)
             _require_finite(values, "Input values")
         else:
-            # Sorted: experiments whose inputs are named in different orders share one program.
+            # Sorted, so that experiments whose inputs are named in different orders share one program.
             values = {}
             for name in sorted(named):
                 what = f"Input {shorten(name)}"
@@ -150,7 +149,7 @@ class Input:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of u: () or (q,). Where its entries have names, q is their number."""
+        """Shape of u: () or (q,). If its entries have names, q is their number."""
         return (len(self.values),) if self.names else tuple(self.values.shape[1:])
 
     def signal(self, t0: float, tf: float) -> PiecewisePolynomial:
@@ -245,14 +244,14 @@ class TerminalCost:
 class TransitionCost:
     """Cost of a transition: adds ``mu(tau, x(tau-), p)`` to J at each transition between two modes.
 
-    tau is the transition time, and x(tau-) the state just before it, to which a reset map has not been applied yet. It
-    is what a switch costs, how far from a wanted state or moment it may happen, or a prior that depends on the state.
+    tau is the transition time, and x(tau-) the state just before it, before any reset map. Use it for the cost of a
+    switch, a penalty on its distance from a desired state or time, or a prior that depends on the state.
 
     Parameters
     ----------
     mu : callable ``mu(t, x, p) -> scalar``, twice differentiable.
     before, after : str, optional
-        The modes between which it counts; left out, any. No two may count at the same transition.
+        The modes between which it counts; any mode if left out. No two may count at the same transition.
 
     See Also
     --------
@@ -296,7 +295,7 @@ class TransitionCost:
 
 @dataclass(frozen=True, eq=False)
 class TerminalConstraint:
-    """What has to hold at the end: ``psi(x(tf), p) = 0``, an equality constraint and no cost.
+    """Equality constraint on the final state: ``psi(x(tf), p) = 0``.
 
     Parameters
     ----------
@@ -336,15 +335,15 @@ class ReferenceSignal:
     signal : PiecewisePolynomial
         y_m, with q channels.
     observe : callable ``h(t, x, p) -> (q,)``, optional
-        Left out, the whole state is compared.
+        If left out, the whole state is compared.
     weights : (q,) or (q, q) array_like, optional
         W, symmetric and positive semi-definite, or its diagonal; the identity if left out.
     names : sequence of str, optional
         One for each channel, for reports and plots.
     samples : (times, values), optional
-        What the signal was made from.
+        Samples from which the signal was made.
     lowpass_hz : float, optional
-        The cut-off with which it was made.
+        Cut-off with which it was filtered.
 
     See Also
     --------
@@ -389,20 +388,20 @@ class ReferenceSignal:
         weights: ArrayLike | None = None,
         names: Sequence[str] | None = None,
     ) -> ReferenceSignal:
-        """Interpolate samples by cubic splines and, if asked, low-pass filter them without phase shift.
+        """Interpolate samples by cubic splines and, optionally, low-pass filter them without phase shift.
 
         Parameters
         ----------
         times : (K,) array_like
-            Increasing sample times in the experiment's time unit, four or more. A time given twice breaks the spline
-            there, as at the transitions of a simulated trajectory; each part then needs four samples.
+            Increasing sample times in the experiment's time unit, four or more. The spline is broken at a time that is
+            given twice, as at the transitions of a simulated trajectory; each part then needs four samples.
         values : (K,) or (K, q) array_like
             NaN marks a missing value, as does the mask of a masked array; it is bridged by the interpolation.
         observe : callable ``h(t, x, p) -> (q,)``, optional
         lowpass_hz : float, optional
-            Cut-off, in cycles per time unit of the experiment (Hz only where that is s), of a second-order Butterworth
-            filter run forward and backward over the interpolated signal, so that no phase shift remains (the gain at
-            the cut-off is then 1/2).
+            Cut-off, in cycles per time unit of the experiment (Hz only if that is s), of a second-order Butterworth
+            filter. It runs forward and backward over the interpolated signal, so that no phase shift remains (the gain
+            at the cut-off is then 1/2).
         weights : (q,) or (q, q) array_like, optional
         names : sequence of str, optional
 
@@ -410,9 +409,9 @@ class ReferenceSignal:
         ------
         ValueError
             For bad times or values, fewer than four samples in a channel, or a cut-off that is not positive or far
-            beyond what the samples show.
+            above the sampling rate.
         TypeError
-            If times, values, weights or the cut-off are not numbers, dates among them.
+            If times, values, weights or the cut-off are not numbers (dates are not).
 
         See Also
         --------
@@ -444,9 +443,9 @@ class ReferenceSignal:
 class Measurements:
     """Discrete noisy samples: adds ``1/2 sum ((y_k - h(t_k, x(t_k), p)) / sigma)**2`` to J.
 
-    With a sigma that is a parameter, ``sum log sigma`` over the samples it belongs to is added too, so that J is the
-    negative logarithm of the likelihood up to a constant. With a robust loss, ``1/2 C**2 rho((r / sigma)**2 / C**2)``
-    stands in place of each ``1/2 (r / sigma)**2``, C being the `loss_scale` (`switchfit.problem.losses`).
+    With a sigma that is a parameter, ``sum log sigma`` over its samples is added too, so that J is the negative
+    logarithm of the likelihood up to a constant. With a robust loss, ``1/2 C**2 rho((r / sigma)**2 / C**2)`` replaces
+    each ``1/2 (r / sigma)**2``, where C is the `loss_scale` (`switchfit.problem.losses`).
 
     Parameters
     ----------
@@ -455,30 +454,30 @@ class Measurements:
     values : (K,) or (K, q) array_like
         Samples; NaN marks a missing one, as does the mask of a masked array.
     observe : callable ``h(t, x, p) -> (q,)``, optional
-        Left out, the whole state is measured. At a transition with a reset map the sample is of the state
+        If left out, the whole state is measured. At a transition with a reset map, the sample is of the state
         just before the jump.
     sigma : float, (q,) or (K, q) array_like, str, or list of float and str, optional
-        Standard deviation of the noise, for all, for each channel or for each sample. A string names the parameter
-        that it is, for all channels; in a list of q entries, for one of them. Left out it is
-        unknown: all samples weigh 1 and the covariance is scaled by the residual variance.
+        Standard deviation of the noise, for all, for each channel or for each sample. A string is the name of a
+        parameter, whose value is sigma: for all channels, or in a list of q entries for one of them. If left out, sigma
+        is unknown: all samples have weight 1, and the covariance is scaled by the residual variance.
     names : sequence of str, optional
         One for each channel.
     loss : {"linear", "soft_l1", "huber", "cauchy"}, optional
-        As in `scipy.optimize.least_squares`; all but the first count outliers for less.
+        As in `scipy.optimize.least_squares`; all but the first reduce the weight of outliers.
     loss_scale : float, optional
         C, in units of sigma: residuals beyond it are outliers.
     delay : float or str, optional
-        By how much the sensor is late, in the experiment's time unit: a sample stamped t_k is of the state at
-        ``t_k - delay``, and `observe` is called with that time. A string names the parameter that it is. Give channels
-        of different delays as several `Measurements`.
+        Delay of the sensor, in the experiment's time unit: a sample with time stamp t_k is of the state at
+        ``t_k - delay``, and `observe` is called with that time. A string is the name of a parameter, whose value is the
+        delay. Give channels with different delays as several `Measurements`.
 
     Raises
     ------
     ValueError
         For times that do not increase, shapes that do not match, no sample at all, infinite values, a
-        sigma that is not positive, or a loss that is not known or has no scale to be measured by.
+        sigma that is not positive, an unknown loss, or a robust loss without sigma.
     TypeError
-        If times, values, sigma or another number is not a number, dates among them.
+        If times, values, sigma or another number is not a number (dates are not).
 
     See Also
     --------
@@ -533,7 +532,7 @@ class Measurements:
 
     @property
     def seen_times(self) -> FloatArray:
-        """Times of the states that were seen, (K,): with a delay that is a parameter, as if there were none."""
+        """Times of the states that were measured, (K,); a delay that is a parameter is not subtracted."""
         return self.times if isinstance(self.delay, str) or self.delay == 0.0 else self.times - self.delay
 
     def _check_loss(self) -> None:
@@ -544,8 +543,8 @@ class Measurements:
         object.__setattr__(self, "loss_scale", scale)
         if self.loss != "linear" and self.sigma is None:
             raise ValueError(
-                f"loss={self.loss!r} counts residuals in units of sigma, which is left out: give sigma a number, or "
-                "the name of a parameter to estimate it."
+                f"loss={self.loss!r} measures residuals in units of sigma, which is left out: set sigma to a number, "
+                "or to the name of a parameter to estimate it."
             )
         if self.loss == "cauchy" and self.sigma_names and scale <= 1:
             raise ValueError(
@@ -555,13 +554,13 @@ class Measurements:
 
     @property
     def sigma_names(self) -> tuple[str | None, ...]:
-        """The parameter that is the sigma of each channel, None where it is a number; empty if all are."""
+        """The parameter that is the sigma of each channel, None for a number; empty if all are numbers."""
         if not isinstance(self.sigma, tuple):
             return ()
         return tuple(entry if isinstance(entry, str) else None for entry in self.sigma)
 
     def noise(self, parameters: Mapping[str, Any]) -> FloatArray | None:
-        """Return the standard deviation of each sample, a (K, q) array, given the model's parameters; None where it is
+        """Return the standard deviation of each sample, a (K, q) array, given the model's parameters; None if it is
         unknown.
 
         See Also
@@ -585,7 +584,7 @@ class Measurements:
 
     @property
     def weights(self) -> FloatArray:
-        """``1 / sigma**2`` (1 where sigma is unknown or a parameter), 0 where a sample is missing: (K, q)."""
+        """``1 / sigma**2`` (1 if sigma is unknown or a parameter), 0 for missing samples: (K, q)."""
         sigma = self.noise(dict.fromkeys(filter(None, self.sigma_names), 1.0))
         inverse = np.ones(self.values.shape) if sigma is None else sigma**-2.0
         return np.where(np.isnan(self.values), 0.0, inverse)
@@ -611,7 +610,7 @@ def _check_samples(
 ) -> tuple[FloatArray, FloatArray]:
     """Return times (K,) and values (K,) or (K, q) as float64, checked against each other.
 
-    With `breaks` a time may stand twice; with `missing` masked values become NaN; without `columns` the shape of the
+    With `breaks`, a time may occur twice; with `missing`, masked values become NaN; without `columns`, the shape of the
     values must be (K,).
     """
     times = as_array(times, f"{what} times", form="an array of numbers")
@@ -661,7 +660,7 @@ def _check_sigma(sigma: Any, shape: tuple[int, ...]) -> FloatArray | tuple[str |
     sigma = as_array(sigma, "sigma")
     if sigma.shape not in ((), (shape[1],), shape):
         raise ValueError(
-            f"sigma must be a number, of shape ({shape[1]},) (one a channel) or {shape} (one a sample); "
+            f"sigma must be a number, of shape ({shape[1]},) (one per channel) or {shape} (one per sample); "
             f"got shape {sigma.shape}."
         )
     if not np.all(sigma > 0) or not np.all(np.isfinite(sigma)):
@@ -677,12 +676,12 @@ def _check_inverse_square(sigma: Any) -> None:
 
 
 def _check_sigma_of_channels(sigma: Sequence[Any], channels: int) -> tuple[str | float, ...]:
-    """Return names of parameters and numbers, one a channel."""
+    """Return names of parameters and numbers, one per channel."""
     if len(sigma) != channels:
         raise ValueError(f"sigma must have one entry for each of the {channels} channels; got {shorten(sigma)}.")
     if any(entry is None for entry in sigma):
         raise ValueError(
-            "sigma of one channel cannot be left out (None) where that of another is a parameter: name a parameter for "
+            "sigma of one channel cannot be left out (None) if that of another is a parameter: name a parameter for "
             f"it too; got {shorten(sigma)}."
         )
     entries = [
@@ -722,7 +721,7 @@ def _build_weight_matrix(weights: ArrayLike | None, channels: int) -> FloatArray
 
 
 def _build_polynomial(knots: FloatArray, powers: list[FloatArray]) -> PiecewisePolynomial:
-    """Return the polynomial with the given coefficient arrays ``(K - 1, q)``, lowest power first, the rest zero."""
+    """Return the polynomial with the given coefficient arrays ``(K - 1, q)``, lowest power first, others zero."""
     coefficients = np.zeros((len(knots) - 1, 4, powers[0].shape[1]))
     for i, power in enumerate(powers):
         coefficients[:, i] = power
@@ -742,13 +741,13 @@ def _fit_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
 
 
 def _join_signals(parts: list[PiecewisePolynomial]) -> PiecewisePolynomial:
-    """Return one signal out of several that follow each other."""
+    """Join consecutive signals into one."""
     knots = np.concatenate([part.knots[:-1] for part in parts[:-1]] + [parts[-1].knots])
     return PiecewisePolynomial(knots, np.concatenate([part.coefficients for part in parts]))
 
 
 def _fit_bridged_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
-    """Return the spline through the samples that are there, each channel's gaps bridged by its own spline first."""
+    """Return the spline through all samples; missing ones are interpolated first, by a spline of their channel."""
     filled = values.copy()
     for channel in filled.T:
         known = np.isfinite(channel)
@@ -760,8 +759,8 @@ def _fit_bridged_spline(times: FloatArray, values: FloatArray) -> PiecewisePolyn
 
 
 def _filter_lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePolynomial:
-    """Filter a signal by Butterworth's filter of second order, forward and backward, on a grid of ten points a period
-    of the cut-off.
+    """Filter a signal by a second-order Butterworth filter, forward and backward, on a grid of ten points per period of
+    the cut-off.
     """
     import scipy.signal  # here, since importing it takes longer than most fits
 
@@ -769,7 +768,7 @@ def _filter_lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewiseP
     step = min(0.1 / cutoff_hz, float(np.median(np.diff(signal.knots))))
     if not (end - start) * max(10 * cutoff_hz, 1 / step) <= MOST_FILTERED:
         raise ValueError(
-            f"lowpass_hz must not ask for more than {MOST_FILTERED} points, ten a period; got {cutoff_hz:g} Hz for a "
+            f"lowpass_hz must not need more than {MOST_FILTERED} points, ten per period; got {cutoff_hz:g} Hz for a "
             f"signal from {start:g} to {end:g}. Its samples show nothing above "
             f"{0.5 / np.min(np.diff(signal.knots)):.3g} Hz; a higher cut-off filters nothing."
         )
@@ -777,8 +776,8 @@ def _filter_lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewiseP
     rate = (len(grid) - 1) / (end - start)
     if cutoff_hz < LOWEST_CUTOFF * rate:
         raise ValueError(
-            f"lowpass_hz must be {LOWEST_CUTOFF * rate:.3g} Hz or more for {rate:.6g} points a second, below which the "
-            f"filter is rounding; got {cutoff_hz:g}."
+            f"lowpass_hz must be {LOWEST_CUTOFF * rate:.3g} Hz or more for {rate:.6g} points per second, below which "
+            f"the filter's output is rounding error; got {cutoff_hz:g}."
         )
     sos = scipy.signal.butter(2, cutoff_hz, fs=rate, output="sos")
     padding = int(min(len(grid) - 1, np.ceil(3 * rate / cutoff_hz)))

@@ -23,7 +23,7 @@ from switchfit.problem.data import (
 from switchfit.problem.parameter import Parameter as Parameter
 from switchfit.problem.parameter import as_parameter
 from switchfit.problem.system import HybridSystem, as_state
-from switchfit.problem.validation import as_instance, as_name, as_number, as_sequence, shorten
+from switchfit.problem.validation import as_instance, as_name, as_number, as_sequence, join_names, shorten
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,13 +40,17 @@ class Experiment:
     transition_times : sequence of float or Parameter, or None
         First guess of each transition, in the experiment's time unit, one fewer than modes, strictly increasing inside
         ``(t0, tf)``; an entry may be a `Parameter` with bounds, or fixed. Its unit, where given, must be `time_unit`.
+        With ``scale="log"``, which all free times of an experiment then have, a free tf among them, the optimiser works
+        in log(tau - t0): for times that may lie in other decades than their guess.
         None: `estimate` looks for them all over the horizon; the guess is evenly spaced.
-    t0 : float
-        Start of the horizon, in the experiment's time unit.
-    tf : float or Parameter
-        End of the horizon. A `Parameter` that is not fixed is estimated, and called "tf" among the unknowns: give it a
-        finite upper bound, up to which inputs and reference signals must be known, and a lower bound where there are
-        samples, none of which may lie after it.
+    t0 : float, optional
+        Start of the horizon, in the experiment's time unit. Left out, the first time of the data: the first sample of
+        the `Measurements` (less a delay that is a number) and the beginning of the reference signals, whichever is
+        first. Other costs have no times: where there are no others, t0 and tf must be given.
+    tf : float or Parameter, optional
+        End of the horizon. Left out, the last time of the data. A `Parameter` that is not fixed is estimated, and
+        called "tf" among the unknowns: give it a finite upper bound, up to which inputs and reference signals must be
+        known, and a lower bound where there are samples, none of which may lie after it.
     inputs : Input, optional
         Known input; modes are then called as ``f(t, x, p, u)``.
     initial_state : (n,) array_like or callable ``p -> (n,)``, optional
@@ -64,8 +68,9 @@ class Experiment:
     Raises
     ------
     ValueError
-        If lengths do not match, times are unordered or outside the horizon, data lies outside it, `time_unit` is empty,
-        a transition time or tf has another unit, or a free tf has bounds that do not fit.
+        If lengths do not match, times are unordered or outside the horizon, data lies outside it, t0 or tf is left out
+        and the data have no times to take it from, `time_unit` is empty, a transition time or tf has another unit, or a
+        free tf has bounds that do not fit.
     TypeError
         If an argument is of the wrong type: times that are not numbers (dates among them), mode names that are no
         strings, data of another kind than those above.
@@ -77,6 +82,9 @@ class Experiment:
     that its functions ask for and to no others, so that many runs with parameters of their own cost each what it alone
     would. (Functions that look at ``p`` as a whole, or hand it to ``jax.jit``, ask for all that it holds.)
 
+    A copy with other data, made by `dataclasses.replace`, keeps the horizon, also where it came from the data; with
+    ``t0=None, tf=None`` beside the data it is that of the new ones.
+
     See Also
     --------
     Problem, HybridSystem, Measurements, Input
@@ -85,29 +93,42 @@ class Experiment:
     --------
     >>> import switchfit as sf
     >>> log = sf.Measurements([1.0, 2.0, 3.0, 4.0], [0.9, 1.8, 1.2, 0.7], sigma=0.1)
-    >>> run = sf.Experiment(log, ("on", "off"), (2.2,), 0.0, 4.0, time_unit="h")
+    >>> run = sf.Experiment(log, ("on", "off"), (2.2,), t0=0.0, time_unit="h")
     >>> run.mode_sequence, run.initial_times
     (('on', 'off'), array([2.2]))
+
+    The horizon begins at t0 and ends, as tf is left out, with the last sample:
+
+    >>> run.t0, run.tf
+    (0.0, 4.0)
     """
 
     data: Any
     mode_sequence: tuple[str, ...]
     transition_times: tuple[Any, ...]
-    t0: float
-    tf: float | Parameter
+    t0: float = None  # type: ignore[assignment]  # a number after __post_init__, as is tf
+    tf: float | Parameter = None  # type: ignore[assignment]
     inputs: Input | None = None
     initial_state: Any = None
     name: str | None = None
     parameter_map: Any = None
     time_unit: str = "s"
     is_guess_proposed: bool = field(init=False, default=False)
+    taken_from_data: tuple[str, ...] = field(init=False, default=())  # which of "t0" and "tf" were left out
 
     def __post_init__(self) -> None:
-        t0, tf = as_number(self.t0, "t0"), _check_final_time(self.tf)
+        data = _check_data(self.data)
+        if self.t0 is None or self.tf is None:
+            missing = tuple(name for name in ("t0", "tf") if getattr(self, name) is None)
+            t0, tf = _choose_horizon(self.t0, self.tf, data, missing)
+            object.__setattr__(self, "taken_from_data", missing)
+        else:
+            t0, tf = as_number(self.t0, "t0"), _check_final_time(self.tf)
         last = float(tf.value) if isinstance(tf, Parameter) else tf
         if not (np.isfinite(t0) and np.isfinite(last) and t0 < last):
             raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got ({t0}, {last}).")
-        if isinstance(tf, Parameter) and np.isfinite(tf.lower) and tf.lower <= t0:
+        by_scale = isinstance(tf, Parameter) and tf.scale == "log" and tf.lower == 0
+        if isinstance(tf, Parameter) and np.isfinite(tf.lower) and tf.lower <= t0 and not by_scale:
             raise ValueError(
                 f"The lower bound of tf must lie after t0 = {t0}; got {tf.lower}. Leave it out, or raise it."
             )
@@ -135,7 +156,7 @@ class Experiment:
             object.__setattr__(self, "initial_state", as_state(self.initial_state, "initial_state"))
         for name, value in (("t0", t0), ("tf", tf), ("mode_sequence", sequence), ("transition_times", times)):
             object.__setattr__(self, name, value)
-        object.__setattr__(self, "data", _check_data(self.data))
+        object.__setattr__(self, "data", data)
         object.__setattr__(self, "parameter_map", _check_map(self.parameter_map))
         self._check_time_unit()
         self._check_times()
@@ -198,8 +219,13 @@ class Experiment:
                 )
 
     def _check_times(self) -> None:
-        if any(tau.scale != "linear" for tau in self.transition_times):
-            raise ValueError("transition_times are estimated as they are; leave out scale='log'.")
+        scales = {tau.scale for tau in self.times if not tau.fixed}
+        if len(scales) > 1:
+            raise ValueError(
+                "the transition times of an experiment that are estimated, and a free tf, must be on one scale, since "
+                f"their order is a constraint; got {shorten([tau.scale for tau in self.times])}. Give scale='log' to "
+                "all of them, or to none."
+            )
         if any(tau.shape != () for tau in self.transition_times):
             shapes = [tau.shape for tau in self.transition_times]
             raise ValueError(
@@ -224,7 +250,7 @@ class Experiment:
                     bound = ", whose end is the upper bound of tf" if self.has_free_tf else ""
                     raise ValueError(
                         f"A ReferenceSignal must reach over (t0, tf) = ({self.t0}, {self.end}){bound}; "
-                        f"this one is known from {first} to {last}."
+                        f"this one is known from {first} to {last}. Give t0 and tf inside that, or a longer signal."
                     )
 
     def _require_inside(self, times: FloatArray, what: str) -> None:
@@ -291,6 +317,31 @@ def _check_data(data: Any) -> tuple[Data, ...]:
     return items
 
 
+def _choose_horizon(
+    t0: Any, tf: Any, data: tuple[Data, ...], missing: tuple[str, ...]
+) -> tuple[float, float | Parameter]:
+    """Return t0 and tf as given and checked; those that are missing are taken from the span of the data."""
+    left_out = f"{' and '.join(missing)} {'are' if len(missing) > 1 else 'is'} left out"
+    spans = [item.seen_times[[0, -1]] for item in data if isinstance(item, Measurements)]
+    spans += [item.signal.knots[[0, -1]] for item in data if isinstance(item, ReferenceSignal)]
+    if not spans:
+        kinds = join_names(dict.fromkeys(type(item).__name__ for item in data))
+        raise ValueError(
+            f"{left_out}, but nothing among the data ({kinds}) has times that say where the horizon begins and ends: "
+            f"give {' and '.join(missing)}."
+        )
+    first, last = float(np.min(spans)), float(np.max(spans))
+    start = first if t0 is None else as_number(t0, "t0")
+    end = last if tf is None else _check_final_time(tf)
+    guess = float(end.value) if isinstance(end, Parameter) else end
+    if not start < guess:
+        raise ValueError(
+            f"{left_out}, and with the span of the data, from {first} to {last}, the horizon (t0, tf) would be "
+            f"({start}, {guess}): give {' and '.join(missing)}, so that t0 < tf."
+        )
+    return start, end
+
+
 def _check_final_time(given: Any) -> float | Parameter:
     """Return tf as a number, or as a `Parameter` where it is free."""
     if not isinstance(given, Parameter):
@@ -299,8 +350,6 @@ def _check_final_time(given: Any) -> float | Parameter:
         raise ValueError(f"tf must be a single number or a Parameter of one; got the shape {given.shape}.")
     if given.fixed:
         return float(given.value)
-    if given.scale != "linear":
-        raise ValueError("tf is estimated as it is; leave out scale='log'.")
     if not np.isfinite(given.upper):
         raise ValueError(
             "A free tf needs a finite upper bound, such as sf.Parameter(2.0, upper=5.0): the latest time to which the "

@@ -1,8 +1,8 @@
-"""The user's functions, traced: each is kept as what it did when its problem was built, and compared by that.
+"""Traced functions of the user: each is a jaxpr, traced when its problem is built, and compared by content.
 
-A `Function` holds a jaxpr. Equal jaxprs are one `Function`, so that programs compiled for one are used for the other,
-whatever Python objects they came from; and a function that reads something that has changed is another `Function`.
-Whether a trace can be used again without calling the user's function is decided by `switchfit.problem.reads`.
+Functions with equal jaxprs are equal, whatever Python objects they came from, so that they share compiled programs. A
+function that reads a value that has changed has another jaxpr and is another `Function`. `switchfit.problem.reads`
+decides whether a trace can be reused without calling the user's function.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Shape = tuple[int, ...]
 
 
 def use_float64() -> Any:
-    """Return a context in which JAX computes in float64; the user's setting is back in force afterwards."""
+    """Return a context in which JAX computes in float64; the user's setting is restored at its end."""
     return jax.enable_x64(True)
 
 
@@ -39,7 +39,7 @@ UNTRACEABLE = (
     jax.errors.TracerArrayConversionError,
     jax.errors.TracerIntegerConversionError,
 )
-"""What JAX raises where Python code wants to know a number that is not known yet."""
+"""Exceptions of JAX when Python code needs the value of a traced number."""
 
 
 class Function:
@@ -48,10 +48,10 @@ class Function:
     Attributes
     ----------
     parameters : tuple of str
-        The names that it asks p for, in the order of the jaxpr's arguments.
+        Names of the parameters that it reads, in the order of the jaxpr's arguments.
     shape : shape of its result
     digest : str
-        Of the jaxpr's content: the same in every process.
+        Hash of the jaxpr's content, the same in every process.
     """
 
     def __init__(self, closed: Any, parameters: tuple[str, ...], digest: str, opaque: tuple[Any, ...]) -> None:
@@ -62,7 +62,7 @@ class Function:
         self._key = (digest, tuple(map(id, opaque)))
 
     def __call__(self, *arguments: Any) -> Array:
-        """Value for arguments in the order of the user's function, p being a mapping of names to arrays."""
+        """Evaluate for arguments in the order of the user's function, p being a mapping of names to arrays."""
         flat = [_as_float64(a) for a in arguments if not isinstance(a, Mapping)]
         named = next(argument for argument in arguments if isinstance(argument, Mapping))
         given = [*flat, *(named[name] for name in self.parameters)]
@@ -76,7 +76,7 @@ class Function:
 
 
 def _as_float64(value: Any) -> Any:
-    """Return a value as a float64 array as the jaxpr expects it: Python's numbers have a weak type."""
+    """Return a value as a float64 array without weak type, which Python's numbers have, as the jaxpr requires."""
     if (
         isinstance(value, (np.ndarray, jax.Array))
         and value.dtype == np.float64
@@ -91,11 +91,11 @@ _traces: OrderedDict[Any, Function] = OrderedDict()
 _lock = threading.Lock()
 
 MOST_TRACES = 1024
-"""Functions whose traces are kept to be used again."""
+"""Number of functions whose traces are cached."""
 
 _turn = itertools.count(1)
 _retracing = jax.make_user_context(0)
-"""With a new value JAX does not use earlier traces of what is jitted inside a function."""
+"""With a new value, JAX does not reuse earlier traces of jitted functions inside a function."""
 
 
 def trace_function(
@@ -109,23 +109,23 @@ def trace_function(
     shape: Shape | None,
     inputs: tuple[str, ...] = (),
 ) -> Function:
-    """Trace a function of the user's, or find the trace that is still what it does.
+    """Trace a function of the user, or return a cached trace that is still valid.
 
     Parameters
     ----------
     function : callable
     arguments : sequence of shape or None
-        Of its arguments; None stands for the dict of parameters.
+        Shapes of its arguments; None stands for the dict of parameters.
     parameters : mapping of str to shape
-        What that dict holds.
+        Names and shapes of the entries of that dict.
     hidden : set of str
-        Those among them that the function sees only if it asks for them by name.
+        Those among them that are in the dict only if the function reads them by name.
     what, form : str
         Its name and signature for messages, such as "mode 'slip'" and "f(t, x, p)".
     shape : shape, optional
-        What it must return; anything if left out.
+        Required shape of its result; any if left out.
     inputs : tuple of str, optional
-        Names of the entries of the last argument, which is then handed over as a dict; the `Function` takes an array.
+        Names of the entries of the last argument, which is then passed as a dict; the `Function` takes an array.
 
     Raises
     ------
@@ -158,14 +158,14 @@ def trace_function(
 
 
 def _without_jit(function: Any) -> Any:
-    """Return the function that was handed to `jax.jit`, which would not look at it again."""
+    """Return the function inside `jax.jit`, which would not trace it again."""
     while type(function) is JITTED and hasattr(function, "__wrapped__"):
         function = function.__wrapped__
     return function
 
 
 class _Call:
-    """How a function is called, and what it must return."""
+    """Arguments with which a function is called, and the shape that it must return."""
 
     def __init__(
         self,
@@ -182,7 +182,7 @@ class _Call:
 
 
 def _trace(function: Callable[..., Any], given: _Call) -> Function:
-    """Trace with a dict that notes what is asked of it; with an ordinary one where the function allows no other."""
+    """Trace with a dict that records which names are read; with an ordinary dict if the function accepts no other."""
     shown = tuple(name for name in given.parameters if name not in given.hidden)
     try:
         return _trace_with(function, given, tuple(given.parameters), watch=True)
@@ -193,7 +193,7 @@ def _trace(function: Callable[..., Any], given: _Call) -> Function:
     except ValueError:
         if not given.hidden:
             raise
-    # One of the hidden may be asked for; if not, this says what is wrong.
+    # The function may read a hidden parameter; if it does not, this raises the error.
     return _trace_with(function, given, tuple(given.parameters), watch=False)
 
 
@@ -221,7 +221,7 @@ def _trace_with(function: Callable[..., Any], given: _Call, names: tuple[str, ..
 def _build_function(
     closed: Any, count: int, names: tuple[str, ...], used: tuple[str, ...], function: Any, given: _Call
 ) -> Function:
-    """Return the jaxpr with the parameters that are used, its constants copied: what they came from may change."""
+    """Return the jaxpr with the parameters that it uses; its constants are copied, since the user may change them."""
     refuse_single_precision_in(closed, function, given.what)
     invars = closed.jaxpr.invars
     kept = [*invars[:count], *(v for name, v in zip(names, invars[count:], strict=True) if name in used)]
@@ -235,7 +235,7 @@ def _build_function(
 
 
 def _copy_literals(jaxpr: Any) -> None:
-    """Copy the numbers that stand in a jaxpr: JAX keeps the user's arrays without axes there, which may change."""
+    """Copy the literals of a jaxpr: JAX keeps references to the user's arrays without axes, which may change."""
     for equation in jaxpr.eqns:
         for atom in equation.invars:
             _copy_literal(atom)
@@ -255,23 +255,23 @@ def _copy_literal(atom: Any) -> None:
 # The content of a jaxpr
 
 RULES = ("jvp_jaxpr_fun", "jvp_jaxpr_thunk", "fwd_jaxpr_thunk", "bwd", "out_trees", "name", "debug_info")
-"""Parameters of operations that are left out: names, and rules of derivatives, which are seen by differentiating."""
+"""Parameters of operations that are not compared: names, and derivative rules, which show in the derivatives."""
 
 
 def _describe_content(closed: Any) -> tuple[list[str], tuple[Any, ...]]:
-    """Return a jaxpr as text, with the values of its constants; and the objects in it that have no text."""
+    """Return a jaxpr as text, with the values of its constants, and the objects in it that have no text."""
     text, opaque = _Text.of(closed)
     if text.has_rules:
         try:
             more = _Text.of(_differentiate_twice(closed))[0].lines
-        except TypeError:  # reverse rules alone, which have no text
+        except TypeError:  # functions with reverse-mode rules only have no forward derivative
             return text.lines, (*opaque, object())
         return text.lines + more, opaque
     return text.lines, opaque
 
 
 def _differentiate_twice(closed: Any) -> Any:
-    """Return the first and second derivatives along all arguments: custom rules have been applied in it."""
+    """Return the jaxpr of the first and second derivatives along all arguments, in which custom rules are applied."""
 
     def value(*arguments: Any) -> Any:
         return jax.core.eval_jaxpr(closed.jaxpr, closed.consts, *arguments)[0]
@@ -341,17 +341,17 @@ class _Text:
         return f"{array.dtype}{list(array.shape)}{digest}"
 
 
-# Calling a function of the user's while tracing
+# Calling a user's function while tracing
 
 
 class WatchedParameters(dict[str, Array]):
-    """The dict the user's functions get while it is found out which parameters they ask for.
+    """Dict of parameters that records which ones a user's function reads.
 
     Parameters
     ----------
-    shown : what the dict holds
-    others : what it holds only for a function that asks by name: the targets of parameter maps
-    asked : set of str, to which every name that is asked for is added
+    shown : entries of the dict
+    others : entries that are found by name only, and are not listed: the targets of parameter maps
+    asked : set of str, to which every name that is read is added
     """
 
     def __init__(self, shown: Mapping[str, Array], others: Mapping[str, Array], asked: set[str]) -> None:
@@ -374,7 +374,7 @@ class WatchedParameters(dict[str, Array]):
         return self[name] if name in self.list_keys() or name in self.others else default
 
     def list_keys(self) -> Any:
-        """Return the names, without asking for them."""
+        """Return the names without recording them as read."""
         return super().keys()
 
     def __iter__(self) -> Iterator[str]:
@@ -393,13 +393,13 @@ class WatchedParameters(dict[str, Array]):
         return self.read_all().items()
 
     def read_all(self) -> dict[str, Array]:
-        """Return all that is shown as a plain dict; all of it then counts as asked for."""
+        """Return all listed entries as a plain dict, and record them as read."""
         self.asked.update(self.list_keys())
         return {name: super(WatchedParameters, self).__getitem__(name) for name in self.list_keys()}
 
 
 def call_while_tracing(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, form: str) -> Array:
-    """Call a function of the user's while tracing; whatever it raises becomes one sentence that names it."""
+    """Call a user's function while tracing; turn any exception into one sentence that names the function."""
     _check_signature(function, arguments, what, form)
     try:
         value = function(*arguments)
@@ -407,7 +407,7 @@ def call_while_tracing(function: Callable[..., Any], arguments: tuple[Any, ...],
         raise ValueError(f"{what} {_describe_missing_name(error.args[0] if error.args else '', arguments)}") from error
     except UNTRACEABLE as error:
         raise ValueError(
-            f"{what} decides by the value of t, x or p (an `if`, a `while`, float() or numpy function), which JAX "
+            f"{what} branches on the value of t, x or p (an `if`, a `while`, float() or numpy function), which JAX "
             "cannot differentiate. Write it with jax.numpy; if the dynamics change there, make it a mode with a "
             "transition time."
         ) from error
@@ -423,23 +423,23 @@ def call_while_tracing(function: Callable[..., Any], arguments: tuple[Any, ...],
 
 
 def _describe_missing_name(name: Any, arguments: tuple[Any, ...]) -> str:
-    """Return the end of the sentence about a name that is neither in p nor, where u is a dict too, in u."""
+    """Return the end of the sentence about a name that is neither in p nor, if u is a dict, in u."""
     parameters, *inputs = [given for given in arguments if isinstance(given, dict)]
     lacks = f"the parameter {name!r}, which the problem lacks; it has {join_names(parameters)}"
     if not inputs or name in inputs[0]:
-        return f"asks for {lacks}."
+        return f"reads {lacks}."
     lacks_input = f"the input {name!r}, which the experiment lacks; it has {join_names(inputs[0])}"
     if name in parameters:
-        return f"asks for {lacks_input}."
+        return f"reads {lacks_input}."
     known = f"a parameter ({join_names(parameters)}) nor an input ({join_names(inputs[0])})"
-    return f"asks for {name!r}, which is neither {known}."
+    return f"reads {name!r}, which is neither {known}."
 
 
 def _check_signature(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, form: str) -> None:
     """Raise ValueError if a function does not take as many arguments as it is called with."""
     try:
         signature = inspect.signature(function)
-    except (TypeError, ValueError):  # it does not tell
+    except (TypeError, ValueError):  # it has no signature
         return
     try:
         signature.bind(*arguments)
@@ -451,9 +451,9 @@ def _check_signature(function: Callable[..., Any], arguments: tuple[Any, ...], w
 def call_for_vector(
     function: Callable[..., Any], arguments: tuple[Any, ...], shape: Shape | None, what: str, form: str
 ) -> Array:
-    """Return what a function of the user's returns, checked (while tracing) to be a float64 array of the given shape.
+    """Return the result of a user's function, checked (while tracing) to be a float64 array of the given shape.
 
-    Without a shape, an array of any.
+    Without a shape, any shape is accepted.
     """
     array = call_while_tracing(function, arguments, what, form)
     if shape is not None and array.shape != shape:

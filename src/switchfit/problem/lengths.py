@@ -12,12 +12,12 @@ def pad_length(length: int) -> int:
 
 
 LONGEST_PADDING = 2.0
-"""Runs of one problem share a length, and with it a program, where that makes none of them longer than this many times
-its own. Compiling a program costs as much as some thousand evaluations, a row of padding as much as any other row."""
+"""Largest ratio of a common padded length to the own length of a run. Runs with a common length share a program:
+compiling one costs as much as some thousand evaluations, while a row of padding costs as much as any other row."""
 
 
 def choose_common_lengths(lengths: Sequence[int]) -> list[int]:
-    """Return lengths out of `pad_length`, as few distinct ones as `LONGEST_PADDING` allows."""
+    """Return padded lengths from `pad_length`, with as few distinct ones as `LONGEST_PADDING` allows."""
     padded = [pad_length(length) for length in lengths]
     common: dict[int, int] = {}
     for length in sorted(set(padded), reverse=True):

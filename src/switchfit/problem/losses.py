@@ -1,4 +1,4 @@
-"""Robust losses: how much a residual counts that is larger than the noise explains.
+"""Robust losses: the cost of residuals that are larger than the noise explains.
 
 With ``u = (r / sigma)**2`` and C the scale of the loss, a sample costs ``1/2 C**2 rho(u / C**2)``, as in
 `scipy.optimize.least_squares` with ``f_scale = C``:
@@ -8,7 +8,7 @@ With ``u = (r / sigma)**2`` and C the scale of the loss, a sample costs ``1/2 C*
     huber     rho(z) = z for z <= 1, else 2 sqrt(z) - 1     (its second derivative jumps at z = 1)
     cauchy    rho(z) = log(1 + z)
 
-Every function takes arrays of NumPy or of JAX, whose module is `xp`.
+Every function takes arrays of NumPy or JAX; `xp` is their module.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ LOSSES = ("linear", "soft_l1", "huber", "cauchy")
 
 
 def robust(loss: str, scale: float, u: Any, xp: Any = np) -> Any:
-    """Return ``C**2 rho(u / C**2)``: what stands in the cost in place of u; the same shape.
+    """Return ``C**2 rho(u / C**2)``, which replaces u in the cost; the same shape.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ def robust(loss: str, scale: float, u: Any, xp: Any = np) -> Any:
     scale : float
         C, in units of sigma.
     u : array
-        Squares of residuals in units of sigma.
+        Squared residuals, in units of sigma.
     """
     if loss == "linear":
         return u

@@ -33,7 +33,8 @@ class Parameter:
         of a fixed parameter counts for nothing.
     scale : {"linear", "log"}, optional
         "log": the optimiser works in log p, and confidence intervals are made there, so that they are positive. All
-        that is given and returned, bounds, priors, theta and covariance too, is p itself.
+        that is given and returned, bounds, priors, theta and covariance too, is p itself. Of a transition time or a
+        free tf it is the logarithm of the time since t0.
 
     Raises
     ------

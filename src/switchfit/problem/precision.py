@@ -1,8 +1,8 @@
-"""Numbers in single precision inside the user's functions.
+"""Find numbers of single precision inside the user's functions.
 
-Outside switchfit JAX computes in 32 bits, so that ``K = jnp.array(0.1)`` is 0.10000000149011612: a fit with it is exact
-for another problem. Constants that a function reads, and numbers that it makes of them, have to pass
-`switchfit.problem.validation.refuse_single_precision`; what depends on t, x or p must not be cast at all.
+By default JAX computes in 32 bits, so that ``K = jnp.array(0.1)`` is 0.10000000149011612: a fit with it solves another
+problem. Constants that a function reads, and numbers computed from them, have to pass
+`switchfit.problem.validation.refuse_single_precision`; values that depend on t, x or p must not be cast at all.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MOVES = frozenset(
     {"slice", "squeeze", "reshape", "broadcast_in_dim", "transpose", "concatenate", "rev", "gather", "stack", "copy"}
     | {"dynamic_slice", "expand_dims", "select_n", "split", "unstack", "stop_gradient", "pad", "tile", "copy_p"}
 )
-"""Operations that compute nothing."""
+"""Operations that only move entries."""
 
 
 def refuse_single_precision_in(closed: Any, function: Any, what: str) -> None:
@@ -63,7 +63,7 @@ def _find_inner_jaxprs(equation: Any) -> list[tuple[Any, Sequence[Any]]]:
 
 
 class _Walk:
-    """Follows known numbers through a jaxpr."""
+    """Propagates known numbers through a jaxpr and checks their precision."""
 
     def __init__(self, what: str) -> None:
         self.what = what
@@ -106,7 +106,7 @@ class _Walk:
         return [value(a) for a in jaxpr.outvars]
 
     def calls(self, equation: Any, inner: list[Any], given: list[Any]) -> list[Any]:
-        """Follow the functions that an operation calls: a plain call with its arguments, loops without."""
+        """Walk through the functions that an operation calls: a plain call with its known arguments, loops without."""
         for jaxpr, consts in inner:
             plain = len(inner) == 1 and len(jaxpr.invars) == len(given) and equation.primitive.name == "jit"
             results = self.through(jaxpr, consts, given if plain else [None] * len(jaxpr.invars))
@@ -124,6 +124,6 @@ class _Walk:
 
 
 def _find_line(equation: Any) -> str:
-    """Return where in the user's code an operation stands, as " (file.py:12)"; empty where that is not known."""
+    """Return the location of an operation in the user's code, as " (file.py:12)"; empty if it is unknown."""
     frame = source_info_util.user_frame(equation.source_info.traceback)
     return "" if frame is None else f" ({frame.file_name.rpartition('/')[2]}:{frame.start_line})"

@@ -1,4 +1,4 @@
-"""What is known about an unknown before the fit: priors, which add to the cost.
+"""Priors: knowledge about an unknown before the fit, as a term of the cost.
 
 A prior counts as one more measurement, of the unknown itself: J with its priors is the negative logarithm of the
 posterior density, up to a constant, and its minimum the maximum a posteriori (MAP) estimate.
@@ -24,7 +24,7 @@ class Normal:
     Parameters
     ----------
     mean : float or array_like
-        In the unit of the unknown.
+        Mean, in the unit of the unknown.
     sd : float or array_like
         Standard deviation, positive, in the same unit.
 
@@ -61,7 +61,7 @@ class LogNormal:
     Parameters
     ----------
     median : float or array_like
-        Positive, in the unit of the unknown.
+        Median, positive, in the unit of the unknown.
     log_sd : float or array_like
         Standard deviation of log p, positive: 0.1 is about 10 %.
 
@@ -74,7 +74,7 @@ class LogNormal:
 
     Notes
     -----
-    This is a normal prior of log p, whose density is taken over log p: the maximum a posteriori is that of log p.
+    This is a normal prior of log p, with a density over log p: the maximum a posteriori is that of log p.
 
     See Also
     --------
@@ -121,7 +121,7 @@ class PriorTerms(NamedTuple):
     Attributes
     ----------
     center : mean, or logarithm of the median
-    precision : 1 / sd**2, 0 where there is no prior
+    precision : 1 / sd**2, 0 without a prior
     log : bool, whether the prior is one of log p
     """
 
@@ -131,7 +131,7 @@ class PriorTerms(NamedTuple):
 
     @classmethod
     def of(cls, prior: Prior | None, shape: tuple[int, ...]) -> PriorTerms:
-        """Return the terms of one unknown of some shape, flat."""
+        """Return the terms of one unknown of the given shape, flattened."""
         size = int(np.prod(shape))
         if prior is None:
             return cls(np.zeros(size), np.zeros(size), np.zeros(size, bool))
@@ -145,12 +145,12 @@ class PriorTerms(NamedTuple):
 
     @classmethod
     def join(cls, parts: list[PriorTerms]) -> PriorTerms:
-        """Return the terms of several unknowns, one after the other."""
+        """Concatenate the terms of several unknowns."""
         return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     @property
     def any(self) -> bool:
-        """Whether there is a prior at all."""
+        """Whether any unknown has a prior."""
         return bool(np.any(self.precision > 0))
 
     def evaluate(self, theta: Any, xp: Any = np, *, gauss_newton: bool = False) -> tuple[Any, Any, Any]:

@@ -41,6 +41,8 @@ from switchfit.runtime.presentation import format_html
 GIVEN = ("system", "experiments", "parameters", "min_duration", "solver", "rtol", "atol", "engine", "max_transitions")
 """What a `Problem` is built from."""
 
+SOLVERS = ("auto", "explicit", "stiff")
+
 SMALLEST_RTOL = 1e-13
 """Local errors below this part of the state are rounding."""
 
@@ -66,6 +68,7 @@ class Unknowns:
     rows : tuple of Constraint, what each row of A theta >= b is
     priors : PriorTerms
     log : (d,) bool, whether an unknown is estimated on a logarithmic scale
+    origin : (d,), from where a logarithm counts: t0 for a transition time or a free tf, otherwise 0
     """
 
     names: tuple[str, ...]
@@ -81,6 +84,7 @@ class Unknowns:
     rows: tuple[Constraint, ...]
     priors: PriorTerms
     log: NDArray[np.bool_]
+    origin: FloatArray
 
     @cached_property
     def is_time(self) -> NDArray[np.bool_]:
@@ -92,8 +96,13 @@ class Unknowns:
 
     @cached_property
     def variables(self) -> Variables:
-        """What the optimiser works with: transition times as they are, other unknowns scaled or their logarithms."""
-        return Variables.of(self.initial, self.lower, self.upper, self.log, keep=self.is_time)
+        """What the optimiser works with: logarithms, transition times as they are, other unknowns scaled."""
+        return Variables.of(self.initial, self.lower, self.upper, self.log, keep=self.is_time, origin=self.origin)
+
+    @cached_property
+    def log_times(self) -> NDArray[np.bool_]:
+        """Which of the unknowns are transition times, or a free tf, on a logarithmic scale: (d,)."""
+        return self.log & self.is_time
 
     @property
     def log_names(self) -> tuple[str, ...]:
@@ -116,8 +125,13 @@ class Problem:
     min_duration : float, optional
         Shortest time a mode may last, in the time unit that all experiments then share; 0 lets a mode vanish, which
         the result then reports.
-    solver : {"explicit", "stiff"}, optional
-        Butcher's explicit Runge-Kutta method of order 5, or Radau IIA of order 5 for stiff modes.
+    solver : {"auto", "explicit", "stiff"}, optional
+        The steps of the integrator: Butcher's explicit Runge-Kutta method of order 5, or implicit ones, Radau IIA of
+        order 5, for stiff modes. "auto" takes explicit steps in an experiment unless they are hopeless there: limited
+        by stability in one of its modes, a thousand or more in that mode, and implicit steps are at least five times
+        fewer. This is decided whenever a mesh is made, at the guess and where a fit refines it, and for an experiment
+        as a whole: its other modes take implicit steps too. `Evaluation.stiffness`, `Estimate.engine`, the report and
+        the log say so. "explicit" and "stiff" are taken as they are.
     rtol, atol : float, optional
         Tolerances of the local error by which the mesh is refined. With the defaults J has a relative error of about
         1e-8, its gradient and its Hessian of about 1e-7. Ten times smaller tolerances make these errors about ten times
@@ -167,7 +181,7 @@ class Problem:
     experiments: Any
     parameters: Mapping[str, Any] = field(default_factory=dict)
     min_duration: float = 0.0
-    solver: Literal["explicit", "stiff"] = "explicit"
+    solver: Literal["auto", "explicit", "stiff"] = "auto"
     rtol: float = 1e-8
     atol: float = 1e-10
     engine: Literal["auto", "native", "jax"] = "auto"
@@ -188,7 +202,7 @@ class Problem:
                         f"mode_sequence names the unknown mode {shorten(mode)}; the modes are "
                         f"{join_names(self.system.modes)}."
                     )
-        object.__setattr__(self, "solver", as_choice(self.solver, "solver", ("explicit", "stiff")))
+        object.__setattr__(self, "solver", as_choice(self.solver, "solver", SOLVERS))
         object.__setattr__(self, "engine", as_choice(self.engine, "engine", ("auto", "native", "jax")))
         if self.max_transitions is not None:
             longest = max(len(e.transition_times) for e in experiments)
@@ -212,7 +226,7 @@ class Problem:
         self._check_delays()
         targets = frozenset(name for e in experiments for name in e.parameter_map.values())
         functions = Functions(parameters, targets)
-        settings = functions, self.solver, self.max_transitions
+        settings = functions, "stiff" if self.solver == "stiff" else "explicit", self.max_transitions
         structures = tuple(trace_structure(self.system, e, *settings) for e in experiments)
         for structure in structures:
             self.system.check_labels_of(structure.n)
@@ -720,9 +734,13 @@ def _list_unknowns(
     flat = {key: np.concatenate([getattr(q, key).ravel() for q in pieces]) for key in ("value", "lower", "upper")}
     priors = PriorTerms.join([PriorTerms.of(q.prior, q.shape) for q in pieces])
     log = np.concatenate([np.full(q.value.size, q.scale == "log") for q in pieces])
+    origin = np.zeros(len(names))
+    for experiment, positions in zip(experiments, where, strict=True):
+        origin[positions[positions >= 0]] = experiment.t0
     A, b, rows = _build_ordering(experiments, where, len(names), dwell)
     vectors = flat["value"], flat["lower"], flat["upper"]
-    return Unknowns(tuple(names), tuple(units), *vectors, tuple(where), spans, tuple(states), A, b, rows, priors, log)
+    places = tuple(where), spans, tuple(states)
+    return Unknowns(tuple(names), tuple(units), *vectors, *places, A, b, rows, priors, log, origin)
 
 
 def _find_delay_targets(experiment: Experiment) -> set[str]:
@@ -753,6 +771,13 @@ def _build_ordering(
         raise ValueError(f"min_duration must be zero or positive; got {dwell}.")
     rows, bounds, constraints = [], [], []
     labels = name_runs(experiments)
+    if dwell > 0 and any(
+        tau.scale == "log" and not tau.fixed for experiment in experiments for tau in experiment.times
+    ):
+        raise ValueError(
+            f"min_duration must be 0 where transition times are on a logarithmic scale, as the difference of two of "
+            f"them is then not linear in what is estimated; got {dwell}. Leave out min_duration, or scale='log'."
+        )
     if dwell > 0:
         units = {name: experiment.time_unit for name, experiment in zip(labels, experiments, strict=True)}
         _require_one_time_unit(units, "min_duration", "leave it out and bound the transition times of each")

@@ -1,9 +1,9 @@
-"""What a Python function reads: its code, closure, defaults and globals, by content.
+"""Contents of a Python function: its code, closure, defaults and globals, for comparison by value.
 
-Two functions for which `read_contents` returns the same do the same when they are traced, so that a trace can be used
-again without calling the function. Only plain things are compared by content: numbers, strings, arrays, tuples, lists,
-dicts, functions made of them, and functions of the libraries in `TRUSTED`, which do not change. For anything else
-(objects with state, modules of the user, files, the time) `read_contents` gives up, and the caller has to trace.
+Two functions with equal `read_contents` have equal traces, so that a trace can be reused without calling the function.
+Only plain values are compared by content: numbers, strings, arrays, tuples, lists, dicts, functions made of them, and
+functions of the libraries in `TRUSTED`, which do not change. For anything else (objects with state, modules of the
+user, files, the time) `read_contents` returns None, and the caller has to trace.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ import numpy as np
 TRUSTED = frozenset(
     {"jax", "jaxlib", "numpy", "scipy", "math", "cmath", "functools", "operator", "itertools", "typing"}
 )
-"""Libraries whose functions, classes and constants stay what they are."""
+"""Libraries whose functions, classes and constants do not change."""
 
 OPAQUE_BUILTINS = frozenset(
     {"__import__", "compile", "delattr", "eval", "exec", "getattr", "globals", "id", "input", "locals", "next", "open"}
     | {"setattr", "vars"}
 )
-"""Builtins through which a function reaches things that its code does not name."""
+"""Builtins by which a function reads values that its code does not name."""
 
 CONSTANTS = (types.NoneType, bool, int, str, bytes, types.EllipsisType)
 
 JITTED = type(jax.jit(lambda: None))
-"""Type of what `jax.jit` returns."""
+"""Type of the result of `jax.jit`."""
 
 FUNCTIONS = (types.FunctionType, JITTED, type(jnp.add), jax.custom_jvp, jax.custom_vjp)
 """Types of a library's functions; instances of its classes may have state."""
 
 DEPTH = 20
-"""Nesting beyond which a structure is not followed."""
+"""Depth of nesting above which a structure is not compared."""
 
 
 class NotPlain(Exception):  # noqa: N818  # control flow: the caller traces
@@ -49,7 +49,7 @@ class NotPlain(Exception):  # noqa: N818  # control flow: the caller traces
 
 
 def read_contents(function: Any) -> Hashable | None:
-    """Return all that a function reads, by content; None if that is unknown, so that it has to be traced."""
+    """Return everything that a function reads, by content; None if it is unknown and the function has to be traced."""
     try:
         return _read(function, DEPTH)
     except NotPlain:
@@ -57,10 +57,11 @@ def read_contents(function: Any) -> Hashable | None:
 
 
 def find_named_values(function: Any) -> dict[str, Any]:
-    """Return what a function reads by name: defaults, globals, its closure, attributes of its object, entries of its
-    dicts.
+    """Return the values that a function reads, by name: defaults, globals, its closure, attributes of its object,
+    entries of its dicts.
 
-    Of dicts and objects what the code names: keys that it holds as constants, attributes that it loads.
+    Only entries and attributes that the code names are included: keys that are constants in it, attributes that it
+    loads.
     """
     if isinstance(function, functools.partial):
         given = {f"argument {k + 1}": value for k, value in enumerate(function.args)} | function.keywords
@@ -110,7 +111,7 @@ def _read(value: Any, depth: int) -> Hashable:
     if _is_trusted(value):
         return _Same(value)
     if kind is JITTED and hasattr(value, "__wrapped__"):
-        raise NotPlain  # JAX keeps a trace of its own: the caller has to make it forget
+        raise NotPlain  # JAX caches a trace of its own, which the caller has to invalidate
     if kind is types.FunctionType:
         return _read_function(value, depth)
     raise NotPlain
@@ -168,7 +169,7 @@ def _is_library(module: str) -> bool:
 
 
 class _Same:
-    """Equal to itself alone; keeps its value alive."""
+    """Compares a value by identity; keeps it alive."""
 
     def __init__(self, value: Any) -> None:
         self.value = value
@@ -181,14 +182,14 @@ class _Same:
 
 
 class _Reads:
-    """What a code object and those inside it read.
+    """Names and constants that a code object, and those inside it, read.
 
     Attributes
     ----------
     names, attributes : of globals, and of attributes
     constants : set of hashable constants
     plain : bool
-        Whether the names tell everything.
+        Whether nothing is read except by these names.
     """
 
     def __init__(self, code: types.CodeType) -> None:

@@ -1,7 +1,7 @@
-"""The structure of an experiment: everything that shapes a compiled program, the user's functions traced.
+"""The structure of an experiment: everything on which a compiled program depends, with the user's functions traced.
 
-Which functions, in which order, with which shapes. Experiments with equal structure and equal (padded) lengths share
-one program, and nothing is compiled anew when transition times, parameters or data change.
+It consists of the functions, their order and their shapes. Experiments with equal structure and equal (padded) lengths
+share one program, and nothing is recompiled when transition times, parameters or data change.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ from switchfit.problem.parameter import Parameter
 from switchfit.problem.system import HybridSystem
 
 REST = ""
-"""Name of the mode after a free tf, which nobody is shown; no mode of a system can have it."""
+"""Internal name of the mode after a free tf; no mode of a system can have it."""
 
 
 def stay_at_rest(t: Any, x: Any, p: Any, u: Any = None) -> Any:
-    """Return the vector field after a free tf: 0, so that x stays x(tf)."""
+    """Return the vector field after a free tf: 0, so that x remains x(tf)."""
     return jnp.zeros_like(x)
 
 
 class Sensor(NamedTuple):
-    """What of one `Measurements` shapes the program: functions, names and the loss."""
+    """The part of one `Measurements` on which programs depend: functions, names and the loss."""
 
     observe: Function | None  # None: the whole state
     channels: int
-    sigma: tuple[str | None, ...]  # the parameter that is the sigma of each channel; empty where all are numbers
+    sigma: tuple[str | None, ...]  # the parameter that is the sigma of each channel; empty if all are numbers
     loss: str
     loss_scale: float
-    delay: str | None  # the parameter that is the delay; None where it is a number, which is in the times
+    delay: str | None  # the parameter that is the delay; None if it is a number, which is subtracted from the times
 
     @classmethod
     def of(cls, item: Measurements, observe: Function | None) -> Sensor:
@@ -56,13 +56,13 @@ class Sensor(NamedTuple):
 
     @property
     def named(self) -> set[str]:
-        """Parameters that it is measured with."""
+        """Names of the parameters that are its sigma or delay."""
         return {name for name in (*self.sigma, self.delay) if name is not None}
 
 
 @dataclass(frozen=True)
 class Structure:
-    """What a compiled program depends on beside the shapes of its arguments. Hashable; functions by what they do."""
+    """All on which a compiled program depends, except the shapes of its arguments. Hashable; functions by content."""
 
     mode_names: tuple[str, ...]
     modes: tuple[Function, ...]
@@ -80,22 +80,22 @@ class Structure:
     terminal_constraints: tuple[Function, ...]
     input_shape: tuple[int, ...] | None
     solver: str
-    transitions: int  # most transitions of a sequence that its library has room for
+    transitions: int  # largest number of transitions of a sequence of its library
     reset_library: tuple[Function, ...]  # reset maps and guards that sequences of these modes may have
     guard_library: tuple[Function, ...]
     transition_costs: tuple[Function | None, ...] = ()
     transition_cost_library: tuple[Function, ...] = ()
     has_free_tf: bool = False
-    """Whether the last of `modes` is rest: after a free tf nothing moves and nothing costs."""
+    """Whether the last of `modes` is the rest after a free tf, in which the state is constant and costs are 0."""
 
     @property
     def outputs(self) -> tuple[tuple[Function | None, int], ...]:
-        """What sees the state, reference signals first, then the Measurements: function and channels of each."""
+        """Function and number of channels of each output: reference signals first, then the Measurements."""
         return (*self.references, *((sensor.observe, sensor.channels) for sensor in self.measurements))
 
     @property
     def N(self) -> int:
-        """Number of transitions, a free tf among them: it is the transition to rest."""
+        """Number of transitions, including a free tf, which is the transition to rest."""
         return len(self.reset_maps)
 
     def is_rest(self, mode: int) -> bool:
@@ -109,7 +109,7 @@ class Structure:
 
     @property
     def functions(self) -> Structure:
-        """The same with one segment: what programs depend on that work in one mode at a time."""
+        """The same with one segment, for programs that work in one mode at a time."""
         return replace(
             self,
             mode_of_segment=(0,),
@@ -125,9 +125,9 @@ class Structure:
 
     @cached_property
     def library(self) -> Structure:
-        """What every sequence of these modes has in common: its reset maps and guards are those there are.
+        """The common structure of all sequences of these modes, with all their reset maps and guards.
 
-        Machine code is written for a library; which mode, reset map and guard comes when, it reads at run time.
+        Machine code is written for a library; it reads the order of modes, reset maps and guards at run time.
         """
         return replace(
             self,
@@ -154,7 +154,7 @@ class Structure:
 
     @property
     def digests(self) -> dict[str, str]:
-        """What identifies each of its functions in every process, by what the function is."""
+        """Hash of each function's content, the same in every process, by the role of the function."""
         found = {f"mode {name!r}": mode for name, mode in zip(self.mode_names, self.modes, strict=True)}
         for kind, functions in (
             ("initial_state", (self.initial_state,)),
@@ -171,7 +171,7 @@ class Structure:
 
     @property
     def constrained(self) -> bool:
-        """Whether anything has to hold beside the differential equation."""
+        """Whether it has guards or terminal constraints."""
         return bool(self.guarded or self.terminal_constraints)
 
 
@@ -181,10 +181,10 @@ class Functions:
     Parameters
     ----------
     parameters : mapping of str to Parameter
-        Of the problem.
+        Parameters of the problem.
     targets : set of str
-        Those that some experiment's map names as what it maps to. They are an experiment's where it maps to them, or
-        asks for them by their own name.
+        Parameters to which the parameter map of an experiment refers. An experiment has such a parameter only if its
+        own map refers to it, or if its functions read it by its own name.
     """
 
     def __init__(self, parameters: Mapping[str, Parameter], targets: frozenset[str]) -> None:
@@ -195,20 +195,20 @@ class Functions:
         """Return a tracer of the functions of one experiment."""
         mapped = experiment.parameter_map
         order = {name: k for k, name in enumerate(self.parameters)}
-        # The same order in every run, whatever its map: runs then share a program.
+        # The same order for every map, so that runs share a program.
         named = sorted({*self.parameters, *mapped}, key=lambda name: (order.get(name, len(order)), name))
         hidden = frozenset(name for name in self.targets if name not in mapped)
         return _Tracer({name: self.parameters[mapped.get(name, name)] for name in named}, hidden, self._traced)
 
 
 class _Tracer:
-    """Traces the functions of one experiment, and notes which parameters they ask for.
+    """Traces the functions of one experiment, and records which parameters they read.
 
     Attributes
     ----------
     named : dict of str to Parameter, by the model's names
     hidden : set of str
-        Those that a function sees only if it asks for them by name.
+        Parameters that a function gets only if it reads them by name.
     asked : set of str
     """
 
@@ -227,7 +227,7 @@ class _Tracer:
         form: str,
         inputs: tuple[str, ...] = (),
     ) -> Function:
-        """Return the trace of a function of arguments of these shapes, None standing for p, and of a result's shape."""
+        """Trace a function with arguments of these shapes, None standing for p, and a result of the given shape."""
         key = (id(function), arguments, shape, what, inputs, self._key)
         traced = self._traced.get(key)
         if traced is None:
@@ -244,13 +244,13 @@ def trace_structure(
 ) -> Structure:
     """Trace and check the functions of one experiment, and return its structure.
 
-    Given `transitions`, its library has all modes of the system and room for so many transitions; left out, those of
-    the experiment.
+    With `transitions`, its library has all modes of the system and at most that many transitions; by default, it has
+    those of the experiment.
 
     Raises
     ------
     ValueError
-        Naming the mode or function, what it should return and what it returned.
+        With the name of the mode or function, what it should return and what it returned.
     """
     trace = functions.of(experiment)
     used = system.modes if transitions is not None else set(experiment.mode_sequence)
@@ -265,7 +265,7 @@ def trace_structure(
     def at_transitions(
         given: Mapping[tuple[str, str], Callable[..., Any]], shape: Shape, what: str, form: str
     ) -> tuple[tuple[Function | None, ...], tuple[Function, ...]]:
-        """Return the function of each transition, None where it has none, and those of all that may happen."""
+        """Return the function of each transition, None for one without, and those of all possible transitions."""
         own = list(pairwise(experiment.mode_sequence))
         here = given if transitions is not None else own
         traced = {pair: trace(g, at, shape, f"{what} {pair}", form) for pair, g in given.items() if pair in here}
@@ -274,7 +274,7 @@ def trace_structure(
     modes = tuple(trace(system.modes[name], in_mode, (n,), f"mode {name!r}", form, input_names) for name in names)
     sequence = tuple(names.index(mode) for mode in experiment.mode_sequence)
     end: tuple[None, ...] = ()
-    if experiment.has_free_tf:  # a free tf is the transition to one more mode, which has no functions beside
+    if experiment.has_free_tf:  # a free tf is the transition to one more mode, which has no other functions
         modes += (trace(stay_at_rest, in_mode, (n,), "the rest after tf", form, input_names),)
         names, sequence, end = (*names, REST), (*sequence, len(names)), (None,)
     references = ((item, item.signal.channels) for item in items(ReferenceSignal))
@@ -321,7 +321,7 @@ def _trace_initial_state(trace: _Tracer, initial: Any) -> tuple[Function | None,
 
 
 def _trace_observe(trace: _Tracer, item: Measurements | ReferenceSignal, channels: int, n: int) -> Function | None:
-    """Return the function h(t, x, p) of one of the data; None if the whole state is compared."""
+    """Return the observation h(t, x, p) of one of the data; None if the whole state is compared."""
     if item.observe is not None:
         return trace(item.observe, ((), (n,), None), (channels,), "observe", "h(t, x, p)")
     if channels != n:
@@ -343,9 +343,9 @@ def _trace_terminal_constraint(trace: _Tracer, item: TerminalConstraint, n: int)
 
 
 def _select_parameters(trace: _Tracer, structure: Structure) -> tuple[tuple[str, tuple[int, ...], bool], ...]:
-    """Return name, shape and whether it is free of each parameter that the functions asked for, and of all fixed ones.
+    """Return name, shape and whether it is free, of each parameter that the functions read and of all fixed ones.
 
-    What is fixed costs nothing.
+    Fixed parameters that are not read do no harm: they are not differentiated.
     """
     asked = trace.asked.union(*(sensor.named for sensor in structure.measurements))
     return tuple(
@@ -365,7 +365,7 @@ def _choose_transition_costs(
         if len(here) > 1:
             raise ValueError(
                 f"{len(here)} TransitionCosts count at a transition from {before!r} to {after!r}, where one may: give "
-                "their sum in one, or say before and after."
+                "their sum in one, or set before and after."
             )
         if here:
             found[before, after] = here[0]
@@ -373,7 +373,7 @@ def _choose_transition_costs(
 
 
 def read_initial_values(initial: Any) -> FloatArray:
-    """Return an initial state that is no function, as numbers (n,): where it is unknown, its guess."""
+    """Return an initial state that is not a function as numbers (n,), with guesses for unknown entries."""
     return np.array([x.value if isinstance(x, Parameter) else x for x in initial], dtype=np.float64)
 
 

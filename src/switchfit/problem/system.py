@@ -1,4 +1,4 @@
-"""What is fitted: a hybrid system, that is named modes, reset maps and guards between them, and an initial state."""
+"""Hybrid systems: named modes, reset maps and guards between them, and an initial state."""
 
 from __future__ import annotations
 
@@ -56,14 +56,15 @@ class HybridSystem:
         One for each state; they label reports and plots.
     guards : mapping of (str, str) to callable, optional
         Every transition from mode ``a`` to mode ``b`` happens where ``guards[a, b](tau, x(tau-), p) = 0``: its time is
-        then no free unknown but follows from the others. Transitions without an entry happen at any time.
+        then determined by the other unknowns. Transitions without an entry may happen at any time.
 
     Raises
     ------
     ValueError
         If a reset map or a guard names an unknown mode, or names, units and initial state differ in length.
     TypeError
-        If a mode, a reset map or a guard is not callable, the initial state not made of numbers, or a name no string.
+        If a mode, a reset map or a guard is not callable, the initial state not made of numbers, or a name not a
+        string.
 
     See Also
     --------
@@ -74,7 +75,7 @@ class HybridSystem:
     >>> import jax.numpy as jnp
     >>> import switchfit as sf
 
-    A ball that falls, and then stays where it is; it comes to rest on the ground:
+    A ball that falls until it reaches the ground, where it comes to rest:
 
     >>> system = sf.HybridSystem(
     ...     modes={
@@ -118,7 +119,7 @@ class HybridSystem:
             self.check_labels_of(len(self.initial_state))
 
     def check_labels_of(self, n: int) -> None:
-        """Raise ValueError unless names and units, where given, have one entry for each of n states.
+        """Raise ValueError unless names and units, if given, have one entry for each of n states.
 
         See Also
         --------
@@ -138,7 +139,7 @@ class HybridSystem:
                 )
 
     def reset_map(self, before: str, after: str) -> ResetMap | None:
-        """Return the map applied at a transition from mode `before` to mode `after`; None where x is continuous.
+        """Return the map applied at a transition from mode `before` to mode `after`; None if x is continuous.
 
         See Also
         --------
@@ -157,7 +158,7 @@ class HybridSystem:
         return self.reset_maps.get((before, after))
 
     def guard(self, before: str, after: str) -> Guard | None:
-        """Return what is zero at a transition from mode `before` to mode `after`; None where it is free.
+        """Return the function that is zero at a transition from mode `before` to mode `after`; None without a guard.
 
         See Also
         --------
@@ -174,12 +175,12 @@ class HybridSystem:
 
 
 def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ...]:
-    """Return `value` as a finite, read-only ``(n,)`` float64 array, or as n `Parameter` where it has any.
+    """Return `value` as a finite, read-only ``(n,)`` float64 array, or as n `Parameter` if it contains any.
 
     Raises
     ------
     ValueError
-        Naming `name`.
+        With `name` in the message.
     """
     if isinstance(value, Parameter):
         if len(value.shape) != 1:
@@ -197,7 +198,7 @@ def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ..
 
 
 def _as_entry(entry: Any, name: str) -> Parameter:
-    """Return one entry of an initial state that has unknown ones: a number is known."""
+    """Return one entry of an initial state with unknown entries as a `Parameter`; a number is a fixed one."""
     if isinstance(entry, Parameter):
         parameter = entry
     else:

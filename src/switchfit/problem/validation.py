@@ -1,21 +1,21 @@
-"""Checks of what users hand over: each function returns the value in the form the code works with, or raises.
+"""Checks of users' arguments: each function returns the value in the form that the code uses, or raises.
 
-Every public constructor, function and method passes its arguments through here, so that a mistake ends in one sentence
-where it was made, and not in an error of NumPy or JAX somewhere inside. A message says which argument of what, what
-was given (shortened, `shorten`) and what is wanted.
+Every public constructor, function and method passes its arguments through here, so that a mistake is reported in one
+sentence where it was made, and not by an error of NumPy or JAX somewhere inside. A message names the argument, the
+required form and the value that was given (shortened, `shorten`).
 
-- `TypeError` for a wrong type, `ValueError` for a wrong value. Text where a number is wanted is a wrong value, as it is
-  for ``float("x")``.
+- `TypeError` for a wrong type, `ValueError` for a wrong value. Text in place of a number is a wrong value, as it is for
+  ``float("x")``.
 - Numbers are integers and floating-point numbers of Python, NumPy, JAX and pandas. Truth values, complex numbers,
   text, dates and `None` are not numbers here, although NumPy would convert most of them.
-- Numbers of less than double precision are refused if reading them as doubles makes visible that they have changed
+- Numbers of less than double precision are refused if their values as doubles show that they have lost digits
   (`refuse_single_precision`).
 - Masked entries are missing samples, NaN, where missing samples are allowed; elsewhere they are refused.
 
-Problem files are validated with pydantic, Python calls are not. pydantic has no notion of arrays, precision, masks or
-dates, so that every field would need a validator of its own, which are the functions below; its errors are tables about
-a model class instead of a sentence about an argument; and it takes longer to import than all else that `import
-switchfit` may load.
+Problem files are validated with pydantic, Python calls are not. pydantic does not handle arrays, precision, masks or
+dates, so that every field would need a validator of its own, like the functions below; its errors are tables about a
+model class instead of a sentence about an argument; and it takes longer to import than everything else that `import
+switchfit` loads.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ ARRAY = "a number or an array of numbers"
 LARGEST_COUNT = 10**9
 LARGEST_SEED = 2**64 - 1
 MOST_DIMENSIONS = 8
-"""Depth of nested lists beyond which nothing is read: lists that contain themselves have no end."""
+"""Largest depth of nested lists: lists that contain themselves have no end."""
 LONGEST = 120
-"""Characters of a value that a message shows."""
+"""Largest number of characters of a value that a message shows."""
 MOST_LISTED = 10
-"""Names that a message lists."""
+"""Largest number of names that a message lists."""
 BLOCK = 4096
-"""Numbers of single precision whose texts are compared at once: a log that changes is refused in the first block."""
+"""Single-precision numbers whose texts are compared at once: a log with lost digits is refused in the first block."""
 
 _INTEGERS = (np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32, np.uint64)
 _EXACT: frozenset[type] = frozenset({int, float, np.float64, *_INTEGERS})
-"""Types that `numpy.array(..., dtype=float64)` reads as they are."""
+"""Types that `numpy.array(..., dtype=float64)` reads without change."""
 _TEXT = (str, bytes, bytearray)
 _DATES = (datetime.date, datetime.time, datetime.timedelta)
 
@@ -63,7 +63,7 @@ _DATES = (datetime.date, datetime.time, datetime.timedelta)
 
 
 class _Short(reprlib.Repr):
-    """Representations of bounded length, made in bounded time."""
+    """Representations of bounded length, computed in bounded time."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -82,7 +82,7 @@ class _Short(reprlib.Repr):
         return f"an array of shape {array.shape} ({array.dtype})"
 
     def repr_instance(self, x: Any, level: int) -> str:
-        """Return the type alone of a dataclass: a problem holds all its data."""
+        """Return only the type of a dataclass: a problem contains all its data."""
         return (
             f"<{type(x).__name__}>" if is_dataclass(x) and not isinstance(x, type) else super().repr_instance(x, level)
         )
@@ -94,10 +94,10 @@ _SHORT = _Short()
 
 
 def shorten(value: Any) -> str:
-    """Return `value` as a message shows it: at most `LONGEST` characters, whatever it is."""
+    """Return any value as text for a message: at most `LONGEST` characters."""
     try:
         text = " ".join(_SHORT.repr(value).split())
-    except Exception:  # a __repr__ of somebody else
+    except Exception:  # a faulty __repr__
         text = f"an object of type {type(value).__name__}"
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
 
@@ -113,15 +113,15 @@ def join_names(names: Iterable[Any]) -> str:
 # --- numbers ----------------------------------------------------------------------------------------------------------
 
 
-class _Door(NamedTuple):
-    """What a message about one argument needs.
+class _Argument(NamedTuple):
+    """An argument, with what messages about it need.
 
     Attributes
     ----------
     what : name of the argument
-    form : what it must be
-    given : all of it
-    missing : whether masked entries stand for missing samples
+    form : its required form
+    given : its whole value
+    missing : whether masked entries are missing samples
     """
 
     what: str
@@ -130,7 +130,7 @@ class _Door(NamedTuple):
     missing: bool
 
     def refuse(self, entry: Any, error: type[Exception] = TypeError, why: str = "") -> NoReturn:
-        """Raise `error` about one entry of what was given."""
+        """Raise `error` about one entry of the argument."""
         inside = "" if entry is self.given else f", in which {shorten(entry)} is not a number"
         raise error(f"{self.what} must be {self.form}; got {shorten(self.given)}{inside}{why}.")
 
@@ -144,7 +144,7 @@ def as_array(value: Any, what: str, *, form: str = ARRAY, missing: bool = False)
     what : str
         Name of the argument, for messages.
     form : str, optional
-        What it must be, for messages.
+        Its required form, for messages.
     missing : bool, optional
         Whether masked entries become NaN; otherwise they are refused.
 
@@ -153,13 +153,13 @@ def as_array(value: Any, what: str, *, form: str = ARRAY, missing: bool = False)
     TypeError
         If something in it is not a number.
     ValueError
-        For text, nested lists of different lengths, numbers beyond the range of doubles, masked entries, or numbers of
-        single precision that reading them as doubles changes.
+        For text, nested lists of different lengths, numbers beyond the range of doubles, masked entries, or
+        single-precision numbers that have lost digits.
     """
     if type(value) is np.ndarray and value.dtype == np.float64:
         return np.array(value, dtype=np.float64)
-    door = _Door(what, form, value, missing)
-    exact = _read_exactly(value, door, 0)
+    argument = _Argument(what, form, value, missing)
+    exact = _read_exactly(value, argument, 0)
     try:
         with np.errstate(all="ignore"):
             return np.array(exact, dtype=np.float64)
@@ -208,7 +208,7 @@ def as_level(value: Any, what: str = "level") -> float:
 
 
 def as_count(value: Any, what: str, *, at_least: int = 0, at_most: int = LARGEST_COUNT) -> int:
-    """Return an integer of Python, NumPy or JAX as an int in the given range; floats are not taken for integers."""
+    """Return an integer of Python, NumPy or JAX as an int in the given range; floats are not accepted."""
     try:
         count = None if isinstance(value, (bool, np.bool_)) else operator.index(value)
     except Exception:  # TypeError; JAX's tracers raise their own
@@ -236,59 +236,59 @@ def as_index(value: Any, what: str, size: int) -> int:
         raise ValueError(f"{what} must lie in 0..{size - 1}; got {shorten(value)}.") from None
 
 
-def _read_exactly(value: Any, door: _Door, depth: int) -> Any:
-    """Return what `numpy.array` turns into float64 without changing a number: a number, an array, or nested lists."""
+def _read_exactly(value: Any, argument: _Argument, depth: int) -> Any:
+    """Return a number, an array or nested lists that `numpy.array` converts to float64 without changing a number."""
     if type(value) in _EXACT:
         return value
     if depth > MOST_DIMENSIONS:
-        door.refuse(door.given, ValueError, f", which is nested more than {MOST_DIMENSIONS} deep")
+        argument.refuse(argument.given, ValueError, f", which is nested more than {MOST_DIMENSIONS} deep")
     if _is_pandas(value) and hasattr(value, "columns"):  # a DataFrame: its columns may differ in type
-        columns = [_read_exactly(value.iloc[:, k], door, depth + 1) for k in range(len(value.columns))]
+        columns = [_read_exactly(value.iloc[:, k], argument, depth + 1) for k in range(len(value.columns))]
         return np.stack(columns, axis=1) if columns else np.zeros((len(value), 0))
     if hasattr(value, "__array__") and not isinstance(value, type):
-        return _read_array_exactly(value, door, depth)
+        return _read_array_exactly(value, argument, depth)
     if isinstance(value, Sequence) and not isinstance(value, (*_TEXT, memoryview)):
         kinds = set(map(type, value))
         if kinds <= _EXACT:
             return list(value)
         if len(kinds) == 1 and issubclass(next(iter(kinds)), np.number):
-            return _read_array_exactly(np.array(value), door, depth)
-        return [_read_exactly(entry, door, depth + 1) for entry in value]
+            return _read_array_exactly(np.array(value), argument, depth)
+        return [_read_exactly(entry, argument, depth + 1) for entry in value]
     if isinstance(value, (numbers.Real, Decimal)) and not isinstance(value, bool):
         try:
             return float(value)
         except OverflowError:
-            door.refuse(value, ValueError, ", which is beyond the largest double, 1.8e308")
+            argument.refuse(value, ValueError, ", which is beyond the largest double, 1.8e308")
         except Exception:
-            door.refuse(value)
+            argument.refuse(value)
     if isinstance(value, _DATES):
-        _refuse_dates(value, door)
+        _refuse_dates(value, argument)
     if isinstance(value, _TEXT):
-        door.refuse(value, ValueError)
-    door.refuse(value, why=": give a list or an array" if isinstance(value, (Iterator, AbstractSet)) else "")
+        argument.refuse(value, ValueError)
+    argument.refuse(value, why=": give a list or an array" if isinstance(value, (Iterator, AbstractSet)) else "")
 
 
-def _read_array_exactly(value: Any, door: _Door, depth: int) -> Any:
-    """Return an array, or whatever else has a dtype, as an array of integers or doubles."""
+def _read_array_exactly(value: Any, argument: _Argument, depth: int) -> Any:
+    """Return an array, or another object with a dtype, as an array of integers or doubles."""
     try:
         array = _read_pandas(value) if _is_pandas(value) else np.asarray(np.ma.getdata(np.asanyarray(value)))
     except Exception as error:
-        door.refuse(value, why=f", which NumPy cannot read ({type(error).__name__})")
+        argument.refuse(value, why=f", which NumPy cannot read ({type(error).__name__})")
     if array.dtype.kind in "Mm":
-        _refuse_dates(value, door)
+        _refuse_dates(value, argument)
     if array.dtype.kind == "O":
-        array = _read_exactly(array.tolist(), door, depth + 1)
+        array = _read_exactly(array.tolist(), argument, depth + 1)
     elif is_low_precision(array.dtype):
-        refuse_single_precision(value if isinstance(value, jax.Array) else array, door.what)
+        refuse_single_precision(value if isinstance(value, jax.Array) else array, argument.what)
         array = array.astype(np.float64)
     elif array.dtype.kind not in "iuf":
-        door.refuse(value, ValueError if array.dtype.kind in "SUT" else TypeError, f" ({array.dtype})")
+        argument.refuse(value, ValueError if array.dtype.kind in "SUT" else TypeError, f" ({array.dtype})")
     mask = np.ma.getmaskarray(value) if isinstance(value, np.ma.MaskedArray) else np.False_
     if np.any(mask):
-        if not door.missing:
+        if not argument.missing:
             raise ValueError(
-                f"{door.what} must be {door.form}; got a masked array with {int(np.sum(mask))} masked entries. Leave "
-                "them out, or fill them in."
+                f"{argument.what} must be {argument.form}; got a masked array with {int(np.sum(mask))} masked entries. "
+                "Leave them out, or fill them in."
             )
         array = np.where(mask, np.nan, array)
     return array
@@ -301,7 +301,7 @@ def _is_pandas(value: Any) -> bool:
 def _read_pandas(value: Any) -> NDArray[Any]:
     """Return a Series or an Index as an array, NA as NaN.
 
-    The types of pandas that know NA turn into arrays of objects, which hide that they were of single precision.
+    The types of pandas with NA become arrays of objects, which would hide that they were of single precision.
     """
     kind = getattr(getattr(value, "dtype", None), "numpy_dtype", None)
     if kind is None or kind.kind not in "iuf":
@@ -310,8 +310,8 @@ def _read_pandas(value: Any) -> NDArray[Any]:
     return np.asarray(value.to_numpy(dtype=np.float64 if gaps and kind.kind != "f" else kind, na_value=np.nan))
 
 
-def _refuse_dates(value: Any, door: _Door) -> NoReturn:
-    door.refuse(
+def _refuse_dates(value: Any, argument: _Argument) -> NoReturn:
+    argument.refuse(
         value,
         why=": dates and time differences are not supported. Give numbers in one unit, such as the seconds since the "
         "start: (dates - dates[0]) / np.timedelta64(1, 's')",
@@ -327,23 +327,23 @@ def is_low_precision(dtype: Any) -> bool:
 
 
 def refuse_single_precision(value: Any, what: str) -> None:
-    """Raise if reading an array or a scalar of less than double precision as doubles changes a number.
+    """Raise if an array or a scalar of less than double precision has numbers that have lost digits.
 
-    A number passes if it equals the double that its shortest decimal text stands for: 0.5 and 3.0 do. The text of
-    ``float32(0.1)`` is 0.1, but the number is 0.10000000149011612, so that a fit would answer another question than the
-    one asked, with an error of 1e-8 that no check inside the fit can see.
+    A number passes if it equals the double with its shortest decimal text, as 0.5 and 3.0 do. The text of
+    ``float32(0.1)`` is 0.1, but the number is 0.10000000149011612: a fit would solve another problem, with an error of
+    1e-8 that no check inside the fit can detect.
 
     Parameters
     ----------
     value : array or scalar of NumPy or JAX
-        Anything else, and any other dtype, passes.
+        Any other type and any other dtype pass.
     what : str
         Name of the argument, or of the constant.
 
     Raises
     ------
     ValueError
-        With the first number that changes, and what to write instead.
+        With the first number that has lost digits, and what to write instead.
     """
     dtype = getattr(value, "dtype", None)
     if not isinstance(dtype, np.dtype) or not is_low_precision(dtype):
@@ -352,7 +352,7 @@ def refuse_single_precision(value: Any, what: str) -> None:
     wide = given.astype(np.float64)
     doubtful = np.isfinite(wide)
     if given.dtype == np.float32:
-        # Decimals of at most 6 digits, and integers up to 2**24, are their own shortest text: no need to write them.
+        # Decimals of at most 6 digits, and integers up to 2**24, are their own shortest text: they need no conversion.
         with np.errstate(over="ignore", invalid="ignore"):
             thousands = 1e3 * wide
             short = (thousands == np.rint(thousands)) & (np.abs(thousands) <= 1e6)
@@ -365,10 +365,9 @@ def refuse_single_precision(value: Any, what: str) -> None:
         if np.any(changed := meant != wide[here]):
             k = int(np.argmax(changed))
             advice = (
-                "JAX makes arrays of 32 bits unless it is told otherwise: write a list or a NumPy array in place of "
-                "the jnp array."
+                "By default JAX makes arrays of 32 bits: write a list or a NumPy array in place of the jnp array."
                 if isinstance(value, jax.Array)
-                else "Give doubles (float64); if the numbers really are of that precision, as those of a log may be, "
+                else "Give doubles (float64); if the numbers really have that precision, as those of a log may, "
                 "write np.asarray(values, dtype=np.float64)."
             )
             raise ValueError(
@@ -378,10 +377,10 @@ def refuse_single_precision(value: Any, what: str) -> None:
 
 
 def _find_shortest_decimals(values: NDArray[Any]) -> FloatArray:
-    """Return the doubles that the shortest decimal texts of finite low-precision numbers (K,) stand for."""
+    """Return the doubles with the shortest decimal texts of finite low-precision numbers (K,)."""
     if values.dtype in (np.float16, np.float32):
         return values.astype(str).astype(np.float64)
-    kind, found = values.dtype.type, []  # bfloat16 and the like: NumPy does not know their shortest texts
+    kind, found = values.dtype.type, []  # bfloat16 and similar types, for which NumPy has no shortest texts
     for value in values:
         texts = (float(f"{float(value):.{digits}e}") for digits in range(17))
         found.append(next(decimal for decimal in texts if kind(decimal) == value))
@@ -392,7 +391,7 @@ def _find_shortest_decimals(values: NDArray[Any]) -> FloatArray:
 
 
 def as_flag(value: Any, what: str) -> bool:
-    """Return a truth value of Python or NumPy as a bool; numbers are not taken for one."""
+    """Return a truth value of Python or NumPy as a bool; numbers are not accepted."""
     if not isinstance(value, (bool, np.bool_)):
         raise TypeError(f"{what} must be True or False; got {shorten(value)}.")
     return bool(value)
@@ -435,7 +434,7 @@ def as_names(value: Any, what: str, form: str) -> tuple[str, ...]:
 
 
 def as_named_columns(value: Any, what: str, form: str) -> dict[str, Any] | None:
-    """Return the entries of a mapping, or of a DataFrame whose columns are all named by strings; None for all else.
+    """Return the entries of a mapping, or of a DataFrame whose columns are all named by strings; else None.
 
     Raises
     ------
@@ -461,7 +460,7 @@ def as_sequence(value: Any, what: str, form: str) -> tuple[Any, ...]:
     Raises
     ------
     TypeError
-        For text, and for what has no order or can be read only once: sets, dicts, generators.
+        For text, and for collections without order or that can be read only once: sets, dicts, generators.
     """
     if isinstance(value, _TEXT):
         raise TypeError(f"{what} must be {form}; got the string {shorten(value)}.")
@@ -476,14 +475,14 @@ def as_sequence(value: Any, what: str, form: str) -> tuple[Any, ...]:
 
 
 def as_instance(value: Any, what: str, kind: type[T], form: str) -> T:
-    """Return `value` if it is an instance of `kind`, which messages call `form`."""
+    """Return `value` if it is an instance of `kind`; messages use `form` as its name."""
     if not isinstance(value, kind):
         raise TypeError(f"{what} must be {form}; got {type(value).__name__}.")
     return value
 
 
 def as_callable(value: Any, what: str, form: str, *, arguments: int | None = None) -> Callable[..., Any]:
-    """Return a function, which messages call `form`; a class is not taken for one.
+    """Return a function, which must not be a class; messages use `form` as its name.
 
     Parameters
     ----------
@@ -492,7 +491,7 @@ def as_callable(value: Any, what: str, form: str, *, arguments: int | None = Non
     form : str
         Such as ``"a function h(t, x, p)"``.
     arguments : int, optional
-        With how many it is called; checked as far as the signature is known.
+        Number of arguments with which it is called; checked if its signature is known.
     """
     if not callable(value) or isinstance(value, type):
         given = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__

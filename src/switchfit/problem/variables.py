@@ -1,8 +1,9 @@
-"""The variables in which the optimiser works: unknowns of any size made to be of size one, or their logarithms.
+"""Variables of the optimizer: unknowns scaled to the size of one, or their logarithms.
 
-    theta = s z,  or  theta = exp(z):      d theta / dz = D,    g_z = D g,    H_z = D H D + diag(E g),
+    theta = s z,  or  theta = o + exp(z):      d theta / dz = D,    g_z = D g,    H_z = D H D + diag(E g),
 
-with E = d^2 theta / dz^2, 0 or theta. What is near one as it is stays as it is: s = 1.
+with E = d^2 theta / dz^2, 0 or theta - o. Unknowns whose size is near one are not scaled: s = 1. The origin o of a
+logarithm is 0; for a transition time it is the t0 of its experiment.
 """
 
 from __future__ import annotations
@@ -15,56 +16,66 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 ORDINARY = (1e-3, 1e3)
-"""Sizes of an unknown between which it is not scaled; the tolerance on the gradient is then that of theta itself."""
+"""Range of sizes in which an unknown is not scaled; the tolerance on the gradient is then that of theta itself."""
 
 
 class Variables(NamedTuple):
-    """The change of variables: ``size`` (d,), powers of 2, and ``log`` (d,) of bool."""
+    """The change of variables: ``size`` (d,), powers of 2, ``log`` (d,) of bool, and ``origin`` (d,) of logarithms."""
 
     size: Any
     log: Any
+    origin: Any
 
     @classmethod
     def of(
-        cls, theta: FloatArray, lower: FloatArray, upper: FloatArray, log: NDArray[np.bool_], keep: NDArray[np.bool_]
+        cls,
+        theta: FloatArray,
+        lower: FloatArray,
+        upper: FloatArray,
+        log: NDArray[np.bool_],
+        keep: NDArray[np.bool_],
+        origin: FloatArray,
     ) -> Variables:
-        """Return variables for unknowns of the size of a first guess, or of the bounds where that is 0.
+        """Return variables scaled by the first guess, or by the bounds if it is 0.
 
         Parameters
         ----------
         theta, lower, upper : (d,)
         log : (d,) of bool
-        keep : (d,) of bool, what is not to be scaled
+        keep : (d,) of bool, unknowns that are not scaled
+        origin : (d,)
         """
         bounds = np.maximum(
             np.where(np.isfinite(lower), np.abs(lower), 0), np.where(np.isfinite(upper), np.abs(upper), 0)
         )
         typical = np.where(theta != 0.0, np.abs(theta), bounds)
         outside = (typical > 0) & ((typical < ORDINARY[0]) | (typical > ORDINARY[1])) & ~keep & ~log
-        # A power of 2, so that scaling rounds nothing.
-        return cls(2.0 ** np.round(np.log2(np.where(outside, typical, 1.0))), log)
+        # A power of 2, so that scaling causes no rounding.
+        return cls(2.0 ** np.round(np.log2(np.where(outside, typical, 1.0))), log, origin)
 
     @property
     def identity(self) -> bool:
-        """Whether nothing changes."""
+        """Whether the variables equal theta."""
         return not self.log.any() and bool(np.all(self.size == 1.0))
 
     def outward(self, z: Any, xp: Any = np) -> Any:
         """Return theta at z: (d,)."""
-        return xp.where(self.log, xp.exp(xp.where(self.log, z, 0.0)), self.size * z)
+        return xp.where(self.log, self.origin + xp.exp(xp.where(self.log, z, 0.0)), self.size * z)
 
     def inward(self, theta: Any, xp: Any = np) -> Any:
-        """Return z at theta (d,): a bound of 0 becomes one of minus infinity for a logarithm."""
-        positive = xp.where(self.log & (theta > 0), theta, 1.0)
-        return xp.where(self.log, xp.where(theta > 0, xp.log(positive), -xp.inf), theta / self.size)
+        """Return z at theta (d,): a bound at the origin becomes one of minus infinity for a logarithm."""
+        away = theta - self.origin
+        positive = xp.where(self.log & (away > 0), away, 1.0)
+        return xp.where(self.log, xp.where(away > 0, xp.log(positive), -xp.inf), theta / self.size)
 
     def sizes_inward(self, sizes: FloatArray) -> FloatArray:
-        """Return sizes of z for sizes of theta (d,): rounding of a logarithm is measured by 1."""
+        """Return sizes of z for sizes of theta (d,); the size of a logarithm is 1."""
         return np.where(self.log, 1.0, sizes / self.size)
 
     def slopes(self, theta: Any, xp: Any = np) -> tuple[Any, Any]:
         """Return D and E at theta: (d,) each."""
-        return xp.where(self.log, theta, self.size), xp.where(self.log, theta, 0.0)
+        away = theta - self.origin
+        return xp.where(self.log, away, self.size), xp.where(self.log, away, 0.0)
 
     def derivatives_outward(self, theta: Any, gradient: Any, hessian: Any, xp: Any = np) -> tuple[Any, Any]:
         """Return the gradient and Hessian in theta from those in z."""

@@ -14,7 +14,7 @@ from switchfit.batch.simulated import MonteCarlo
 from switchfit.batch.starts import Multistart
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report.tables import format_table
+from switchfit.report.tables import format_table, wrap_text
 from switchfit.runtime.presentation import draw_figure, format_text
 
 if TYPE_CHECKING:
@@ -25,6 +25,8 @@ ESTIMATE, TRUTH, NORMAL = "#4a7fb5", "#b2182b", "#222222"
 CLUSTER_COLOURS = ("#b2182b", "#4a7fb5", "#e0a030", "#5c9e5c", "#8a5fa3", "#777777")
 COLUMNS = 3
 LISTED_MINIMA = 10
+LISTED_UNKNOWNS, LISTED_PLACES = 12, 6
+"""Unknowns in a table, and in the line of a minimum; of more, transition times are left out first."""
 BOOTSTRAP_TITLES = {
     "residuals": "Bootstrap of residuals",
     "wild": "Bootstrap of residuals with random signs",
@@ -34,7 +36,7 @@ BOOTSTRAP_TITLES = {
 
 
 def summarise(fits: Fits) -> list[str]:
-    """Return how many fits were done, how they ended, and the first that did not converge.
+    """Return the verdict, how many fits were done, how they ended, and the first that did not converge.
 
     Parameters
     ----------
@@ -42,7 +44,8 @@ def summarise(fits: Fits) -> list[str]:
     """
     count, good = len(fits), int(fits.success.sum())
     each = 1e3 * fits.seconds / max(count, 1)
-    lines = [f"{count} fits in {fits.seconds:.1f} s ({each:.2f} ms each), {good} converged"]
+    lines = wrap_text(str(fits.verdict))
+    lines.append(f"{count} fits in {fits.seconds:.1f} s ({each:.2f} ms each), {good} converged")
     if count < fits.requested:
         lines.append(f"STOPPED: {fits.requested - count} of {fits.requested} fits were not done")
     endings = Counter(fits.status.tolist()).most_common()
@@ -58,7 +61,7 @@ def summarise(fits: Fits) -> list[str]:
 
 @format_text.register(Fits)
 def write_fits(fits: Fits) -> str:
-    """Return how the fits ended.
+    """Return the verdict, and how the fits ended.
 
     Parameters
     ----------
@@ -69,7 +72,7 @@ def write_fits(fits: Fits) -> str:
 
 @format_text.register(MonteCarlo)
 def write_monte_carlo(study: MonteCarlo) -> str:
-    """Return how the fits ended, and a line for each unknown.
+    """Return the verdict, how the fits ended, and a line for each unknown.
 
     Parameters
     ----------
@@ -80,7 +83,7 @@ def write_monte_carlo(study: MonteCarlo) -> str:
 
 @format_text.register(Bootstrap)
 def write_bootstrap(study: Bootstrap) -> str:
-    """Return how the fits ended, what was resampled, and a line for each unknown.
+    """Return the verdict, how the fits ended, what was resampled, and a line for each unknown.
 
     Parameters
     ----------
@@ -92,7 +95,7 @@ def write_bootstrap(study: Bootstrap) -> str:
 
 @format_text.register(Multistart)
 def write_multistart(study: Multistart) -> str:
-    """Return the verdict on the best, how the fits ended, and a line for each of the ten lowest minima.
+    """Return the verdict, how the fits ended, and a line for each of the ten lowest minima.
 
     Parameters
     ----------
@@ -102,11 +105,26 @@ def write_multistart(study: Multistart) -> str:
     rows = []
     for k in range(min(minima, LISTED_MINIMA)):
         here = np.flatnonzero(study.clusters == k)
-        columns = zip(study.theta_names, study.theta[here[0]], study.theta_units, strict=True)
-        place = ", ".join(f"{name} = {value:.6g}{unit_suffix(unit)}" for name, value, unit in columns)
+        shown, at = _select_unknowns(study, LISTED_PLACES), study.theta[here[0]]
+        named = [f"{study.theta_names[i]} = {at[i]:.6g}{unit_suffix(study.theta_units[i])}" for i in shown]
+        more = len(at) - len(shown)
+        place = ", ".join(named) + (f" and {more} more" if more else "")
         rows.append((f"J = {study.cost[here].min():.9g}", f"{len(here)} starts", place))
-    best = [] if study.best is None else [str(study.best.verdict)]
-    return "\n".join([*best, *summarise(study), "", f"{minima} minima:", *format_table(rows, "<><")])
+    return "\n".join([*summarise(study), "", f"{minima} minima:", *format_table(rows, "<><")])
+
+
+def _select_unknowns(fits: Fits, most: int) -> list[int]:
+    """Return which unknowns are listed: of more than `most` first those that are no transition times."""
+    names = fits.theta_names
+    if len(names) <= most:
+        return list(range(len(names)))
+    is_time = [name.rsplit(".", 1)[-1].startswith("tau_") for name in names]
+    return sorted(sorted(range(len(names)), key=lambda i: is_time[i])[: most - 1])
+
+
+def _count_rest(fits: Fits, shown: Sequence[int]) -> list[str]:
+    more = len(fits.theta_names) - len(shown)
+    return [f"and {more} more unknowns"] if more else []
 
 
 def tabulate_monte_carlo(study: MonteCarlo) -> list[str]:
@@ -118,21 +136,20 @@ def tabulate_monte_carlo(study: MonteCarlo) -> list[str]:
     with np.errstate(invalid="ignore"):
         reported = np.median(study.standard_errors[study.success], axis=0)
     header = ("", "truth", "bias", "+-", "spread", "standard error", "in 95 % interval")
+    shown = _select_unknowns(study, LISTED_UNKNOWNS)
     rows: list[Sequence[str]] = [
         (
-            f"{name} ({unit})" if unit and unit != "1" else name,
-            f"{truth:.6g}",
-            f"{b:+.2e}",
-            f"{s / np.sqrt(count):.1e}",
-            f"{s:.3e}",
-            "-" if np.isnan(error) else f"{error:.3e}",
-            "-" if np.isnan(part) else f"{100 * part:.1f} %",
+            _label(study, i),
+            f"{study.truth[i]:.6g}",
+            f"{bias[i]:+.2e}",
+            f"{spread[i] / np.sqrt(count):.1e}",
+            f"{spread[i]:.3e}",
+            "-" if np.isnan(reported[i]) else f"{reported[i]:.3e}",
+            "-" if np.isnan(coverage[i]) else f"{100 * coverage[i]:.1f} %",
         )
-        for name, unit, truth, b, s, error, part in zip(
-            study.theta_names, study.theta_units, study.truth, bias, spread, reported, coverage, strict=True
-        )
+        for i in shown
     ]
-    return format_table([header, *rows], "<" + ">" * 6, indent="")
+    return format_table([header, *rows], "<" + ">" * 6, indent="") + _count_rest(study, shown)
 
 
 def tabulate_bootstrap(study: Bootstrap) -> list[str]:
@@ -140,15 +157,22 @@ def tabulate_bootstrap(study: Bootstrap) -> list[str]:
     if int(study.success.sum()) < 2:
         return ["Fewer than two fits converged: no statistics."]
     rows: list[Sequence[str]] = [("", "estimate", "bias", "standard error", "95 % interval (BCa)")]
-    columns = study.theta_names, study.theta_units, study.estimate, study.bias, study.standard_deviation
-    for k, (name, unit, value, bias, error) in enumerate(zip(*columns, strict=True)):
-        label = f"{name} ({unit})" if unit and unit != "1" else name
+    shown = _select_unknowns(study, LISTED_UNKNOWNS)
+    bias, error, intervals = study.bias, study.standard_deviation, study.intervals()
+    for k in shown:
+        label, value = _label(study, k), f"{study.estimate[k]:.6g}"
         if not study.resampled[k]:
-            rows.append((label, f"{value:.6g}", "-", "-", "of one run alone"))
+            rows.append((label, value, "-", "-", "of one run alone"))
             continue
-        low, high = study.intervals()[k]
-        rows.append((label, f"{value:.6g}", f"{bias:+.2e}", f"{error:.3e}", f"[{low:.6g}, {high:.6g}]"))
-    return format_table(rows, "<" + ">" * 4, indent="")
+        low, high = intervals[k]
+        rows.append((label, value, f"{bias[k]:+.2e}", f"{error[k]:.3e}", f"[{low:.6g}, {high:.6g}]"))
+    return format_table(rows, "<" + ">" * 4, indent="") + _count_rest(study, shown)
+
+
+def _label(fits: Fits, k: int) -> str:
+    """Return name and unit of unknown k."""
+    unit = fits.theta_units[k]
+    return fits.theta_names[k] + (f" ({unit})" if unit and unit != "1" else "")
 
 
 @draw_figure.register(Bootstrap)
@@ -188,8 +212,7 @@ def _choose_limits(values: FloatArray, centre: float) -> tuple[float, float]:
 
 def _draw_histogram_axis(study: Fits, k: int, limits: tuple[float, float], ax: Axes) -> None:
     """Write name and unit of unknown k along the axis, with few ticks."""
-    unit = study.theta_units[k]
-    ax.set_xlabel(study.theta_names[k] + (f" ({unit})" if unit and unit != "1" else ""))
+    ax.set_xlabel(_label(study, k))
     ax.set_xlim(limits)
     ax.set_yticks([])
     ax.ticklabel_format(axis="x", useOffset=False)

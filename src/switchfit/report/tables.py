@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -26,6 +27,10 @@ class Table(NamedTuple):
         return [k for k in range(len(self.alignment)) if any(row[k] for row in self.rows)]
 
 
+WIDTH = 100
+"""Columns of a report, where names allow it."""
+
+
 def format_table(rows: Sequence[Sequence[str]], alignment: str, *, indent: str = "  ") -> list[str]:
     """Return rows as lines with their columns aligned, two spaces between them; columns without an entry are left out.
 
@@ -41,3 +46,17 @@ def format_table(rows: Sequence[Sequence[str]], alignment: str, *, indent: str =
     columns = [k for k in range(len(alignment)) if any(row[k] for row in rows)]
     widths = {k: max(len(row[k]) for row in rows) for k in columns}
     return [(indent + "  ".join(f"{row[k]:{alignment[k]}{widths[k]}}" for k in columns)).rstrip() for row in rows]
+
+
+def wrap_text(text: str, first: str = "", others: str = "  ") -> list[str]:
+    """Return text as lines of at most `WIDTH` columns.
+
+    Parameters
+    ----------
+    text : str
+    first, others : str, optional
+        What the first line and the others begin with.
+    """
+    return textwrap.wrap(
+        text, WIDTH, initial_indent=first, subsequent_indent=others, break_long_words=False, break_on_hyphens=False
+    )

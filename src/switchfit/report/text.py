@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import sys
-import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.fit.result import Fit, disagreement, interval
+from switchfit.fit.result import Fit, Step, disagreement, interval
 from switchfit.fit.trajectory import Comparison
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report.numbers import format_rounded, format_unit, get_unit
-from switchfit.report.tables import Table, format_table
+from switchfit.report.tables import Table, format_table, wrap_text
 from switchfit.report.uncertainty import write_direction
-from switchfit.report.verdict import format_share
+from switchfit.report.verdict import format_share, write_agreement
 from switchfit.runtime.presentation import format_text
 from switchfit.uncertainty.certificate import Certificate
 from switchfit.uncertainty.identification import WEAK, Identifiability, analyse_solution
@@ -27,7 +26,6 @@ from switchfit.uncertainty.quality import explain_channel
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals
 from switchfit.uncertainty.verdict import Verdict, judge
 
-WIDTH = 100
 ONE_SIDED = 1.2
 """Ratio of the two sides of an interval above which it is said that they differ."""
 LABEL = 18
@@ -75,6 +73,7 @@ def report(
     *,
     verdict: Verdict | None = None,
     full: bool = False,
+    files: Mapping[str, str] | None = None,
 ) -> str:
     """Return the verdict, what was fitted, how it ended, how well it fits, the unknowns with their errors, and what to
     be wary of.
@@ -91,6 +90,8 @@ def report(
     full : bool
         All experiments, channels, unknowns, correlations and directions, and all warnings in full; otherwise a screen,
         without the warnings that the verdict gives already.
+    files : mapping of str to str, optional
+        Names of files that have all "runs" and all "unknowns", said where a screen has no room for them.
 
     Returns
     -------
@@ -99,17 +100,19 @@ def report(
     """
     verdict = judge(fit, certificate) if verdict is None else verdict
     limits = EVERYTHING if full else SCREEN
+    runs, unknowns = (f", all in {files[name]}" if files and name in files else "" for name in ("runs", "unknowns"))
     weak = analyse_solution(fit, None) if found is None else found
     sections = [
-        _wrap(str(verdict), "", "  "),
+        wrap_text(str(verdict), "", "  "),
         _format_section(
-            "Fit", _format_rows([*list_experiments(fit, limits.experiments, full=full), *list_course(fit, full=full)])
+            "Fit",
+            _format_rows([*list_experiments(fit, limits.experiments, runs, full=full), *list_course(fit, full=full)]),
         ),
         _format_section(
             "Quality of the fit",
-            [*_format_rows(list_quality(fit, full=full)), *_format_channels(fit, limits.channels)],
+            [*_format_rows(list_quality(fit, full=full)), *_format_channels(fit, limits.channels, runs)],
         ),
-        _format_section("Unknowns", _format_unknowns(fit, limits.unknowns)),
+        _format_section("Unknowns", _format_unknowns(fit, limits.unknowns, unknowns)),
         _format_section("Held fixed", _format_fixed(fit, limits.fixed)),
         _format_section(CORRELATIONS, _format_correlations(fit, limits.correlations, full=full)),
         _format_section("Determined worst by the data", _describe_weak(fit, weak, limits.directions)),
@@ -126,18 +129,19 @@ def write_fit(fit: Fit, *, full: bool = False) -> str:
 
 
 @format_text.register(Estimate)
-def write_estimate(estimate: Estimate, *, full: bool = False) -> str:
+def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str, str] | None = None) -> str:
     """Return the report of an estimate, with its certificate if that is known already, and J evaluated where it is
     weak.
     """
     verdict = estimate.verdict
-    return report(estimate, estimate.known_certificate, estimate.identifiability, verdict=verdict, full=full)
+    found = estimate.identifiability
+    return report(estimate, estimate.known_certificate, found, verdict=verdict, full=full, files=files)
 
 
 # --- sections ---------------------------------------------------------------------------------------------------------
 
 
-def list_experiments(fit: Fit, most: int, *, full: bool) -> list[Row]:
+def list_experiments(fit: Fit, most: int, where: str = "", *, full: bool) -> list[Row]:
     """Return each experiment's modes, its horizon and its data; on one screen of several a row each.
 
     Parameters
@@ -145,6 +149,8 @@ def list_experiments(fit: Fit, most: int, *, full: bool) -> list[Row]:
     fit : Fit
     most : int
         Experiments that are listed; the others are counted.
+    where : str, optional
+        Where the others are, as the end of a sentence.
     full : bool
         A row for each of an experiment's data, however many experiments there are.
     """
@@ -160,7 +166,7 @@ def list_experiments(fit: Fit, most: int, *, full: bool) -> list[Row]:
         else:
             rows.append((name, "; ".join([f"{sequence}, {horizon}", *data])))
     if len(names) > most:
-        rows.append(("", f"and {len(names) - most} more experiments"))
+        rows.append(("", f"and {len(names) - most} more experiments{where}"))
     return rows
 
 
@@ -186,15 +192,36 @@ def list_course(fit: Fit, *, full: bool) -> list[Row]:
         The message in full, and the engine in a row of its own.
     """
     rows = [("method", METHODS.get(fit.hessian_kind, fit.hessian_kind))]
-    effort = f"{_count(fit.iterations, 'iteration')}, {_count(fit.evaluations, 'evaluation')}, {fit.seconds:.3g} s"
+    iterations, evaluations = _count(fit.iterations, "iteration"), _count(fit.evaluations, "evaluation")
+    effort = f"{iterations}, {evaluations}, {fit.seconds:.3g} s"
+    if fit.steps:  # the iterations of short fits are not counted, and the last fit has few
+        effort = f"{evaluations}, {fit.seconds:.3g} s in all, {iterations} in the last fit"
     rows.append(("effort", effort if fit.engine is None or full else f"{effort}. {fit.engine}"))
     if fit.engine is not None and full:
         rows.append(("", str(fit.engine)))
     if fit.steps:
-        tried = (f"{step.strategy}: J = {step.cost:.6g} ({step.seconds:.2g} s)" for step in fit.steps)
-        rows.append(("tried", "; ".join(tried)))
+        rows.append(("tried", "; ".join(map(_format_step, fit.steps))))
+    if fit.starts is not None and fit.starts[0]:
+        ended = next((step.ended for step in reversed(fit.steps) if step.ended), "")
+        rows.append(("starts", f"{write_agreement(*fit.starts)}{_ENDED.get(ended, '')}"))
     rows.append(("status", fit.message if full or not fit.status.successful else _shorten_status(fit)))
     return rows
+
+
+_ENDED = {
+    "settled": "; no further minimum is likely",
+    "most": "; there may be further minima",
+    "time": "; ended by time_budget",
+    "interrupted": "; interrupted",
+}
+"""Why the many starts ended."""
+
+
+def _format_step(step: Step) -> str:
+    """Return a strategy and the lowest J after it; none where the model could not be integrated, or constraints are not
+    met."""
+    cost = f"J = {step.cost:.6g}" if np.isfinite(step.cost) else "failed"
+    return f"{step.strategy}: {cost} ({step.seconds:.2g} s)"
 
 
 def _shorten_status(fit: Fit) -> str:
@@ -217,7 +244,11 @@ def list_quality(fit: Fit, *, full: bool) -> list[Row]:
     full : bool
         With the optimality.
     """
-    start = f"   (first guess: {fit.history[0].cost:.8g})" if fit.history else ""
+    first = fit.initial_cost
+    if np.isnan(first) and fit.history and not fit.steps:
+        first = fit.history[0].cost
+    guess = f"{first:.8g}" if np.isfinite(first) else "not integrable" if fit.steps else ""
+    start = f"   (first guess: {guess})" if guess else ""
     rows = [("cost J", f"{fit.cost:.8g}{start}")]
     if full:
         rows.append(("KKT residual", f"{fit.optimality:.1e}   (tolerance: {fit.tolerance:.1e})"))
@@ -236,7 +267,7 @@ def list_quality(fit: Fit, *, full: bool) -> list[Row]:
     return rows
 
 
-def _format_channels(fit: Fit, most: int) -> list[str]:
+def _format_channels(fit: Fit, most: int, where: str) -> list[str]:
     """Return the table of the channels as lines; of more than `most` those that are explained worst."""
     table, shares = tabulate_channels(fit)
     header, *rows = table.rows
@@ -245,7 +276,7 @@ def _format_channels(fit: Fit, most: int) -> list[str]:
     kept = sorted(np.argsort(shares, kind="stable")[: _count_shown(len(rows), most)].tolist())
     lines = format_table([header, *(rows[k] for k in kept)], table.alignment)
     more = len(rows) - len(kept)
-    return ["", *lines] + ([f"  and {more} more channels, of which more is explained"] if more else [])
+    return ["", *lines] + ([f"  and {more} more channels, of which more is explained{where}"] if more else [])
 
 
 def tabulate_channels(fit: Fit) -> tuple[Table, list[float]]:
@@ -283,11 +314,11 @@ def _format_residuals(comparison: Comparison, k: int) -> tuple[str, str, str]:
     return count, f"{rmse:.4g}", "" if isinstance(scaled, str) else f"{np.sqrt(np.mean(scaled**2)):.3g}"
 
 
-def _format_unknowns(fit: Fit, most: int) -> list[str]:
+def _format_unknowns(fit: Fit, most: int, where: str) -> list[str]:
     """Return the table of the unknowns as lines, those that are left out counted."""
     table, note = tabulate_unknowns(fit, shown := select_unknowns(fit, most))
     more = len(fit.theta) - len(shown)
-    lines = format_table(*table) + ([f"  and {more} more unknowns"] if more else [])
+    lines = format_table(*table) + ([f"  and {more} more unknowns{where}"] if more else [])
     return [*lines, f"  {note}"] if note else lines
 
 
@@ -388,7 +419,8 @@ def _format_log_scale(fit: Fit, i: int, errors: FloatArray) -> str:
         return ""
     low, high = fit.confidence_intervals()[i]
     if low < high and errors[i] > fit.standard_errors[i]:
-        ends = interval(fit.theta[i : i + 1], fit.quantile(0.95) * errors[i : i + 1], np.ones(1, dtype=bool))[0]
+        half, origin = fit.quantile(0.95) * errors[i : i + 1], fit.log_origins[i]
+        ends = interval(fit.theta[i : i + 1], half, np.ones(1, dtype=bool), origin)[0]
         low, high = np.clip(ends, fit.lower[i], fit.upper[i])
     return f"95 % in [{low:.4g}, {high:.4g}]" if low < high else ""
 
@@ -433,7 +465,7 @@ def _format_correlations(fit: Fit, most: int, *, full: bool) -> list[str]:
         return format_table(rows, "<>")
     more = len(above) - len(rows)
     listed = [f"{pair} {value}" for pair, value in rows] + ([f"and {more} more"] if more > 0 else [])
-    return _wrap("; ".join(listed), "  ", "    ")
+    return wrap_text("; ".join(listed), "  ", "    ")
 
 
 def list_correlations(fit: Fit) -> list[tuple[str, str, float]]:
@@ -455,7 +487,7 @@ def list_correlations(fit: Fit) -> list[tuple[str, str, float]]:
 def _describe_weak(fit: Fit, found: Identifiability, most: int) -> list[str]:
     """Return the combinations of unknowns that the data hardly see, if there are any."""
     weak = list_weak(fit, found)
-    lines = [line for sentence in weak[:most] for line in _wrap(sentence, "  - ", "    ")]
+    lines = [line for sentence in weak[:most] for line in wrap_text(sentence, "  - ", "    ")]
     more = len(weak) - len(weak[:most])
     return lines + ([f"  and {_count(more, 'direction')} more"] if more else [])
 
@@ -495,7 +527,7 @@ def _format_warnings(fit: Fit, verdict: Verdict, most: int, *, full: bool) -> li
     """Return what to be wary of; on one screen without what the verdict has said."""
     said = set() if full else set().union(*(_SAID.get(reason.kind, set()) for reason in verdict.reasons))
     issues = [issue for issue in find_issues(fit) if issue.kind not in said]
-    lines = [line for issue in issues[:most] for line in _wrap(str(issue), "  - ", "    ")]
+    lines = [line for issue in issues[:most] for line in wrap_text(str(issue), "  - ", "    ")]
     more = len(issues) - len(issues[:most])
     return lines + ([f"  and {_count(more, 'warning')} more"] if more else [])
 
@@ -519,14 +551,8 @@ def _format_rows(rows: Sequence[Row]) -> list[str]:
 def _format_row(label: str, text: str) -> list[str]:
     """Return a label at the left and text, wrapped, beside it."""
     if len(label) > LABEL:
-        return [f"  {label}", *_wrap(text, " " * (LABEL + 4), " " * (LABEL + 4))]
-    return _wrap(text, f"  {label:<{LABEL}}  ", " " * (LABEL + 4))
-
-
-def _wrap(text: str, first: str, others: str) -> list[str]:
-    return textwrap.wrap(
-        text, WIDTH, initial_indent=first, subsequent_indent=others, break_long_words=False, break_on_hyphens=False
-    )
+        return [f"  {label}", *wrap_text(text, " " * (LABEL + 4), " " * (LABEL + 4))]
+    return wrap_text(text, f"  {label:<{LABEL}}  ", " " * (LABEL + 4))
 
 
 def _count(number: int, what: str) -> str:

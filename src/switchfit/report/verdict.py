@@ -10,7 +10,7 @@ from switchfit.optimize import Status
 from switchfit.report.sentences import join_words
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text
-from switchfit.uncertainty.verdict import Verdict
+from switchfit.uncertainty.verdict import LEVELS, Verdict
 
 LISTED_REASONS, LISTED_STEPS, LISTED_NAMES = 4, 2, 3
 """Reasons, steps and names in the line; all are in the data."""
@@ -55,7 +55,24 @@ def write_step(step: Issue) -> str:
     ----------
     step : Issue
     """
-    return _STEPS.get(step.kind.removeprefix("next: "), step.kind)
+    text = _STEPS.get(step.kind.removeprefix("next: "), step.kind).format(*step.subjects)
+    return text.replace("one of them", "it") if len(step.subjects) == 1 else text
+
+
+def write_agreement(tried: int, better: int, agreeing: int, *, few: bool = False) -> str:
+    """Return from how many of the other starts the lowest J was found, as a part of a sentence.
+
+    Parameters
+    ----------
+    tried, better, agreeing : int
+        As in `Fit.starts`.
+    few : bool
+        Whether the agreement is small enough to be doubted.
+    """
+    if better > 0:
+        return f"{better} of {tried} other starts are better"
+    count = "none" if not agreeing else f"only {agreeing}" if few else str(agreeing)
+    return f"the lowest J was found from {count} of {tried} other starts"
 
 
 def _figure(issue: Issue, name: str) -> float:
@@ -117,6 +134,11 @@ def _count_modes(collapsed: list[Issue]) -> str:
     return f"{len(names)} modes collapsed ({_name(names)})"
 
 
+def _read_starts(issue: Issue) -> tuple[int, int, int]:
+    tried, better, agreeing = (int(_figure(issue, name)) for name in ("tried", "better", "agreeing"))
+    return tried, better, agreeing
+
+
 _ENDINGS: Mapping[str, str] = {
     Status.MAX_ITERATIONS.name: "not converged: stopped after {iterations:.0f} iterations",
     Status.LINE_SEARCH_FAILED.name: "not converged: the line search failed (optimality {optimality:.1e})",
@@ -133,12 +155,49 @@ def _write_ending(issue: Issue) -> str:
     return _ENDINGS.get(issue.subjects[0], "not converged").format(**figures)
 
 
+def _describe_many(issue: Issue) -> str:
+    """Return how many fits are of each level, and how much of the data they explain."""
+    counts = {level: int(_figure(issue, level)) for level in LEVELS}
+    total = sum(counts.values())
+    told = [f"{count} {'is' if count == 1 else 'are'} {level}" for level, count in counts.items() if count]
+    if len(told) == 1:
+        told = [told[0].replace(f"{total} ", "the only fit " if total == 1 else f"all {total} fits ", 1)]
+    else:
+        told[0] = told[0].replace(" ", f" of {total} fits ", 1)
+    worst = _figure(issue, "worst")
+    if not np.isfinite(worst):
+        return join_words(told)
+    if total == 1:
+        return f"{told[0]} and explains {format_share(worst)} of the variance"
+    return f"{told[0]} and explain {format_share(worst)} of the variance or more (fit {issue.subjects[0]} least)"
+
+
+def _count_fits(issue: Issue) -> str:
+    """Return how many of the fits something is said of."""
+    count, total = int(_figure(issue, "count")), int(_figure(issue, "fits"))
+    return "the only fit" if total == 1 else f"all {total} fits" if count == total else f"{count} of {total} fits"
+
+
+def _write_misfit(text: str) -> Callable[[Issue], str]:
+    """Return a writer that says in how many fits a text is true, and which of them explains least."""
+
+    def write(issue: Issue) -> str:
+        share = _figure(issue, "worst")
+        least = f" (fit {issue.subjects[0]} explains {format_share(share)} of the variance)"
+        return f"{text} in {_count_fits(issue)}{least if np.isfinite(share) else ''}"
+
+    return write
+
+
+def _write_failures(issue: Issue) -> str:
+    statuses = ", ".join(issue.subjects[:LISTED_NAMES])
+    return f"{_count_fits(issue)} did not converge ({statuses})"
+
+
 _REASONS: dict[str, Callable[[Issue], str]] = {
     "fits": _explain,
     "a minimum": lambda issue: f"a minimum (KKT residual {_figure(issue, 'optimality'):.1e})",
-    "starts agree": lambda issue: (
-        f"{_figure(issue, 'agreeing'):.0f} of {_figure(issue, 'tried'):.0f} other starts agree, none is better"
-    ),
+    "starts agree": lambda issue: write_agreement(*_read_starts(issue)),
     "at kinks": lambda issue: f"{_name(issue.subjects)} at a kink of the cost",
     "not converged": _write_ending,
     "unexplained": _explain_worst,
@@ -164,17 +223,33 @@ _REASONS: dict[str, Callable[[Issue], str]] = {
     "a mode collapsed": lambda issue: f"{_name_mode(issue)} collapsed",
     "a mode is short": lambda issue: f"{_name_mode(issue)} is at its minimum duration",
     "idle": lambda issue: f"the cost does not depend on {_name(issue.subjects)}",
-    "other starts are better": lambda issue: (
-        f"{_figure(issue, 'better'):.0f} of {_figure(issue, 'tried'):.0f} other starts are better"
-    ),
-    "few starts agree": lambda issue: (
-        f"only {_figure(issue, 'agreeing'):.0f} of {_figure(issue, 'tried'):.0f} other starts agree, none is better"
-    ),
+    "other starts are better": lambda issue: write_agreement(*_read_starts(issue)),
+    "few starts agree": lambda issue: write_agreement(*_read_starts(issue), few=True),
     "not determined": lambda issue: f"the data hardly determine {_name(issue.subjects)}",
     "at bounds": lambda issue: f"{_name(issue.subjects)} at a bound",
     "integration error": lambda issue: (
         f"the integration error of {_name(issue.subjects)} is {_figure(issue, 'error'):.1e}, relative"
     ),
+    "many fits": _describe_many,
+    "some not converged": _write_failures,
+    "some unexplained": _write_misfit("the model is far from the data"),
+    "some slightly wrong": _write_misfit("slightly wrong at high precision"),
+    "some little explained": _write_misfit("little of the variance is explained"),
+    "some too few samples": _write_misfit("no more values than unknowns"),
+    "some reference not followed": _write_misfit("the reference is not followed"),
+    "some a mode collapsed": lambda issue: f"modes collapsed in {_count_fits(issue)}",
+    "some at bounds": lambda issue: f"unknowns are at a bound in {_count_fits(issue)}",
+    "some not determined": lambda issue: f"the data hardly determine the unknowns of {_count_fits(issue)}",
+    "ended elsewhere": lambda issue: (
+        f"{_count_fits(issue)} ended in another minimum, fit {issue.subjects[0]} farthest off"
+    ),
+    "resampled fit": lambda issue: f"the fit that was resampled is {issue.subjects[0]}",
+    "intervals too short": lambda issue: (
+        f"{100 * _figure(issue, 'level'):.0f} % intervals of {_name(issue.subjects)} hold the truth in "
+        f"{100 * _figure(issue, 'share'):.0f} % of the fits"
+    ),
+    "stopped": lambda issue: f"stopped, {_count_fits(issue)} were not done",
+    "study": lambda issue: f"{_count_fits(issue)} converged, in one minimum",
 }
 
 _STEPS = {
@@ -193,4 +268,11 @@ _STEPS = {
     "start elsewhere": "start elsewhere, or check the model there",
     "start nearer": "start nearer to a point that meets it",
     "check derivatives": "run sf.check_derivatives(problem)",
+    "fit alone": "fit problem {} by itself with sf.estimate",
+    "look at the fit": "look at the verdict on the fit that was resampled",
+    "see failures": "see .failures",
+    "take quantiles": "take quantiles of .theta in place of standard deviations",
+    "start nearer by": "start nearer by",
+    "profiles": "take estimate.profile() for them",
+    "go on": "call it again with the same folder",
 }

@@ -1,1 +1,1 @@
-"""What a process needs whatever it computes: files, caches, XLA's flags, progress. Imports no other room."""
+"""Services that do not depend on the problem: files, caches, XLA's flags, progress. Imports no other room."""

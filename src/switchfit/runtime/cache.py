@@ -1,11 +1,11 @@
-"""The persistent compilation cache: a program that was compiled once is read from the user's cache folder later.
+"""The persistent compilation cache: compiled programs are stored in the user's cache folder and loaded from there.
 
-It lies in the user's cache folder under ``switchfit`` (``~/.cache/switchfit`` on Linux), or in the folder that the
+It is the folder ``switchfit`` in the user's cache folder (``~/.cache/switchfit`` on Linux), or the folder that the
 environment variable ``SWITCHFIT_CACHE`` names; ``SWITCHFIT_CACHE=off`` turns it off. A cache folder that the user has
 configured for JAX is used in its place. JAX's configuration is changed only while switchfit compiles.
 
-What is in the folder is run, so it must belong to the user, and nobody else may write to it; otherwise it is not used.
-Each file begins with a digest of the rest: one that was cut off is compiled and written again.
+The code in the folder is run: the folder must belong to the user, and nobody else may have write permission; otherwise
+it is not used. Each file begins with a digest of the rest: a truncated file is compiled and written again.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SETTINGS: dict[str, Any] = {
 
 
 def find_folder() -> Path | None:
-    """Return where compiled programs are kept; None if the cache is off."""
+    """Return the folder of compiled programs; None if the cache is off."""
     chosen = os.environ.get("SWITCHFIT_CACHE", "")
     if chosen.lower() == "off":
         return None
@@ -44,8 +44,8 @@ def find_folder() -> Path | None:
 
 @contextmanager
 def use_compilation_cache() -> Iterator[None]:
-    """Return a context in which JAX reads and writes compiled programs in `find_folder`; everything is as before
-    afterwards.
+    """Return a context in which JAX reads and writes compiled programs in `find_folder`; it restores JAX's settings at
+    its end.
     """
     path = get_usable_folder()
     before = {name: getattr(jax.config, name) for name in SETTINGS}
@@ -56,7 +56,7 @@ def use_compilation_cache() -> Iterator[None]:
     try:
         for name, value in settings.items():
             jax.config.update(name, value)
-        jax_cache.reset_cache()  # JAX decides once whether it uses a cache; make it decide again
+        jax_cache.reset_cache()  # JAX decides once whether to use a cache; this makes it decide again
         _use_whole_files(path)
         yield
     finally:
@@ -66,7 +66,7 @@ def use_compilation_cache() -> Iterator[None]:
 
 
 def get_usable_folder() -> Path | None:
-    """Return the cache folder, made if it is missing; None if it cannot be written to, or others can write to it."""
+    """Return the cache folder, created if missing; None if it is not writable, or if others can write to it."""
     path = find_folder()
     if path is None:
         return None
@@ -83,7 +83,7 @@ def get_usable_folder() -> Path | None:
 
 
 def can_others_write(found: os.stat_result) -> str:
-    """Return why somebody else may have written a file or a folder; "" if nobody may, or the system does not tell."""
+    """Return why others may have written a file or a folder; "" if they cannot, or the system does not tell."""
     if not hasattr(os, "geteuid"):
         return ""
     if found.st_uid != os.geteuid():
@@ -96,14 +96,14 @@ def can_others_write(found: os.stat_result) -> str:
 @cache
 def _warn_once(path: Path, reason: str) -> None:
     warnings.warn(
-        f"The cache folder {path} is not used, since what is in it is run: {reason}. Delete it, or name one of your "
-        "own with the environment variable SWITCHFIT_CACHE. Until then everything is compiled anew.",
+        f"The cache folder {path} is not used, since code in it would be run: {reason}. Delete it, or set the "
+        "environment variable SWITCHFIT_CACHE to a folder of your own. Until then compiled programs are not cached.",
         stacklevel=2,
     )
 
 
 def read_code(path: Path) -> bytes | None:
-    """Return what `write_code` wrote; None if the file is missing, damaged or not the user's own.
+    """Read code that `write_code` wrote; None if the file is missing, damaged or not the user's own.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def read_code(path: Path) -> bytes | None:
 
 
 def write_code(path: Path, code: bytes) -> None:
-    """Write machine code with its digest; where that fails nothing is left behind.
+    """Write machine code with its digest; if that fails, no file remains.
 
     Parameters
     ----------
@@ -129,15 +129,15 @@ def write_code(path: Path, code: bytes) -> None:
         In the folder of `get_usable_folder`.
     code : bytes
     """
-    with suppress(OSError):  # a cache that cannot be written is no reason to stop
+    with suppress(OSError):  # the cache is optional: a failed write is ignored
         write_atomically(hashlib.sha256(code).digest() + code, path, sync=False)
 
 
 class _WholeFiles:
-    """JAX's compiled programs in files as of `write_code`, with the methods of JAX's own cache.
+    """Stores JAX's compiled programs by `write_code`; has the methods of JAX's own cache.
 
-    JAX writes its files in place: one that was cut off, or is read while another process writes it, gives a warning and
-    is never replaced.
+    JAX's cache writes files in place. A file that is truncated, or read while another process writes it, causes a
+    warning there and is never replaced.
     """
 
     def __init__(self, path: Path) -> None:
@@ -151,7 +151,7 @@ class _WholeFiles:
 
 
 def _use_whole_files(path: Path) -> None:
-    """Hand JAX a `_WholeFiles`. The names are private: should JAX change them, it goes on with its own cache."""
+    """Replace JAX's cache by `_WholeFiles`. The names are private: if JAX changes them, its own cache remains."""
     internals: Any = sys.modules[jax_cache.reset_cache.__module__]
     with getattr(internals, "_cache_initialized_mutex", nullcontext()):
         internals._cache_initialized, internals._cache = True, _WholeFiles(path)

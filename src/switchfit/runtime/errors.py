@@ -1,10 +1,10 @@
-"""Errors that callers tell from others: a file that somebody wrote is wrong, a model cannot be integrated."""
+"""Errors that callers distinguish: wrong input in a file, a model that cannot be integrated."""
 
 from __future__ import annotations
 
 
 class InputError(ValueError):
-    """Something given is wrong; the message names the file and the key or line, what was given, and what to do."""
+    """An input is wrong; the message names the file and the key or line, the value given, and what to do."""
 
 
 class NotIntegrableError(ValueError):

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and files that turned out to be damaged."""
+"""Write files atomically, and set damaged files aside."""
 
 from __future__ import annotations
 
@@ -10,37 +10,37 @@ from pathlib import Path
 
 try:
     import fcntl
-except ImportError:  # Windows, which refuses to delete a file that another process has open
+except ImportError:  # Windows, where a file that another process has open cannot be deleted
     fcntl = None  # type: ignore[assignment]
 
 PREFIX, SUFFIX = ".switchfit-", ".tmp"
-"""How the names of temporary files begin and end."""
+"""Prefix and suffix of the names of temporary files."""
 ATTEMPTS = 100
 
 
 def write_atomically(content: str | bytes, path: Path, *, sync: bool = True) -> None:
-    """Write a temporary file beside `path`, then rename it to `path`; text as UTF-8.
+    """Write a temporary file in the folder of `path`, then rename it to `path`; text as UTF-8.
 
-    Temporary files that a killed process left in the same folder are deleted first. A file that is being written is
-    locked, and the lock ends with the process: so those of processes that still write are left alone.
+    Temporary files of killed processes in the same folder are deleted first. A file that is being written is locked,
+    and the lock ends with its process, so that files of running processes are not deleted.
 
     Parameters
     ----------
     content : str or bytes
     path : Path
     sync : bool
-        False does not wait until the disk has the content: for files that are checked when they are read.
+        Whether to wait until the content is on the disk; not needed for files that are checked when they are read.
 
     Raises
     ------
     OSError
-        If the file cannot be written, with the name of the file; an existing one is then left as it was.
+        If the file cannot be written; the error names the file. An existing file is then unchanged.
     """
     data = content.encode() if isinstance(content, str) else content
     if path.exists() and not path.is_file() and not path.is_dir():
         path.write_bytes(data)  # a device or a pipe, which cannot be replaced
         return
-    path = path.resolve()  # a link stays one
+    path = path.resolve()  # write the target of a link; the link remains
     try:
         _delete_abandoned(path.parent)
         for attempt in range(ATTEMPTS):
@@ -66,7 +66,7 @@ def _write(data: bytes, path: Path, sync: bool) -> None:
             if sync:
                 os.fsync(file.fileno())
             if fcntl is not None:
-                temporary.replace(path)  # while it is locked
+                temporary.replace(path)  # while locked
         if fcntl is None:
             temporary.replace(path)
     finally:
@@ -79,7 +79,7 @@ def _delete_abandoned(folder: Path) -> None:
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         found = [entry.path for entry in entries if entry.name.startswith(PREFIX) and entry.name.endswith(SUFFIX)]
     for name in found:
-        with contextlib.suppress(OSError):  # locked, or gone in the meantime
+        with contextlib.suppress(OSError):  # locked, or deleted in the meantime
             if fcntl is None:
                 os.unlink(name)
                 continue
@@ -89,7 +89,7 @@ def _delete_abandoned(folder: Path) -> None:
 
 
 def is_regular(path: Path) -> bool:
-    """Return whether there is a file of that name; False for names that no file can have."""
+    """Return whether a regular file has that name; False for invalid names."""
     try:
         return path.is_file()
     except (OSError, ValueError):  # too long; a null character
@@ -111,14 +111,14 @@ def set_aside(path: Path, reason: str, remedy: str) -> None:
     ----------
     path : Path
     reason : str
-        What is wrong with it, as the end of a sentence.
+        The damage, as the end of a sentence.
     remedy : str
-        What happens now, as a sentence.
+        What happens next, as a sentence.
     """
     number, target = 1, path.with_name(f"{path.name}.damaged")
     while target.exists():
         number += 1
         target = path.with_name(f"{path.name}.damaged-{number}")
-    with contextlib.suppress(FileNotFoundError):  # another process was first
+    with contextlib.suppress(FileNotFoundError):  # another process has renamed it already
         path.rename(target)
     warnings.warn(f"{path} is damaged: {reason}. It is now {target.name}. {remedy}", stacklevel=2)

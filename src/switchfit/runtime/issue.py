@@ -1,4 +1,4 @@
-"""`Issue`: something to know about a result, as data. The report has the sentence."""
+"""`Issue`: a warning or a failure about a result, as data. The report writes the sentence."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class Issue:
     Attributes
     ----------
     kind : str
-        What it is, such as "collapsed" or "integration error"; the kinds are those in `switchfit.report.sentences`.
+        Kind of the issue, such as "collapsed" or "integration error"; `switchfit.report.sentences` lists the kinds.
     subjects : tuple of str
-        Names of what it is about: unknowns, channels, outputs.
+        Names of the unknowns, channels or outputs that it concerns.
     figures : mapping of str to float or tuple of float
-        The numbers of the sentence by their names; a tuple has one entry for each subject.
+        Numbers in the sentence, by name; a tuple has one entry for each subject.
 
     See Also
     --------

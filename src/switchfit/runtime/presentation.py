@@ -1,8 +1,8 @@
-"""How results are written and drawn, without their knowing who does it.
+"""Dispatch of results to the functions that write and draw them.
 
-Results are data. Their ``__str__`` and ``plot`` call `format_text` and `draw_figure`, and the modules of
-`switchfit.report` register a function for each kind of result. So the report depends on the results, and no result on
-the report.
+Results are data. Their ``__str__`` and ``plot`` call `format_text` and `draw_figure`, for which the modules of
+`switchfit.report` register a function for each kind of result. The report thus depends on the results, and no result
+depends on the report.
 """
 
 from __future__ import annotations
@@ -13,16 +13,18 @@ from typing import Any
 
 @singledispatch
 def format_text(result: Any, **settings: Any) -> str:
-    """Return a result as plain text, one line or several without a newline at the end.
+    """Return a result as plain text, of one or more lines, without a newline at the end.
 
     Parameters
     ----------
     result : object
         Of a kind that a module of `switchfit.report` has registered.
     settings
-        What that kind of text can be given.
+        Keyword arguments of the registered function.
     """
-    raise TypeError(f"no module of switchfit.report writes a {type(result).__name__}; register one with text_of.")
+    raise TypeError(
+        f"no module of switchfit.report writes a {type(result).__name__}; register one with format_text.register."
+    )
 
 
 @singledispatch
@@ -34,9 +36,11 @@ def draw_figure(result: Any, **settings: Any) -> Any:
     result : object
         Of a kind that a module of `switchfit.report` has registered.
     settings
-        What that kind of figure can be given.
+        Keyword arguments of the registered function.
     """
-    raise TypeError(f"no module of switchfit.report draws a {type(result).__name__}; register one with figure_of.")
+    raise TypeError(
+        f"no module of switchfit.report draws a {type(result).__name__}; register one with draw_figure.register."
+    )
 
 
 @singledispatch

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 import scipy.special
@@ -18,14 +18,17 @@ from switchfit.optimize import IterationRecord, Status
 from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.problem import GIVEN, Problem
-from switchfit.problem.validation import as_choice, as_positive
+from switchfit.problem.validation import as_callable, as_choice, as_positive
 from switchfit.runtime.errors import NotIntegrableError
+from switchfit.runtime.progress import Line, show_line
 from switchfit.strategy.horizon import REFERENCE_POINTS, can_grow, grow_horizon
+from switchfit.strategy.minimum_time import is_minimum_time, try_shorter_horizons
 from switchfit.strategy.quick import End, fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
 from switchfit.strategy.runs import fit_runs_alone, has_runs
 from switchfit.strategy.scan import can_scan, scan_intervals
-from switchfit.strategy.starts import SAME_COST, try_starts
+from switchfit.strategy.starts import SAME_COST, Starts, try_starts
+from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 from switchfit.uncertainty.quality import measure_quality
 from switchfit.uncertainty.verdict import UNLIKELY
 
@@ -43,12 +46,13 @@ SCAN, GROW, REINSERT, STARTS = (
 )
 """Names of strategies."""
 
-REMESH, INSIDE = "new meshes", "constraints inside the programme"
+REMESH = "new meshes"
 
-CONSTRAINTS_AGREE = "constraints inside the programme agree"
+GROWTH_AGREES = "growing horizon agrees"
+"""The growing horizon, which does not start from the guess, has ended at the same cost as the fit."""
 
-EVERYWHERE = frozenset({GROW, REINSERT, STARTS, CONSTRAINTS_AGREE})
-"""Strategies that look everywhere, and the one that meets constraints in another way, if it ends at the same cost."""
+EVERYWHERE = frozenset({GROW, REINSERT, STARTS})
+"""Strategies that look everywhere."""
 
 PERFECT = 0.9999
 """Share of the variance of a reference that must be explained for a fit not to need confirmation: wrong ends of the
@@ -88,7 +92,7 @@ def estimate(
     hessian : {"auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"}
         Quadratic term of the sequential quadratic programme: equation (3), shifted inside a trust region where it is
         not positive definite; equation (3), its eigenvalues made positive where they are not, with a line search, which
-        guards and 16 experiments or more have in any case; steepest descent until it is positive definite, then
+        16 experiments or more have in any case; steepest descent until it is positive definite, then
         equation (3), as the paper does it (Section II-A); equation (4); the Gauss-Newton matrix; or none (steepest
         descent). With another than "auto" the strategy is "local" unless "thorough" is asked for.
     tolerance : float
@@ -119,6 +123,12 @@ def estimate(
     TypeError
         If an argument is of the wrong type.
 
+    Notes
+    -----
+    On a terminal, a line on stderr says from a second on which strategy is under way, the lowest J, how far it is and
+    for how long. Many starts that last are fitted by other processes as well, one a core, where the model runs in
+    machine code and cloudpickle is installed; what is found does not depend on them.
+
     See Also
     --------
     estimate_many, multistart : many fits.
@@ -138,25 +148,40 @@ def estimate(
     """
     strategy = as_choice(strategy, "strategy", STRATEGIES)
     budget = np.inf if time_budget is None else as_positive(time_budget, "time_budget")
-    settings: dict[str, Any] = {"tolerance": tolerance, "max_iterations": max_iterations, "callback": callback}
-    settings["hessian"] = hessian
+    if callback is not None:
+        as_callable(callback, "callback", "a function callback(record)", arguments=1)
+    settings: dict[str, Any] = {"tolerance": tolerance, "max_iterations": max_iterations, "hessian": hessian}
     began = time.perf_counter()
-    try:
-        best = fit_locally(problem, start=start, **settings)
-    except NotIntegrableError:
-        if strategy == "local":
-            raise
-        search = Search(problem, None, problem.check_theta(start), strategy, settings, began, budget)
-        search.run()
-        if search.best is None:
-            raise
-        return search.finish(search.best)
-    limited = best.status is Status.MAX_ITERATIONS and max_iterations < ITERATIONS
-    if strategy == "local" or (strategy == "auto" and (hessian != "auto" or limited or _is_enough(problem, best))):
-        return best
-    search = Search(problem, best, problem.check_theta(start), strategy, settings, began, budget)
-    search.run()
-    return search.finish(search.best or best)
+    with show_line("fit: not begun, or compiling (only the first time)") as line:
+        settings["callback"] = _write_to(line, "fit", callback)
+        try:
+            best = fit_locally(problem, start=start, **settings)
+        except NotIntegrableError:
+            if strategy == "local":
+                raise
+            search = Search(problem, None, problem.check_theta(start), strategy, settings, began, budget)
+            search.run(line, callback)
+            if search.best is None:
+                raise
+            return search.finish(search.best)
+        limited = best.status is Status.MAX_ITERATIONS and max_iterations < ITERATIONS
+        if strategy == "local" or (strategy == "auto" and (hessian != "auto" or limited or _is_enough(problem, best))):
+            return best
+        search = Search(problem, best, problem.check_theta(start), strategy, settings, began, budget)
+        search.run(line, callback)
+        return search.finish(search.best or best)
+
+
+def _write_to(
+    line: Line, name: str, callback: Callable[[IterationRecord], object] | None
+) -> Callable[[IterationRecord], object]:
+    """Return the callback of a fit, which writes to the line of progress as well."""
+
+    def report(record: IterationRecord) -> object:
+        line.write(f"{name}: iteration {record.iteration}, J = {record.cost:.6g}, optimality {record.optimality:.1e}")
+        return callback is not None and callback(record)
+
+    return report
 
 
 def _is_enough(problem: Problem, fit: Estimate, tried: Collection[str] = ()) -> bool:
@@ -170,6 +195,8 @@ def _is_enough(problem: Problem, fit: Estimate, tried: Collection[str] = ()) -> 
         return True
     if _is_confirmed(problem, fit):
         return True
+    if GROWTH_AGREES in tried and SCAN in tried and fit.status.successful:
+        return True  # what is doubted is the model: two searches that share no start have found the same minimum
     if is_doubted(fit) or (_is_coarse(fit) and REMESH not in tried):
         return False
     if any(run.is_guess_proposed for run in problem.experiments) and fit.sigma_known is not True:
@@ -215,13 +242,30 @@ def _cost_of_means(problem: Problem) -> float:
 
 
 def _is_coarse(fit: Estimate) -> bool:
-    """Return whether the integration error is too large: mostly, since the meshes were made for where the fit began."""
+    """Return whether the integration error is too large: mostly, since the meshes were made for where the fit began.
+
+    A fit that has not converged is resumed on no finer meshes: it may have gone down into their error.
+    """
+    if not fit.status.successful and fit.integration_error > LARGE_INTEGRATION_ERROR:
+        return True
     return any(step.kind == SMALLER_RTOL for step in fit.verdict.next_steps)
 
 
 def is_doubted(fit: Estimate) -> bool:
     """Return whether a better end may be elsewhere, by what the verdict says."""
     return not fit.status.successful or any(step.kind == MORE_STARTS for step in fit.verdict.next_steps)
+
+
+def is_searching() -> bool:
+    """Return whether strategies are being tried: Ctrl-C then keeps the best so far, wherever it comes."""
+    return Search.running > 0
+
+
+def was_interrupted(fit: Estimate) -> bool:
+    """Return whether Ctrl-C or a callback ended a fit, or the search that found it."""
+    last = fit.steps[-1] if fit.steps else None
+    searching = last is not None and "interrupted" in (last.strategy, last.ended)
+    return searching or fit.status is Status.INTERRUPTED
 
 
 def without_guards(problem: Problem) -> Problem:
@@ -232,6 +276,8 @@ def without_guards(problem: Problem) -> Problem:
 
 class Search:
     """The strategies in turn, the best fit so far, and what each brought."""
+
+    running: ClassVar[int] = 0
 
     def __init__(
         self,
@@ -246,20 +292,37 @@ class Search:
         self.problem, self.best, self.theta = problem, best, theta
         self.strategy, self.settings, self.began, self.budget = strategy, settings, began, budget
         self.evaluations = 0 if best is None else best.evaluations
-        cost = np.inf if best is None else best.cost
         proposed = any(run.is_guess_proposed for run in problem.experiments)
         name = "local, from evenly spaced times" if proposed else "local"
-        self.steps = [Step(name, cost, self.evaluations, time.perf_counter() - began)]
-        self.first_cost = best.history[0].cost if best is not None and best.history else 0.0
-        self.starts: tuple[int, int, int] | None = None
+        self.steps = [Step(name, self.lowest, self.evaluations, time.perf_counter() - began)]
+        self.first_cost = np.nan if best is None else best.initial_cost
+        self.starts: Starts | None = None
 
     @property
     def late(self) -> bool:
         """Whether the time budget is spent."""
         return time.perf_counter() - self.began > self.budget
 
-    def run(self) -> None:
+    def run(self, line: Line, callback: Callable[[IterationRecord], object] | None) -> None:
         """Try one strategy after the other until the verdict is good; Ctrl-C ends it with the best so far."""
+        self.line, self.callback = line, callback
+        Search.running += 1
+        try:
+            self._run()
+        finally:
+            Search.running -= 1
+
+    @property
+    def lowest(self) -> float:
+        """The lowest J so far; infinite where there is none, or constraints are not met: J says nothing then."""
+        return np.inf if self.best is None or self.best.violated else self.best.cost
+
+    def _begin(self, name: str) -> None:
+        """Say on the line of progress which strategy is under way, and the lowest J before it."""
+        self.settings["callback"] = _write_to(self.line, f"{name}, fit of its end", self.callback)
+        self.line.write(name, self.lowest)
+
+    def _run(self) -> None:
         tried: set[str] = set()
         try:
             if self.best is not None and _is_coarse(self.best):
@@ -271,23 +334,33 @@ class Search:
                 if self.late:
                     break
                 agrees = self._try(name, find)
-                tried.add(CONSTRAINTS_AGREE if agrees and name == INSIDE else name)
+                tried.add(name)
+                if agrees and name == GROW:
+                    tried.add(GROWTH_AGREES)
                 if self.strategy == "auto" and self.best is not None and _is_enough(self.problem, self.best, tried):
                     break
-                if self.best is not None and self.best.status is Status.INTERRUPTED:
+                if self.best is not None and was_interrupted(self.best):
+                    break
+                if self.starts is not None and self.starts.ended == "interrupted":
                     break
         except KeyboardInterrupt:
             if self.best is None:
                 raise
-            self.steps.append(Step("interrupted", self.best.cost, 0, 0.0))
+            self.steps.append(Step("interrupted", self.lowest, 0, 0.0))
 
     def finish(self, best: Estimate) -> Estimate:
         """Return the best fit with all that was done."""
+        starts = None
+        if self.starts is not None:
+            accuracy = max(self.problem.rtol * abs(best.cost), self._margin(best.cost))
+            agreeing = self.starts.count_agreeing(best.cost, accuracy)
+            starts = len(self.starts.costs), 0, agreeing  # the lowest of them is what `best` began at
         return replace(
             best,
             initial_theta=self.theta,
+            initial_cost=self.first_cost,
             steps=tuple(self.steps),
-            starts=self.starts,
+            starts=starts,
             evaluations=self.evaluations,
             seconds=time.perf_counter() - self.began,
         )
@@ -298,19 +371,20 @@ class Search:
         found: list[tuple[str, Callable[[FloatArray], End]]] = []
         doubted = best is None or is_doubted(best)
         if problem.constraint_names:
-            found.append((INSIDE, lambda theta: fit_briefly(problem, self.theta)))
             if any(structure.guarded for structure in problem.structures):
                 found.append(("transitions free of their guards", self._free_transitions))
             return [*found, (STARTS, self._try_starts)]
-        if best is not None and best.status is Status.MAX_ITERATIONS and not can_grow(problem):
+        unfinished = best is not None and best.status is Status.MAX_ITERATIONS
+        if unfinished and (has_runs(problem) or not can_grow(problem)):
             found.append(("more iterations", lambda theta: fit_briefly(problem, theta, MORE_ITERATIONS)))
         if has_runs(problem) and (doubted or self.strategy == "thorough"):
             found.append(("each run alone", self._fit_runs_alone))
         if can_scan(problem):
             found.append((SCAN, lambda theta: scan_intervals(problem, theta)))
         if can_grow(problem):
-            # Far from the data the intervals near by are hopeless.
-            place = 0 if best is None or best.verdict.level == "bad" else len(found)
+            # Far from the data the intervals near by are hopeless; several runs have been fitted alone by then.
+            far = best is None or best.verdict.level == "bad"
+            place = 0 if far and not has_runs(problem) else len(found)
             found.insert(place, (GROW, lambda theta: grow_horizon(problem, theta)))
         if can_reinsert(problem):
             found.append((REINSERT, lambda theta: reinsert_modes(problem, theta)))
@@ -318,7 +392,7 @@ class Search:
 
     def _free_transitions(self, theta: FloatArray) -> End:
         """Fit with transitions that may happen anywhere, and from there with their guards."""
-        free = estimate(without_guards(self.problem), start=self.theta, time_budget=self._time_left)
+        free = self._estimate_inside(without_guards(self.problem), self.theta)
         end = fit_briefly(self.problem, free.theta)
         return end._replace(evaluations=end.evaluations + free.evaluations)
 
@@ -326,10 +400,17 @@ class Search:
         """Fit each run by itself, then all together."""
 
         def fit(part: Problem, start: FloatArray) -> tuple[FloatArray, FloatArray, int]:
-            found = estimate(part, start=start, time_budget=self._time_left)
+            found = self._estimate_inside(part, start)
             return found.theta, found.hessian, found.evaluations
 
         return fit_runs_alone(self.problem, self.theta, fit)
+
+    def _estimate_inside(self, problem: Problem, start: FloatArray) -> Estimate:
+        """Estimate another problem within the time that is left; Ctrl-C then ends this search as well."""
+        found = estimate(problem, start=start, time_budget=self._time_left)
+        if was_interrupted(found):
+            raise KeyboardInterrupt
+        return found
 
     @property
     def _time_left(self) -> float | None:
@@ -337,9 +418,11 @@ class Search:
         return None if left == np.inf else max(left, 1e-3)
 
     def _try_starts(self, theta: FloatArray) -> End:
-        found = try_starts(self.problem, theta, stop=lambda: self.late)
-        self.starts = found.tried, 0, found.agreeing
-        return found.end
+        if self.best is not None and is_minimum_time(self.problem, self.best):
+            self.starts = try_shorter_horizons(self.problem, self.best, lambda: self.late)
+        else:
+            self.starts = try_starts(self.problem, theta, stop=lambda: self.late)
+        return self.starts.end
 
     def _margin(self, cost: float) -> float:
         """Return by how much an end has to be lower than a cost: where a fit is perfect, J is rounding."""
@@ -349,10 +432,11 @@ class Search:
     def _fit_on_new_meshes(self, fit: Estimate) -> None:
         """Fit again from where the best fit ended, on meshes made for it."""
         began = time.perf_counter()
-        again = fit_locally(self.problem, start=fit.theta, first_cost=self.first_cost, **self.settings)
+        self._begin(REMESH)
+        again = fit_locally(self.problem, start=fit.theta, first_cost=np.nan_to_num(self.first_cost), **self.settings)
         self.best = again if again.integration_error < fit.integration_error else fit
         self.evaluations += again.evaluations
-        self.steps.append(Step(REMESH, self.best.cost, again.evaluations, time.perf_counter() - began))
+        self.steps.append(Step(REMESH, self.lowest, again.evaluations, time.perf_counter() - began))
 
     def _try(self, name: str, find: Callable[[FloatArray], End]) -> bool:
         """Run one strategy; a full fit follows where its end is lower than the best so far.
@@ -360,16 +444,17 @@ class Search:
         Returns whether it ended at the same cost as the best.
         """
         began = time.perf_counter()
+        self._begin(name)
         end = find(self.theta if self.best is None else self.best.theta)
         evaluations = end.evaluations
         # The cost of a fit whose constraints are not met says nothing: any that meets them is better.
-        before = np.inf if self.best is None or self.best.violated else self.best.cost
+        before = self.lowest
         if not end.failed and (before == np.inf or end.cost < before - self._margin(before)):
-            fit = fit_locally(self.problem, start=end.theta, first_cost=self.first_cost, **self.settings)
+            fit = fit_locally(self.problem, start=end.theta, first_cost=np.nan_to_num(self.first_cost), **self.settings)
             evaluations += fit.evaluations
             if self.best is None or (fit.cost < before and not fit.violated) or self.best.violated:
                 self.best = fit
         self.evaluations += evaluations
-        cost = np.inf if self.best is None else self.best.cost
-        self.steps.append(Step(name, cost, evaluations, time.perf_counter() - began))
+        ended = self.starts.ended if self.starts is not None and name == STARTS else ""
+        self.steps.append(Step(name, self.lowest, evaluations, time.perf_counter() - began, ended))
         return bool(np.isfinite(before) and abs(end.cost - before) <= SAME_COST * abs(before))

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.solution import minimize_cost, minimize_with_constraints
+from switchfit.fit.solution import minimize_cost
+from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
-from switchfit.strategy.constrained import meet_constraints
 
 ITERATIONS = 60
 """Iterations of a short fit: what has not converged by then is in a valley that leads nowhere."""
@@ -32,20 +32,30 @@ class End(NamedTuple):
         return not np.isfinite(self.cost)
 
 
-def fit_briefly(problem: Problem, theta: FloatArray, iterations: int = ITERATIONS) -> End:
+def prepare_meshes(problem: Problem, theta: FloatArray) -> Evaluator | None:
+    """Return the problem on meshes for theta (d,); None where it cannot be integrated there."""
+    try:
+        with np.errstate(all="ignore"):
+            return Evaluator(problem, theta)
+    except (ValueError, ArithmeticError):
+        return None
+
+
+def fit_briefly(
+    problem: Problem, theta: FloatArray, iterations: int = ITERATIONS, evaluator: Evaluator | None = None
+) -> End:
     """Return where a short fit from theta (d,) ends; with an infinite cost where it cannot begin, or where guards or
     terminal constraints are not met: their violation may make the cost as low as it likes.
+
+    It works on the meshes of the evaluator, if one is given.
     """
     failed = End(theta, np.inf, 0)
     try:
         with np.errstate(all="ignore"):  # far from the data numbers may overflow
-            taken = 0
-            if problem.constraint_names:
-                theta, taken = meet_constraints(problem, theta)
-                result, _ = minimize_with_constraints(Evaluator(problem, theta), theta, TOLERANCE, iterations)
-            else:
-                result = minimize_cost(Evaluator(problem, theta), theta, "auto", TOLERANCE, iterations)
+            result = minimize_cost(evaluator or Evaluator(problem, theta), theta, "auto", TOLERANCE, iterations)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return failed
+    if result.status is Status.INTERRUPTED:  # Ctrl-C, which the optimiser takes for the end of its own work
+        raise KeyboardInterrupt
     usable = np.isfinite(result.cost) and not result.violated
-    return End(result.theta, result.cost if usable else np.inf, taken + result.evaluations)
+    return End(result.theta, result.cost if usable else np.inf, result.evaluations)

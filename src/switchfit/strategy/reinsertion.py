@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
+from switchfit.runtime.progress import show_detail
 from switchfit.strategy.quick import End, fit_briefly
 
 PLACES = 60
@@ -49,7 +50,8 @@ def reinsert_modes(problem: Problem, theta: FloatArray) -> End:
     """Return where removals and insertions end that begin at the end of a fit, theta (d,)."""
     current = fit_briefly(problem, theta)
     evaluations = current.evaluations
-    for _ in range(ROUNDS):
+    for repeated in range(ROUNDS):
+        show_detail(f"round {repeated + 1}", current.cost)
         better = None
         for candidate, tried in _list_candidates(problem, current.theta):
             end = fit_briefly(problem, candidate)

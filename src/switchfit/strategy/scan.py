@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
+from switchfit.runtime.progress import show_detail
 from switchfit.strategy.horizon import list_sample_times
-from switchfit.strategy.quick import End, fit_briefly
+from switchfit.strategy.quick import End, fit_briefly, prepare_meshes
 
 ROUNDS = 8
 
@@ -42,7 +43,11 @@ FAR = 3.0
 """Multiple of the lowest cost of a run that counts as far above it."""
 
 LOWER = 1e-6
-"""A cost has to fall by this part of itself for the scan to be repeated."""
+"""A cost has to promise to fall by this part of itself for another fit."""
+
+WORTHWHILE = 1e-5
+"""It has to have fallen by this part of itself for the intervals near by to be scanned once more: after less, nothing
+more has been found."""
 
 SMALLEST_EIGENVALUE = 1e-8
 """Eigenvalues of a matrix, scaled to a diagonal of one, below which they are replaced."""
@@ -71,28 +76,34 @@ def can_scan(problem: Problem) -> bool:
 
 def scan_intervals(problem: Problem, theta: FloatArray) -> End:
     """Return where scans end that begin at the end of a fit, theta (d,)."""
-    current = fit_briefly(problem, theta)
+    evaluator = prepare_meshes(problem, theta)
+    current = fit_briefly(problem, theta, evaluator=evaluator)
+    if evaluator is None or current.failed:
+        return current
     evaluations = current.evaluations
-    for repeated in range(ROUNDS if not current.failed else 0):
-        scan = Scan(problem, current.theta, everywhere=not repeated)
-        start = scan.choose()
-        end = fit_briefly(problem, start)
-        evaluations += end.evaluations + -(-scan.evaluations // len(problem.experiments))
-        lower = end.cost < current.cost - LOWER * abs(current.cost)
-        current = min(current, end, key=lambda one: one.cost)
+    scan = Scan(problem, evaluator, current.theta)
+    for repeated in range(ROUNDS):
+        start, fall = scan.choose(everywhere=not repeated)
+        if repeated and fall <= LOWER * abs(current.cost):
+            break
+        evaluator = prepare_meshes(problem, start)
+        end = fit_briefly(problem, start, evaluator=evaluator)
+        evaluations += end.evaluations
+        lower = end.cost < current.cost - WORTHWHILE * abs(current.cost)
+        if evaluator is not None and end.cost < current.cost:
+            current = end
+            scan.move(evaluator, end.theta)
         if repeated and not lower:
             break
-    return current._replace(evaluations=evaluations)
+    return current._replace(evaluations=evaluations - (-scan.evaluations // len(problem.experiments)))
 
 
 class Scan:
-    """One scan of all runs about theta (d,): of all intervals, or, more accurately, of those near by."""
+    """Scans of all runs about theta (d,): of all intervals, or, more accurately, of those near by."""
 
-    def __init__(self, problem: Problem, theta: FloatArray, *, everywhere: bool) -> None:
-        self.problem, self.theta = problem, theta
-        self.reach: float = np.inf if everywhere else NEAR
-        self.settled = SETTLED[0] if everywhere else SETTLED[1]
-        self.evaluator = Evaluator(problem, theta)
+    def __init__(self, problem: Problem, evaluator: Evaluator, theta: FloatArray) -> None:
+        self.problem, self.evaluator, self.theta = problem, evaluator, theta
+        self.reach, self.settled = float(NEAR), SETTLED[1]
         self.evaluations = 0
         touched = np.array([self._touched(e) for e in range(len(problem.experiments))])
         several = len(touched) > 1
@@ -109,9 +120,18 @@ class Scan:
             sums[row, own[mine == place]] = 1.0
         return sums
 
-    def choose(self) -> FloatArray:
-        """Return the theta that is the best of all combinations of intervals, as far as parabolas tell."""
-        options = [self._scan_run(e) for e in range(len(self.problem.experiments))]
+    def move(self, evaluator: Evaluator, theta: FloatArray) -> None:
+        """Scan about another theta from now on, on its meshes."""
+        self.evaluator, self.theta = evaluator, theta
+
+    def choose(self, *, everywhere: bool) -> tuple[FloatArray, float]:
+        """Return the theta that is the best of all combinations of intervals, and by how much J is lower there, as far
+        as parabolas tell."""
+        self.reach, self.settled = (np.inf, SETTLED[0]) if everywhere else (float(NEAR), SETTLED[1])
+        options = []
+        for e in range(len(self.problem.experiments)):
+            show_detail(f"run {e + 1} of {len(self.problem.experiments)}")
+            options.append(self._scan_run(e))
         move = np.zeros(len(self.shared))
         for _ in range(20):
             best = [min(own, key=lambda option: self._predict(option, move)) for own in options]
@@ -126,7 +146,8 @@ class Scan:
             theta[own] = option.theta[own] + option.follows @ move
         unknowns = self.problem.unknowns
         theta = np.clip(theta, unknowns.lower, unknowns.upper)
-        return self._in_order(theta)
+        cost = sum(self._derivatives(self.theta, e, 1)[0] for e in range(len(best)))
+        return self._in_order(theta), cost - sum(self._predict(option, move) for option in best)
 
     def _in_order(self, theta: FloatArray) -> FloatArray:
         """Return theta with the transition times of each run inside its horizon and in order."""

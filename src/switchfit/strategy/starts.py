@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,9 @@ import numpy as np
 from switchfit.fit.random_starts import draw_starts
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
+from switchfit.runtime.progress import show_detail
 from switchfit.strategy.quick import End, fit_briefly
+from switchfit.strategy.workers import fit_all
 
 MOST = 128
 """Starts at most; a study of more is what `multistart` is for."""
@@ -23,21 +26,37 @@ SAME_COST = 1e-6
 
 
 class Starts(NamedTuple):
-    """The lowest end, and how many starts were tried, ended lower than where the search began, and at the lowest."""
+    """Where short fits ended: the lowest end, the costs of all (n,), and why there are no more (`Step.ended`)."""
 
     end: End
-    tried: int
-    better: int
-    agreeing: int
+    costs: FloatArray
+    ended: str
+
+    def count_agreeing(self, cost: float, accuracy: float) -> int:
+        """Return how many ended where a fit did whose J is `cost`: at the lowest end, if that is at this J.
+
+        Short fits have meshes of their own, whose J is accurate to `accuracy` alone; among themselves ends of one
+        minimum differ by `SAME_COST`.
+        """
+        lowest = self.end.cost
+        if not abs(lowest - cost) <= accuracy + SAME_COST * abs(cost):
+            return 0
+        return int(np.sum(self.costs <= max(lowest, cost) + accuracy + SAME_COST * abs(cost)))
 
 
 def try_starts(
-    problem: Problem, theta: FloatArray, *, seed: int = 0, most: int = MOST, stop: Callable[[], bool] = lambda: False
+    problem: Problem,
+    theta: FloatArray,
+    *,
+    seed: int = 0,
+    most: int = MOST,
+    stop: Callable[[], bool] = lambda: False,
+    cores: int | None = None,
 ) -> Starts:
     """Return the lowest end of short fits from random starts, theta (d,) among them.
 
     They stop where, after n fits that ended in w different minima, no more than half a minimum is expected to be
-    missing ([1]_), and the lowest has been found `AGREE` times.
+    missing ([1]_), and the lowest has been found `AGREE` times. Ctrl-C ends them as well, once one has ended.
 
     Parameters
     ----------
@@ -49,6 +68,8 @@ def try_starts(
         Starts at most.
     stop : callable
         Asked after each fit; true ends the search.
+    cores : int, optional
+        Processes at most; as many as there are cores if left out. What is found does not depend on it.
 
     References
     ----------
@@ -56,18 +77,23 @@ def try_starts(
        Math. Program. 37 (1987) 59-80.
     """
     first = fit_briefly(problem, theta)
-    ends, evaluations = [first], first.evaluations
-    for start in draw_starts(problem, most, seed)[1:]:
-        end = fit_briefly(problem, start)
-        evaluations += end.evaluations
-        ends.append(end)
-        if stop() or _is_enough(np.array([one.cost for one in ends if not one.failed])):
-            break
+    ends, evaluations, ended = [first], first.evaluations, "most"
+    try:
+        with closing(fit_all(problem, draw_starts(problem, most, seed)[1:], cores)) as found:
+            for end in found:
+                evaluations += end.evaluations
+                ends.append(end)
+                show_detail(f"start {len(ends) - 1} of at most {most - 1}", min(one.cost for one in ends))
+                if _is_enough(np.array([one.cost for one in ends if not one.failed])):
+                    ended = "settled"
+                    break
+                if stop():
+                    ended = "time"
+                    break
+    except KeyboardInterrupt:
+        ended = "interrupted"
     best = min(ends, key=lambda one: one.cost)
-    costs = np.array([one.cost for one in ends[1:]])
-    margin = SAME_COST * abs(best.cost)
-    better = int(np.sum(costs < first.cost - SAME_COST * abs(first.cost)))
-    return Starts(best._replace(evaluations=evaluations), len(costs), better, int(np.sum(costs <= best.cost + margin)))
+    return Starts(best._replace(evaluations=evaluations), np.array([one.cost for one in ends[1:]]), ended)
 
 
 def _is_enough(costs: FloatArray) -> bool:

@@ -1,4 +1,4 @@
-"""What the data say about a fit, beside its numbers: profiles, predictions, identifiability, residuals, certificate.
+"""Uncertainty and checks of a fit: profiles, predictions, identifiability, residuals, certificate, verdict.
 
 Imports `fit` and the rooms before it.
 """

@@ -1,4 +1,4 @@
-"""How the numbers of a fit were checked: computed again from the fit, not taken from the optimiser."""
+"""Checks of the numbers of a fit, computed from the fit and not taken from the optimizer."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from switchfit.uncertainty.derivative_check import (
 from switchfit.uncertainty.identification import Combination, analyse_solution
 
 LARGE_INTEGRATION_ERROR = 1e-6
-"""Relative error of J or of a constraint by halving the steps above which a fit has fewer digits than it seems."""
+"""Relative change of J or of a constraint by halving the steps, above which it counts as inaccurate."""
 
 NEGATIVE = -1e-8
 """Eigenvalues of the scaled Hessian below this are negative curvature, not rounding."""
@@ -32,37 +32,37 @@ NEGATIVE = -1e-8
 
 @dataclass(frozen=True)
 class Certificate:
-    """How the numbers of a fit were checked.
+    """Checks of the numbers of a fit.
 
     Attributes
     ----------
     optimality : float
         KKT residual at the solution.
     smallest_eigenvalue : float
-        Of the Hessian on the free directions; positive: the second-order sufficient condition holds. NaN if
-        nothing is free.
+        Smallest eigenvalue of the Hessian on the free directions; if it is positive, the second-order sufficient
+        condition holds. NaN if nothing is free.
     smallest_scaled_eigenvalue : float
-        The same with the unknowns scaled to unit curvature each: 1 is perfectly, 0 not at all determined.
+        The same with each unknown scaled to unit curvature: 1 is perfectly determined, 0 is not determined at all.
     condition_number : float
-        Of that scaled Hessian.
+        Condition number of that scaled Hessian.
     worst_unknowns : tuple of str
-        The unknowns that the worst-determined direction mostly consists of, the one with the largest part first.
+        Unknowns with the largest components in the worst-determined direction, the largest first.
     integration_error : float
-        Largest relative change by halving all steps of J, the guards and the terminal constraints: of J relative to J,
-        or to 1e-3 of the first J where that is more; of a constraint relative to what the
-        states make of it as they go through their ranges in the run.
+        Largest relative change by halving all steps of J, the guards and the terminal constraints. For J it is relative
+        to J, or to 1e-3 of the first J if that is more; for a constraint, to the sum of its changes over the ranges of
+        the states in the run.
     gradient_gap, hessian_gap : float
-        Relative gap between the paper's equations (6)-(17) and the exact derivatives of the discretised cost; NaN
-        where that was not checked.
+        Relative gap between the paper's equations (6)-(17) and the exact derivatives of the discretized cost; NaN
+        if not checked.
     taylor_orders : tuple of float
         Orders of the remainders of J, of J with its gradient and of J with its Hessian along a random direction: at
-        least 1, 2, 3 where the derivatives are right (2, 2, 3 at a minimum, where the gradient vanishes); NaN where a
-        remainder is rounding, or where that was not checked.
+        least 1, 2, 3 if the derivatives are right (2, 2, 3 at a minimum, where the gradient vanishes); NaN if a
+        remainder is rounding, or if not checked.
     active : tuple of ActiveConstraint
-        Constraints that hold with equality, collapsed modes and bounds among them.
+        Constraints that hold with equality, including collapsed modes and bounds.
     kinks : tuple of Kink
     failures : tuple of Issue
-        What of all this is not as it has to be; empty where the certificate is good.
+        Failed checks; empty if the certificate is good.
     integration_error_of : str
         The output that has the `integration_error`: "J", or the name of a guard or terminal constraint.
 
@@ -100,7 +100,7 @@ class Certificate:
 
     @property
     def passed(self) -> bool:
-        """Whether nothing that was checked failed."""
+        """Whether no check failed."""
         return not self.failures
 
     @property
@@ -119,8 +119,8 @@ def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
     ----------
     fit : Fit
     evaluator : Evaluator or None
-        Of its problem, its meshes refined at the solution. Without it the paper's equations are not evaluated, and
-        gaps and Taylor orders are NaN.
+        Evaluator of its problem, with meshes refined at the solution. Without it, the paper's equations are not
+        evaluated, and gaps and Taylor orders are NaN.
 
     Returns
     -------
@@ -133,7 +133,7 @@ def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
     if evaluator is not None:
         gaps = measure_derivative_gap(evaluator, fit.theta)
         orders = estimate_orders(build_taylor_table(evaluator, fit.theta).orders)
-    stiff = evaluator is not None and evaluator.problem.solver == "stiff"
+    stiff = evaluator is not None and evaluator.takes_implicit_steps
     smallest = float(scaled[0]) if len(scaled) else np.nan
     return Certificate(
         optimality=fit.optimality,
@@ -164,6 +164,6 @@ def _find_failures(
         yield Issue("integration error", (fit.integration_error_of,), {"error": fit.integration_error})
     if max(gaps) > LARGEST_GAP and not stiff:
         yield Issue("derivative gap", figures={"gap": max(gaps)})
-    # The first order says nothing at a minimum, where the gradient vanishes.
+    # The first order is not tested: at a minimum, the gradient vanishes.
     if not are_orders_right((np.nan, *orders[1:])):
         yield Issue("Taylor orders", figures={"orders": orders})

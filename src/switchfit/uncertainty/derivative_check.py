@@ -1,4 +1,4 @@
-"""Checking derivatives at any theta: Taylor remainders, and the paper's equations against the discretised cost."""
+"""Check derivatives at any theta: Taylor remainders, and the paper's equations against the discretized cost."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.fit.evaluator import Evaluation, Evaluator, evaluator_of, knows_paper
+from switchfit.fit.evaluator import Evaluation, Evaluator, evaluator_of, is_covered_by_paper
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_instance, as_seed
 from switchfit.runtime.presentation import format_text
 
 LARGEST_GAP = 1e-4
-"""Relative gap between the paper's equations and the discretised cost's derivatives that is still the integrator's."""
+"""Largest relative gap between the paper's equations and the discretized cost's derivatives by integration error."""
 
 
 class TaylorTable(NamedTuple):
-    """Remainders of J along a direction: steps (S,), remainders (S, 3), observed orders (S - 1, 3), and where (d,)."""
+    """Remainders of J along a direction: steps (S,), remainders (S, 3), observed orders (S - 1, 3), and theta (d,)."""
 
     steps: FloatArray
     remainders: FloatArray
@@ -28,7 +28,7 @@ class TaylorTable(NamedTuple):
 
 
 def build_taylor_table(evaluator: Evaluator, theta: FloatArray, *, seed: int = 0) -> TaylorTable:
-    """Return remainders of J with its gradient and its Hessian along a random direction, at theta but off the nodes."""
+    """Return remainders of J with its gradient and Hessian along a random direction, near theta but off the nodes."""
     at = _move_off_nodes(evaluator, theta)
     base = evaluator(at)
     direction = np.random.default_rng(seed).choice([-1.0, 1.0], size=len(at)) * _choose_scales(base, at)
@@ -47,7 +47,7 @@ def estimate_orders(orders: FloatArray) -> tuple[float, ...]:
 
 
 def are_orders_right(observed: tuple[float, ...]) -> bool:
-    """Return whether the orders are 1, 2, 3 or more within 0.25, or beyond what can be seen."""
+    """Return whether the orders are at least 1, 2, 3 within 0.25, or not observable because of rounding."""
     return all(order > k - 0.25 or np.isnan(order) for k, order in enumerate(observed, start=1))
 
 
@@ -60,17 +60,17 @@ class DerivativeCheck:
     steps : (S,) array
         Step lengths h.
     remainders : (S, 3) array
-        ``|J(theta + h v) - J|``, the same less ``h g.v``, and the same less ``h^2/2 v'Hv``.
+        ``|J(theta + h v) - J|``, the same minus ``h g.v``, and the same minus ``h^2/2 v'Hv``.
     orders : (S - 1, 3) array
         Observed orders in h, which are 1, 2 and 3 if J, g and H are right; NaN where a remainder is rounding.
     gradient_gap, hessian_gap : float
-        Relative gap between the paper's equations (6)-(17) and the discretised cost's exact derivatives.
+        Relative gap between the paper's equations (6)-(17) and the discretized cost's exact derivatives.
     gradient_gap_halved, hessian_gap_halved : float
         The same with every step halved: smaller by ``2**order`` of the integrator, down to rounding.
     theta : (d,) array
     stiff : bool
-        With the stiff solver the gaps are reported, not judged: the paper's adjoints have boundary layers of their own
-        at transitions and samples, which a mesh refined for the state does not resolve.
+        With the stiff solver, the gaps are reported but do not count: the paper's adjoints have boundary layers of
+        their own at transitions and samples, which a mesh refined for the state does not resolve.
 
     See Also
     --------
@@ -106,8 +106,8 @@ class DerivativeCheck:
 
     @property
     def passed(self) -> bool:
-        """Whether the orders are 1, 2, 3 within 0.25, or beyond what can be seen, and the methods agree to 1e-4."""
-        agree = self.stiff or not max(self.gradient_gap, self.hessian_gap) >= LARGEST_GAP  # NaN where not checked
+        """Whether the orders are 1, 2, 3 within 0.25, or not observable, and the methods agree to 1e-4."""
+        agree = self.stiff or not max(self.gradient_gap, self.hessian_gap) >= LARGEST_GAP  # NaN if not checked
         return are_orders_right(self.observed_orders) and agree
 
     def __str__(self) -> str:
@@ -115,16 +115,16 @@ class DerivativeCheck:
 
 
 def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, seed: int = 0) -> DerivativeCheck:
-    """Check the gradient and the Hessian of a problem against its cost, and the two ways to find them.
+    """Check the gradient and the Hessian of a problem against its cost, and two methods against each other.
 
     Parameters
     ----------
     problem : Problem
     theta : (d,) array_like, optional
-        The initial guess if left out. Transition times that lie on a node of the mesh, or on what a late sample sees,
-        are moved off it, since derivatives jump there.
+        The initial guess if left out. Transition times that lie on a node of the mesh, or on the time that a late
+        sample sees, are moved off it, since derivatives jump there.
     seed : int, optional
-        Of the random direction.
+        Seed of the random direction.
 
     Returns
     -------
@@ -134,7 +134,7 @@ def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, seed:
     Raises
     ------
     ValueError
-        For a theta of the wrong shape or order, or a seed that is negative.
+        For a theta of the wrong shape or order, or a negative seed.
     TypeError
         If an argument is of the wrong type.
 
@@ -158,17 +158,18 @@ def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, seed:
     at = table.theta
     gaps = measure_derivative_gap(evaluator, at)
     halved = measure_derivative_gap(evaluator.halved, at)
-    return DerivativeCheck(table.steps, table.remainders, table.orders, *gaps, *halved, at, problem.solver == "stiff")
+    return DerivativeCheck(
+        table.steps, table.remainders, table.orders, *gaps, *halved, at, evaluator.takes_implicit_steps
+    )
 
 
 def measure_derivative_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[float, float]:
-    """Return the relative gap of gradient and Hessian between the paper's equations and the discretised cost.
+    """Return the relative gap of gradient and Hessian between the paper's equations and the discretized cost.
 
-    NaN where the cost has what the paper's equations do not know. Unknowns are scaled to unit curvature each. Near a
-    minimum the gradient vanishes; its gap is then relative to the gradient that a change of all unknowns by 0.1 % would
-    cause.
+    NaN if the paper's equations do not cover the cost. Each unknown is scaled to unit curvature. Near a minimum the
+    gradient vanishes; its gap is then relative to the gradient after a change of all unknowns by 0.1 %.
     """
-    if not knows_paper(evaluator.problem):
+    if not is_covered_by_paper(evaluator.problem):
         return np.nan, np.nan
     paper, discrete = evaluator(theta, method="adjoint"), evaluator(theta)
     scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(discrete.hessian)), 1e-300))
@@ -192,7 +193,7 @@ def _choose_scales(base: Evaluation, theta: FloatArray) -> FloatArray:
 
 
 def _move_off_nodes(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
-    """Return theta with each transition time in the middle of the cell it is in, where J is smooth for longest."""
+    """Return theta with each transition time in the middle of its cell, where J is smooth over the longest distance."""
     moved = theta.copy()
     late = _list_late_times(evaluator, theta)
     for i, nodes in enumerate(evaluator.breakpoints()):
@@ -204,9 +205,9 @@ def _move_off_nodes(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
 
 
 def _find_room(evaluator: Evaluator, theta: FloatArray, direction: FloatArray) -> float:
-    """Return the largest step that leaves every transition time in its cell, and every unknown near its size.
+    """Return the largest step with every transition time in its cell, and changes of unknowns small against their size.
 
-    No transition may pass what a late sample sees, either, which moves with the delay.
+    Nor may a transition pass the time that a late sample sees, which moves with the delay.
     """
     room = 1e-2 * np.min(np.where(theta != 0, np.abs(theta), 1.0) / np.abs(direction))
     for i, nodes in enumerate(evaluator.breakpoints()):
@@ -220,7 +221,7 @@ def _find_room(evaluator: Evaluator, theta: FloatArray, direction: FloatArray) -
 
 
 def _list_late_times(evaluator: Evaluator, theta: FloatArray) -> dict[int, FloatArray]:
-    """Return, for each transition time in theta, the times that late samples of its run see, if there are any."""
+    """Return the times that late samples see, by the transition times in theta of their runs."""
     problem = evaluator.problem
     found: dict[int, FloatArray] = {}
     for e, where in enumerate(problem.unknowns.times):

@@ -1,15 +1,15 @@
-"""Which combinations of the unknowns the data determine badly, in words and with their size, and whether that is so.
+"""Find the combinations of unknowns that the data determine badly, and test them by evaluating J along them.
 
-The Hessian scaled to unit curvature of each unknown, ``S H S`` with ``S = diag(H)^(-1/2)``, does not know the units:
+The Hessian scaled to unit curvature of each unknown, ``S H S`` with ``S = diag(H)^(-1/2)``, does not depend on units:
 its eigenvalues would all be 1 if every unknown were determined independently of the others. An eigenvector v with a
-small eigenvalue lambda is a combination that the data hardly see: J rises by lambda / 2 a unit of length along ``S v``.
+small eigenvalue lambda is a badly determined combination: a step of length s along ``S v`` changes J by lambda s^2 / 2.
 
-The statement "tau_2 later and mu lower leaves J as it is" is made with a length at which the quadratic form says that
-J rises by `Identifiability.rise`, and J is evaluated there on both sides: what is printed is what was found. Where
-that is more than twice of what was predicted, since the valley bends, the length is halved until it is not.
+A statement such as "tau_2 later and mu lower leaves J as it is" is made for the step at which the quadratic form
+predicts that J rises by `Identifiability.rise`. J is evaluated there on both sides, and the result is what is printed.
+If J rises by more than twice the prediction, since the valley bends, the step is halved until it does not.
 
-Before a fit the same is done with data as the first guess itself would produce them, without noise: there the cost is
-0, its gradient vanishes, and its exact Hessian is the Gauss-Newton matrix (the expected information).
+Before a fit, the same is done with noise-free data simulated at the first guess: the cost is 0 there, its gradient
+vanishes, and its exact Hessian is the Gauss-Newton matrix (the expected information).
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ from switchfit.runtime.presentation import format_text
 WEAK = 0.05
 """Scaled eigenvalues below this are reported: standard errors along them are 4.5 times those of each unknown alone."""
 MOST = 3
-"""Most directions that are reported."""
+"""Largest number of directions that are reported."""
 NAMED = 0.2
 """Unknowns with less than this part of the largest weight in a direction are not named."""
 UNDETERMINED = 1e-10
 """Scaled eigenvalues below this are zero."""
 HALVINGS = 20
 Meaning = Literal["noise", "1 % of J", "1 % of variation"]
-"""What a rise of J is: what noise hides in 95 % of all cases, 1 % of J, or what a change of all that is measured by 1 %
-of how it varies makes of J."""
+"""Meaning of a rise of J: hidden by noise in 95 % of all cases, 1 % of J, or caused by a change of all measured values
+by 1 % of their variation."""
 
 
 @dataclass(frozen=True)
 class Combination:
-    """Unknowns that trade off, or one that is by itself; print it for the words.
+    """Unknowns that trade off, or a single one; print it for the words.
 
     Attributes
     ----------
     unknowns : tuple of str
-        The one with the largest part first.
+        In the order of their components, the largest first.
     """
 
     unknowns: tuple[str, ...]
@@ -63,20 +63,20 @@ class Combination:
 
 @dataclass(frozen=True, eq=False)
 class Direction:
-    """A combination of the unknowns, and what was found along it.
+    """A combination of the unknowns, and the rise of J along it.
 
     Attributes
     ----------
     eigenvalue : float
-        Of the Hessian scaled to unit curvature of each unknown.
+        Eigenvalue of the Hessian scaled to unit curvature of each unknown.
     weights : (d,)
         Its eigenvector, in scaled unknowns, the largest entry positive.
     change : (d,)
-        The change of theta that was tried, a multiple of the scaled eigenvector, in units.
+        The change of theta that was tried, a multiple of the scaled eigenvector, in the units of theta.
     rises : (float, float)
-        By how much J rises at theta + change and at theta - change; NaN where that is not allowed.
+        Rise of J at theta + change and at theta - change; NaN at a point that is not feasible.
     names : tuple of str
-        The unknowns that it mostly consists of, the one with the largest weight first.
+        Unknowns with the largest weights, the largest first.
 
     See Also
     --------
@@ -117,23 +117,23 @@ class Identifiability:
     is_time : (d,) bool
         Which of the unknowns are transition times.
     eigenvalues : (k,)
-        Ascending, of the Hessian scaled to unit curvature of each unknown, on the directions that nothing holds.
+        Eigenvalues, ascending, of the Hessian scaled to unit curvature of each unknown, on the free directions.
     vectors : (d, k)
         Their eigenvectors in scaled unknowns.
     without : tuple of str
         Unknowns on which the cost does not depend at all, to second order.
     held : tuple of str
-        Unknowns that a constraint, a kink or a collapsed mode holds, of which nothing is said.
+        Unknowns that a constraint, a kink or a collapsed mode holds; they are not analyzed.
     directions : tuple of Direction
-        The badly determined ones, at most three, and the worst one at any rate.
+        The badly determined directions, at most three; the worst direction is always among them.
     rise : float
-        Of J, for which the changes are chosen.
+        Rise of J for which the changes are chosen.
     meaning : {"noise", "1 % of J", "1 % of variation"}
-        What that rise is: what noise hides in 95 % of all cases, 1 % of J, or what a change of all that is measured by
-        1 % of how it varies makes of J.
+        Meaning of that rise: hidden by noise in 95 % of all cases, 1 % of J, or caused by a change of all measured
+        values by 1 % of their variation.
     where : {"solution", "first guess"}
     cost : float
-        J there, to which a rise is related; NaN where it is not.
+        J there, to which a rise is compared; NaN if it is not compared.
     tried : bool
         Whether J was evaluated along the directions.
     idle : tuple of str
@@ -171,7 +171,7 @@ class Identifiability:
 
     @property
     def condition_number(self) -> float:
-        """Of the scaled Hessian; infinite where it is singular."""
+        """Condition number of the scaled Hessian; infinite if it is singular."""
         if not len(self.eigenvalues) or self.without or self.eigenvalues[0] <= UNDETERMINED:
             return np.inf if len(self.eigenvalues) or self.without else np.nan
         return float(self.eigenvalues[-1] / self.eigenvalues[0])
@@ -226,7 +226,7 @@ def identifiability(subject: Any) -> Identifiability:
 
 
 def analyse_solution(fit: Fit, evaluator: Evaluator | None) -> Identifiability:
-    """At the solution of a fit; without an evaluator nothing is tried.
+    """Analyze the solution of a fit; without an evaluator, J is not evaluated along the directions.
 
     Parameters
     ----------
@@ -258,7 +258,7 @@ def analyse_solution(fit: Fit, evaluator: Evaluator | None) -> Identifiability:
 
 
 def _analyse_first_guess(problem: Problem) -> Identifiability:
-    """Analyse a problem at its first guess, with the data that it would itself produce, where they are Measurements."""
+    """Analyze a problem at its first guess, with Measurements replaced by data simulated there."""
     theta, unknowns = problem.initial_theta, problem.unknowns
     own = evaluator_of(problem)
     refuse_hidden_switches(own, theta, own(theta).gradient)
@@ -267,7 +267,7 @@ def _analyse_first_guess(problem: Problem) -> Identifiability:
     if all(isinstance(item, Measurements) for item in items):
         clean = _drop_noise(problem, own)
         evaluator = Evaluator(clean, meshes=own.meshes)
-        # Where sigma is a parameter J has no minimum without noise; its expected Hessian is Gauss-Newton's.
+        # If sigma is a parameter, J has no minimum without noise; its expected Hessian is the Gauss-Newton matrix.
         hessian = evaluator(theta, matrix="exact" if is_least_squares(problem) else "gauss-newton").hessian
         if all(item.sigma is not None for item in items):
             rise, meaning = 0.5 * float(scipy.special.ndtri(0.975)) ** 2, "noise"
@@ -296,7 +296,7 @@ def _analyse_first_guess(problem: Problem) -> Identifiability:
 
 
 def _drop_noise(problem: Problem, evaluator: Evaluator) -> Problem:
-    """Return the problem with the values that its first guess produces; missing ones stay missing."""
+    """Return the problem with measured values replaced by those simulated at its first guess; missing ones stay so."""
     theta = problem.initial_theta
     comparisons = compare(problem, theta, evaluator.simulate(theta))[1]
     experiments = []
@@ -310,7 +310,7 @@ def _drop_noise(problem: Problem, evaluator: Evaluator) -> Problem:
 
 
 def _measure_variation(problem: Problem) -> float:
-    """Return half the weighted sum of squares of what is measured about its mean, channel by channel."""
+    """Return half the weighted sum of squares of the measured values about the mean of their channel."""
     total = 0.0
     for experiment in problem.experiments:
         for item in experiment.data:
@@ -345,26 +345,26 @@ def analyse(
     allowed: Callable[[FloatArray], bool] | None = None,
     base: float = np.nan,
 ) -> Identifiability:
-    """Return the badly determined directions of a Hessian, tried out with the cost it belongs to.
+    """Return the badly determined directions of a Hessian, tested with the cost it belongs to.
 
     Parameters
     ----------
     hessian : (d, d)
     basis : (d, k)
-        Orthonormal basis of the directions that nothing holds.
+        Orthonormal basis of the free directions.
     theta : (d,)
     names, units : tuple of str
     is_time : (d,) bool
         Which of the unknowns are transition times.
     cost : callable ``theta -> J``, or None
-        None: nothing is tried.
+        With None, J is not evaluated along the directions.
     rise : float
-        Of J, for which changes of theta are chosen.
-    meaning, where : as of `Identifiability`
+        Rise of J for which changes of theta are chosen.
+    meaning, where : as in `Identifiability`
     allowed : callable ``theta -> bool``, optional
         Whether theta satisfies the constraints.
     base : float, optional
-        J, to which a rise is related; NaN if it should not be.
+        J, to which a rise is compared; NaN if it should not be.
     """
     free = np.abs(basis).max(1, initial=0.0) > 1e-9
     held = tuple(n for n, f in zip(names, free, strict=True) if not f)
@@ -375,7 +375,7 @@ def analyse(
     without = tuple(n for n, f, nothing in zip(names, free, flat, strict=True) if f and nothing)
     spectrum = compute_scaled_spectrum(hessian, basis)
     values, vectors = spectrum.values, spectrum.vectors
-    # What the cost does not depend on at all is reported separately.
+    # Unknowns on which the cost does not depend at all are reported separately.
     dead = np.array([n in without for n in names])
     kept = [k for k in range(len(values)) if not np.sum(vectors[dead, k] ** 2) > 0.5]
     values, vectors = values[kept], vectors[:, kept]
@@ -399,11 +399,9 @@ def _try_direction(
     rise: float,
     allowed: Callable[[FloatArray], bool] | None,
 ) -> tuple[FloatArray, tuple[float, float]]:
-    """Return the change along a direction (d,) at which J should rise by `rise`, and by how much it does
-    on both sides.
-    """
+    """Return the change along a direction (d,) at which J should rise by `rise`, and its actual rises on both sides."""
     known = theta != 0
-    # No unknown moves by more than its own size, where it has one.
+    # No unknown moves by more than its own size, if it is not zero.
     share = np.max(np.abs(direction[known] / theta[known]), initial=0.0)
     reach = 1.0 / float(share or np.max(np.abs(direction)))
     length = min(np.sqrt(2 * rise / eigenvalue), reach) if eigenvalue > 0 else reach

@@ -1,4 +1,4 @@
-"""What a reader should know before believing the numbers of a fit, as data; the report makes sentences of it."""
+"""Warnings about the numbers of a fit, as data; the report writes the sentences."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 from switchfit.uncertainty.residuals import diagnose
 
 BARELY_DETERMINED = 1e-6
-"""Smallest eigenvalue of the scaled Hessian below which there is a warning; correlations of 0.999999 give it."""
+"""Smallest eigenvalue of the scaled Hessian below which a warning is given; correlations of 0.999999 have it."""
 UNSEEN = 100.0
-"""The same factor from which the Gauss-Newton matrix counts as singular rather than different: as for a transition at
-which the vector field does not jump, such as a block that comes to rest."""
+"""Factor between the standard errors of the two Hessians above which the Gauss-Newton matrix counts as singular, as for
+a transition at which the vector field does not jump, such as a block that comes to rest."""
 UNLIKELY = 1e-3
-"""Probability of the residual variance below which there is a warning, if it is 10 % off as well."""
+"""Probability of the residual variance below which a warning is given, if it is also 10 % off."""
 DIFFERENT = 1.2
-"""Factor between the standard errors of the two Hessians, of any combination of the unknowns, above which there is a
-warning: a 95 % interval that is too narrow by it covers 90 %, one too wide 98 %."""
+"""Factor between the standard errors of the two Hessians, for any combination of the unknowns, above which a warning is
+given: a 95 % interval that is too narrow by this factor covers 90 %, one that is too wide 98 %."""
 
 
 def find_issues(fit: Fit) -> list[Issue]:
-    """Return what a reader should know before believing the numbers, in the order in which the report says it.
+    """Return the warnings about a fit, in the order of the report.
 
     Parameters
     ----------
@@ -82,14 +82,14 @@ def _find_undetermined(fit: Fit) -> Iterator[Issue]:
 
 
 def _find_missing_errors(fit: Fit) -> Iterator[Issue]:
-    """Find out why there are no standard errors."""
+    """Find the reason why a fit has no standard errors."""
     if np.isfinite(fit.standard_errors).all():
         return
     k = fit.free_basis.shape[1]
     if not np.isfinite(fit.hessian).all():
         yield Issue("no errors: not finite")
     elif fit.sigma_known is None:
-        if not any(fit.comparisons):  # a cost of the trajectory: there is nothing to be done
+        if not any(fit.comparisons):  # a cost of the trajectory alone never has standard errors
             return
         yield Issue("no errors: no noise model")
     elif fit.sigma_known is False and fit.samples <= k:
@@ -100,7 +100,7 @@ def _find_missing_errors(fit: Fit) -> Iterator[Issue]:
 
 
 def _check_noise(fit: Fit) -> Iterator[Issue]:
-    """Find out whether a known sigma contradicts the residuals: 2 J should be chi-square distributed."""
+    """Test whether a known sigma contradicts the residuals: 2 J should be chi-square distributed."""
     variance = fit.residual_variance
     if not (fit.status.successful and fit.sigma_known and np.isfinite(variance)):
         return
@@ -118,7 +118,7 @@ def _check_residuals(fit: Fit) -> Iterator[Issue]:
 
 
 def _compare_covariances(fit: Fit) -> Iterator[Issue]:
-    """Find out whether the exact Hessian and the Gauss-Newton matrix give different standard errors."""
+    """Test whether the exact Hessian and the Gauss-Newton matrix give different standard errors."""
     found = disagreement(fit) if fit.status.successful else None
     if found is not None and found.factor > DIFFERENT:
         kind = "known to second order" if found.factor > UNSEEN else "covariances differ"
@@ -127,6 +127,6 @@ def _compare_covariances(fit: Fit) -> Iterator[Issue]:
 
 
 def _check_integration(fit: Fit) -> Iterator[Issue]:
-    """Find out whether the integration is not accurate enough."""
+    """Test whether the integration is accurate enough."""
     if not fit.integration_error <= LARGE_INTEGRATION_ERROR:
         yield Issue("large integration error", (fit.integration_error_of,), {"error": fit.integration_error})

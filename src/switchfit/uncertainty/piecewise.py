@@ -8,13 +8,13 @@ of the profile, all other unknowns eliminated by a Newton step (the Schur comple
     J_p = J − ½ g_o' H_oo⁻¹ g_o,   s = g_k − H_ko H_oo⁻¹ g_o,   c = H_kk − H_ko H_oo⁻¹ H_ok,
 
 and the interval is where 2 (J_p − J) stays below the squared quantile. It costs an evaluation for each sample time on
-the way.
+the way. Of many fits the pieces are kept (`switchfit.batch.intervals`), so that intervals can be had at any level.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,6 +33,26 @@ AT_SAMPLE = 1e-9
 """A transition time nearer to a sample time than this part of the horizon is at it."""
 
 
+class Piece(NamedTuple):
+    """The profile of J between two sample times, going to one side from the estimate.
+
+    Attributes
+    ----------
+    start, stop : float
+        Transition times between which it holds.
+    rise : float
+        By how much the profile exceeds J of the estimate at the start.
+    slope, curvature : float
+        There, in the direction in which the side goes.
+    """
+
+    start: float
+    stop: float
+    rise: float
+    slope: float
+    curvature: float
+
+
 def replace_intervals(
     fit: Fit, problem: Problem, evaluator: Evaluator, intervals: FloatArray, level: float
 ) -> FloatArray:
@@ -42,16 +62,20 @@ def replace_intervals(
     if threshold is None or len(problem.experiments) > MOST_RUNS:
         return found
     others = _movable(fit)
-    for e, k in _transitions(problem):
-        samples = _sample_times(problem, e)
+    span = [trajectory.times[[0, -1]] for trajectory in fit.trajectories]
+    for e, k in list_transitions(problem):
+        samples = list_sample_times(problem, e)
         held = any(kink.unknown == fit.theta_names[k] for kink in fit.kinks)
         low, high = intervals[k]
         inside = samples[(samples >= low) & (samples <= high)]
         if held or (inside.size and others[k]):
             free = others.copy()
             free[k] = False
-            ends = (_walk(fit, problem, evaluator, e, k, free, samples, side, threshold) for side in (-1, 1))
-            found[k] = next(ends), next(ends)
+            knots = np.concatenate([span[e][:1], fit.transition_times[e], span[e][1:]])
+            for end, side in enumerate((-1, 1)):
+                stops = list_stops(problem, fit.theta, e, k, samples, knots, fit.lower, fit.upper, side)
+                pieces = trace_profile(evaluator, fit.theta, fit.cost, k, free, stops, fit.lower, fit.upper, side)
+                found[k, end] = find_end(pieces, threshold, side)
     return found
 
 
@@ -69,7 +93,7 @@ def _movable(fit: Fit) -> Any:
     return np.sum(Z * Z, axis=1) > 1 - 1e-9
 
 
-def _transitions(problem: Problem) -> Iterator[tuple[int, int]]:
+def list_transitions(problem: Problem) -> Iterator[tuple[int, int]]:
     """Yield the experiment and the place in theta of each free transition time that moves alone."""
     places = [place for where in problem.unknowns.times for place in where[where >= 0].tolist()]
     for e, where in enumerate(problem.unknowns.times):
@@ -78,55 +102,93 @@ def _transitions(problem: Problem) -> Iterator[tuple[int, int]]:
                 yield e, place
 
 
-def _sample_times(problem: Problem, e: int) -> FloatArray:
+def list_sample_times(problem: Problem, e: int) -> FloatArray:
     """Return the times of all measurements of an experiment, in ascending order."""
     times = [data.times for data in problem.experiments[e].data if isinstance(data, Measurements)]
     return np.unique(np.concatenate(times)) if times else np.zeros(0)
 
 
-def _walk(
-    fit: Fit,
+def list_stops(
     problem: Problem,
-    evaluator: Evaluator,
+    theta: FloatArray,
     e: int,
     k: int,
-    free: Any,
     samples: FloatArray,
+    knots: FloatArray,
+    lower: FloatArray,
+    upper: FloatArray,
     side: int,
-    threshold: float,
-) -> float:
-    """Return where the profile reaches the threshold, going to one side of the estimate from sample to sample."""
-    theta, here = fit.theta.copy(), float(fit.theta[k])
-    limit = _limit(fit, problem, e, k, side)
-    span = fit.trajectories[e].times
-    near = AT_SAMPLE * (span[-1] - span[0])
-    ahead = samples[side * (samples - here) > near]
-    for stop in [*ahead[::side][:MOST_PIECES], limit]:
-        stop = side * min(side * stop, side * limit)
-        at = evaluator(theta, side)
-        cost, slope, curvature, follow = _profile_at(at, k, free)
-        rise = cost - fit.cost
-        if rise >= threshold:
-            return float(theta[k])
-        reach = _first_root(threshold - rise, side * slope, curvature)
-        length = side * (stop - theta[k])
-        if reach <= length or stop == limit:
-            return float(theta[k] + side * min(reach, length))
-        theta[free] -= follow[0] + follow[1] * side * length
-        theta = np.clip(theta, fit.lower, fit.upper)
+) -> list[float]:
+    """Return the sample times on the way to one side, and how far a transition time may move alone: to its bound or to
+    its neighbour.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta, lower, upper : (d,)
+    e, k : int
+        The experiment, and the place in theta of the transition time.
+    samples : (n,)
+    knots : (N + 2,)
+        Where the modes of the experiment begin and end.
+    side : -1 or 1
+    """
+    i = int(np.flatnonzero(problem.unknowns.times[e] == k)[0]) + 1
+    neighbour = knots[min(i + 1, len(knots) - 1)] if side > 0 else knots[i - 1]
+    limit = min(neighbour, upper[k]) if side > 0 else max(neighbour, lower[k])
+    near = AT_SAMPLE * (knots[-1] - knots[0])
+    ahead = samples[(side * (samples - theta[k]) > near) & (side * (samples - limit) < 0)]
+    return [*ahead[::side][:MOST_PIECES].tolist(), float(limit)]
+
+
+def trace_profile(
+    evaluate: Callable[[FloatArray, int], Any],
+    theta: FloatArray,
+    cost: float,
+    k: int,
+    free: Any,
+    stops: Sequence[float],
+    lower: FloatArray,
+    upper: FloatArray,
+    side: int,
+) -> Iterator[Piece]:
+    """Yield the pieces of the profile of theta[k] from the estimate to one side, with an evaluation each.
+
+    Parameters
+    ----------
+    evaluate : callable
+        ``evaluate(theta, side)`` returns cost, gradient and hessian, to that side of breakpoints.
+    theta, lower, upper : (d,)
+    cost : float
+        J at theta.
+    k : int
+    free : (d,) bool
+        Unknowns that follow.
+    stops : sequence of float
+        Where one piece ends and the next begins.
+    side : -1 or 1
+    """
+    theta = theta.copy()
+    for stop in stops:
+        here, slope, curvature, (newton, follow) = _profile_at(evaluate(theta, side), k, free)
+        yield Piece(float(theta[k]), stop, here - cost, side * slope, curvature)
+        theta[free] -= newton + follow * (stop - theta[k])
+        theta = np.clip(theta, lower, upper)
         theta[k] = stop
-    return float(theta[k] + side * reach)
 
 
-def _limit(fit: Fit, problem: Problem, e: int, k: int, side: int) -> float:
-    """Return how far a transition time may move alone: to its bound or to its neighbour."""
-    times = fit.transition_times[e]
-    i = int(np.flatnonzero(problem.unknowns.times[e] == k)[0])
-    span = fit.trajectories[e].times
-    if side > 0:
-        neighbour = times[i + 1] if i + 1 < len(times) else span[-1]
-        return float(min(neighbour, fit.upper[k]))
-    return float(max(times[i - 1] if i else span[0], fit.lower[k]))
+def find_end(pieces: Iterable[Piece], threshold: float, side: int) -> float:
+    """Return where a profile reaches a threshold above the estimate; where the last piece ends if it does not."""
+    end = np.nan
+    for piece in pieces:
+        if piece.rise >= threshold:
+            return piece.start
+        reach = _first_root(threshold - piece.rise, piece.slope, piece.curvature)
+        length = side * (piece.stop - piece.start)
+        if reach <= length:
+            return piece.start + side * reach
+        end = piece.stop
+    return end
 
 
 def _profile_at(at: Any, k: int, free: Any) -> tuple[float, float, float, tuple[FloatArray, FloatArray]]:

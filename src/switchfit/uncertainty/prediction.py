@@ -1,12 +1,12 @@
-"""Bands of the fitted trajectory: how far states and outputs may lie from it, and where the next sample would fall.
+"""Confidence bands of the fitted states and outputs, and prediction bands of new samples.
 
-By the delta method: with X the exact derivative of a state or an output in theta at time t and C the covariance of
-theta, its standard error is sqrt(X C X'), and sqrt(X C X' + sigma^2) that of a new sample there ([1]_). The bands hold
-at each time by itself, not for the whole curve at once.
+They follow from the delta method: with X the exact derivative of a state or an output in theta at time t and C the
+covariance of theta, its standard error is sqrt(X C X'), and that of a new sample is sqrt(X C X' + sigma^2) ([1]_). The
+bands hold at each time separately, not for the whole curve at once.
 
 At a transition X jumps (see `switchfit.uncertainty.sensitivity`): just before it the state does not depend on that
-transition time, just after it does. The linear approximation takes the mode that is active in the fit as the mode that
-is active, which within two standard errors of a transition time it need not be: `near_transition` says where that is.
+transition time, just after it does. The linear approximation assumes that the active mode is that of the fit, which may
+be wrong within two standard errors of a transition time: `near_transition` marks these times.
 
 References
 ----------
@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.discretization.mesh import Mesh
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
@@ -31,7 +30,7 @@ from switchfit.problem.validation import as_array, as_index
 from switchfit.uncertainty.sensitivity import Points, Sensitivity, compute_sensitivity
 
 NEAR = 2.0
-"""Standard errors of a transition time within which a band is not to be trusted."""
+"""Distance from a transition time, in its standard errors, within which a band is unreliable."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,15 +42,15 @@ class Prediction:
     times : (K,) array, in `time_unit`
     states, state_errors : (K, n)
     outputs, output_errors : (K, q)
-        What the reference signals see, then the Measurements; their standard errors.
+        Outputs of the reference signals, then of the Measurements; their standard errors.
     noise : (K, q)
-        Standard deviation of one sample: sigma (of the sample nearest in time, where it differs), or where that is
-        unknown the root of the residual variance; NaN for reference signals.
+        Standard deviation of one sample: sigma (that of the sample nearest in time, if it varies); if sigma is unknown,
+        the root of the residual variance; NaN for reference signals.
     state_names, state_units, output_names : tuple of str
     time_unit : str
-        That of the experiment.
+        Unit of the experiment's times.
     near_transition : (K,) bool
-        Within two standard errors of a transition time: the bands take no account of the other mode there.
+        Whether a time is within two standard errors of a transition time, where the bands ignore the other mode.
     fit : Fit
 
     See Also
@@ -126,7 +125,7 @@ class Prediction:
         return _build_band(self.outputs, self.fit.quantile(level) * self.output_errors)
 
     def prediction_band(self, level: float = 0.95) -> FloatArray:
-        """Return where a new sample would fall at each time, noise included: (K, q, 2).
+        """Return the prediction band of a new sample at each time, noise included: (K, q, 2).
 
         See Also
         --------
@@ -157,10 +156,10 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
     ----------
     estimate : Estimate
     times : (K,) array_like, optional
-        In any order, inside [t0, tf], in the experiment's time unit, at samples or between them; at a transition what
-        is just before it. Left out, all nodes of the mesh, each transition twice: with the state before and after it.
+        In any order, inside [t0, tf], in the experiment's time unit; at a transition, values are those just before it.
+        If left out, all nodes of the mesh, each transition twice: with the state before and after it.
     experiment : int, optional
-        Which experiment, from 0.
+        Index of the experiment, from 0.
 
     Returns
     -------
@@ -169,7 +168,7 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
     Raises
     ------
     TypeError
-        If this is no estimate, or an argument is of the wrong type.
+        If `estimate` is not an estimate, or an argument is of the wrong type.
     ValueError
         For times outside the horizon, an experiment that does not exist, or an estimate without a problem or without
         a covariance.
@@ -201,7 +200,7 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
         points = estimate.sensitivities[experiment].nodes
     else:
         asked = _check_times(times, problem, experiment, fit.trajectories[experiment])
-        mesh = Mesh.from_times(np.concatenate([evaluator.meshes[experiment].times, asked]))
+        mesh = evaluator.meshes[experiment].insert(asked)
         found: Sensitivity = compute_sensitivity(problem, experiment, fit.theta, mesh)
         points = found.at(asked)
     return _build_prediction(fit, problem, experiment, points)
@@ -211,8 +210,8 @@ def _build_prediction(fit: Fit, problem: Problem, e: int, points: Points) -> Pre
     covariance = fit.covariance
     if not np.isfinite(covariance).all():
         raise ValueError(
-            "There are no bands without a covariance: the cost must be made of Measurements alone, with more values "
-            "than unknowns, and the Hessian positive definite. The report says what is missing."
+            "There are no bands without a covariance: the cost must consist of Measurements alone, with more values "
+            "than unknowns, and the Hessian must be positive definite. The report says what is missing."
         )
     trajectory = fit.trajectories[e]
     names = [name for comparison in fit.comparisons[e] for name in comparison.names]
@@ -243,7 +242,7 @@ def _get_noise(fit: Fit, problem: Problem, e: int, times: FloatArray) -> FloatAr
     columns = [np.full((len(times), q), np.nan) for _, q in problem.structures[e].references]
     for item, comparison in zip(_list_compared(problem, e), fit.comparisons[e], strict=True):
         if isinstance(item, Measurements):
-            # Weights are 1 where sigma is unknown; a known one beside an unknown one is scaled like it.
+            # Weights are 1 where sigma is unknown; a known sigma is scaled in the same way if another is unknown.
             unknown = 1.0 if fit.sigma_known else np.sqrt(fit.residual_variance)
             sigma = np.broadcast_to(1.0 if comparison.sigma is None else comparison.sigma, item.values.shape) * unknown
             columns.append(sigma[np.abs(times[:, None] - item.times[None]).argmin(1)])

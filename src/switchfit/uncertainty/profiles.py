@@ -1,4 +1,4 @@
-"""Profile likelihoods: how much worse the fit becomes when one unknown is held and all others are fitted again.
+"""Profile likelihoods: the cost as a function of one unknown, with all others fitted again.
 
 With J_p(v) the smallest cost at theta_k = v, the signed root of the likelihood ratio,
 
@@ -6,11 +6,12 @@ With J_p(v) the smallest cost at theta_k = v, the signed root of the likelihood 
 
 is standard normal at the true value to first order, Student's t with n - d degrees of freedom where sigma is unknown,
 so that ``|zeta| <= quantile`` is a confidence region ([1]_, [2]_). For a linear model zeta is the straight line
-``(v - theta_k) / standard error``, and the region is the quadratic interval. How much it bends is how wrong that is.
+``(v - theta_k) / standard error``, and the region is the quadratic interval. The curvature of zeta shows the error of
+that interval.
 
-zeta is what everything here works with: near linear, it tells how long the next step has to be, and where it crosses
-the quantile is found in a few more evaluations. An evaluation is one more fit, begun where the neighbouring one ended,
-with the unknown's lower and upper bound set to v: the program is the one the fit was made with.
+All computations here use zeta. It is nearly linear, so that it predicts the next step, and its crossing of the quantile
+is found in a few more evaluations. An evaluation is one more fit, started at the result of a neighboring one, with the
+unknown's lower and upper bound set to v; it uses the compiled program of the original fit.
 
 References
 ----------
@@ -50,24 +51,24 @@ End = Literal["crossed", "limit", "flat", "failed", "stopped"]
 STEPS = 5
 """Points between the estimate and the crossing of the threshold, on each side."""
 BEYOND = 1.15
-"""The march goes on until zeta is this many times the threshold ..."""
+"""The march continues until zeta is this many times the threshold ..."""
 LOOK_AHEAD = 3
-"""... and then looks this many times further out, each time twice as far, for a second region; as many times more while
-the cost falls on the way."""
+"""... and then adds this many points for a second region, each twice as far out as the one before; twice as many while
+the cost falls outwards."""
 MOST_POINTS = 60
-"""On one side."""
+"""Largest number of points on one side."""
 LONGEST_GROWTH = 2.5
-"""Factor by which a step may be longer than the one before."""
+"""Largest ratio of a step to the one before."""
 FAR = 1e2
-"""A side is flat if nothing is crossed up to this many times the unknown's size or its standard error."""
+"""A side is flat if the threshold is not crossed up to this many times the unknown's size or its standard error."""
 HALVINGS = 8
-"""Times a step is halved where the fit does not succeed."""
+"""Largest number of times that a step is reduced because a fit fails or zeta rises too much."""
 LARGE_ERROR = 1e-2
-"""Error of zeta^2 by the integration, as a part of the threshold, above which the mesh is refined."""
+"""Integration error of zeta^2, as a part of the threshold, above which the mesh is refined."""
 MOST_KINKS = 10
-"""Sample times at which a profile is evaluated, to show the kinks there."""
+"""Largest number of sample times at which a profile is evaluated, to show the kinks there."""
 ITERATIONS = 100
-"""Most of one fit along the profile."""
+"""Largest number of iterations of one fit along the profile."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,20 +83,20 @@ class Point:
 
 
 class Trace:
-    """The points of a profile, and how more are made.
+    """The points of a profile; it adds points where they are needed.
 
     Attributes
     ----------
     points : list of Point
-        Ascending in value; the estimate's own among them.
+        Ascending in value, the estimate among them.
     ends : dict
         How the march to the lower (-1) and to the upper (+1) side ended.
     jumps : list of float
-        Where the threshold was crossed by a jump: the minimum of the others that was followed ends there.
+        Values at which the threshold was crossed by a jump: the minimum in the other unknowns ends there.
     interrupted : bool
-        No more is done.
+        Whether the profile was interrupted: no more points are added.
     coarse : bool
-        The mesh is too coarse at the ends.
+        Whether the mesh is too coarse at the ends.
     """
 
     def __init__(self, fit: Fit, evaluator: Evaluator, index: int) -> None:
@@ -107,13 +108,13 @@ class Trace:
         self.points = [self.centre]
         self.ends: dict[int, End] = {}
         self.fits = 0
-        self.limits = {side: self._limit(side) for side in (-1, 1)}
+        self.limits = {side: self._find_limit(side) for side in (-1, 1)}
         self.interrupted = False
         self.jumps: list[float] = []
         self.coarse = False
         self.should_stop: Callable[[], bool] = lambda: False
 
-    # --- what the points say
+    # --- properties of points
 
     def zeta(self, point: Point) -> float:
         """Return the signed root of the likelihood ratio; 0 where the cost is below that of the estimate."""
@@ -127,13 +128,13 @@ class Trace:
 
     @property
     def best(self) -> Point:
-        """The lowest of all."""
+        """The point with the lowest cost."""
         return min(self.points, key=lambda q: q.cost)
 
-    # --- making points
+    # --- adding points
 
-    def _limit(self, side: int) -> float:
-        """Return how far the constraints let the unknown go."""
+    def _find_limit(self, side: int) -> float:
+        """Return the limit that the constraints set to the unknown on one side."""
         k, c = self.index, self.constraints
         coupled = np.flatnonzero(np.any(c.A != 0, axis=0))
         if k not in coupled:
@@ -141,12 +142,12 @@ class Trace:
         objective = np.where(coupled == k, -float(side), 0.0)
         bounds = np.stack([c.lower, c.upper], axis=1)[coupled]
         found = linprog(objective, -c.A[:, coupled], -c.b, bounds=bounds)
-        # The centre is feasible; rounding of the programme must not put a limit on the wrong side of it.
+        # The centre is feasible; rounding of the linear program must not put a limit on the wrong side of it.
         return side * max(side * float(found.x[coupled == k][0]), side * float(self.fit.theta[k]))
 
-    def _feasible(self, target: FloatArray, inside: FloatArray) -> FloatArray | None:
-        """Return the feasible point nearest to `target` with its value of the unknown, from one that is feasible
-        without it.
+    def _find_feasible(self, target: FloatArray, inside: FloatArray) -> FloatArray | None:
+        """Return the feasible point nearest to `target` with the same value of the unknown, given a feasible point
+        `inside` with another value.
 
         None if no point is feasible, which rounding may cause at a limit.
         """
@@ -156,10 +157,10 @@ class Trace:
         moved[k] = value
         if np.all(c.A @ moved >= c.b):
             return moved
-        # What the unknown pushes away moves just as far as it has to: a programme in the others from a point that lies
-        # on the way from the inside to the end of what is allowed, which is feasible since the constraints are convex.
+        # Other unknowns move only as far as the constraints force them: a quadratic program in them, which starts on
+        # the line from `inside` to a feasible point at the limit. It is feasible since the constraints are convex.
         side = 1 if value > inside[k] else -1
-        extreme = self._extreme(side, inside)
+        extreme = self._find_extreme(side, inside)
         span = extreme[k] - inside[k]
         start = inside + (0.0 if span == 0 else (value - inside[k]) / span) * (extreme - inside)
         start[k] = value
@@ -174,8 +175,8 @@ class Trace:
         violated = c.A @ start - c.b
         return start if np.all(violated >= -1e-9 * (1 + np.abs(c.b))) else None
 
-    def _extreme(self, side: int, inside: FloatArray) -> FloatArray:
-        """Return a feasible point at the limit; unknowns that no constraint couples with this one stay."""
+    def _find_extreme(self, side: int, inside: FloatArray) -> FloatArray:
+        """Return a feasible point at the limit; unknowns that no constraint couples with this one are unchanged."""
         c = self.constraints
         coupled = np.flatnonzero(np.any(c.A != 0, axis=0))
         objective = np.where(coupled == self.index, -float(side), 0.0)
@@ -185,7 +186,7 @@ class Trace:
         return found
 
     def _fit(self, value: float, start: FloatArray) -> Point | None:
-        """Return the point at `value`, fitted from `start`; None where that fails."""
+        """Return the point at `value`, fitted from `start`; None if the fit fails."""
         lower, upper = self.constraints.lower.copy(), self.constraints.upper.copy()
         lower[self.index] = upper[self.index] = value
         held = replace(self.constraints, lower=lower, upper=upper)
@@ -199,13 +200,13 @@ class Trace:
             raise KeyboardInterrupt
         if not np.isfinite(result.cost):
             return None
-        # The others are optimal: their change contributes nothing to the derivative.
+        # The other unknowns are optimal, so that they contribute nothing to the derivative.
         slope = float(result.gradient[self.index])
         good = result.status.successful
         return Point(value, result.cost, slope, result.theta, good)
 
     def add(self, value: float, near: Point, before: Point | None = None) -> Point | None:
-        """Return a new point, from a neighbour or along the line through two of them; None where no fit succeeds."""
+        """Add a point, fitted from a neighbor or from the line through two neighbors; None if all fits fail."""
         k = self.index
         starts = []
         if before is not None and before.value != near.value:
@@ -215,22 +216,20 @@ class Trace:
         best: Point | None = None
         for start in starts:
             start[k] = value
-            feasible = self._feasible(start, near.theta)
+            feasible = self._find_feasible(start, near.theta)
             found = None if feasible is None else self._fit(value, feasible)
             if found is not None and (
                 best is None or (not found.converged, found.cost) < (not best.converged, best.cost)
             ):
                 best = found
-            if best is not None and best.converged and not self._suspicious(best, near):
+            if best is not None and best.converged and not self._is_suspicious(best, near):
                 break
         if best is not None:
             self._insert(best)
         return best
 
-    def _suspicious(self, point: Point, near: Point) -> bool:
-        """Return whether zeta has risen so much faster than a straight line that this may be another,
-        higher minimum.
-        """
+    def _is_suspicious(self, point: Point, near: Point) -> bool:
+        """Return whether zeta rose so much faster than a straight line that this may be another, higher minimum."""
         distance, reached = abs(point.value - self.centre.value), abs(near.value - self.centre.value)
         if reached > 0:
             expected = abs(self.zeta(near)) * distance / reached
@@ -245,7 +244,7 @@ class Trace:
     # --- marching
 
     def march(self, side: int, threshold: float) -> None:
-        """Add points on one side until zeta has crossed the threshold, or there is a reason why it will not."""
+        """Add points on one side until zeta has crossed the threshold, or cannot cross it."""
         if self.interrupted or self.ends.get(side) in ("limit", "flat", "failed"):
             return
         spacing = threshold / STEPS
@@ -253,7 +252,7 @@ class Trace:
         if len(points) > 1 and abs(self.zeta(points[-1])) >= BEYOND * threshold:
             self.ends[side] = "crossed"
             return
-        step = abs(points[-1].value - points[-2].value) if len(points) > 1 else self._first_step(side, spacing)
+        step = abs(points[-1].value - points[-2].value) if len(points) > 1 else self._choose_first_step(side, spacing)
         ahead = 0
         self.ends[side] = "stopped"
         for _ in range(MOST_POINTS):
@@ -261,20 +260,20 @@ class Trace:
             height = abs(self.zeta(last))
             if last.value == self.limits[side]:
                 self.ends[side] = "crossed" if abs(self.zeta(last)) >= threshold else "limit"
-                return self._dip(side)
+                return self._add_minima(side)
             if height >= BEYOND * threshold:
                 self.ends[side] = "crossed"
                 if ahead >= LOOK_AHEAD * (1 + (side * last.slope < 0)):
-                    return self._dip(side)
+                    return self._add_minima(side)
                 ahead += 1
                 step = abs(last.value - self.centre.value)
             elif abs(last.value - self.centre.value) > self._far:
                 self.ends[side] = "flat"
                 return
-            new = self._next(side, points, step, spacing, threshold, looking=ahead > 0)
+            new = self._add_next(side, points, step, spacing, threshold, looking=ahead > 0)
             if new is None:
                 self.ends[side] = "crossed" if height >= threshold else "failed"
-                return self._dip(side)
+                return self._add_minima(side)
             if new.cost < last.cost - 1e-9 * abs(last.cost):
                 self._sweep_inward(side)
             points = self.side(side)
@@ -283,10 +282,10 @@ class Trace:
             step = abs(new.value - last.value) * float(np.clip(growth, 0.4, LONGEST_GROWTH))
         self.ends[side] = "flat" if self.ends[side] == "stopped" else self.ends[side]
 
-    def _next(
+    def _add_next(
         self, side: int, points: list[Point], step: float, spacing: float, threshold: float, *, looking: bool
     ) -> Point | None:
-        """Return the next point outwards, nearer where a fit fails or zeta rises too much at once."""
+        """Return the next point outwards; the step is shortened if a fit fails or zeta rises too much."""
         last = points[-1]
         before = points[-2] if len(points) > 1 else self._along_covariance(last)
         limit = self.limits[side]
@@ -317,15 +316,15 @@ class Trace:
         return None
 
     def _fill(self, inner: Point, outer: Point, spacing: float) -> None:
-        """Add points between two, evenly in zeta as far as a straight line tells."""
+        """Add points between two, evenly spaced in zeta if zeta is linear."""
         count = int(abs(self.zeta(outer) - self.zeta(inner)) / spacing)
         previous: Point = inner
         for part in np.arange(1, count) / count:
             found = self.add(inner.value + float(part) * (outer.value - inner.value), previous)
             previous = found if found is not None else previous
 
-    def _dip(self, side: int) -> None:
-        """Add points at minima that the slopes tell of between points far apart."""
+    def _add_minima(self, side: int) -> None:
+        """Add points at minima between points far apart, where the slopes show one."""
         points = self.side(side)[1:]
         for inner, outer in pairwise(points):
             if side * inner.slope < 0 < side * outer.slope:
@@ -341,12 +340,12 @@ class Trace:
                 )
 
     def _sweep_inward(self, side: int) -> None:
-        """Follow a branch that is lower further out back in, where it may be lower as well."""
+        """Follow a branch of lower cost from its outer end inwards, as long as it remains lower."""
         outer, *inward = self.side(side)[:0:-1]
         for inner in inward:
             start = outer.theta.copy()
             start[self.index] = inner.value
-            feasible = self._feasible(start, outer.theta)
+            feasible = self._find_feasible(start, outer.theta)
             found = None if feasible is None else self._fit(inner.value, feasible)
             if found is None or not found.converged or found.cost >= inner.cost - 1e-9 * abs(inner.cost):
                 return
@@ -354,16 +353,16 @@ class Trace:
             outer = found
 
     def _along_covariance(self, centre: Point) -> Point | None:
-        """Return a second point on the tangent of the path of the others at the estimate: theta moves along C e_k."""
+        """Return a second point on the tangent of the profile's path at the estimate: theta moves along C e_k."""
         column = self.fit.covariance[:, self.index]
         if not (np.isfinite(column).all() and column[self.index] > 0):
             return None
         theta = centre.theta - column / column[self.index]
         return Point(float(theta[self.index]), np.nan, np.nan, theta, True)
 
-    def _first_step(self, side: int, spacing: float) -> float:
-        """Return a length after which zeta should be the spacing: by the standard error; at a kink or a bound by the
-        slope.
+    def _choose_first_step(self, side: int, spacing: float) -> float:
+        """Return the step after which zeta should equal the spacing: from the standard error, or at a kink or a bound
+        from the slope.
         """
         k, size = self.index, self._size
         error = self.fit.standard_errors[k]
@@ -375,7 +374,7 @@ class Trace:
 
     @property
     def _size(self) -> float:
-        """A length of the unknown's own: what is allowed, or its value."""
+        """Typical size of the unknown: its feasible range, or its value."""
         span = self.limits[1] - self.limits[-1]
         return float(span if np.isfinite(span) else abs(self.centre.value) or 1.0)
 
@@ -384,16 +383,16 @@ class Trace:
         error = self.fit.standard_errors[self.index]
         return FAR * max(abs(self.centre.value) or 1.0, float(error) if np.isfinite(error) else 0.0)
 
-    # --- where it crosses
+    # --- crossings of the threshold
 
     def find_crossing(self, a: Point, b: Point, threshold: float) -> float:
-        """Return where |zeta| is the threshold between two neighbouring points on different sides of it."""
+        """Return where |zeta| equals the threshold, between two neighboring points on different sides of it."""
         found = {a.value: a, b.value: b}
         inner = min((a, b), key=lambda q: abs(q.value - self.centre.value))
 
         def excess(value: float) -> float:
             point = found.get(value) or self.add(value, min(found.values(), key=lambda q: abs(q.value - value)))
-            if point is None:  # as if it were at the nearest one that could be fitted
+            if point is None:  # use the nearest point that could be fitted
                 point = min(found.values(), key=lambda q: abs(q.value - value))
             found[value] = point
             return abs(self.zeta(point)) - threshold
@@ -408,7 +407,7 @@ class Trace:
         """Return all intervals found in which |zeta| is at most the threshold, ascending; open ends are infinite."""
         points = list(self.points)
         inside = [abs(self.zeta(q)) <= threshold for q in points]
-        low = self._open_end(-1) if inside[0] else None
+        low = self._get_open_end(-1) if inside[0] else None
         found: list[tuple[float, float]] = []
         for a, b, a_in, b_in in zip(points[:-1], points[1:], inside[:-1], inside[1:], strict=True):
             if a_in != b_in:
@@ -418,10 +417,10 @@ class Trace:
                 elif low is not None:
                     found.append((low, edge))
                     low = None
-        return found if low is None else [*found, (low, self._open_end(1))]
+        return found if low is None else [*found, (low, self._get_open_end(1))]
 
-    def _open_end(self, side: int) -> float:
-        """Return where a region ends that was not left on this side."""
+    def _get_open_end(self, side: int) -> float:
+        """Return the end of a region on a side where the threshold was not crossed."""
         end, last = self.ends.get(side, "stopped"), self.side(side)[-1].value
         if end in ("limit", "crossed"):
             return last
@@ -433,9 +432,7 @@ class Trace:
         return [next((q for q in points if abs(self.zeta(q)) >= threshold), points[-1]) for points in sides]
 
     def integration_error(self, threshold: float) -> float:
-        """Return the largest error of zeta^2 by the integration where it crosses the threshold, by
-        halving all steps.
-        """
+        """Return the largest integration error of zeta^2 at the edges of the threshold, by halving all steps."""
         fine = self.evaluator.halved
         base = fine.cost(self.centre.theta) - self.centre.cost
         ends = self.edges(threshold)
@@ -453,7 +450,7 @@ class Trace:
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Profile likelihood of one unknown; print it, plot it, ask it for intervals at any level.
+    """Profile likelihood of one unknown: print it, plot it, or get intervals at any level.
 
     Attributes
     ----------
@@ -461,14 +458,14 @@ class Profile:
     value : float
         The estimate.
     standard_error : float
-        From the exact Hessian; 0 where it is held, NaN where it is not known.
+        Standard error from the exact Hessian; 0 if the unknown is held, NaN if it is not known.
     level : float
-        Up to which the profile was followed.
+        Confidence level up to which the profile was followed.
     fit : Fit
     sample_times : (K,)
         For a transition time the sample times of its run, where the slope of the profile may jump; empty otherwise.
     trace : Trace
-        The points, and how more are made.
+        The points; it adds more when needed.
 
     See Also
     --------
@@ -496,7 +493,7 @@ class Profile:
 
     @property
     def values(self) -> FloatArray:
-        """At which the unknown was held, ascending: (P,)."""
+        """Values at which the unknown was held, ascending: (P,)."""
         return np.array([q.value for q in self.trace.points])
 
     @property
@@ -523,15 +520,15 @@ class Profile:
     def ends(self) -> tuple[str, str]:
         """How the lower and the upper side ended.
 
-        "crossed": the threshold was crossed; "limit": a bound, or the order of the transition times, came first;
-        "flat": the cost does not rise, not identifiable on this side; "failed": no fit succeeded further out;
-        "stopped": interrupted.
+        "crossed": the threshold was crossed; "limit": a bound or the order of the transition times was reached before;
+        "flat": the cost does not rise, the unknown is not identifiable on this side; "failed": all fits further out
+        failed; "stopped": interrupted.
         """
         return self.trace.ends.get(-1, "stopped"), self.trace.ends.get(1, "stopped")
 
     @property
     def lower_cost(self) -> FloatArray | None:
-        """Unknowns (d,) with a cost below that of the estimate, if any were found; begin a fit there."""
+        """Unknowns (d,) with a cost below that of the estimate, if any were found: start a new fit there."""
         best = self.trace.best
         better = best.cost < self.trace.centre.cost - 1e-6 * self.trace.scale
         return best.theta.copy() if better else None
@@ -542,13 +539,13 @@ class Profile:
         Parameters
         ----------
         level : float, optional
-            Between 0 and 1; that of the profile if left out. The profile is followed further where it has to be.
+            Between 0 and 1; that of the profile if left out. The profile is followed further if necessary.
 
         Returns
         -------
         list of (low, high)
-            Where a side ends before the threshold is crossed, its end is the limit that the constraints set, infinite
-            where the cost does not rise, NaN where it could not be followed.
+            If the threshold is not crossed on a side, the end is the limit that the constraints set, infinite if the
+            cost does not rise, or NaN if the profile could not be followed.
 
         See Also
         --------
@@ -577,7 +574,7 @@ class Profile:
         Parameters
         ----------
         level : float, optional
-            As of `regions`.
+            As in `regions`.
 
         See Also
         --------
@@ -602,7 +599,7 @@ class Profile:
         return format_html(self)
 
     def plot(self) -> Figure:
-        """Draw the likelihood ratio with its thresholds, and the quadratic approximation beside it.
+        """Draw the likelihood ratio with its thresholds, and the quadratic approximation.
 
         See Also
         --------
@@ -627,14 +624,14 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     Parameters
     ----------
     estimate : Estimate
-        Of a cost that is made of `Measurements` alone.
+        Its cost must consist of `Measurements` alone.
     name : str
         One of ``estimate.theta_names``.
     level : float, between 0 and 1
-        Confidence level up to which the profile is followed; it is followed further when asked for a higher one.
+        Confidence level up to which the profile is followed; requests for a higher level continue it.
     callback : callable, optional
-        ``callback(done, total)`` after each fit, the total a guess; a true return value stops. Ctrl-C does as well;
-        what is done is returned.
+        ``callback(done, total)`` after each fit, where the total is a guess; a true return value stops, and so does
+        Ctrl-C. The points computed so far are returned.
 
     Returns
     -------
@@ -643,15 +640,15 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     Raises
     ------
     TypeError
-        If this is no estimate, or an argument is of the wrong type.
+        If `estimate` is not an estimate, or an argument is of the wrong type.
     ValueError
         For an unknown that is not in theta, an estimate that has no problem, did not converge or has no noise model,
         and for a problem with guards or terminal constraints.
 
     Notes
     -----
-    Costs some twenty warm-started fits and compiles nothing, unless the mesh of the fit turns out too coarse at the
-    ends of the profile.
+    Takes about twenty warm-started fits and compiles nothing, unless the mesh of the fit is too coarse at the ends of
+    the profile.
 
     See Also
     --------
@@ -670,7 +667,7 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     if not isinstance(fit, Fit):
         raise TypeError(f"profile needs the result of sf.estimate; got {type(fit).__name__}. Fit the problem first.")
     if as_name(name, "name") not in fit.theta_names:
-        raise ValueError(f"there is no unknown {shorten(name)}; there are {join_names(fit.theta_names)}.")
+        raise ValueError(f"there is no unknown {shorten(name)}; the unknowns are {join_names(fit.theta_names)}.")
     level = as_level(level)
     if callback is not None:
         as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
@@ -678,7 +675,7 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     _check(fit)
     threshold = fit.quantile(level)
     index = fit.theta_names.index(name)
-    times = _sample_times(evaluator, index)
+    times = _list_sample_times(evaluator, index)
     report, end = show_progress(callback, f"Profile of {name}")
     trace = Trace(fit, evaluator, index)
     try:
@@ -704,9 +701,7 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
 
 
 def _refine_mesh(problem: Problem, trace: Trace, threshold: float) -> Evaluator | None:
-    """Return the problem on meshes that resolve both ends of a profile as well; None where these cannot
-    be integrated.
-    """
+    """Return the problem on meshes that resolve both ends of a profile too; None if these cannot be integrated."""
     thetas = [trace.centre.theta, *(q.theta for q in trace.edges(threshold))]
     try:
         meshes = [refine_mesh(problem, e, *thetas, finer=2.0) for e in range(len(problem.experiments))]
@@ -716,7 +711,7 @@ def _refine_mesh(problem: Problem, trace: Trace, threshold: float) -> Evaluator 
 
 
 def _wrap_callback(report: Progress, trace: Trace) -> bool:
-    """Tell how many fits are done, of as many as a profile usually takes; whether to stop."""
+    """Report how many fits are done, of as many as a profile usually takes; return whether to stop."""
     return bool(report(trace.fits, max(2 * (STEPS + LOOK_AHEAD + 2), trace.fits)))
 
 
@@ -725,17 +720,19 @@ def _check(fit: Fit) -> None:
         raise ValueError(f"a profile begins at a minimum, and this fit has not found one: {fit.message}")
     if fit.constraints:
         raise ValueError(
-            "a profile knows no guards and no terminal constraints, without which its intervals would be too wide: "
-            "take confidence_intervals or sf.monte_carlo."
+            "a profile does not support guards and terminal constraints, without which its intervals would be too "
+            "wide: use confidence_intervals or sf.monte_carlo."
         )
     if fit.sigma_known is None:
-        raise ValueError("a profile needs a noise model: a cost made of Measurements alone, with sigma or without.")
+        raise ValueError("a profile needs a noise model: a cost of Measurements alone, with or without sigma.")
     if fit.sigma_known is False and fit.freedom < 1:
-        raise ValueError(f"sigma is unknown and {fit.samples} values are too few to estimate it beside the unknowns.")
+        raise ValueError(
+            f"sigma is unknown and {fit.samples} values are too few to estimate it along with the unknowns."
+        )
 
 
-def _sample_times(evaluator: Evaluator, index: int) -> FloatArray:
-    """Return sample times of the run whose transition time this unknown is; none for a parameter."""
+def _list_sample_times(evaluator: Evaluator, index: int) -> FloatArray:
+    """Return the sample times of the run of which this unknown is a transition time; empty for a parameter."""
     problem = evaluator.problem
     for experiment, where in zip(problem.experiments, problem.unknowns.times, strict=True):
         if index in where:

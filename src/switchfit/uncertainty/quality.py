@@ -1,12 +1,12 @@
-"""How well a fit explains its data: shares of the variance channel by channel, and chi-square where sigma is known.
+"""How well a fit explains its data: share of the variance of each channel, and chi-square if sigma is known.
 
 - explained share (R²) of a channel: ``1 - sum r² / sum (y - mean)²`` over its samples that are not missing; for a
-  reference signal the sums are integrals over time, and channels of no weight are left out. Where measurements do not
+  reference signal the sums are integrals over time, and channels of weight zero are left out. If measurements do not
   vary, the sum in the denominator is that of y² itself, so that ``1 - share`` is the square of the relative root mean
-  square of the residuals (NRMSE); of a reference that is constant there is nothing to explain.
-- samples that a robust loss counts as outliers are left out, unless they are more than half: then it is the fit
-  that is far from the samples, not the samples that are outliers.
-- chi-square: 2 J where all sigmas are known numbers, with `Fit.freedom` degrees of freedom.
+  square of the residuals (NRMSE); a constant reference has no variance to explain.
+- samples that a robust loss treats as outliers are left out, unless they are more than half of all: the fit is then
+  wrong, not the samples.
+- chi-square: 2 J if all sigmas are known numbers, with `Fit.freedom` degrees of freedom.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from switchfit.problem.data import FloatArray
 from switchfit.uncertainty.residuals import ResidualDiagnostics, diagnose
 
 NO_VARIATION = 1e-9
-"""Standard deviation of a channel, as a part of its largest value, below which it counts as constant: rounding."""
+"""Standard deviation of a channel, relative to its largest value, below which it counts as constant (rounding)."""
 
 MOST_OUTLIERS = 0.5
-"""Share of outliers from which they are no outliers: with the usual scales of 1.3 to 3 sigma normal noise has up to a
-fifth beyond, and logs with a tenth of real outliers have been seen to have a third."""
+"""Share from which samples beyond the loss scale do not count as outliers: with the usual scales of 1.3 to 3 sigma, up
+to a fifth of normal noise is beyond it, and in logs with a tenth of real outliers a third has been observed."""
 
 
 @dataclass(frozen=True)
@@ -36,24 +36,26 @@ class ChannelQuality:
     Attributes
     ----------
     label : str
-        Its name, with that of the experiment where there are several.
+        Its name, with that of the experiment if there are several.
+    experiment : int, from 0
     kind : "measurements" or "reference"
     count : int
-        Values that are not missing.
+        Number of values that are not missing.
     explained : float
         Share of the variance that the model explains, at most 1; negative if a constant would fit better. NaN for a
         channel that is 0 throughout, and for a constant reference.
     chi_square : float
-        Sum of the squared residuals over sigma; NaN where sigma is unknown.
+        Sum of the squared residuals over sigma; NaN if sigma is unknown.
     whiteness : float
         Probability of the residuals' correlation if they are white; NaN for fewer than 20, and for a reference signal.
     correlated : bool
-        Whether neighbouring residuals are alike, see `ResidualDiagnostics.correlated`.
+        Whether the residuals are correlated, see `ResidualDiagnostics.correlated`.
     outliers : float
-        Share of the values that a robust loss counts as outliers; 0 without such a loss.
+        Share of the values that a robust loss treats as outliers; 0 without such a loss.
     """
 
     label: str
+    experiment: int
     kind: str
     count: int
     explained: float
@@ -75,12 +77,12 @@ class Quality:
     Attributes
     ----------
     channels : tuple of ChannelQuality
-        Those with values.
+        Channels with values.
     explained : float
-        Of all of them together: ``1 - sum (r / sigma)² / sum ((y - mean) / sigma)²``, sigma being 1 where it is
-        unknown. NaN without data.
+        Share of the variance of all channels: ``1 - sum (r / sigma)² / sum ((y - mean) / sigma)²``, where an unknown
+        sigma is 1. NaN without data.
     chi_square : float
-        2 J; NaN where sigma is not known as a number for all samples, or a loss is robust.
+        2 J; NaN if sigma is not a known number for all samples, or a loss is robust.
     freedom : int
     residuals : ResidualDiagnostics
     """
@@ -93,7 +95,7 @@ class Quality:
 
     @property
     def has_chi_square(self) -> bool:
-        """Whether there is a chi-square, with degrees of freedom left."""
+        """Whether chi-square is known and has degrees of freedom."""
         return bool(np.isfinite(self.chi_square))
 
     @property
@@ -108,7 +110,7 @@ class Quality:
 
     @property
     def ratio(self) -> float:
-        """Reduced chi-square, near 1 where model and sigma are right; NaN without."""
+        """Reduced chi-square, near 1 if model and sigma are right; NaN without."""
         return self.chi_square / self.freedom if self.has_chi_square else np.nan
 
 
@@ -143,10 +145,11 @@ def measure_quality(fit: Fit) -> Quality:
                 channels.append(
                     ChannelQuality(
                         label=name if single else f"{fit.run_names[e]} {name}",
+                        experiment=e,
                         kind=comparison.kind,
                         count=int(np.isfinite(comparison.measured[:, k]).sum()),
                         explained=1 - squares / spread if spread > 0 else np.nan,
-                        chi_square=_chi_square(comparison, k),
+                        chi_square=_compute_chi_square(comparison, k),
                         whiteness=whiteness,
                         correlated=correlated,
                         outliers=_share_outliers(comparison, k),
@@ -163,13 +166,13 @@ def measure_quality(fit: Fit) -> Quality:
 
 
 def explain_channel(comparison: Comparison, k: int) -> float:
-    """Return the share of the variance of channel k that is explained; NaN where there is none.
+    """Return the share of the variance of channel k that is explained; NaN if its variance is zero.
 
     Parameters
     ----------
     comparison : Comparison
     k : int
-        Which channel, from 0.
+        Index of the channel, from 0.
     """
     if comparison.weights is not None and comparison.weights[k] == 0:
         return np.nan
@@ -178,8 +181,8 @@ def explain_channel(comparison: Comparison, k: int) -> float:
 
 
 def _sum_squares(comparison: Comparison, k: int) -> tuple[float, float, float]:
-    """Return the sums of squares of the residuals of a channel and of its values about their mean, and what both are
-    divided by where channels are added; NaN if the channel has no values.
+    """Return the sums of squares of the residuals of a channel and of its values about their mean, and the divisor of
+    both when channels are added; NaN if the channel has no values.
     """
     y, residual = comparison.measured[:, k], comparison.residuals[:, k]
     there = np.isfinite(residual)
@@ -187,7 +190,7 @@ def _sum_squares(comparison: Comparison, k: int) -> tuple[float, float, float]:
         there &= ~comparison.downweighted[:, k]
     if not there.any():
         return np.nan, np.nan, 1.0
-    weight = _weights(comparison)[there]
+    weight = _compute_weights(comparison)[there]
     y, residual = y[there], residual[there]
     size = 1.0
     if comparison.sigma is not None:
@@ -202,23 +205,23 @@ def _sum_squares(comparison: Comparison, k: int) -> tuple[float, float, float]:
 
 
 def _share_outliers(comparison: Comparison, k: int) -> float:
-    """Return the share of a channel's values that a robust loss counts as outliers."""
+    """Return the share of a channel's values that a robust loss treats as outliers."""
     there = np.isfinite(comparison.residuals[:, k])
     if comparison.downweighted is None or not there.any():
         return 0.0
     return float(comparison.downweighted[there, k].mean())
 
 
-def _weights(comparison: Comparison) -> FloatArray:
-    """Return what each row counts: 1 for a sample, the trapezoidal rule's weight for a node of a reference signal."""
+def _compute_weights(comparison: Comparison) -> FloatArray:
+    """Return the weight of each row: 1 for a sample, that of the trapezoidal rule for a node of a reference signal."""
     if comparison.kind == "measurements":
         return np.ones(len(comparison.times))
     steps = np.diff(comparison.times)
     return 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
 
 
-def _chi_square(comparison: Comparison, k: int) -> float:
-    """Return the sum of the squared residuals over sigma; NaN where sigma is unknown or a loss is robust."""
+def _compute_chi_square(comparison: Comparison, k: int) -> float:
+    """Return the sum of the squared residuals over sigma; NaN if sigma is unknown or a loss is robust."""
     if comparison.sigma is None or comparison.downweighted is not None:
         return np.nan
     residual = comparison.residuals[:, k]

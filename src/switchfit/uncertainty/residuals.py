@@ -1,14 +1,14 @@
-"""Do the residuals look like the noise they are taken for: white, normal, of the size that sigma says?
+"""Test whether residuals are like the assumed noise: white, normal, and of the size of sigma.
 
-Each channel by itself, in the order of its samples that are not missing; for samples at irregular times a lag counts
-samples. Standardised residuals are z = (measured - fitted) / sigma, or over their own root mean square where sigma is
-unknown.
+Each channel is tested by itself, in the order of its samples that are not missing. At irregular sample times, a lag
+counts samples. Standardized residuals are z = (measured - fitted) / sigma; if sigma is unknown, they are divided by
+their own root mean square.
 
 - whiteness: Ljung and Box's Q = n (n + 2) sum_k r_k^2 / (n - k) over the first h lags, chi-square with h degrees of
   freedom, h = min(10, n / 5) ([1]_, [2]_);
 - normality: Jarque and Bera's n / 6 (S^2 + (K - 3)^2 / 4), chi-square with 2 degrees of freedom ([3]_);
-- effective sample size: n (1 - r_1) / (1 + r_1), at most n: what n samples of a first-order autoregressive noise are
-  worth as independent ones.
+- effective sample size: n (1 - r_1) / (1 + r_1), at most n: the number of independent samples that are worth n samples
+  with first-order autoregressive noise.
 
 References
 ----------
@@ -32,15 +32,15 @@ from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text
 
 UNLIKELY = 1e-3
-"""Probability below which a test counts as failed: with ten channels one false alarm in fifty fits. Where it decides on
-the verdict it is shared among the channels: of 200 right runs, one in five fits would have a false alarm otherwise."""
+"""Probability below which a test counts as failed: with ten channels, one false alarm in fifty fits. For the verdict it
+is divided by the number of channels: with 200 correct runs, one in five fits would have a false alarm otherwise."""
 
 SERIOUS = 1.2
-"""Factor by which correlated residuals make standard errors too small from which the report speaks of it: a 95 %
-interval that is too narrow by it covers 90 %."""
+"""Factor by which correlated residuals make standard errors too small, above which the report mentions it: a 95 %
+interval that is too narrow by this factor covers 90 %."""
 
 FEWEST = 20
-"""Residuals that the tests need: below it the chi-square distributions are far from theirs."""
+"""Smallest number of residuals for the tests: with fewer, their statistics are far from chi-square."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +52,14 @@ class ChannelResiduals:
     experiment : int, from 0
     name : str
     times, values : (n,), (n,)
-        Sample times and standardised residuals of the samples that are not missing.
+        Sample times and standardized residuals of the samples that are not missing.
     time_unit : str
-        That of the experiment.
+        Unit of the experiment's times.
     sigma_known : bool
     mean : float
-        Of the standardised residuals; 1 / sqrt(n) is its standard deviation if they are white.
+        Mean of the standardized residuals; 1 / sqrt(n) is its standard deviation if they are white.
     rms : float
-        Of the standardised residuals: near 1 where sigma is right, 1 where it is unknown.
+        Root mean square of the standardized residuals: near 1 if sigma is right, 1 if it is unknown.
     lags : int
     autocorrelation : (lags,)
         At lags 1, 2, ...
@@ -71,7 +71,7 @@ class ChannelResiduals:
     effective : float
         Effective sample size.
     outliers : int
-        Residuals beyond four standard deviations; a thousandth of one is expected in 16 samples.
+        Number of residuals beyond four standard deviations; 0.001 are expected in 16 samples.
 
     See Also
     --------
@@ -107,28 +107,28 @@ class ChannelResiduals:
 
     @property
     def correlation(self) -> float:
-        """Correlation of neighbouring residuals, at lag 1; 0 if there are too few residuals."""
+        """Correlation of neighboring residuals, at lag 1; 0 if there are too few residuals."""
         return float(self.autocorrelation[0]) if self.lags else 0.0
 
     @property
     def white(self) -> bool:
-        """Whether the test of whiteness is passed (or there are too few to tell)."""
+        """Whether the test of whiteness is passed (or there are too few residuals to test)."""
         return not self.whiteness < UNLIKELY
 
     @property
     def normal(self) -> bool:
-        """Whether the test of normality is passed (or there are too few to tell)."""
+        """Whether the test of normality is passed (or there are too few residuals to test)."""
         return not self.normality < UNLIKELY
 
     @property
     def narrowing(self) -> float:
-        """Factor by which standard errors that take the residuals as independent are too small."""
+        """Factor by which standard errors that assume independent residuals are too small."""
         return float(np.sqrt(len(self.values) / self.effective))
 
     @property
     def widening(self) -> float:
-        """Factor that corrects standard errors for correlated residuals, and where these are larger than sigma for that
-        too; at least 1.
+        """Factor that corrects standard errors for correlated residuals, and for residuals larger than sigma; at least
+        1.
         """
         size = self.rms if self.sigma_known else 1.0
         return max(1.0, size * self.narrowing)
@@ -142,7 +142,7 @@ class ResidualDiagnostics:
     ----------
     channels : tuple of ChannelResiduals
     labels : tuple of str
-        Of each channel, with the experiment's name where there are several.
+        Name of each channel, with the experiment's name if there are several.
 
     See Also
     --------
@@ -168,16 +168,16 @@ class ResidualDiagnostics:
 
     @property
     def correlated(self) -> tuple[bool, ...]:
-        """Of which channels neighbouring residuals are alike, more than chance explains and by so much that it matters.
+        """Which channels have correlated residuals: beyond chance, and with an effect on standard errors that matters.
 
-        The chance is shared among the channels.
+        The probability of a false alarm is divided among the channels.
         """
         shared = UNLIKELY / max(len(self.channels), 1)
         return tuple(c.whiteness < shared and c.correlation > 0 and c.narrowing > SERIOUS for c in self.channels)
 
     @property
     def issues(self) -> list[Issue]:
-        """What fails: channels whose residuals are correlated, and channels whose residuals are not normal."""
+        """Failed tests: channels whose residuals are correlated, and channels whose residuals are not normal."""
         found = []
         named = list(zip(self.labels, self.channels, strict=True))
         tested = zip(named, self.correlated, strict=True)
@@ -246,8 +246,10 @@ def correct_intervals(fit: Fit, level: float = 0.95) -> FloatArray:
     """
     factors, found = measure_widening(fit)[:, None], fit.confidence_intervals(level)
     theta, log = fit.theta[:, None], np.isin(fit.theta_names, fit.log_scaled)[:, None]
+    origin = fit.log_origins[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        wide = np.where(log, theta * (found / theta) ** factors, theta + factors * (found - theta))
+        size = theta - origin
+        wide = np.where(log, origin + size * ((found - origin) / size) ** factors, theta + factors * (found - theta))
     wide = np.where(factors > 1.0, wide, found)
     return np.stack([np.maximum(wide[:, 0], fit.lower), np.minimum(wide[:, 1], fit.upper)], axis=1)
 
@@ -255,7 +257,7 @@ def correct_intervals(fit: Fit, level: float = 0.95) -> FloatArray:
 def measure_widening(fit: Fit) -> FloatArray:
     """Return by how much the standard errors of a fit are too small because residuals are correlated: (d,), at least 1.
 
-    Those of a transition time by the channels of its own run, of any other unknown by all; the largest factor counts.
+    The largest factor of all channels counts; for a transition time, that of the channels of its own run.
 
     Parameters
     ----------
@@ -282,10 +284,10 @@ def diagnose_channel(comparison: Comparison, k: int, experiment: int = 0, time_u
     ----------
     comparison : Comparison
     k : int
-        Which channel, from 0.
+        Index of the channel, from 0.
     experiment : int, optional
     time_unit : str, optional
-        Both are noted in the result.
+        Both are stored in the result.
     """
     raw = comparison.residuals[:, k]
     there = np.isfinite(raw)

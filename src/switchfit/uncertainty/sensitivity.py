@@ -1,4 +1,4 @@
-"""How states and outputs depend on theta along a trajectory: exact first derivatives of the discretised system.
+"""Sensitivities of states and outputs along a trajectory: exact first derivatives of the discretized system.
 
 The derivative of x at a *fixed* time t jumps where a transition time passes t. With X^i the jump of the vector field,
 equation (8), it is 0 in tau_i just before the transition and -X^i just after. At a transition both are given, one with
@@ -31,7 +31,7 @@ class Points(NamedTuple):
     times : (L,)
     states, states_d : (L, n), (L, n, d)
     outputs, outputs_d : (L, Q), (L, Q, d)
-        Of the reference signals, then of the Measurements, in their order.
+        Outputs of the reference signals, then of the Measurements, in order.
     """
 
     times: FloatArray
@@ -48,9 +48,9 @@ class Sensitivity:
     Attributes
     ----------
     simulation : Simulation
-        With its derivatives in the experiment's own unknowns.
+        With derivatives in the experiment's own unknowns.
     places : (D,) int
-        Where these stand in theta, -1 where they are fixed.
+        Indices of these unknowns in theta, -1 for fixed ones.
     d : int
         Length of theta.
     """
@@ -61,16 +61,14 @@ class Sensitivity:
 
     @property
     def nodes(self) -> Points:
-        """At all nodes in order, as `Trajectory` has them: each transition stands twice, before and after it."""
+        """Points at all nodes in order, as in `Trajectory`: each transition occurs twice, before and after it."""
         s, along = self.simulation, self._tangents
         columns = (s.start, s.end), (s.before, s.after), along[:2], (s.y_before, s.y_after), along[2:]
         times, states, states_d, outputs, outputs_d = (select_visible(s, *pair) for pair in columns)
         return Points(times, states, self._in_theta(states_d), outputs, self._in_theta(outputs_d))
 
     def at(self, times: FloatArray) -> Points:
-        """Return the sensitivity at nodes (K,) of the mesh; at a transition what is just before it, as a sample there
-        is.
-        """
+        """Return the sensitivity at nodes (K,) of the mesh; at a transition, that just before it, as for a sample."""
         s, along = self.simulation, self._tangents
         row = s.row_ending(np.searchsorted(s.nodes, times) - 1)
 
@@ -85,14 +83,14 @@ class Sensitivity:
     @property
     def _tangents(self) -> Tangents:
         if self.simulation.tangents is None:
-            raise ValueError("the simulation was made without its derivatives.")
+            raise ValueError("the simulation has no derivatives: pass tangents=True.")
         return self.simulation.tangents
 
     def _in_theta(self, derivative: FloatArray) -> FloatArray:
         """Return derivatives in theta (..., d) from those in the experiment's own unknowns (..., D)."""
         own = self.places >= 0
         full = np.zeros((*derivative.shape[:-1], self.d))
-        # Two names of the model may mean one parameter: both count.
+        # Two names of the model may refer to one parameter: both count.
         np.add.at(np.moveaxis(full, -1, 0), self.places[own], np.moveaxis(derivative, -1, 0)[own])
         return full
 
@@ -104,32 +102,32 @@ def compute_sensitivity(problem: Problem, e: int, theta: FloatArray, mesh: Mesh)
     ----------
     problem : Problem
     e : int
-        Which experiment, from 0.
+        Index of the experiment, from 0.
     theta : (d,)
     mesh : Mesh
-        With all sample times and knots as nodes.
+        It must have all sample times and knots as nodes.
     """
     engine = engine_of(problem, e, build_arguments(problem, e, mesh), mesh)
     return get_sensitivity_program(problem, e, engine.simulate(*problem.vectors(theta, e), tangents=True))
 
 
 def get_sensitivity_program(problem: Problem, e: int, simulation: Simulation) -> Sensitivity:
-    """Return the sensitivity of experiment e from a simulation with its derivatives."""
+    """Return the sensitivity of experiment e from a simulation with derivatives."""
     return Sensitivity(simulation, problem.places[e], len(problem.theta_names))
 
 
 class SampleDerivatives(NamedTuple):
-    """The samples that are not missing, S of them over all experiments.
+    """All samples that are not missing, S over all experiments.
 
     Attributes
     ----------
     experiment : (S,) int
     item, channel : (S,) int
-        Which of the experiment's Measurements, and which of its channels.
+        Indices of the Measurements in the experiment, and of the channel in it.
     time, residual, weight : (S,)
-        Sample time in the experiment's time unit, fitted less measured, ``1 / sigma**2`` (1 where sigma is unknown).
+        Sample time in the experiment's time unit, fitted minus measured, ``1 / sigma**2`` (1 if sigma is unknown).
     derivative : (S, d)
-        Of the fitted value in theta.
+        Derivative of the fitted value in theta.
     """
 
     experiment: NDArray[np.intp]
@@ -142,12 +140,12 @@ class SampleDerivatives(NamedTuple):
 
 
 def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensitivity]) -> SampleDerivatives:
-    """Return residuals of all samples and the derivatives of what is fitted to them.
+    """Return the residuals of all samples and the derivatives of the fitted values.
 
     Parameters
     ----------
     problem : Problem
-    sensitivities : sequence of Sensitivity, one an experiment
+    sensitivities : sequence of Sensitivity, one per experiment
     """
     d = len(problem.theta_names)
     columns: list[tuple[NDArray[Any], ...]] = []

@@ -166,11 +166,16 @@ def judge(fit: Fit, certificate: Certificate | None = None) -> Verdict:
     steps = dict.fromkeys(step for f in found for step in f.steps)
     if fit.starts is not None and fit.starts[1] == 0:  # other starts were tried: they are no remedy any more
         steps.pop("more starts", None)
-    return Verdict(found[0].level, tuple(f.reason for f in found), tuple(Issue(f"next: {step}") for step in steps))
+    subjects = {step: f.reason.subjects for f in found for step in f.steps if step == FIX}
+    advised = tuple(Issue(f"next: {step}", subjects.get(step, ())) for step in steps)
+    return Verdict(found[0].level, tuple(f.reason for f in found), advised)
 
 
 ELSEWHERE = ("more starts", "look at the residuals")
 """What to do about a model that does not fit: the minimum may be a local one, or the model wrong."""
+
+FIX = "fix or add data"
+"""What to do about unknowns that are not determined, which are the subjects of this advice."""
 
 MISFITS = ("unexplained", "mostly outliers", "slightly wrong", "reference not followed")
 """Kinds of reasons that say that the model does not fit, other than by the size of the noise."""
@@ -326,7 +331,7 @@ def _find_undetermined(fit: Fit) -> Iterator[Finding]:
     if fit.status is Status.SINGULAR or smallest < BARELY_DETERMINED:
         names = curvature.weakest or tuple(name for name, _ in fit.flat_direction)
         reason = Issue("not determined", names, {"eigenvalue": smallest})
-        yield Finding("doubtful", reason, ("fix or add data",))
+        yield Finding("doubtful", reason, (FIX,))
 
 
 def _find_bounds(fit: Fit) -> Iterator[Finding]:

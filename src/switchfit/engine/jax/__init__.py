@@ -1,1 +1,1 @@
-"""Derivatives of the discretised system by JAX: of first order, second order backward and forward, Gauss-Newton."""
+"""Derivatives of the discretized system by JAX: first order, second order backward and forward, Gauss-Newton."""

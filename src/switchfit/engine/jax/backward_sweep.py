@@ -1,4 +1,4 @@
-"""The backward sweep: the derivative psi of the cost to go, one row after another, and with it the gradient."""
+"""The backward sweep: the derivative psi of the cost to go, row by row, and with it the gradient."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ class Backward(NamedTuple):
 
 
 def backward_sweep(model: Model, first: Forward, p: Array, weights: Array | None = None) -> Backward:
-    """Differentiate the cost backward, with ``weights . c`` of the constraints (m,) added where given.
+    """Differentiate the cost backward, with ``weights . c`` of the constraints (m,) added if given.
 
     The costate jumps at samples, ``psi(t-) = psi(t+) + D_x ell_k``, at reset maps, ``psi(tau-) = psi(tau+) D_x R``, and
-    by the derivatives of what stands at transitions and at the end.
+    by the derivatives of the terms at transitions and at the end.
     """
     layout, resets = first.path.layout, first.resets
     nodes = node_gradients(model, first, p, weights)
@@ -103,7 +103,7 @@ class NodeGradients(NamedTuple):
     ends, starts : (Q, C, n), in the states at the ends of rows; at the starts, of late samples, None without any
     transitions : (N + 1, n), in the state before the transition that opens each segment; None if there are no terms
     final : (n,), in x(tf)
-    of_tau, of_p : (N,), (M,), direct ones in tau and p
+    of_tau, of_p : (N,), (M,), direct derivatives in tau and p
     """
 
     cost: Array
@@ -117,11 +117,11 @@ class NodeGradients(NamedTuple):
 
 
 def node_gradients(model: Model, first: Forward, p: Array, weights: Array | None) -> NodeGradients:
-    """Differentiate samples, and what ``J + weights . c`` has at transitions and at the end."""
+    """Differentiate the samples, and the terms of ``J + weights . c`` at transitions and at the end."""
     structure, path = model.structure, first.path
     Q, C, n = path.after.shape
     cost, of_tau, of_p = add_point_costs(model, path, p), jnp.zeros(structure.N), jnp.zeros(structure.M)
-    ends, starts = jnp.zeros((Q * C + 1, n)), jnp.zeros((Q * C, n))  # the first of the ends is t0
+    ends, starts = jnp.zeros((Q * C + 1, n)), jnp.zeros((Q * C, n))  # entry 0 of `ends` is t0
     for k, samples in enumerate(model.arguments.samples):
         if structure.measurements[k].delay is None:
             values, (g_x, g_p) = sample_gradients(model, path, k, samples, p)
@@ -130,7 +130,7 @@ def node_gradients(model: Model, first: Forward, p: Array, weights: Array | None
             at = anchors(model, path, k, p)
             values, (g_start, g_x, g_p) = late_gradients(model, at, k, samples, p)
             starts = starts.at[at.row].add(g_x)
-            # Entry 0 collects the rows that start at a node of the mesh, which stays where it is.
+            # Entry 0 collects the rows that start at a node of the mesh, whose time is fixed.
             of_tau = of_tau + jnp.zeros(structure.N + 1).at[at.starts_at + 1].add(g_start)[1:]
         cost, of_p = cost + values.sum(), of_p + g_p.sum(0)
     transitions = jnp.zeros((structure.N + 1, n))
@@ -176,7 +176,7 @@ def rows_at_transitions(first: Forward) -> Array:
 
 
 def row_ends_gradient(model: Model, first: Forward, psi: Costates) -> Array:
-    """Return the derivative of the cost in tau: ``V h' + sum_j (w_j . f + h b_j ell)_t t_j'`` of the rows beside it."""
+    """Return the derivative of the cost in tau: ``V h' + sum_j (w_j . f + h b_j ell)_t t_j'`` of the two rows at it."""
     tableau, layout = model.tableau, first.path.layout
     if model.structure.N == 0:
         return jnp.zeros(0)

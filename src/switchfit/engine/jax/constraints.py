@@ -1,8 +1,8 @@
 """Costs and constraints at transitions and at the end, ``c = 0``.
 
 Values and first derivatives of constraints follow from the forward sweep. Their second derivatives are only ever
-needed in the sum ``weights . c`` of a Lagrangian: each is a cost at a transition or at the end, so that one backward
-sweep over the cost with these terms beside it gives them all.
+needed in the sum ``weights . c`` of a Lagrangian. Each of its terms is a cost at a transition or at the end, so that
+one backward sweep over the cost with these terms added gives them all.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Array = jax.Array
 
 
 def terms_at_transitions(model: Model, weights: Array | None) -> list[tuple[int, NodeFunction]]:
-    """Return what ``J + weights . c`` has at transitions: each term with its transition; c only with `weights` (m,)."""
+    """Return the terms of ``J + weights . c`` at transitions, each with its transition; c only with `weights` (m,)."""
     if weights is None:
         return list_costs_at_transitions(model)
     constraints = enumerate(list_constraints_at_transitions(model))
@@ -33,7 +33,7 @@ def terms_at_transitions(model: Model, weights: Array | None) -> list[tuple[int,
 
 
 def terms_at_end(model: Model, weights: Array | None) -> list[NodeFunction]:
-    """Return what ``J + weights . c`` has at the end; c only with `weights` (m,)."""
+    """Return the terms of ``J + weights . c`` at the end; c only with `weights` (m,)."""
     cost, constraints = get_end_cost(model), get_end_constraints(model)
     terms = [] if cost is None else [cost]
     if weights is not None and constraints is not None:

@@ -1,4 +1,4 @@
-"""JAX as an engine: whatever the model does, on any device."""
+"""JAX as an engine: for any model, on any device."""
 
 from __future__ import annotations
 
@@ -19,26 +19,25 @@ from switchfit.runtime.cache import use_compilation_cache
 
 
 class JaxEngine:
-    """Evaluates one experiment on one mesh with programs of JAX.
+    """Evaluates one experiment on one mesh with JAX programs.
 
     Attributes
     ----------
     reason : str
-        Why there is no machine code.
+        Why the experiment is not evaluated in machine code.
     """
 
     def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh) -> None:
         self._structure, self._arguments, self._mesh = structure, arguments, mesh
         self._on_device: Arguments | None = None
         self._compiled: set[tuple[Method, Matrix]] = set()
-        self._last: tuple[bytes, Simulation] | None = (
-            None  # without tangents: J and a trajectory are often both asked for
-        )
-        self.reason = "engine='jax' asks for it"
+        # The last simulation without tangents, since J and the trajectory are often requested at the same point.
+        self._last: tuple[bytes, Simulation] | None = None
+        self.reason = "engine='jax' is set"
 
     @property
     def engine(self) -> Engine:
-        """JAX, and why it evaluates."""
+        """JAX, with the reason."""
         return Engine("jax", self.reason)
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
@@ -55,7 +54,7 @@ class JaxEngine:
             found = derivatives(*given, structure=self._structure, method=method, matrix=matrix)
         self._compiled.add((method, matrix))
         J, g, H = found
-        return Derivatives(float(J), np.array(g), np.array(H))  # copies: what JAX owns cannot be written to
+        return Derivatives(float(J), np.array(g), np.array(H))  # copies: arrays of JAX are read-only
 
     def constrained(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray

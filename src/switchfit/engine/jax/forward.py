@@ -1,4 +1,4 @@
-"""Gradient and exact Hessian of the *discretised* cost in forward mode, for few unknowns and as a check of the adjoint.
+"""Gradient and exact Hessian of the *discretized* cost in forward mode, for few unknowns and as a check of the adjoint.
 
 With z = (x_k, theta) the arguments of node map k and Z_k their derivative in theta,
 
@@ -10,8 +10,8 @@ and the second derivative of the state obeys
     D^2 J     = sum_k L_x x_tt, k + D^2 L_k (Z_k, Z_k),
 
 where steps, samples, reset maps, the initial state and the terminal cost are all such maps. The sources S_k are
-evaluated for a chunk of rows at once, for the D (D + 1) / 2 pairs i <= j of unknowns; what is done one row after
-another is a product of small matrices. There is no adjoint here, so that a mistake in one is not repeated in the other.
+evaluated for a chunk of rows at once, for the D (D + 1) / 2 pairs i <= j of unknowns; only products of small matrices
+are computed row by row. No adjoint is used, so that an error in one method is not repeated in the other.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Second(NamedTuple):
 
 
 def forward_hessian(model: Model, first: Forward, p: Array) -> Array:
-    """Return the Hessian (D, D) of the discretised cost, D = N + M, without an adjoint.
+    """Return the Hessian (D, D) of the discretized cost, D = N + M, without an adjoint.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def forward_hessian(model: Model, first: Forward, p: Array) -> Array:
 
 
 def forward_gradient(model: Model, first: Forward, p: Array) -> tuple[Array, Array]:
-    """Return the discretised cost () and its gradient (D,), without an adjoint.
+    """Return the discretized cost () and its gradient (D,), without an adjoint.
 
     The derivatives of all running costs, samples, transitions and terminal costs, along the tangents of the forward
     sweep. The Gauss-Newton matrix needs these tangents too, and no adjoint.
@@ -107,7 +107,7 @@ def forward_gradient(model: Model, first: Forward, p: Array) -> tuple[Array, Arr
             at = anchors(model, path, k, p)
             values, (g_start, g_x, g_p) = late_gradients(model, at, k, samples, p)
             x_d = flatten_rows(X.before)[at.row]
-            # Entry 0 collects the rows that start at a node of the mesh, which stays where it is.
+            # Entry 0 collects the rows that start at a node of the mesh, whose time is fixed.
             gradient = gradient.at[:N].add(jnp.zeros(N + 1).at[at.starts_at + 1].add(g_start)[1:])
         cost = cost + values.sum()
         gradient = gradient + jnp.einsum("kn,knd->d", g_x, x_d) + g_p.sum(0) @ P

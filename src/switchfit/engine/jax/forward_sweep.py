@@ -1,7 +1,7 @@
 """The forward sweep: states, derivatives of f and ell at the stages, and the derivative of the state along theta.
 
 theta here is (tau_1 .. tau_N, p_1 .. p_M), D = N + M entries; fixed transition times are among them. f and ell are
-differentiated at all stages of a chunk of rows at once; what remains to be done one row after another is linear.
+differentiated at all stages of a chunk of rows at once; only a linear recursion remains to be done row by row.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Array = jax.Array
 
 
 KEPT = 2**25
-"""Bytes up to which the derivatives at the stages are kept: finding them again takes a fifth of a Hessian's time."""
+"""Largest size, in bytes, of stored tangents at the stages; recomputing them takes a fifth of a Hessian's time."""
 
 
 class StageJacobians(NamedTuple):
@@ -47,7 +47,7 @@ class StageJacobians(NamedTuple):
 
 
 class ResetJacobians(NamedTuple):
-    """Derivatives of the map at the opening of each segment, identity where there is none: (N + 1, ...) arrays."""
+    """Derivatives of the reset map at the start of each segment, by default the identity: (N + 1, ...) arrays."""
 
     t: Array  # (N + 1, n)
     x: Array  # (N + 1, n, n)
@@ -77,7 +77,7 @@ class Tangents(NamedTuple):
 
 
 class Forward(NamedTuple):
-    """Result of the forward sweep. XLA does not compute those fields that a program does not read."""
+    """Result of the forward sweep. XLA does not compute fields that a program does not read."""
 
     path: Path
     jacobians: StageJacobians
@@ -121,7 +121,7 @@ def stage_jacobians(model: Model, path: Path, p: Array) -> StageJacobians:
             f_t, f_x, f_p = jax.jacfwd(f, argnums=(0, 1, 2))(t, x, p)
             if not model.has_running_cost:
                 return StageJacobians(f_t, f_x, f_p)
-            # A scalar: backward is cheaper.
+            # ell is a scalar: reverse mode is cheaper.
             l, gradient = jax.value_and_grad(model.density(mode, piece), argnums=(0, 1, 2))(t, x, p)  # noqa: E741
             return StageJacobians(f_t, f_x, f_p, l, *gradient)
 
@@ -155,8 +155,8 @@ def reset_jacobians(model: Model, path: Path, p: Array) -> ResetJacobians | None
 def tangents(model: Model, path: Path, jacobians: StageJacobians, resets: ResetJacobians | None, p: Array) -> Tangents:
     """Return ``x_theta`` along the path: a linear recursion over the rows.
 
-    Every row is treated as if both its ends moved, which only those beside a transition do. Measured, that costs no
-    more than treating those rows by themselves and adding what they give.
+    Every row is treated as if both its ends moved with theta, although only rows next to a transition do. Measured,
+    this costs no more than treating those rows separately.
     """
     layout, P = path.layout, parameter_directions(model)
     keep = 8 * path.stages.size * P.shape[1] <= KEPT
@@ -170,7 +170,7 @@ def tangents(model: Model, path: Path, jacobians: StageJacobians, resets: ResetJ
         if resets is not None:
             behind = resets.x[segment] @ X + resets.p[segment] @ P + resets.t[segment][:, None] * start_d[0][None]
             X = jnp.where(opens, behind, X)
-        # For all rows of a chunk at once, outside of the loop over them: a tenth of an evaluation.
+        # For all rows of a chunk at once, outside the loop over them: saves a tenth of an evaluation.
         direct = jax.vmap(partial(direct_derivatives, model))(at, start_d, end_d)
         return lax.scan(row, X, (h, slopes, at.f_x, *direct))
 
@@ -204,7 +204,7 @@ def row_tangents(
 
     Returns
     -------
-    X_d, K_d, after : (s, n, D), (s, n, D), (n, D); of states and slopes of the stages, and of the state behind the row
+    X_d, K_d, after : (s, n, D), (s, n, D), (n, D); of states and slopes of the stages, and of the state after the row
     """
     function = partial(row_functions(model.tableau).tangent, model.tableau, h, list(slopes), list(f_x))
     along = jax.vmap(function, in_axes=(-1, -1, None if h_d is None else -1), out_axes=-1)
@@ -215,7 +215,7 @@ def row_tangents(
 def stages_along(model: Model, first: Forward) -> tuple[tuple[Any, ...], Callable[..., Array]]:
     """Return arrays (Q, C, ...), and a function that computes the tangents of the stages of a row from its slices.
 
-    The arrays are these tangents themselves, (s, n, D) for each row, if they were kept.
+    If the tangents are stored (`KEPT`), the arrays are the tangents, (s, n, D) for each row.
     """
     kept = first.tangents.stages
     if kept is not None:
@@ -233,7 +233,7 @@ def row_operands(model: Model, first: Forward) -> tuple[Any, ...]:
 def recompute_tangents(
     model: Model, x_d: Array, h: Array, slopes: Array, at: StageJacobians, start_d: Array, end_d: Array
 ) -> tuple[Array, Array, Array]:
-    """Compute the result of `row_tangents` for one row again."""
+    """Recompute the result of `row_tangents` for one row."""
     return row_tangents(model, x_d, h, slopes, at.f_x, *direct_derivatives(model, at, start_d, end_d))
 
 

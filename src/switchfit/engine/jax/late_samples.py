@@ -1,12 +1,12 @@
-"""Samples that are seen late by a delay d that is a parameter: the state at ``s_k = t_k - d``.
+"""Late samples, with a delay d that is a parameter: they see the state at ``s_k = t_k - d``.
 
-The nodes of the mesh stay where they are. The state at s_k comes from one Runge-Kutta step of its own, from the start
-of the row that holds s_k to s_k itself; this step is part of the discretised system, and its derivatives are exact. A
-sample thus is a cost of (start of the row, state there, p), with s_k a function of p; the start moves with tau_i where
-the row opens a mode. Everything is found by forward differentiation, sample by sample.
+The nodes of the mesh are fixed. The state at s_k comes from one Runge-Kutta step of its own, from the start of the row
+that holds s_k to s_k itself; this step is part of the discretized system, and its derivatives are exact. A sample thus
+is a cost of (start of the row, state there, p), with s_k a function of p; the start moves with tau_i where the row
+opens a mode. All derivatives are computed in forward mode, sample by sample.
 
 Where s_k passes a transition, J has a kink, as where a transition passes a sample; where it passes a node of the mesh,
-one of the size of the integration error.
+J has a kink of the size of the integration error.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def _costs(model: Model, k: int) -> Callable[..., Array]:
     return cost
 
 
-def _each(function: Callable[..., Any], *given: Any) -> Any:
+def _map_samples(function: Callable[..., Any], *given: Any) -> Any:
     """Map ``function(sample, anchor, ...)`` over all samples."""
     return lax.map(lambda of_sample: function(*of_sample), given, batch_size=SAMPLES_AT_ONCE)
 
@@ -83,7 +83,7 @@ def late_gradients(
         gradient, value = jax.jacfwd(of, argnums=(0, 1, 2), has_aux=True)(at.start, at.x, p)
         return value, gradient
 
-    return _each(one, samples, at)
+    return _map_samples(one, samples, at)
 
 
 def _along(model: Model, at: Anchors, x_d: Array, p: Array, e: Array) -> tuple[Array, Array, Array]:
@@ -105,7 +105,7 @@ def late_curvature(model: Model, at: Anchors, x_d: Array, k: int, samples: Sampl
 
         return jax.jacfwd(jax.jacfwd(along))(jnp.zeros(x_d.shape[-1]))
 
-    return _each(one, samples, at, x_d).sum(0)
+    return _map_samples(one, samples, at, x_d).sum(0)
 
 
 def late_gauss_newton(model: Model, at: Anchors, x_d: Array, k: int, samples: Samples, p: Array) -> Array:
@@ -125,7 +125,7 @@ def late_gauss_newton(model: Model, at: Anchors, x_d: Array, k: int, samples: Sa
             H = H + 2.0 * s_d.T @ s_d
         return H
 
-    return _each(one, samples, at, x_d).sum(0)
+    return _map_samples(one, samples, at, x_d).sum(0)
 
 
 def late_state_derivatives(model: Model, at: Anchors, k: int, samples: Samples, p: Array) -> tuple[Any, Any]:
@@ -145,4 +145,4 @@ def late_state_derivatives(model: Model, at: Anchors, k: int, samples: Samples, 
         first = jax.jacfwd(of, argnums=(0, 1))
         return first(at.x, p), jax.jacfwd(first, argnums=(0, 1))(at.x, p)
 
-    return _each(one, samples, at)
+    return _map_samples(one, samples, at)

@@ -42,7 +42,7 @@ def derivatives(
     if method == "autodiff":
         return _autodiff(model, tau, p, side)
     first = forward_sweep(model, tau, p, side)
-    if method == "forward" or matrix == "gauss-newton":  # which needs the tangents anyway, and no adjoint
+    if method == "forward" or matrix == "gauss-newton":  # both need the tangents, and no adjoint
         cost, gradient = forward_gradient(model, first, p)
         if matrix == "gauss-newton":
             return cost, gradient, gauss_newton_hessian(model, first, p)

@@ -1,15 +1,14 @@
-"""Exact Hessian of the *discretised* cost by a backward sweep, after the forward sweep.
+"""Exact Hessian of the *discretized* cost by a backward sweep, after the forward sweep.
 
 With z = (x_k, theta) the arguments of node map k, Z_k their derivative in theta and psi_{k+1} the derivative of the
 cost to go,
 
     D^2 J = sum_k Z_k' D^2 (psi_{k+1} . F_k + L_k) Z_k,
 
-where steps, samples, reset maps, the initial state and terminal costs are all such maps. The sum is what the sweep
-over (psi_k, Omega_k, Theta_k, H_k) of the general discrete form adds up to; written like this its terms are
-independent of each other, so that they are evaluated for a chunk of rows at once. Only psi and x_theta are found one
-row after another. Inside a step the same is done once more, for its stages: only f itself is ever differentiated
-twice, never a composition.
+where steps, samples, reset maps, the initial state and terminal costs are all such maps. The sum equals the result of
+the sweep over (psi_k, Omega_k, Theta_k, H_k) of the general discrete form. Its terms are independent of each other, so
+that they are evaluated for a chunk of rows at once; only psi and x_theta are computed row by row. The stages inside a
+step are treated in the same way: only f itself is differentiated twice, never a composition.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ SAMPLES_AT_ONCE = 1024
 
 
 def adjoint_hessian(model: Model, first: Forward, back: Backward, p: Array, weights: Array | None = None) -> Array:
-    """Return the Hessian (D, D) of the discretised cost, with ``weights . c`` of the constraints (m,) if given.
+    """Return the Hessian (D, D) of the discretized cost, with ``weights . c`` of the constraints (m,) if given.
 
     `back` is the backward sweep of the same sum.
     """
@@ -244,7 +243,7 @@ def sample_curvature(
         r_d = _columns(lambda x, p: model.sample_residual(k, sample, x, p), (x, p), (x_d, P))
         H = r_d.T @ (model.sample_information(k, sample, x, p)[:, None] * r_d)
         if model.structure.measurements[k].sigma:
-            # Fisher's information of normal noise: 2 of log sigma, none between sigma and the rest.
+            # Fisher information of normal noise: 2 for log sigma, 0 between sigma and the rest.
             s_d = _columns(lambda p: model.log_sigma(k, sample, p), (p,), (P,))
             H = H + 2.0 * s_d.T @ s_d
         return H
@@ -271,7 +270,7 @@ def _second(
 ) -> Array:
     """Return the second derivative of a scalar function along D directions (last axes of `along`): (D, D).
 
-    With `P_last` the last of `along` is that of p, [0 | I], whose product need not be computed.
+    With `P_last`, the last of `along` is that of p, [0 | I], whose product need not be computed.
     """
     D = along[0].shape[-1]
     if D == 0:

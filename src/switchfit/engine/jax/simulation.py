@@ -1,8 +1,8 @@
-"""Simulations by JAX, some rows at a time: one small program a model, whatever the mesh and the number of samples.
+"""Simulations by JAX, a block of rows at a time: one small program per model, for any mesh and number of samples.
 
-Where derivatives are asked for, they are carried from row to row beside the state. What is carried is the derivative of
-x at the end of a row, which moves with theta where it is a transition; what is returned is that at the time at which
-the end is: less dx/dt times the end's own derivative.
+If derivatives are requested, they are propagated from row to row with the state. The propagated derivative is that of
+x at the end of a row, which moves with theta where it is a transition. The returned derivative is that at fixed time:
+the propagated one minus dx/dt times the derivative of the end.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from switchfit.problem.structure import Structure
 from switchfit.runtime.cache import use_compilation_cache
 
 BLOCK = 64
-"""Rows that one call of the program takes: with shapes that do not depend on the mesh it is compiled once a model."""
+"""Rows per call of the program. Its shapes do not depend on the mesh, so that it is compiled once per model."""
 
 
 def simulate_by_jax(
     structure: Structure, whole: Arguments, mesh: Mesh, tau: FloatArray, p: FloatArray, tangents: bool
 ) -> Simulation:
-    """Return all rows of one experiment, and their derivatives if asked for."""
+    """Return all rows of one experiment, with their derivatives if `tangents`."""
     arguments = whole.without_mesh()
     layout = build_rows(mesh.nodes, tau, 1.0, np)
     cell, start, end = (np.reshape(a, -1) for a in (layout.cell, layout.start, layout.end))
@@ -46,11 +46,11 @@ def simulate_by_jax(
     costly = {i for i, _ in list_costs_at_transitions(Model(structure, arguments))}
     kept, parts, cost = [], [], 0.0
     with use_float64(), use_compilation_cache():
-        start_of = partial(_start, structure=structure.functions, N=structure.N, tangents=tangents)
+        start_of = partial(_compute_initial_state, structure=structure.functions, N=structure.N, tangents=tangents)
         x, X = map(np.asarray, start_of(arguments, p))
         for i, mode in enumerate(structure.mode_of_segment):
             if i > 0 and structure.reset_maps[i - 1] is not None:
-                through = partial(_through_reset, structure=structure, i=i - 1, tangents=tangents)
+                through = partial(_apply_reset, structure=structure, i=i - 1, tangents=tangents)
                 x, X = map(np.asarray, through(arguments, tau[i - 1], x, X, p))
             first = int(layout.first_chunk[i]) * CHUNK
             count = int(layout.last_row[i]) + 1 - first
@@ -59,13 +59,13 @@ def simulate_by_jax(
             here = slice(first, first + count)
             pieces = Piece(whole.nodes[cell[here]], whole.signals[cell[here]])
             given = start[here], end[here], starts_d[here], ends_d[here], pieces
-            x, X, added, columns = _segment(structure, arguments, mode, x, X, p, given, tangents)
+            x, X, added, columns = _simulate_segment(structure, arguments, mode, x, X, p, given, tangents)
             kept.append(np.arange(here.start, here.stop))
             parts.append(columns)
             cost += added
             if i in costly:
-                cost += float(_at_transition(arguments, tau[i], x, p, structure=structure, i=i))
-        cost += float(_terminal(arguments, x, p, structure=structure.functions))
+                cost += float(_compute_transition_cost(arguments, tau[i], x, p, structure=structure, i=i))
+        cost += float(_compute_terminal_cost(arguments, x, p, structure=structure.functions))
     own = np.concatenate(kept)
     before, after, y_before, y_after, *derivatives = (np.concatenate(column) for column in zip(*parts, strict=True))
     simulation = Simulation(
@@ -81,7 +81,7 @@ def simulate_by_jax(
         tangents=Tangents(*derivatives) if tangents else None,
     )
     late = {
-        k: _late_outputs(structure, whole, simulation, k, cell[own], p)
+        k: _compute_late_outputs(structure, whole, simulation, k, cell[own], p)
         for k, sensor in enumerate(structure.measurements)
         if sensor.delay is not None
     }
@@ -90,7 +90,7 @@ def simulate_by_jax(
 
 
 def _cost_of_samples(structure: Structure, arguments: Arguments, seen: tuple[FloatArray, ...], p: FloatArray) -> float:
-    """Return the costs of all samples from the outputs, in NumPy: a program of JAX would be compiled for each count."""
+    """Return the costs of all samples from the outputs, in NumPy: JAX would compile a program for each sample count."""
     named, total = _name_parameters(structure, arguments, p), 0.0
     for samples, sensor, y in zip(arguments.samples, structure.measurements, seen, strict=True):
         there = np.asarray(samples.weight) > 0
@@ -105,10 +105,10 @@ def _cost_of_samples(structure: Structure, arguments: Arguments, seen: tuple[Flo
 
 def _name_parameters(structure: Structure, arguments: Arguments, p: FloatArray) -> dict[str, Any]:
     """Return the parameters by the model's names."""
-    return dict(Model(structure, arguments).parameters(p))  # type: ignore[arg-type]  # arrays of NumPy's
+    return dict(Model(structure, arguments).parameters(p))  # type: ignore[arg-type]  # NumPy arrays
 
 
-def _segment(
+def _simulate_segment(
     structure: Structure,
     arguments: Arguments,
     mode: int,
@@ -120,15 +120,15 @@ def _segment(
 ) -> tuple[FloatArray, FloatArray, float, list[FloatArray]]:
     """Return all rows of a segment, block by block; the last block is padded with rows of length zero at fixed times.
 
-    Returns the state behind it and its derivative, the running cost, and columns: states before and after, outputs
-    before and after; then their derivatives, if asked for.
+    Returns the state after it and its derivative, the running cost, and columns: states before and after, outputs
+    before and after; then their derivatives, if requested.
     """
     end, count = given[1], len(given[0])
     missing = -count % BLOCK
     still = (np.repeat(end[-1:], missing),) * 2 + (np.zeros((missing, given[2].shape[1])),) * 2
     times = [np.concatenate([a, b]) for a, b in zip(given[:4], still, strict=True)]
     pieces = jax.tree.map(lambda a: np.concatenate([a, np.repeat(a[-1:], missing, axis=0)]), given[4])
-    block = partial(_block, structure=structure.functions, tangents=tangents)
+    block = partial(_simulate_block, structure=structure.functions, tangents=tangents)
     parts, cost = [], 0.0
     for k in range(0, count + missing, BLOCK):
         span = slice(k, k + BLOCK)
@@ -141,7 +141,7 @@ def _segment(
 
 
 @partial(jax.jit, static_argnames=("structure", "N", "tangents"))
-def _start(
+def _compute_initial_state(
     arguments: Arguments, p: jax.Array, *, structure: Structure, N: int, tangents: bool
 ) -> tuple[jax.Array, jax.Array]:
     """Return x(t0) and its derivative in (tau, p): (n,), (n, D)."""
@@ -153,7 +153,7 @@ def _start(
 
 
 @partial(jax.jit, static_argnames=("structure", "i", "tangents"))
-def _through_reset(
+def _apply_reset(
     arguments: Arguments,
     t: jax.Array,
     x: jax.Array,
@@ -174,7 +174,7 @@ def _through_reset(
 
 
 @partial(jax.jit, static_argnames=("structure", "tangents"))
-def _block(
+def _simulate_block(
     arguments: Arguments,
     mode: jax.Array,
     x: jax.Array,
@@ -185,7 +185,7 @@ def _block(
     structure: Structure,
     tangents: bool,
 ) -> tuple[tuple[jax.Array, jax.Array], jax.Array, tuple[jax.Array, ...]]:
-    """Return x and X behind a block of rows in one mode, its running cost, and columns as of `_segment`."""
+    """Return x and X after a block of rows in one mode, its running cost, and columns as in `_simulate_segment`."""
     model = Model(structure, arguments)
     P = _of_parameters(X, p) if tangents else X
 
@@ -235,7 +235,7 @@ def _of_parameters(X: jax.Array, p: jax.Array) -> jax.Array:
 
 
 @partial(jax.jit, static_argnames=("structure", "i"))
-def _at_transition(
+def _compute_transition_cost(
     arguments: Arguments, t: jax.Array, x: jax.Array, p: jax.Array, *, structure: Structure, i: int
 ) -> jax.Array:
     """Return the costs at transition i (from 0)."""
@@ -246,11 +246,11 @@ def _at_transition(
 
 
 @partial(jax.jit, static_argnames=("structure",))
-def _terminal(arguments: Arguments, x: jax.Array, p: jax.Array, *, structure: Structure) -> jax.Array:
+def _compute_terminal_cost(arguments: Arguments, x: jax.Array, p: jax.Array, *, structure: Structure) -> jax.Array:
     return Model(structure, arguments).terminal(x, p)
 
 
-def _late_outputs(
+def _compute_late_outputs(
     structure: Structure, whole: Arguments, simulation: Simulation, k: int, cell: NDArray[np.intp], p: FloatArray
 ) -> FloatArray:
     """Return the outputs of all sensors at the samples of the k-th Measurements, which are late: (K, Q)."""
@@ -265,12 +265,14 @@ def _late_outputs(
     with use_float64(), use_compilation_cache():
         for first in range(0, len(padded[0]), BLOCK):
             block = [a[first : first + BLOCK] for a in padded]
-            parts.append(np.asarray(_late_block(whole.without_mesh(), *block, p, structure=structure.functions)))
+            parts.append(
+                np.asarray(_simulate_late_block(whole.without_mesh(), *block, p, structure=structure.functions))
+            )
     return np.concatenate(parts)[: len(times)]
 
 
 @partial(jax.jit, static_argnames=("structure",))
-def _late_block(
+def _simulate_late_block(
     arguments: Arguments,
     times: jax.Array,
     mode: jax.Array,

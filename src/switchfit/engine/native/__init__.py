@@ -1,7 +1,7 @@
-"""The discretised system and its derivatives in machine code of its own: what evaluates a single fit.
+"""The discretized system and its derivatives in machine code, which evaluates single fits.
 
-JAX traces and differentiates the user's functions; `trace` writes what comes out as scalars (`scalars`), `templates`
-holds them, `kernels` puts them into the shared rows and nodes, `driver` loops over these, `llvm` compiles, `program`
-keeps, and `experiment` runs. What `trace` needs for decisions at run time stands in `entries` (choices), `integers`,
-`indexing`, `sorting` and `matrices`.
+JAX traces and differentiates the user's functions; `trace` translates the result to expression graphs (`scalars`),
+`templates` holds them, `kernels` inserts them into the shared rows and nodes, `driver` loops over these, `llvm`
+compiles, `program` caches, and `experiment` calls the machine code. `entries` (selections), `integers`, `indexing`,
+`sorting` and `matrices` are the parts of `trace` that depend on values at run time.
 """

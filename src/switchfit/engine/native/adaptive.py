@@ -1,4 +1,4 @@
-"""The adaptive solve in machine code: `discretization.step_size` as straight lines between slopes of a mode."""
+"""Adaptive steps in machine code: `discretization.step_size` as straight-line functions between slopes of a mode."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from switchfit.engine.native.templates import ELL, F, Sizes
 
 STAGES = len(ADAPTIVE.tableau.b)
 STAGE_TIMES = [*ADAPTIVE.tableau.c.tolist(), 1.0]
-"""Where in a step its slopes are, the last one behind it."""
+"""Times of the slopes of a step, as fractions of it; the last one is at its end."""
 
 SLOPE = ("c", "p", "moment", "signal", "y", "K", CHECKED)
 STEP = ("state", "y", "argument", "K")
@@ -49,24 +49,24 @@ class Adaptive(NamedTuple):
 def write_slope(
     module: Module, name: str, stage: Template, inputs: tuple[Graph, Objects, list[Objects]], sizes: Sizes
 ) -> None:
-    """Write f and ell at one moment: the derivative of y = (x, running cost so far); `inputs` are a graph, p and c."""
+    """Write f and ell at one time: the derivative of y = (x, running cost so far); `inputs` are a graph, p and c."""
     graph, p, constants = inputs
     t, origin = graph.loads("moment", 2)
     signal = graph.loads("signal", 4 * sizes.signals)
-    none = np.full(sizes.n, graph.constant(0.0), dtype=object)
-    given = (t, graph.loads("y", sizes.n), p, none, graph.constant(0.0), origin, signal, *constants)
+    zeros = np.full(sizes.n, graph.constant(0.0), dtype=object)
+    given = (t, graph.loads("y", sizes.n), p, zeros, graph.constant(0.0), origin, signal, *constants)
     f, ell = stage(graph, *given, only=(F, ELL), checked=True)
     stores = [("K", k, node) for k, node in enumerate([*f, ell.item()])]
     module.write_straight_line(name, SLOPE, stores + graph.check(), exported=True)
 
 
 def step_functions() -> list[str]:
-    """Return the names of what `write_step` writes, in the order in which a step calls them, a slope before each."""
+    """Return the names of the functions of `write_step` in the order of their calls; a slope precedes each call."""
     return [*(f"adaptive_{j}" for j in range(1, STAGES)), "adaptive_after", "adaptive_judge"]
 
 
 def write_step(module: Module, sizes: Sizes) -> None:
-    """Write what a step computes between its slopes K: the states at which these are asked for, and the judgement."""
+    """Write the functions between the slopes K of a step: the states for the next slope, and the error control."""
     size, at = sizes.n + 1, Adaptive()
 
     def begin(slopes: int) -> tuple[Graph, Objects, Objects, list[Objects]]:
@@ -77,7 +77,7 @@ def write_step(module: Module, sizes: Sizes) -> None:
     def write(name: str, values: Objects) -> None:
         module.write_straight_line(name, STEP, [("argument", k, node) for k, node in enumerate(values)])
 
-    *of_stages, of_end, of_judgement = step_functions()
+    *of_stages, of_end, of_control = step_functions()
     for j, name in enumerate(of_stages, start=1):
         _, state, y, K = begin(j)
         write(name, stage_state(ADAPTIVE.tableau.a[j], state[at.step], y, K))
@@ -97,4 +97,4 @@ def write_step(module: Module, sizes: Sizes) -> None:
     stores = [("state", at.t, now.t), ("state", at.step, now.step)]
     for place, flag in ((at.refused, now.refused), (at.stuck, now.stuck)):
         stores.append(("state", place, graph.apply("select", flag, 1.0, 0.0)))
-    module.write_straight_line(of_judgement, STEP, stores + [("y", k, node) for k, node in enumerate(y_now)])
+    module.write_straight_line(of_control, STEP, stores + [("y", k, node) for k, node in enumerate(y_now)])

@@ -1,12 +1,12 @@
-"""The loops around the straight lines of `switchfit.engine.native.kernels`, in LLVM's language, written by hand.
+"""Loops that call the straight-line functions of `switchfit.engine.native.kernels`, in hand-written LLVM IR.
 
-Rows are numbered by ``cell + segment``: each transition cuts one cell in two. Which mode a segment has, and which reset
-map and other functions a transition, is read at run time. The segments that a sequence does not need are idle: they
-begin and end at tf.
+Rows are numbered by ``cell + segment``: each transition cuts one cell in two. The mode of a segment, and the reset map
+and other functions of a transition, are read at run time. Segments that a sequence does not need are idle: they begin
+and end at tf.
 
-Python hears Ctrl-C only between two calls. Loops therefore stop when a budget is spent, and go on where they stopped
-when they are called again. `progress` is what they leave in memory between two calls: three integers, the phase of the
-evaluation (-1 at its end), how many turns of the loop in it are done, and what is left of the budget (`llvm.BUDGET`).
+Python handles Ctrl-C only between two calls. Loops therefore return when a budget is spent, and resume at the next
+call. Their state between two calls is `progress`, three integers: the phase of the evaluation (-1 at its end), the
+number of finished iterations of the loop in this phase, and the rest of the budget (`llvm.BUDGET`).
 """
 
 from __future__ import annotations
@@ -30,9 +30,10 @@ WHOLE = f"{TABLE}, i64 %segment, ptr %progress"
 
 
 def write_evaluation(writer: Writer) -> str:
-    """Write `evaluate`: all phases in order; those that are loops return whether they are finished.
+    """Write `evaluate`, which runs all phases in order; the loops among them return whether they are finished.
 
-    They are the segments forward, the Measurements, the end, and the segments backward.
+    The phases are the segments forward, the samples of each Measurements, the terminal terms, and the segments
+    backward.
     """
     N, K = writer.sizes.N, len(writer.library.measurements)
     found = writer.pointers()
@@ -118,7 +119,7 @@ def write_outputs(writer: Writer) -> str:
 
 
 def write_slope_in_cell(writer: Writer, mode: int) -> str:
-    """Write the slope of one mode at any time, with the signals of its cell; `low` and `high` limit the search."""
+    """Write the slope of one mode at any time, with the signals of the cell that holds it, clipped to [low, high]."""
     S, at = writer.sizes.signals, Adaptive()
     writer.line("%moment = alloca [2 x double]")
     found = writer.pointers()
@@ -130,7 +131,7 @@ def write_slope_in_cell(writer: Writer, mode: int) -> str:
         below = writer.let(f"fcmp ogt double {later}, {high}")
         inside = writer.let(f"select i1 {below}, double {high}, double {later}")
         writer.line("br label %search")
-        writer.label("search")  # the first node of the cell is at or before the time, the one at %right after
+        writer.label("search")  # nodes[left] <= time; time < nodes[right], or right is the last node
         writer.line("%left = phi i64 [0, %entry], [%left_next, %halve]")
         writer.line("%right = phi i64 [%cells, %entry], [%right_next, %halve]")
         writer.line("%width = sub i64 %right, %left")
@@ -155,9 +156,10 @@ def write_slope_in_cell(writer: Writer, mode: int) -> str:
 
 
 def write_adaptive_solve(writer: Writer, mode: int) -> str:
-    """Write adaptive steps in one mode, until the end, `most` of them or the budget; they store the accepted times.
+    """Write the loop over adaptive steps in one mode; it stores the times of accepted steps.
 
-    Refused steps count for the budget too.
+    It ends at the end time, after `most` accepted steps, when the solver is stuck, or when the budget is spent.
+    Rejected steps count for the budget too.
     """
     size, at = writer.sizes.n + 1, Adaptive()
     given = {name: f"%{name}" for name in STEP}

@@ -1,6 +1,4 @@
-"""Machine code as an engine: one program for each order of derivatives that is asked for, and JAX where one presumed
-wrongly.
-"""
+"""Machine code as an engine: a program for each requested order of derivatives; JAX where a finiteness check fails."""
 
 from __future__ import annotations
 
@@ -39,12 +37,12 @@ class NativeEngine:
     structure : Structure
     arguments : Arguments
     mesh : Mesh
-    otherwise : ExperimentEngine
-        Evaluates what machine code cannot: a product with zero was left out whose other factor is not finite.
+    fallback : ExperimentEngine
+        Evaluates where machine code cannot: a product with zero was left out whose other factor is not finite.
     """
 
-    def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh, otherwise: ExperimentEngine) -> None:
-        self._structure, self._arguments, self._mesh, self._otherwise = structure, arguments, mesh, otherwise
+    def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh, fallback: ExperimentEngine) -> None:
+        self._structure, self._arguments, self._mesh, self._fallback = structure, arguments, mesh, fallback
         self._experiments: dict[Order, NativeExperiment | None] = {}
 
     @property
@@ -62,13 +60,13 @@ class NativeEngine:
         """Return J alone."""
         native = self.at(Order.COST)
         found = None if native is None else native.cost(tau, p)
-        return self._otherwise.cost(tau, p) if found is None else found
+        return self._fallback.cost(tau, p) if found is None else found
 
     def derivatives(self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix) -> Derivatives:
         """Return J and its derivatives."""
         native = self.at(ORDERS[matrix])
         found = None if native is None else native(tau, p, side)
-        return self._otherwise.derivatives(tau, p, side, matrix) if found is None else found
+        return self._fallback.derivatives(tau, p, side, matrix) if found is None else found
 
     def constrained(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
@@ -76,18 +74,18 @@ class NativeEngine:
         """Return J and its constraints."""
         native = self.at(Order.HESSIAN)
         found = None if native is None else native.constrained(tau, p, side, multipliers, penalty)
-        return self._otherwise.constrained(tau, p, side, multipliers, penalty) if found is None else found
+        return self._fallback.constrained(tau, p, side, multipliers, penalty) if found is None else found
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""
         native, plain = self.at(Order.HESSIAN if tangents else Order.COST), self.at(Order.COST)
         found = None
         if native is not None and plain is not None:
-            found = _simulation(self._structure, self._arguments, native, plain, tau, p, tangents)
-        return self._otherwise.simulate(tau, p, tangents=tangents) if found is None else found
+            found = _simulate(self._structure, self._arguments, native, plain, tau, p, tangents)
+        return self._fallback.simulate(tau, p, tangents=tangents) if found is None else found
 
 
-def _simulation(
+def _simulate(
     structure: Structure,
     arguments: Arguments,
     native: NativeExperiment,
@@ -96,16 +94,16 @@ def _simulation(
     p: FloatArray,
     tangents: bool,
 ) -> Simulation | None:
-    """Return all rows; None if a presumption was wrong.
+    """Return all rows; None if a finiteness check failed.
 
-    Machine code has the derivatives at the ends of rows, which move where they are transitions. At the time at which
-    such an end is they are less dx/dt.
+    Machine code has the derivatives at the ends of rows, which move with theta where they are transitions. The
+    derivative at fixed time is this one minus dx/dt, in the column of the transition time.
     """
     found = native.simulate(tau, p)
     if found is None:
         return None
     first_cell, start, end = found.first_cell.astype(np.intp), found.times[:-1], found.times[1:]
-    opening = (first_cell + np.arange(len(first_cell)))[1:]  # rows that begin at a transition, where those before end
+    opening = (first_cell + np.arange(len(first_cell)))[1:]  # rows that begin at a transition
     before, at_ends, fixed = found.states[:-1].copy(), found.tangents, found.tangents
     for i in structure.resets:
         before[opening[i]] = found.reset_states[i]

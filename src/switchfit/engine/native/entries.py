@@ -1,4 +1,4 @@
-"""What the entries of a traced array are, and the choices among them that are made at run time.
+"""Entries of traced arrays, and selections among them at run time.
 
 An entry is a Python number, a node (a double, or a truth value in an array of booleans), or an `Integer`.
 """
@@ -34,13 +34,13 @@ class Unsupported(Exception):  # noqa: N818  # control flow, not an error: the c
 
 
 MOST_CHOICES = 64
-"""Entries that depend on the state among which an index chooses: each takes a comparison and a selection."""
+"""Largest number of state-dependent entries from which an index selects: each takes a comparison and a selection."""
 
 MOST_SELECTIONS = 4
-"""Known entries among which an index chooses by selections; more are looked up in memory."""
+"""Largest number of known entries from which an index selects by comparisons; more become a table in memory."""
 
 MOST_ROWS_OF_TABLE = 100_000
-"""Known entries of a table in memory: it is written into the machine code, 2 MB of text for this size."""
+"""Largest number of entries of a table in memory. It is part of the module's text: 2 MB at this size."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class Integer:
     node : Node
         Its value, as a double; it is finite, and never -0.0.
     low, high : int
-        Between which it is, inclusive: far below 2**53, so that arithmetic with doubles is exact.
+        Inclusive bounds of its value, far below 2**53, so that arithmetic with doubles is exact.
     """
 
     node: Node
@@ -61,7 +61,7 @@ class Integer:
 
     @classmethod
     def of(cls, graph: Graph, value: Any) -> Integer:
-        """Return a known integer, or a truth value, or what is an `Integer` already, as one."""
+        """Convert a known integer or a truth value to an `Integer`; return an `Integer` as it is."""
         if isinstance(value, Integer):
             return value
         if isinstance(value, Node):
@@ -79,7 +79,7 @@ def _is_known_integer(value: Any) -> bool:
 
 
 def choose(graph: Graph, condition: Any, yes: Any, no: Any) -> Any:
-    """Return one of two entries of the same type; what the condition is may be known."""
+    """Select one of two entries of the same type; the condition may be known or traced."""
     if isinstance(condition, Node) and condition.number is not None:
         condition = condition.number
     if not isinstance(condition, Node):
@@ -92,7 +92,7 @@ def choose(graph: Graph, condition: Any, yes: Any, no: Any) -> Any:
 
 
 def less(graph: Graph, a: Any, b: Any) -> Any:
-    """Return whether a < b for integers, which may be known from their bounds."""
+    """Return whether a < b for integers: a bool if their bounds decide it."""
     if not is_traced(a) and not is_traced(b):
         return bool(a < b)
     one, other = Integer.of(graph, a), Integer.of(graph, b)
@@ -104,7 +104,7 @@ def less(graph: Graph, a: Any, b: Any) -> Any:
 
 
 def equal(graph: Graph, a: Any, b: Any) -> Any:
-    """Return whether a == b for integers, which may be known from their bounds."""
+    """Return whether a == b for integers: a bool if their bounds decide it."""
     if not is_traced(a) and not is_traced(b):
         return bool(a == b)
     one, other = Integer.of(graph, a), Integer.of(graph, b)
@@ -124,7 +124,7 @@ def both(graph: Graph, a: Any, b: Any) -> Any:
 
 
 def clamp(graph: Graph, index: Any, low: int, high: int) -> Any:
-    """Return an integer, moved into a range; an int if that is known."""
+    """Clamp an integer to a range; return an int if the result is known."""
     if not isinstance(index, Integer):
         return min(max(int(index), low), high)
     result: Any = index
@@ -140,10 +140,10 @@ def clamp(graph: Graph, index: Any, low: int, high: int) -> Any:
 
 
 def pick(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
-    """Return the entry for the value of an index: the first one is for `index.low`, the last one for `index.high`.
+    """Select an entry by an index; the first entry belongs to `index.low`, the last one to `index.high`.
 
-    Neighbours that are equal count as one, so that a row of zeros around a number takes two selections. Known numbers
-    are looked up in memory, where it takes as long for many as for few.
+    Equal neighbors are merged, so that one number in a row of zeros takes two selections. More than a few known numbers
+    become a table in memory, whose lookup takes the same time for any size.
     """
     starts = [k for k in range(len(entries)) if k == 0 or not _is_same(entries[k - 1], entries[k])]
     if len(starts) == 1:
@@ -155,18 +155,18 @@ def pick(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
             f"takes one of {len(starts)} numbers by an index that depends on the state (limit: {MOST_CHOICES})"
         )
 
-    def chosen(runs: list[int]) -> Any:
+    def select_run(runs: list[int]) -> Any:
         if len(runs) == 1:
             return entries[runs[0]]
         middle = len(runs) // 2
         before = less(graph, index, index.low + runs[middle])
-        return choose(graph, before, chosen(runs[:middle]), chosen(runs[middle:]))
+        return choose(graph, before, select_run(runs[:middle]), select_run(runs[middle:]))
 
-    return chosen(starts)
+    return select_run(starts)
 
 
 def known_number(entry: Any) -> Any:
-    """Return the number that an entry is; None if it depends on the state."""
+    """Return the value of an entry; None if it depends on the state."""
     return entry.number if isinstance(entry, Node) else None
 
 

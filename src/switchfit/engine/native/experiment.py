@@ -48,10 +48,10 @@ def reason_for_jax(structure: Structure, arguments: Arguments, order: Order) -> 
 
 
 def places_in_library(structure: Structure) -> dict[str, NDArray[np.int64]]:
-    """Return which mode of the library each segment has, and which reset map and other function each transition.
+    """Return the index in the library of the mode of each segment, and of the functions of each transition.
 
-    Transitions without one have -1. Segments that the sequence does not need have its last mode, and their transitions
-    nothing. A -1 that nobody reads ends each array, so that none is empty.
+    Transitions without a function of a kind have -1. Idle segments, which the sequence does not need, have its last
+    mode and no functions. Each array ends with an unused -1, so that it is never empty.
     """
     library, idle = structure.library, structure.transitions - structure.N
 
@@ -75,8 +75,8 @@ class Simulated(NamedTuple):
     times, states, tangents : (R + 1,), (R + 1, n), (R + 1, n, D)
         At t0, then at the end of each row, before a jump. The tangents, in second order, are derivatives at an end that
         moves with theta where it is a transition.
-    reset_states, reset_tangents : (N, n), (N, n, D), behind the reset maps; meaningless where there is none
-    late : for each Measurements that is late, by its place, the moments of which its samples are, and the states then
+    reset_states, reset_tangents : (N, n), (N, n, D), after the reset maps; undefined at transitions without one
+    late : for each late Measurements, by its index, the times at which its samples saw the state, and the states then
     """
 
     cost: float
@@ -119,9 +119,11 @@ class NativeExperiment:
         self._workspace = program.workspace
         N, D, width, cells = sizes.N, sizes.D, sizes.width, len(times) - 1
         self._channels = sum(channels for _, channels in structure.outputs)
-        self._own = np.concatenate([np.arange(structure.N), np.arange(N, D)])  # its unknowns among the program's
+        self._own = np.concatenate(
+            [np.arange(structure.N), np.arange(N, D)]
+        )  # positions of its unknowns in the program
         self._all_own = structure.N == N
-        counts = [_count(samples) for samples in arguments.samples]
+        counts = [_count_samples(samples) for samples in arguments.samples]
         pointer, number = ctypes.c_void_p, ctypes.c_int64
         self._program = program  # keeps its code alive
         self._evaluate = program.function(f"{self._prefix}evaluate", pointer, pointer, *[number] * len(counts))
@@ -153,7 +155,7 @@ class NativeExperiment:
             "units": units,
         }
         arrays |= places_in_library(structure)
-        arrays |= _parts(self._sums, lengths)
+        arrays |= _split_array(self._sums, lengths)
         self._check, self._J = arrays[CHECKED], arrays["J"]
         self._lengths = {name: length.at(cells + N) for name, length in memory(library, sizes, order).items()}
         self._size = sum(self._lengths.values())
@@ -176,16 +178,16 @@ class NativeExperiment:
         self._address = self._table.ctypes.data
         self._progress = (ctypes.c_int64 * 3)()
         self._result = self._named["g"][:D], self._named["H"].reshape(D, width)[:, :D]
-        self._delays = _places_of_delays(structure, arguments)
+        self._delays = _find_delays(structure, arguments)
 
     def __call__(self, tau: FloatArray, p: FloatArray, side: float) -> Derivatives | None:
-        """Return J, its gradient (D,) and its Hessian (D, D), NaN if the order has none.
+        """Return J, its gradient (D,) and its Hessian (D, D), which is NaN at orders below the second.
 
-        None if a presumption was wrong: the caller falls back to JAX.
+        None if a finiteness check failed: the caller falls back to JAX.
         """
         with self._workspace.lock:
             self._run(tau, p, side)
-            if self._is_presumption_wrong:
+            if self._has_failed_check:
                 return None
             g, H = self._result
             if not self._all_own:
@@ -198,7 +200,7 @@ class NativeExperiment:
     ) -> Constrained | None:
         """Return the cost, the constraints and their derivatives; the multipliers and penalties are (m,).
 
-        None if a presumption was wrong.
+        None if a finiteness check failed.
         """
         where = self._constraint_rows
         with self._workspace.lock:
@@ -207,7 +209,7 @@ class NativeExperiment:
                 self._run(tau, p, side)
             finally:
                 self._weights[:] = 0.0
-            if self._is_presumption_wrong:
+            if self._has_failed_check:
                 return None
             (g, H), own = self._result, self._own
             c = self._named["constraints"][where]
@@ -220,28 +222,28 @@ class NativeExperiment:
         return lambda: self._call_in_pieces(self._evaluate, *self._counts)
 
     @property
-    def _is_presumption_wrong(self) -> bool:
+    def _has_failed_check(self) -> bool:
         """Whether a product with zero was left out whose other factor was not finite.
 
-        A cost that is not finite says enough as it is.
+        If the cost is not finite, it is returned without fallback: the caller rejects the point anyway.
         """
         check = self._check.item(0)
         return check != check and math.isfinite(self._J.item(0))
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float | None:
-        """Return J alone; None if a presumption was wrong."""
+        """Return J alone; None if a finiteness check failed."""
         with self._workspace.lock:
             self._run(tau, p, 1.0)
-            return None if self._is_presumption_wrong else self._J.item(0)
+            return None if self._has_failed_check else self._J.item(0)
 
     def simulate(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
-        """Return the states at all ends of rows, in second order with tangents; None if a presumption was wrong."""
+        """Return the states at the ends of all rows, at second order with tangents; None if a check failed."""
         with self._workspace.lock:
             return self._simulate(tau, p)
 
     def _simulate(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
         self._run(tau, p, 1.0)
-        if self._is_presumption_wrong:
+        if self._has_failed_check:
             return None
         n, N, cells = self.sizes.n, self.structure.N, self._cells
         first_cell = self._first_cell[: N + 1].copy()
@@ -267,7 +269,7 @@ class NativeExperiment:
         )
 
     def _late_states(self, k: int, count: int) -> tuple[FloatArray, FloatArray]:
-        """Return the times (K,) at which the late samples of the k-th Measurements saw the state, and it (K, n)."""
+        """Return the times (K,) at which late samples of the k-th Measurements saw the state, and the states (K, n)."""
         times, states = np.zeros(count), np.zeros((count, self.sizes.n))
         pointer = ctypes.c_void_p
         types = [pointer, ctypes.c_int64, pointer, pointer]
@@ -280,7 +282,7 @@ class NativeExperiment:
     ) -> tuple[FloatArray, FloatArray] | None:
         """Return the outputs of all sensors (L, q), and their tangents if those of the states (L, n, D) are given.
 
-        None if a presumption was wrong.
+        None if a finiteness check failed.
         """
         count, (n, width) = len(times), (self.sizes.n, self.sizes.width)
         y, Y = np.zeros((count, self._channels)), np.zeros((count, self._channels, width))
@@ -300,13 +302,13 @@ class NativeExperiment:
         return y, Y[..., self._own]
 
     def initial_state(self, p: FloatArray) -> FloatArray:
-        """Return x(t0): (n,); NaN if a presumption was wrong."""
+        """Return x(t0): (n,); NaN if a finiteness check failed."""
         self._own_p[:] = p
         x = np.zeros(self.sizes.n)
         return x + self._call("start", START, {"x": x})
 
     def after_reset(self, i: int, t: float, x: FloatArray, p: FloatArray) -> FloatArray:
-        """Return the state after the reset map of transition i (from 0): (n,); NaN if a presumption was wrong."""
+        """Return the state after the reset map of transition i (from 0): (n,); NaN if a finiteness check failed."""
         self._own_p[:] = p
         which = int(self._named["resets"][i])
         given = {"time": np.array([t]), "x": np.array(x, dtype=float), "x_after": np.zeros(self.sizes.n)}
@@ -314,9 +316,9 @@ class NativeExperiment:
         return given["x_after"] + self._call(f"reset_{which}", RESET, given)
 
     def slope(self, mode: int, t: float, y: FloatArray, p: FloatArray, cell: int | None = None) -> FloatArray:
-        """Return f and ell at t, y = (x, running cost so far): (n + 1,); NaN if a presumption was wrong.
+        """Return f and ell at t, y = (x, running cost so far): (n + 1,); NaN if a finiteness check failed.
 
-        With the signals of a cell; left out, of the one that holds t, or begins there.
+        The signals are those of `cell`; by default, of the cell that holds t (at a node, of the later one).
         """
         self._own_p[:] = p
         if cell is None:
@@ -328,8 +330,8 @@ class NativeExperiment:
     def adaptive_steps(self, mode: int, state: FloatArray, y: FloatArray, p: FloatArray, most: int) -> FloatArray:
         """Take up to `most` adaptive steps from `state` and y, which are updated; return the accepted times.
 
-        y is NaN if a presumption was wrong. It may return early, even without a step, when its budget is spent: call it
-        again.
+        y is NaN if a finiteness check failed. If the budget is spent, it returns early, possibly without a step: call
+        it again.
 
         Parameters
         ----------
@@ -350,9 +352,9 @@ class NativeExperiment:
         return times[: count[0]]
 
     def _call(self, name: str, order: tuple[str, ...], given: dict[str, FloatArray]) -> float:
-        """Call one of the straight lines; pointers that are not given are those of the driver.
+        """Call a straight-line function; pointers that are not given are those of the driver.
 
-        Return 0, or NaN if a presumption was wrong.
+        Return 0, or NaN if a finiteness check failed.
         """
         check = np.zeros(1)
         arrays = [given[key] if key in given else self._named.get(key) for key in order[:-1]]
@@ -363,7 +365,7 @@ class NativeExperiment:
     def _run(self, tau: FloatArray, p: FloatArray, side: float) -> None:
         self._tau[:] = tau
         self._own_p[:] = p
-        self._place(tau, side)
+        self._find_first_cells(tau, side)
         self._workspace.reserve(self._size)
         if self._memory is not self._workspace.memory:
             self._bind(self._workspace.memory)
@@ -371,7 +373,7 @@ class NativeExperiment:
         for part in self._zeroed:
             part[:] = 0.0
         if self._late:
-            self._place_late(p)
+            self._find_late_cells(p)
         self._call_in_pieces(self._evaluate, *self._counts)
 
     def _call_in_pieces(self, function: Callable[..., object], *given: Any) -> None:
@@ -385,20 +387,20 @@ class NativeExperiment:
     def _bind(self, workspace: FloatArray) -> None:
         """Store the addresses of another workspace in the table."""
         self._memory = workspace
-        found = _parts(workspace, self._lengths)
+        found = _split_array(workspace, self._lengths)
         self._zeroed = [found[name] for name in ZEROED if found[name].size]
         self._named |= found
         for k, name in enumerate(self._pointers):
             if name in found:
                 self._table[k] = found[name].ctypes.data
 
-    def _place(self, tau: FloatArray, side: float) -> None:
+    def _find_first_cells(self, tau: FloatArray, side: float) -> None:
         """Find the cells in which segments begin, as in `switchfit.discretization.mesh.rows`."""
         if len(tau):
             passed = self.times.searchsorted(tau, "right" if side > 0 else "left")
             self._begins[:] = np.minimum(np.maximum(passed - 1, 0), self._cells - 1)
 
-    def _place_late(self, p: FloatArray) -> None:
+    def _find_late_cells(self, p: FloatArray) -> None:
         """Find the cells and segments of the late samples: those of the rows with ``start < t - delay <= end``."""
         for _, name, times, cell, segment in self._late:
             place, value = self._delays[name]
@@ -407,13 +409,13 @@ class NativeExperiment:
             segment[:] = self._tau.searchsorted(seen, "left")
 
 
-def _parts(whole: FloatArray, lengths: dict[str, int]) -> dict[str, FloatArray]:
+def _split_array(whole: FloatArray, lengths: dict[str, int]) -> dict[str, FloatArray]:
     """Return consecutive parts of an array by their names and lengths."""
     ends = np.cumsum(list(lengths.values())).tolist()
     return {name: whole[end - length : end] for (name, length), end in zip(lengths.items(), ends, strict=True)}
 
 
-def _places_of_delays(structure: Structure, arguments: Arguments) -> dict[str, tuple[int | None, float]]:
+def _find_delays(structure: Structure, arguments: Arguments) -> dict[str, tuple[int | None, float]]:
     """Return the position in p of each scalar parameter, or its value if it is fixed."""
     found: dict[str, tuple[int | None, float]] = {}
     fixed, position = iter(arguments.fixed), 0
@@ -425,7 +427,7 @@ def _places_of_delays(structure: Structure, arguments: Arguments) -> dict[str, t
     return found
 
 
-def _count(samples: Samples) -> int:
-    """Return the number of samples up to the last that has a value: the rest is padding."""
+def _count_samples(samples: Samples) -> int:
+    """Return the number of samples up to the last with a nonzero weight, at least 1; the rest is padding."""
     there = np.flatnonzero(np.asarray(samples.weight).any(1))
     return int(there[-1]) + 1 if len(there) else 1

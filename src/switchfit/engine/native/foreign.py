@@ -1,8 +1,9 @@
-"""The machine code of an experiment as an operation inside a JAX program, for fits that run in one program on a CPU."""
+"""Machine code of an experiment as a foreign function in a JAX program, for fits that run in one program on a CPU."""
 
 from __future__ import annotations
 
 import ctypes
+import threading
 from collections.abc import Mapping
 from functools import cache
 from typing import Any
@@ -19,23 +20,38 @@ from switchfit.engine.native.templates import Order, Sizes, constants_of
 from switchfit.engine.native.workspace import GIVEN, constraint_rows, memory, sums
 from switchfit.problem.structure import Structure
 
+_registered: dict[str, Program] = {}
+"""Programs whose addresses XLA keeps, by the names of their operations: they must stay alive."""
+_one_at_a_time = threading.Lock()
 
-@cache  # XLA keeps the address: the program must stay alive
-def _register(library: Structure, sizes: Sizes) -> tuple[str, Program]:
-    """Register the operation of a library with XLA; return its name and its program."""
+
+@cache
+def _register(library: Structure, sizes: Sizes) -> str:
+    """Register the operation of a library with XLA; return its name.
+
+    XLA takes a name once. Models with the same machine code, which may differ in the names of their parameters, share
+    the operation of the first.
+    """
     program = program_of(library, sizes, Order.HESSIAN)
     if isinstance(program, str):
-        raise ValueError(f"there is no machine code: {program}")
+        raise ValueError(f"the experiment has no machine code: {program}")
     name = f"switchfit_{program.key[:32]}"
+    with _one_at_a_time:
+        if name not in _registered:
+            jax.ffi.register_ffi_target(name, _make_capsule(program), platform="cpu")
+            _registered[name] = program
+    return name
+
+
+def _make_capsule(program: Program) -> Any:
+    """Return the address of a program's handler as XLA takes it."""
     new_capsule = ctypes.pythonapi.PyCapsule_New
     new_capsule.restype, new_capsule.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
-    capsule = new_capsule(program.address("xla_handler"), b"xla._CUSTOM_CALL_TARGET", None)
-    jax.ffi.register_ffi_target(name, capsule, platform="cpu")
-    return name, program
+    return new_capsule(program.address("xla_handler"), b"xla._CUSTOM_CALL_TARGET", None)
 
 
 def can_be_foreign(structure: Structure) -> bool:
-    """Return whether the operation covers an experiment: it has no late samples."""
+    """Return whether a JAX program can call the machine code of an experiment: it must have no late samples."""
     return all(sensor.delay is None for sensor in structure.measurements)
 
 
@@ -49,17 +65,17 @@ def foreign_derivatives(
 ) -> Any:
     """Return cost, gradient (D,) and Hessian (D, D) of one experiment inside a JAX program that runs on a CPU.
 
-    For an experiment that `can_be_foreign` and for which there is machine code. `side` is +1 or -1: the right or left
-    derivatives by a transition time that sits on a node.
+    The experiment must satisfy `can_be_foreign` and have machine code. `side` is +1 or -1: the right or left
+    derivative in a transition time that lies on a node.
 
-    Given `places`, what `places_in_library` returns, nothing else of the structure is used than its library: a program
-    of JAX that takes them as arguments serves all sequences of a library with the same number of transitions. It is
-    then keyed by ``structure.library``, which may be given in place of the structure.
+    With `places`, the result of `places_in_library`, only the library of the structure is used. A JAX program that
+    takes the places as arguments then serves all sequences of a library with the same number of transitions, and
+    ``structure.library`` may be passed in place of the structure, as the key of that program.
     """
     sizes, library = Sizes.of(structure, arguments), structure.library
-    name, _ = _register(library, sizes)
+    name = _register(library, sizes)
     N, D, width = sizes.N, sizes.D, sizes.width
-    idle = N - tau.shape[0]  # segments that the sequence does not need: they begin and end at tf
+    idle = N - tau.shape[0]  # number of segments that the sequence does not need: they begin and end at tf
     places = places_in_library(structure) if places is None else places
     nodes = arguments.nodes
     cells = nodes.shape[0] - 1
@@ -90,6 +106,6 @@ def foreign_derivatives(
     totals = jax.ffi.ffi_call(name, results, vmap_method="expand_dims")(*buffers)[0]
     ends = dict(zip(lengths, np.cumsum(list(lengths.values())).tolist(), strict=True))
     J, g, H = (totals[ends[key] - lengths[key] : ends[key]] for key in ("J", "g", "H"))
-    cost = J[0] + totals[-1]  # NaN if a presumption was wrong: the finisher of a batch then falls back to JAX
-    own = np.concatenate([np.arange(N - idle), np.arange(N, D)])  # its unknowns among the program's
+    cost = J[0] + totals[-1]  # NaN if a finiteness check failed: the finisher of a batch then falls back to JAX
+    own = np.concatenate([np.arange(N - idle), np.arange(N, D)])  # positions of its unknowns among the program's
     return cost, g[own], H.reshape(D, width)[np.ix_(own, own)]

@@ -1,6 +1,6 @@
-"""How XLA calls machine code: a handler that finds arguments and results in a frame of pointers.
+"""Handler by which XLA calls machine code; it reads the arguments and results from XLA's call frame.
 
-Only a few fields of that frame are read. Where they stand is fixed by XLA's C interface for foreign functions
+Only a few fields of the frame are read. Their offsets are fixed by XLA's C interface for foreign functions
 (``xla/ffi/api/c_api.h``).
 """
 
@@ -13,21 +13,21 @@ MAJOR, MINOR = 0, 1
 """Version of the interface."""
 
 EXTENSION, ARGUMENTS, RESULTS = 8, 72, 112
-"""Bytes into the frame: pointers to the first extension, to the arguments and to the results."""
+"""Byte offsets in the frame of the pointers to the first extension, to the arguments and to the results."""
 
 DATA, RANK, DIMENSIONS = 24, 32, 40
-"""Bytes into a buffer: its data, the number of its dimensions, and these."""
+"""Byte offsets in a buffer of its data, its rank and its dimensions."""
 
 RANKS = {"signals": 3, "units": 2, "value": 2, "weight": 2}
-"""Numbers of dimensions of what one experiment is given, where they are not 1."""
+"""Ranks of the arguments of one experiment that are not 1."""
 
 
 def write_handler(writer: Writer) -> str:
-    """Return the handler's text: it fills the table of pointers and calls the writer, once per entry of a batch.
+    """Return the text of the handler, which fills the table of pointers and calls `evaluate` for each entry of a batch.
 
-    Its arguments are those of `workspace.GIVEN`, then those of the samples; its results are all sums in one, and the
-    memory. In a batch all of them have one dimension more, of length 1 where they are the same for all; the memory of
-    the first serves all, one after the other, and stays in the caches.
+    Arguments are those of `workspace.GIVEN`, then those of the samples; results are all accumulators in one array, and
+    the scratch space. In a batch, each has one more dimension in front, of length 1 if all entries share it. All
+    entries use the scratch space of the first one after another, so that it stays in the CPU caches.
     """
     library, sizes = writer.library, writer.sizes
     measurements = len(library.measurements)
@@ -39,7 +39,7 @@ def write_handler(writer: Writer) -> str:
     writer.label("asked")
     kind = writer.load("i32", writer.into(extension, 8))
     writer.line(f"br i1 {writer.let(f'icmp eq i32 {kind}, 1')}, label %answer, label %run")
-    writer.label("answer")  # which version of the interface this is
+    writer.label("answer")  # XLA queries the version of the interface
     metadata = writer.load("ptr", writer.into(extension, 24))
     for offset, value in ((24, MAJOR), (28, MINOR), (32, 0)):
         writer.line(f"store i32 {value}, ptr {writer.into(metadata, offset)}")
@@ -55,7 +55,7 @@ def write_handler(writer: Writer) -> str:
 
     totals, rank, dimensions = buffer(results, 0)
     batched = writer.let(f"icmp eq i64 {rank}, 2")
-    leading = writer.let(f"zext i1 {batched} to i64")  # dimensions before those of one experiment
+    leading = writer.let(f"zext i1 {batched} to i64")  # number of batch dimensions
     first = writer.load("i64", dimensions)
     repeats = writer.let(f"select i1 {batched}, i64 {first}, i64 1")
     between = buffer(results, 1)[0]
@@ -94,7 +94,7 @@ def write_handler(writer: Writer) -> str:
     for k, name in enumerate([*writer.names, *names[len(GIVEN) :]]):
         writer.line(f"store ptr {found[name]}, ptr {writer.at('%table', k)}")
     counts = "".join(f", i64 {lengths[f'{OF_SAMPLES[0]} {k}']}" for k in range(measurements))
-    writer.line("store [3 x i64] [i64 0, i64 0, i64 9223372036854775807], ptr %progress")  # all at once
+    writer.line("store [3 x i64] [i64 0, i64 0, i64 9223372036854775807], ptr %progress")  # unlimited budget
     writer.line(f"call void @evaluate(ptr %table, ptr %progress{counts})")
     writer.line("%following = add i64 %which, 1")
     writer.line(f"%more = icmp slt i64 %following, {repeats}")

@@ -1,6 +1,6 @@
-"""Entries taken from arrays, and put into them, at indices that may depend on the state: gather, scatter and slices.
+"""Gather, scatter and slices of arrays at indices that may depend on the state.
 
-Which entry it is, selections decide at run time (`entries.pick`). Indices out of range are treated as JAX does.
+Selections choose the entry at run time (`entries.pick`). Indices out of range are treated as in JAX.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Combine = Callable[[Any, Any, Any], Any]
 def take(graph: Graph, a: Any, starts: Sequence[Any], sizes: Sequence[int]) -> Any:
     """Return a window of an array: (sizes); each start is in range, an int or an `Integer`."""
     moving = [k for k, start in enumerate(starts) if isinstance(start, Integer)]
-    a = a[tuple(_reach(start, size) for start, size in zip(starts, sizes, strict=True))]
+    a = a[tuple(_get_reach(start, size) for start, size in zip(starts, sizes, strict=True))]
     if len(moving) > 1 and not any(is_traced(e) and known_number(e) is None for e in a.reshape(-1)):
         return _from_table(graph, a, [starts[k] for k in moving], moving, sizes)
     for axis in moving:
@@ -49,8 +49,8 @@ def take(graph: Graph, a: Any, starts: Sequence[Any], sizes: Sequence[int]) -> A
     return a
 
 
-def _reach(start: Any, size: int) -> slice:
-    """Return the range of places that a window may reach."""
+def _get_reach(start: Any, size: int) -> slice:
+    """Return the range of indices that a window may reach."""
     return slice(start.low, start.high + size) if isinstance(start, Integer) else slice(start, start + size)
 
 
@@ -91,13 +91,13 @@ def put(graph: Graph, a: Objects, starts: Sequence[Any], window: Any, combine: C
 
 
 def dynamic_slice(graph: Graph, equation: Any, a: Any, *starts: Any) -> Any:
-    """Do what `jax.lax.dynamic_slice` does: a window that does not fit is moved inside."""
+    """Trace `jax.lax.dynamic_slice`: a window that is out of range is moved inside."""
     sizes = equation.params["slice_sizes"]
     return take(graph, a, _move_inside(graph, starts, a.shape, sizes), sizes)
 
 
 def dynamic_update_slice(graph: Graph, equation: Any, a: Any, update: Any, *starts: Any) -> Any:
-    """Do what `jax.lax.dynamic_update_slice` does."""
+    """Trace `jax.lax.dynamic_update_slice`."""
     result = a.astype(object)
     inside = _move_inside(graph, starts, a.shape, update.shape)
     put(graph, result, inside, update, lambda here, old, new: choose(graph, here, new, old))
@@ -115,11 +115,11 @@ class _Window:
     Attributes
     ----------
     starts : list
-        Where it begins along each axis of the operand, moved into range.
+        First index along each axis of the operand, moved into range.
     fits : bool or Node
-        Whether nothing had to be moved.
+        Whether the window was in range.
     among : tuple
-        Its place in the array of all windows; entries along slices are those of `kept` axes.
+        Index of the window in the array of all windows, with slices along the axes inside windows.
     """
 
     starts: list[Any]
@@ -127,10 +127,10 @@ class _Window:
     among: tuple[Any, ...]
 
 
-def _windows(
+def _list_windows(
     graph: Graph, shape: Sequence[int], indices: Any, sizes: Sequence[int], numbers: Any, inside: Any, many: int
 ) -> Iterator[_Window]:
-    """Yield the windows of a gather or scatter; `inside` are the axes in windows, of the `many` of their array."""
+    """Yield the windows of a gather or scatter; `inside` are the window axes among the `many` axes of their array."""
     gathers = hasattr(numbers, "start_index_map")
     axes = numbers.start_index_map if gathers else numbers.scatter_dims_to_operand_dims
     batched = dict(
@@ -157,12 +157,12 @@ def _windows(
 
 
 def gather(graph: Graph, equation: Any, a: Any, indices: Any) -> Any:
-    """Do what `jax.lax.gather` does."""
+    """Trace `jax.lax.gather`."""
     params, out = equation.params, equation.outvars[0].aval
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
     result = np.empty(out.shape, dtype=object)
-    for window in _windows(graph, a.shape, indices, sizes, numbers, numbers.offset_dims, len(out.shape)):
+    for window in _list_windows(graph, a.shape, indices, sizes, numbers, numbers.offset_dims, len(out.shape)):
         taken = np.squeeze(take(graph, a, window.starts, sizes), axis=dropped)
         if params["mode"] == GatherScatterMode.FILL_OR_DROP and window.fits is not True:
             fill = _fill_value(params["fill_value"], out.dtype)
@@ -182,14 +182,14 @@ def _fill_value(given: Any, dtype: np.dtype[Any]) -> Any:
 
 
 def scatter(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any, combine: Combine) -> Any:
-    """Do what `jax.lax.scatter`, `scatter_add` and the like do."""
+    """Trace `jax.lax.scatter`, `scatter_add` and their variants."""
     params = equation.params
     numbers = params["dimension_numbers"]
     inside, dropped = numbers.update_window_dims, (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
     lengths = iter([updates.shape[k] for k in inside])
     sizes = [1 if k in dropped else next(lengths) for k in range(a.ndim)]
     result = a.astype(object)
-    for window in _windows(graph, a.shape, indices, sizes, numbers, inside, updates.ndim):
+    for window in _list_windows(graph, a.shape, indices, sizes, numbers, inside, updates.ndim):
         fits = True if params["mode"] == GatherScatterMode.CLIP else window.fits
         if fits is False:
             continue
@@ -199,7 +199,7 @@ def scatter(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any, com
 
 
 def add_where(graph: Graph, add: Callable[[Any, Any], Any], of_integers: bool) -> Combine:
-    """Return how an update is added where a condition holds."""
+    """Return a function that adds an update if a condition holds."""
 
     def combine(here: Any, old: Any, update: Any) -> Any:
         if not isinstance(here, Node):

@@ -1,7 +1,7 @@
 """Arithmetic with integers that depend on the state, as doubles.
 
-Each `Integer` knows between which bounds it is. Where a result might leave its type, or be too large for doubles to be
-exact, the graph requires at run time that it does not (`Graph.require`), and JAX evaluates the point where it does.
+Each `Integer` has bounds. If they allow a result to overflow its type, or to be too large for doubles to be exact, the
+program checks the result at run time (`Graph.require`), and falls back to JAX if it is too large.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from switchfit.engine.native.entries import Integer, Unsupported, choose, clamp,
 from switchfit.engine.native.scalars import Graph, Node
 
 Meaning = Callable[[Graph, Any, np.dtype[Any]], Callable[..., Any]]
-"""From a graph, the parameters of an operation of JAX and the type of its result: what it does to entries."""
+"""Takes a graph, the parameters of a JAX operation and the type of its result; returns the operation on entries."""
 
 LARGEST = 2**51
 """Bound below which sums, products and quotients of doubles are exact for integers."""
@@ -28,7 +28,7 @@ def _bounds(dtype: np.dtype[Any]) -> tuple[int, int]:
 
 
 def within(graph: Graph, node: Node, low: int, high: int, dtype: np.dtype[Any]) -> Any:
-    """Return what is between two bounds as an integer of a type; it is clamped, as memory may be read there."""
+    """Return a node between two bounds as an integer of a type, clamped to its range: it may be an index of memory."""
     least, most = _bounds(dtype)
     if high < least or low > most:
         raise Unsupported(f"does arithmetic with integers beyond {most}")
@@ -44,7 +44,7 @@ def _from_bounds(op: str, bounds: Callable[..., tuple[int, int]]) -> Meaning:
         def apply(*given: Any) -> Any:
             args = [Integer.of(graph, a) for a in given]
             low, high = bounds(*((a.low, a.high) for a in args))
-            node = _without_sign_of_zero(graph, graph.apply(op, *(a.node for a in args)), low, high, op)
+            node = _drop_sign_of_zero(graph, graph.apply(op, *(a.node for a in args)), low, high, op)
             return within(graph, node, low, high, dtype)
 
         return apply
@@ -52,7 +52,7 @@ def _from_bounds(op: str, bounds: Callable[..., tuple[int, int]]) -> Meaning:
     return get_meaning
 
 
-def _without_sign_of_zero(graph: Graph, node: Node, low: int, high: int, op: str) -> Node:
+def _drop_sign_of_zero(graph: Graph, node: Node, low: int, high: int, op: str) -> Node:
     if op not in ("mul", "neg", "trunc") or low > 0 or high < 0 or node.op == "const":
         return node if node.number != 0.0 else graph.constant(0.0)
     return graph.apply("select", graph.apply("eq", node, 0.0), 0.0, node)
@@ -68,14 +68,14 @@ def _absolute(a: tuple[int, int]) -> tuple[int, int]:
 
 
 def _quotient(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
-    """Return the quotient towards zero; -1 for a division by zero."""
+    """Return division rounded towards zero; division by zero yields -1."""
 
     def divide(one: Any, other: Any) -> Any:
         a, b = Integer.of(graph, one), Integer.of(graph, other)
         largest = max(abs(a.low), abs(a.high), 1)
         node = graph.apply("trunc", a.node / b.node)
         found = within(
-            graph, _without_sign_of_zero(graph, node, -largest, largest, "trunc"), *_signs(a, b, largest), dtype
+            graph, _drop_sign_of_zero(graph, node, -largest, largest, "trunc"), *_signs(a, b, largest), dtype
         )
         return choose(graph, equal(graph, b, 0), -1, found)
 
@@ -87,7 +87,7 @@ def _signs(a: Integer, b: Integer, largest: int) -> tuple[int, int]:
 
 
 def _remainder(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
-    """Return the remainder, with the sign of the dividend; the dividend itself for a division by zero."""
+    """Return the remainder with the sign of the dividend; for a division by zero, it is the dividend itself."""
 
     def remainder(one: Any, other: Any) -> Any:
         a, b = Integer.of(graph, one), Integer.of(graph, other)
@@ -155,12 +155,12 @@ def _of_type(graph: Graph, a: Integer, kind: np.dtype[Any]) -> Any:
 
 
 def invert(graph: Graph, condition: Any) -> Any:
-    """Return whether a condition does not hold; it may be known."""
+    """Negate a condition, known or traced."""
     return graph.apply("not", condition) if isinstance(condition, Node) else not condition
 
 
 def from_double(graph: Graph, kind: np.dtype[Any]) -> Callable[[Any], Any]:
-    """Return how doubles become integers of a type: towards zero, NaN is 0, and what does not fit is the bound."""
+    """Return the conversion of doubles to integers of a type: rounded towards zero, NaN to 0, clipped to the bounds."""
     least, most = _bounds(kind)
 
     def convert(a: Any) -> Integer:

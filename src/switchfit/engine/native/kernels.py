@@ -1,22 +1,22 @@
-"""Rows and nodes as straight lines: `switchfit.discretization.rows`, with a vector of all unknowns for a direction.
+"""Straight-line functions for rows and nodes: `switchfit.discretization.rows`, with derivatives as vectors over theta.
 
-What a straight line reads and writes it finds behind pointers. Every pointer means the same wherever its name stands:
+A straight-line function reads and writes through pointers. The name of a pointer means the same in all functions:
 
     c, p            constants, parameters
     row, signal     (start, end, first node of the cell), coefficients (4, S) of the signals there
     x, Z            state and its derivative: before a row, at a sample, at a transition
-    x_after, Z_after  the same behind a row or a reset map
+    x_after, Z_after  the same after a row or a reset map
     X, XZ           at the stages of a row: (s, n), (s, n, width)
     opens, closes   derivatives of the start and the end of a row: two vectors
-    moves           derivative of the moment of a node: a vector
-    psi, jump       costate; what nodes at the end of a row add to it; late, what late samples add at its start
+    moves           derivative of the time of a node: a vector
+    psi, jump, late  costate; what nodes at the end of a row add to it; what late samples add to it at its start
     J, g, H         cost, gradient (width,), Hessian (D, width): sums
-    time, y, Y      a moment, what the sensors see then, and its derivative
+    time, y, Y      a time, the outputs of the sensors at it, and their derivatives
     multiplier, penalty, constraint, jacobian
                     of some constraints: (m,), (m,), their values (m,) and derivatives (m, width)
     moment          (t, first node of the cell), for the adaptive solver; its y is (x, running cost)
     entries         second derivatives at the stages of a row, (s, count)
-    check           NaN once something presumed finite was not, else 0
+    check           0, or NaN once a value that was presumed finite is not
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ STAGE_TIMES = EXPLICIT.c.tolist()
 
 Store = tuple[str, int, Node]
 Along = list[tuple[Node, list[Node]]]
-"""The derivatives of some scalars along theta: each as a vector and entry by entry."""
+"""Derivatives of some scalars along theta, each as a vector and as a list of its entries."""
 
 FORWARD = ("c", "p", "row", "signal", "opens", "closes", "x", "Z", "X", "XZ", "x_after", "Z_after", "J", CHECKED)
 BACKWARD = (
@@ -88,7 +88,7 @@ LARGE = 1e200
 """States beyond 1e308 / LARGE count as infinite."""
 
 SHORT = 100
-"""Products of a row with a vector that are written out for each stage."""
+"""Largest n D for which one function adds the curvature of all stages; above it, each call adds one stage."""
 
 
 def has_jumps(library: Structure) -> bool:
@@ -97,7 +97,7 @@ def has_jumps(library: Structure) -> bool:
 
 
 class Kernels:
-    """Writes the straight lines of a library into a module, with derivatives of an order."""
+    """Writes the straight-line functions of a library into a module, with derivatives of an order."""
 
     def __init__(self, library: Structure, sizes: Sizes, order: Order, module: Module) -> None:
         self.library, self.sizes, self.order, self.module = library, sizes, order, module
@@ -108,13 +108,13 @@ class Kernels:
 
     @property
     def stages_at_once(self) -> int:
-        """Stages that one function adds to the Hessian: all of a row, unless the function became too long."""
+        """Number of stages that one function adds to the Hessian: all of a row, or one where it would be too long."""
         return STAGES if self.sizes.n * self.sizes.D <= SHORT else 1
 
     # Rows
 
     def forward_row(self, name: str, stage: Template, moving: bool, costs: bool) -> None:
-        """Write a row forward: its stages, the state behind it, their derivatives, and what it costs."""
+        """Write the forward step of a row: its stages, the state after it, their derivatives and its running cost."""
         graph, n = Graph(), self.sizes.n
         at = self._row(graph)
         x = graph.loads("x", n)
@@ -151,10 +151,11 @@ class Kernels:
         self.module.write_straight_line(name, FORWARD, stores)
 
     def backward_row(self, name: str, stage: Template, moving: bool, late: bool = False) -> list[tuple[int, int]]:
-        """Write a row backward: the costate before it, its part of the gradient, second derivatives at its stages.
+        """Write the backward step of a row: the costate before it, its part of the gradient, second derivatives.
 
-        Returns which entries of the second derivative along (t, x, p) these are; behind them, for a row that moves,
-        stands c_j. The row of a `late` sample belongs to no segment: nothing else ends or begins with it.
+        Return which entries of the second derivative along (t, x, p) are stored for each stage. For a row that moves
+        with theta, c_j is stored after them. The row of a `late` sample belongs to no segment: no node lies at its
+        ends, so that no jump is added to the costate.
         """
         graph, n = Graph(), self.sizes.n
         at = self._row(graph)
@@ -206,7 +207,7 @@ class Kernels:
         return chosen
 
     def curvature(self, name: str, chosen: list[tuple[int, int]], moving: bool) -> None:
-        """Write ``H += Z' S Z`` at `stages_at_once` stages; `chosen` are the entries of S, whose values it is given."""
+        """Write ``H += Z' S Z`` at `stages_at_once` stages; `chosen` are the entries of S from `backward_row`."""
         graph, n, D = Graph(), self.sizes.n, self.sizes.D
         H = [graph.load("H", d, vector=True) for d in range(D)]
         rows = H
@@ -221,7 +222,7 @@ class Kernels:
                 entries = [one + c_j * (other - one) for one, other in zip(starts, ends, strict=True)]
                 of_time = start_d + c_j * (end_d - start_d), entries
             rows = self._add_curvature(graph, rows, second, [of_time, *self._state_directions(graph, "XZ", j * n)])
-        self.module.write_straight_line(name, CURVATURE, _change(H, rows))
+        self.module.write_straight_line(name, CURVATURE, _store_changed_rows(H, rows))
 
     def length(self) -> None:
         """Write ``H += h' x V' + V' x h'``, V' being what `backward_row` stored for a row that moves."""
@@ -242,11 +243,11 @@ class Kernels:
         template, n, N = self.templates.start(), self.sizes.n, self.sizes.N
         graph = Graph()
         p, constants = self.inputs(graph)
-        none = np.full(n, graph.constant(0.0), dtype=object)
-        (x,) = template(graph, p, none, *constants, only=(0,), checked=self.order == Order.COST)
+        zeros = np.full(n, graph.constant(0.0), dtype=object)
+        (x,) = template(graph, p, zeros, *constants, only=(0,), checked=self.order == Order.COST)
         stores = _store("x", 0, x)
         if self.with_tangents:
-            (x_p,) = template(graph, p, none, *constants, only=(1,))
+            (x_p,) = template(graph, p, zeros, *constants, only=(1,))
             stores += _store("Z", 0, [_as_vector(graph, v) for v in self._along_p(graph, x_p)])
         if self.order == Order.COST:
             stores += graph.check()
@@ -273,11 +274,11 @@ class Kernels:
         graph = Graph()
         p, constants = self.inputs(graph)
         x, t = graph.loads("x", n), graph.load("time", 0)
-        none = np.full(n, graph.constant(0.0), dtype=object)
-        (after,) = template(graph, t, x, p, none, *constants, only=(0,), checked=self.order == Order.COST)
+        zeros = np.full(n, graph.constant(0.0), dtype=object)
+        (after,) = template(graph, t, x, p, zeros, *constants, only=(0,), checked=self.order == Order.COST)
         stores = _store("x_after", 0, after)
         if self.with_tangents:
-            R_t, R_x, R_p = template(graph, t, x, p, none, *constants, only=(1, 2, 3))
+            R_t, R_x, R_p = template(graph, t, x, p, zeros, *constants, only=(1, 2, 3))
             Z, moves = graph.loads("Z", n, vector=True), graph.load("moves", 0, vector=True)
             Z_after = times_vector(R_x, Z) + self._along_p(graph, R_p) + R_t * moves
             stores += _store("Z_after", 0, [_as_vector(graph, v) for v in Z_after])
@@ -295,7 +296,7 @@ class Kernels:
         self.module.write_straight_line(f"reset_back_{which}", RESET_BACK, stores + graph.check())
 
     def sample(self, k: int) -> None:
-        """Write the cost of a sample of the k-th Measurements: late ones move."""
+        """Write the cost of a sample of the k-th Measurements; the time of a late sample depends on theta."""
         template, q = self.templates.sample(k), self.library.measurements[k].channels
         late = self.library.measurements[k].delay is not None
         graph = Graph()
@@ -305,7 +306,7 @@ class Kernels:
         self.module.write_straight_line(f"sample_{k}", SAMPLE, self._cost(graph, found, moving=late) + graph.check())
 
     def late_time(self, k: int) -> None:
-        """Write of which moment a late sample is: the end of its row, and its derivative."""
+        """Write the time at which a late sample saw the state, which is the end of its row, and its derivative."""
         template, graph = self.templates.late_time(k), Graph()
         p, constants = self.inputs(graph)
         t, t_p = template(graph, graph.load("time", 0), p, *constants, checked=True)
@@ -340,8 +341,8 @@ class Kernels:
                 name, CONSTRAINT, self._constraint(graph, found, moving=True) + graph.check()
             )
         else:
-            none = np.full(1, graph.constant(0.0), dtype=object)
-            found = template(graph, *given, none, *constants, checked=True)
+            zeros = np.full(1, graph.constant(0.0), dtype=object)
+            found = template(graph, *given, zeros, *constants, checked=True)
             self.module.write_straight_line(name, NODE, self._cost(graph, found, moving=True) + graph.check())
 
     def end_constraint(self) -> None:
@@ -356,9 +357,10 @@ class Kernels:
         )
 
     def state(self) -> None:
-        """Write a check that a state is finite, and so small that products of a few entries do not overflow.
+        """Write a check that a state and its tangents are finite.
 
-        And that its tangents are finite. Products with zero have been left out without a look at it.
+        A state counts as infinite above a bound below which products of a few entries do not overflow. The check is
+        needed because products of zero with states were left out: the results may not show that a state is infinite.
         """
         graph, n = Graph(), self.sizes.n
         total = graph.load(CHECKED, 0)
@@ -371,7 +373,7 @@ class Kernels:
         self.module.write_straight_line("check_state", STATES, [(CHECKED, 0, total)])
 
     def outputs(self) -> None:
-        """Write what all sensors see, with its derivatives."""
+        """Write the outputs of all sensors and their derivatives."""
         template, graph = self.templates.outputs(), Graph()
         p, constants = self.inputs(graph)
         given = graph.load("time", 0), graph.loads("x", self.sizes.n), p
@@ -383,7 +385,7 @@ class Kernels:
             stores += _store("Y", 0, [_as_vector(graph, value) for value in y_d])
         self.module.write_straight_line("outputs", OUTPUTS, stores + graph.check())
 
-    # What they have in common
+    # Shared parts
 
     def inputs(self, graph: Graph) -> tuple[Objects, list[Objects]]:
         """Load p and the constants."""
@@ -398,9 +400,9 @@ class Kernels:
         """Return the inputs of a stage as a function of (t, x, w, hb); w and hb default to zero."""
         p, constants = self.inputs(graph)
         origin, signal = graph.load("row", 2), graph.loads("signal", 4 * self.sizes.signals)
-        nothing = graph.constant(0.0)
-        none = np.full(self.sizes.n, nothing, dtype=object)
-        return lambda t, x, w=none, hb=nothing: (t, x, p, w, hb, origin, signal, *constants)
+        zero = graph.constant(0.0)
+        zeros = np.full(self.sizes.n, zero, dtype=object)
+        return lambda t, x, w=zeros, hb=zero: (t, x, p, w, hb, origin, signal, *constants)
 
     def _ends(self, graph: Graph) -> tuple[Node, Node]:
         return graph.load("opens", 0, vector=True), graph.load("closes", 0, vector=True)
@@ -430,7 +432,7 @@ class Kernels:
                 of_time = graph.load("moves", 0, vector=True), [graph.load("moves", d) for d in range(D)]
             H = [graph.load("H", d, vector=True) for d in range(D)]
             along = [of_time, *self._state_directions(graph, "Z")]
-            stores += _change(H, self._add_curvature(graph, H, _entries(second, with_time=moving), along))
+            stores += _store_changed_rows(H, self._add_curvature(graph, H, _entries(second, with_time=moving), along))
         return stores
 
     def _cost(self, graph: Graph, found: Sequence[Objects], moving: bool) -> list[Store]:
@@ -446,8 +448,8 @@ class Kernels:
         self, graph: Graph, template: Template, given: tuple[Any, ...], constants: list[Objects], count: int
     ) -> Objects:
         """Return ``multiplier + penalty c``: the weights of the constraints in the Lagrangian."""
-        none = np.full(count, graph.constant(0.0), dtype=object)
-        (c,) = template(graph, *given, none, *constants, only=(0,))
+        zeros = np.full(count, graph.constant(0.0), dtype=object)
+        (c,) = template(graph, *given, zeros, *constants, only=(0,))
         return graph.loads("multiplier", count) + graph.loads("penalty", count) * c
 
     def _constraint(self, graph: Graph, found: Sequence[Objects], moving: bool) -> list[Store]:
@@ -506,7 +508,7 @@ def _entries(second: Sequence[Objects], with_time: bool) -> dict[tuple[int, int]
     return entries
 
 
-def _change(H: list[Node], rows: list[Node]) -> list[Store]:
+def _store_changed_rows(H: list[Node], rows: list[Node]) -> list[Store]:
     return [("H", d, row) for d, (old, row) in enumerate(zip(H, rows, strict=True)) if row is not old]
 
 

@@ -1,4 +1,4 @@
-"""Straight-line graphs as LLVM functions, and LLVM modules as machine code.
+"""Write expression graphs as LLVM functions, and compile LLVM modules to machine code.
 
 Object code is cached in the folder of `switchfit.runtime.cache`; the next process loads it from there.
 """
@@ -27,10 +27,10 @@ from switchfit.engine.native.scalars import Node, list_needed
 from switchfit.runtime.cache import get_usable_folder, read_code, write_code
 
 LOOKUP = 3
-"""Cost of a lookup in a table, in additions."""
+"""Cost of a table lookup, in additions."""
 
 BUDGET = 20_000_000
-"""Work, in additions, after which a loop returns to Python, so that Ctrl-C is heard: measured, it takes 2 to 10 ms."""
+"""Work, in additions, after which a loop returns to Python, which then handles Ctrl-C. Measured: 2 to 10 ms."""
 
 
 def literal(number: float) -> str:
@@ -39,17 +39,17 @@ def literal(number: float) -> str:
 
 
 class Module:
-    """The text of an LLVM module, function by function.
+    """Text of an LLVM module, collected function by function.
 
     Parameters
     ----------
     width : int
-        Entries of a vector.
+        Number of entries of a vector.
 
     Attributes
     ----------
     prefix : str
-        Start of the names of all functions that are written from now on.
+        Prefix of the names of all functions that are written from now on.
     """
 
     def __init__(self, width: int) -> None:
@@ -63,16 +63,16 @@ class Module:
     def write_straight_line(
         self, name: str, pointers: Sequence[str], stores: Sequence[tuple[str, int, Node]], exported: bool = False
     ) -> None:
-        """Write a function of pointers that loads, computes and stores: ``(pointer, offset, node)``.
+        """Write a function that loads, computes, and then stores each ``(pointer, offset, node)``.
 
-        Everything is loaded before anything is stored. Offsets count doubles, those of vectors vectors. Only what is
-        `exported` can be called from Python.
+        All loads come before the first store. Offsets count doubles, or vectors if the node is a vector. Only
+        `exported` functions can be called from Python.
         """
         writer = _Writer(self)
         nodes = list_needed([node for _, _, node in stores])
         for node in nodes:
             writer.value(node)
-        self._work[self.prefix + name] = sum(self._effort(node) for node in nodes)
+        self._work[self.prefix + name] = sum(self._estimate_cost(node) for node in nodes)
         for pointer, offset, node in stores:
             writer.store(pointer, offset, node)
         arguments = ", ".join(f"ptr %{pointer}" for pointer in pointers)
@@ -84,13 +84,13 @@ class Module:
         """Return the cost of a function of the current prefix, in additions."""
         return self._work[self.prefix + name]
 
-    def _effort(self, node: Node) -> int:
+    def _estimate_cost(self, node: Node) -> int:
         operation = OPERATIONS.get(node.op)
         effort = LOOKUP if node.op == "lookup" else 1 if operation is None else operation.effort
         return effort * (1 + self.width // 4 if node.vector else 1)
 
     def add(self, text: str) -> None:
-        """Add a function written by hand, which calls only functions of the current prefix and LLVM's."""
+        """Add a hand-written function; all function names in it, except LLVM's intrinsics, get the current prefix."""
         self.functions.append(re.sub(r"@(?!llvm\.)(\w+)\(", rf"@{self.prefix}\1(", text))
 
     def declare(self, name: str, signature: str) -> None:
@@ -103,8 +103,8 @@ class Module:
         return "\n".join([*self._declared.values(), *self.functions])
 
 
-def _declaration(operation: Operation) -> str:
-    """Return the declaration of the function that an operation calls; those of the C library have no side effects."""
+def _write_declaration(operation: Operation) -> str:
+    """Return the declaration of the function that an operation calls; C functions are declared without side effects."""
     operands = ", ".join(["double"] * operation.operands)
     memory = " memory(none) nounwind willreturn" if operation.function in FROM_LIBM else ""
     return f"declare double @{operation.function}({operands}){memory}"
@@ -128,10 +128,10 @@ class _Writer:
         """Return the name of the value of a node, or its literal; emit it first if needed."""
         name = self.names.get(node.index)
         if name is None:
-            name = self.names[node.index] = self._written(node)
+            name = self.names[node.index] = self._emit_node(node)
         return name
 
-    def _written(self, node: Node) -> str:
+    def _emit_node(self, node: Node) -> str:
         op, args = node.op, node.args
         if op == "const":
             return str(args[0]).lower() if isinstance(args[0], bool) else literal(args[0])
@@ -151,7 +151,7 @@ class _Writer:
             return self.emit(f"load double, ptr {address}, align 8")
         operation = OPERATIONS[op]
         if operation.function is not None:
-            self.module.declare(operation.function, _declaration(operation))
+            self.module.declare(operation.function, _write_declaration(operation))
         return self.emit(operation.code.format(*(self._as(a, node.vector) for a in args), type=self._type(node)))
 
     def _table(self, values: NDArray[np.float64]) -> str:
@@ -191,11 +191,11 @@ class _Writer:
 
 
 class Workspace:
-    """Scratch space of a program: all calls share it, one at a time, so that it stays in the processor's caches.
+    """Scratch space of a program. Calls share it, one at a time, so that it stays in the CPU caches.
 
     Attributes
     ----------
-    lock : held during a call, since machine code runs beside other threads
+    lock : held during a call, since ctypes releases the GIL
     memory : array of doubles
     """
 
@@ -210,12 +210,12 @@ class Workspace:
 
 
 class Program:
-    """Machine code of a module, alive as long as this object.
+    """Machine code of a module; it is freed with this object.
 
     Attributes
     ----------
     key : str
-        Different for every module, the same in every process.
+        Hash of the module, the same in every process.
     workspace : Workspace
     """
 
@@ -229,7 +229,7 @@ class Program:
         return int(self._engine.get_function_address(name))
 
     def function(self, name: str, *types: Any) -> Any:
-        """Return a function that returns nothing, callable from Python."""
+        """Return a Python callable for a void function with arguments of these ctypes."""
         if name not in self._functions:
             self._functions[name] = ctypes.CFUNCTYPE(None, *types)(self.address(name))
         return self._functions[name]
@@ -237,15 +237,15 @@ class Program:
 
 def compile_module(text: str) -> Program:
     """Compile a module for this processor, or load its code from the cache."""
-    _start()
-    key = hashlib.sha256("\n".join([text, llvmlite.__version__, *_processor()]).encode()).hexdigest()
-    name, features = _processor()
+    _initialize_llvm()
+    key = hashlib.sha256("\n".join([text, llvmlite.__version__, *_get_processor()]).encode()).hexdigest()
+    name, features = _get_processor()
     machine = llvm.Target.from_default_triple().create_target_machine(cpu=name, features=features, opt=2)
     folder = get_usable_folder()
     path = None if folder is None else folder / f"native-{key}"
     code = None if path is None else read_code(path)
     if code is None:
-        code = _object_code(machine, text)
+        code = _compile_to_object_code(machine, text)
         if path is not None:
             write_code(path, code)
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
@@ -254,23 +254,23 @@ def compile_module(text: str) -> Program:
     return Program(engine, key)
 
 
-def _object_code(machine: Any, text: str) -> bytes:
-    """Compile in a thread: long functions take seconds, and the wait for a thread can be ended by Ctrl-C."""
+def _compile_to_object_code(machine: Any, text: str) -> bytes:
+    """Compile in a thread: long functions take seconds, and Ctrl-C can interrupt the wait for a thread."""
     executor = ThreadPoolExecutor(1)
     future = executor.submit(lambda: bytes(machine.emit_object(llvm.parse_assembly(text))))
     executor.shutdown(wait=False)
-    while not wait([future], timeout=0.1).done:  # on Windows a wait without an end cannot be interrupted
+    while not wait([future], timeout=0.1).done:  # on Windows, a wait without timeout cannot be interrupted
         pass
     return future.result()
 
 
 @cache
-def _processor() -> tuple[str, str]:
+def _get_processor() -> tuple[str, str]:
     return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
 
 
 @cache
-def _start() -> None:
+def _initialize_llvm() -> None:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     for name in (*FROM_LIBM, "sincos"):
@@ -280,12 +280,12 @@ def _start() -> None:
 
 
 @cache
-def _library() -> Any:
+def _load_libm() -> Any:
     if sys.platform == "win32":
         return ctypes.CDLL("ucrtbase")
     return ctypes.CDLL(ctypes.util.find_library("m"))
 
 
 def _address(name: str) -> int | None:
-    function = getattr(_library(), name, None)
+    function = getattr(_load_libm(), name, None)
     return None if function is None else ctypes.cast(function, ctypes.c_void_p).value

@@ -1,6 +1,6 @@
-"""Linear algebra of small matrices, written out: LU with pivots chosen at run time, Cholesky, triangular systems.
+"""Unrolled linear algebra of small matrices: LU with pivots chosen at run time, Cholesky, triangular systems.
 
-As LAPACK does it, for matrices that lie in the last two axes of arrays.
+The algorithms are those of LAPACK; the matrices are the last two axes of arrays.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from switchfit.engine.native.entries import Unsupported, both, choose, equal, kn
 from switchfit.engine.native.scalars import Graph, Objects
 
 MOST_ROWS_TO_PIVOT = 5
-"""Rows of a matrix in an LU factorization, whose pivots are chosen by selections."""
+"""Largest number of rows in an LU factorization, whose pivots take selections."""
 
 MOST_ROWS = 6
-"""Rows of a matrix in a Cholesky factorization, or of a triangular system that depends on the state."""
+"""Largest number of rows in a Cholesky factorization, or in a triangular system that depends on the state."""
 
 MOST_KNOWN_ROWS = 30
-"""Rows of a triangular system whose matrix is known."""
+"""Largest number of rows in a triangular system whose matrix is known."""
 
 
-def _for_each(function: Callable[..., tuple[Any, ...]], *arrays: Any) -> list[Any]:
+def _map_matrices(function: Callable[..., tuple[Any, ...]], *arrays: Any) -> list[Any]:
     """Map a function of matrices over arrays of matrices."""
     batch = arrays[0].shape[:-2]
     parts = [function(*(np.asarray(a[place], dtype=object) for a in arrays)) for place in np.ndindex(*batch)]
@@ -31,9 +31,9 @@ def _for_each(function: Callable[..., tuple[Any, ...]], *arrays: Any) -> list[An
 
 
 def lu(graph: Graph, equation: Any, a: Any) -> list[Any]:
-    """Do what `jax.lax.linalg.lu` does: L and U in one matrix, the row that each step exchanges, the order."""
+    """Trace `jax.lax.linalg.lu`: L and U in one matrix, the pivots, the permutation."""
     _check_rows(max(a.shape[-2:]), MOST_ROWS_TO_PIVOT)
-    return _for_each(lambda matrix: _lu(graph, matrix), a)
+    return _map_matrices(lambda matrix: _lu(graph, matrix), a)
 
 
 def _lu(graph: Graph, matrix: Objects) -> tuple[Any, ...]:
@@ -42,12 +42,12 @@ def _lu(graph: Graph, matrix: Objects) -> tuple[Any, ...]:
     order: Any = np.array(range(rows), dtype=object)
     pivots: Any = np.empty(min(rows, columns), dtype=object)
     for k in range(min(rows, columns)):
-        pivots[k] = _largest(graph, a[:, k], k)
+        pivots[k] = _find_largest(graph, a[:, k], k)
         if pivots[k] != k:
             a = _exchange_rows(graph, a, k, pivots[k])
             order = _exchange_rows(graph, order[:, None], k, pivots[k])[:, 0]
         pivot = a[k, k]
-        # LAPACK leaves a column of zeros as it is.
+        # Like LAPACK, leave a column of zeros unchanged.
         inverse = graph.apply("div", 1.0, choose(graph, graph.apply("eq", pivot, 0.0), 1.0, pivot))
         for i in range(k + 1, rows):
             a[i, k] = graph.apply("mul", a[i, k], inverse)
@@ -57,7 +57,7 @@ def _lu(graph: Graph, matrix: Objects) -> tuple[Any, ...]:
     return a, pivots, order
 
 
-def _largest(graph: Graph, column: Objects, k: int) -> Any:
+def _find_largest(graph: Graph, column: Objects, k: int) -> Any:
     """Return the index of the largest entry from k on, the first of several; entries known to be zero are skipped."""
     size, found = graph.apply("abs", column[k]), k
     for i in range(k + 1, len(column)):
@@ -82,9 +82,9 @@ def _exchange_rows(graph: Graph, a: Any, k: int, other: Any) -> Any:
 
 
 def cholesky(graph: Graph, equation: Any, a: Any) -> list[Any]:
-    """Do what `jax.lax.linalg.cholesky` does for a symmetric matrix; all is NaN if it is not positive definite."""
+    """Trace `jax.lax.linalg.cholesky` for a symmetric matrix; L is NaN if the matrix is not positive definite."""
     _check_rows(a.shape[-1], MOST_ROWS)
-    return _for_each(lambda matrix: (_cholesky(graph, matrix),), a)
+    return _map_matrices(lambda matrix: (_cholesky(graph, matrix),), a)
 
 
 def _check_rows(rows: int, most: int) -> None:
@@ -116,7 +116,7 @@ def _sum_of_products(graph: Graph, a: Any, b: Any) -> Any:
 
 
 def triangular_solve(graph: Graph, equation: Any, a: Any, b: Any) -> list[Any]:
-    """Do what `jax.lax.linalg.triangular_solve` does."""
+    """Trace `jax.lax.linalg.triangular_solve`."""
     params = equation.params
     _check_rows(a.shape[-1], MOST_ROWS if a.dtype == object else MOST_KNOWN_ROWS)
     lower = params["lower"] != params["transpose_a"]
@@ -128,7 +128,7 @@ def triangular_solve(graph: Graph, equation: Any, a: Any, b: Any) -> list[Any]:
         # x A = b is A' x' = b'
         return (_substitute(graph, matrix.T, right.T, not lower, params["unit_diagonal"]).T,)
 
-    return _for_each(solve, a, b)
+    return _map_matrices(solve, a, b)
 
 
 def _substitute(graph: Graph, a: Objects, b: Objects, lower: bool, unit_diagonal: bool) -> Objects:

@@ -1,8 +1,8 @@
-"""The operations of a graph of scalars, one row each: what it takes and gives, its value, its code.
+"""Operations of an expression graph, one row each: types of operands and result, value, LLVM code.
 
-An operation that JAX has for doubles under the same name, and whose code is a call of the C library, is one more line
-here: `trace` finds it by its primitive, `scalars` folds constants by its value, `llvm` writes its code, and
-`tests/test_operations.py` compares the three.
+To add a function of the C library that JAX has under the same name, add one line here: `trace` finds it by its
+primitive, `scalars` folds constants by its value, `llvm` writes its code, and `tests/test_operations.py` compares the
+three.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 MANY = 20
-"""Effort of a function of the C library, in additions."""
+"""Cost of a function of the C library, in additions."""
 
 
 class Operation(NamedTuple):
@@ -24,27 +24,27 @@ class Operation(NamedTuple):
     ----------
     name : str
     value : callable
-        Its value for numbers or arrays: a function of NumPy, by which functions that take `xp` call it too.
+        Function of NumPy that evaluates it for numbers or arrays; `scalars.Namespace` finds the operation by it.
     code : str
         LLVM's instruction, with {0}, {1}, {2} for the operands and {type} for the type of the result: a double, a
         vector of doubles or a truth value.
     operands : int
         Number of operands.
     takes_truth, gives_truth : bool
-        Whether operands, or the result, are truth values; else they are doubles. `select` says for itself.
+        Whether operands, or the result, are truth values; else they are doubles. `select` is treated separately.
     function : str or None
-        What its code calls: an intrinsic ("llvm.") or a function of the C library.
+        Function that its code calls: an intrinsic ("llvm.") or a function of the C library.
     primitives, of_truth : tuple of str
-        Primitives of JAX that it is, for doubles and for truth values.
+        JAX primitives that it implements, for doubles and for truth values.
     effort : int
         Its cost, in additions.
     may_fail : bool
-        Whether it is infinite or not a number for some finite operands; sums and products that overflow aside.
+        Whether it is infinite or NaN for some finite operands; overflow of sums and products does not count.
     commutes : bool
     gives_integer : bool
         Whether its result is an integer, as a double.
     known_alike : bool
-        Whether NumPy has JAX's value for arrays of any type: known arrays then need no start of XLA.
+        Whether NumPy and JAX agree for arrays of any type: known arrays are then evaluated without XLA.
     """
 
     name: str
@@ -149,7 +149,7 @@ OPERATIONS = {
 }
 
 BY_VALUE = {operation.value: operation for operation in OPERATIONS.values()}
-"""The operations by their functions of NumPy."""
+"""Operations by their NumPy functions."""
 
 COMPARISONS = frozenset(
     name for name, operation in OPERATIONS.items() if operation.gives_truth and not operation.takes_truth

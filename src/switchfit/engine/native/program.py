@@ -1,7 +1,7 @@
-"""Machine code for a library of modes: written, compiled, kept.
+"""Write, compile and cache machine code for a library of modes.
 
-A program goes through the segments forward, then through samples and terminal costs, then backward. It is written for
-a library: which mode a segment has is read at run time.
+A program runs through the segments forward, then through samples and terminal costs, then through the segments
+backward. The mode of each segment is read at run time, so that all sequences of a library share a program.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ _one_at_a_time = threading.Lock()
 log = logging.getLogger("switchfit")
 
 PREFIX = {Order.COST: "plain_", Order.GRADIENT: "first_", Order.HESSIAN: "", Order.GAUSS_NEWTON: "gauss_newton_"}
-"""What the names of functions begin with, by the order of their derivatives."""
+"""Prefix of the names of functions, by the order of their derivatives."""
 
 
 def program_of(library: Structure, sizes: Sizes, order: Order) -> Program | str:
-    """Return machine code for a library with derivatives of an order, or the reason why there is none.
+    """Return machine code for a library with derivatives of an order, or the reason why it cannot be compiled.
 
-    There is none for implicit steps, and for functions that cannot be written as a straight line of scalars. A fit
-    needs simulations and second derivatives: they are one program. Any other failure is a defect of this package: the
-    caller falls back to JAX as well, and the reason begins with "internal: ".
+    Implicit steps, and functions that cannot be written as straight-line code, have no machine code. A fit needs
+    simulations and second derivatives: both are compiled into one program. Any other failure is a defect of this
+    package: the caller falls back to JAX as well, and the reason begins with "internal: ".
     """
     with _one_at_a_time:
         both = (Order.COST, Order.HESSIAN)
@@ -122,7 +122,7 @@ def _write(module: Module, library: Structure, sizes: Sizes, order: Order) -> No
 
 
 def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> int:
-    """Write the rows of a mode; return how many second derivatives a late sample has at each stage of its row."""
+    """Write the rows of a mode; return the number of second derivatives at each stage of a late sample's row."""
     module, order, library = kernels.module, kernels.order, kernels.library
     running = bool(library.running or library.references) and not library.is_rest(mode)
     stage = kernels.templates.stage(mode, running=running)

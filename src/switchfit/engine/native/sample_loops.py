@@ -1,4 +1,4 @@
-"""The loops over samples, in LLVM's language, by hand: those at nodes, and late ones, which lie between them."""
+"""Loops over samples in hand-written LLVM IR: samples at nodes, and late samples, which lie between nodes."""
 
 from __future__ import annotations
 
@@ -36,28 +36,28 @@ def write_samples(writer: Writer, k: int) -> str:
     for begin in begins:
         beyond = writer.let(f"icmp sge i64 {cell}, {begin}")
         index = writer.let(f"add i64 {index}, {writer.let(f'zext i1 {beyond} to i64')}")
-    given = found | state_pointers(writer, found, index) | _sample(writer, own, q)
+    given = found | state_pointers(writer, found, index) | _sample_pointers(writer, own, q)
     given |= {"moves": found["units"], "time": writer.at(own["time"], "%sample")}
     given["jump"] = writer.at(found["jumps"], index, n) if writer.order else found["jumps"]
-    _next_sample(writer, writer.call(f"sample_{k}", SAMPLE, given))
+    _end_sample(writer, writer.call(f"sample_{k}", SAMPLE, given))
     return writer.end_function(f"internal i1 @samples_{k}({TABLE}, i64 %count, ptr %progress)", returns=False)
 
 
-def _sample(writer: Writer, own: dict[str, str], q: int) -> dict[str, str]:
+def _sample_pointers(writer: Writer, own: dict[str, str], q: int) -> dict[str, str]:
     return {"value": writer.at(own["value"], "%sample", q), "weight": writer.at(own["weight"], "%sample", q)}
 
 
-def _next_sample(writer: Writer, work: int) -> None:
+def _end_sample(writer: Writer, work: int) -> None:
     writer.line(f"%left = sub i64 %budget, {work}")
     writer.line("%more = add i64 %sample, 1")
     writer.line("%done = icmp sge i64 %more, %count")
     writer.next_turn("%sample", "%done")
 
 
-def _late_row(
+def _write_late_row(
     writer: Writer, k: int, found: dict[str, str], own: dict[str, str]
 ) -> tuple[str, dict[str, str], str, int]:
-    """Take the row of a late sample forward; return the index of the row that holds it, pointers, mode and work."""
+    """Write the forward step of a late sample's row; return the index of the row around it, pointers, mode, work."""
     n, S, width = writer.sizes.n, writer.sizes.signals, writer.sizes.width
     cell, segment = (writer.load("i64", writer.at(own[name], "%sample")) for name in ("cell", "segment"))
     row = writer.let(f"add i64 {cell}, {segment}")
@@ -104,9 +104,9 @@ def _late_row(
 
 
 def write_late_samples(writer: Writer, k: int, counts: list[int]) -> str:
-    """Write the loop over the samples of the k-th Measurements, which are late: each ends a row of its own.
+    """Write the loop over the late samples of the k-th Measurements; each ends a row of its own.
 
-    `counts` are the numbers of entries of the second derivatives of such a row, by modes.
+    `counts` are the numbers of second derivatives at a stage of such a row, one for each mode.
     """
     n, q = writer.sizes.n, writer.library.measurements[k].channels
     found, own = writer.pointers(), writer.samples_of(k)
@@ -115,8 +115,8 @@ def write_late_samples(writer: Writer, k: int, counts: list[int]) -> str:
     writer.label("loop")
     writer.line(f"%sample = phi i64 [{before}, %entry], [%more, %next]")
     writer.line(f"%budget = phi i64 [{left}, %entry], [%left, %next]")
-    row, given, mode, work = _late_row(writer, k, found, own)
-    at_end = {"x": found["late_state"], "Z": found["late_tangent"], "J": found["J"]} | _sample(writer, own, q)
+    row, given, mode, work = _write_late_row(writer, k, found, own)
+    at_end = {"x": found["late_state"], "Z": found["late_tangent"], "J": found["J"]} | _sample_pointers(writer, own, q)
     at_end |= {"time": writer.at(found["late_row"], 1), "moves": found["late_closes"]}
     for entry in range(n):
         writer.line(f"store double 0.0, ptr {writer.at(found['late_psi'], entry)}")
@@ -135,7 +135,7 @@ def write_late_samples(writer: Writer, k: int, counts: list[int]) -> str:
         work += writer.call("end_of_late", END_OF_LATE, given | {"late": writer.at(found["late"], row, n)})
     writer.line("br label %next")
     writer.label("next")
-    _next_sample(writer, work)
+    _end_sample(writer, work)
     return writer.end_function(f"internal i1 @samples_{k}({TABLE}, i64 %count, ptr %progress)", returns=False)
 
 
@@ -146,7 +146,7 @@ def write_late_states(writer: Writer, k: int) -> str:
     writer.line("br label %loop")
     writer.label("loop")
     writer.line("%sample = phi i64 [0, %entry], [%more, %forward_end]")
-    _late_row(writer, k, found, own)
+    _write_late_row(writer, k, found, own)
     moment = writer.load("double", writer.at(found["late_row"], 1))
     writer.line(f"store double {moment}, ptr {writer.at('%times', '%sample')}")
     for entry in range(n):

@@ -1,13 +1,13 @@
-"""Arithmetic on scalars and vectors as a graph, simplified while it grows; and straight-line programs made of it.
+"""Expression graphs of scalars and vectors, simplified while they are built, and templates made of them.
 
-A node is an operation on earlier nodes. Equal operations are one node; sums with zero, products with zero and one are
-gone before they exist, so that structural zeros of Jacobians and Hessians cost nothing. A node is a scalar or a vector
-with one entry for each unknown (the derivative of some scalar along theta); a scalar beside a vector stands for all its
-entries. A scalar is a double or a truth value, which do not mix.
+A node is an operation on earlier nodes. Equal operations share a node. Sums with zero and products with zero or one are
+simplified at once, so that structural zeros of Jacobians and Hessians cost nothing. A node is a scalar, or a vector
+with one entry for each unknown (the derivative of some scalar along theta); a scalar operand of a vector operation is
+broadcast. A scalar is a double or a truth value; the two types do not mix.
 
-A product with zero is zero only if the other factor is finite, and it is left out before anybody knows. What can be
-infinite or not a number for finite arguments (`MAY_FAIL`) is therefore *presumed* finite where such a product is left
-out, and a program checks at run time what it presumed (`Graph.check`): JAX does the evaluation again if it was wrong.
+A product with zero is zero only if the other factor is finite, which is not known yet when the product is left out. The
+operations in such a factor that can be infinite or NaN for finite arguments (`MAY_FAIL`) are therefore *presumed*
+finite. The program checks them at run time (`Graph.check`); if one is not finite, the caller falls back to JAX.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from switchfit.engine.native.operations import BY_VALUE, COMMUTATIVE, COMPARISON
 Objects = NDArray[np.object_]
 
 CHECKED = "check"
-"""Pointer to what is not a number once a presumption was wrong."""
+"""Name of the pointer to a double that is NaN once a value presumed finite was not."""
 
 
 class Table:
@@ -146,7 +146,7 @@ class Graph:
     Attributes
     ----------
     presumed : dict of index -> Node
-        What must be finite for the products with zero that were left out.
+        Nodes that must be finite, since products of zero with them were left out.
     """
 
     def __init__(self) -> None:
@@ -173,7 +173,7 @@ class Graph:
     def lookup(self, table: NDArray[np.float64], index: Node) -> Node:
         """Return the entry of a constant table (K,) at an index that is an integer from 0 to K - 1.
 
-        The caller makes sure that it is: machine code reads the memory without another look.
+        The caller guarantees the range: machine code reads the memory without a bounds check.
         """
         constant = Table(table)
         return self.apply("lookup", self._node("table", (constant,), False), index)
@@ -196,7 +196,7 @@ class Graph:
         if args[0].op == "const" and all(a.op == "const" for a in args):
             with np.errstate(all="ignore"):
                 return self.constant(OPERATIONS[op].value(*(a.args[0] for a in args)))
-        simpler = self._simpler(op, args)
+        simpler = self._simplify(op, args)
         if simpler is not None:
             return simpler
         if op in COMMUTATIVE and args[0].index > args[1].index:
@@ -233,7 +233,7 @@ class Graph:
             total = total + self.certain_product(0.0, node)
         return [(CHECKED, 0, total)] if self.presumed else []
 
-    def _simpler(self, op: str, args: tuple[Node, ...]) -> Node | None:
+    def _simplify(self, op: str, args: tuple[Node, ...]) -> Node | None:
         a, b = args[0], args[-1]
         if op in ("add", "sub"):
             if b.number == 0.0:
@@ -282,14 +282,14 @@ class Graph:
         return None
 
     def _is_zero_in_any_case(self, condition: Node, yes: Node, no: Node) -> bool:
-        """Return whether 0.0 is chosen in place of an entry of a table that is 0.0 already, and never -0.0."""
+        """Return whether a selection only replaces a table entry of 0.0 by 0.0, in a table without -0.0."""
         if no.op != "lookup" or yes.number != 0.0 or condition.op != "eq" or no not in condition.args:
             return False
         table = no.args[0].args[0].values
         return condition.args[1 - condition.args.index(no)].number == 0.0 and not np.signbit(table[table == 0.0]).any()
 
     def _compare_table(self, op: str, a: Node, b: Node) -> Node | None:
-        """Return what is true of all entries of a table: that none is NaN, or below a number."""
+        """Return a comparison as a constant if it has the same result for all entries of a table; else None."""
         if a is b or (a.op == b.op and a.args[1] is b.args[1]) or "const" in (a.op, b.op):
             sides = [node.args[0].args[0].values if node.op == "lookup" else node.number for node in (a, b)]
             if np.size(sides[0]) == np.size(sides[1]) or 1 in map(np.size, sides):
@@ -309,9 +309,9 @@ class Graph:
 
 
 class Namespace:
-    """Functions of NumPy, by their names there, for arrays of nodes: the `xp` of functions shared with NumPy.
+    """NumPy functions, by name, for arrays of nodes: the `xp` of functions that run with NumPy too.
 
-    Comparisons of nodes are truth values, but ``==`` says whether two are the same node.
+    Comparisons of nodes yield truth values, except ``==``, which tests whether two nodes are the same object.
     """
 
     def __init__(self, graph: Graph) -> None:
@@ -320,7 +320,7 @@ class Namespace:
     def __getattr__(self, name: str) -> Callable[..., Any]:
         operation = BY_VALUE.get(getattr(np, name))
         if operation is None:
-            raise AttributeError(f"there is no operation for numpy.{name}: add it to engine/native/operations.py")
+            raise AttributeError(f"no operation for numpy.{name}: add it to engine/native/operations.py")
         return np.frompyfunc(partial(self._graph.apply, operation.name), operation.operands, 1)
 
 
@@ -349,12 +349,11 @@ def list_needed(outputs: Sequence[Node]) -> list[Node]:
 
 
 class Template:
-    """A function of scalars that can be put into graphs: inputs and outputs are lists of arrays.
+    """A traced function of scalars that can be copied into graphs; inputs and outputs are lists of arrays.
 
     Parameters
     ----------
-    inputs : list of arrays of nodes, which are loads from pointers "0", "1", ...
-    outputs : list of arrays of nodes and numbers
+    outputs : list of arrays of nodes and numbers; the inputs are loads from pointers "0", "1", ...
     presumed : nodes that have to be finite
     """
 
@@ -369,7 +368,7 @@ class Template:
     ) -> list[Objects]:
         """Copy the function into a graph; return its outputs, or `only` some, for the given inputs.
 
-        With `checked` the graph takes over all presumptions of the template.
+        With `checked`, the graph also presumes finite what the template does.
         """
         chosen = tuple(range(len(self._flat)) if only is None else only)
         presumed = self.presumed if checked else []

@@ -1,4 +1,4 @@
-"""The loops over the rows of a segment, and over the segments, forward and backward, in LLVM's language, by hand."""
+"""Loops over the rows of a segment and over the segments, forward and backward, in hand-written LLVM IR."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ WHOLE = f"{TABLE}, i64 %segment, ptr %progress"
 
 
 def row_pointers(writer: Writer, found: dict[str, str], cell: str) -> dict[str, str]:
-    """Find times, signals and directions of the row of a segment in a cell, and whether it moves."""
+    """Emit the times, signals and directions of the row of a segment in a cell, and whether it moves with theta."""
     N, S, width = writer.sizes.N, writer.sizes.signals, writer.sizes.width
     first, last = writer.let(f"icmp eq i64 {cell}, %first"), writer.let(f"icmp eq i64 {cell}, %last")
     here = writer.load("double", writer.at(found["nodes"], cell))
@@ -52,7 +52,7 @@ def row_pointers(writer: Writer, found: dict[str, str], cell: str) -> dict[str, 
 
 
 def pointers_at_row(writer: Writer, found: dict[str, str], row: str) -> dict[str, str]:
-    """Emit the addresses of what is kept of a row."""
+    """Emit the addresses of the stages of a row and of their tangents."""
     n, width = writer.sizes.n, writer.sizes.width
     return {
         "X": writer.at(found["stages"], row, STAGES * n),
@@ -135,7 +135,10 @@ def write_backward_segment(writer: Writer, mode: int, inner: int, end: int) -> s
 
 
 def add_curvature(writer: Writer, name: str, given: dict[str, str], count: int, moving: bool) -> int:
-    """Add to H what `count` entries a stage say, and the length of a row that moves: what it costs."""
+    """Emit the calls that add the second derivatives of a row to H; return their cost.
+
+    `count` is the number of entries at a stage. For a row that moves, the derivative of its length is added too.
+    """
     n, width, work = writer.sizes.n, writer.sizes.width, 0
     if writer.order < Order.HESSIAN:
         return work
@@ -149,7 +152,7 @@ def add_curvature(writer: Writer, name: str, given: dict[str, str], count: int, 
 
 
 def segment_pointers(writer: Writer, found: dict[str, str]) -> dict[str, str]:
-    """Find where a segment begins and ends: cells, times, indices of states; and the arguments of its rows."""
+    """Emit where a segment begins and ends (cells, times, indices of states), and the arguments of its rows."""
     next_ = writer.let("add i64 %segment, 1")
     first, last = (writer.load("i64", writer.at(found["first_cell"], k)) for k in ("%segment", next_))
     begins, finishes = (writer.load("double", writer.at(found["bounds"], k)) for k in ("%segment", next_))
@@ -159,8 +162,8 @@ def segment_pointers(writer: Writer, found: dict[str, str]) -> dict[str, str]:
     return {"next": next_, "before": before, "after": after, "given": given}
 
 
-def _reset_of(writer: Writer, found: dict[str, str], name: str) -> tuple[str, dict[str, str], list[str]]:
-    """Switch to the reset map at the start of a segment; return which it is, its pointers, and the blocks."""
+def _switch_to_reset(writer: Writer, found: dict[str, str], name: str) -> tuple[str, dict[str, str], list[str]]:
+    """Emit a switch to the reset map at the start of a segment; return its index, its pointers and the blocks."""
     n, width = writer.sizes.n, writer.sizes.width
     transition = writer.let("sub i64 %segment, 1")
     opens = writer.let("icmp sgt i64 %segment, 0")
@@ -182,7 +185,7 @@ def write_forward(writer: Writer) -> str:
     place = segment_pointers(writer, found)
     state = state_pointers(writer, found, place["before"])
     if writer.library.reset_maps:
-        which, given, labels = _reset_of(writer, found, "reset")
+        which, given, labels = _switch_to_reset(writer, found, "reset")
         for k, label in enumerate(labels):
             writer.label(label)
             writer.call(f"reset_{k}", RESET, found | state | given)
@@ -203,12 +206,14 @@ def write_forward(writer: Writer) -> str:
     state = state_pointers(writer, found, place["after"])
     writer.call("check_state", STATES, found | state)
     if writer.sizes.N:
-        _transition(writer, found, place, state)
+        _call_transition_functions(writer, found, place, state)
     writer.line("ret i1 true")
     return writer.end_function(f"internal i1 @forward_any({WHOLE})", returns=False)
 
 
-def _transition(writer: Writer, found: dict[str, str], place: dict[str, str], state: dict[str, str]) -> None:
+def _call_transition_functions(
+    writer: Writer, found: dict[str, str], place: dict[str, str], state: dict[str, str]
+) -> None:
     """Call the functions at the transition that ends a segment."""
     n, width = writer.sizes.n, writer.sizes.width
     kinds = [kind for kind in AT_TRANSITIONS if getattr(writer.library, kind.name)]
@@ -260,7 +265,7 @@ def write_backward(writer: Writer) -> str:
     writer.label("mode_end")
     if writer.library.reset_maps:
         state = state_pointers(writer, found, place["before"])
-        _, given, labels = _reset_of(writer, found, "reset")
+        _, given, labels = _switch_to_reset(writer, found, "reset")
         for k, label in enumerate(labels):
             writer.label(label)
             writer.call(f"reset_back_{k}", RESET_BACK, found | state | given)

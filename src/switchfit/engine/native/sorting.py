@@ -1,4 +1,4 @@
-"""Sorting and searching, written out."""
+"""Sorting and searching, unrolled into comparisons and selections."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from switchfit.engine.native.entries import (
 from switchfit.engine.native.scalars import Graph, Node, as_objects
 
 MOST_SORTED = 16
-"""Entries to sort: n of them take n (n - 1) / 2 comparisons of neighbours, each followed by selections."""
+"""Largest number of entries to sort. n entries take n (n - 1) / 2 comparisons, each followed by selections."""
 
 Entries = tuple[Any, ...]
-"""What is moved together: an entry of each of the arrays that are sorted."""
+"""Entries that move together: one of each array that is sorted."""
 
 
 def sort(graph: Graph, equation: Any, *arrays: Any) -> list[Any]:
-    """Do what `jax.lax.sort` does: stable, with NaN last, by the first `num_keys` arrays."""
+    """Trace `jax.lax.sort`: stable, NaN last, by the first `num_keys` arrays."""
     params = equation.params
     axis, keys = params["dimension"], params["num_keys"]
     kinds = [variable.aval.dtype.kind for variable in equation.invars[:keys]]
@@ -52,7 +52,7 @@ def sort(graph: Graph, equation: Any, *arrays: Any) -> list[Any]:
 def _sort_entries(
     graph: Graph, entries: list[Entries], behind: Callable[[Entries, Entries], Any], first: int | None = None
 ) -> list[Entries]:
-    """Sort entries, or the first few of them, by exchanging neighbours."""
+    """Sort entries, or only until the `first` ones are in place, by exchanging neighbors."""
     n = len(entries)
     if n > MOST_SORTED:
         raise Unsupported(f"sorts {n} numbers that depend on the state (limit: {MOST_SORTED})")
@@ -85,9 +85,9 @@ def _is_behind(graph: Graph, kinds: list[str], one: Entries, other: Entries) -> 
 
 
 def top_k(graph: Graph, equation: Any, a: Any) -> list[Any]:
-    """Do what `jax.lax.top_k` does: the largest entries and their places, NaN first, the first of equal ones.
+    """Trace `jax.lax.top_k`: the largest entries and their indices; NaN counts as largest, ties keep their order.
 
-    Other than in a sort, 0.0 is larger than -0.0: the reciprocal of each entry, which is moved with it, tells.
+    Unlike in a sort, 0.0 is larger than -0.0. The reciprocal of each entry moves with it and tells the two apart.
     """
     k, kind = equation.params["k"], equation.invars[0].aval.dtype.kind
 
@@ -107,11 +107,11 @@ def top_k(graph: Graph, equation: Any, a: Any) -> list[Any]:
     return [values.reshape(shape), places.reshape(shape)]
 
 
-# Where a number belongs in a sorted array
+# Searching sorted arrays
 
 
 def compare_in_order(graph: Graph, op: str, a: Any, b: Any) -> Any:
-    """Return whether a < b ("lt") or a <= b ("le") where NaN is behind all numbers."""
+    """Return whether a < b ("lt") or a <= b ("le") in the order in which NaN comes after all numbers."""
     undefined = graph.apply("ne", b, b)
     if op == "lt":
         undefined = graph.apply("and", undefined, graph.apply("eq", a, a))
@@ -119,7 +119,7 @@ def compare_in_order(graph: Graph, op: str, a: Any, b: Any) -> Any:
 
 
 def search(graph: Graph, table: Any, query: Any, right: bool) -> Any:
-    """Do what `jnp.searchsorted` does: find before which entry of a sorted table (K,) each number belongs."""
+    """Trace `jnp.searchsorted`: the insertion index of each number in a sorted table (K,)."""
     entries = [known_number(e) if is_traced(e) else e for e in table.tolist()]
     numbers = None if None in entries else np.array(entries, dtype=float)
     of_constants = numbers is not None and not any(a > b for a, b in pairwise(numbers)) and not np.isnan(numbers).any()
@@ -133,7 +133,7 @@ def search(graph: Graph, table: Any, query: Any, right: bool) -> Any:
 
 
 def _search(graph: Graph, table: list[Any], x: Any, right: bool) -> Any:
-    """Search with the comparisons that JAX makes, along all branches."""
+    """Bisect with JAX's comparisons, written out for all branches."""
 
     if len(table) > MOST_CHOICES:
         raise Unsupported(f"searches {len(table)} numbers that depend on the state (limit: {MOST_CHOICES})")
@@ -143,7 +143,7 @@ def _search(graph: Graph, table: list[Any], x: Any, right: bool) -> Any:
             return high
         middle = low + (high - low) // 2
         entry = table[min(middle, len(table) - 1)]
-        # To the left of entries that are not smaller, or to the right of entries that are not larger.
+        # Insert before equal entries, or after them (`right`).
         left = compare_in_order(graph, "lt", x, entry) if right else compare_in_order(graph, "le", x, entry)
         return choose(graph, left, between(low, middle, turns - 1), between(middle, high, turns - 1))
 
@@ -151,7 +151,7 @@ def _search(graph: Graph, table: list[Any], x: Any, right: bool) -> Any:
 
 
 def _search_constants(graph: Graph, table: Any, x: Any, right: bool) -> Any:
-    """Search by bisection with the table in memory: log2 K turns, whatever is found."""
+    """Bisect a constant table in memory, in a fixed number of log2 K steps."""
     K = len(table)
     if K > MOST_ROWS_OF_TABLE:
         raise Unsupported(f"searches a table of {K} entries (limit: {MOST_ROWS_OF_TABLE})")
@@ -161,7 +161,7 @@ def _search_constants(graph: Graph, table: Any, x: Any, right: bool) -> Any:
     for step in (2**k for k in reversed(range(turns))):
         last = found + float(step - 1)
         entry = graph.lookup(padded, last)
-        beyond = graph.apply("not", graph.apply("lt" if right else "le", x, entry))  # NaN is beyond all
+        beyond = graph.apply("not", graph.apply("lt" if right else "le", x, entry))  # NaN comes after all numbers
         found = graph.apply("select", beyond, found + float(step), found)
     most = float(K)
     if 2**turns - 1 > K:

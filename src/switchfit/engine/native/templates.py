@@ -1,4 +1,4 @@
-"""The functions of a model with their derivatives, traced: scalars that kernels put together."""
+"""Trace the functions of a model and their derivatives into templates, from which kernels are written."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ Shape = tuple[int, ...]
 
 F, F_T, F_X, F_P, ELL = range(5)
 SLOPES = tuple(range(8))
-"""f, D_2 f, D_1 f, D_p f, ell and its derivatives in t, x and p: places in what `Templates.stage` returns."""
+"""Positions in the outputs of `Templates.stage`: f, D_2 f, D_1 f, D_p f, ell and its derivatives in t, x and p."""
 
 GRADIENT = (8, 9, 10)
 SECOND = tuple(range(11, 17))
-"""Of ``w . f + hb ell``: first derivatives in t, x and p; second in tt, xt, xx, pt, px, pp."""
+"""Positions of the derivatives of ``w . f + hb ell``: first in t, x and p; second in tt, xt, xx, pt, px, pp."""
 
 
 class Order(IntEnum):
-    """What a program computes: each beside what those before it do, but the Gauss-Newton matrix for the Hessian."""
+    """What a program computes: each order includes those before it, but GAUSS_NEWTON has its matrix for the Hessian."""
 
     COST = 0
     GRADIENT = 1
@@ -41,14 +41,14 @@ class Order(IntEnum):
 
 @dataclass(frozen=True)
 class Sizes:
-    """What a program depends on beside the library.
+    """Sizes on which a program depends, in addition to the library.
 
     Attributes
     ----------
-    n, N, M : states, most transitions, entries of p
-    signals : channels of all signals
-    m : terminal constraints
-    constants : shapes of all that is given and no signal: fixed parameters, weights of references, initial state
+    n, N, M : numbers of states, of transitions at most, and of entries of p
+    signals : number of channels of all signals
+    m : number of terminal constraints
+    constants : shapes of the fixed parameters, the weights of references and the initial state
     """
 
     n: int
@@ -72,20 +72,20 @@ class Sizes:
 
     @property
     def width(self) -> int:
-        """Number of entries of a vector: even, so that vector instructions of the processor fit."""
+        """Number of entries of a vector: even above 1, to suit the vector instructions of the CPU."""
         return self.D if self.D == 1 else self.D + self.D % 2
 
 
 def constants_of(arguments: Arguments) -> list[Any]:
-    """Return the arrays that functions of the model read beside t, x, p and signals."""
+    """Return the arrays that functions of the model read in addition to t, x, p and signals."""
     return [*arguments.fixed, *arguments.weights, arguments.initial_state]
 
 
 class Templates:
     """Traces the functions of a library, with derivatives of an order.
 
-    Derivatives in one list are those of a scalar: first in t, x, p, second in tt, xt, xx, pt, px, pp. At the order of
-    Gauss-Newton the second ones are of its matrix.
+    The derivatives of a scalar are listed in this order: first in t, x, p, then second in tt, xt, xx, pt, px, pp. At
+    order GAUSS_NEWTON, the second ones are the entries of the Gauss-Newton matrix.
     """
 
     def __init__(self, library: Structure, sizes: Sizes, order: Order) -> None:
@@ -105,9 +105,9 @@ class Templates:
         return Model(self.library, arguments)
 
     def stage(self, mode: int, running: bool = True) -> Template:
-        """Trace f, ell, their derivatives and those of ``w . f + hb ell``; `F` to `SECOND` are their places.
+        """Trace f, ell, their derivatives and those of ``w . f + hb ell``; `F` to `SECOND` are their positions.
 
-        Without `running` ell is left out.
+        Without `running`, ell is zero.
         """
         n, M, S = self.sizes.n, self.sizes.M, self.sizes.signals
 
@@ -168,7 +168,7 @@ class Templates:
                 jax.jacfwd(residual, argnums=(0, 1, 2))(time, x, p), lambda A: apply_weights(information, A)
             )
             if self.library.measurements[k].sigma:
-                # Fisher's information of normal noise: 2 of log sigma, none between sigma and the rest.
+                # Fisher information of normal noise: 2 for log sigma, 0 between sigma and the rest.
                 log_sigma = lambda t, x, p: model.log_sigma(k, given(t), p)  # noqa: E731
                 s_d = jax.jacfwd(log_sigma, argnums=(0, 1, 2))(time, x, p)
                 second = _add_all(second, _normal_matrix(s_d, lambda A: 2.0 * A))
@@ -212,7 +212,7 @@ class Templates:
             function = get_transition_function(self.model(constants), kind, which)
             if function is None:
                 raise ValueError("there is no function at this transition")
-            if not kind.constraint:  # whose own second derivatives belong to the Gauss-Newton matrix too
+            if not kind.constraint:  # the second derivatives of a cost belong to the Gauss-Newton matrix too
                 first = [function(t, x, p)]
                 return first if self.order == Order.COST else [*first, *_first_and_second(function, t, x, p)]
             return self._constraint(lambda t, x, p: function(t, x, p)[None], t, x, p, weight)

@@ -1,10 +1,9 @@
-"""From a JAX function to scalars: its jaxpr, read one operation after another, with arrays of nodes for arrays.
+"""Translate a JAX function to scalar operations: interpret its jaxpr, with object arrays of nodes for arrays.
 
-JAX has differentiated by then; what happens here is bookkeeping. Whatever moves entries about (reshape, slice, pad and
-so on) leaves no trace. What has no meaning here (loops of unknown length, random numbers, solvers) raises
-`Unsupported`.
+The jaxpr contains the derivatives already. Operations that only move entries (reshape, slice, pad and so on) emit
+nothing. Operations without a scalar form (loops of unknown length, random numbers, solvers) raise `Unsupported`.
 
-An array is a NumPy array of numbers where all its entries are known, else an object array of what `entries` says.
+An array whose entries are all known is a NumPy array of numbers, any other an object array of what `entries` describes.
 """
 
 from __future__ import annotations
@@ -31,10 +30,10 @@ __all__ = ["Unsupported", "trace_scalars"]
 
 
 MOST_NODES = 10_000
-"""Operations of one function beyond which compiling takes too long: at this size 20 s, and the time grows faster."""
+"""Largest number of operations of one function. Compiling takes 20 s at this size, and grows faster than it."""
 
 MOST_TURNS = 100_000
-"""Turns of a loop beyond which it is not followed."""
+"""Largest number of iterations of a loop that is unrolled."""
 
 
 def trace_scalars(
@@ -51,7 +50,7 @@ def trace_scalars(
     graph = Graph()
     inputs = [graph.loads(str(k), int(np.prod(shape))).reshape(shape) for k, shape in enumerate(shapes)]
     try:
-        closed = _jaxpr_of(function, structs)
+        closed = _make_jaxpr(function, structs)
         with np.errstate(all="ignore"):
             outputs = _run(graph, closed.jaxpr, closed.consts, inputs)
         if any(variable.aval.dtype != np.float64 for variable in closed.jaxpr.outvars):
@@ -61,10 +60,10 @@ def trace_scalars(
     return Template(outputs, list(graph.presumed.values()))
 
 
-def _jaxpr_of(function: Callable[..., Sequence[Any]], structs: Sequence[Any]) -> Any:
+def _make_jaxpr(function: Callable[..., Sequence[Any]], structs: Sequence[Any]) -> Any:
     try:
         return jax.make_jaxpr(function)(*structs)
-    except Exception as error:  # the function's own, or JAX's: that it has no derivative, for instance
+    except Exception as error:  # raised by the function, or by JAX: for example, an operation without derivative
         line = (str(error).strip() or "no message").splitlines()[0]
         raise Unsupported(f"cannot be traced with its derivatives: {type(error).__name__}: {line}") from error
 
@@ -91,41 +90,41 @@ def _run(graph: Graph, jaxpr: Any, consts: Sequence[Any], inputs: Sequence[Any])
 
 
 def _as_array(value: Any) -> Any:
-    """Return a NumPy array; keys of random numbers, which NumPy does not know, stay as they are."""
+    """Return a NumPy array; typed random keys of JAX, for which NumPy has no type, stay as they are."""
     extended = isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended)
     return value if extended or isinstance(value, np.ndarray) else np.asarray(value)
 
 
 def _add_location(error: Unsupported, equation: Any) -> Unsupported:
-    """Add the line of the user's code, and the name of JAX's function that it calls.
+    """Add the line of the user's code, and the name of the JAX function that it calls.
 
-    Functions of JAX such as `jnp.sort` are traced once for all their callers. What their inner operations say of where
-    they stand may thus be the place of another call.
+    JAX traces functions such as `jnp.sort` once for all callers: the source location of their inner operations may be
+    that of another call. The location of the call itself is therefore used.
     """
     inner = equation.params.get("jaxpr") if equation.primitive.name in ("jit", "pjit") else None
-    name = None if inner is None else _public_name(inner.jaxpr)
+    name = None if inner is None else _find_public_name(inner.jaxpr)
     if name is not None:
         calls, _, why = error.what.partition(", which ")
         why = why if calls.startswith("calls ") else error.what
         more = f", which {why}" if why else ""
-        return Unsupported(f"calls {name}{more}", _line_of(equation))
-    return Unsupported(error.what, error.where or _line_of(equation))
+        return Unsupported(f"calls {name}{more}", _find_line(equation))
+    return Unsupported(error.what, error.where or _find_line(equation))
 
 
-def _public_name(jaxpr: Any) -> str | None:
+def _find_public_name(jaxpr: Any) -> str | None:
     """Return the public name of a function of JAX; None for any other function."""
     info = getattr(jaxpr, "debug_info", None)
     file, name = getattr(info, "func_filename", None), str(getattr(info, "func_name", "")).lstrip("_")
     if file is None or not file.startswith(os.path.dirname(jax.__file__) + os.sep):
         return None
-    for place, module in _modules():
+    for place, module in _list_modules():
         if hasattr(module, name):
             return f"{place}.{name}"
     return name or "a function of JAX"
 
 
 @cache
-def _modules() -> list[tuple[str, Any]]:
+def _list_modules() -> list[tuple[str, Any]]:
     import jax.scipy.linalg
     import jax.scipy.special
 
@@ -143,9 +142,9 @@ def _modules() -> list[tuple[str, Any]]:
     ]
 
 
-def _line_of(equation: Any) -> str | None:
+def _find_line(equation: Any) -> str | None:
     """Return file and line of the user's code from which an operation comes; None if JAX does not say."""
-    try:  # not public: what JAX says where it fails may be said in another way one day
+    try:  # private API of JAX: if it changes, messages have no location
         frame = source_info_util.user_frame(equation.source_info.traceback)
         return None if frame is None else f"{os.path.basename(frame.file_name)}:{frame.start_line}"
     except (AttributeError, TypeError):
@@ -157,7 +156,7 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
     shapes = [variable.aval.shape for variable in equation.outvars]
     if shapes and all(0 in shape for shape in shapes):
         return [np.empty(shape) for shape in shapes]
-    # An empty array is a known one: what a sum over nothing is, JAX knows.
+    # An empty array counts as known, so that JAX evaluates reductions over it.
     args = [a if a.size else np.empty(a.shape, v.aval.dtype) for a, v in zip(args, equation.invars, strict=True)]
     known = all(a.dtype != object for a in args)
     if name in CALLS:
@@ -182,7 +181,7 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
     if known:
         dtype = equation.outvars[0].aval.dtype
         if name == "convert_element_type" and args[0].dtype.kind == "f" and dtype.kind in "iu":
-            return _evaluate_known(equation, args)  # NumPy and JAX differ where a number does not fit
+            return _evaluate_known(equation, args)  # NumPy and JAX differ for numbers out of range
         return [np.asarray(NUMPY[name](params, *args)).astype(dtype).reshape(shapes[0])]
     if name in WRITTEN_OUT:
         for variable in equation.invars:
@@ -225,9 +224,9 @@ def _check_type(dtype: np.dtype[Any]) -> None:
 
 
 def _is_search(equation: Any) -> bool:
-    """Return whether JAX searches one sorted array with a loop, as `jnp.interp` does too.
+    """Return whether an operation is JAX's search in one sorted array, which `jnp.interp` calls too.
 
-    Behind the array and the numbers come tangents, which an index does not depend on.
+    Operands after the array and the numbers are tangents, on which an index does not depend.
     """
     if equation.params.get("name") != "_searchsorted_scan_impl" or len(equation.invars) < 2:
         return False
@@ -246,7 +245,7 @@ def _primitives(jaxpr: Any) -> Iterator[str]:
 
 
 OTHER_NAMES = {"while": "jax.lax.while_loop", "eigh": "jnp.linalg.eigh", "eig": "jnp.linalg.eig", "fft": "jnp.fft"}
-"""What users call some operations that are not called `jax.lax.NAME`."""
+"""Public names of operations for which it is not `jax.lax.NAME`."""
 
 
 # Loops and branches
@@ -287,7 +286,7 @@ def _while(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
 
 
 def _cond(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
-    """Trace all branches, and choose among their results."""
+    """Trace all branches, and select among their results."""
     which, *operands = args
     branches = [
         (lambda branch=branch: _run(graph, branch.jaxpr, branch.consts, operands))
@@ -305,7 +304,7 @@ def _cond(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
 
 
 def _linear_solve(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
-    """Trace the solver of a linear system; its derivatives have been taken before."""
+    """Trace the solver of a linear system; JAX has differentiated it before."""
     lengths, jaxprs = equation.params["const_lengths"], equation.params["jaxprs"]
     before = lengths.matvec + lengths.vecmat
     right = before + lengths.solve + (lengths.transpose_solve if jaxprs.transpose_solve is not None else 0)
@@ -332,10 +331,10 @@ CALLS = {
     "custom_vjp_call": "call_jaxpr",
     "custom_vjp_call_jaxpr": "fun_jaxpr",
 }
-"""Operations that run another jaxpr, by where they keep it. Custom derivatives have been used before."""
+"""Operations that run another jaxpr, and the parameter that holds it. Custom derivatives have been applied before."""
 
 
-# Entries of arrays that are moved about
+# Operations that move entries
 
 
 def _broadcast(params: Any, a: Any, *_: Any) -> Any:
@@ -351,7 +350,7 @@ def _slice(params: Any, a: Any) -> Any:
 
 
 def _pad(params: Any, a: Any, value: Any) -> Any:
-    """Add entries between and around those of an array; a negative number at an end cuts entries off."""
+    """Insert entries between and around those of an array; a negative count at an end removes entries."""
     config = params["padding_config"]
     whole = [n + max(n - 1, 0) * inner for n, (_, _, inner) in zip(a.shape, config, strict=True)]
     shape = [max(low, 0) + n + max(high, 0) for n, (low, high, _) in zip(whole, config, strict=True)]
@@ -386,7 +385,7 @@ MOVES: dict[str, Callable[..., Any]] = {
     "stop_gradient": lambda params, a: a,
     "optimization_barrier": lambda params, *a: a,
 }
-"""Operations that only move entries about."""
+"""Operations that only move entries."""
 
 NUMPY: dict[str, Callable[..., Any]] = {
     "iota": lambda params: (
@@ -406,7 +405,7 @@ NUMPY: dict[str, Callable[..., Any]] = {
     "ge": lambda params, a, b: a >= b,
     "select_n": lambda params, which, *cases: np.choose(which.astype(int), cases),
 }
-"""Operations on known numbers that models have often, without a start of XLA for each."""
+"""Frequent operations on known numbers, evaluated by NumPy, since calling XLA for each would be slow."""
 
 
 # Doubles
@@ -470,7 +469,7 @@ def _round(graph: Graph, params: Any) -> Callable[[Any], Any]:
 
 def _sign(graph: Graph, params: Any) -> Callable[[Any], Any]:
     def sign(a: Any) -> Any:
-        negative = graph.apply("select", graph.apply("lt", a, 0.0), -1.0, a)  # 0 and nan stay what they are
+        negative = graph.apply("select", graph.apply("lt", a, 0.0), -1.0, a)  # 0 and NaN are unchanged
         return graph.apply("select", graph.apply("lt", 0.0, a), 1.0, negative)
 
     return sign
@@ -536,7 +535,7 @@ def _dot(graph: Graph, equation: Any, a: Any, b: Any) -> Any:
     (sum_a, sum_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
     a = np.moveaxis(a, batch_a, range(len(batch_a)))
     b = np.moveaxis(b, batch_b, range(len(batch_b)))
-    # Where the summed axes lie once the batch is in front.
+    # Positions of the summed axes once the batch axes are in front.
     rest_a = [k for k in range(a.ndim) if k not in batch_a]
     rest_b = [k for k in range(b.ndim) if k not in batch_b]
     axes = [[rest_a.index(k) for k in sum_a], [rest_b.index(k) for k in sum_b]]
@@ -549,7 +548,7 @@ def _dot(graph: Graph, equation: Any, a: Any, b: Any) -> Any:
 
 
 def _contract(a: Any, b: Any, axes: Any) -> Objects:
-    a, b = (np.asarray(each, dtype=object) for each in (a, b))  # NumPy hands out scalars without an array around them
+    a, b = (np.asarray(each, dtype=object) for each in (a, b))  # NumPy may return bare scalars
     return np.asarray(np.tensordot(a, b, axes=axes), dtype=object)
 
 
@@ -581,7 +580,7 @@ def _accumulate(name: str) -> Callable[..., Any]:
 
 
 def _find_first(name: str) -> Callable[..., Any]:
-    """Find the largest (or smallest) entry along an axis, the first of several; a NaN counts as such."""
+    """Find the index of the largest (smallest) entry along an axis, the first of several; NaN counts as extreme."""
 
     def along(graph: Graph, equation: Any, a: Any) -> Any:
         (axis,), dtype = equation.params["axes"], equation.invars[0].aval.dtype
@@ -655,4 +654,4 @@ INDEXED: dict[str, Callable[..., Any]] = {
 """Operations at indices."""
 
 WRITTEN_OUT: dict[str, Callable[..., list[Any]]] = {**MATRICES, **SORTING}
-"""Operations that are loops in JAX, up to some size; each returns a list of arrays."""
+"""Operations that are loops in JAX and unrolled here, up to a size limit; each returns a list of arrays."""

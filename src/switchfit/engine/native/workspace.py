@@ -1,7 +1,7 @@
-"""Where everything lies that machine code reads and writes: one description for calls from Python and from XLA.
+"""Layout of the memory that machine code reads and writes, shared by calls from Python and from XLA.
 
-The table of pointers holds, in the order of `pointers`, first what is given, then the sums, then the memory in between,
-then for each Measurements what `OF_SAMPLES` lists. Lengths count doubles; those of the memory grow with the rows.
+The table of pointers holds, in the order of `pointers`, the arguments, the accumulators and the scratch space, then for
+each Measurements what `OF_SAMPLES` lists. Sizes count doubles; those of the scratch space grow with the number of rows.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ GIVEN = (
     *(kind.name for kind in AT_TRANSITIONS),
     *("multipliers", "penalties", "units"),
 )
-"""What is given: nodes (G + 1,), signals (G, 4, S), constants, p (M,); the transition times between t0 and tf (N + 2,);
-the cell in which each segment begins, then the last cell (N + 2,); the mode of each segment (N + 1,); which reset map
-and which function of each kind a transition has, -1 for none (N,); multipliers and penalties of all constraints; the
-derivatives of the transition times, after a row of zeros (D + 1, width)."""
+"""Arguments: nodes (G + 1,), signals (G, 4, S), constants, p (M,); the transition times between t0 and tf (N + 2,);
+the cell in which each segment begins, then the last cell (N + 2,); the mode of each segment (N + 1,); the index of the
+reset map and of the function of each kind at each transition, -1 without one (N,); multipliers and penalties of all
+constraints; the derivatives of the transition times, after a row of zeros (D + 1, width)."""
 
 WHOLE_NUMBERS = ("first_cell", "modes", "resets", *(kind.name for kind in AT_TRANSITIONS))
-"""What of it are integers of 64 bits."""
+"""Arguments that are 64-bit integers."""
 
 OF_SAMPLES = ("cell", "time", "value", "weight", "segment")
-"""What is given for each Measurements: the cell at whose end a sample is, or that holds it if it is late; (K,), (K,),
-(K, q), (K, q); and the segment that holds a late one."""
+"""Arguments of each Measurements: the cell at whose end a sample lies, or that holds a late sample, (K,); times (K,),
+values (K, q), weights (K, q); the segment that holds a late sample, (K,)."""
 
 WHOLE_OF_SAMPLES = ("cell", "segment")
 
@@ -46,9 +46,9 @@ class Length(NamedTuple):
 
 
 def constraint_rows(library: Structure, sizes: Sizes) -> dict[str, int]:
-    """Return where the constraints of each kind begin among all: a row a transition each; "end" the terminal ones.
+    """Return the first row of each kind of constraints, one row per transition; "end" is the first terminal one.
 
-    The count of all stands under "count".
+    "count" is the number of all rows.
     """
     first, count = {}, 0
     for kind in AT_TRANSITIONS:
@@ -59,7 +59,7 @@ def constraint_rows(library: Structure, sizes: Sizes) -> dict[str, int]:
 
 
 def sums(library: Structure, sizes: Sizes) -> dict[str, int]:
-    """Return the lengths of what an evaluation adds up, and begins with zeros: the results."""
+    """Return the sizes of the accumulators, which start at zero: they are the results."""
     count = constraint_rows(library, sizes)["count"]
     return {
         "psi": sizes.n,
@@ -73,7 +73,7 @@ def sums(library: Structure, sizes: Sizes) -> dict[str, int]:
 
 
 def memory(library: Structure, sizes: Sizes, order: Order) -> dict[str, Length]:
-    """Return the lengths of what lies between the parts of an evaluation."""
+    """Return the sizes of the parts of the scratch space."""
     n, N, width = sizes.n, sizes.N, sizes.width
     second, first = int(order >= Order.HESSIAN), int(order >= Order.GRADIENT)
     resets, jumps = int(bool(library.reset_maps)), int(has_jumps(library))
@@ -101,9 +101,9 @@ def memory(library: Structure, sizes: Sizes, order: Order) -> dict[str, Length]:
 
 
 ZEROED = ("jumps", "late")
-"""What of the memory begins with zeros."""
+"""Parts of the scratch space that start at zero."""
 
 
 def pointers(library: Structure, sizes: Sizes, order: Order) -> tuple[str, ...]:
-    """Return the names of the pointers in the table, but for those of the samples."""
+    """Return the names of the pointers in the table, except those of the samples."""
     return (*GIVEN, *sums(library, sizes), *memory(library, sizes, order))

@@ -1,4 +1,4 @@
-"""Emit LLVM's language line by line: names of values, addresses, loads, loops that return when a budget is spent."""
+"""Emit LLVM IR line by line: names of values, addresses, loads, loops that return when a budget is spent."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ WHOLE = f"{TABLE}, i64 %segment, ptr %progress"
 
 
 class Writer:
-    """Emits the lines of one function after the other for a library.
+    """Emits the functions of a library, one at a time.
 
     Attributes
     ----------
     library, sizes, order, kernels, module : as given
     names : list of str
-        What the table of pointers holds.
+        Names of the pointers in the table.
     rows : dict
-        Where the constraints stand.
+        First row of each kind of constraints, see `workspace.constraint_rows`.
     lines : list of str
-        Of the function under way.
+        Lines of the current function.
     """
 
     def __init__(self, library: Structure, sizes: Sizes, order: Order, kernels: Kernels, module: Module) -> None:
@@ -77,14 +77,14 @@ class Writer:
         return self.let(f"getelementptr inbounds i8, ptr {pointer}, i64 {offset}")
 
     def call(self, name: str, order: tuple[str, ...], given: dict[str, str]) -> int:
-        """Call a straight line with its pointers in order; return its cost."""
+        """Emit the call of a straight-line function with its pointers in order; return its cost."""
         self.line(f"call void @{name}({', '.join(f'ptr {given[key]}' for key in order)})")
         return self.module.work(name)
 
     def choose(self, which: str, count: int, name: str) -> list[str]:
-        """Switch to one of `count` blocks at run time; return their labels. Each block continues at ``{name}_end``.
+        """Emit a switch to one of `count` blocks; return their labels. Each block continues at ``{name}_end``.
 
-        A choice of -1 goes there at once.
+        The choice -1 jumps to ``{name}_end`` directly.
         """
         labels = [f"{name}_{k}" for k in range(count)]
         cases = " ".join(f"i64 {k}, label %{label}" for k, label in enumerate(labels))
@@ -92,15 +92,15 @@ class Writer:
         return labels
 
     def load_progress(self) -> tuple[str, str]:
-        """Load from `progress` how many turns of a loop are done, and what is left of the budget."""
+        """Load from `progress` the number of finished iterations of a loop, and the rest of the budget."""
         places = (self.let(f"getelementptr inbounds i64, ptr %progress, i64 {k}") for k in (1, 2))
         turns, left = (self.load("i64", place) for place in places)
         return turns, left
 
     def next_turn(self, turns: str, done: str) -> None:
-        """End a turn of a loop: leave it if it is `done`, return if the budget is spent, else start the next one.
+        """End an iteration: save the progress and return if the loop is `done` or the budget spent, else continue.
 
-        The loop has the label `loop`, this block the label `next`. `%left` is what is left after this turn.
+        The label of the loop is `loop`. `%left` is the budget after this iteration.
         """
         self.line(f"%turns = add i64 {turns}, 1")
         self.line("%spent = icmp sle i64 %left, 0")

@@ -296,8 +296,8 @@ def _make_small(x: str, y: str) -> Any:
 # --- the whole fit ----------------------------------------------------------------------------------------------------
 
 
-def draw_convergence(history: Sequence[IterationRecord], tolerance: float) -> list[Any]:
-    """Return J and the optimality by iteration.
+def draw_convergence(history: Sequence[IterationRecord], tolerance: float) -> dict[str, Any]:
+    """Return J and the optimality by iteration, by their names in the page; none of values that no axis can show.
 
     Parameters
     ----------
@@ -308,9 +308,11 @@ def draw_convergence(history: Sequence[IterationRecord], tolerance: float) -> li
     wide = costs.min() > 0 and costs.max() > 30 * costs.min()
     optimality = np.array([record.optimality for record in history], dtype=float)
     optimality = np.where(optimality > 0, optimality, np.nan)
-    found = []
+    found = {}
     given = ((costs, "cost J", "log" if wide else "linear"), (optimality, "optimality (KKT residual)", "log"))
-    for values, label, scale in given:
+    for k, (values, label, scale) in enumerate(given):
+        if not np.isfinite(values).any():
+            continue
         plot = _make_figure(SMALL_HEIGHT, y_axis_type=scale)
         plot.xaxis.axis_label, plot.yaxis.axis_label = PlainText(text="iteration"), PlainText(text=label)
         iterations, steps = ([getattr(record, name) for record in history] for name in ("iteration", "step"))
@@ -321,7 +323,7 @@ def draw_convergence(history: Sequence[IterationRecord], tolerance: float) -> li
         plot.xaxis.ticker.min_interval = 1
         if values is optimality:
             _tag(plot.hspan(y=tolerance, line_color=DATA, line_dash="dashed"), "muted")
-        found.append(plot)
+        found[f"convergence-{k}"] = plot
     return found
 
 

@@ -166,7 +166,15 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
         "steps_tried": Table(
             [
                 ["strategy", "lowest J after it", "evaluations", "seconds"],
-                *([s.strategy, f"{s.cost:.8g}", f"{s.evaluations}", f"{s.seconds:.2g}"] for s in estimate.steps),
+                *(
+                    [
+                        s.strategy,
+                        f"{s.cost:.8g}" if np.isfinite(s.cost) else "failed",
+                        f"{s.evaluations}",
+                        f"{s.seconds:.2g}",
+                    ]
+                    for s in estimate.steps
+                ),
             ],
             "<>>>",
         ),
@@ -243,8 +251,7 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[Run], dict[str, Any]]:
         names = [estimate.theta_names[i] for i in correlated]
         always["correlation"] = draw_correlation(names, estimate.correlation[np.ix_(correlated, correlated)])
     if estimate.history:
-        pair = draw_convergence(estimate.history, estimate.tolerance)
-        always |= {f"convergence-{k}": part for k, part in enumerate(pair)}
+        always |= draw_convergence(estimate.history, estimate.tolerance)
     figures |= {name: FigureData(name, {}, {}, {}).to_json() for name in always}
     moved = [slider.place for slider in sliders]
     return runs, {

@@ -1,0 +1,115 @@
+"""How well each of many fits explains its data, and where it ended: from J and theta alone, without a simulation.
+
+With J half a sum of squares, and V that of the data about their means, the share of the variance that is explained is
+``1 - J / V``. So it needs V once for each data set, where a single fit compares its trajectory channel by channel.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.fit.solution import is_least_squares
+from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal, TerminalConstraint
+from switchfit.problem.experiment import Experiment
+from switchfit.problem.problem import Problem
+from switchfit.uncertainty.quality import NO_VARIATION
+
+REFERENCE_POINTS = 400
+"""Points at which a reference signal is compared with its mean."""
+
+AT_END = 1e-9
+"""Part of the horizon that a mode lasts, or of a bound, that counts as none."""
+
+
+def measure_variation(problem: Problem) -> FloatArray:
+    """Return J of data that are met by their means alone, one for each experiment: (E,).
+
+    NaN where J is anything but half a sum of squares of data (and priors): costs of the trajectory, a robust loss, a
+    sigma that is a parameter.
+    """
+    if not is_least_squares(problem):
+        return np.full(len(problem.experiments), np.nan)
+    found = []
+    for run in problem.experiments:
+        items = [item for item in run.data if not isinstance(item, TerminalConstraint)]
+        found.append(sum(_vary(item, run) for item in items) if items else np.nan)
+    return np.array(found, dtype=np.float64)
+
+
+def _vary(item: Any, run: Experiment) -> float:
+    if isinstance(item, Measurements):
+        return float(sum(_vary_channel(*pair) for pair in zip(item.values.T, item.weights.T, strict=True)))
+    if isinstance(item, ReferenceSignal):
+        times = np.linspace(run.t0, run.end, REFERENCE_POINTS)
+        followed = item.signal(times)
+        deviation = followed - followed.mean(axis=0)
+        return 0.5 * float(np.einsum("ki,ij,kj->", deviation, item.weights, deviation)) * float(times[1] - times[0])
+    return np.nan
+
+
+def _vary_channel(values: FloatArray, weights: FloatArray) -> float:
+    """Return half the weighted squares of a channel about its mean; about 0 where it does not vary."""
+    there = weights > 0
+    y, w = values[there], weights[there]
+    if not len(y):
+        return 0.0
+    about_mean, about_zero = float(w @ (y - w @ y / w.sum()) ** 2), float(w @ y**2)
+    return 0.5 * (about_mean if about_mean > NO_VARIATION**2 * about_zero else about_zero)
+
+
+def describe_ends(
+    problem: Problem, theta: FloatArray, cost: FloatArray, variation: FloatArray | float
+) -> dict[str, NDArray[Any]]:
+    """Return the fields `explained`, `collapsed` and `at_bounds` of `Fits`, (R,) each.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its bounds, modes and horizons; its data may differ from those that were fitted.
+    theta : (R, d)
+    cost : (R,)
+    variation : float or (R,)
+        Sum of `measure_variation` over the experiments.
+    """
+    unknowns, priors = problem.unknowns, problem.unknowns.priors
+    squares = cost - np.array([priors.evaluate(each)[0] for each in theta]) if priors.any else cost
+    total = np.broadcast_to(np.asarray(variation, dtype=float), cost.shape)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        explained = np.where(total == 0, np.where(squares <= 0, 1.0, 0.0), 1 - squares / total)
+    free = ~unknowns.is_time
+    near = AT_END * np.maximum(np.abs(theta), 1e-300)
+    with np.errstate(invalid="ignore"):
+        held = (theta <= unknowns.lower + near) | (theta >= unknowns.upper - near)
+        collapsed = sum(_count_collapsed(problem, e, theta) for e in range(len(problem.experiments)))
+    return {
+        "explained": np.where(np.isnan(total) | np.isnan(cost), np.nan, explained),
+        "collapsed": np.asarray(collapsed, dtype=np.int64),
+        "at_bounds": np.sum(held & free & ~np.isnan(theta), axis=1).astype(np.int64),
+    }
+
+
+def _count_collapsed(problem: Problem, e: int, theta: FloatArray) -> NDArray[np.int64]:
+    """Return how many modes of experiment e last no longer than they must: (R,)."""
+    experiment, where = problem.experiments[e], problem.unknowns.times[e]
+    times = np.repeat(experiment.initial_times[None], len(theta), axis=0)
+    times[:, where >= 0] = theta[:, where[where >= 0]]
+    begin = np.full((len(theta), 1), experiment.t0)
+    knots = np.concatenate([begin, times], axis=1)
+    if not experiment.has_free_tf:
+        knots = np.concatenate([knots, np.full((len(theta), 1), experiment.end)], axis=1)
+    shortest = problem.min_duration + AT_END * (experiment.end - experiment.t0)
+    found: NDArray[np.int64] = np.sum(np.diff(knots, axis=1) <= shortest, axis=1)
+    return found
+
+
+def count_samples(problem: Problem) -> int:
+    """Return the measured values that are not missing."""
+    return sum(item.count for run in problem.experiments for item in run.data if isinstance(item, Measurements))
+
+
+def count_priors(problem: Problem) -> int:
+    """Return the unknowns that have a prior."""
+    return int(np.count_nonzero(problem.unknowns.priors.precision))

@@ -1,0 +1,145 @@
+"""All runs and all unknowns of a fit as CSV: what one screen of the report has no room for."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from switchfit.estimation.estimator import Estimate
+from switchfit.fit.result import Fit
+from switchfit.optimize.arrow import ArrowLayout
+from switchfit.problem.problem import Problem
+from switchfit.uncertainty.quality import ChannelQuality, measure_quality
+from switchfit.uncertainty.residuals import correct_errors
+from switchfit.uncertainty.verdict import CLEARLY_OFF, UNLIKELY
+
+
+def write_unknowns(fit: Fit) -> str:
+    """Return a CSV table with a line for each unknown: value, standard error, interval, first guess, what holds it.
+
+    The standard errors are those of the report, which allow for correlated residuals; the naive ones stand beside them.
+
+    Parameters
+    ----------
+    fit : Fit
+    """
+    header = [
+        "name",
+        "unit",
+        "value",
+        "std. error",
+        "naive",
+        "low 95 %",
+        "high 95 %",
+        "first guess",
+        "transition",
+        "held",
+    ]
+    joins = {transition.index: f"{transition.before} -> {transition.after}" for transition in fit.transitions}
+    errors, naive, intervals = correct_errors(fit), fit.standard_errors, fit.confidence_intervals()
+    rows = []
+    for i, name in enumerate(fit.theta_names):
+        numbers = [fit.theta[i], errors[i], naive[i], *intervals[i], fit.initial_theta[i]]
+        held = "; ".join(_list_holds(fit, name))
+        rows.append([name, fit.theta_units[i], *map(_format, numbers), joins.get(i, ""), held])
+    return _write(header, rows)
+
+
+def write_runs(estimate: Estimate) -> str:
+    """Return a CSV table with a line for each run: modes, data, how well it fits, its own unknowns and their errors.
+
+    An unknown is called as the model calls it, so that those of all runs share a column.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        With its problem.
+    """
+    problem = estimate.evaluator_at_solution().problem
+    errors, quality = correct_errors(estimate), measure_quality(estimate)
+    names = list(_name_own_unknowns(problem, estimate))
+    columns = list(dict.fromkeys(column for own in names for column in own))
+    header = ["run", "modes", "t0", "tf", "time unit", "values", "chi2", "explained", "flags"]
+    header += [part for column in columns for part in (column, f"{column} std. error")]
+    rows = []
+    for e, (own, trajectory) in enumerate(zip(names, estimate.trajectories, strict=True)):
+        here = [channel for channel in quality.channels if channel.experiment == e]
+        row = [
+            estimate.run_names[e],
+            " -> ".join(mode for mode, _, _ in trajectory.mode_spans),
+            _format(trajectory.times[0]),
+            _format(trajectory.times[-1]),
+            trajectory.time_unit,
+            str(sum(channel.count for channel in here)),
+            _format(sum(channel.chi_square for channel in here) if here else np.nan),
+            _format(min((c.explained for c in here if np.isfinite(c.explained)), default=np.nan)),
+            "; ".join(_flag(estimate, e, here, own, len(quality.channels))),
+        ]
+        for column in columns:
+            place = own.get(column)
+            row += ["", ""] if place is None else [_format(estimate.theta[place]), _format(errors[place])]
+        rows.append(row)
+    return _write(header, rows)
+
+
+def _name_own_unknowns(problem: Problem, fit: Fit) -> Iterator[dict[str, int]]:
+    """Yield where in theta the unknowns of each run alone stand, by the model's names, transition times first."""
+    unknowns, ends = problem.unknowns, fit.final_places
+    layout = ArrowLayout.of(len(fit.theta), problem.places)
+    spans = {i: name for name, span in unknowns.parameters.items() for i in range(span.start, span.stop)}
+    for e, experiment in enumerate(problem.experiments):
+        times = {int(place): f"tau_{k + 1}" for k, place in enumerate(fit.transition_places[e])} | {ends[e]: "tf"}
+        inside = {experiment.parameter_map.get(name, name): name for name, _, _ in problem.structures[e].parameters}
+        found = {}
+        for i in (int(place) for place in layout.own[e] if place < layout.size):
+            name = fit.theta_names[i]
+            if i in times:
+                column = times[i]
+            elif i in spans:
+                column = name.replace(spans[i], inside.get(spans[i], spans[i]), 1)
+            else:
+                column = name.removeprefix(f"{fit.run_names[e]}.")
+            unit = fit.theta_units[i]
+            found[f"{column} ({unit})" if unit and unit != "1" else column] = i
+        yield found
+
+
+def _flag(fit: Fit, e: int, channels: Sequence[ChannelQuality], own: dict[str, int], tested: int) -> Iterator[str]:
+    """Yield what the verdict says of a run; the probability of chi-square is shared among all channels `tested`."""
+    for channel in channels:
+        if channel.probability < UNLIKELY / tested and channel.chi_square > (1 + CLEARLY_OFF) * channel.count:
+            yield f"chi2 of {channel.label} too large"
+        if channel.correlated:
+            yield f"residuals of {channel.label} correlated"
+    for constraint in fit.active:
+        if constraint.position is not None and constraint.run == fit.run_names[e]:
+            state = "collapsed" if constraint.kind == "collapsed" else "at its minimum duration"
+            yield f"mode {constraint.mode} {state}"
+    for column, i in own.items():
+        for hold in _list_holds(fit, fit.theta_names[i]):
+            yield f"{column} {hold}"
+
+
+def _list_holds(fit: Fit, name: str) -> Iterator[str]:
+    """Yield what holds an unknown."""
+    if name in fit.idle:
+        yield "idle"
+    yield from (f"at {c.kind}" for c in fit.active if c.unknown == name and c.position is None)
+    if name in [kink.unknown for kink in fit.kinks]:
+        yield "at a kink"
+
+
+def _format(value: float) -> str:
+    """Return a number so that it reads back as the same; nothing for NaN."""
+    return "" if np.isnan(value) else repr(float(value))
+
+
+def _write(header: list[str], rows: list[list[str]]) -> str:
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\r\n")
+    table.writerow(header)
+    table.writerows(rows)
+    return text.getvalue()

@@ -1,0 +1,220 @@
+"""The step of an iteration with equality constraints c(theta) = 0: towards them, and along them.
+
+The quadratic programme with linearised constraints
+
+    minimise  gᵀd + ½ dᵀHd   subject to   c + A d = 0,   N d >= offsets,   |d_i| <= radius reach_i
+
+need not have a feasible point: the linearisations may contradict one another, the inequalities or the trust region. The
+composite step of Byrd and Omojokun ([1]_, section 18.5, algorithm 18.4) asks of c + A d what can be had:
+
+1. the *normal step* v minimises ‖c + A v‖₂ within a part of the trust region and the inequalities;
+2. the *tangential step* t minimises the model within ``A t = 0``, the rest of the trust region and the inequalities.
+
+With an orthonormal basis Z of the null space of A the second is a programme in w, t = Z w, of which w = 0 is a feasible
+point, as `solve_qp` needs it; only ZᵀHZ has to be positive definite, and is shifted where it is not. Both are solved in
+units of `reach`.
+
+References
+----------
+.. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapters 15 and 18.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg.lapack import dgeqp3, dorgqr, dtrtrs
+
+from switchfit.optimize.algebra import FloatArray
+from switchfit.optimize.dense import make_positive, solve_in_bounds
+from switchfit.optimize.qp import solve_qp
+
+NORMAL_PART = 0.95
+"""Part of the trust region in which the normal step has to stay; the rest is left for the tangential step."""
+
+DEPENDENT = 1e-10
+"""Rows of a Jacobian whose part across the others is below this part of the largest row depend on them."""
+
+FLAT = 1e-8
+"""Curvature that counts as none, as a part of the largest slope: where J is linear, the trust region ends the step."""
+
+RIDGE = 1e-12
+"""Part of the mean curvature of ½‖c + A v‖² that is added to all directions, to make the shortest of all v the
+solution."""
+
+
+class Equalities(NamedTuple):
+    """Equality constraints at a point: values c, (k,), and Jacobian A, (k, d)."""
+
+    values: FloatArray
+    jacobian: FloatArray
+
+    @property
+    def violation(self) -> float:
+        """‖c‖₂."""
+        return float(np.sqrt(self.values @ self.values))
+
+    def predict(self, step: FloatArray) -> float:
+        """Return ‖c + A d‖₂ for a step d (d,)."""
+        left = self.values + self.jacobian @ step
+        return float(np.sqrt(left @ left))
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """The factorisation Aᵀ P = Q R of a Jacobian A (k, d), which may have dependent rows: Q is (d, d), R (d, k)."""
+
+    jacobian: FloatArray
+    orthogonal: FloatArray
+    triangular: FloatArray
+    order: FloatArray
+
+    @classmethod
+    def of(cls, jacobian: FloatArray) -> Rows:
+        """Factorise a Jacobian (k, d), k > 0."""
+        k, d = jacobian.shape
+        packed, order, tau, _, _ = dgeqp3(jacobian.T)
+        full = np.zeros((d, d), order="F")
+        full[:, : min(k, d)] = packed[:, : min(k, d)]
+        return cls(jacobian, dorgqr(full, tau)[0], np.triu(packed), order - 1)
+
+    @cached_property
+    def rank(self) -> int:
+        """Number of independent rows."""
+        sizes = np.abs(self.triangular.diagonal())
+        return int(np.sum(sizes > DEPENDENT * sizes.max(initial=0.0)))
+
+    @property
+    def null(self) -> FloatArray:
+        """Orthonormal basis of the null space of A: (d, d - rank)."""
+        return self.orthogonal[:, self.rank :]
+
+    @cached_property
+    def _regular(self) -> FloatArray | None:
+        k = len(self.order)
+        return self.triangular[:k] if self.rank == k else None
+
+    def solve(self, values: FloatArray) -> FloatArray:
+        """Return the shortest v (d,) that minimises ‖values + A v‖₂."""
+        if self._regular is None:
+            return -np.asarray(np.linalg.lstsq(self.jacobian, values, rcond=DEPENDENT)[0])
+        inside = dtrtrs(self._regular, values[self.order], trans=1)[0]
+        return -np.asarray(self.orthogonal[:, : self.rank] @ inside)
+
+    def multipliers(self, force: FloatArray) -> FloatArray:
+        """Return the lam (k,) that minimises ‖force + Aᵀ lam‖₂ ([1]_, section 18.3), the shortest of them."""
+        if self._regular is None:
+            return -np.asarray(np.linalg.lstsq(self.jacobian.T, force, rcond=DEPENDENT)[0])
+        found = np.empty(len(self.order))
+        found[self.order] = -dtrtrs(self._regular, self.orthogonal[:, : self.rank].T @ force)[0]
+        return found
+
+
+class Composite(NamedTuple):
+    """A composite step.
+
+    Attributes
+    ----------
+    step : array, shape (d,)
+    inequalities : array, shape (m,)
+        Multipliers of the inequalities; the trust region's are left out.
+    multipliers : array, shape (k,)
+        Of the equality constraints: ``g + H d + Aᵀ lam = Nᵀ inequalities``, as nearly as that can be had.
+    """
+
+    step: FloatArray
+    inequalities: FloatArray
+    multipliers: FloatArray
+
+
+def solve_composite(
+    gradient: FloatArray,
+    hessian: FloatArray,
+    equalities: Equalities,
+    normals: FloatArray,
+    offsets: FloatArray,
+    reach: FloatArray,
+    radius: float,
+) -> Composite:
+    """Return the composite step.
+
+    Parameters
+    ----------
+    gradient : array, shape (d,)
+        Of J.
+    hessian : array, shape (d, d)
+        Of the Lagrangian ``J + lam . c``.
+    equalities : Equalities
+    normals, offsets : array, shape (m, d), (m,)
+        ``N d >= offsets``, offsets not positive.
+    reach : array, shape (d,)
+    radius : float
+        No unknown moves by more than ``radius * reach``.
+    """
+    d = gradient.size
+    slope, bending = gradient * reach, hessian * (reach[:, None] * reach)
+    scaled = Equalities(equalities.values, equalities.jacobian * reach)
+    rows = Rows.of(scaled.jacobian)
+    kept = offsets > -np.inf
+    # A row of the inequalities that the whole trust region satisfies is left out.
+    within = normals * reach
+    kept &= np.abs(within).sum(1) * radius > -offsets
+    within, room = within[kept], offsets[kept]
+    normal = _find_normal_step(scaled, rows, within, room, NORMAL_PART * radius)
+    null = rows.null
+    inequalities = np.zeros(len(offsets))
+    force = np.zeros(d)
+    step = normal
+    if null.shape[1]:
+        least = FLAT * float(np.max(np.abs(slope))) + np.finfo(float).tiny
+        matrix = make_positive(null.T @ bending @ null, least)
+        inside = np.vstack([within @ null, null, -null])
+        left = np.concatenate([room - within @ normal, -radius - normal, normal - radius])
+        found = solve_qp(null.T @ (slope + bending @ normal), matrix, inside, np.minimum(left, 0.0))
+        step = normal + null @ found.step
+        count = len(room)
+        inequalities[kept] = found.multipliers[:count]
+        force = within.T @ found.multipliers[:count] + found.multipliers[count : count + d]
+        force -= found.multipliers[count + d :]
+    multipliers = rows.multipliers(slope + bending @ step - force)
+    return Composite(step * reach, inequalities, multipliers)
+
+
+def find_normal_step(
+    equalities: Equalities, normals: FloatArray, offsets: FloatArray, reach: FloatArray, radius: float
+) -> FloatArray:
+    """Return the v (d,) that minimises ‖c + A v‖₂ in a trust region; arguments as of `solve_composite`."""
+    scaled = Equalities(equalities.values, equalities.jacobian * reach)
+    kept = offsets > -np.inf
+    within = normals[kept] * reach
+    return _find_normal_step(scaled, Rows.of(scaled.jacobian), within, offsets[kept], radius) * reach
+
+
+def _find_normal_step(
+    equalities: Equalities, rows: Rows, normals: FloatArray, offsets: FloatArray, radius: float
+) -> FloatArray:
+    """Return the v of `find_normal_step` in units in which the trust region is a cube."""
+    shortest = rows.solve(equalities.values)
+    if (np.abs(shortest) <= radius).all() and (normals @ shortest >= offsets).all():
+        return shortest
+    A, d = equalities.jacobian, shortest.size
+    matrix = A.T @ A
+    matrix.reshape(-1)[:: d + 1] += RIDGE * max(float(matrix.trace()) / d, np.finfo(float).tiny)
+    identity = np.eye(d)
+    inside, left = normals, offsets
+    if radius < np.inf:
+        inside = np.vstack([normals, identity, -identity])
+        left = np.concatenate([offsets, np.full(2 * d, -radius)])
+    left = np.minimum(left, 0.0)
+    slope = A.T @ equalities.values
+    found = None
+    if radius < np.inf:
+        with suppress(np.linalg.LinAlgError):
+            found = solve_in_bounds(slope, matrix, shortest, inside, left)
+    if found is not None:
+        return found[0]
+    return solve_qp(slope, matrix, inside, left).step

@@ -1,0 +1,176 @@
+"""The merit function of equality constraints, ``J + mu ‖c‖₂``, and the search for a step that decreases it.
+
+The penalty mu is raised to where the model of the merit function decreases by a part of what the penalty itself makes
+of the step ([1]_, (18.36)); it never falls. A step that fails because the constraints bend is corrected: the
+*second-order correction* is the shortest step that meets the constraints as they are at its end ([1]_, section 15.6).
+Without it the merit function refuses full steps near the solution (Maratos). If that fails too, the trust region
+shrinks.
+
+References
+----------
+.. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapters 15 and 18.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from switchfit.optimize import box
+from switchfit.optimize.algebra import ARMIJO, ARMIJO_ACROSS, NOISE, FloatArray
+from switchfit.optimize.composite import find_normal_step
+from switchfit.optimize.direction import Direction, find_direction
+from switchfit.optimize.feasibility import Trial, move
+from switchfit.optimize.line_search import MANY_BREAKPOINTS, MAX_BACKTRACKS
+from switchfit.optimize.point import MET, Oracle, Point, Sample
+from switchfit.optimize.state import Accepted, State
+
+#: Part of the decrease of ``mu ‖c‖`` that the decrease of the model has to be, rho of [1]_, (18.36).
+SHARE = 0.1
+#: The penalty is raised beyond what is needed by this factor, or it would have to be again at the next step.
+RAISED = 1.1
+#: Radius of the trust region below which violated constraints count as stuck.
+SMALLEST_RADIUS = 1e-10
+#: Factor by which the trust region shrinks after a step that failed.
+SHRINK = 0.5
+#: A violation that a normal step reduces by less than this part of it is stationary.
+STATIONARY = 1e-6
+#: Iterations without a fall of the violation by a tenth after which it counts as stationary.
+STAGNANT = 10
+
+
+def search_merit(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
+    """Shrink the trust region until a composite step decreases the merit function."""
+    problem, point = oracle.problem, state.point
+    breakpoints, constraints = problem.breakpoints, problem.constraints
+    piece = None
+    whole = box.measure(problem, direction.step)
+    penalty = state.penalty
+    for k in range(MAX_BACKTRACKS):
+        penalty = raise_penalty(penalty, point, direction)
+        length = box.measure(problem, direction.step)
+        crossed = breakpoints.count_crossed(point.theta, direction.step)
+        reduction = direction.reduction + penalty * (point.violation - direction.left)
+        if direction.multipliers is not None:
+            oracle.multipliers = direction.multipliers
+        trial = move(problem, point.theta, direction.step, state.scale)
+        if (trial.theta == point.theta).all():
+            return None
+        fraction = ARMIJO_ACROSS if crossed else ARMIJO
+        accepted = _accept(oracle, state, trial, penalty, reduction, fraction, k == 0)
+        if accepted is not None:
+            there, decrease = accepted
+            radius = _next_radius(direction.radius, length, decrease, reduction, _noise(state, penalty))
+            return Accepted(there, length / whole if k else 1.0, radius, penalty)
+        if length < SMALLEST_RADIUS:
+            break
+        if 0 < crossed < MANY_BREAKPOINTS and piece is None:
+            piece = breakpoints.piece(point.theta, constraints.lower, constraints.upper)
+            radius = direction.radius
+        else:
+            radius = SHRINK * length
+        direction = find_direction(problem, replace(state, radius=radius), piece)
+    return None
+
+
+def raise_penalty(penalty: float, point: Point, direction: Direction) -> float:
+    """Return the penalty for which a step of the model decreases the merit function by enough ([1]_, (18.36))."""
+    gain = point.violation - direction.left
+    # The model without its curvature where that is negative, sigma of [1].
+    rise = max(-direction.reduction, direction.slope)
+    if gain <= 1e-14 * point.violation or rise <= 0.0:
+        return penalty
+    needed = rise / ((1.0 - SHARE) * gain)
+    return penalty if penalty >= needed else RAISED * needed
+
+
+def is_stuck(oracle: Oracle, state: State, direction: Direction) -> bool:
+    """Return whether the violation of constraints that are not met is stationary: no step reduces it to first order.
+
+    Or nearly so: it has not fallen by a tenth for some iterations (with 6 to 40 of them as many fits end right).
+    """
+    problem, point = oracle.problem, state.point
+    violation = point.violation
+    if violation > MET and state.stagnant >= STAGNANT:
+        return True
+    if violation <= MET or violation - direction.left > STATIONARY * violation:
+        return False
+    equalities = point.equalities(point.reported_sides)
+    room = -np.maximum(point.slack, 0.0)
+    radius = max(direction.radius, 1.0)
+    normal = find_normal_step(equalities, problem.constraints.normals, room, problem.reach, radius)
+    return violation - equalities.predict(normal) <= STATIONARY * violation
+
+
+def correct(oracle: Oracle, trial: Trial, sample: Sample, scale: FloatArray, radius: float) -> Trial | None:
+    """Return the trial moved by the second-order correction: the shortest step to where the constraints there lead."""
+    problem = oracle.problem
+    if sample.equalities is None:
+        return None
+    room = -np.maximum(trial.slack, 0.0)
+    step = find_normal_step(sample.equalities, problem.constraints.normals, room, problem.reach, radius)
+    moved = move(problem, trial.theta, step, scale)
+    return None if (moved.theta == trial.theta).all() else moved
+
+
+def _accept(
+    oracle: Oracle, state: State, trial: Trial, penalty: float, reduction: float, fraction: float, corrects: bool
+) -> tuple[Point, float] | None:
+    """Return the point of a trial that decreases the merit function, after a correction if need be, and by how much."""
+    first = oracle.first(trial)
+    if first is None:
+        return None
+    found = _judge(oracle, state, trial, first, penalty, reduction, fraction)
+    if found is not None or not corrects:
+        return found
+    problem = oracle.problem
+    moved = correct(oracle, trial, first, state.scale, np.inf)
+    # What is longer than the step that it is to correct corrects nothing.
+    length = box.measure(problem, trial.theta - state.point.theta)
+    if moved is None or not box.measure(problem, moved.theta - trial.theta) < length:
+        return None
+    first = oracle.first(moved)
+    if first is None:
+        return None
+    return _judge(oracle, state, moved, first, penalty, reduction, fraction)
+
+
+def _judge(
+    oracle: Oracle, state: State, trial: Trial, first: Sample, penalty: float, reduction: float, fraction: float
+) -> tuple[Point, float] | None:
+    """Return the point of a trial that decreases the merit function by a fraction of what is predicted, and how much.
+
+    Where the predicted decrease is below the rounding error of the merit function, the residuals of the optimality
+    conditions have to fall.
+    """
+    point, noise = state.point, _noise(state, penalty)
+    violation = 0.0 if first.equalities is None else first.equalities.violation
+    decrease = point.cost + penalty * point.violation - first.cost - penalty * violation
+    below_noise = reduction <= noise
+    if not (decrease >= -noise if below_noise else decrease >= fraction * reduction):
+        return None
+    there = oracle.complete(trial, first, state.scale)
+    if there is None or (below_noise and not _residual(state, there) < _residual(state, point)):
+        return None
+    return there, decrease
+
+
+def _residual(state: State, point: Point) -> float:
+    """Return how far a point is from the optimality conditions: relative optimality and violation."""
+    return point.optimality / max(state.gradient_scale, np.finfo(float).tiny) + point.violation
+
+
+def _noise(state: State, penalty: float) -> float:
+    """Return the rounding error of the merit function."""
+    return NOISE * (abs(state.point.cost) + penalty * state.point.violation)
+
+
+def _next_radius(radius: float, length: float, decrease: float, reduction: float, noise: float) -> float:
+    """Return the radius after an accepted step ([1]_, algorithm 4.1)."""
+    if reduction <= noise:
+        return radius
+    ratio = decrease / reduction
+    if ratio < box.POOR:
+        return min(radius, SHRINK * length)
+    return radius * box.GROW if ratio > box.GOOD and length > 0.9 * radius else radius

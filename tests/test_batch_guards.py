@@ -1,0 +1,124 @@
+"""Many fits with guards and terminal constraints: far starts end where near ones do, and bad starts end nothing."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import switchfit as sf
+from benchmarks.starts.bounces import FALL, ball_on_guards
+from switchfit.batch import again
+from switchfit.problem.problem import GIVEN
+
+COLLAPSE = [1, 10, 13]
+"""Starts from which the guards pull transitions together, so that a direct fit loses modes."""
+
+
+@pytest.fixture(scope="module")
+def case():
+    """A ball with eight bounces; their times are known to 30 ms, and restitution, height and speed roughly."""
+    return ball_on_guards(16)
+
+
+@pytest.fixture(scope="module")
+def best(case):
+    return sf.estimate(case.problem, strategy="local", start=np.r_[case.starts[0]])
+
+
+def starting_at(problem, theta):
+    """The same problem with another guess."""
+    run = problem.experiments[0]
+    moved = sf.Experiment(run.data, run.mode_sequence, tuple(theta[:8]), run.t0, run.tf)
+    bounds = {"e": (0.1, 1.0), "height": (0.1, 3.0), "speed": (-3.0, 3.0)}
+    parameters = {
+        name: sf.Parameter(value, lower=low, upper=high)
+        for (name, (low, high)), value in zip(bounds.items(), theta[8:], strict=True)
+    }
+    given = {name: getattr(problem, name) for name in GIVEN}
+    return sf.Problem(**given | {"experiments": moved, "parameters": parameters})
+
+
+def test_all_starts_near_the_truth_find_the_restitution(case):
+    found = sf.multistart(case.problem, case.starts)
+    assert found.success.all()
+    assert found.clusters.tolist() == [0] * 16
+    assert found.verdict.level == "good"
+    assert "15 of 15 other starts agree" in str(found.verdict)
+    assert found.best.parameters["e"] == pytest.approx(FALL[0], abs=4 * found.best.standard_errors[8])
+
+
+def test_without_the_second_attempt_they_do_not(case, monkeypatch):
+    """What the test above is about: a direct fit from some of the starts loses modes."""
+    monkeypatch.setattr(again, "_is_doubted", lambda *given: False)
+    found = sf.multistart(case.problem, case.starts[COLLAPSE])
+    assert (found.collapsed > 0).all()
+
+
+def test_a_bootstrap_finds_the_restitution(best):
+    study = sf.bootstrap(best, 24, seed=1)
+    assert study.success.all()
+    assert study.verdict.level == "good"
+    low, high = study.intervals()[8]
+    assert low < FALL[0] < high
+    assert study.standard_deviation[8] == pytest.approx(best.standard_errors[8], rel=0.5)
+
+
+def test_a_study_from_a_far_start_finds_the_truth(case, best):
+    study = sf.monte_carlo(case.problem, 6, theta=best.theta, start=case.starts[COLLAPSE[0]])
+    assert study.verdict.level == "good"
+    np.testing.assert_allclose(study.theta[:, 8], best.theta[8], atol=0.002)
+
+
+def test_logs_with_far_guesses_find_the_restitution(case):
+    many = sf.estimate_many([starting_at(case.problem, case.starts[k]) for k in COLLAPSE])
+    assert many.verdict.level == "good"
+    np.testing.assert_allclose(many.theta[:, 8], FALL[0], atol=0.002)
+
+
+def test_a_goal_is_met_from_far_starts():
+    """A terminal constraint alone: from rest to rest over a metre, as fast as possible."""
+    system = sf.HybridSystem(
+        {
+            "push": lambda t, x, p: jnp.stack([x[1], 1.0 + 0 * t]),
+            "brake": lambda t, x, p: jnp.stack([x[1], -1.0 + 0 * t]),
+        },
+        [0.0, 0.0],
+    )
+    clock = sf.RunningCost(lambda t, x, p: 1.0 + 0 * t)
+    goal = sf.TerminalConstraint(lambda x, p: x - jnp.array([1.0, 0.0]))
+    run = sf.Experiment([clock, goal], ("push", "brake"), (0.7,), t0=0.0, tf=sf.Parameter(2.5, upper=5.0))
+    found = sf.multistart(sf.Problem(system, run), [[0.7, 2.5], [0.05, 4.9], [4.5, 4.9], [0.01, 0.02]])
+    np.testing.assert_allclose(found.theta, [[1.0, 2.0]] * 4, atol=1e-6)
+    assert found.verdict.level == "good"
+
+
+# --- starts that cannot be integrated ---------------------------------------------------------------------------------
+
+
+def grow(t, x, p):
+    return p["a"] * x**2
+
+
+def growing(guess):
+    """A state that grows without bound within the horizon unless it is stopped in time."""
+    system = sf.HybridSystem({"grow": grow, "rest": lambda t, x, p: -x}, [1.0])
+    times = np.linspace(0.1, 3.0, 30)
+    values = np.where(times < 1.0, 1 / (1 - 0.5 * np.minimum(times, 1.0)), 2.0 * np.exp(-(times - 1.0)))
+    data = sf.Measurements(times, values + np.random.default_rng(0).normal(0, 0.01, 30), sigma=0.01)
+    run = sf.Experiment(data, ("grow", "rest"), guess[:1], 0.0, 3.0)
+    return sf.Problem(system, run, {"a": sf.Parameter(guess[1], lower=0.0, upper=4.0)})
+
+
+@pytest.mark.parametrize("guess", [(2.0, 2.0), (0.9, 0.6)])
+def test_a_start_that_cannot_be_integrated_is_a_bad_start(guess):
+    """Whether or not it is the problem's own guess."""
+    found = sf.multistart(growing(guess), [[2.0, 2.0], [0.9, 0.6], [1.1, 0.4]])
+    assert found.success.tolist() == [False, True, True]
+    np.testing.assert_allclose(found.best.theta, [1.0, 0.5], atol=0.02)
+    assert found.verdict.level == "good"
+
+
+def test_no_start_that_can_be_integrated_is_an_error():
+    with pytest.raises(ValueError, match=r"cannot be integrated|grows without bound"):
+        sf.multistart(growing((2.0, 2.0)), [[2.0, 2.0], [2.5, 3.0]])

@@ -1,0 +1,145 @@
+"""Intervals of many fits where samples are far apart: those of single fits, at kinks and across samples."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from models import ball
+
+import switchfit as sf
+from benchmarks.coverage import RATE, SIGMA, TIMES, build_problem, charge, rest
+from switchfit.batch import again
+
+SYSTEM = sf.HybridSystem(modes={"rest": rest, "charge": charge}, initial_state=[0.0])
+
+
+def measured(tau, seed, times=TIMES):
+    clean = np.where(tau < times, 1 - np.exp(-RATE * (times - tau)), 0.0)
+    return (clean + SIGMA * np.random.default_rng(seed).standard_normal(len(times)))[:, None]
+
+
+def unknown_sigma(problem):
+    run = problem.experiments[0]
+    return replace(problem, experiments=replace(run, data=[replace(run.data[0], sigma=None)]))
+
+
+def check_same(problems, level, *, rtol=1e-4):
+    """Each interval of the batch is that of a single fit, measured by its length; returns the batch."""
+    many = sf.estimate_many(problems)
+    found = many.confidence_intervals(level)
+    for k, problem in enumerate(problems):
+        single = sf.estimate(problem, strategy="local", start=many.theta[k])
+        expected = single.confidence_intervals(level)
+        np.testing.assert_allclose(many.theta[k], single.theta, rtol=1e-5)
+        length = np.nan_to_num(expected[:, 1] - expected[:, 0], nan=1.0)[:, None]
+        np.testing.assert_allclose(found[k] / length, expected / length, atol=rtol, rtol=0, err_msg=f"fit {k}")
+    return many
+
+
+@pytest.mark.parametrize("tau", [2.0, 2.01, 2.05])
+@pytest.mark.parametrize("rate_known", [True, False])
+@pytest.mark.parametrize("level", [0.68, 0.95])
+def test_intervals_are_those_of_single_fits(tau, rate_known, level):
+    problems = [build_problem(measured(tau, seed), tau, rate_known=rate_known) for seed in range(16)]
+    many = check_same(problems, level)
+    if tau == 2.0:
+        assert (many.status == "CONVERGED_AT_KINK").any()
+    if tau != 2.05:
+        plain = many.theta[:, 0] + 1.96 * many.standard_errors[:, 0]
+        assert np.max(np.abs(many.confidence_intervals()[:, 0, 1] - plain)) > 1e-3  # it matters
+
+
+def test_intervals_where_sigma_is_unknown():
+    check_same([unknown_sigma(build_problem(measured(2.0, seed), 2.0, rate_known=False)) for seed in range(12)], 0.95)
+
+
+def test_each_log_has_its_own_sample_times():
+    problems = []
+    for seed in range(8):
+        times = TIMES + 0.01 * seed
+        data = sf.Measurements(times, measured(2.03, seed, times), sigma=SIGMA)
+        run = sf.Experiment(data, ("rest", "charge"), (2.03,), 0.0, 4.2)
+        problems.append(sf.Problem(SYSTEM, run, {"k": sf.Parameter(RATE, lower=0.5, upper=40.0)}))
+    many = check_same(problems, 0.95)
+    assert (~np.isnan(many.pieces[:, :, 0, 0, 0])).sum() > 4
+
+
+def test_runs_of_one_problem_have_theirs():
+    problems = []
+    for seed in range(6):
+        runs = [
+            sf.Experiment(
+                sf.Measurements(TIMES, measured(tau, seed + 10 * e), sigma=SIGMA), ("rest", "charge"), (tau,), 0.0, 4.0
+            )
+            for e, tau in enumerate((2.0, 1.51))
+        ]
+        problems.append(sf.Problem(SYSTEM, runs, {"k": sf.Parameter(RATE, lower=0.5, upper=40.0)}))
+    many = check_same(problems, 0.95)
+    assert many.pieces.shape[1] == 2
+    assert many.piece_places.tolist() == [0, 1]
+
+
+def test_an_interval_grows_with_its_level_beyond_the_pieces_too():
+    many = sf.estimate_many([build_problem(measured(2.0, seed), 2.0, rate_known=False) for seed in range(12)])
+    lengths = [
+        np.ptp(many.confidence_intervals(level)[:, 0], axis=1) for level in (0.5, 0.9, 0.95, 0.99, 0.999, 0.9999)
+    ]
+    assert np.isfinite(lengths).all()
+    assert (np.diff(lengths, axis=0) > 0).all()
+    for side, limit in enumerate((0.0, 4.0)):  # the last piece goes on to the end of the horizon
+        stops = many.pieces[:, 0, side, :, 1]
+        assert (np.where(limit, np.nanmax(stops, axis=1), np.nanmin(stops, axis=1)) == limit).all()
+
+
+def test_an_unknown_that_a_bound_holds_has_no_interval():
+    problem = build_problem(measured(2.05, 0), 2.05, rate_known=False)
+    low = replace(problem, parameters={"k": sf.Parameter(4.0, lower=0.5, upper=5.0)})
+    many = sf.estimate_many([low])
+    assert many.at_bounds.tolist() == [1]
+    assert np.isnan(many.confidence_intervals()[0, 1]).all()
+    assert np.isfinite(many.confidence_intervals()[0, 0]).all()
+
+
+@pytest.mark.parametrize("tau", [2.0, 2.01])
+def test_a_study_covers_the_truth_on_and_beside_a_sample(tau):
+    """As single fits do (benchmarks/coverage.py); with one parabola each 77 % of these intervals hold the truth."""
+    study = sf.monte_carlo(build_problem(measured(tau, 0), tau, rate_known=True), 600, theta=[tau])
+    assert 0.92 < study.coverage()[0] < 0.97
+    symmetric = np.abs(study.theta[:, 0] - tau) < 1.96 * study.standard_errors[:, 0]
+    assert symmetric.mean() < 0.84
+    assert study.verdict.level == "good"
+
+
+def test_a_kink_has_an_interval_with_jax_too():
+    """Where an evaluation would have to be compiled first, the others keep one parabola."""
+    problems = [replace(build_problem(measured(2.0, s), 2.0, rate_known=True), engine="jax") for s in range(12)]
+    many = sf.estimate_many(problems)
+    at_kink = many.status == "CONVERGED_AT_KINK"
+    assert at_kink.any()
+    assert not at_kink.all()
+    assert np.isnan(many.pieces[~at_kink]).all()
+    native = sf.estimate_many([replace(problem, engine="auto") for problem in problems])
+    np.testing.assert_allclose(many.confidence_intervals()[at_kink], native.confidence_intervals()[at_kink], rtol=1e-6)
+
+
+def test_a_fit_that_was_done_again_is_evaluated_on_its_own_meshes(monkeypatch):
+    problem = build_problem(measured(2.0, 3), 2.0, rate_known=True)
+    plain = sf.monte_carlo(problem, 8, theta=[2.0])
+    monkeypatch.setattr(again, "differ", lambda one, other: np.ones(len(one.cost), dtype=bool))
+    monkeypatch.setattr("switchfit.batch.simulated.differ", again.differ)
+    own = sf.monte_carlo(problem, 8, theta=[2.0])
+    np.testing.assert_allclose(own.confidence_intervals(), plain.confidence_intervals(), rtol=1e-5)
+
+
+def test_costs_without_noise_have_no_pieces():
+    many = sf.estimate_many([ball((3.0, 8.0, 12.0))])
+    assert many.pieces.shape[:2] == (1, 0)
+    assert np.isnan(many.confidence_intervals()).all()
+
+
+def test_a_folder_keeps_them(tmp_path):
+    problems = [build_problem(measured(2.0, seed), 2.0, rate_known=True) for seed in range(4)]
+    first, second = (sf.estimate_many(problems, folder=tmp_path) for _ in range(2))
+    np.testing.assert_array_equal(first.confidence_intervals(), second.confidence_intervals())

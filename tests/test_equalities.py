@@ -1,0 +1,458 @@
+"""Equality constraints in the SQP: published and closed answers, SciPy, and what each term of the method is for."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+
+from switchfit.optimize import LinearConstraints, Status, minimize
+from switchfit.optimize.composite import Equalities, Rows, find_normal_step, solve_composite
+from switchfit.problem.functions import use_float64
+
+
+@dataclass
+class Here:
+    """One evaluation."""
+
+    cost: float
+    gradient: np.ndarray
+    hessian: np.ndarray
+    constraints: np.ndarray
+    jacobian: np.ndarray
+
+
+def differentiate(cost, constraints):
+    """Return `evaluate` of a cost and constraints written for JAX."""
+
+    def lagrangian(x, multipliers):
+        return cost(x) + multipliers @ constraints(x)
+
+    parts = [jax.jit(f) for f in (cost, jax.grad(cost), jax.hessian(lagrangian), constraints, jax.jacfwd(constraints))]
+
+    def evaluate(x, side, multipliers):
+        with use_float64():
+            x, lam = jnp.asarray(x), jnp.asarray(multipliers)
+            found = [part(x, lam) if k == 2 else part(x) for k, part in enumerate(parts)]
+        return Here(float(found[0]), *map(np.asarray, found[1:]))
+
+    return evaluate
+
+
+def free(d):
+    return LinearConstraints.box(np.full(d, -np.inf), np.full(d, np.inf))
+
+
+def solve(cost, constraints, start, bounds=None, **settings):
+    start = np.array(start, dtype=float)
+    evaluate = differentiate(cost, lambda x: jnp.stack(constraints(x)))
+    with use_float64():
+        count = len(constraints(jnp.asarray(start)))
+    linear = free(len(start)) if bounds is None else bounds
+    names = tuple(f"c{i}" for i in range(count))
+    return minimize(evaluate, start, constraints=linear, hessian="auto", equalities=names, **settings)
+
+
+# --- known answers ----------------------------------------------------------------------------------------------------
+
+# Hock and Schittkowski, Test Examples for Nonlinear Programming Codes, Springer 1981: number, cost, constraints, start,
+# lowest cost.
+PUBLISHED = {
+    6: (lambda x: (1 - x[0]) ** 2, lambda x: [10 * (x[1] - x[0] ** 2)], [-1.2, 1.0], 0.0),
+    7: (
+        lambda x: jnp.log(1 + x[0] ** 2) - x[1],
+        lambda x: [(1 + x[0] ** 2) ** 2 + x[1] ** 2 - 4],
+        [2.0, 2.0],
+        -np.sqrt(3),
+    ),
+    27: (
+        lambda x: 0.01 * (x[0] - 1) ** 2 + (x[1] - x[0] ** 2) ** 2,
+        lambda x: [x[0] + x[2] ** 2 + 1],
+        [2.0, 2.0, 2.0],
+        0.04,
+    ),
+    39: (
+        lambda x: -x[0],
+        lambda x: [x[1] - x[0] ** 3 - x[2] ** 2, x[0] ** 2 - x[1] - x[3] ** 2],
+        [2.0, 2.0, 2.0, 2.0],
+        -1.0,
+    ),
+    40: (
+        lambda x: -x[0] * x[1] * x[2] * x[3],
+        lambda x: [x[0] ** 3 + x[1] ** 2 - 1, x[0] ** 2 * x[3] - x[2], x[3] ** 2 - x[1]],
+        [0.8, 0.8, 0.8, 0.8],
+        -0.25,
+    ),
+    42: (
+        lambda x: (x[0] - 1) ** 2 + (x[1] - 2) ** 2 + (x[2] - 3) ** 2 + (x[3] - 4) ** 2,
+        lambda x: [x[0] - 2, x[2] ** 2 + x[3] ** 2 - 2],
+        [1.0, 1.0, 1.0, 1.0],
+        28 - 10 * np.sqrt(2),
+    ),
+    77: (
+        lambda x: (x[0] - 1) ** 2 + (x[0] - x[1]) ** 2 + (x[2] - 1) ** 2 + (x[3] - 1) ** 4 + (x[4] - 1) ** 6,
+        lambda x: [
+            x[0] ** 2 * x[3] + jnp.sin(x[3] - x[4]) - 2 * np.sqrt(2),
+            x[1] + x[2] ** 4 * x[3] ** 2 - 8 - np.sqrt(2),
+        ],
+        [2.0, 2.0, 2.0, 2.0, 2.0],
+        0.24150513,
+    ),
+    78: (
+        lambda x: x[0] * x[1] * x[2] * x[3] * x[4],
+        lambda x: [jnp.sum(x**2) - 10, x[1] * x[2] - 5 * x[3] * x[4], x[0] ** 3 + x[1] ** 3 + 1],
+        [-2.0, 1.5, 2.0, -1.0, -1.0],
+        -2.91970041,
+    ),
+    79: (
+        lambda x: (x[0] - 1) ** 2 + (x[0] - x[1]) ** 2 + (x[1] - x[2]) ** 2 + (x[2] - x[3]) ** 4 + (x[3] - x[4]) ** 4,
+        lambda x: [
+            x[0] + x[1] ** 2 + x[2] ** 3 - 2 - 3 * np.sqrt(2),
+            x[1] - x[2] ** 2 + x[3] + 2 - 2 * np.sqrt(2),
+            x[0] * x[4] - 2,
+        ],
+        [2.0, 2.0, 2.0, 2.0, 2.0],
+        0.0787768209,
+    ),
+}
+
+
+@pytest.mark.parametrize("number", PUBLISHED)
+def test_published_problems_are_solved_from_their_starts(number):
+    cost, constraints, start, lowest = PUBLISHED[number]
+    found = solve(cost, constraints, start)
+    assert found.status.successful, found.status
+    assert found.cost == pytest.approx(lowest, rel=1e-7, abs=1e-12)
+    assert max(abs(value) for _, value, _ in found.equalities) < 1e-9
+    assert found.violated == ()
+    assert found.evaluations < 60
+
+
+def test_a_published_problem_with_bounds_and_an_inequality():
+    """Hock and Schittkowski's 71: the product of four is at least 25, as an equality with a slack."""
+    bounds = LinearConstraints.box([1.0, 1.0, 1.0, 1.0, 0.0], [5.0, 5.0, 5.0, 5.0, np.inf])
+    found = solve(
+        lambda x: x[0] * x[3] * (x[0] + x[1] + x[2]) + x[2],
+        lambda x: [x[0] * x[1] * x[2] * x[3] - x[4] - 25, jnp.sum(x[:4] ** 2) - 40],
+        [1.0, 5.0, 5.0, 1.0, 0.0],
+        bounds,
+    )
+    assert found.status is Status.CONVERGED
+    assert found.cost == pytest.approx(17.0140173, rel=1e-8)
+    assert set(found.active) == {"theta[0] at lower bound", "theta[4] at lower bound"}
+    assert found.free_basis.shape == (5, 1)
+    # g + A' lam is what the bounds push back with.
+    x = found.theta
+    product = np.prod(x[:4])
+    A = np.array([[*(product / x[:4]), -1.0], [*(2 * x[:4]), 0.0]])
+    pushed = found.gradient + A.T @ [multiplier for _, _, multiplier in found.equalities]
+    lower = found.multipliers[:5]
+    np.testing.assert_allclose(pushed, lower, atol=1e-7)
+    assert np.all(lower >= 0.0)
+
+
+def test_multipliers_hessian_and_free_directions_in_closed_form():
+    """The lowest x + y on a circle of radius sqrt(2) about 0 is at (-1, -1); the multiplier is 1/2."""
+    found = solve(lambda x: x[0] + x[1], lambda x: [x[0] ** 2 + x[1] ** 2 - 2], [-2.0, 0.5])
+    assert found.status is Status.CONVERGED
+    np.testing.assert_allclose(found.theta, [-1.0, -1.0], atol=1e-9)
+    ((name, value, multiplier),) = found.equalities
+    assert (name, abs(value) < 1e-9) == ("c0", True)
+    assert multiplier == pytest.approx(0.5, abs=1e-9)
+    np.testing.assert_allclose(found.hessian, np.eye(2), atol=1e-8)
+    np.testing.assert_allclose(np.abs(found.free_basis[:, 0]), np.sqrt([0.5, 0.5]), atol=1e-9)
+    assert found.free_basis[0, 0] * found.free_basis[1, 0] < 0
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_random_problems_end_where_trust_constr_ends(seed):
+    """A convex cost, a bent surface, an order and a bound."""
+    rng = np.random.default_rng(seed)
+    d, k = 5, 2
+    root, g = rng.normal(size=(d, d)), rng.normal(size=d)
+    B = root @ root.T + np.eye(d)
+    rows, bend, point = rng.normal(size=(k, d)), 0.1 * rng.normal(size=(k, d)), 0.5 + rng.random(d)
+    level = np.asarray(rows @ point + bend @ point**2)
+    order = np.array([[-1.0, 1.0, 0.0, 0.0, 0.0]])
+    lower = np.full(d, -3.0)
+
+    def cost(x):
+        return g @ x + 0.5 * x @ (B @ x)
+
+    def constraints(x):
+        return [rows[i] @ x + bend[i] @ x**2 - level[i] for i in range(k)]
+
+    point = np.sort(point)
+    names = ("order", *(f"lower {i}" for i in range(d)), *(f"upper {i}" for i in range(d)))
+    linear = LinearConstraints(order, np.zeros(1), lower, np.full(d, 3.0), names)
+    found = solve(cost, constraints, point, linear)
+    assert found.status.successful
+    expected = scipy.optimize.minimize(
+        lambda x: float(cost(x)),
+        found.theta + 1e-2,
+        jac=lambda x: g + B @ x,
+        hess=lambda x: B,
+        method="trust-constr",
+        constraints=[
+            scipy.optimize.NonlinearConstraint(
+                lambda x: np.array(constraints(x)),
+                0,
+                0,
+                jac=lambda x: rows + 2 * bend * x,
+                hess=lambda x, v: np.diag(2 * v @ bend),
+            ),
+            scipy.optimize.LinearConstraint(order, 0, np.inf),
+        ],
+        bounds=[(-3, 3)] * d,
+        options={"gtol": 1e-10, "xtol": 1e-12, "barrier_tol": 1e-10, "maxiter": 2000},
+    )
+    assert found.cost <= expected.fun + 1e-6 * abs(expected.fun)
+    assert found.cost == pytest.approx(expected.fun, rel=1e-5)
+
+
+# --- each part of the method ------------------------------------------------------------------------------------------
+
+
+def circle(angle, **settings):
+    """Maratos' problem ([Nocedal & Wright], example 15.4): near the solution a full step makes both J and c worse."""
+    start = [np.cos(angle), np.sin(angle)]
+    cost = lambda x: 2 * (x[0] ** 2 + x[1] ** 2 - 1) - x[0]  # noqa: E731
+    return solve(cost, lambda x: [x[0] ** 2 + x[1] ** 2 - 1], start, **settings)
+
+
+@pytest.mark.parametrize("angle", [0.05, 0.1, 0.4])
+def test_second_order_correction_keeps_full_steps(angle):
+    found = circle(angle)
+    assert found.status is Status.CONVERGED
+    np.testing.assert_allclose(found.theta, [1.0, 0.0], atol=1e-8)
+    assert found.equalities[0][2] == pytest.approx(-1.5)
+    assert all(record.step == 1.0 for record in found.history[1:])
+
+
+def test_convergence_is_quadratic():
+    """The Hessian is that of the Lagrangian: without the constraints' part the steps shrink by a factor."""
+    found = solve(*PUBLISHED[40][:3])
+    ends = np.array([np.linalg.norm(record.theta - found.theta) for record in found.history])
+    small = np.flatnonzero((ends < 1e-2) & (ends > 1e-7))
+    assert small.size >= 1
+    for i in small:
+        assert ends[i + 1] < 10 * ends[i] ** 2 + 1e-12
+
+
+def test_the_penalty_is_raised_where_its_first_value_is_too_small():
+    """At the start the cost is lowest: the multipliers are 0 there, and so is the first penalty."""
+    found = solve(lambda x: 0.5 * jnp.sum(x**2), lambda x: [jnp.exp(x[0]) - 3.0], [0.0, 0.0])
+    assert found.status is Status.CONVERGED
+    np.testing.assert_allclose(found.theta, [np.log(3.0), 0.0], atol=1e-10)
+
+
+def test_linearisations_that_bounds_contradict_are_met_as_far_as_they_can_be():
+    """From 0.1 the linearised x² = 4 leads to 20, far outside the bounds."""
+    found = solve(
+        lambda x: x[1], lambda x: [x[0] ** 2 - 4, x[1] - x[0]], [0.1, 0.0], LinearConstraints.box([0, 0], [3, 3])
+    )
+    assert found.status is Status.CONVERGED
+    np.testing.assert_allclose(found.theta, [2.0, 2.0], atol=1e-9)
+
+
+def test_constraints_that_say_the_same_twice_are_met():
+    found = solve(
+        lambda x: x[0] + x[1],
+        lambda x: [x[0] ** 2 + x[1] ** 2 - 2, 3 * (x[0] ** 2 + x[1] ** 2 - 2)],
+        [-2.0, 0.5],
+    )
+    assert found.status.successful
+    np.testing.assert_allclose(found.theta, [-1.0, -1.0], atol=1e-8)
+
+
+def test_constraints_that_cannot_be_met_are_named():
+    found = solve(lambda x: (x[0] - 3.0) ** 2 + x[1] ** 2, lambda x: [x[1] - 1.0, x[0] ** 2 + 1.0], [2.0, 0.0])
+    assert found.status is Status.INFEASIBLE
+    assert not found.status.successful
+    assert found.violated[-1][0] == "c1"
+    assert found.violated[-1][1] == pytest.approx(1.0, abs=1e-3)
+    assert found.evaluations < 40  # 53 where only a trust region that has vanished ends it
+
+
+def test_constraints_that_contradict_each_other_are_named():
+    found = solve(lambda x: x[0] ** 2 + x[1] ** 2, lambda x: [x[0] - 1.0, x[0] - 2.0], [0.0, 0.0])
+    assert found.status is Status.INFEASIBLE
+    assert {name for name, _ in found.violated} == {"c0", "c1"}
+    assert found.evaluations < 10
+
+
+def test_a_saddle_on_a_surface_is_left():
+    """On the unit circle x² - y² is highest at (1, 0), where a start is stationary, and lowest at (0, 1)."""
+    found = solve(lambda x: x[0] ** 2 - x[1] ** 2, lambda x: [x[0] ** 2 + x[1] ** 2 - 1], [1.0, 0.0])
+    assert found.status is Status.CONVERGED
+    np.testing.assert_allclose(np.abs(found.theta), [0.0, 1.0], atol=1e-7)
+    assert found.cost == pytest.approx(-1.0)
+
+
+def test_a_maximum_from_which_nothing_leads_is_no_minimum():
+    """The same circle is all there is: with the way blocked by bounds it stays a saddle."""
+    found = solve(
+        lambda x: -(x[1] ** 2),
+        lambda x: [x[0] ** 2 + x[1] ** 2 - 1],
+        [1.0, 0.0],
+        LinearConstraints.box([-2, 0], [2, 0]),
+    )
+    assert found.status.successful  # held by its bounds, it has nowhere to go
+    assert found.free_basis.shape == (2, 0)
+
+
+def test_a_kink_on_a_surface_holds_the_solution():
+    """|x - 1| + (y - 2)²/2 on x = y²: at the kink the multiplier is -1/2, and the slope 1/2 is between -1 and 1."""
+
+    def evaluate(z, side, multipliers):
+        x, y = z
+        slope = np.sign(x - 1.0) or side
+        gradient = np.array([slope, y - 2.0])
+        hessian = np.diag([0.0, 1.0 - 2.0 * multipliers[0]])
+        return Here(abs(x - 1) + 0.5 * (y - 2) ** 2, gradient, hessian, np.array([x - y**2]), np.array([[1.0, -2 * y]]))
+
+    for start in ([0.3, 0.9], [1.0, 1.0], [2.5, 1.2], [1.0, 0.6]):
+        found = minimize(
+            evaluate, start, constraints=free(2), breakpoints=([1.0], ()), hessian="auto", equalities=("surface",)
+        )
+        assert found.status is Status.CONVERGED_AT_KINK, start
+        assert found.theta[0] == 1.0
+        assert found.theta[1] == pytest.approx(1.0, abs=1e-8)
+        assert found.equalities[0][2] == pytest.approx(-0.5, abs=1e-7)
+
+
+def test_a_kink_that_does_not_hold_the_solution_is_passed():
+    """0.2 |x - 1| + (y - 3)²/2 on x = y²: at y = 1 the pull is (y - 3)/2y = -1, more than the kink can hold."""
+
+    def evaluate(z, side, multipliers):
+        x, y = z
+        slope = 0.2 * (np.sign(x - 1.0) or side)
+        gradient = np.array([slope, y - 3.0])
+        hessian = np.diag([0.0, 1.0 - 2.0 * multipliers[0]])
+        cost = 0.2 * abs(x - 1) + 0.5 * (y - 3) ** 2
+        return Here(cost, gradient, hessian, np.array([x - y**2]), np.array([[1.0, -2 * y]]))
+
+    for start in ([0.3, 0.9], [1.0, 1.0], [1.0, 0.6]):
+        found = minimize(
+            evaluate, start, constraints=free(2), breakpoints=([1.0], ()), hessian="auto", equalities=("surface",)
+        )
+        assert found.status is Status.CONVERGED, start
+        # y - 3 + 2 y 0.2 = 0
+        assert found.theta[1] == pytest.approx(3.0 / 1.4, abs=1e-8)
+
+
+@pytest.mark.parametrize("place", [0.7, 1.3])
+@pytest.mark.parametrize("weight", [5.0, -1e-9])
+def test_a_kink_is_left_where_constraints_cannot_be_met_on_it(place, weight):
+    """w |x - 1| + y²/2 with x given: the kink at which the start is holds x, or keeps it to one side."""
+
+    def evaluate(z, side, multipliers):
+        x, y = z
+        slope = weight * (np.sign(x - 1.0) or side)
+        cost = weight * abs(x - 1) + 0.5 * y**2
+        return Here(cost, np.array([slope, y]), np.diag([0.0, 1.0]), np.array([x - place]), np.array([[1.0, 0.0]]))
+
+    found = minimize(
+        evaluate, [1.0, 0.5], constraints=free(2), breakpoints=([1.0], ()), hessian="auto", equalities=("place",)
+    )
+    assert found.status is Status.CONVERGED
+    np.testing.assert_allclose(found.theta, [place, 0.0], atol=1e-10)
+    assert found.equalities[0][2] == pytest.approx(weight * np.sign(1 - place))
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_units_of_constraints_and_unknowns_do_not_matter(unit):
+    """The same iterations, whatever a constraint and an unknown are measured in."""
+    cost, constraints, start, _ = PUBLISHED[79]
+    scale = np.array([unit, 1.0, 1.0, 1.0, 1.0])
+    start = np.array(start)
+    plain = solve(cost, constraints, start, reach=0.1 * start)
+    found = solve(
+        lambda x: cost(x / scale),
+        lambda x: [100 * unit * c for c in constraints(x / scale)],
+        start * scale,
+        reach=0.1 * start * scale,
+        tolerance=1e-7 if unit >= 1 else 1e-1,
+    )
+    assert found.status.successful
+    np.testing.assert_allclose(found.theta / scale, plain.theta, rtol=1e-6)
+    assert abs(found.iterations - plain.iterations) <= 2
+
+
+def test_iterations_and_callbacks_end_it():
+    cost, constraints, start, _ = PUBLISHED[77]
+    few = solve(cost, constraints, start, max_iterations=2)
+    assert (few.status, few.iterations, len(few.history)) == (Status.MAX_ITERATIONS, 2, 3)
+    assert few.violated
+    stopped = solve(cost, constraints, start, callback=lambda record: record.iteration == 1)
+    assert (stopped.status, stopped.iterations) == (Status.INTERRUPTED, 1)
+
+
+def test_constraints_that_are_not_finite_at_the_start():
+    found = solve(lambda x: x[0] ** 2 + 0 * x[1], lambda x: [jnp.log(x[1])], [1.0, -1.0])
+    assert found.status is Status.NONFINITE_START
+    assert found.equalities == ()
+
+
+def test_points_where_constraints_are_not_finite_are_avoided():
+    """From 5 a full step of log(x) = 0 leads below 0."""
+    found = solve(lambda x: (x[1] - 1) ** 2 + 0 * x[0], lambda x: [jnp.log(x[0])], [5.0, 0.0])
+    assert found.status is Status.CONVERGED
+    np.testing.assert_allclose(found.theta, [1.0, 1.0], atol=1e-8)
+
+
+def test_equalities_need_the_exact_hessian():
+    with pytest.raises(ValueError, match="equality constraints need the exact Hessian"):
+        minimize(lambda x, side, lam: None, [0.0], constraints=free(1), hessian="none", equalities=("c",))
+
+
+# --- the composite step -----------------------------------------------------------------------------------------------
+
+
+def test_factorised_rows_solve_and_project_like_lstsq():
+    rng = np.random.default_rng(0)
+    for k, d, copies in ((2, 5, 0), (5, 5, 0), (3, 5, 2), (7, 4, 0)):
+        A = rng.normal(size=(k, d))
+        A = np.vstack([A, A[:copies]])
+        c, g = rng.normal(size=len(A)), rng.normal(size=d)
+        rows = Rows.of(A)
+        assert rows.rank == np.linalg.matrix_rank(A)
+        np.testing.assert_allclose(A @ rows.null, 0.0, atol=1e-13)
+        np.testing.assert_allclose(rows.solve(c), -np.linalg.lstsq(A, c, rcond=1e-10)[0], atol=1e-12)
+        np.testing.assert_allclose(rows.multipliers(g), -np.linalg.lstsq(A.T, g, rcond=1e-10)[0], atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_composite_steps_satisfy_the_conditions_of_their_programmes(seed):
+    """Stationarity, feasibility and signs, also where trust region or bounds leave the constraints unmet."""
+    rng = np.random.default_rng(seed)
+    d, k = 6, 2
+    A, c, g = rng.normal(size=(k, d)), rng.normal(size=k) * 10 ** rng.uniform(-2, 1), rng.normal(size=d)
+    root = rng.normal(size=(d, d))
+    H = 0.5 * (root + root.T) if seed % 2 else root @ root.T
+    N = np.vstack([np.eye(d), -np.eye(d)])
+    offsets = -rng.uniform(0.0, 1.0, size=2 * d) * (rng.random(2 * d) > 0.2)
+    reach, radius = 10 ** rng.uniform(-1, 1, size=d), 10 ** rng.uniform(-1, 1)
+    found = solve_composite(g, H, Equalities(c, A), N, offsets, reach, radius)
+    step = found.step
+    assert np.all(np.abs(step) <= radius * reach * (1 + 1e-9))
+    assert np.all(N @ step >= offsets - 1e-9)
+    normal = find_normal_step(Equalities(c, A), N, offsets, reach, 0.95 * radius)
+    best = scipy.optimize.lsq_linear(
+        A,
+        -c,
+        (
+            np.maximum(offsets[:d], -0.95 * radius * reach) - 1e-300,
+            np.minimum(-offsets[d:], 0.95 * radius * reach) + 1e-300,
+        ),
+        method="bvls",
+    )
+    assert np.linalg.norm(c + A @ normal) == pytest.approx(np.sqrt(2 * best.cost), rel=1e-6, abs=1e-9)
+    np.testing.assert_allclose(A @ step, A @ normal, atol=1e-8 * (1 + np.abs(c).max()))
+    assert np.all(found.inequalities >= 0.0)
+    # Inside the null space the model, made convex, is not lower at the normal step.
+    convex = np.all(np.linalg.eigvalsh(H) >= 0)
+    model = lambda s: g @ s + 0.5 * s @ H @ s  # noqa: E731
+    assert not convex or model(step) <= model(normal) + 1e-9

@@ -1,0 +1,325 @@
+"""Transition times on a logarithmic scale: the optimiser works in log(tau - t0), all numbers given are those of tau."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import switchfit as sf
+from switchfit.fit.random_starts import draw_starts
+from switchfit.io.problem_file import load_problem
+from switchfit.io.summary import describe
+from switchfit.optimize.arrow import Arrow
+from switchfit.problem.functions import use_float64
+from switchfit.problem.variables import Variables
+from switchfit.runtime.errors import InputError
+
+TRUTH, RATES = (0.03, 4.0), (20.0, 0.3, 0.002)
+BEST = np.array([0.0301556479, 4.15919815, 20.0582402, 0.291234028, 0.00197205875])
+"""Where the fits of `relaxation` end, times since t0."""
+
+
+def decay_at(k):
+    return lambda t, x, p: -p["k"][k] * x
+
+
+def relaxation(guess, scale="log", t0=0.0, **tf):
+    """Three rates of decay, seen from a millisecond to a thousand seconds."""
+    times = np.geomspace(1e-3, 1e3, 61)
+    first, second = TRUTH
+    spent = [np.minimum(times, first), np.clip(times - first, 0, second - first), np.clip(times - second, 0, None)]
+    values = np.exp(-np.array(RATES) @ spent) + 0.01 * np.random.default_rng(1).normal(size=61)
+    system = sf.HybridSystem({name: decay_at(k) for k, name in enumerate("abc")}, [1.0])
+    data = sf.Measurements(t0 + times, values, sigma=0.01)
+    given = [sf.Parameter(t0 + g, scale=scale) if np.isscalar(g) else g for g in guess]
+    run = sf.Experiment(data, ("a", "b", "c"), given, t0, tf.get("tf", t0 + 1000.0))
+    return sf.Problem(system, run, {"k": sf.Parameter([10.0, 0.1, 0.01], scale="log")})
+
+
+RAMP = sf.HybridSystem({"up": lambda t, x, p: p["v"] + 0 * x, "rest": lambda t, x, p: 0 * x}, [0.0])
+
+
+def ramp(seed, scale, t0=2.0, sigma=0.05, times=None, **tau):
+    """A ramp that stops at t0 + 1.2, with samples every tenth."""
+    times = np.linspace(0.1, 2.0, 20) if times is None else times
+    values = 3 * np.minimum(times, 1.2) + sigma * np.random.default_rng(seed).normal(size=len(times))
+    data = sf.Measurements(t0 + times, values, sigma=sigma)
+    run = sf.Experiment(data, ("up", "rest"), (sf.Parameter(t0 + 1.0, scale=scale, **tau),), t0)
+    return sf.Problem(RAMP, run, {"v": 2.0})
+
+
+# The change of variables
+
+
+def test_derivatives_of_the_change_of_variables_are_those_of_autodiff():
+    """Gradient and Hessian in z of J(theta(z)), the term with d2 theta / dz2 = theta - t0 included."""
+    theta, origin = np.array([5.0, 7.5, 0.3, 40.0]), np.array([4.0, 4.0, 0.0, 0.0])
+    log = np.array([True, True, True, False])
+    keep = np.array([True, True, False, False])
+    variables = Variables.of(theta, theta - 100, theta + 100, log, keep, origin)
+
+    def cost(theta):
+        return jnp.sin(theta[0] * theta[2]) + theta[1] ** 3 * theta[0] + jnp.exp(0.01 * theta[3] * theta[1])
+
+    with use_float64():
+        z = jnp.asarray(variables.inward(theta))
+        along = lambda z: cost(variables.outward(z, jnp))  # noqa: E731
+        gradient, hessian = jax.grad(cost)(jnp.asarray(theta)), jax.hessian(cost)(jnp.asarray(theta))
+        g, H = variables.derivatives_inward(theta, np.asarray(gradient), np.asarray(hessian))
+        np.testing.assert_allclose(variables.outward(np.asarray(z)), theta, rtol=1e-14)
+        np.testing.assert_allclose(g, jax.grad(along)(z), rtol=1e-12)
+        np.testing.assert_allclose(H, jax.hessian(along)(z), rtol=1e-12)
+        back = variables.derivatives_outward(theta, g, H)
+    np.testing.assert_allclose(back[0], gradient, rtol=1e-12)
+    np.testing.assert_allclose(back[1], hessian, rtol=1e-12, atol=1e-10)
+
+
+def test_an_arrow_shaped_hessian_is_changed_in_the_same_way():
+    from switchfit.fit.solution import _to_variables
+
+    theta, origin, log = np.array([5.0, 6.0, 0.5]), np.array([4.0, 4.5, 0.0]), np.array([True, True, True])
+    variables = Variables.of(theta, theta - 100, theta + 100, log, ~log, origin)
+    problem = sf.Problem(RAMP, [replace(ramp(0, "log").experiments[0], name=name) for name in "ab"], {"v": 2.0})
+    from switchfit.fit.evaluator import Evaluator
+
+    here = Evaluator(problem).arrow(problem.initial_theta)
+    assert isinstance(here.hessian, Arrow)
+    found = _to_variables(variables, theta, here)
+    matrix = np.column_stack([here.hessian @ column for column in np.eye(3)])
+    expected = variables.derivatives_inward(theta, here.gradient, matrix)
+    np.testing.assert_allclose(found.gradient, expected[0])
+    np.testing.assert_allclose(np.column_stack([found.hessian @ e for e in np.eye(3)]), expected[1], rtol=1e-12)
+
+
+# Fits
+
+
+@pytest.mark.parametrize("t0", [0.0, 7.0])
+@pytest.mark.parametrize("guess", [(0.03, 4.0), (1.0, 30.0), (10.0, 300.0)])
+def test_times_are_found_from_guesses_decades_away(guess, t0):
+    fit = sf.estimate(relaxation(guess, t0=t0), strategy="local")
+    assert fit.success
+    np.testing.assert_allclose(fit.theta - [t0, t0, 0, 0, 0], BEST, rtol=1e-6)
+    assert fit.log_scaled == ("tau_1", "tau_2", "k[0]", "k[1]", "k[2]")
+
+
+def test_steps_on_a_linear_scale_do_not_get_there():
+    fit = sf.estimate(relaxation((10.0, 300.0), "linear"), strategy="local")
+    assert not fit.success
+
+
+def test_all_that_is_returned_is_that_of_the_times_themselves():
+    """The same minimum: gradient, Hessian, covariance, history."""
+    linear, log = (sf.estimate(ramp(1, scale), strategy="local") for scale in ("linear", "log"))
+    np.testing.assert_allclose(log.theta, linear.theta, rtol=1e-10)
+    np.testing.assert_allclose(log.hessian, linear.hessian, rtol=1e-7)
+    np.testing.assert_allclose(log.standard_errors, linear.standard_errors, rtol=1e-7)
+    assert log.history[0].theta == pytest.approx([3.0, 2.0])
+    np.testing.assert_array_equal(log.initial_theta, [3.0, 2.0])
+
+
+def test_a_fit_that_ends_at_a_sample_ends_there_to_the_bit():
+    """Rounding of the logarithm would put it beside the sample, where the one-sided derivatives are others."""
+    hours = np.linspace(0.1, 2.0, 20)
+    scales = (1e3 * (1 + 1e-4 * k) for k in range(100))
+    times = next(scale * hours for scale in scales if np.exp(np.log(scale * hours[11])) != scale * hours[11])
+    values = 3 * np.minimum(hours, 1.2) + 0.05 * np.random.default_rng(4).normal(size=20)
+    data = sf.Measurements(times, values, sigma=0.05)
+
+    def fit_on(scale):
+        run = sf.Experiment(data, ("up", "rest"), (sf.Parameter(times[9], scale=scale),), 0.0)
+        return sf.estimate(sf.Problem(RAMP, run, {"v": sf.Parameter(0.002, scale="log")}), strategy="local")
+
+    linear, log = fit_on("linear"), fit_on("log")
+    assert log.status is sf.Status.CONVERGED_AT_KINK
+    assert log.theta[0] == linear.theta[0] == times[11]
+    (kink,), (expected,) = log.kinks, linear.kinks
+    assert kink.value == expected.value
+    assert (kink.left, kink.right) == pytest.approx((expected.left, expected.right), rel=1e-6)
+    np.testing.assert_allclose(log.confidence_intervals(), linear.confidence_intervals(), rtol=1e-6)
+
+
+PUSHED = sf.HybridSystem(
+    {
+        "push": lambda t, x, p: jnp.array([x[1], 1.0 + 0 * x[0]]),
+        "slide back": lambda t, x, p: jnp.array([x[1] - 1.0, 0 * x[0]]),
+        "roll": lambda t, x, p: jnp.array([x[1], 0 * x[0]]),
+    },
+    [0.0, 0.0],
+)
+HOURS = np.linspace(0.1, 4.0, 40)
+LEAP = np.where(HOURS < 1.6, 0.5 * HOURS**2, 1.28 + 1.6 * (HOURS - 1.6) + 0.1)
+"""Push for 1.6, then leap ahead and roll: what would have to slide forward slides back."""
+
+
+def constrained(sequence, values, guesses, fixed, scale):
+    """Modes in an order that the data do not have: one of them lasts no time."""
+    data = sf.Measurements(3.0 + HOURS, values, observe=lambda t, x, p: x[:1], sigma=0.1)
+    taus = [sf.Parameter(3.0 + g, scale=scale, fixed=f) for g, f in zip(guesses, fixed, strict=True)]
+    return sf.Problem(PUSHED, sf.Experiment(data, sequence, taus, 3.0, 7.0))
+
+
+@pytest.mark.parametrize(
+    ("sequence", "values", "guesses", "fixed"),
+    [
+        (("push", "slide back", "roll"), LEAP, [1.5, 1.7], [False, False]),
+        (("push", "slide back", "roll"), LEAP, [1.0, 1.4], [False, True]),
+        (("push", "slide back", "roll"), LEAP, [1.6, 2.5], [True, False]),
+        (("roll", "push", "slide back", "roll"), LEAP, [0.01, 1.5, 1.7], [True, False, False]),
+    ],
+    ids=["between two", "before a fixed time", "after a fixed time", "after a fixed time, between two"],
+)
+def test_active_constraints_and_multipliers_are_those_of_the_linear_scale(sequence, values, guesses, fixed):
+    linear, log = (
+        sf.estimate(constrained(sequence, values, guesses, fixed, scale), strategy="local")
+        for scale in ("linear", "log")
+    )
+    assert log.status.successful
+    np.testing.assert_allclose(log.theta, linear.theta, rtol=1e-7)
+    assert [(c.kind, c.mode, c.position) for c in log.active] == [(c.kind, c.mode, c.position) for c in linear.active]
+    assert log.active[0].multiplier > 0.01
+    assert log.active[0].multiplier == pytest.approx(linear.active[0].multiplier, rel=1e-5)
+
+
+def test_a_mode_that_should_not_be_there_becomes_short_at_t0_but_does_not_vanish():
+    """The logarithm of no time is minus infinity."""
+    fit = sf.estimate(
+        constrained(("slide back", "push"), 0.5 * HOURS**2 + 0.01, [0.5], [False], "log"), strategy="local"
+    )
+    assert 3.0 < fit.theta[0] < 3.01
+
+
+def test_bounds_hold():
+    fit = sf.estimate(ramp(1, "log", upper=3.1), strategy="local")
+    assert fit.theta[0] == 3.1
+    assert fit.active[0].kind == "upper bound"
+    linear = sf.estimate(ramp(1, "linear", upper=3.1), strategy="local")
+    assert fit.active[0].multiplier == pytest.approx(linear.active[0].multiplier, rel=1e-6)
+
+
+def test_a_free_end_on_a_logarithmic_scale():
+    """x' = 1 has to reach 300 from a guess of 2."""
+    system = sf.HybridSystem({"go": lambda t, x, p: jnp.ones(1)}, [0.0])
+    cost = sf.TerminalCost(lambda x, p: 0.5 * (x[0] - 300.0) ** 2)
+    run = sf.Experiment(cost, ("go",), (), 0.0, sf.Parameter(2.0, upper=1e4, scale="log"))
+    fit = sf.estimate(sf.Problem(system, run), strategy="local")
+    assert fit.theta_names == ("tf",)
+    assert fit.theta[0] == pytest.approx(300.0, rel=1e-9)
+
+
+# Uncertainty
+
+
+def test_intervals_are_made_on_the_logarithmic_scale():
+    """Between samples J is smooth, and nothing but the standard error makes the interval."""
+    problem = ramp(1, "log", sigma=0.2, times=np.array([0.3, 0.6, 2.0, 2.2, 2.4, 2.6]))
+    fit = sf.estimate(problem, strategy="local")
+    assert 2.7 < fit.theta[0] < 3.9
+    away, error = fit.theta[0] - 2.0, fit.standard_errors[0]
+    expected = 2.0 + away * np.exp(np.array([-1, 1]) * fit.quantile(0.5) * error / away)
+    low, high = fit.confidence_intervals(0.5)[0]
+    np.testing.assert_allclose([low, high], expected, rtol=1e-9)
+    assert high - fit.theta[0] > 1.01 * (fit.theta[0] - low)
+    fits = sf.estimate_many([problem, problem])
+    np.testing.assert_allclose(fits.confidence_intervals(0.5)[1, 0], expected, rtol=1e-6)
+
+
+def test_a_saved_fit_has_the_same_intervals(tmp_path):
+    fit = sf.estimate(relaxation((0.03, 4.0), t0=7.0), strategy="local")
+    fit.save(tmp_path / "fit.json")
+    loaded = sf.Estimate.load(tmp_path / "fit.json")
+    assert loaded.log_scaled == fit.log_scaled
+    np.testing.assert_array_equal(loaded.log_origins, [7.0, 7.0, 0.0, 0.0, 0.0])
+    away, error = fit.theta - fit.log_origins, fit.standard_errors
+    expected = fit.log_origins + away * np.exp(-fit.quantile(0.95) * error / away)
+    np.testing.assert_allclose(loaded.confidence_intervals()[:, 0], expected, rtol=1e-12)
+
+
+# Starts and many fits
+
+
+def test_starts_are_drawn_evenly_over_the_decades():
+    problem = relaxation((0.03, 4.0), t0=7.0)
+    drawn = draw_starts(problem, 256, 0)[1:, :2] - 7.0
+    assert (np.diff(drawn, axis=1) > 0).all()
+    assert drawn.min() > 0.003 * 0.999
+    assert drawn.max() < 1000.0
+    counts, _ = np.histogram(np.log10(drawn), bins=np.log10(0.003 * (1000 / 0.003) ** np.linspace(0, 1, 6)))
+    np.testing.assert_allclose(counts / counts.sum(), 0.2, atol=0.03)
+    linear = draw_starts(relaxation((0.03, 4.0), "linear"), 256, 0)[1:, :2]
+    assert (linear < 10.0).mean() < 0.05
+
+
+def test_starts_between_fixed_times():
+    fixed = sf.Parameter(4.0, fixed=True)
+    drawn = draw_starts(relaxation((0.03, fixed)), 64, 0)[:, 0]
+    assert drawn.min() >= 0.003 * 0.999
+    assert drawn.max() <= 4.0
+    after = draw_starts(relaxation((sf.Parameter(0.5, fixed=True), 4.0)), 64, 0)[:, 0]
+    assert after.min() >= 0.5
+    assert np.median(after) == pytest.approx(np.sqrt(0.5 * 1000.0), rel=0.2)
+
+
+def test_many_starts_and_many_logs_end_where_single_fits_do():
+    found = sf.multistart(relaxation((0.02, 3.0)), 2, seed=1)
+    np.testing.assert_allclose(found.best.theta, BEST, rtol=1e-6)
+    fits = sf.estimate_many([relaxation((0.02, 3.0)), relaxation((0.03, 4.0))])
+    np.testing.assert_allclose(fits.theta, [BEST, BEST], rtol=1e-5)
+
+
+def test_strategies_find_the_times_from_where_one_fit_does_not():
+    """The guess is that of modes that are over before the first is: the local fit ends at a saddle."""
+    problem = relaxation((200.0, 600.0))
+    assert not sf.estimate(problem, strategy="local").success
+    np.testing.assert_allclose(sf.estimate(problem).theta, BEST, rtol=1e-5)
+
+
+# What is given
+
+
+@pytest.mark.parametrize(
+    ("build", "said"),
+    [
+        (
+            lambda: relaxation((sf.Parameter(0.03), 4.0)),
+            r"must be on one scale.*got \['linear', 'log'\].*all of them, or",
+        ),
+        (lambda: relaxation((0.03, 4.0), tf=sf.Parameter(1000.0, lower=1000, upper=2000.0)), "must be on one scale"),
+        (lambda: relaxation((-0.03, 4.0)), "Parameter with scale='log' must be positive"),
+        (
+            lambda: sf.Problem(RAMP, ramp(0, "log").experiments, {"v": 2.0}, min_duration=0.1),
+            "min_duration must be 0 where transition times are on a logarithmic scale.*got 0.1",
+        ),
+    ],
+)
+def test_what_does_not_go_together_is_said(build, said):
+    with pytest.raises(ValueError, match=said):
+        build()
+
+
+def test_a_fixed_time_may_have_any_scale():
+    problem = relaxation((0.03, sf.Parameter(4.0, fixed=True)))
+    assert problem.theta_names[0] == "tau_1"
+    assert problem.unknowns.log_times.tolist() == [True, False, False, False]
+
+
+def test_problem_files(tmp_path):
+    (tmp_path / "log.csv").write_text("t,x\n0.001,1\n0.01,0.8\n1,0.4\n100,0.3\n")
+    (tmp_path / "m.py").write_text(
+        "import switchfit as sf\n"
+        "model = sf.HybridSystem({'a': lambda t, x, p: -p['k'] * x, 'b': lambda t, x, p: 0 * x}, [1.0])\n"
+    )
+    text = (
+        'model = "m.py:model"\nparameters = {{ k = 1.0 }}\n[[experiments]]\nmode_sequence = ["a", "b"]\n'
+        'transition_times = [{{ value = 0.1, scale = "{}" }}]\n'
+        'data = {{ file = "log.csv", time = "t", columns = ["x"] }}\n'
+    )
+    (tmp_path / "p.toml").write_text(text.format("log"))
+    problem = load_problem(tmp_path / "p.toml").problem
+    assert problem.unknowns.log_names == ("tau_1",)
+    assert "(log scale)" in describe(problem)
+    (tmp_path / "p.toml").write_text(text.format("ln"))
+    with pytest.raises(InputError, match=r"transition_times\[1\]\.scale"):
+        load_problem(tmp_path / "p.toml")

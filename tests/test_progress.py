@@ -1,0 +1,102 @@
+"""The line of progress: on a terminal alone, from a second on, taken away at the end."""
+
+import io
+import sys
+import threading
+import time
+
+from test_strategy import FAR, thermostat
+
+import switchfit as sf
+from switchfit.runtime import progress
+from switchfit.runtime.progress import show_detail, show_line
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def open_terminal(monkeypatch):
+    """Return a terminal in the place of stderr, where lines are shown at once; not in a fixture, since pytest's capture
+    takes stderr back after it."""
+    stream = Terminal()
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setattr(progress, "DELAY", 0.001)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    return stream
+
+
+def wait_for(text, stream, seconds=5.0):
+    end = time.monotonic() + seconds
+    while text not in stream.getvalue() and time.monotonic() < end:
+        time.sleep(0.01)
+    return text in stream.getvalue()
+
+
+def test_the_line_says_what_is_done_and_how_far_it_is(monkeypatch):
+    terminal = open_terminal(monkeypatch)
+    before = set(threading.enumerate())
+    with show_line("begins") as line:
+        assert wait_for("begins   ", terminal)
+        line.write("many starts", 3.0)
+        show_detail("start 3 of at most 127", 2.0)
+        assert wait_for("many starts, lowest J = 2, start 3 of at most 127   ", terminal)
+        line.write("other")
+        assert wait_for("other   ", terminal)
+    assert terminal.getvalue().endswith("\x1b[2K")  # the line is erased
+    for thread in set(threading.enumerate()) - before:
+        thread.join(5.0)
+        assert not thread.is_alive()
+
+
+def test_calls_inside_another_one_and_other_threads_show_nothing(monkeypatch):
+    terminal = open_terminal(monkeypatch)
+    with show_line("outer"):
+        assert wait_for("outer", terminal)
+        with show_line("inner"):
+            show_detail("deeper")
+            time.sleep(0.3)
+
+    def elsewhere():
+        with show_line("thread"):
+            time.sleep(0.1)
+
+    thread = threading.Thread(target=elsewhere)
+    thread.start()
+    thread.join()
+    for text in ("inner", "deeper", "thread"):
+        assert text not in terminal.getvalue()
+
+
+def test_nothing_without_a_terminal(monkeypatch):
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setattr(progress, "DELAY", 0.001)
+    with show_line("begins"):
+        show_detail("more")
+        time.sleep(0.1)
+    assert stream.getvalue() == ""
+    show_detail("nowhere")
+
+
+def test_what_ends_at_once_shows_nothing(monkeypatch):
+    stream = Terminal()
+    monkeypatch.setattr(sys, "stderr", stream)
+    with show_line("begins"):
+        pass
+    time.sleep(progress.DELAY + 0.3)
+    assert stream.getvalue() == ""
+
+
+def test_strategies_are_shown(monkeypatch):
+    terminal = open_terminal(monkeypatch)
+    seen = []
+    found = sf.estimate(thermostat(FAR), callback=lambda record: seen.append(record.iteration))
+    shown = terminal.getvalue()
+    assert f"growing horizon, lowest J = {found.steps[0].cost:.6g}, window" in shown
+    assert "of 18   " in shown
+    assert seen[0] == 1  # the user's callback is called as well
+    stopped = sf.estimate(thermostat(FAR), callback=lambda record: record.iteration == 2)
+    assert stopped.iterations == 2

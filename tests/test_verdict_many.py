@@ -1,0 +1,309 @@
+"""Verdicts on many fits: each as that on a single fit as far as J tells, and rules for all of them together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from models import curve, decay
+
+import switchfit as sf
+from switchfit.batch.verdict import find_elsewhere
+from switchfit.uncertainty.quality import measure_quality
+
+TIMES = np.linspace(0.25, 6.0, 24)
+TRUTH = np.array([2.1, 0.8])
+
+
+def heating(t, x, p):
+    return 1.0 - p["k"] * x
+
+
+ROOM = sf.HybridSystem({"on": heating, "off": decay}, [0.2])
+
+
+def temperatures(tau=2.1, k=0.8):
+    rising = 1 / k + (0.2 - 1 / k) * np.exp(-k * np.minimum(TIMES, tau))
+    return rising * np.exp(-k * np.maximum(TIMES - tau, 0.0))
+
+
+def room(values=None, *, sigma=0.01, upper=5.0, seed=0, noise=0.01, min_duration=0.0, prior=None, guess=(1.7, 1.0)):
+    values = temperatures() if values is None else values
+    values = values + noise * np.random.default_rng(seed).standard_normal(24)
+    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=sigma), ("on", "off"), guess[:1], 0.0, 6.0)
+    k = sf.Parameter(guess[1], lower=0.1, upper=upper, prior=prior)
+    return sf.Problem(ROOM, run, {"k": k}, min_duration=min_duration)
+
+
+def wave(size):
+    return temperatures() + size * np.sin(4 * TIMES)
+
+
+def kinds(result):
+    return [reason.kind for reason in result.verdict.reasons]
+
+
+# --- fits of logs -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def good():
+    return sf.estimate_many([room(seed=seed) for seed in range(12)])
+
+
+def test_good_fits_are_good(good):
+    assert good.verdict.level == "good"
+    assert good.levels.tolist() == ["good"] * 12
+    worst = int(np.argmin(good.explained))
+    assert str(good.verdict).startswith("Good: all 12 fits are good and explain 99.")
+    assert f"(fit {worst} least)" in str(good.verdict)
+    assert str(good).startswith(str(good.verdict))
+    assert good.verdict.next_steps == ()
+
+
+@pytest.mark.parametrize(
+    ("settings", "level"),
+    [
+        ({}, "good"),
+        ({"values": wave(0.03)}, "doubtful"),  # slightly wrong
+        ({"values": wave(0.3)}, "bad"),
+        ({"noise": 0.5, "sigma": 0.5}, "good"),
+        ({"values": wave(0.3), "sigma": None}, "bad"),
+        ({"upper": 0.5, "guess": (1.7, 0.4)}, "bad"),
+        ({"upper": 0.785, "guess": (1.7, 0.6)}, "doubtful"),  # at its bound, and the data do not mind
+    ],
+)
+def test_the_level_of_a_fit_is_that_of_a_single_one(settings, level):
+    problem = room(**settings)
+    single = sf.estimate(problem, strategy="local")
+    many = sf.estimate_many([problem])
+    assert single.verdict.level == level
+    if settings.get("sigma", 1.0) is None:  # of its residuals a single fit knows that they are correlated
+        assert many.levels.tolist() == ["doubtful"]
+    else:
+        assert many.levels.tolist() == [level]
+    assert many.verdict.level == many.levels[0]
+
+
+@pytest.mark.parametrize("settings", [{}, {"sigma": None}, {"noise": 0.5}, {"prior": sf.Normal(0.9, 0.05)}])
+def test_the_share_that_is_explained_is_that_of_a_single_fit(settings):
+    problem = room(**settings)
+    single = measure_quality(sf.estimate(problem, strategy="local")).explained
+    assert sf.estimate_many([problem]).explained[0] == pytest.approx(single, abs=1e-9)
+
+
+def test_the_share_of_a_reference_is_that_of_a_single_fit():
+    signal = sf.ReferenceSignal.from_samples(np.r_[0.0, TIMES], np.r_[0.2, wave(0.1)][:, None])
+    problem = sf.Problem(ROOM, sf.Experiment(signal, ("on", "off"), (1.7,), 0.0, 6.0), {"k": 1.0})
+    single = sf.estimate(problem, strategy="local")
+    many = sf.estimate_many([problem, problem])
+    assert many.explained[0] == pytest.approx(measure_quality(single).explained, abs=1e-3)
+    assert many.verdict.level == single.verdict.level == "bad"
+    assert "the reference is not followed in all 2 fits" in str(many.verdict)
+
+
+def test_a_cost_without_data_has_no_share():
+    cost = sf.RunningCost(lambda t, x, p: (x[0] - 0.8) ** 2)
+    problem = sf.Problem(
+        ROOM, sf.Experiment(cost, ("on", "off"), (1.0,), 0.0, 6.0), {"k": sf.Parameter(0.8, fixed=True)}
+    )
+    many = sf.estimate_many([problem])
+    assert np.isnan(many.explained).all()
+    assert str(many.verdict) == "Good: the only fit is good."
+
+
+def test_one_bad_fit_among_many_is_named():
+    problems = [room(seed=seed) for seed in range(20)]
+    problems[13] = room(wave(0.3))
+    many = sf.estimate_many(problems)
+    assert many.verdict.level == "doubtful"
+    assert np.flatnonzero(many.levels == "bad").tolist() == [13]
+    assert str(many.verdict).startswith(
+        "Doubtful: 19 of 20 fits are good and 1 is bad; the model is far from the data in "
+    )
+    assert "(fit 13 explains" in str(many.verdict)
+    assert str(many.verdict).endswith("fit problem 13 by itself with sf.estimate.")
+
+
+def test_all_are_bad_where_half_of_them_are():
+    problems = [room(wave(0.3)) if seed < 3 else room(seed=seed) for seed in range(6)]
+    assert sf.estimate_many(problems).verdict.level == "bad"
+    assert sf.estimate_many(problems[1:]).verdict.level == "doubtful"
+
+
+def test_chi_square_is_shared_among_the_fits(good):
+    """One fit in a thousand has so large a chi-square by chance, and 10,000 fits have ten."""
+    noisy = replace(
+        good,
+        cost=np.repeat(0.5 * 58.0, 12),
+        explained=np.repeat(0.9, 12),
+    )  # of 22 degrees of freedom: probability 4e-5
+    assert noisy.verdict.level == "bad"
+    thousand = replace(
+        noisy,
+        **{
+            name: np.repeat(getattr(noisy, name)[:1], 1000, axis=0)
+            for name in ("theta", "hessian", "status", "free", "samples", "collapsed", "at_bounds", "covariance")
+        },
+        requested=1000,
+        runs=np.arange(1000),
+        cost=np.r_[0.5 * 58.0, np.repeat(11.0, 999)],
+        explained=np.repeat(0.9, 1000),
+    )
+    assert thousand.verdict.level == "good"
+
+
+def test_fits_that_did_not_converge_are_counted():
+    many = sf.estimate_many([room(seed=seed) for seed in range(4)], max_iterations=1)
+    assert many.verdict.level == "bad"
+    assert kinds(many) == ["many fits", "some not converged"]
+    assert "(MAX_ITERATIONS)" in str(many.verdict)
+
+
+def test_collapsed_modes_are_counted():
+    """A log of a room that was never heated."""
+    cold = 0.2 * np.exp(-0.8 * TIMES)
+    many = sf.estimate_many([room(cold, guess=(1.0, 1.0), upper=1.1, seed=seed) for seed in range(3)])
+    assert (many.collapsed == 1).any()
+    assert many.verdict.level == "doubtful"
+    assert "some a mode collapsed" in kinds(many)
+    assert "modes collapsed in" in str(many.verdict)
+
+
+def test_a_stop_is_said():
+    problems = [room(seed=seed) for seed in range(33)]
+    many = sf.estimate_many(problems, callback=lambda done, total: True)
+    assert len(many) < 33
+    assert many.verdict.level == "doubtful"
+    assert kinds(many)[-1] == "stopped"
+
+
+def test_a_prior_counts_as_a_sample():
+    many = sf.estimate_many([room(prior=sf.Normal(0.8, 0.5)), room(prior=sf.Normal(0.8, 0.5))])
+    assert many.priors == 1
+    assert many.verdict.level == "good"
+
+
+# --- studies ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def study():
+    return sf.monte_carlo(room(), 200, theta=TRUTH)
+
+
+def test_a_study_whose_fits_agree_is_good(study):
+    assert study.verdict.level == "good"
+    assert str(study).startswith("Good: all 200 fits converged, in one minimum.\n")
+
+
+def test_a_study_with_more_noise_than_sigma_says_so():
+    found = sf.monte_carlo(room(), 200, theta=TRUTH, noise=0.03)
+    assert found.verdict.level == "doubtful"
+    assert {"some slightly wrong", "intervals too short"} <= set(kinds(found))
+    share = found.verdict.reasons[-1].figures["share"]
+    assert share == pytest.approx(found.coverage().min())
+
+
+def test_an_end_in_another_minimum_is_found(study):
+    theta = study.theta.copy()
+    theta[17] += 30 * study.standard_deviation
+    away = replace(study, theta=theta)
+    assert np.flatnonzero(find_elsewhere(away)).tolist() == [17]
+    assert away.verdict.level == "doubtful"
+    assert "1 of 200 fits ended in another minimum, fit 17 farthest off" in str(away.verdict)
+    assert not find_elsewhere(study).any()
+
+
+@pytest.mark.parametrize(("failed", "level"), [(2, "good"), (3, "doubtful"), (99, "doubtful"), (100, "bad")])
+def test_a_hundredth_of_a_study_may_fail(study, failed, level):
+    status = study.status.astype(object)
+    status[:failed] = "MAX_ITERATIONS"
+    assert replace(study, status=status.astype(str)).verdict.level == level
+
+
+def test_an_integration_error_counts(study):
+    assert replace(study, integration_error=1e-4).verdict.level == "doubtful"
+    assert replace(study, integration_error=0.1).verdict.level == "bad"
+
+
+def test_a_bootstrap_of_a_bad_fit_is_bad():
+    found = sf.bootstrap(sf.estimate(room(wave(0.3)), strategy="local"), 20)
+    assert found.origin.level == "bad"
+    assert found.verdict.level == "bad"
+    assert str(found).startswith("Bad: the fit that was resampled is bad")
+    fine = sf.bootstrap(sf.estimate(room(wave(0.03)), strategy="local"), 20)
+    assert fine.origin.level == "doubtful"  # sigma is too small, which is what a bootstrap is for
+    assert fine.verdict.level == "good"
+
+
+def test_a_bootstrap_of_runs_is_judged_by_what_runs_share():
+    problem = sf.Problem(ROOM, [room(seed=seed).experiments[0] for seed in range(5)], {"k": 1.0})
+    found = sf.bootstrap(sf.estimate(problem), 40, resample="runs")
+    assert found.verdict.level == "good"
+    theta = found.theta.copy()
+    theta[3, 0] += 1.0  # the time of a run that was not drawn
+    assert replace(found, theta=theta).verdict.level == "good"
+
+
+# --- starts -----------------------------------------------------------------------------------------------------------
+
+
+def test_many_starts_have_the_verdict_of_the_best_and_say_how_many_found_it():
+    found = sf.multistart(room(), 16)
+    assert found.verdict.level == found.best.verdict.level == "good"
+    agree = next(reason for reason in found.verdict.reasons if reason.kind == "starts agree")
+    assert agree.figures["agreeing"] == np.sum(found.clusters == 0) - 1
+    assert str(found).startswith("Good: ")
+
+
+def test_the_share_of_starts_is_said_beside_other_doubts():
+    found = sf.multistart(room(wave(0.03)), 16)
+    assert found.verdict.level == "doubtful"
+    assert kinds(found)[0] == "slightly wrong"
+    assert kinds(found)[-1] == "starts agree"
+
+
+def test_no_start_that_can_be_fitted_is_bad():
+    found = replace(sf.multistart(room(), 4), best=None)
+    assert found.verdict.level == "bad"
+
+
+# --- folders ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_gives_the_same_verdict(tmp_path, monkeypatch):
+    problems = [room(wave(0.3)), room(), room()]
+    first = sf.estimate_many(problems, folder=tmp_path)
+    monkeypatch.setattr("switchfit.batch.logs.fit_chunk", None)  # nothing is fitted
+    again = sf.estimate_many(problems, folder=tmp_path)
+    assert again.verdict == first.verdict
+    np.testing.assert_array_equal(again.levels, first.levels)
+
+
+def test_a_folder_of_another_format_is_not_read(tmp_path, monkeypatch):
+    sf.estimate_many([room()], folder=tmp_path)
+    monkeypatch.setattr("switchfit.batch.logs.CHUNK_FORMAT", "fits 1")
+    with pytest.raises(ValueError, match="holds the results of another run"):
+        sf.estimate_many([room()], folder=tmp_path)
+
+
+def test_channels_of_no_variation_and_missing_ones_count():
+    def both(t, x, p):
+        return jnp.stack([x[0], 0.0 * x[0] + p["c"]])
+
+    values = np.stack([temperatures(), np.full(24, 2.0)], axis=1)
+    values[3, 0] = np.nan
+    values[:, 1] += 1e-3 * np.random.default_rng(0).standard_normal(24)
+    data = sf.Measurements(TIMES, values, observe=both, sigma=[0.01, 1.0])
+    run = sf.Experiment(data, ("on", "off"), (1.7,), 0.0, 6.0)
+    problem = sf.Problem(ROOM, run, {"k": 1.0, "c": 1.9})
+    single = sf.estimate(problem, strategy="local")
+    assert sf.estimate_many([problem]).explained[0] == pytest.approx(measure_quality(single).explained, abs=1e-9)
+
+
+def test_a_straight_line_that_is_met_exactly_is_good():
+    problem = curve(lambda t, x, p: jnp.stack([p["a"]]), TIMES, np.full((24, 1), 2.0), {"a": 1.0}, tf=6.0)
+    assert sf.estimate_many([problem]).verdict.level == "good"
