@@ -74,7 +74,7 @@ def test_fit_converged(folder, tmp_path):
     out = tmp_path / "a" / "b"
     result = run("fit", folder / "problem.toml", "--out", out)
     assert result.exit_code == 0, result.stderr
-    assert sorted(path.name for path in out.iterdir()) == ["estimate.json", "fit.png", "report.txt"]
+    assert sorted(path.name for path in out.iterdir()) == ["estimate.json", "fit.png", "report.html", "report.txt"]
     assert (out / "report.txt").read_text().strip() == result.stdout.strip()
     assert "heating" in result.stdout
     assert "tau_1" in result.stdout

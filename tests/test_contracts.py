@@ -273,7 +273,7 @@ import sys, jax
 before = dict(jax.config.values)
 import switchfit
 changed = {k for k, v in jax.config.values.items() if before.get(k, v) != v}
-heavy = {"matplotlib", "pydantic", "typer", "rich"} & set(sys.modules)
+heavy = {"bokeh", "jinja2", "switchfit.report.html.page", "matplotlib", "pydantic", "typer", "rich"} & set(sys.modules)
 print(changed or "", heavy or "", end="")
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)

@@ -77,7 +77,7 @@ def fit(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for report.txt, estimate.json and fit.png; runs.csv and unknowns.csv where they are many.",
+            help="Folder for report.html, report.txt, estimate.json, fit.png; runs.csv, unknowns.csv for many.",
             show_default=False,
         ),
     ] = None,
@@ -108,7 +108,9 @@ def fit(
     max_iterations: Annotated[
         int | None, typer.Option(min=0, help="Most iterations.", show_default="the library's")
     ] = None,
-    no_figures: Annotated[bool, typer.Option("--no-figures", help="Write no figure.")] = False,
+    no_figures: Annotated[
+        bool, typer.Option("--no-figures", help="Write no figures: neither fit.png nor report.html.")
+    ] = False,
     certificate: Annotated[
         bool, typer.Option("--certificate", help="Check with the paper's equations too, and print the checks.")
     ] = False,
@@ -148,8 +150,9 @@ def fit(
         loaded = _load(problem[0])
         if out is not None:
             _make_folder(out)
-        estimate = _estimate(loaded, loaded.options | overrides, prepare_figures=output.figures)
-        _write_estimate(estimate, output, output.folder)
+        options = loaded.options | overrides
+        estimate = _estimate(loaded, options, prepare_figures=output.figures)
+        _write_estimate(estimate, loaded, options, output, output.folder)
     _fail_for_refused(loaded.issues)
     if not estimate.success:
         reason = "" if estimate.status.successful else f"not converged. {estimate.message}"
@@ -427,8 +430,16 @@ class _Output:
     full: bool
 
 
-def _write_estimate(estimate: Any, output: _Output, folder: Path | None, *, show: bool = True) -> None:
-    """Print the report, and write report, estimate and figure into a folder."""
+def _write_estimate(
+    estimate: Any,
+    loaded: ProblemFile,
+    options: dict[str, Any],
+    output: _Output,
+    folder: Path | None,
+    *,
+    show: bool = True,
+) -> None:
+    """Print the report, and write report, page, estimate and figure into a folder."""
     checked = f"\n\nCertificate\n{estimate.certificate}" if output.certificate else ""
     tables = _choose_tables(estimate, folder)
     # The report after the certificate, which is part of the verdict.
@@ -445,6 +456,7 @@ def _write_estimate(estimate: Any, output: _Output, folder: Path | None, *, show
         figure = io.BytesIO()
         estimate.plot().savefig(figure, format="png", dpi=150)
         _write(folder / "fit.png", figure.getvalue())
+        _write_page(estimate, loaded, options, folder / "report.html")
     _print(f"written to {folder}", err=True)
 
 
@@ -463,9 +475,10 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
             estimate, error = _estimate_log(loaded, overrides, output)
         results.add(str(path), estimate, error)
         _print(results.describe_last())
-        if estimate is not None and output.folder is not None:
+        if loaded is not None and estimate is not None and output.folder is not None:
             _make_folder(output.folder / name)
-            _write_estimate(estimate, output, output.folder / name, show=False)
+            options = loaded.options | overrides
+            _write_estimate(estimate, loaded, options, output, output.folder / name, show=False)
         if table is not None:  # after each log, so that an interrupted run leaves what it has
             _write(table, results.write())
         if estimate is not None and estimate.status.name == "INTERRUPTED":
@@ -496,6 +509,19 @@ def _save(estimate: Any, path: Path, *, complete: bool) -> None:
     from switchfit.uncertainty.certificate import certify
 
     save_fit(estimate.complete(), estimate.certificate if complete else certify(estimate, None), path)
+
+
+def _write_page(estimate: Any, loaded: ProblemFile, options: dict[str, Any], path: Path) -> None:
+    """Write the report as an HTML file; without the libraries that it needs, say how to install them."""
+    from switchfit.runtime.errors import MissingExtraError
+    from switchfit.runtime.presentation import format_page
+
+    try:
+        page = format_page(estimate, problem_file=loaded.path, options=options)
+    except MissingExtraError as missing:
+        _print(f"no {path.name}: {missing}", err=True)
+    else:
+        _write(path, page)
 
 
 @contextlib.contextmanager

@@ -24,7 +24,7 @@ from switchfit.fit.solution import is_sigma_known
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_path
-from switchfit.runtime.presentation import format_text
+from switchfit.runtime.presentation import format_html, format_text
 from switchfit.runtime.progress import show_progress
 from switchfit.uncertainty.verdict import Verdict
 
@@ -188,6 +188,9 @@ class Fits:
 
     def __str__(self) -> str:
         return format_text(self)
+
+    def _repr_html_(self) -> str:
+        return format_html(self)
 
 
 def check_long_run(client: Any, folder: Any, callback: Any) -> None:

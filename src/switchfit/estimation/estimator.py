@@ -32,7 +32,8 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_choice, as_count, as_flag, as_instance, as_path, as_positive
-from switchfit.runtime.presentation import draw_figure, format_text
+from switchfit.runtime.files import write_atomically
+from switchfit.runtime.presentation import draw_figure, format_html, format_page, format_text
 from switchfit.runtime.progress import Progress
 from switchfit.uncertainty.certificate import Certificate, certify
 from switchfit.uncertainty.identification import Identifiability, identifiability
@@ -328,6 +329,9 @@ class Estimate(Fit):
     def __str__(self) -> str:
         return format_text(self)
 
+    def _repr_html_(self) -> str:
+        return format_html(self)
+
     def plot(self, *, bands: bool = True, level: float = 0.95) -> Any:
         """Draw measured against fitted over time with the modes shaded, as a matplotlib Figure.
 
@@ -429,6 +433,45 @@ class Estimate(Fit):
         """
         file = as_path(path, "path")
         save_fit(self.complete(), self.certificate, file)
+
+    def save_report(self, path: str | Path, *, problem_file: str | Path | None = None) -> None:
+        """Write the report as one HTML file, atomically: figures to zoom into, a slider for each unknown, the inputs.
+
+        It needs no network and no other file. `switchfit fit --out` writes it too.
+
+        Parameters
+        ----------
+        path : path
+            Such as "report.html".
+        problem_file : path, optional
+            The problem file that was fitted, whose text goes into the report; left out, the report holds the hashes of
+            the data.
+
+        Raises
+        ------
+        ImportError
+            Without the libraries of the extra `report`, with the command that installs them.
+
+        See Also
+        --------
+        Estimate.report, Estimate.plot, Estimate.save
+
+        Examples
+        --------
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> with TemporaryDirectory() as folder:
+        ...     fit.save_report(Path(folder) / "report.html")
+        ...     (Path(folder) / "report.html").read_text().splitlines()[0]
+        '<!DOCTYPE html>'
+        """
+        file = as_path(path, "path")
+        given = None if problem_file is None else as_path(problem_file, "problem_file")
+        write_atomically(format_page(self, problem_file=given), file)
 
     def complete(self) -> Estimate:
         """Return the estimate with all fields that are saved: computes the Gauss-Newton matrix.

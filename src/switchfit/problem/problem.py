@@ -36,6 +36,7 @@ from switchfit.problem.validation import (
     shorten,
 )
 from switchfit.problem.variables import Variables
+from switchfit.runtime.presentation import format_html
 
 GIVEN = ("system", "experiments", "parameters", "min_duration", "solver", "rtol", "atol", "engine", "max_transitions")
 """What a `Problem` is built from."""
@@ -483,6 +484,9 @@ class Problem:
                 for e, length in zip(group, choose_common_lengths([counts[e][k] for e in group]), strict=True):
                     counts[e][k] = length
         return tuple(tuple(lengths) for lengths in counts)
+
+    def _repr_html_(self) -> str:
+        return format_html(self)
 
     def name_parameters(self, theta: FloatArray, e: int) -> dict[str, FloatArray]:
         """Return the parameters of experiment e under the names that the model has for them.

@@ -133,6 +133,25 @@ def plot_fit(fit: Fit, bands: Sequence[Bands] = ()) -> Figure:
         if bands:
             _draw_bands(fit, e, block.axes, bands[e])
     _draw_head(fit, figure, shown, colours)
+    return turn_off_formulas(figure)
+
+
+def turn_off_formulas(figure: Figure) -> Figure:
+    """Let names stand as they are: matplotlib takes what is between two dollar signs as a formula, or fails.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        if "$" in text.get_text() and "\\mathdefault" not in text.get_text():  # as in ticks of matplotlib's own
+            text.set_parse_math(False)
     return figure
 
 

@@ -1,9 +1,31 @@
-"""The one function that lays out tables of text."""
+"""Tables as data, and the one function that lays them out as text."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
+from typing import NamedTuple
+
+
+class Table(NamedTuple):
+    """Cells as text.
+
+    Attributes
+    ----------
+    rows : sequence of sequences of str, of the same length each
+        A header is a row like others.
+    alignment : str
+        A character for each column: "<" aligns it to the left, ">" to the right.
+    """
+
+    rows: Sequence[Sequence[str]]
+    alignment: str
+
+    @property
+    def columns(self) -> list[int]:
+        """Columns that have an entry in some row."""
+        return [k for k in range(len(self.alignment)) if any(row[k] for row in self.rows)]
+
 
 WIDTH = 100
 """Columns of a report, where names allow it."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report.numbers import format_rounded, format_unit, get_unit
-from switchfit.report.tables import format_table, wrap_text
+from switchfit.report.tables import Table, format_table, wrap_text
 from switchfit.report.uncertainty import write_direction
 from switchfit.report.verdict import format_share, write_agreement
 from switchfit.runtime.presentation import format_text
@@ -23,13 +23,17 @@ from switchfit.uncertainty.certificate import Certificate
 from switchfit.uncertainty.identification import WEAK, Identifiability, analyse_solution
 from switchfit.uncertainty.issues import DIFFERENT, find_issues
 from switchfit.uncertainty.quality import explain_channel
-from switchfit.uncertainty.residuals import correct_errors
+from switchfit.uncertainty.residuals import correct_errors, correct_intervals
 from switchfit.uncertainty.verdict import Verdict, judge
 
 ONE_SIDED = 1.2
 """Ratio of the two sides of an interval above which it is said that they differ."""
 LABEL = 18
 """Columns of the labels at the left."""
+
+
+Row = tuple[str, str]
+"""A label at the left, empty where it is that of the row before, and a text."""
 
 
 class Limits(NamedTuple):
@@ -101,10 +105,12 @@ def report(
     sections = [
         wrap_text(str(verdict), "", "  "),
         _format_section(
-            "Fit", _format_experiments(fit, limits.experiments, runs, full=full) + _format_course(fit, full=full)
+            "Fit",
+            _format_rows([*list_experiments(fit, limits.experiments, runs, full=full), *list_course(fit, full=full)]),
         ),
         _format_section(
-            "Quality of the fit", [*_format_quality(fit, full=full), *_format_channels(fit, limits.channels, runs)]
+            "Quality of the fit",
+            [*_format_rows(list_quality(fit, full=full)), *_format_channels(fit, limits.channels, runs)],
         ),
         _format_section("Unknowns", _format_unknowns(fit, limits.unknowns, unknowns)),
         _format_section("Held fixed", _format_fixed(fit, limits.fixed)),
@@ -135,9 +141,20 @@ def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str
 # --- sections ---------------------------------------------------------------------------------------------------------
 
 
-def _format_experiments(fit: Fit, most: int, where: str, *, full: bool) -> list[str]:
-    """Return each experiment's modes, its horizon and its data; on one screen of several a line each."""
-    lines: list[str] = []
+def list_experiments(fit: Fit, most: int, where: str = "", *, full: bool) -> list[Row]:
+    """Return each experiment's modes, its horizon and its data; on one screen of several a row each.
+
+    Parameters
+    ----------
+    fit : Fit
+    most : int
+        Experiments that are listed; the others are counted.
+    where : str, optional
+        Where the others are, as the end of a sentence.
+    full : bool
+        A row for each of an experiment's data, however many experiments there are.
+    """
+    rows: list[Row] = []
     single = len(fit.trajectories) == 1
     names = ["experiment"] if single else fit.run_names
     for name, trajectory, run in list(zip(names, fit.trajectories, fit.comparisons, strict=True))[:most]:
@@ -145,14 +162,12 @@ def _format_experiments(fit: Fit, most: int, where: str, *, full: bool) -> list[
         horizon = f"{trajectory.times[0]:.6g} to {trajectory.times[-1]:.6g}{unit_suffix(trajectory.time_unit)}"
         data = [_format_data(comparison) for comparison in run] or ["no data: a cost of the trajectory"]
         if full or single:
-            lines += _format_row(name, f"{sequence}, {horizon}")
-            for text in data:
-                lines += _format_row("", text)
+            rows += [(name, f"{sequence}, {horizon}"), *(("", text) for text in data)]
         else:
-            lines += _format_row(name, "; ".join([f"{sequence}, {horizon}", *data]))
+            rows.append((name, "; ".join([f"{sequence}, {horizon}", *data])))
     if len(names) > most:
-        lines += _format_row("", f"and {len(names) - most} more experiments{where}")
-    return lines
+        rows.append(("", f"and {len(names) - most} more experiments{where}"))
+    return rows
 
 
 def _format_data(comparison: Comparison) -> str:
@@ -167,23 +182,30 @@ def _format_data(comparison: Comparison) -> str:
     return f"{names}: {_count(len(comparison.times), 'sample')}{note}"
 
 
-def _format_course(fit: Fit, *, full: bool) -> list[str]:
-    """Return method, effort, the strategies with the lowest J after each, and how it ended."""
-    lines = _format_row("method", METHODS.get(fit.hessian_kind, fit.hessian_kind))
+def list_course(fit: Fit, *, full: bool) -> list[Row]:
+    """Return method, effort, the strategies with the lowest J after each, and how it ended.
+
+    Parameters
+    ----------
+    fit : Fit
+    full : bool
+        The message in full, and the engine in a row of its own.
+    """
+    rows = [("method", METHODS.get(fit.hessian_kind, fit.hessian_kind))]
     iterations, evaluations = _count(fit.iterations, "iteration"), _count(fit.evaluations, "evaluation")
     effort = f"{iterations}, {evaluations}, {fit.seconds:.3g} s"
     if fit.steps:  # the iterations of short fits are not counted, and the last fit has few
         effort = f"{evaluations}, {fit.seconds:.3g} s in all, {iterations} in the last fit"
-    lines += _format_row("effort", effort if fit.engine is None or full else f"{effort}. {fit.engine}")
+    rows.append(("effort", effort if fit.engine is None or full else f"{effort}. {fit.engine}"))
     if fit.engine is not None and full:
-        lines += _format_row("", str(fit.engine))
+        rows.append(("", str(fit.engine)))
     if fit.steps:
-        lines += _format_row("tried", "; ".join(map(_format_step, fit.steps)))
+        rows.append(("tried", "; ".join(map(_format_step, fit.steps))))
     if fit.starts is not None and fit.starts[0]:
         ended = next((step.ended for step in reversed(fit.steps) if step.ended), "")
-        lines += _format_row("starts", f"{write_agreement(*fit.starts)}{_ENDED.get(ended, '')}")
-    lines += _format_row("status", fit.message if full or not fit.status.successful else _shorten_status(fit))
-    return lines
+        rows.append(("starts", f"{write_agreement(*fit.starts)}{_ENDED.get(ended, '')}"))
+    rows.append(("status", fit.message if full or not fit.status.successful else _shorten_status(fit)))
+    return rows
 
 
 _ENDED = {
@@ -213,36 +235,57 @@ def _shorten_status(fit: Fit) -> str:
     return f"{where}: the optimality {fit.optimality:.1e} is {side} the tolerance {fit.tolerance:.1e}."
 
 
-def _format_quality(fit: Fit, *, full: bool) -> Iterator[str]:
-    """Return cost, optimality (which the status says as well), residual variance, integration error."""
+def list_quality(fit: Fit, *, full: bool) -> list[Row]:
+    """Return cost, optimality (which the status says as well), residual variance, integration error.
+
+    Parameters
+    ----------
+    fit : Fit
+    full : bool
+        With the optimality.
+    """
     first = fit.initial_cost
     if np.isnan(first) and fit.history and not fit.steps:
         first = fit.history[0].cost
     guess = f"{first:.8g}" if np.isfinite(first) else "not integrable" if fit.steps else ""
     start = f"   (first guess: {guess})" if guess else ""
-    yield from _format_row("cost J", f"{fit.cost:.8g}{start}")
+    rows = [("cost J", f"{fit.cost:.8g}{start}")]
     if full:
-        yield from _format_row("KKT residual", f"{fit.optimality:.1e}   (tolerance: {fit.tolerance:.1e})")
-    for name, value, multiplier in fit.constraints:
-        yield from _format_row(name, f"{value:.1e}   (multiplier {multiplier:.6g})")
+        rows.append(("KKT residual", f"{fit.optimality:.1e}   (tolerance: {fit.tolerance:.1e})"))
+    rows += [(name, f"{value:.1e}   (multiplier {multiplier:.6g})") for name, value, multiplier in fit.constraints]
     variance, unknowns = fit.residual_variance, _count(fit.free_basis.shape[1], "free unknown")
     if np.isfinite(variance):
         priors = f" + {_count(len(fit.priors), 'prior')}" if fit.priors else ""
         origin = f"2 J / ({fit.samples} values{priors} - {unknowns})"
         if fit.sigma_known:
-            yield from _format_row("reduced chi-square", f"{variance:.4g}   ({origin}; near 1 where sigma is right)")
+            rows.append(("reduced chi-square", f"{variance:.4g}   ({origin}; near 1 where sigma is right)"))
         else:
             noise = f"so sigma is about {np.sqrt(variance):.4g}"
-            yield from _format_row("residual variance", f"{variance:.4g}   ({origin}, {noise})")
+            rows.append(("residual variance", f"{variance:.4g}   ({origin}, {noise})"))
     of = fit.integration_error_of
-    yield from _format_row(
-        "integration error", f"{fit.integration_error:.1e}   (of {of}, relative, by halving all steps)"
-    )
+    rows.append(("integration error", f"{fit.integration_error:.1e}   (of {of}, relative, by halving all steps)"))
+    return rows
 
 
 def _format_channels(fit: Fit, most: int, where: str) -> list[str]:
+    """Return the table of the channels as lines; of more than `most` those that are explained worst."""
+    table, shares = tabulate_channels(fit)
+    header, *rows = table.rows
+    if not rows:
+        return []
+    kept = sorted(np.argsort(shares, kind="stable")[: _count_shown(len(rows), most)].tolist())
+    lines = format_table([header, *(rows[k] for k in kept)], table.alignment)
+    more = len(rows) - len(kept)
+    return ["", *lines] + ([f"  and {more} more channels, of which more is explained{where}"] if more else [])
+
+
+def tabulate_channels(fit: Fit) -> tuple[Table, list[float]]:
     """Return a table of the channels: root mean square of the residuals, in units and in sigmas, and the share of the
-    variance that is explained; of more than `most` those that are explained worst.
+    variance that is explained; and these shares, infinite where there is nothing to explain.
+
+    Parameters
+    ----------
+    fit : Fit
     """
     single = len(fit.trajectories) == 1
     rows, shares = [], []
@@ -255,14 +298,8 @@ def _format_channels(fit: Fit, most: int, where: str) -> list[str]:
                 explained = "" if np.isnan(share) else format_share(share)
                 rows.append([label, count, rmse, get_unit(channel, trajectory), scaled, explained])
                 shares.append(np.inf if np.isnan(share) else share)
-    if not rows:
-        return []
-    kept = sorted(np.argsort(shares, kind="stable")[: _count_shown(len(rows), most)].tolist())
     in_sigmas = "rmse/sigma" if any(row[4] for row in rows) else ""
-    header = ["channel", "values", "rmse", "", in_sigmas, "explained"]
-    table = format_table([header, *(rows[k] for k in kept)], "<>><>>")
-    more = len(rows) - len(kept)
-    return ["", *table] + ([f"  and {more} more channels, of which more is explained{where}"] if more else [])
+    return Table([["channel", "values", "rmse", "", in_sigmas, "explained"], *rows], "<>><>>"), shares
 
 
 def _format_residuals(comparison: Comparison, k: int) -> tuple[str, str, str]:
@@ -278,39 +315,80 @@ def _format_residuals(comparison: Comparison, k: int) -> tuple[str, str, str]:
 
 
 def _format_unknowns(fit: Fit, most: int, where: str) -> list[str]:
-    """Return the table of the unknowns; standard errors that are corrected have the naive ones beside them."""
+    """Return the table of the unknowns as lines, those that are left out counted."""
+    table, note = tabulate_unknowns(fit, shown := select_unknowns(fit, most))
+    more = len(fit.theta) - len(shown)
+    lines = format_table(*table) + ([f"  and {more} more unknowns{where}"] if more else [])
+    return [*lines, f"  {note}"] if note else lines
+
+
+def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> tuple[Table, str]:
+    """Return the table of the unknowns, and what the standard errors are; those that are corrected have the naive ones
+    beside them.
+
+    Parameters
+    ----------
+    fit : Fit
+    shown : sequence of int
+        Which of them, by their places in theta.
+    ends : bool, optional
+        With the ends of the 95 % intervals, which allow for correlated residuals as the standard errors do.
+    """
     naive, errors = fit.standard_errors, correct_errors(fit)
     known = bool(np.isfinite(errors).any())
     corrected = known and not np.array_equal(naive, errors, equal_nan=True)
     joins = {t.index: f"{t.before} -> {t.after}" for t in fit.transitions}
-    rows = [["", "value", "std. error", "", "naive", "", "first guess", ""]]
-    shown = _select_unknowns(fit, most)
+    rows = [["", "value", "std. error", "", "naive", "95 % from", "to", "", "first guess", ""]]
     intervals, plain_intervals = fit.confidence_intervals(), Fit.confidence_intervals(fit)
+    wide = correct_intervals(fit) if ends else intervals
     for i in shown:
         name = fit.theta_names[i]
         value, error, relative = format_rounded(fit.theta[i], np.nan if name in fit.idle else errors[i])
         plain = format_rounded(fit.theta[i], np.nan if name in fit.idle else naive[i])[1]
         prior = f"prior: {fit.priors[name]}" if name in fit.priors else ""
-        sided = _format_sides(intervals[i], plain_intervals[i], fit.theta[i]) if i in joins else ""
-        notes = [joins.get(i, ""), prior, _format_log_scale(fit, i, errors), sided, _mark_unknown(fit, name)]
+        sided = _format_sides(intervals[i], plain_intervals[i], fit.theta[i]) if i in joins and not ends else ""
+        log_scale = "" if ends else _format_log_scale(fit, i, errors)
+        notes = [joins.get(i, ""), prior, log_scale, sided, _mark_unknown(fit, name)]
         note = ", ".join(note for note in notes if note)
         unit = format_unit(fit.theta_units[i])
-        rows.append([name, value, error, relative, plain, unit, f"{fit.initial_theta[i]:.6g}", note])
-    columns = [k for k in range(8) if (known or k not in (2, 3, 4)) and (corrected or k != 4)]
-    table = format_table([[row[k] for k in columns] for row in rows], "".join("<><><<><"[k] for k in columns))
-    more = len(fit.theta) - len(shown)
-    table += [f"  and {more} more unknowns{where}"] if more else []
+        low, high = (format_end(end, wide[i]) for end in wide[i])
+        rows.append([name, value, error, relative, plain, low, high, unit, f"{fit.initial_theta[i]:.6g}", note])
+    without = set() if known else {2, 3, 4, 5, 6}
+    without |= set() if corrected else {4}
+    without |= set() if ends else {5, 6}
+    columns = [k for k in range(10) if k not in without]
+    table = Table([[row[k] for k in columns] for row in rows], "".join("<><<<>><><"[k] for k in columns))
     if not known:
-        return table
+        return table, ""
     if corrected:
         allowed = "Standard errors allow for the correlation of the residuals; naive: as if these were independent."
-        return [*table, f"  {allowed}"]
-    return [*table, f"  Standard errors from the exact Hessian{_compare_covariances(fit)}."]
+        return table, allowed
+    return table, f"Standard errors from the exact Hessian{_compare_covariances(fit)}."
 
 
-def _select_unknowns(fit: Fit, most: int) -> list[int]:
+def format_end(end: float, ends: FloatArray) -> str:
+    """Return an end of an interval to the third digit of its width; nothing for one that is not known.
+
+    Parameters
+    ----------
+    end : float
+    ends : (2,)
+        Both of them.
+    """
+    width = ends[1] - ends[0]
+    if not (np.isfinite(end) and np.isfinite(width) and width > 0):
+        return ""
+    return format_rounded(end, width / 10)[0]
+
+
+def select_unknowns(fit: Fit, most: int) -> list[int]:
     """Return which unknowns are listed: of more than `most` first those at a bound, a kink or of a collapsed mode, then
     parameters, then transition times; in the order of theta.
+
+    Parameters
+    ----------
+    fit : Fit
+    most : int
     """
     marked = [bool(_mark_unknown(fit, name)) for name in fit.theta_names] if len(fit.theta) > most else []
     order = sorted(range(len(fit.theta)), key=lambda i: (not marked[i], bool(fit.is_time[i]))) if marked else None
@@ -358,25 +436,31 @@ def _mark_unknown(fit: Fit, name: str) -> str:
 
 
 def _format_fixed(fit: Fit, most: int) -> list[str]:
-    """Return transition times and parameters that were not estimated."""
+    """Return the table of what was not estimated as lines."""
+    rows = tabulate_fixed(fit).rows
+    more = len(rows) - len(rows[:most])
+    return format_table(rows[:most], "<<<<") + ([f"  and {more} more"] if more else [])
+
+
+def tabulate_fixed(fit: Fit) -> Table:
+    """Return transition times and parameters that were not estimated, without a header.
+
+    Parameters
+    ----------
+    fit : Fit
+    """
     fixed = [t for t in fit.transitions if t.index is None]
     rows = [[t.name, f"{t.time:.8g}", format_unit(t.unit), f"{t.before} -> {t.after}"] for t in fixed]
     for name in fit.fixed:
         text = np.array2string(fit.parameters[name], precision=8, threshold=6, edgeitems=2, separator=", ")
         rows.append([name, " ".join(text.split()), format_unit(fit.parameter_units[name]), ""])
-    more = len(rows) - len(rows[:most])
-    return format_table(rows[:most], "<<<<") + ([f"  and {more} more"] if more else [])
+    return Table(rows, "<<<<")
 
 
 def _format_correlations(fit: Fit, most: int, *, full: bool) -> list[str]:
     """Return the largest correlations, in one line or all of them."""
-    if not np.isfinite(fit.standard_errors).any():
-        return []
-    correlation = np.nan_to_num(np.tril(fit.correlation, -1))
-    above = np.argwhere(np.abs(correlation) > SMALL_CORRELATION)
-    above = above[np.argsort(-np.abs(correlation[tuple(above.T)]), kind="stable")]
-    names = fit.theta_names
-    rows = [[f"{names[j]}, {names[i]}", f"{correlation[i, j]:+.3f}"] for i, j in above[:most]]
+    above = list_correlations(fit)
+    rows = [[f"{one}, {other}", f"{value:+.3f}"] for one, other, value in above[:most]]
     if full or not rows:
         return format_table(rows, "<>")
     more = len(above) - len(rows)
@@ -384,12 +468,40 @@ def _format_correlations(fit: Fit, most: int, *, full: bool) -> list[str]:
     return wrap_text("; ".join(listed), "  ", "    ")
 
 
+def list_correlations(fit: Fit) -> list[tuple[str, str, float]]:
+    """Return the pairs of unknowns whose correlation is above `SMALL_CORRELATION`, the largest first.
+
+    Parameters
+    ----------
+    fit : Fit
+    """
+    if not np.isfinite(fit.standard_errors).any():
+        return []
+    correlation = np.nan_to_num(np.tril(fit.correlation, -1))
+    above = np.argwhere(np.abs(correlation) > SMALL_CORRELATION)
+    above = above[np.argsort(-np.abs(correlation[tuple(above.T)]), kind="stable")]
+    names = fit.theta_names
+    return [(names[j], names[i], float(correlation[i, j])) for i, j in above]
+
+
 def _describe_weak(fit: Fit, found: Identifiability, most: int) -> list[str]:
     """Return the combinations of unknowns that the data hardly see, if there are any."""
-    weak = [d for d in found.directions if d.eigenvalue < WEAK] if fit.status.successful else []
-    lines = [line for direction in weak[:most] for line in wrap_text(write_direction(found, direction), "  - ", "    ")]
+    weak = list_weak(fit, found)
+    lines = [line for sentence in weak[:most] for line in wrap_text(sentence, "  - ", "    ")]
     more = len(weak) - len(weak[:most])
     return lines + ([f"  and {_count(more, 'direction')} more"] if more else [])
+
+
+def list_weak(fit: Fit, found: Identifiability) -> list[str]:
+    """Return the combinations of unknowns that the data of a fit hardly see, a sentence each.
+
+    Parameters
+    ----------
+    fit : Fit
+    found : Identifiability
+    """
+    weak = [d for d in found.directions if d.eigenvalue < WEAK] if fit.status.successful else []
+    return [write_direction(found, direction) for direction in weak]
 
 
 _SAID = {
@@ -430,6 +542,10 @@ def _count_shown(count: int, most: int) -> int:
 
 def _format_section(title: str, lines: Sequence[str]) -> list[str]:
     return [title, *lines] if lines else []
+
+
+def _format_rows(rows: Sequence[Row]) -> list[str]:
+    return [line for row in rows for line in _format_row(*row)]
 
 
 def _format_row(label: str, text: str) -> list[str]:

@@ -10,8 +10,9 @@ import scipy.special
 
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report.numbers import format_rounded, label_time
+from switchfit.report.plot import turn_off_formulas
 from switchfit.report.sentences import join_words
-from switchfit.report.tables import format_table
+from switchfit.report.tables import Table, format_table
 from switchfit.runtime.presentation import draw_figure, format_text
 from switchfit.uncertainty.certificate import Certificate
 from switchfit.uncertainty.derivative_check import DerivativeCheck
@@ -42,6 +43,16 @@ def write_certificate(certificate: Certificate) -> str:
     ----------
     certificate : Certificate
     """
+    return "\n".join(format_table(*tabulate_certificate(certificate), indent=""))
+
+
+def tabulate_certificate(certificate: Certificate) -> Table:
+    """Return every check with its number, and the verdict, without a header.
+
+    Parameters
+    ----------
+    certificate : Certificate
+    """
     held = "; ".join(map(str, [*certificate.active, *certificate.kinks]))
     failures = "; ".join(map(str, certificate.failures))
     error = f"{certificate.integration_error:.1e} ({certificate.integration_error_of})"
@@ -58,7 +69,7 @@ def write_certificate(certificate: Certificate) -> str:
         ("active constraints", held or "none"),
         ("verdict", f"FAILED: {failures}" if failures else "passed"),
     ]
-    return "\n".join(format_table(rows, "<<", indent=""))
+    return Table(rows, "<<")
 
 
 def _format_gap(gap: float) -> str:
@@ -206,6 +217,17 @@ def write_diagnostics(diagnostics: ResidualDiagnostics) -> str:
     """
     if not diagnostics.channels:
         return "No residuals: the cost has no Measurements."
+    lines = ["Standardised residuals", *format_table(*tabulate_diagnostics(diagnostics))]
+    return "\n".join([*lines, *(f"  - {issue}" for issue in diagnostics.issues)])
+
+
+def tabulate_diagnostics(diagnostics: ResidualDiagnostics) -> Table:
+    """Return a row for each channel.
+
+    Parameters
+    ----------
+    diagnostics : ResidualDiagnostics
+    """
     rows = [["", "values", "rms", "mean", "lag 1", "worth", "P(white)", "P(normal)", "beyond 4"]]
     for label, channel in zip(diagnostics.labels, diagnostics.channels, strict=True):
         rows.append(
@@ -221,8 +243,7 @@ def write_diagnostics(diagnostics: ResidualDiagnostics) -> str:
                 f"{channel.outliers}",
             ]
         )
-    lines = ["Standardised residuals", *format_table(rows, "<" + ">" * 8)]
-    return "\n".join([*lines, *(f"  - {issue}" for issue in diagnostics.issues)])
+    return Table(rows, "<" + ">" * 8)
 
 
 def _format_probability(value: float) -> str:
@@ -330,7 +351,7 @@ def plot_profile(profile: Profile) -> Figure:
 
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     draw_profile(profile, figure.subplots())
-    return figure
+    return turn_off_formulas(figure)
 
 
 def draw_profile(profile: Profile, ax: Axes) -> Axes:
@@ -427,7 +448,7 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics) -> Figure:
             ax.set_xlabel(label_time(unit))
     for ax, label in zip(axes[-1, 1:], ("lag (samples)", "normal quantile"), strict=True):
         ax.set_xlabel(label)
-    return figure
+    return turn_off_formulas(figure)
 
 
 def draw_in_time(channel: ChannelResiduals, ax: Axes) -> Axes:

@@ -11,6 +11,10 @@ class NotIntegrableError(ValueError):
     """The model cannot be integrated at a theta: it is undefined, grows without bound or takes too many steps."""
 
 
+class MissingExtraError(ImportError):
+    """A library that comes with one of switchfit's extras is not installed; the message has the command."""
+
+
 def get_first_line(error: BaseException) -> str:
     """Return an exception in one line: its type and the first line of its message."""
     message = str(error).strip().splitlines()

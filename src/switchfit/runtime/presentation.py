@@ -41,3 +41,29 @@ def draw_figure(result: Any, **settings: Any) -> Any:
     raise TypeError(
         f"no module of switchfit.report draws a {type(result).__name__}; register one with draw_figure.register."
     )
+
+
+@singledispatch
+def format_page(result: Any, **settings: Any) -> str:
+    """Return a result as one HTML page that needs no other file.
+
+    Parameters
+    ----------
+    result : object
+        Of a kind that a module of `switchfit.report` has registered.
+    settings
+        What that kind of page can be given.
+    """
+    raise TypeError(f"no module of switchfit.report makes a page of a {type(result).__name__}; register one.")
+
+
+@singledispatch
+def format_html(result: Any) -> str:
+    """Return a result as a few lines of HTML, as a notebook shows it.
+
+    Parameters
+    ----------
+    result : object
+        Of a kind that a module of `switchfit.report` has registered.
+    """
+    raise TypeError(f"no module of switchfit.report shows a {type(result).__name__} in a notebook; register one.")

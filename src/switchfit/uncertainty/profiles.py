@@ -40,7 +40,7 @@ from switchfit.optimize import Status, solve_qp
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_name, join_names, shorten
-from switchfit.runtime.presentation import draw_figure, format_text
+from switchfit.runtime.presentation import draw_figure, format_html, format_text
 from switchfit.runtime.progress import Progress, show_progress
 
 if TYPE_CHECKING:
@@ -594,6 +594,9 @@ class Profile:
 
     def __str__(self) -> str:
         return format_text(self)
+
+    def _repr_html_(self) -> str:
+        return format_html(self)
 
     def plot(self) -> Figure:
         """Draw the likelihood ratio with its thresholds, and the quadratic approximation.

@@ -227,24 +227,54 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
 def correct_errors(fit: Fit) -> FloatArray:
     """Return the standard errors of a fit, widened where residuals are correlated: (d,).
 
+    Parameters
+    ----------
+    fit : Fit
+    """
+    return np.asarray(measure_widening(fit) * fit.standard_errors)
+
+
+def correct_intervals(fit: Fit, level: float = 0.95) -> FloatArray:
+    """Return the confidence intervals of a fit, widened as `correct_errors` widens standard errors: (d, 2).
+
+    Each side of an interval by itself, on a logarithmic scale its logarithm; cut off at the bounds.
+
+    Parameters
+    ----------
+    fit : Fit
+    level : float, between 0 and 1
+    """
+    factors, found = measure_widening(fit)[:, None], fit.confidence_intervals(level)
+    theta, log = fit.theta[:, None], np.isin(fit.theta_names, fit.log_scaled)[:, None]
+    origin = fit.log_origins[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = theta - origin
+        wide = np.where(log, origin + size * ((found - origin) / size) ** factors, theta + factors * (found - theta))
+    wide = np.where(factors > 1.0, wide, found)
+    return np.stack([np.maximum(wide[:, 0], fit.lower), np.minimum(wide[:, 1], fit.upper)], axis=1)
+
+
+def measure_widening(fit: Fit) -> FloatArray:
+    """Return by how much the standard errors of a fit are too small because residuals are correlated: (d,), at least 1.
+
     The largest factor of all channels counts; for a transition time, that of the channels of its own run.
 
     Parameters
     ----------
     fit : Fit
     """
-    errors = fit.standard_errors
+    each = np.ones(len(fit.theta))
     if fit.sigma_known is None or not fit.status.successful:
-        return errors
+        return each
     found = diagnose(fit)
     factors = np.ones(len(fit.comparisons))
     for channel, correlated in zip(found.channels, found.correlated, strict=True):
         if correlated and channel.widening > SERIOUS:
             factors[channel.experiment] = max(factors[channel.experiment], channel.widening)
-    each = np.full(len(errors), factors.max(initial=1.0))
+    each *= factors.max(initial=1.0)
     for factor, places in zip(factors, fit.transition_places, strict=True):
         each[places[places >= 0]] = factor
-    return np.asarray(each * errors)
+    return each
 
 
 def diagnose_channel(comparison: Comparison, k: int, experiment: int = 0, time_unit: str = "s") -> ChannelResiduals:

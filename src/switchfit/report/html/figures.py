@@ -1,0 +1,380 @@
+"""Figures of a page, drawn with Bokeh. Import this only where Bokeh is installed.
+
+The figures of runs are drawn without numbers, which the page's script puts into the sources by their names. Colours
+that have to change with the reader's light or dark background carry the tag "ink", "muted" or "edge"; the script sets
+them, and those of axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from bokeh.layouts import column
+from bokeh.models import ColumnDataSource, FactorRange, HoverTool, PlainText, PrintfTickFormatter, Range1d
+from bokeh.plotting import figure
+
+from switchfit.optimize import IterationRecord
+from switchfit.problem.data import FloatArray
+from switchfit.report.html.columns import FigureData
+from switchfit.report.html.curves import Curves, find_plane
+from switchfit.report.numbers import label_time
+
+FIT, DATA = "#d0392b", "#5b6470"
+"""Of what is fitted, readable on white and on black; of what is measured, until the page's script sets the ink."""
+BLUE = "#2f74c0"
+HEIGHT, RESIDUAL_HEIGHT, PATH_HEIGHT, SMALL_HEIGHT = 270, 130, 420, 230
+LEFT = 78
+"""Pixels to the left of all axes, so that figures below one another share their times."""
+UNBROKEN = {"break-inside": "avoid"}
+"""A channel is printed on one page."""
+TOOLS = "box_zoom,pan,wheel_zoom,reset,save"
+MOST_LABELLED = 12
+"""Unknowns up to which the fields of the heat map have their numbers in them."""
+
+
+# --- a run ------------------------------------------------------------------------------------------------------------
+
+
+def draw_run(curves: Sequence[Curves], data: FigureData, *, time_unit: str) -> Any:
+    """Return the figures of one run below one another: each channel with its residuals, and the path in the plane.
+
+    Parameters
+    ----------
+    curves : sequence of Curves
+        Of one of the runs that share the drawing.
+    data : FigureData
+        Of the same run: the columns that there are.
+    time_unit : str
+    """
+    sources = {name: make_source(name, columns) for name, columns in data.sources.items()}
+    times = _make_range("times", data)
+    blocks: list[Any] = []
+    number = 0
+    for c, own in enumerate(curves):
+        for k, name in enumerate(own.names):
+            panel = _make_time_figure(HEIGHT, times, _add_unit(name, own.units[k]))
+            _draw_modes(panel, sources)
+            _draw_curve(panel, own, k, sources[f"curve-{c}"])
+            parts = [panel]
+            if own.kind != "states":
+                _draw_samples(panel, own, k, sources[f"samples-{c}"], time_unit)
+                below = _make_time_figure(RESIDUAL_HEIGHT, times, "residual")
+                below.yaxis.formatter = PrintfTickFormatter(format="%.2g")
+                _draw_modes(below, sources)
+                _draw_residuals(below, own, k, sources[f"samples-{c}"], time_unit)
+                panel.xaxis.visible = False
+                parts.append(below)
+            parts[-1].xaxis.axis_label = PlainText(text=label_time(time_unit))
+            line = panel.select_one({"name": "fitted"})
+            _add_hover(panel, line, [("time", "t", time_unit), ("fitted", f"y{k}", ""), ("mode", "mode", "")])
+            _put_legend_above(panel)
+            blocks.append(
+                column(*parts, name=f"channel-{number}", sizing_mode="stretch_width", spacing=0, styles=UNBROKEN)
+            )
+            number += 1
+        if (plane := find_plane(own)) is not None:
+            blocks.append(_draw_path(own, plane, sources[f"curve-{c}"], sources[f"samples-{c}"], time_unit))
+    return column(*blocks, sizing_mode="stretch_width", spacing=6)
+
+
+def make_source(name: str, columns: Any) -> ColumnDataSource:
+    """Return a source with the columns, but none of their numbers.
+
+    Parameters
+    ----------
+    name : str
+    columns : mapping of name to column
+    """
+    return ColumnDataSource({key: [] for key in columns}, name=name)
+
+
+def describe_layout(curves: Sequence[Curves], time_unit: str) -> tuple[Any, ...]:
+    """Return what two runs have to share to be shown by the same drawing.
+
+    Parameters
+    ----------
+    curves : sequence of Curves
+    time_unit : str
+    """
+    each = [
+        (own.kind, own.names, own.units, own.band is None, own.sigma is None, own.outliers is None, _size_dots(own))
+        for own in curves
+    ]
+    return (time_unit, *each)
+
+
+def _make_range(name: str, data: FigureData) -> Range1d:
+    start, end = data.ranges[name]
+    return Range1d(start=start, end=end, name=name)
+
+
+def _add_unit(name: str, unit: str) -> str:
+    return f"{name} ({unit})" if unit else name
+
+
+def _size_dots(curves: Curves) -> float:
+    """Return the size of the dots, smaller the more there are."""
+    return 6.0 if len(curves.sample_times) <= 150 else 4.0 if len(curves.sample_times) <= 600 else 2.5
+
+
+def _make_figure(height: int, **settings: Any) -> Any:
+    plot = figure(
+        height=height,
+        sizing_mode="stretch_width",
+        tools=TOOLS,
+        active_drag="box_zoom",
+        toolbar_location="right",
+        min_border_left=LEFT,
+        min_border_right=10,
+        **settings,
+    )
+    plot.toolbar.logo = None
+    plot.toolbar.autohide = True
+    plot.background_fill_color = plot.outline_line_color = None
+    return plot
+
+
+def _make_time_figure(height: int, times: Range1d, label: str) -> Any:
+    plot = _make_figure(height, x_range=times)
+    plot.yaxis.axis_label = PlainText(text=label)
+    plot.xgrid.visible = False
+    plot.yaxis.ticker.desired_num_ticks = 5 if height > RESIDUAL_HEIGHT else 3
+    return plot
+
+
+def _put_legend_above(plot: Any) -> None:
+    """Move the legend out of the way of the data; a click on an entry hides what it stands for."""
+    plot.legend.click_policy = "hide"
+    plot.legend.orientation = "horizontal"
+    plot.add_layout(plot.legend[0], "above")
+
+
+def _tag(renderer: Any, tag: str) -> Any:
+    """Let the page's script colour a glyph."""
+    renderer.glyph.tags = [tag]
+    return renderer
+
+
+def _add_hover(plot: Any, renderer: Any, rows: Sequence[tuple[str, str, str]]) -> None:
+    """Show (label, column, unit) under the pointer. Bokeh escapes what is in columns, but neither labels nor units."""
+    texts = ("mode", "name", "modes", "value", "interval", "x_name", "y_name")
+    tips: list[tuple[str, str]] = []
+    formatters: dict[str, Any] = {}
+    for label, name, unit in rows:
+        if name in texts:
+            tips.append((label, f"@{name}"))
+            continue
+        plain = unit if unit.isalnum() and unit != "1" else ""
+        tips.append((label, f"@{name}{{%.6g}} {plain}".rstrip()))
+        formatters[f"@{name}"] = "printf"
+    plot.add_tools(HoverTool(renderers=[renderer], tooltips=tips, formatters=formatters, visible=False))
+
+
+def _draw_modes(plot: Any, sources: dict[str, ColumnDataSource]) -> None:
+    """Shade the modes, and draw the transition times in their intervals."""
+    plot.vstrip(
+        x0="left",
+        x1="right",
+        source=sources["modes"],
+        fill_color="colour",
+        fill_alpha=0.16,
+        line_color=None,
+        level="underlay",
+    )
+    own = sources["transitions"]
+    plot.vstrip(x0="low", x1="high", source=own, fill_color=DATA, fill_alpha=0.18, line_color=None, level="underlay")
+    line = _tag(plot.vspan(x="x", source=own, line_color=DATA, line_width=1.3), "ink")
+    rows = [("transition", "name", ""), ("modes", "modes", ""), ("time", "value", ""), ("95 %", "interval", "")]
+    _add_hover(plot, line, rows)
+
+
+def _draw_curve(plot: Any, curves: Curves, k: int, source: ColumnDataSource) -> None:
+    """Draw what is fitted: its band, the fit itself that is shown once something has been moved, what moves."""
+    if curves.band is not None:
+        band = {"y1": f"lo{k}", "y2": f"hi{k}", "legend_label": "95 % band"}
+        plot.varea(x="bt", source=source, fill_color=FIT, fill_alpha=0.25, **band)
+    still = plot.line("bt", f"b{k}", source=source, line_color=DATA, line_dash="dashed", line_width=1.2)
+    _tag(still, "muted")
+    still.name, still.visible = "still", False
+    plot.line("t", f"y{k}", source=source, line_color=FIT, line_width=2, legend_label="fitted", name="fitted")
+
+
+def _draw_samples(plot: Any, curves: Curves, k: int, source: ColumnDataSource, time_unit: str) -> None:
+    """Draw what is measured: dots, or a dashed line of a reference signal."""
+    if curves.kind == "reference":
+        dashed: dict[str, Any] = {"line_color": DATA, "line_dash": "dashed", "line_width": 1.6}
+        _tag(plot.line("t", f"m{k}", source=source, legend_label="reference", **dashed), "ink")
+        return
+    dots: dict[str, Any] = {"size": _size_dots(curves), "fill_color": DATA, "fill_alpha": 0.75, "line_color": None}
+    drawn = _tag(plot.scatter("t", f"m{k}", source=source, legend_label="measured", **dots), "ink")
+    if curves.outliers is not None:
+        rings: dict[str, Any] = {"size": 11, "fill_color": None, "line_color": FIT}
+        plot.scatter("t", f"o{k}", source=source, legend_label="weighed down", **rings)
+    _add_hover(plot, drawn, [("time", "t", time_unit), ("measured", f"m{k}", ""), ("residual", f"y{k}", "")])
+
+
+def _draw_residuals(plot: Any, curves: Curves, k: int, source: ColumnDataSource, time_unit: str) -> None:
+    plot.hspan(y=0.0, line_color=FIT, line_width=1)
+    if curves.kind == "reference":
+        drawn = _tag(plot.line("t", f"y{k}", source=source, line_color=DATA, line_width=1.2), "ink")
+    else:
+        for side in ("s", "n") if curves.sigma is not None else ():
+            _tag(plot.line("t", f"{side}{k}", source=source, line_color=DATA, line_dash="dotted"), "muted")
+        dots: dict[str, Any] = {"fill_color": DATA, "fill_alpha": 0.75, "line_color": None}
+        size = 0.75 * _size_dots(curves)
+        drawn = _tag(plot.scatter("t", f"y{k}", source=source, size=size, **dots), "ink")
+    _add_hover(plot, drawn, [("time", "t", time_unit), ("residual", f"y{k}", "")])
+
+
+def _draw_path(
+    curves: Curves, plane: tuple[int, int], curve: ColumnDataSource, samples: ColumnDataSource, time_unit: str
+) -> Any:
+    """Draw two positions against one another, with the transitions on the fitted path."""
+    x, y = plane
+    plot = _make_figure(PATH_HEIGHT, match_aspect=True)
+    plot.xaxis.axis_label = PlainText(text=_add_unit(curves.names[x], curves.units[x]))
+    plot.yaxis.axis_label = PlainText(text=_add_unit(curves.names[y], curves.units[y]))
+    if curves.kind == "reference":
+        dashed: dict[str, Any] = {"line_color": DATA, "line_dash": "dashed", "legend_label": "reference"}
+        _tag(plot.line(f"m{x}", f"m{y}", source=samples, **dashed), "ink")
+    else:
+        dots: dict[str, Any] = {"fill_color": DATA, "fill_alpha": 0.75, "line_color": None, "legend_label": "measured"}
+        _tag(plot.scatter(f"m{x}", f"m{y}", source=samples, size=_size_dots(curves), **dots), "ink")
+    line = plot.line(f"y{x}", f"y{y}", source=curve, line_color=FIT, line_width=2, legend_label="fitted")
+    mark: dict[str, Any] = {"marker": "diamond", "size": "size", "fill_color": FIT, "line_color": DATA}
+    _tag(plot.scatter(f"y{x}", f"y{y}", source=curve, legend_label="transition", **mark), "edge")
+    _add_hover(plot, line, [("time", "t", time_unit), ("mode", "mode", "")])
+    _put_legend_above(plot)
+    return plot
+
+
+# --- residuals --------------------------------------------------------------------------------------------------------
+
+
+def draw_diagnostics(data: FigureData) -> Any:
+    """Return the histogram, the quantiles or the autocorrelation of one channel's standardised residuals.
+
+    Parameters
+    ----------
+    data : FigureData
+        Which of them, and the columns that there are.
+    """
+    sources = {name: make_source(name, columns) for name, columns in data.sources.items()}
+    if data.template == "quantiles":
+        plot = _make_small("normal quantile", "residual")
+        plot.line("x", "y", source=sources["line"], line_color=FIT, line_width=1.4)
+        _tag(plot.scatter("x", "y", source=sources["dots"], size=4, fill_color=DATA, line_color=None), "ink")
+    elif data.template == "autocorrelation":
+        plot = _make_small("lag (samples)", "autocorrelation")
+        shade: dict[str, Any] = {"fill_color": BLUE, "fill_alpha": 0.2, "line_color": None, "level": "underlay"}
+        plot.hstrip(y0="low", y1="high", source=sources["limit"], **shade)
+        own = sources["lags"]
+        plot.segment("x", "zero", "x", "y", source=own, line_color=FIT, line_width=2)
+        plot.scatter("x", "y", source=own, size=6, fill_color=FIT, line_color=None)
+        plot.y_range = _make_range("reach", data)
+        plot.xaxis.ticker.min_interval = 1
+        _tag(plot.hspan(y=0.0, line_color=DATA, line_width=1), "ink")
+    else:
+        unit = "residual / sigma" if data.template == "histogram-sigma" else "residual / rms"
+        plot = _make_small(unit, "density")
+        bars: dict[str, Any] = {"fill_color": DATA, "fill_alpha": 0.35, "line_color": None}
+        _tag(plot.quad(left="left", right="right", bottom=0, top="top", source=sources["bars"], **bars), "ink")
+        plot.line("x", "y", source=sources["normal"], line_color=FIT, line_width=1.6)
+        plot.y_range.start = 0
+    return plot
+
+
+def _make_small(x: str, y: str) -> Any:
+    plot = _make_figure(SMALL_HEIGHT)
+    plot.min_border_left = 55
+    plot.xaxis.axis_label, plot.yaxis.axis_label = PlainText(text=x), PlainText(text=y)
+    return plot
+
+
+# --- the whole fit ----------------------------------------------------------------------------------------------------
+
+
+def draw_convergence(history: Sequence[IterationRecord], tolerance: float) -> dict[str, Any]:
+    """Return J and the optimality by iteration, by their names in the page; none of values that no axis can show.
+
+    Parameters
+    ----------
+    history : sequence of IterationRecord
+    tolerance : float
+    """
+    costs = np.array([record.cost for record in history], dtype=float)
+    wide = costs.min() > 0 and costs.max() > 30 * costs.min()
+    optimality = np.array([record.optimality for record in history], dtype=float)
+    optimality = np.where(optimality > 0, optimality, np.nan)
+    found = {}
+    given = ((costs, "cost J", "log" if wide else "linear"), (optimality, "optimality (KKT residual)", "log"))
+    for k, (values, label, scale) in enumerate(given):
+        if not np.isfinite(values).any():
+            continue
+        plot = _make_figure(SMALL_HEIGHT, y_axis_type=scale)
+        plot.xaxis.axis_label, plot.yaxis.axis_label = PlainText(text="iteration"), PlainText(text=label)
+        iterations, steps = ([getattr(record, name) for record in history] for name in ("iteration", "step"))
+        source = ColumnDataSource({"x": iterations, "y": values, "step": steps})
+        plot.line("x", "y", source=source, line_color=FIT, line_width=1.6)
+        dots = plot.scatter("x", "y", source=source, size=6, fill_color=FIT, line_color=None)
+        _add_hover(plot, dots, [("iteration", "x", ""), ("value", "y", ""), ("step", "step", "")])
+        plot.xaxis.ticker.min_interval = 1
+        if values is optimality:
+            _tag(plot.hspan(y=tolerance, line_color=DATA, line_dash="dashed"), "muted")
+        found[f"convergence-{k}"] = plot
+    return found
+
+
+def draw_correlation(names: Sequence[str], correlation: FloatArray) -> Any:
+    """Return the heat map of the correlations; red is positive, blue negative, the stronger the more opaque.
+
+    Parameters
+    ----------
+    names : sequence of str
+    correlation : (d, d)
+    """
+    d = len(names)
+    rows, columns = (grid.ravel().tolist() for grid in np.indices((d, d)))
+    values = correlation[rows, columns]
+    source = ColumnDataSource(
+        {
+            "x_name": [names[i] for i in columns],
+            "y_name": [names[i] for i in rows],
+            "value_": values,
+            "colour": np.where(values > 0, FIT, BLUE).tolist(),
+            "alpha": 0.85 * np.abs(values),
+            "text": [f"{value:.2f}" for value in values],
+        }
+    )
+    side = min(max(220 + 24 * d, 300), 900)
+    plot = _make_figure(side, x_range=FactorRange(factors=list(names)), y_range=FactorRange(factors=list(names)[::-1]))
+    plot.max_width = side + 120
+    plot.min_border_left = 20
+    fill: dict[str, Any] = {"fill_color": "colour", "fill_alpha": "alpha", "line_color": DATA, "line_alpha": 0.25}
+    drawn = plot.rect("x_name", "y_name", 1, 1, source=source, **fill)
+    if d <= MOST_LABELLED:
+        centred: dict[str, Any] = {"text_align": "center", "text_baseline": "middle", "text_font_size": "11px"}
+        _tag(plot.text("x_name", "y_name", text="text", source=source, **centred), "ink")
+    _add_hover(plot, drawn, [("unknown", "x_name", ""), ("and", "y_name", ""), ("correlation", "value_", "")])
+    plot.xaxis.major_label_orientation = 0.9
+    plot.grid.visible = False
+    return plot
+
+
+def draw_slice() -> Any:
+    """Return an empty figure of the rise of J along one unknown; the page's script fills it."""
+    plot = _make_figure(SMALL_HEIGHT)
+    plot.min_border_left = 70
+    plot.xaxis.axis_label, plot.yaxis.axis_label = PlainText(text="", name="slice-label"), PlainText(text="rise of J")
+    source, mark = make_source("slice", ("x", "exact", "quadratic")), make_source("mark", ("x", "y"))
+    plot.line("x", "exact", source=source, line_color=FIT, line_width=2, legend_label="exact")
+    _tag(
+        plot.line("x", "quadratic", source=source, line_color=DATA, line_dash="dashed", legend_label="quadratic"),
+        "muted",
+    )
+    _tag(plot.scatter("x", "y", source=mark, size=10, fill_color=FIT, line_color=DATA), "edge")
+    plot.yaxis.formatter = PrintfTickFormatter(format="%.2g")
+    _put_legend_above(plot)
+    return plot

@@ -1,0 +1,192 @@
+"""Sliders: how far an unknown may be moved, and the exact J on the way.
+
+The curves move by their derivatives, ``x(t; theta + d) ~ x + S d``, and how far that is off is measured: the model is
+simulated at both ends of a slider. J along one unknown, the others held, is evaluated; where several are moved, J is
+the quadratic approximation ``J + g d + d' H d / 2``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from switchfit.estimation.estimator import Estimate
+from switchfit.fit.trajectory import select_visible
+from switchfit.problem.data import FloatArray
+from switchfit.report.html.curves import Curves
+
+SIDE_POINTS = 20
+"""Values of J to each side of the estimate."""
+VISIBLE = 0.15
+"""Part of a channel's range by which the end of a slider moves the curve, if the bounds allow it."""
+LARGEST_GAP = 0.1
+"""Part of its range by which a curve may be off at the ends of a slider; the slider is made shorter until it is not."""
+HALVINGS = 6
+ERRORS = 3.0
+"""Standard errors that a slider reaches, unless the curves are too far off there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Slider:
+    """One unknown that can be moved.
+
+    Attributes
+    ----------
+    place : int
+        In theta.
+    values, costs : (M,)
+        J along this unknown, the others held; NaN where it cannot be evaluated.
+    gap : float
+        Root mean square by which the curves that move by their derivatives are off at the ends, as a part of the
+        channel's range; of the worst channel. NaN where they cannot be simulated.
+    """
+
+    place: int
+    values: FloatArray
+    costs: FloatArray
+    gap: float
+
+
+def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Sequence[int]) -> list[Slider]:
+    """Return a slider for each unknown that has room to move.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        With its problem.
+    runs : mapping of run to its curves
+        Those that are shown.
+    places : sequence of int
+        The unknowns.
+    """
+    found = []
+    for place in places:
+        (low, high), theta = find_range(estimate, runs, place), float(estimate.theta[place])
+        if not low < high:
+            continue
+        gap = measure_gap(estimate, runs, place, (low, high))
+        for _ in range(HALVINGS):
+            if not gap > LARGEST_GAP:
+                break
+            low, high = 0.5 * (low + theta), 0.5 * (high + theta)
+            gap = measure_gap(estimate, runs, place, (low, high))
+        below = np.linspace(low, theta, SIDE_POINTS + 1) if low < theta else np.array([theta])
+        above = np.linspace(theta, high, SIDE_POINTS + 1)[1:] if high > theta else np.zeros(0)
+        values = np.concatenate([below, above])
+        costs = np.array([evaluate_moved(estimate, place, value) for value in values])
+        found.append(Slider(place, values, costs, gap))
+    return found
+
+
+def find_range(estimate: Estimate, runs: dict[int, list[Curves]], place: int) -> tuple[float, float]:
+    """Return how far an unknown can be moved: until a curve has moved visibly, inside its bounds, in its order.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    runs : mapping of run to its curves
+    place : int
+    """
+    theta = float(estimate.theta[place])
+    wanted = []
+    for curves in (c for run in runs.values() for c in run if place in c.tangents):
+        for k in range(len(curves.names)):
+            extent, slope = _find_extent(curves.values[:, k]), _find_largest(curves.tangents[place][:, k])
+            if extent > 0 and slope > 0:
+                wanted.append(VISIBLE * extent / slope)
+    error = float(estimate.standard_errors[place])
+    half = min(wanted, default=0.0)
+    half = max(half, ERRORS * error) if np.isfinite(error) else half
+    half = half or 0.1 * abs(theta) or 1.0
+    low, high = max(theta - half, float(estimate.lower[place])), min(theta + half, float(estimate.upper[place]))
+    if place in np.flatnonzero(estimate.is_time):
+        before, after = _find_neighbours(estimate, place)
+        low, high = max(low, before + 0.02 * (theta - before)), min(high, after - 0.02 * (after - theta))
+    return low, high
+
+
+def evaluate_moved(estimate: Estimate, place: int, value: float) -> float:
+    """Return J with one unknown moved, by evaluating the runs that depend on it.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    place : int
+    value : float
+    """
+    evaluator = estimate.evaluator_at_solution()
+    problem = evaluator.problem
+    moved = estimate.theta.copy()
+    moved[place] = value
+    total = estimate.cost
+    for e, places in enumerate(problem.places):
+        if place in places:
+            now, then = (problem.vectors(theta, e) for theta in (moved, estimate.theta))
+            total += evaluator.engines[e].cost(*now) - evaluator.engines[e].cost(*then)
+    if problem.unknowns.priors.any:
+        now_prior, then_prior = (float(problem.unknowns.priors.evaluate(t)[0]) for t in (moved, estimate.theta))
+        total += now_prior - then_prior
+    return float(total) if np.isfinite(total) else np.nan
+
+
+def measure_gap(estimate: Estimate, runs: dict[int, list[Curves]], place: int, ends: tuple[float, float]) -> float:
+    """Return how far the linear curves are off at the ends of a slider: root mean square over a channel's range.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    runs : mapping of run to its curves
+    place : int
+    ends : (float, float)
+    """
+    evaluator = estimate.evaluator_at_solution()
+    gaps = []
+    for e, run in runs.items():
+        for end in ends if any(place in curves.tangents for curves in run) else ():
+            moved = estimate.theta.copy()
+            moved[place] = end
+            s = evaluator.engines[e].simulate(*evaluator.problem.vectors(moved, e), tangents=False)
+            times, outputs, states = (
+                select_visible(s, *pair) for pair in ((s.start, s.end), (s.y_before, s.y_after), (s.before, s.after))
+            )
+            first = 0
+            for curves in run:
+                if curves.kind == "states":
+                    names = estimate.trajectories[e].state_names
+                    exact = states[:, [names.index(name) for name in curves.names]]
+                else:
+                    exact = outputs[:, first : (first := first + len(curves.names))]
+                there = np.isfinite(curves.times)
+                at = curves.times[there] - (curves.times[0] - estimate.trajectories[e].times[0])
+                linear = curves.values[there] + (end - estimate.theta[place]) * curves.tangents[place][there]
+                for k in range(len(curves.names)):
+                    extent = _find_extent(curves.values[:, k])
+                    off = np.interp(at, times, exact[:, k]) - linear[:, k]
+                    if extent > 0 and np.isfinite(off).any():
+                        gaps.append(float(np.sqrt(np.nanmean(off**2))) / extent)
+    return max(gaps, default=np.nan)
+
+
+def _find_extent(values: FloatArray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.ptp(finite)) if len(finite) else 0.0
+
+
+def _find_largest(values: FloatArray) -> float:
+    return float(np.nanmax(np.abs(values), initial=0.0))
+
+
+def _find_neighbours(estimate: Estimate, place: int) -> tuple[float, float]:
+    """Return the transition times, or ends of the horizon, between which one of them has to stay."""
+    each = zip(
+        estimate.trajectories, estimate.transition_times, estimate.transition_places, estimate.final_places, strict=True
+    )
+    for trajectory, times, places, final in each:
+        own = [*places.tolist(), final]
+        if place in own:
+            k = own.index(place)
+            around = [float(trajectory.times[0]), *times.tolist(), float(trajectory.times[-1])]
+            return around[k], around[k + 2] if k + 2 < len(around) else np.inf
+    return -np.inf, np.inf

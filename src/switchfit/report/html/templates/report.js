@@ -1,0 +1,234 @@
+"use strict";
+(() => {
+  const payload = JSON.parse(document.getElementById("payload").textContent);
+  const sliders = payload.sliders;
+  const known = (value) => (value === null ? NaN : value); // JSON has no NaN
+  const documents = new Map(); // name of a figure -> Bokeh document
+  const dark = window.matchMedia("(prefers-color-scheme: dark)");
+  const coarse = window.matchMedia("(pointer: coarse)").matches;
+  const moved = sliders.map(() => 0);
+  let last = 0;
+
+  // --- figures -------------------------------------------------------------------------------------------------------
+
+  function paint(root, name) {
+    const style = getComputedStyle(document.documentElement);
+    const [page, ink, muted, faint, panel] = ["page", "ink", "muted", "faint", "panel"].map((name) =>
+      style.getPropertyValue(`--${name}`).trim());
+    const tagged = { ink, muted, faint, edge: page };
+    for (const model of root.references()) {
+      if (model.type === "Figure") {
+        model.border_fill_color = name === "slice" ? panel : page;
+        if (coarse) model.toolbar.active_drag = null; // a finger scrolls the page
+      } else if (model.type.endsWith("Axis")) {
+        model.setv({
+          axis_line_color: muted, major_tick_line_color: muted, minor_tick_line_color: null,
+          major_label_text_color: ink, axis_label_text_color: ink, axis_label_text_font_style: "normal",
+        });
+      } else if (model.type === "Grid") {
+        model.grid_line_color = faint;
+      } else if (model.type === "Legend") {
+        model.setv({
+          label_text_color: ink, background_fill_color: null, border_line_color: null, inactive_fill_color: page,
+          label_text_font_size: "12px", padding: 2, margin: 0, spacing: 12,
+        });
+      }
+      for (const tag of model.tags) {
+        const colour = tagged[tag];
+        if (colour === undefined) continue;
+        for (const name of tag === "edge" ? ["line_color"] : ["line_color", "fill_color", "text_color"]) {
+          if (!(name in model)) continue;
+          const now = model[name];
+          if (now === null || (typeof now === "object" && now.value == null)) continue;
+          model[name] = typeof now === "object" ? { value: colour } : colour;
+        }
+      }
+    }
+  }
+
+  // Put numbers into a copy of a drawing, by the names of its sources and ranges.
+  function fill(part, { sources, ranges }) {
+    if (Array.isArray(part)) return part.map((entry) => fill(entry, { sources, ranges }));
+    if (part === null || typeof part !== "object") return part;
+    const copy = Object.fromEntries(Object.entries(part).map(([key, value]) => [key, fill(value, { sources, ranges })]));
+    const name = part.type === "object" && part.attributes && part.attributes.name;
+    if (name && sources[name]) copy.attributes.data = sources[name];
+    if (name && ranges[name]) Object.assign(copy.attributes, ranges[name]);
+    return copy;
+  }
+
+  async function embed(name) {
+    if (documents.has(name)) return;
+    documents.set(name, null);
+    const figure = payload.figures[name];
+    if (name === "slice") figure.sources = sliceSources();
+    const views = await Bokeh.embed.embed_item(fill(payload.templates[figure.template], figure), name);
+    const root = [...views.roots][0].model;
+    paint(root, name);
+    documents.set(name, root.document);
+    const run = name.startsWith("run-") ? document.getElementById(name).closest(".run") : null;
+    if (run) run.querySelectorAll("[data-channel]").forEach(switchChannel);
+  }
+
+  function repaint() {
+    for (const [name, doc] of documents) if (doc) doc.roots().forEach((root) => paint(root, name));
+  }
+  dark.addEventListener("change", repaint);
+
+  // --- runs ----------------------------------------------------------------------------------------------------------
+
+  async function show(choice) {
+    for (const element of document.querySelectorAll(".run")) {
+      element.classList.toggle("shown", choice === "all" || element.dataset.run === choice);
+    }
+    const chosen = choice === "all" ? Object.keys(payload.groups) : [choice];
+    document.querySelectorAll(".slider").forEach((element, k) => {
+      element.classList.toggle("shown", chosen.some((run) => sliders[k].runs.includes(Number(run))));
+    });
+    for (const run of chosen) for (const name of payload.groups[run]) await embed(name);
+    move();
+  }
+
+  function switchChannel(box) {
+    const doc = documents.get(`run-${box.closest(".run").dataset.run}`);
+    if (doc) doc.get_model_by_name(`channel-${box.dataset.channel}`).visible = box.checked;
+  }
+  for (const box of document.querySelectorAll("[data-channel]")) {
+    box.addEventListener("change", () => switchChannel(box));
+  }
+
+  // --- sliders -------------------------------------------------------------------------------------------------------
+
+  const ends = (k) => [sliders[k].values[0], sliders[k].values[sliders[k].values.length - 1]];
+  const number = (value, digits) => (value !== 0 && (Math.abs(value) < 1e-3 || Math.abs(value) >= 1e7)
+    ? value.toExponential(digits - 1) : value.toPrecision(digits));
+  const digits = (value, step) => value.toFixed(Math.min(Math.max(1 - Math.floor(Math.log10(Math.abs(step) || 1)), 0), 12));
+
+  function interpolate(k, value) {
+    const { values, costs } = sliders[k];
+    let i = 1;
+    while (i < values.length - 1 && values[i] < value) i += 1;
+    if (costs[i] === null || costs[i - 1] === null) return null;
+    return costs[i - 1] + (costs[i] - costs[i - 1]) * (value - values[i - 1]) / (values[i] - values[i - 1]);
+  }
+
+  function quadratic(change) {
+    let cost = payload.cost;
+    change.forEach((d, i) => {
+      if (d !== 0) cost += known(payload.gradient[i]) * d;
+      change.forEach((other, j) => {
+        if (d !== 0 && other !== 0) cost += 0.5 * d * known(payload.hessian[i][j]) * other;
+      });
+    });
+    return cost;
+  }
+
+  function moveCurves(name, doc) {
+    const by = new Map(sliders.map((slider, k) => [slider.place, moved[k]]));
+    const shift = (place) => by.get(place) || 0;
+    function change(key, edit) {
+      const source = doc.get_model_by_name(key);
+      const data = { ...source.data };
+      edit(data);
+      source.data = data;
+    }
+    change("modes", (data) => {
+      data.left = Float64Array.from(data.left_b, (left, i) => left + shift(data.left_place[i]));
+      data.right = Float64Array.from(data.right_b, (right, i) => right + shift(data.right_place[i]));
+    });
+    change("transitions", (data) => { data.x = Float64Array.from(data.x_b, (x, i) => x + shift(data.place[i])); });
+    for (const [key, { channels, places, delay }] of Object.entries(payload.figures[name].moves)) {
+      change(key, (data) => {
+        for (let k = 0; k < channels; k += 1) {
+          const values = Float64Array.from(data[`b${k}`]);
+          for (const place of places) {
+            const d = shift(place);
+            const slope = data[`d${place}_${k}`];
+            if (d !== 0) for (let i = 0; i < values.length; i += 1) values[i] += slope[i] * d;
+          }
+          data[`y${k}`] = values;
+        }
+        if (delay >= 0) data.t = Float64Array.from(data.bt, (t) => t + shift(delay));
+      });
+    }
+    const still = moved.some((d) => d !== 0);
+    for (const model of doc.roots().flatMap((root) => [...root.references()])) {
+      if (model.name === "still") model.visible = still;
+    }
+  }
+
+  // What is in the figure of J: columns by source.
+  function sliceColumns() {
+    const { values, costs, theta } = sliders[last];
+    const change = (value) => sliders.map((_, k) => (k === last ? value - theta : 0));
+    const rise = (cost) => known(cost) - payload.cost;
+    return {
+      slice: { x: values, exact: costs.map(rise), quadratic: values.map((value) => rise(quadratic(change(value)))) },
+      mark: { x: [theta + moved[last]], y: [rise(interpolate(last, theta + moved[last]))] },
+    };
+  }
+
+  function sliceSources() {
+    return Object.fromEntries(Object.entries(sliceColumns()).map(([name, columns]) =>
+      [name, { type: "map", entries: Object.entries(columns) }]));
+  }
+
+  function drawSlice() {
+    const doc = documents.get("slice");
+    if (!doc) return;
+    for (const [name, columns] of Object.entries(sliceColumns())) doc.get_model_by_name(name).data = columns;
+    const { name, unit } = sliders[last];
+    doc.get_model_by_name("slice-label").text = unit ? `${name} (${unit})` : name;
+  }
+
+  function move() {
+    if (!sliders.length) return;
+    sliders.forEach((slider, k) => {
+      const [low, high] = ends(k);
+      const step = (high - low) / 400;
+      const output = document.querySelector(`[data-slider="${k}"] output`);
+      const change = moved[k] ? ` (${moved[k] > 0 ? "+" : "−"}${digits(Math.abs(moved[k]), step)})` : "";
+      output.textContent = `${digits(slider.theta + moved[k], step)} ${slider.unit}`.trim() + change;
+    });
+    const away = moved.flatMap((d, k) => (d === 0 ? [] : [k]));
+    const one = away.length === 1 ? interpolate(away[0], sliders[away[0]].theta + moved[away[0]]) : null;
+    const cost = away.length === 0 ? payload.cost : one === null ? quadratic(moved) : one;
+    const how = away.length === 0 ? "at the estimate" : one === null ? "by the quadratic approximation" : "evaluated";
+    const rise = away.length ? `, ${number(cost - payload.cost, 3)} above the estimate's` : "";
+    document.getElementById("cost").textContent = Number.isNaN(cost) ? "J is not known there" : `J = ${number(cost, 8)}${rise} (${how})`;
+    for (const [name, doc] of documents) if (doc && name.startsWith("run-")) moveCurves(name, doc);
+    drawSlice();
+  }
+
+  function place(k) {
+    const [low, high] = ends(k);
+    document.getElementById(`slider-${k}`).value = Math.round(400 * (sliders[k].theta + moved[k] - low) / (high - low));
+  }
+
+  sliders.forEach((slider, k) => {
+    place(k);
+    document.getElementById(`slider-${k}`).addEventListener("input", (event) => {
+      const [low, high] = ends(k);
+      const value = low + (high - low) * Number(event.target.value) / 400;
+      moved[k] = Math.abs(value - slider.theta) <= 0.5 * (high - low) / 400 ? 0 : value - slider.theta;
+      last = k;
+      move();
+    });
+  });
+  const reset = document.getElementById("reset");
+  if (reset) reset.addEventListener("click", () => { moved.fill(0); sliders.forEach((_, k) => place(k)); move(); });
+
+  // --- start ---------------------------------------------------------------------------------------------------------
+
+  window.addEventListener("beforeprint", () => {
+    for (const details of document.querySelectorAll("details")) details.open = true;
+  });
+  const chooser = document.getElementById("run");
+  if (chooser) chooser.addEventListener("change", () => show(chooser.value));
+  (async () => {
+    await show("0");
+    for (const name of payload.always) await embed(name);
+    move();
+    document.documentElement.dataset.ready = "true";
+  })();
+})();

@@ -1,0 +1,735 @@
+"""The report as one HTML file: what it says, that it needs nothing else, and what it does in a browser."""
+
+import base64
+import gzip
+import hashlib
+import html.parser
+import importlib.metadata
+import importlib.util
+import io
+import json
+import re
+import runpy
+import warnings
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import switchfit as sf
+from switchfit import cli
+from switchfit.io.problem_file import load_problem
+from switchfit.models import heater_problem
+from switchfit.report.html.curves import collect_curves, find_plane, list_places
+from switchfit.report.html.inputs import collect_inputs
+from switchfit.report.html.sliders import LARGEST_GAP, build_sliders, evaluate_moved
+from switchfit.report.text import format_end, tabulate_unknowns
+from switchfit.runtime.presentation import format_page
+from switchfit.uncertainty.residuals import correct_errors, correct_intervals
+
+pytest.importorskip("bokeh", reason="needs the extra report: pip install 'switchfit[report]'")
+pages = importlib.import_module("switchfit.report.html.page")
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+TOSS = EXAMPLES / "toss" / "problem.toml"
+LARGEST = 5_000_000
+"""Bytes of a page."""
+VOID = {"meta", "link", "input", "br", "img", "hr"}
+HOSTILE = '<script>window.hacked = true</script>"><img src=x onerror="window.hacked = true">'
+
+
+class Reader(html.parser.HTMLParser):
+    """Reads a page strictly: elements in their order with their attributes, tables as text, scripts apart."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.elements, self.tables, self.scripts, self.text = [], [], [], [], []
+        self.feed(text)
+        self.close()
+        assert not self.open, f"not closed: {self.open}"
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+        if tag not in VOID:
+            self.open.append(tag)
+        if tag == "table":
+            self.tables.append([])
+        elif tag == "tr":
+            self.tables[-1].append([])
+        elif tag in ("td", "th"):
+            self.tables[-1][-1].append("")
+
+    def handle_endtag(self, tag):
+        assert self.open
+        assert self.open.pop() == tag
+
+    def handle_data(self, text):
+        if self.open and self.open[-1] == "script":
+            self.scripts.append(text)
+            return
+        self.text.append(text)
+        if {"td", "th"} & set(self.open):
+            self.tables[-1][-1][-1] += text
+
+    @property
+    def words(self):
+        return " ".join(" ".join(self.text).split())
+
+
+def payload_of(text):
+    return json.loads(re.search(r'<script type="application/json" id="payload">(.*?)</script>', text, re.DOTALL)[1])
+
+
+def array_of(sources, source, column):
+    """A column of a source, from what Bokeh makes of it."""
+    entry = dict(sources[source]["entries"])[column]
+    return np.frombuffer(gzip.decompress(base64.b64decode(entry["array"]["data"])), dtype=entry["dtype"]).astype(float)
+
+
+@pytest.fixture(scope="module")
+def toss():
+    loaded = load_problem(TOSS)
+    return sf.estimate(loaded.problem, **loaded.options)
+
+
+@pytest.fixture(scope="module")
+def toss_page(toss):
+    return format_page(toss, problem_file=TOSS, options={"strategy": "auto"})
+
+
+@pytest.fixture(scope="module")
+def heater():
+    return sf.estimate(heater_problem())
+
+
+def hostile_problem(name=HOSTILE):
+    """Names of everything that a user names, made to do harm; positions x and y among the names."""
+    system = sf.HybridSystem(
+        {name: lambda t, x, p: p["$$k$$"] * jnp.ones(2), "b": lambda t, x, p: jnp.zeros(2)},
+        [0.0, 0.0],
+        state_names=(name, "@{t}{safe} $$y$$"),
+        state_units=("</script>", "m"),
+    )
+    times = np.linspace(0.1, 4.0, 30)
+    noise = 0.05 * np.random.default_rng(1).normal(size=(30, 2))
+    values = np.minimum(times, 2.2)[:, None] * [1.0, 1.0] + noise
+    data = sf.Measurements(times, values, sigma=0.05)
+    runs = [
+        sf.Experiment(data, (name, "b"), (2.0,), 0.0, 4.0, name=run, time_unit="</script>")
+        for run in ("<b>run</b>", "<i>run</i>")
+    ]
+    return sf.Problem(system, runs, {"$$k$$": sf.Parameter(0.9, unit="<i>")})
+
+
+def ramp(t, x, p):
+    return p["v"] * jnp.ones(1)
+
+
+def rest(t, x, p):
+    return jnp.zeros(1)
+
+
+RAMP = sf.HybridSystem({"ramp": ramp, "rest": rest}, [0.0], state_names=("x",), state_units=("m",))
+
+
+def ramps(count=1, *, spread=0.02, **settings):
+    """Runs that stop at different times; the last is the noisiest."""
+    random = np.random.default_rng(0)
+    times = np.linspace(0.1, 4.0, 40)
+    runs = []
+    for e in range(count):
+        values = np.minimum(times, 2.0 + 0.01 * e)[:, None]
+        noise = spread * (1 + 4 * (e == count - 1)) * random.normal(size=values.shape)
+        data = sf.Measurements(times, values + noise, names=("x",), **settings)
+        runs.append(sf.Experiment(data, ("ramp", "rest"), (1.8,), 0.0, 4.0))
+    return runs
+
+
+def late_problem():
+    """An estimated delay, a robust loss with an outlier, a missing sample, a fixed parameter and a free tf."""
+    times = np.linspace(0.2, 4.2, 41)
+    values = np.minimum(np.maximum(times - 0.2, 0.0), 2.0)[:, None] + 0.01 * np.sin(37 * times)[:, None]
+    values[20] += 1.0
+    values[5] = np.nan
+    data = sf.Measurements(times, values, names=("x",), sigma=0.01, delay="late", loss="huber")
+    run = sf.Experiment(data, ("ramp", "rest"), (1.8,), 0.0, 4.2)
+    unknowns = {"v": 0.9, "late": sf.Parameter(0.1, lower=0.0, upper=0.2, unit="s")}
+    return sf.Problem(RAMP, run, unknowns)
+
+
+def clock_problem():
+    """No data at all: the time at which a state is reached, with a free tf."""
+    end = sf.TerminalConstraint(lambda x, p: x[0] - 1.0)
+    data = [sf.RunningCost(lambda t, x, p: 1.0 + 0.0 * x[0]), end]
+    run = sf.Experiment(data, ("ramp",), (), 0.0, sf.Parameter(1.2, lower=0.2, upper=5.0))
+    return sf.Problem(RAMP, run, {"v": sf.Parameter(1.0, fixed=True)})
+
+
+# --- content ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_verdict_comes_first_with_reasons_and_what_to_do(toss, toss_page):
+    words = Reader(toss_page).words
+    level = toss.verdict.level.capitalize()
+    assert words.index(level) < words.index("Estimates")
+    for part in str(toss.verdict).removesuffix(".").removeprefix(f"{level}: ").split(": ")[-1].split(", or "):
+        assert part in words
+
+
+def test_numbers_are_those_of_the_estimate(toss, toss_page):
+    table = next(t for t in Reader(toss_page).tables if t[0][1] == "value")
+    rows, note = tabulate_unknowns(toss, range(len(toss.theta)), ends=True)
+    assert [row[0] for row in table[1:]] == list(toss.theta_names)
+    assert table == [[row[k] for k in rows.columns] for row in rows.rows]
+    head = table[0]
+    low, high = head.index("95 % from"), head.index("to")
+    for i, row in enumerate(table[1:]):
+        scale = correct_errors(toss)[i]
+        assert float(row[1]) == pytest.approx(toss.theta[i], abs=0.06 * scale)
+        assert float(row[2].removeprefix("± ")) == pytest.approx(scale, rel=0.06)
+        assert float(row[head.index("naive")].removeprefix("± ")) == pytest.approx(toss.standard_errors[i], rel=0.06)
+        np.testing.assert_allclose([float(row[low]), float(row[high])], correct_intervals(toss)[i], atol=0.04 * scale)
+    assert note in Reader(toss_page).words
+
+
+def test_sentences_are_those_of_the_text(toss, toss_page):
+    words = Reader(toss_page).words
+    for title in ("cost J", "KKT residual", "integration error", "status", "method"):
+        line = next(line for line in toss.report(full=True).splitlines() if line.strip().startswith(title))
+        assert " ".join(line.split()) in words
+    certificate = str(sf.Estimate.certificate.func(toss)) if toss.known_certificate else ""
+    assert all(" ".join(line.split()) in words for line in certificate.splitlines())
+
+
+def test_curves_and_samples_in_the_page_are_those_of_the_fit(toss, toss_page):
+    sources = payload_of(toss_page)["figures"]["run-0"]["sources"]
+    comparison = toss.comparisons[0][0]
+    np.testing.assert_array_equal(array_of(sources, "samples-0", "m0"), comparison.measured[:, 0])
+    np.testing.assert_allclose(array_of(sources, "samples-0", "y1"), comparison.residuals[:, 1], atol=1e-15)
+    times, curve = array_of(sources, "curve-0", "t"), array_of(sources, "curve-0", "y0")
+    np.testing.assert_array_equal(np.isnan(times), np.isnan(curve))
+    there = ~np.isnan(times)
+    np.testing.assert_allclose(curve[there], np.interp(times[there], comparison.curve_times, comparison.curve[:, 0]))
+    assert np.isnan(times).sum() == 1, "broken at the transition"
+
+
+def test_residuals_in_the_page_move_against_the_fit(toss, toss_page):
+    sources = payload_of(toss_page)["figures"]["run-0"]["sources"]
+    evaluator = toss.evaluator_at_solution()
+    for place in (toss.theta_names.index("mu"), toss.theta_names.index("vx0")):
+        theta = toss.theta.copy()
+        theta[place] += 1e-4
+        moved, now = (evaluator.simulate(at)[0].seen[0][:, 0] for at in (theta, toss.theta))
+        slopes = array_of(sources, "samples-0", f"d{place}_0")
+        count = len(slopes)
+        np.testing.assert_allclose(slopes, (now - moved)[:count] / 1e-4, atol=2e-3 * np.abs(slopes).max())
+        assert np.abs(slopes).max() > 0.01
+
+
+def test_the_inputs_are_there_to_run_it_again(toss_page):
+    reader = Reader(toss_page)
+    assert " ".join(TOSS.read_text().split()) in reader.words
+    files = next(t for t in reader.tables if t[0][-1] == "SHA-256")
+    for row in files[1:]:
+        raw = (TOSS.parent / row[0]).read_bytes()
+        assert row[1:] == [f"{len(raw):,} bytes", hashlib.sha256(raw).hexdigest()]
+    assert [row[0] for row in files[1:]] == ["problem.toml", "toss_000.csv"]
+    assert f"switchfit {importlib.metadata.version('switchfit')}" in reader.words
+    assert "strategy auto" in reader.words
+
+
+def test_without_a_problem_file_the_data_are_hashed(heater):
+    found = collect_inputs(heater)
+    log = heater.problem.experiments[0].data[0]
+    raw = np.column_stack([log.times, log.values]).astype("<f8").tobytes()
+    assert [file.sha256 for file in found.files] == [hashlib.sha256(raw).hexdigest()]
+
+
+def test_files_that_a_problem_file_names_are_found_wherever_it_names_them(heater, tmp_path):
+    (tmp_path / "a.csv").write_text("t,y\n")
+    (tmp_path / "m.py").write_text("")
+    text = 'model = "m.py:make"\n[[experiments]]\nmode_sequence = ["on"]\n[[experiments.data]]\nfile = "a.csv"\n'
+    (tmp_path / "p.toml").write_text(text + 'columns = ["x"]\nobserve = "gone.py:see"\n')
+    found = collect_inputs(heater, tmp_path / "p.toml")
+    assert [(file.name, bool(file.sha256)) for file in found.files] == [
+        ("p.toml", True), ("m.py", True), ("a.csv", True), ("gone.py", False),
+    ]  # fmt: skip
+    assert found.files[-1].size == "not read: No such file or directory"
+
+
+def test_intervals_are_widened_as_the_errors_are(toss, heater):
+    np.testing.assert_array_equal(correct_intervals(heater), heater.confidence_intervals())
+    factors = correct_errors(toss) / toss.standard_errors
+    assert (factors > 2).all()
+    narrow, wide = toss.confidence_intervals(), correct_intervals(toss)
+    for k in (0, 1):
+        free = (wide[:, k] > toss.lower) & (wide[:, k] < toss.upper)
+        assert free.any()
+        off = (wide[:, k] - toss.theta) / (narrow[:, k] - toss.theta)
+        np.testing.assert_allclose(off[free], factors[free], rtol=1e-9)
+
+
+def test_intervals_on_a_logarithmic_scale_are_widened_there(toss):
+    problem = load_problem(TOSS).problem
+    mu = sf.Parameter(0.3, lower=0.01, upper=2.0, unit="1", scale="log")
+    fit = sf.estimate(sf.Problem(problem.system, problem.experiments, {**problem.parameters, "mu": mu}))
+    i = fit.theta_names.index("mu")
+    factor = correct_errors(fit)[i] / fit.standard_errors[i]
+    narrow, wide = (
+        np.log(fit.confidence_intervals()[i] / fit.theta[i]),
+        np.log(correct_intervals(fit)[i] / fit.theta[i]),
+    )
+    assert factor > 2
+    np.testing.assert_allclose(wide, factor * narrow, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("ends", "shown"),
+    [((0.21395, 0.218461), ("0.21395", "0.21846")), ((-np.inf, 1.0), ("", "")), ((np.nan, np.nan), ("", ""))],
+)
+def test_ends_of_intervals_have_the_digits_of_their_width(ends, shown):
+    assert tuple(format_end(end, np.array(ends)) for end in ends) == shown
+
+
+# --- sliders ----------------------------------------------------------------------------------------------------------
+
+
+def test_costs_along_an_unknown_are_exact(toss, toss_page):
+    payload = payload_of(toss_page)
+    assert {slider["name"] for slider in payload["sliders"]} == set(toss.theta_names)
+    evaluator = toss.evaluator_at_solution()
+    for slider in payload["sliders"]:
+        assert slider["values"][0] < slider["theta"] < slider["values"][-1]
+        assert slider["theta"] in slider["values"]
+        for k in (0, 7, -1):
+            theta = toss.theta.copy()
+            theta[slider["place"]] = slider["values"][k]
+            assert slider["costs"][k] == pytest.approx(evaluator.cost(theta), rel=1e-9)
+
+
+def test_costs_of_joint_fits_count_all_runs_and_the_priors():
+    known = sf.Parameter(0.9, prior=sf.Normal(1.0, 0.01))
+    fit = sf.estimate(sf.Problem(RAMP, ramps(3, sigma=0.02), {"v": known}))
+    for place in range(len(fit.theta)):
+        theta = fit.theta.copy()
+        theta[place] += 0.01
+        expected = fit.evaluator_at_solution().cost(theta)
+        assert evaluate_moved(fit, place, theta[place]) == pytest.approx(expected, rel=1e-12)
+
+
+def test_curves_follow_an_unknown_to_first_order(toss):
+    """Off by the square of the step, and a residual by as much the other way."""
+    place = toss.theta_names.index("mu")
+    (own, *_) = collect_curves(toss, 0, [place], 800)
+    errors = []
+    for step in (1e-2, 5e-3):
+        theta = toss.theta.copy()
+        theta[place] += step
+        path = sf.simulate(toss.problem, theta)
+        there = ~np.isnan(own.times)
+        exact = np.interp(own.times[there], path.times, path.states[:, 0])
+        errors.append(np.abs(exact - own.values[there, 0] - step * own.tangents[place][there, 0]).max())
+        samples = np.interp(own.sample_times, path.times, path.states[:, 0])
+        off = samples - own.fitted[:, 0] - step * own.sample_tangents[place][:, 0]
+        assert np.abs(off).max() < 0.02 * step
+    assert errors[0] < 0.02 * 1e-2
+
+
+def test_a_delay_moves_the_samples_as_the_curve_in_time():
+    fit = sf.estimate(late_problem(), strategy="local")
+    place = fit.theta_names.index("late")
+    (own, *_) = collect_curves(fit, 0, list_places(fit, 0), 800)
+    assert own.delay == place
+    theta = fit.theta.copy()
+    theta[place] += 1e-3
+    evaluator = fit.evaluator_at_solution()
+    moved = evaluator.simulate(theta)[0].seen[0][: len(own.sample_times), 0]
+    before = evaluator.simulate(fit.theta)[0].seen[0][: len(own.sample_times), 0]
+    assert f"x is late by {fit.theta[place]:.6g} s" in Reader(format_page(fit)).words
+    away = np.abs(own.sample_times - fit.transition_times[0][0] - fit.theta[place]) > 0.2
+    np.testing.assert_allclose(own.sample_tangents[place][away, 0], (moved - before)[away] / 1e-3, atol=1e-2)
+
+
+def test_sliders_stop_where_the_curves_would_be_far_off(toss):
+    runs = {0: collect_curves(toss, 0, list_places(toss, 0), 200)}
+    sliders = build_sliders(toss, runs, list_places(toss, 0))
+    assert all(slider.gap <= LARGEST_GAP for slider in sliders)
+    assert any(slider.gap > 1e-3 for slider in sliders), "none would have been cut"
+    tau = sliders[0]
+    assert toss.lower[0] <= tau.values[0]
+    assert tau.values[-1] < toss.trajectory.times[-1]
+
+
+def test_what_was_loaded_without_its_model_has_no_sliders(toss, tmp_path):
+    toss.save(tmp_path / "toss.json")
+    text = format_page(sf.Estimate.load(tmp_path / "toss.json"))
+    assert payload_of(text)["sliders"] == []
+    assert "loaded without its model" in Reader(text).words
+
+
+@pytest.mark.parametrize(
+    ("names", "units", "plane"),
+    [
+        (("x", "y"), ("m", "m"), (0, 1)),
+        (("X", "dX", "Y"), ("m", "m/s", "m"), (0, 2)),
+        (("pos_x", "pos_y"), ("", ""), (0, 1)),
+        (("north", "east"), ("km", "km"), (1, 0)),
+        (("x", "y"), ("m", "V"), None),
+        (("v_x", "v_y"), ("", ""), None),
+        (("x", "y"), ("m/s", "m/s"), None),
+        (("a", "b"), ("m", "m"), None),
+    ],
+)
+def test_positions_in_a_plane_are_told_by_names_and_units(toss, names, units, plane):
+    from dataclasses import replace
+
+    (own, *_) = collect_curves(toss, 0, [], 100)
+    assert find_plane(replace(own, names=names, units=units)) == plane
+
+
+# --- one file ---------------------------------------------------------------------------------------------------------
+
+
+def check_alone(text):
+    """Well-formed, small, and without anything that a browser would fetch."""
+    assert len(text.encode()) < LARGEST
+    reader = Reader(text)
+    assert text.startswith("<!DOCTYPE html>\n")
+    for tag, attributes in reader.elements:
+        for name in ("src", "href", "action", "data", "poster", "srcset"):
+            value = attributes.get(name, "#")
+            assert value.startswith(("#", "data:")), (tag, name, value)
+    ids = [attributes["id"] for _, attributes in reader.elements if "id" in attributes]
+    assert len(ids) == len(set(ids))
+    style = re.search(r"<style>(.*?)</style>", text, re.DOTALL)[1]
+    assert "@import" not in style
+    assert "url(" not in style
+    assert {attributes.get("for") for tag, attributes in reader.elements if tag == "label"} <= {None, *ids}
+    return reader
+
+
+def test_a_page_is_one_file_that_needs_no_other(toss_page):
+    check_alone(toss_page)
+
+
+def test_names_do_no_harm():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        text = format_page(sf.estimate(hostile_problem()))
+    reader = check_alone(text)
+    assert sum(tag == "script" for tag, _ in reader.elements) == 3
+    assert not any(tag == "img" for tag, _ in reader.elements)
+    assert " ".join(HOSTILE.split()) in reader.words
+
+
+def test_many_runs_stay_small_and_the_worst_come_first():
+    fit = sf.estimate(sf.Problem(RAMP, ramps(45, sigma=0.02), {"v": 0.9}))
+    text = format_page(fit)
+    reader = check_alone(text)
+    payload = payload_of(text)
+    assert len(payload["groups"]) == pages.MOST_RUNS
+    assert f"The {pages.MOST_RUNS} of 45 runs that are explained worst" in reader.words
+    options = re.findall(r'<option value="\d+">\s*(\S+):', text)
+    assert options[0] == fit.run_names[-1]
+    assert len([name for name in payload["templates"] if name.startswith("run-")]) == 1, "all runs share a drawing"
+    assert len(text) < 2_500_000
+    first, everything = (table for table in reader.tables if table[0][1] == "value")
+    assert len(first) < len(everything)
+    assert [row[0] for row in everything[1:]] == list(fit.theta_names)
+    assert "v" in [row[0] for row in first], "parameters before transition times"
+
+
+def test_save_report_writes_whole_or_not_at_all(heater, tmp_path):
+    path = tmp_path / "report.html"
+    heater.save_report(path)
+    assert path.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    assert list(tmp_path.iterdir()) == [path]
+    with pytest.raises(OSError, match="nowhere"):
+        heater.save_report(tmp_path / "nowhere" / "report.html")
+
+
+@pytest.fixture
+def without_bokeh(monkeypatch):
+    real = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "bokeh" else real(name, *more))
+
+
+def test_without_the_extra_it_says_how_to_get_it(heater, tmp_path, without_bokeh):
+    with pytest.raises(ImportError, match=r"needs bokeh, not installed here: pip install 'switchfit\[report\]'"):
+        heater.save_report(tmp_path / "report.html")
+    done = CliRunner().invoke(cli.app, ["fit", str(TOSS), "--out", str(tmp_path)])
+    assert done.exit_code == 0
+    assert "no report.html: an HTML report needs bokeh" in done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["estimate.json", "fit.png", "report.txt"]
+
+
+def test_the_command_line_writes_it_with_its_options(tmp_path):
+    done = CliRunner().invoke(cli.app, ["fit", str(TOSS), "--out", str(tmp_path), "--strategy", "local"])
+    assert done.exit_code == 0, done.stderr
+    words = check_alone((tmp_path / "report.html").read_text(encoding="utf-8")).words
+    assert "strategy local" in words
+    assert "switchfit fit problem.toml" in words
+
+
+def test_no_module_makes_a_page_of_other_things():
+    with pytest.raises(TypeError, match="makes a page of a int"):
+        format_page(1)
+
+
+# --- in a notebook ----------------------------------------------------------------------------------------------------
+
+
+def notebook(result):
+    """What a notebook shows of a result: well-formed, without scripts, and pictures that are pictures."""
+    reader = Reader(result._repr_html_())
+    for tag, attributes in reader.elements:
+        assert tag in {"div", "p", "pre", "table", "thead", "tbody", "tr", "th", "td", "img"}
+        if tag == "img":
+            kind, _, content = attributes["src"].partition(",")
+            assert kind == "data:image/png;base64"
+            assert pixels_of(base64.b64decode(content)).std() > 5
+            assert attributes["alt"]
+    return reader
+
+
+def test_a_notebook_shows_the_verdict_the_numbers_and_a_figure(toss):
+    reader = notebook(toss)
+    assert str(toss.verdict) in reader.words
+    rows, _ = tabulate_unknowns(toss, range(len(toss.theta)))
+    assert reader.tables == [[[row[k] for k in rows.columns] for row in rows.rows]]
+    assert [tag for tag, _ in reader.elements].count("img") == 1
+    assert len(toss._repr_html_()) < 150_000
+
+
+def test_a_notebook_shows_a_problem_before_it_is_fitted():
+    runs, unknowns = notebook(heater_problem()).tables
+    assert runs[1] == ["1", "on → off", "0 to 6", "h", "24"]
+    assert unknowns[1][:2] == ["tau_1", "2"]
+    assert unknowns[2][:5] == ["k", "0.5", "0.01", "5", "1/h"]
+
+
+def test_a_notebook_shows_a_profile_and_many_fits(heater):
+    profile = heater.profile("k")
+    assert " ".join(str(profile).split()) in notebook(profile).words
+    fits = sf.multistart(heater_problem(), 4)
+    assert " ".join(str(fits).split()) in notebook(fits).words
+
+
+def test_names_do_no_harm_in_a_notebook():
+    problem = hostile_problem("<b>$$x")
+    assert "<b>$$x → b" in notebook(problem).words
+    fit = sf.estimate(problem)
+    assert "<b>run</b>.tau_1" in notebook(fit).words
+    assert "Profile of $$k$$" in notebook(fit.profile("$$k$$")).words
+    fit.plot_residuals().savefig(io.BytesIO())
+
+
+def test_a_notebook_shows_no_figure_of_many_runs():
+    problem = sf.Problem(RAMP, ramps(12, sigma=0.02), {"v": 0.9})
+    assert "And 2 more." in notebook(problem).words
+    reader = notebook(sf.estimate(problem, strategy="local"))
+    assert "img" not in [tag for tag, _ in reader.elements]
+    assert "And 5 more unknowns." in reader.words
+
+
+# --- in a browser -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    from browser import Browser, find_browser
+
+    if find_browser() is None:
+        pytest.skip("no Chromium on this machine")
+    opened = Browser(tmp_path_factory.mktemp("chromium"))
+    yield opened
+    opened.close()
+
+
+def check_quiet(browser):
+    """No error, no warning, nothing asked of the network."""
+    assert browser.errors == []
+    assert [url for url in browser.requests if not url.startswith(("file:", "data:", "blob:"))] == []
+
+
+def write(folder, text):
+    path = folder / "report.html"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+MODELS = "Bokeh.documents.flatMap((d) => d.roots()).flatMap((r) => [...r.references()])"
+
+COLUMN = """(name, source, column) => {
+  const element = document.getElementById(name);
+  for (const doc of Bokeh.documents) {
+    const found = doc.get_model_by_name(source);
+    if (found) return Array.from(found.data[column]).map((v) => (Number.isNaN(v) ? null : v));
+  }
+}"""
+
+MOVE = """(k, position) => {
+  const slider = document.getElementById(`slider-${k}`);
+  slider.value = position;
+  slider.dispatchEvent(new Event("input"));
+}"""
+
+
+CHOOSE = """(value) => {
+  const chooser = document.getElementById("run");
+  chooser.value = value;
+  chooser.dispatchEvent(new Event("change"));
+}"""
+
+
+def test_sliders_move_curves_modes_and_cost(browser, toss, toss_page, tmp_path):
+    browser.open(write(tmp_path, toss_page))
+    names = [slider["name"] for slider in payload_of(toss_page)["sliders"]]
+
+    def read(source, column):
+        found = browser.evaluate(f"({COLUMN})('run-0', '{source}', '{column}')")
+        return np.array([np.nan if value is None else value for value in found])
+
+    def cost():
+        return browser.evaluate("document.getElementById('cost').textContent")
+
+    before = read("curve-0", "y0"), read("samples-0", "y0")
+    assert cost() == f"J = {toss.cost:.7e} (at the estimate)".replace("e-0", "e-")
+    assert browser.evaluate("document.querySelectorAll('.slider.shown').length") == len(toss.theta)
+
+    k = names.index("mu")
+    browser.evaluate(f"({MOVE})({k}, 400)")
+    slider = payload_of(toss_page)["sliders"][k]
+    change = slider["values"][-1] - slider["theta"]
+    expected = before[0] + change * read("curve-0", f"d{slider['place']}_0")
+    np.testing.assert_allclose(read("curve-0", "y0"), expected, rtol=1e-12)
+    np.testing.assert_allclose(
+        read("samples-0", "y0"), before[1] + change * read("samples-0", f"d{slider['place']}_0"), rtol=1e-9, atol=1e-15
+    )
+    shown = float(cost().split()[2].rstrip(","))
+    assert shown == pytest.approx(slider["costs"][-1], rel=1e-6)
+    assert "(evaluated)" in cost()
+
+    t = names.index("tau_1")
+    browser.evaluate(f"({MOVE})({t}, 0)")
+    assert "(by the quadratic approximation)" in cost()
+    first = payload_of(toss_page)["sliders"][t]["values"][0]
+    assert read("transitions", "x")[0] == pytest.approx(first)
+    assert read("modes", "right")[0] == read("modes", "left")[1] == pytest.approx(first)
+
+    browser.evaluate("document.getElementById('reset').click()")
+    np.testing.assert_array_equal(read("curve-0", "y0"), before[0])
+    assert "(at the estimate)" in cost()
+    check_quiet(browser)
+
+
+def test_channels_are_switched_on_and_off(browser, toss_page, tmp_path):
+    browser.open(write(tmp_path, toss_page))
+
+    def heights():
+        return browser.evaluate("document.getElementById('run-0').getBoundingClientRect().height")
+
+    before = heights()
+    browser.evaluate("document.querySelector('[data-channel=\"0\"]').click()")
+    browser.wait(f"document.getElementById('run-0').getBoundingClientRect().height < {before - 200}", 10)
+    browser.evaluate("document.querySelector('[data-channel=\"2\"]').click()")
+    browser.wait(f"document.getElementById('run-0').getBoundingClientRect().height > {before - 200}", 10)
+    check_quiet(browser)
+
+
+@pytest.mark.parametrize(("width", "dark"), [(1240, False), (1240, True), (390, False), (390, True)])
+def test_wide_and_narrow_light_and_dark(browser, toss_page, tmp_path, width, dark):
+    browser.open(write(tmp_path, toss_page), width=width, dark=dark)
+    assert browser.evaluate("document.documentElement.scrollWidth") <= width
+    background = browser.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert background == ("rgb(20, 23, 27)" if dark else "rgb(255, 255, 255)")
+    inks = browser.evaluate(
+        f"[...new Set({MODELS}.filter((m) => m.type.endsWith('Axis')).map((m) => m.major_label_text_color))]"
+    )
+    assert inks == ["#e4e7eb" if dark else "#1f2328"]
+    picture = pixels_of(browser.screenshot())
+    assert (np.median(picture) > 128) != dark
+    sizes = browser.evaluate(
+        "[...document.querySelectorAll('.run.shown .figure, #slice, #correlation')].map((f) => f.offsetWidth)"
+    )
+    assert min(sizes) > 150
+    check_quiet(browser)
+
+
+def test_figures_are_drawn_in_colour(browser, toss_page, tmp_path):
+    browser.open(write(tmp_path, toss_page), height=1600)
+    picture = pixels_of(browser.screenshot()).astype(int)
+    red = (picture[..., 0] > 190) & (picture[..., 1] < 90) & (picture[..., 2] < 80)
+    assert red[700:, :850].sum() > 500, "the fitted curves"
+
+
+def test_a_page_follows_the_reader_who_turns_the_light_off(browser, toss_page, tmp_path):
+    browser.open(write(tmp_path, toss_page))
+    browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}])
+    browser.wait(
+        f"{MODELS}.every((m) => !m.type.endsWith('Axis') || m.major_label_text_color === '#e4e7eb')",
+        10,
+    )
+    check_quiet(browser)
+
+
+def test_it_prints(browser, toss_page, tmp_path):
+    browser.open(write(tmp_path, toss_page))
+    browser.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = false; })")
+    document = browser.print()
+    assert document.startswith(b"%PDF")
+    assert browser.evaluate("[...document.querySelectorAll('details')].every((d) => d.open)")
+    check_quiet(browser)
+
+
+def test_runs_are_chosen_and_shown_together(browser, tmp_path):
+    fit = sf.estimate(sf.Problem(RAMP, ramps(4, sigma=0.02), {"v": 0.9}))
+    browser.open(write(tmp_path, format_page(fit)))
+    shown = "[...document.querySelectorAll('#fit .run.shown')].map((r) => r.dataset.run).join()"
+    drawn = "[...document.querySelectorAll('#fit .run.shown .figure')].every((f) => f.offsetHeight > 300)"
+    assert browser.evaluate(shown) == "0"
+    names = "[...document.querySelectorAll('.slider.shown label')].map((l) => l.textContent).join()"
+    assert browser.evaluate(names) == "run4.tau_1,v"
+    browser.evaluate(f"({CHOOSE})('2')")
+    browser.wait(drawn)
+    assert browser.evaluate(shown) == "2"
+    browser.evaluate(f"({CHOOSE})('all')")
+    browser.wait(drawn)
+    assert browser.evaluate(shown) == "0,1,2,3"
+    check_quiet(browser)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [hostile_problem, late_problem, clock_problem, lambda: sf.Problem(RAMP, ramps(), {"v": 0.9})],
+    ids=["hostile names", "delay, outliers", "no data", "sigma unknown"],
+)
+def test_every_kind_of_problem_is_shown_without_an_error(browser, tmp_path, make):
+    text = format_page(sf.estimate(make(), strategy="local"))
+    check_alone(text)
+    browser.open(write(tmp_path, text))
+    for k in range(len(payload_of(text)["sliders"])):
+        browser.evaluate(f"({MOVE})({k}, 300)")
+    browser.evaluate("document.querySelectorAll('[data-channel]').forEach((box) => { if (!box.checked) box.click(); })")
+    browser.evaluate("new Promise((done) => setTimeout(done, 200))")
+    assert browser.evaluate("window.hacked") is None
+    check_quiet(browser)
+
+
+def test_the_paper_s_vehicle_has_a_path(browser, tmp_path):
+    problem = runpy.run_path(str(EXAMPLES / "vehicle" / "vehicle.py"))["make_problem"]()
+    text = format_page(sf.estimate(problem))
+    browser.open(write(tmp_path, text))
+    assert len(payload_of(text)["figures"]["run-0"]["sources"]) == 4
+    labels = f"{MODELS}.filter((m) => m.type === 'PlainText').map((m) => m.text)"
+    assert {"X (m)", "Y (m)"} <= set(browser.evaluate(labels))
+    check_quiet(browser)
+
+
+def pixels_of(picture):
+    """A PNG as an array."""
+    import matplotlib.image
+
+    return (255 * matplotlib.image.imread(io.BytesIO(picture), format="png")[..., :3]).astype(np.uint8)
