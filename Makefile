@@ -17,7 +17,7 @@ help:
 	@echo "make paper      every experiment and figure of the paper, into out/paper and the documentation (ten minutes)"
 	@echo "make docs       build the documentation;  make clean: remove what was built"
 
-demo: $(VENV)/.installed
+demo: $(VENV)/.installed-report
 	$(BIN)/switchfit fit examples/toss/problem.toml --out out/demo
 	$(BIN)/switchfit fit examples/vehicle/problem.toml --out out/demo-vehicle
 
