@@ -123,6 +123,7 @@ def build_page(estimate: Estimate, problem_file: Path | None, options: Mapping[s
         inputs=collect_inputs(estimate, problem_file, options),
         runs=runs,
         sliders=payload["sliders"],
+        sliders_cut=any(len(list_places(estimate, run.e)) > MOST_SLIDERS for run in runs),
         payload=_write_json(payload),
         library=library,
     )

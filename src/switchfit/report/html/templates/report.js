@@ -47,13 +47,14 @@
   }
 
   // Put numbers into a copy of a drawing, by the names of its sources and ranges.
-  function fill(part, { sources, ranges }) {
-    if (Array.isArray(part)) return part.map((entry) => fill(entry, { sources, ranges }));
+  function fill(part, figure) {
+    if (Array.isArray(part)) return part.map((entry) => fill(entry, figure));
     if (part === null || typeof part !== "object") return part;
-    const copy = Object.fromEntries(Object.entries(part).map(([key, value]) => [key, fill(value, { sources, ranges })]));
+    const copy = Object.fromEntries(Object.entries(part).map(([key, value]) => [key, fill(value, figure)]));
     const name = part.type === "object" && part.attributes && part.attributes.name;
-    if (name && sources[name]) copy.attributes.data = sources[name];
-    if (name && ranges[name]) Object.assign(copy.attributes, ranges[name]);
+    if (name && figure.sources[name]) copy.attributes.data = figure.sources[name];
+    if (name && figure.ranges[name]) Object.assign(copy.attributes, figure.ranges[name]);
+    if (name === "slice-label") copy.attributes.text = sliceLabel(); // there is no room for one that comes later
     return copy;
   }
 
@@ -168,6 +169,11 @@
     };
   }
 
+  function sliceLabel() {
+    const { name, unit } = sliders[last];
+    return unit ? `${name} (${unit})` : name;
+  }
+
   function sliceSources() {
     return Object.fromEntries(Object.entries(sliceColumns()).map(([name, columns]) =>
       [name, { type: "map", entries: Object.entries(columns) }]));
@@ -177,8 +183,7 @@
     const doc = documents.get("slice");
     if (!doc) return;
     for (const [name, columns] of Object.entries(sliceColumns())) doc.get_model_by_name(name).data = columns;
-    const { name, unit } = sliders[last];
-    doc.get_model_by_name("slice-label").text = unit ? `${name} (${unit})` : name;
+    doc.get_model_by_name("slice-label").text = sliceLabel();
   }
 
   function move() {
