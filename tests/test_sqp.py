@@ -794,6 +794,19 @@ def test_the_limit_of_precision_is_a_success():
     assert result.iterations < 100
 
 
+@pytest.mark.parametrize("hessian", ["auto", "exact"])
+def test_a_cost_without_any_curvature(hessian):
+    """A constant has neither a gradient nor a Hessian; a plane has no Hessian, and its lowest corner is found."""
+    nothing = [[0.0, 0.0], [0.0, 0.0]]
+    flat = minimize(smooth(lambda theta: (1.0, [0.0, 0.0], nothing)), [1.0, 2.0], constraints=free(2), hessian=hessian)
+    assert flat.status is Status.SINGULAR
+    plane = smooth(lambda theta: (theta[0] - 1e-3 * theta[1], [1.0, -1e-3], nothing))
+    box = rows(np.zeros((0, 2)), [], [-1.0, -5.0], [4.0, 7.0])
+    corner = minimize(plane, [1.0, 2.0], constraints=box, hessian=hessian)
+    np.testing.assert_array_equal(corner.theta, [-1.0, 7.0])
+    assert corner.status.successful
+
+
 def test_a_step_back_to_the_point_itself_is_no_progress():
     """Past the iterations after which a failed step may be followed by another one, at the limit of precision."""
 

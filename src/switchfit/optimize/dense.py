@@ -17,6 +17,7 @@ from scipy.linalg import qr
 
 from switchfit.optimize.algebra import (
     EIGENVALUE_FLOOR,
+    EIGENVALUE_REPLACEMENT,
     EPS,
     FloatArray,
     positive_eigenvalues,
@@ -354,6 +355,7 @@ def make_positive(matrix: FloatArray, least: float = 0.0) -> FloatArray:
     margin = max(EIGENVALUE_FLOOR * float(np.max(np.abs(values), initial=0.0)), least)
     if values.size == 0 or values[0] > margin:
         return symmetric
+    margin = margin or EIGENVALUE_REPLACEMENT  # without any curvature nothing says how large it is
     return np.asarray(symmetric + (margin - RAISED * values[0]) * np.eye(len(values)))
 
 
