@@ -357,7 +357,7 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
     without |= set() if corrected else {4}
     without |= set() if ends else {5, 6}
     columns = [k for k in range(10) if k not in without]
-    table = Table([[row[k] for k in columns] for row in rows], "".join("<><<<>><><"[k] for k in columns))
+    table = Table([[row[k] for k in columns] for row in rows], "".join("<><><>><><"[k] for k in columns))
     if not known:
         return table, ""
     if corrected:
