@@ -31,7 +31,7 @@ TESTS = {
     "rows": [SYSTEMS],
     "native": [SYSTEMS, PROTOCOL],
     "sqp": [["tests/test_sqp.py", "tests/test_qp.py"]],
-    "equalities": [["tests/test_equalities.py"]],
+    "equalities": [["tests/test_equalities.py"], ["tests/test_final_time.py", "-k", "hardly_depends"]],
     "final time": [["tests/test_final_time.py", "-k", "closed_form or engines or every_check"]],
 }
 """What must notice the mistakes of each part, one after the other until something does."""
@@ -154,10 +154,15 @@ IN_EQUALITIES: dict[str, tuple[str, Replacements]] = {
         MERIT,
         [
             (
-                "return violation > MET and state.stagnant >= STAGNANT and direction.left > FALL * violation",
+                "return equalities.predict(normal) > FALL * point.violation",
                 "return False",
             )
         ],
+    ),
+    "constraints are measured anew": (POINT, [("grown = lengths > GROWN", "grown = lengths < 0.0")]),
+    "a violation that stays the same for a while is no end": (
+        MERIT,
+        [("return equalities.predict(normal) > FALL * point.violation", "return True")],
     ),
     "the constraints in the Hessian of the Lagrangian": (POINT, [("self.multipliers / units)", "0.0 * units)")]),
     "bounds of the normal step": (

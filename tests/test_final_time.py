@@ -243,6 +243,16 @@ def test_multistart_draws_tf_between_its_bounds_and_monte_carlo_varies_it():
     assert np.ptp(fits.theta[:, 0]) > 0.02
 
 
+@pytest.mark.parametrize("start", [(8.36892163, 2.13785481), (7.27120961, 2.65140112)])
+def test_a_constraint_that_hardly_depends_on_the_unknowns_at_the_start_is_met(start):
+    """x(tf) is nearly 0 at the start whatever tf and k: its gradient there is no measure of the constraint. Nor has a
+    violation stagnated for good that stays the same while a trust region that was small grows again."""
+    fit = sf.estimate(cooling(), start=start, strategy="local")
+    assert fit.success
+    assert fit.iterations < 60
+    np.testing.assert_allclose(fit.theta[0], np.log(1 / LEVEL) / fit.theta[1], rtol=1e-7)
+
+
 def test_batches_without_constraints_take_a_free_tf_in_their_compiled_program():
     """A prior on tf and a cost of x(tf): the program that all fits share, and one fit alone, end in the same place."""
     system = sf.HybridSystem({"cools": decay}, [1.0])

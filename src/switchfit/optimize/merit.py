@@ -85,13 +85,20 @@ def raise_penalty(penalty: float, point: Point, direction: Direction) -> float:
     return penalty if penalty >= needed else RAISED * needed
 
 
-def is_stuck(state: State, direction: Direction) -> bool:
-    """Return whether constraints are not met, their violation has stagnated, and the next step will hardly reduce it.
+def is_stuck(oracle: Oracle, state: State) -> bool:
+    """Return whether constraints are not met, their violation has stagnated, and no step would reduce it by much.
 
-    Along curved constraints the violation may stagnate while J falls; a step then still leads to where they are met.
+    Along curved constraints the violation may stagnate while J falls, or while the trust region, having been small,
+    grows again: a step as long as the first trust region then still leads to where they are met.
     """
-    violation = state.point.violation
-    return violation > MET and state.stagnant >= STAGNANT and direction.left > FALL * violation
+    point, problem = state.point, oracle.problem
+    if point.violation <= MET or state.stagnant < STAGNANT:
+        return False
+    equalities = point.equalities(point.reported_sides)
+    room = -np.maximum(point.slack, 0.0)
+    radius = max(state.radius, box.FIRST_CONSTRAINED_RADIUS)
+    normal = find_normal_step(equalities, problem.constraints.normals, room, problem.reach, radius)
+    return equalities.predict(normal) > FALL * point.violation
 
 
 def correct(oracle: Oracle, trial: Trial, sample: Sample, scale: FloatArray, radius: float) -> Trial | None:

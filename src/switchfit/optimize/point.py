@@ -25,6 +25,8 @@ from switchfit.optimize.kkt import kkt_residual
 from switchfit.optimize.matrix import Curvature, SymmetricMatrix
 from switchfit.optimize.problem import Problem
 
+#: Growth of a constraint's gradient from which it is measured anew.
+GROWN = 100.0
 #: Equality constraints count as met where they are below this, in their units.
 MET = 1e-8
 #: Jumps of a derivative above this part of the largest derivative are no errors of the integration.
@@ -172,7 +174,8 @@ class Oracle:
         Of the equality constraints, with which the Hessian of the Lagrangian is evaluated next.
     units : array, shape (k,), or None
         What the equality constraints are measured by: the lengths of their gradients, over `Problem.reach`, at the
-        first point. Constraints and multipliers are in these units everywhere but in the caller's function.
+        first point, or where these have grown by far. Constraints and multipliers are in these units everywhere but in
+        the caller's function.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -214,6 +217,23 @@ class Oracle:
         if self.units is None:
             self.units = unit_rows(A * self.problem.reach)[1]
         return Equalities(c / self.units, A / self.units[:, None])
+
+    def rescale(self, point: Point) -> bool:
+        """Take new units where the gradient of a constraint has grown by far; return whether one has.
+
+        A constraint that hardly depends on the unknowns at the start would else be measured by rounding: its violation
+        would never count as met, and its penalty would make every step along it short.
+        """
+        held = point.plus.equalities
+        if held is None or self.units is None:
+            return False
+        lengths = unit_rows(held.jacobian * self.problem.reach)[1]
+        grown = lengths > GROWN
+        if not grown.any():
+            return False
+        self.units = np.where(grown, self.units * lengths, self.units)
+        self.multipliers = np.where(grown, self.multipliers * lengths, self.multipliers)
+        return True
 
     def first(self, trial: Trial) -> Sample | None:
         """Do the evaluation that suffices to judge the cost."""

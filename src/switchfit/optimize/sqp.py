@@ -172,12 +172,25 @@ def _step(oracle: Oracle, state: State) -> State:
         return _finish(oracle, state, direction, Status.CONVERGED)
     if state.iteration >= problem.max_iterations:
         return replace(state, status=Status.MAX_ITERATIONS)
-    if problem.equalities and is_stuck(state, direction):
+    if problem.equalities and is_stuck(oracle, state):
         return replace(state, status=Status.INFEASIBLE)
     accepted = (search_merit if problem.equalities else search)(oracle, state, direction)
     if accepted is None:
         return _handle_stall(oracle, state, direction)
-    return state.advance(accepted, problem.tolerance)
+    following = state.advance(accepted, problem.tolerance)
+    return _measure_anew(oracle, following) if oracle.rescale(following.point) else following
+
+
+def _measure_anew(oracle: Oracle, state: State) -> State:
+    """Return the state with constraints in new units, in which penalty and violation begin anew."""
+    theta = state.point.theta
+    point = oracle.point(Trial.at(oracle.problem.constraints, theta), state.scale)
+    if point is None:
+        return state
+    fresh = State.at(point)
+    return replace(
+        state, point=point, penalty=fresh.penalty, steady_violation=fresh.steady_violation, stagnant=fresh.stagnant
+    )
 
 
 def _is_settled(problem: Problem, state: State, direction: Direction) -> bool:
