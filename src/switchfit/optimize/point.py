@@ -33,6 +33,9 @@ MET = 1e-8
 LARGE_JUMP = 1e-6
 
 
+NO_FORCES: FloatArray = np.zeros(0)
+
+
 @dataclass(frozen=True, eq=False)
 class Sample:
     """One evaluation: cost, gradient, shape (d,), and Hessian, symmetric.
@@ -96,7 +99,7 @@ class Point:
     multipliers: FloatArray
     downhill: NDArray[np.int_]
     idle: NDArray[np.bool_] | None
-    forces: FloatArray = field(default_factory=lambda: np.zeros(0))
+    forces: FloatArray = field(default_factory=lambda: NO_FORCES)
     curvatures: dict[bytes, Curvature] = field(default_factory=dict)
 
     @property

@@ -73,6 +73,11 @@ class Line:
         """Say something else, and the lowest J so far if there is one."""
         self.text, self.detail, self.lowest = text, "", lowest
 
+    @property
+    def is_started(self) -> bool:
+        """Whether it will be shown if the call lasts."""
+        return self._timer is not None
+
     def start(self) -> None:
         """Show the line from `DELAY` seconds on."""
         self._timer = threading.Timer(DELAY, self._show)

@@ -174,8 +174,10 @@ def estimate(
 
 def _write_to(
     line: Line, name: str, callback: Callable[[IterationRecord], object] | None
-) -> Callable[[IterationRecord], object]:
-    """Return the callback of a fit, which writes to the line of progress as well."""
+) -> Callable[[IterationRecord], object] | None:
+    """Return the callback of a fit, which writes to the line of progress as well if that can be shown."""
+    if not line.is_started:
+        return callback
 
     def report(record: IterationRecord) -> object:
         line.write(f"{name}: iteration {record.iteration}, J = {record.cost:.6g}, optimality {record.optimality:.1e}")
