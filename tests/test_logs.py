@@ -507,3 +507,11 @@ def test_units_are_those_of_the_values_and_not_of_sigma(problem, write):
     data = problem(("sigma = 0.1", 'sigma = ["Fehler"]')).problem.experiments[0].data[0]
     assert data.units == ("m",)
     np.testing.assert_array_equal(data.sigma, [[2], [2]])
+
+
+def test_a_text_that_is_no_name_of_a_file_is_shown_in_part():
+    with pytest.raises(
+        ValueError, match=r"path must name a file, with at most 255 characters; got 'word word"
+    ) as error:
+        sf.read_log("word " * 1000)
+    assert len(str(error.value)) < 300

@@ -16,6 +16,9 @@ from switchfit.problem.validation import as_choice, as_name, as_names, as_path, 
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import is_regular
 
+LONGEST_NAME = 255
+"""Characters of a file's name at most, in most file systems."""
+
 
 @dataclass(frozen=True)
 class Options:
@@ -98,8 +101,11 @@ def read_log(
     ('Weg',)
     >>> Path("drive.csv").unlink()
     """
+    path = as_path(path, "path")
+    if len(path.name) > LONGEST_NAME:
+        raise InputError(f"path must name a file, with at most {LONGEST_NAME} characters; got {shorten(str(path))}.")
     return read_source(
-        as_path(path, "path"),
+        path,
         columns=columns,
         time=time,
         time_unit=time_unit,
