@@ -62,7 +62,8 @@ print(found.theta.tobytes().hex())
 
 TIMES = {
     ".json": (rb'"seconds": [0-9.e-]+', b""),
-    ".txt": (rb"evaluations?, [0-9.e-]+ s", b""),
+    ".txt": (rb"[0-9.e-]+\s+s in all|\([0-9.e-]+\s+s\)|evaluations?, [0-9.e-]+ s|\s+", b""),
+    ".html": (rb"[0-9.e-]+ s in all|\([0-9.e-]+ s\)|>[0-9.e-]+</td", b""),
     ".md": (rb"[0-9]+ s in all", b""),
     ".pdf": (rb"/CreationDate \(.*?\)", b""),
 }
@@ -86,7 +87,7 @@ def check_whole(folder: Path) -> None:
             json.loads(path.read_text(encoding="utf-8"))
         elif path.suffix == ".npz":
             with np.load(path) as file:
-                assert all(file[name].size for name in file.files)
+                assert [file[name] for name in file.files]  # an array that is cut off raises an error
         elif path.suffix == ".png":
             assert path.read_bytes().endswith(b"IEND\xaeB`\x82")
         elif path.suffix == ".pdf":
