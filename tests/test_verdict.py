@@ -27,6 +27,7 @@ from switchfit.models import heater_problem
 from switchfit.optimize import Status
 from switchfit.report.verdict import format_share
 from switchfit.runtime.issue import Issue
+from switchfit.uncertainty.quality import measure_quality
 
 TIMES = np.linspace(0.1, 10.0, 100)
 
@@ -372,6 +373,22 @@ def test_few_starts_that_agree_are_doubtful_where_nothing_confirms_the_fit():
     assert str(few.verdict) == "Doubtful: the lowest J was found from only 3 of 40 other starts."
     none = replace(fit, starts=(40, 0, 0))
     assert str(none.verdict) == "Doubtful: the lowest J was found from none of 40 other starts."
+
+
+def test_white_residuals_confirm_a_minimum_that_two_starts_have_found_where_sigma_is_unknown():
+    fit = straight(2.0 + 0.5 * TIMES + noise(0.01), sigma=None)
+    assert measure_quality(fit).channels[0].whiteness > 0.05
+    assert replace(fit, starts=(40, 0, 2)).verdict.level == "good"
+    assert replace(fit, starts=(40, 0, 1)).verdict.level == "doubtful"
+    loud = straight(2.0 + 0.5 * TIMES + noise(), sigma=None)  # much is left to explain
+    assert replace(loud, starts=(40, 0, 2)).verdict.level == "doubtful"
+
+
+def test_correlated_residuals_doubt_the_minimum_where_sigma_is_unknown():
+    fit = straight(2.0 + 0.5 * TIMES + 0.1 * np.sin(3 * TIMES), sigma=None)
+    assert (fit.verdict.level, kinds(fit)) == ("doubtful", ["correlated residuals"])
+    assert steps(fit) == ["next: more starts", "next: corrected errors", "next: look at the residuals"]
+    assert steps(replace(fit, starts=(40, 0, 40))) == ["next: corrected errors", "next: look at the residuals"]
 
 
 def test_more_starts_are_no_advice_where_none_was_better():
