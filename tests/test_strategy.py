@@ -101,6 +101,20 @@ def test_where_the_model_is_doubted_and_two_searches_agree_a_few_starts_are_enou
     assert fit.cost == pytest.approx(4 * right.cost, rel=1e-6)
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e-3])
+def test_the_horizon_grows_where_sigma_is_left_out_whatever_the_unit(unit):
+    """Parameters are kept near their guesses by priors, which a cost without sigma refuses, and whose weight beside the
+    data would depend on the unit."""
+    right, problem = logistic(19.2, r=0.904, K1=4.93, K2=13.2, x0=0.525)
+    (run,) = problem.experiments
+    (data,) = run.data
+    scaled = replace(data, values=data.values * unit, observe=lambda t, x, p: x * unit)
+    problem = replace(problem, experiments=replace(run, data=scaled))
+    end = grow_horizon(problem, problem.initial_theta)
+    assert end.evaluations > 100
+    assert end.cost == pytest.approx(right.cost * unit**2, rel=1e-4)
+
+
 def grow_logistically(capacity):
     return lambda t, x, p: p["r"] * x * (1 - x / p[capacity])
 
@@ -129,10 +143,9 @@ def logistic(guess, **parameters):
     return right, pose(values, guess, far)
 
 
-def test_searches_that_share_a_guess_of_the_parameters_do_not_settle_where_the_fit_ends():
-    """Local fit, scan and growing horizon all end where one capacity is at its bound, with thirty times the cost.
-
-    The model explains 98 % there, and without sigma nothing but the correlated residuals says that it is wrong.
+def test_correlated_residuals_of_an_unknown_sigma_lead_to_a_search():
+    """A local fit ends where one capacity is at its bound, with thirty times the cost; the model explains 98 % there,
+    and without sigma nothing but the correlated residuals says that it is wrong.
     """
     right, problem = logistic(19.2, r=0.904, K1=4.93, K2=13.2, x0=0.525)
     alone = sf.estimate(problem, strategy="local")

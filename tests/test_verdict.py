@@ -389,6 +389,8 @@ def test_correlated_residuals_doubt_the_minimum_where_sigma_is_unknown():
     assert (fit.verdict.level, kinds(fit)) == ("doubtful", ["correlated residuals"])
     assert steps(fit) == ["next: more starts", "next: corrected errors", "next: look at the residuals"]
     assert steps(replace(fit, starts=(40, 0, 40))) == ["next: corrected errors", "next: look at the residuals"]
+    slight = straight(2.0 + 0.5 * TIMES + 0.01 * np.sin(3 * TIMES), sigma=None)  # as most real logs at high precision
+    assert steps(slight) == ["next: corrected errors", "next: look at the residuals"]
 
 
 def test_more_starts_are_no_advice_where_none_was_better():

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from switchfit.estimation.estimator import Estimate, fit_locally
 from switchfit.fit.result import Step
 from switchfit.fit.solution import is_least_squares, is_sigma_known, smallest_cost
+from switchfit.fit.variation import measure_variation
 from switchfit.optimize import IterationRecord, Status
 from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
@@ -21,7 +22,7 @@ from switchfit.problem.problem import GIVEN, Problem
 from switchfit.problem.validation import as_callable, as_choice, as_positive
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.runtime.progress import Line, show_line
-from switchfit.strategy.horizon import REFERENCE_POINTS, can_grow, grow_horizon
+from switchfit.strategy.horizon import can_grow, grow_horizon
 from switchfit.strategy.minimum_time import is_minimum_time, try_shorter_horizons
 from switchfit.strategy.quick import End, fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
@@ -232,16 +233,7 @@ def _is_confirmed(problem: Problem, fit: Estimate) -> bool:
 def _cost_of_means(problem: Problem) -> float:
     """Return J of references that are met by their means, kept with the problem."""
     if "cost_of_means" not in problem.__dict__:
-        total = 0.0
-        for run in problem.experiments:
-            for item in run.data:
-                times = np.linspace(run.t0, run.end, REFERENCE_POINTS)
-                followed = item.signal(times)
-                deviation = followed - followed.mean(axis=0)
-                total += (
-                    0.5 * float(np.einsum("ki,ij,kj->", deviation, item.weights, deviation)) * (times[1] - times[0])
-                )
-        object.__setattr__(problem, "cost_of_means", total)
+        object.__setattr__(problem, "cost_of_means", float(measure_variation(problem).sum()))
     return float(problem.__dict__["cost_of_means"])
 
 

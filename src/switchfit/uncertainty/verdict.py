@@ -258,9 +258,9 @@ def _judge_residuals(
         if worst.explained < EXPLAINED_UNKNOWN:
             yield Finding("bad", Issue("unexplained", (worst.label,), figures), ELSEWHERE)
         elif not sigma_too_large:
-            # Wrong ends explain up to 99.5 %, too, and leave correlated residuals: the minimum is in doubt, not only
-            # the standard errors.
-            steps = ("more starts", *CORRECTED)
+            # Wrong ends explain up to 99.8 %, too, and leave correlated residuals: below `NEARLY_ALL` of all data the
+            # minimum is in doubt, not only the standard errors.
+            steps = CORRECTED if quality.explained >= NEARLY_ALL else ("more starts", *CORRECTED)
             yield from (f._replace(steps=steps) for f in _find_correlation(quality))
         return
     if sigma_too_large:
