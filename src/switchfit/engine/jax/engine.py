@@ -21,24 +21,27 @@ from switchfit.runtime.cache import use_compilation_cache
 class JaxEngine:
     """Evaluates one experiment on one mesh with JAX programs.
 
-    Attributes
+    Parameters
     ----------
-    reason : str
+    structure : Structure
+    arguments : Arguments
+    mesh : Mesh
+    reason : str, optional
         Why the experiment is not evaluated in machine code.
     """
 
-    def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh) -> None:
+    def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh, reason: str = "") -> None:
         self._structure, self._arguments, self._mesh = structure, arguments, mesh
+        self._reason = reason
         self._on_device: Arguments | None = None
         self._compiled: set[tuple[Method, Matrix]] = set()
         # The last simulation without tangents, since J and the trajectory are often requested at the same point.
         self._last: tuple[bytes, Simulation] | None = None
-        self.reason = "engine='jax' is set"
 
     @property
     def engine(self) -> Engine:
         """JAX, with the reason."""
-        return Engine("jax", self.reason)
+        return Engine("jax", self._reason)
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """Return J alone."""
