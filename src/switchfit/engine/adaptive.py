@@ -233,8 +233,8 @@ class _Stretch:
     end: float
     x: FloatArray
     p: FloatArray
-    unit: str
-    watch: Watch | None
+    unit: str = ""
+    watch: Watch | None = None
 
     @property
     def name(self) -> str:
