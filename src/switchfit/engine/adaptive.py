@@ -1,13 +1,13 @@
-"""Choosing the mesh: how short the steps have to be, from one adaptive solve at a given theta.
+"""Choose the mesh from an adaptive solve at one or more thetas.
 
-The adaptive solve has the same order as the fixed steps that follow. It also integrates the running costs, so that
-they are resolved as well. Its steps are turned into a refinement of the intervals between the nodes that have to be
-there anyway; the mesh then stays as it is while theta moves.
+The adaptive solve has the same order as the fixed steps that follow. It integrates the running costs too, so that the
+mesh resolves them. Its step sizes determine into how many cells each interval between two required nodes is divided;
+the mesh is then frozen while theta moves.
 
-Explicit solves run in machine code if there is any: a hundred steps cost less than a tenth of a millisecond there, ten
-milliseconds in Python. The control of the step size is the same (`switchfit.discretization.step_size`). Python solves
-what has no machine code, and says what is wrong where a solve fails. SciPy's Radau solves stiff modes; where the
-problem leaves the choice, the explicit solve is watched (`switchfit.engine.stiffness`).
+Explicit solves run in machine code if possible: a hundred steps take less than a tenth of a millisecond there, and ten
+milliseconds in Python. Both use the step size control of `switchfit.discretization.step_size`. Python solves models
+without machine code, and repeats a solve that failed, for its error message. SciPy's Radau solves stiff modes; with
+``solver="auto"``, a `Watch` decides which modes are stiff (`switchfit.engine.stiffness`).
 """
 
 from __future__ import annotations
@@ -53,16 +53,16 @@ from switchfit.runtime.errors import NotIntegrableError
 T = TypeVar("T")
 
 MAX_STEPS = 200_000
-"""Adaptive steps in one mode before it is called stiff."""
+"""Largest number of adaptive steps in one mode; a mode that needs more cannot be integrated."""
 
 PACE = 1000
-"""Steps over which the pace of a mode is measured; a stiff one is thus refused before it has cost much."""
+"""Steps over which the pace of a mode is measured, so that a stiff mode is refused early."""
 
 
 def list_fixed_nodes(experiment: Experiment) -> FloatArray:
     """Return the times that must be nodes: t0, tf, and samples and knots of signals inside the horizon.
 
-    Of a free tf it is the upper bound that is a node.
+    If tf is free, its upper bound is the last node.
     """
     t0, tf = experiment.t0, experiment.end
     times = [np.array([t0, tf])]
@@ -90,10 +90,10 @@ def refine_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1.
 
 
 def refine_if_unstable(problem: Problem, e: int, mesh: Mesh, *thetas: FloatArray) -> Mesh | None:
-    """Return a mesh with implicit steps that meets the tolerances at each of the thetas, if those of `mesh` fail there.
+    """Return a mesh with implicit steps that meets the tolerances at each theta, if explicit ones are unstable.
 
-    That is asked where a fit on it has failed, at the last theta, where it ended. None if the steps of the mesh are
-    implicit, or explicit because the problem insists on them; if they are stable; or if implicit ones are no better.
+    It is called after a fit on `mesh` has failed, at the last of the thetas. None if the steps of the mesh are implicit
+    already, or the problem sets the solver; if they are stable; or if implicit steps are hardly fewer.
     """
     if problem.solver != "auto" or mesh.stiffness is not None:
         return None
@@ -119,10 +119,10 @@ def _build_mesh(coarse: Mesh, solutions: list[FloatArray], stiffness: Stiffness 
 def _solve_at(
     problem: Problem, e: int, thetas: Sequence[FloatArray], coarse: Mesh
 ) -> tuple[list[FloatArray], Stiffness | None]:
-    """Return the accepted times of an adaptive solve at each theta, by the method that the problem asks for.
+    """Return the accepted times of an adaptive solve at each theta, by the problem's solver.
 
-    Where it leaves the choice and explicit steps are hopeless at one of the thetas, all are solved by implicit steps;
-    with the reason.
+    With ``solver="auto"``, if a mode is stiff at one of the thetas, all are solved by implicit steps, and the reason is
+    returned too.
     """
     structure = problem.structures[e]
     if problem.solver != "auto":
