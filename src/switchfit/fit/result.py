@@ -414,6 +414,20 @@ class Fit:
             The quantile is that of Student's t if sigma is unknown, of the normal distribution if it is known.
         hessian : {"exact", "gauss-newton"}
             As in `covariance_from`.
+
+        See Also
+        --------
+        profile, bootstrap
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.confidence_intervals(0.95).round(2)
+        array([[2.43, 2.5 ],
+               [0.38, 0.4 ]])
         """
         half = self.quantile(level) * np.sqrt(np.diag(self.covariance_from(hessian)))
         log = np.isin(self.theta_names, self.log_scaled)
