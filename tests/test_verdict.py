@@ -640,7 +640,7 @@ def test_the_verdict_costs_nothing_until_it_is_asked_for():
     ("share", "text"),
     [
         (1.0, "all"), (0.9999999, "all but 1e-6"), (0.99985999, "99.985 %"), (0.99499, "99.49 %"), (0.61, "61 %"),
-        (0.0, "none"), (-3.0, "none"), (0.95, "95.0 %"),
+        (0.0, "none"), (-3.0, "none"), (0.95, "95.0 %"), (0.29, "29 %"), (0.57, "57 %"),
     ],
 )  # fmt: skip
 def test_shares_are_never_rounded_up(share, text):
