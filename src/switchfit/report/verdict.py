@@ -213,6 +213,9 @@ _REASONS: dict[str, Callable[[Issue], str]] = {
     "mostly outliers": lambda issue: (
         f"the robust loss counts {100 * _figure(issue, 'share'):.0f} % of {_name(issue.subjects)} as outliers"
     ),
+    "large residuals": lambda issue: (
+        f"the typical residual of {_name(issue.subjects)} is {_figure(issue, 'typical'):.2g} sigma of noise"
+    ),
     "too few samples": lambda issue: (
         f"{_figure(issue, 'samples'):.0f} values for {_figure(issue, 'unknowns'):.0f} unknowns leave nothing to check "
         "the fit with"
