@@ -90,7 +90,14 @@ class Provenance:
         ----------
         path : Path
             Of the saved file.
+
+        Raises
+        ------
+        ValueError
+            If no folder can have that name.
         """
+        if "\0" in self.folder:
+            raise ValueError("provenance.folder has a null character")
         return replace(self, folder=os.path.normpath(path.resolve().parent / self.folder)) if self.folder else self
 
 

@@ -219,7 +219,7 @@ def _say_outcome(saved: Fit, again: Fit, scaled: FloatArray, unlike: FloatArray,
         return f"The same answer, to the last bit: {costs.partition(',')[0].replace('was', 'is')}."
     how = ""
     if worst >= 0 and np.isfinite(scaled[worst]):
-        how = f"{saved.theta_names[worst]} differs by {abs(scaled[worst]):.2g} standard errors"
+        how = f"{saved.theta_names[worst]} differs by {_format_count(abs(scaled[worst]))} standard errors"
     elif worst >= 0:
         how = f"{saved.theta_names[worst]} was {saved.theta[worst]:.9g}, and is {again.theta[worst]:.9g}"
     if same:
@@ -232,6 +232,11 @@ def _say_outcome(saved: Fit, again: Fit, scaled: FloatArray, unlike: FloatArray,
     return f"Another answer: {how}; {costs}."
 
 
+def _format_count(number: float) -> str:
+    """Return a number of standard errors to two digits, and large ones in full."""
+    return f"{number:.2g}" if number < 99.5 else f"{number:,.0f}"
+
+
 def _tabulate(saved: Fit, again: Fit, errors: FloatArray, scaled: FloatArray, unlike: FloatArray) -> list[str]:
     """Return the unknowns that differ most, as lines."""
     order = np.argsort(-unlike, kind="stable")[:MOST_LISTED]
@@ -240,7 +245,7 @@ def _tabulate(saved: Fit, again: Fit, errors: FloatArray, scaled: FloatArray, un
         value, error, _ = format_rounded(saved.theta[i], errors[i])
         now = format_rounded(again.theta[i], errors[i])[0]
         unit = unit_suffix(saved.theta_units[i]).strip()
-        apart = f"{scaled[i]:+.2g} std. errors" if np.isfinite(scaled[i]) else f"{again.theta[i] - saved.theta[i]:+.2g}"
+        apart = f"{'-' if scaled[i] < 0 else '+'}{_format_count(abs(scaled[i]))} std. errors" if np.isfinite(scaled[i]) else f"{again.theta[i] - saved.theta[i]:+.2g}"
         rows.append((saved.theta_names[i], value, error, now, unit, apart))
     lines = format_table(rows, "<><><>")
     more = len(saved.theta) - len(order)
