@@ -546,11 +546,8 @@ class Estimate(Fit, Tabular):
         >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
-        >>> fit.to_pandas()[["value", "std_error", "unit"]].round(3)
-                 value  std_error unit
-        unknown
-        tau_1    2.462      0.018    h
-        k        0.393      0.005  1/h
+        >>> fit.to_pandas()[["value", "std_error"]].round(3).to_dict("index")
+        {'tau_1': {'value': 2.462, 'std_error': 0.018}, 'k': {'value': 0.393, 'std_error': 0.005}}
         >>> fit.to_pandas("residuals").shape
         (24, 6)
         """

@@ -245,7 +245,11 @@ def _tabulate(saved: Fit, again: Fit, errors: FloatArray, scaled: FloatArray, un
         value, error, _ = format_rounded(saved.theta[i], errors[i])
         now = format_rounded(again.theta[i], errors[i])[0]
         unit = unit_suffix(saved.theta_units[i]).strip()
-        apart = f"{'-' if scaled[i] < 0 else '+'}{_format_count(abs(scaled[i]))} std. errors" if np.isfinite(scaled[i]) else f"{again.theta[i] - saved.theta[i]:+.2g}"
+        apart = (
+            f"{'-' if scaled[i] < 0 else '+'}{_format_count(abs(scaled[i]))} std. errors"
+            if np.isfinite(scaled[i])
+            else f"{again.theta[i] - saved.theta[i]:+.2g}"
+        )
         rows.append((saved.theta_names[i], value, error, now, unit, apart))
     lines = format_table(rows, "<><><>")
     more = len(saved.theta) - len(order)
