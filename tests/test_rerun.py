@@ -138,6 +138,8 @@ def test_the_same_answer_also_after_the_folder_has_moved(project, tmp_path):
     result = again(tmp_path / "moved" / "out" / "estimate.json")
     assert result.exit_code == 0, result.stderr
     assert result.stdout.startswith("The same answer, to the last bit: J is ")
+    (tmp_path / "moved" / "log.csv").write_text(log_of(3.5))
+    assert again(tmp_path / "moved" / "out" / "estimate.json").exit_code == 1, "read where it was before"
 
 
 def test_the_problem_is_the_one_that_was_saved(project):

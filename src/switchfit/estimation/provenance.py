@@ -7,6 +7,7 @@ import os
 import platform
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -161,6 +162,7 @@ def find_versions() -> dict[str, str]:
     return {"Python": platform.python_version(), **{package: find_version(package) for package in PACKAGES}}
 
 
+@cache
 def find_version(package: str) -> str:
     """Return the version of a package.
 
