@@ -299,7 +299,7 @@ def test_of_many_unknowns_those_that_differ_most_are_listed(monkeypatch):
         Prepared(fit, describe_python_problem(fit), None, ()), replace(fit, theta=fit.theta + np.array([0.1, 0.0, 0.1]))
     )
     assert [line.split()[0] for line in answers.text.splitlines()[3:]] == ["mu", "and"]
-    assert str(answers).endswith("and 2 more unknowns, which differ less")
+    assert str(answers).endswith("and 2 more unknowns with smaller differences")
 
 
 # --- what cannot be run again -----------------------------------------------------------------------------------------

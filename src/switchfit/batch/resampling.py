@@ -42,7 +42,7 @@ from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
 from switchfit.batch.intervals import make_no_pieces
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
-from switchfit.batch.quality import count_samples, describe_ends, measure_variation
+from switchfit.batch.quality import count_samples, describe_ends
 from switchfit.batch.simulated import fit_simulated
 from switchfit.batch.verdict import judge_study
 from switchfit.discretization.arguments import build_arguments
@@ -51,6 +51,7 @@ from switchfit.estimation.estimator import Estimate, check_settings
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import inverse_on
 from switchfit.fit.solution import is_plain_least_squares
+from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_count, as_level, as_seed

@@ -18,7 +18,7 @@ from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
 from switchfit.batch.intervals import trace_chunk
 from switchfit.batch.program import Evaluations, Varying, chunk_size, fit_chunk, with_errors
-from switchfit.batch.quality import count_samples, describe_ends, measure_variation
+from switchfit.batch.quality import count_samples, describe_ends
 from switchfit.batch.verdict import LEVEL, judge_study
 from switchfit.discretization.arguments import build_arguments, split_by_cell
 from switchfit.discretization.mesh import Mesh
@@ -28,6 +28,7 @@ from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.guards import place_on_near_guards
 from switchfit.fit.trajectory import compare
+from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_callable, as_count, as_instance, as_seed, shorten

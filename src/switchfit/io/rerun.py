@@ -21,7 +21,7 @@ from switchfit.fit.result import Fit
 from switchfit.io.problem_file import OPTIONS, OptionsTable, ProblemFile, load_problem
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report.numbers import format_rounded
+from switchfit.report.numbers import format_count, format_rounded
 from switchfit.report.tables import format_table
 from switchfit.runtime.errors import InputError
 from switchfit.uncertainty.residuals import correct_errors
@@ -156,7 +156,7 @@ def _list_changes(given: Provenance, loaded: ProblemFile, problem_file: Path) ->
     ]
     yield from changes[:MOST_LISTED]
     if len(changes) > MOST_LISTED:
-        yield f"and {len(changes) - MOST_LISTED} more files have changed"
+        yield f"and {format_count(len(changes) - MOST_LISTED, 'more file')}"
     versions = find_versions()
     for name, version in given.versions.items():
         if versions.get(name, version) != version:
@@ -253,4 +253,4 @@ def _tabulate(saved: Fit, again: Fit, errors: FloatArray, scaled: FloatArray, un
         rows.append((saved.theta_names[i], value, error, now, unit, apart))
     lines = format_table(rows, "<><><>")
     more = len(saved.theta) - len(order)
-    return [*lines, f"  and {more} more unknowns, which differ less"] if more else lines
+    return [*lines, f"  and {format_count(more, 'more unknown')} with smaller differences"] if more else lines

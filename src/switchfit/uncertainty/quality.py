@@ -18,11 +18,9 @@ import scipy.special
 
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison
+from switchfit.fit.variation import NO_VARIATION
 from switchfit.problem.data import FloatArray
 from switchfit.uncertainty.residuals import ResidualDiagnostics, diagnose
-
-NO_VARIATION = 1e-9
-"""Standard deviation of a channel, relative to its largest value, below which it counts as constant (rounding)."""
 
 MOST_OUTLIERS = 0.5
 """Share from which samples beyond the loss scale do not count as outliers: with the usual scales of 1.3 to 3 sigma, up
