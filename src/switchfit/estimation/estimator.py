@@ -7,13 +7,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
-from switchfit.estimation.saved import load_fit, save_fit
+from switchfit.estimation.provenance import Provenance, describe_python_problem, digest_data
+from switchfit.estimation.saved import load_saved, save_fit
 from switchfit.fit.accuracy import worst_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.hidden import refuse_jumps
@@ -33,6 +34,7 @@ from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_choice, as_count, as_flag, as_instance, as_path, as_positive
 from switchfit.runtime.files import write_atomically
+from switchfit.runtime.frames import Tabular, build_pandas, build_xarray, describe_frame
 from switchfit.runtime.presentation import draw_figure, format_html, format_page, format_text
 from switchfit.runtime.progress import Progress
 from switchfit.uncertainty.certificate import Certificate, certify
@@ -49,7 +51,14 @@ from switchfit.uncertainty.sensitivity import (
 )
 from switchfit.uncertainty.verdict import Verdict, judge
 
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
 HESSIANS = get_args(HessianKind)
+
+TableKind = Literal["unknowns", "trajectories", "residuals", "history"]
+TABLES = get_args(TableKind)
 
 REFINEMENTS = 2
 """Largest number of times that the mesh is refined at the solution, and the fit resumed, for the integration error."""
@@ -69,8 +78,13 @@ ORDER = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate(Fit):
+class Estimate(Fit, Tabular):
     """Result of `estimate`: everything in `Fit`, with methods that need the model. Print it for the report.
+
+    Attributes
+    ----------
+    provenance : Provenance or None
+        What a loaded estimate was made from, if its file says so: problem file, hashes of data and models, versions.
 
     See Also
     --------
@@ -96,6 +110,7 @@ class Estimate(Fit):
     saved_certificate: Certificate | None = None
     problem: Problem | None = None
     evaluator: Evaluator | None = None
+    provenance: Provenance | None = None
 
     def simulate_later(self, simulation: SimulatedProblem) -> None:
         """Compute `trajectories` and `comparisons` from a simulation at the first access; many fits never need them.
@@ -417,8 +432,15 @@ class Estimate(Fit):
         """Which combinations of the unknowns the data determine badly, with J evaluated there."""
         return identifiability(self)
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, *, provenance: Provenance | None = None) -> None:
         """Write everything but the model to a JSON file, atomically; `load` reads it.
+
+        Parameters
+        ----------
+        path : path
+        provenance : Provenance, optional
+            What the fit was made from, ``load_problem("problem.toml").provenance``, so that ``switchfit rerun`` can run
+            it again. Left out, the file keeps hashes of the data, and versions.
 
         See Also
         --------
@@ -437,7 +459,35 @@ class Estimate(Fit):
         ...     (Path(folder) / "fit.json").read_text().splitlines()[1]
         '  "verdict": {'
         """
-        save_fit(self.complete(), self.certificate, as_path(path, "path"))
+        file = as_path(path, "path")
+        if provenance is not None:
+            as_instance(provenance, "provenance", Provenance, "the provenance of a problem file")
+        save_fit(self.complete(), self.certificate, file, self.describe_provenance(provenance))
+
+    def describe_provenance(self, given: Provenance | None = None) -> Provenance | None:
+        """Return what the file of the estimate keeps of its origin; None for one that was loaded from a file without.
+
+        Parameters
+        ----------
+        given : Provenance, optional
+            Of its problem file.
+
+        See Also
+        --------
+        Estimate.save
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> [digest.name for digest in fit.describe_provenance().data]
+        ['thermometer']
+        """
+        if given is not None:
+            return replace(given, data=digest_data(self))
+        return self.provenance if self.saved_certificate is not None else describe_python_problem(self)
 
     def save_report(self, path: str | Path, *, problem_file: str | Path | None = None) -> None:
         """Write the report as one HTML file, atomically: figures to zoom into, a slider for each unknown, the inputs.
@@ -477,6 +527,65 @@ class Estimate(Fit):
         file = as_path(path, "path")
         given = None if problem_file is None else as_path(problem_file, "problem_file")
         write_atomically(format_page(self, problem_file=given), file)
+
+    def to_pandas(self, what: TableKind = "unknowns") -> pandas.DataFrame:
+        """Return one of the tables of the fit as a DataFrame; units are in ``.attrs["units"]``.
+
+        Parameters
+        ----------
+        what : {"unknowns", "trajectories", "residuals", "history"}
+            A row for each unknown, with its standard error and 95 % interval; for each node of each run; for each value
+            that was measured; for each iteration.
+
+        Raises
+        ------
+        ImportError
+            If pandas is not installed.
+
+        See Also
+        --------
+        Estimate.to_xarray, Trajectory.to_pandas, Fits.to_pandas
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.to_pandas()[["value", "std_error"]].round(3).to_dict("index")
+        {'tau_1': {'value': 2.462, 'std_error': 0.018}, 'k': {'value': 0.393, 'std_error': 0.005}}
+        >>> fit.to_pandas("residuals").shape
+        (24, 6)
+        """
+        return build_pandas(describe_frame(self, what=as_choice(what, "what", TABLES)))
+
+    def to_xarray(self, what: TableKind = "unknowns") -> xarray.Dataset:
+        """Return one of the tables of the fit as a Dataset; that of the unknowns has covariance and Hessian too.
+
+        Parameters
+        ----------
+        what : {"unknowns", "trajectories", "residuals", "history"}
+            As in `to_pandas`.
+
+        Raises
+        ------
+        ImportError
+            If xarray is not installed.
+
+        See Also
+        --------
+        Estimate.to_pandas, Trajectory.to_xarray, Fits.to_xarray
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.to_xarray()["covariance"].sel(unknown="k", unknown_2="k").item() > 0
+        True
+        """
+        return build_xarray(describe_frame(self, what=as_choice(what, "what", TABLES)))
 
     def complete(self) -> Estimate:
         """Return the estimate with all fields that are saved: computes the Gauss-Newton matrix.
@@ -531,11 +640,12 @@ class Estimate(Fit):
         """
         if problem is not None:
             as_instance(problem, "problem", Problem, "an sf.Problem")
-        fit, certificate = load_fit(as_path(path, "path"))
+        found = load_saved(as_path(path, "path"))
+        fit = found.fit
         if problem is not None:
             _check_loaded(fit, problem, path)
         own = {f.name: getattr(fit, f.name) for f in fields(Fit)}
-        return cls(**own, saved_certificate=certificate, problem=problem)
+        return cls(**own, saved_certificate=found.certificate, problem=problem, provenance=found.provenance)
 
 
 def _check_loaded(fit: Fit, problem: Problem, path: str | Path) -> None:

@@ -14,7 +14,7 @@ from switchfit.batch.simulated import MonteCarlo
 from switchfit.batch.starts import Multistart
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report.numbers import format_count
+from switchfit.report.numbers import format_count, format_rounded
 from switchfit.report.tables import format_table, wrap_text
 from switchfit.runtime.presentation import draw_figure, format_text
 
@@ -24,10 +24,17 @@ if TYPE_CHECKING:
 
 ESTIMATE, TRUTH, NORMAL = "#4a7fb5", "#b2182b", "#222222"
 CLUSTER_COLOURS = ("#b2182b", "#4a7fb5", "#e0a030", "#5c9e5c", "#8a5fa3", "#777777")
+LEVEL_COLOURS = {"good": "#1a7f4b", "doubtful": "#c07800", "bad": "#bb2a20"}
 COLUMNS = 3
 LISTED_MINIMA = 10
 LISTED_UNKNOWNS, LISTED_PLACES = 12, 6
 """Largest numbers of unknowns in a table, and in the line of a minimum; transition times are left out first."""
+LISTED_FITS, LISTED_WORST = 24, 12
+"""Fits up to which all are listed in their order; of more, the worst."""
+LISTED_COLUMNS = 4
+"""Unknowns in the line of a fit."""
+DRAWN_FITS, DRAWN_UNKNOWNS = 40, 6
+"""Fits and unknowns in a figure: the worst fits, and of more unknowns first those that are no transition times."""
 TOO_FEW = "Fewer than two fits converged: no statistics."
 BOOTSTRAP_TITLES = {
     "residuals": "Bootstrap of residuals",
@@ -63,13 +70,35 @@ def summarise(fits: Fits) -> list[str]:
 
 @format_text.register(Fits)
 def write_fits(fits: Fits) -> str:
-    """Return the verdict, and how the fits ended.
+    """Return the verdict, how the fits ended, and a line for each of them; of many, for the worst.
 
     Parameters
     ----------
     fits : Fits
     """
-    return "\n".join(summarise(fits))
+    return "\n".join([*summarise(fits), "", *tabulate_fits(fits)])
+
+
+def tabulate_fits(fits: Fits) -> list[str]:
+    """Return a line for each fit: level, cost, and the unknowns with their standard errors; of many, the worst first.
+
+    Parameters
+    ----------
+    fits : Fits
+    """
+    most = len(fits) if len(fits) <= LISTED_FITS else LISTED_WORST
+    listed = range(most) if most == len(fits) else fits.worst_first[:most].tolist()
+    shown = _select_unknowns(fits, LISTED_COLUMNS)
+    header = ["run", "", "J", *(part for i in shown for part in (_label(fits, i), ""))]
+    errors = fits.standard_errors
+    rows = [header]
+    for k in listed:
+        cells = [part for i in shown for part in format_rounded(fits.theta[k, i], errors[k, i])[:2]]
+        rows.append([str(fits.runs[k]), str(fits.levels[k]), f"{fits.cost[k]:.6g}", *cells])
+    lines = format_table(rows, ">" + "<>" + "><" * len(shown), indent="")
+    if most < len(fits):
+        lines.append(f"the worst {most} of {len(fits)} fits; .to_pandas() has all of them")
+    return lines + _count_rest(fits, shown)
 
 
 @format_text.register(MonteCarlo)
@@ -177,6 +206,44 @@ def _label(fits: Fits, k: int) -> str:
     """Return name and unit of unknown k."""
     unit = fits.theta_units[k]
     return fits.theta_names[k] + (f" ({unit})" if unit and unit != "1" else "")
+
+
+@draw_figure.register(Fits)
+def plot_fits(fits: Fits) -> Figure:
+    """Draw unknowns with their 95 % intervals, a row for each fit, the worst on top.
+
+    Parameters
+    ----------
+    fits : Fits
+    """
+    from matplotlib.figure import Figure
+
+    shown, order = _select_unknowns(fits, DRAWN_UNKNOWNS), fits.worst_first[:DRAWN_FITS]
+    count, columns = len(order), max(len(shown), 1)
+    size = (1.2 + 2.6 * columns, 1.4 + 0.2 * max(count, 5))
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(1, columns, sharey=True, squeeze=False)[0]
+    places, intervals, levels = np.arange(count), fits.confidence_intervals(), fits.levels[order]
+    for ax, i in zip(axes, shown, strict=False):
+        for level, colour in LEVEL_COLOURS.items():
+            here = levels == level
+            if not here.any():
+                continue
+            value, (low, high) = fits.theta[order[here], i], intervals[order[here], i].T
+            ax.hlines(places[here], low, high, color=colour, linewidth=1.6, alpha=0.6)
+            ax.scatter(value, places[here], s=18, color=colour, label=level, zorder=2)
+        ax.set_xlabel(_label(fits, i))
+        ax.ticklabel_format(axis="x", useOffset=False)
+        ax.locator_params(axis="x", nbins=4)
+        ax.grid(axis="x", linewidth=0.4, alpha=0.6)
+    axes[0].set_yticks(places, [str(run) for run in fits.runs[order]])
+    axes[0].set_ylabel("run")
+    axes[0].set_ylim(max(count, 1) - 0.5, -0.5)
+    handles, labels = axes[0].get_legend_handles_labels()
+    if handles:
+        title = None if count == len(fits) else f"the worst {count} of {len(fits)} fits"
+        figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False, title=title)
+    return figure
 
 
 @draw_figure.register(Bootstrap)
