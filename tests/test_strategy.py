@@ -115,6 +115,23 @@ def test_the_horizon_grows_where_sigma_is_left_out_whatever_the_unit(unit):
     assert end.cost == pytest.approx(right.cost * unit**2, rel=1e-4)
 
 
+def test_the_horizon_grows_where_a_delay_is_a_parameter():
+    """Samples are taken in by the least delay that they may have."""
+    times = TIMES[:-1]
+    values = temperatures(times - 0.1, TRUTH[:5], *TRUTH[5:])
+
+    def pose(guess):
+        data = sf.Measurements(times, values, sigma=0.02, delay="late")
+        run = sf.Experiment(data, ("on", "off") * 3, tuple(guess), 0.0, 10.0)
+        late = sf.Parameter(0.05, lower=0.0, upper=0.2)
+        return sf.Problem(HEATER, run, {"power": 1.2, "k": 0.6, "late": late})
+
+    problem = pose(FAR)
+    end = grow_horizon(problem, problem.initial_theta)
+    assert end.evaluations > 100
+    np.testing.assert_allclose(end.theta, [*TRUTH, 0.1], atol=1e-4)
+
+
 def grow_logistically(capacity):
     return lambda t, x, p: p["r"] * x * (1 - x / p[capacity])
 

@@ -31,7 +31,8 @@ from switchfit.strategy.scan import can_scan, scan_intervals
 from switchfit.strategy.starts import MOST, SAME_COST, Starts, try_starts
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 from switchfit.uncertainty.quality import measure_quality
-from switchfit.uncertainty.verdict import UNLIKELY
+from switchfit.uncertainty.residuals import are_uneven
+from switchfit.uncertainty.verdict import NEARLY_ALL, UNLIKELY
 
 Strategy = Literal["local", "auto", "thorough"]
 STRATEGIES = get_args(Strategy)
@@ -195,8 +196,8 @@ def _is_enough(problem: Problem, fit: Estimate, tried: Collection[str] = ()) -> 
     """Return whether nothing more has to be tried: nothing that the verdict doubts could be better elsewhere.
 
     Where the size of the noise is not known, the residuals of a minimum near the lowest look as good as its own: the
-    intervals between samples have to have been `tried`. Where there is no noise at all, and the quality of the fit is
-    not perfect, a strategy that looks everywhere.
+    intervals between samples have to have been `tried`, and all strategies where residuals hint at a short misfit.
+    Where there is no noise at all, and the quality of the fit is not perfect, a strategy that looks everywhere.
     """
     if fit.status is Status.INTERRUPTED:
         return True
@@ -204,13 +205,14 @@ def _is_enough(problem: Problem, fit: Estimate, tried: Collection[str] = ()) -> 
         return True
     if is_doubted(fit) or (_is_coarse(fit) and REMESH not in tried):
         return False
-    if any(run.is_guess_proposed for run in problem.experiments) and fit.sigma_known is not True:
-        return not EVERYWHERE.isdisjoint(tried)
     if fit.sigma_known is True or not any(run.transition_times for run in problem.experiments):
         return True
+    elsewhere = not EVERYWHERE.isdisjoint(tried)
+    proposed = any(run.is_guess_proposed for run in problem.experiments)
     if all(any(comparison.kind == "measurements" for comparison in run) for run in fit.comparisons):
-        return SCAN in tried
-    return not EVERYWHERE.isdisjoint(tried) or measure_quality(fit).explained >= PERFECT
+        hidden = STARTS not in tried and measure_quality(fit).explained < NEARLY_ALL and are_uneven(fit)
+        return SCAN in tried and (elsewhere or not proposed) and not hidden
+    return elsewhere or (not proposed and measure_quality(fit).explained >= PERFECT)
 
 
 def _is_confirmed(problem: Problem, fit: Estimate) -> bool:

@@ -223,6 +223,13 @@ class GrowingRun:
         except ValueError:  # a transition that is fixed or bounded to be later, or no data yet
             return None
 
+    def _find_least_delay(self, item: Any) -> float:
+        """Return the lower bound of a delay that is a parameter; 0 of any other data."""
+        if not (isinstance(item, Measurements) and isinstance(item.delay, str)):
+            return 0.0
+        parameter = self.problem.parameters[self.run.parameter_map.get(item.delay, item.delay)]
+        return float(parameter.value if parameter.fixed else parameter.lower)
+
     def cut(self, k: int) -> Experiment:
         """Return the run up to the window with its first k transitions; ValueError if there is no such run."""
         if self.is_whole:
@@ -239,7 +246,7 @@ class GrowingRun:
             ]
         return replace(
             run,
-            data=[cut for item in run.data if (cut := _cut(item, end)) is not None],
+            data=[cut for item in run.data if (cut := _cut(item, end, self._find_least_delay(item))) is not None],
             mode_sequence=run.mode_sequence[: k + 1],
             transition_times=tuple(taken),
             tf=end,
@@ -333,10 +340,13 @@ def _fit_best(part: Problem, starts: list[Beginning], free: NDArray[np.bool_]) -
     return [fit_briefly(part, theta, ITERATIONS) for theta in thetas[:TRIED]], len(thetas)
 
 
-def _cut(item: Any, end: float) -> Any:
-    """Return one part of the data up to `end`; None if nothing is left. What is said of the end holds at tf alone."""
-    if isinstance(item, Measurements) and not isinstance(item.delay, str):
-        there = item.seen_times <= end
+def _cut(item: Any, end: float, delay: float) -> Any:
+    """Return one part of the data up to `end`; None if nothing is left. What is said of the end holds at tf alone.
+
+    Samples with a delay that is a parameter belong to the part if they do with its least value, `delay`.
+    """
+    if isinstance(item, Measurements):
+        there = item.seen_times - delay <= end
         if not there.any():
             return None
         sigma = item.sigma
