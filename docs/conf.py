@@ -1,47 +1,69 @@
-"""Sphinx configuration; `make docs` builds to out/docs."""
+"""Sphinx configuration; `make docs` builds to out/docs. Neither the build nor the pages need a network."""
 
+import importlib
 import sys
 from importlib.metadata import version as installed_version
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent))
-import ball_figures  # these stand beside this file
-import covid_figures
-import heaters_figures
-import paper_figures
-import speed_figures
-import starts_figures
-import tosses_figures
-import uncertainty_figures
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))  # the modules beside this file
+import command_pages
 
-DRAWN_HERE = (
-    ball_figures,
-    covid_figures,
-    heaters_figures,
-    paper_figures,
-    speed_figures,
-    starts_figures,
-    tosses_figures,
-    uncertainty_figures,
-)
-for pictures in DRAWN_HERE:
-    pictures.draw(Path(__file__).parent / "_figures")
+SOURCES = [*HERE.glob("*_figures.py"), *HERE.glob("*-results.*"), *HERE.parent.glob("src/**/*.py")]
+SOURCES += [*HERE.parent.glob("examples/**/*.py"), *HERE.parent.glob("examples/**/*.csv")]
+"""What the figures are made from: the library, the examples, stored results."""
+
+
+def draw_figures(folder: Path) -> None:
+    """Draw every figure, unless nothing that they are made from has changed since."""
+    stamp = folder / ".drawn"
+    if stamp.exists() and stamp.stat().st_mtime > max(path.stat().st_mtime for path in SOURCES):
+        return
+    for path in sorted(HERE.glob("*_figures.py")):
+        importlib.import_module(path.stem).draw(folder)
+    stamp.touch()
+
+
+draw_figures(HERE / "_figures")
+command_pages.write(HERE / "_generated")
 
 project = "switchfit"
 author = "switchfit developers"
+project_copyright = "switchfit developers, BSD-3-Clause"
 version = release = installed_version("switchfit")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.napoleon"]
+extensions = [
+    "mathml",  # beside this file
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx_copybutton",
+    "sphinx_design",
+]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
-exclude_patterns = ["_build"]
-html_theme = "alabaster"
-html_static_path = ["_static"]
-html_theme_options = {"description": "When did it switch, and what were the parameters?", "page_width": "1100px"}
+exclude_patterns = ["_build", "_generated"]
+templates_path = ["_templates"]
 
+html_theme = "furo"
+html_title = f"switchfit {release}"
+html_static_path = ["_static"]
+html_css_files = ["custom.css"]
+html_theme_options = {"navigation_with_keys": True, "top_of_page_buttons": []}
+html_copy_source = False
+html_show_sourcelink = False
+pygments_style = "friendly"
+pygments_dark_style = "monokai"
+copybutton_prompt_text = r"\$ |>>> |\.\.\. "
+copybutton_prompt_is_regexp = True
+
+add_module_names = False
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 autodoc_default_options = {"members": True}
+autosummary_generate = True
+autosummary_imported_members = True
 napoleon_google_docstring = False
 napoleon_use_ivar = True
-myst_enable_extensions = ["dollarmath"]
+myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3  # links to headings, as README pages on the web have them
