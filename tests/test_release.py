@@ -64,8 +64,9 @@ def read_lowest():
 
 def find_python(version):
     """Return the path of a Python of that version, and skip the test where there is none."""
-    for name in (f"python{version}", "python3", sys.executable):
-        path = shutil.which(name)
+    names = [shutil.which(name) for name in (f"python{version}", "python3", sys.executable)]
+    pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
+    for path in [*names, *pyenv.glob(f"versions/{version}.*/bin/python")]:
         if path and run(path, "-c", "import sys; print('%d.%d' % sys.version_info[:2])").stdout.strip() == version:
             return path
     pytest.skip(f"there is no Python {version}")
@@ -101,7 +102,14 @@ def test_what_the_distributions_hold(distributions):
     assert {path.partition("/")[0] for path in packed} == {"switchfit", f"{name}.dist-info"}
     assert f"{name}.dist-info/licenses/LICENSE" in packed
     sources = {path.removeprefix(f"{name}/") for path in tarfile.open(source).getnames()}
-    assert {"LICENSE", "CITATION.cff", "CHANGELOG.md", "README.md", "pyproject.toml", "tests/test_release.py"} <= sources
+    assert {
+        "LICENSE",
+        "CITATION.cff",
+        "CHANGELOG.md",
+        "README.md",
+        "pyproject.toml",
+        "tests/test_release.py",
+    } <= sources
     assert wheel.stat().st_size < 2e6, "the wheel has something large in it"
     assert source.stat().st_size < 5e6, "the source distribution has something large in it"
 
