@@ -5,10 +5,10 @@ import sys
 from importlib.metadata import version as installed_version
 from pathlib import Path
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE))  # the modules beside this file
-import command_pages
+sys.path.insert(0, str(Path(__file__).parent))
+import command_pages  # the modules beside this file are imported from here on
 
+HERE = Path(__file__).parent
 SOURCES = [*HERE.glob("*_figures.py"), *HERE.glob("*-results.*"), *HERE.parent.glob("src/**/*.py")]
 SOURCES += [*HERE.parent.glob("examples/**/*.py"), *HERE.parent.glob("examples/**/*.csv")]
 """What the figures are made from: the library, the examples, stored results."""

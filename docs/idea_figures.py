@@ -1,4 +1,4 @@
-"""The picture of README and landing page: a measured toss of a cube, fitted. `python docs/idea_figures.py` writes idea.svg.
+"""The picture of README and landing page: a measured toss, fitted. `python docs/idea_figures.py` writes idea.svg.
 
 The landing page has it in the colours of a light and of a dark page, drawn when the documentation is built; README's is
 kept, since a README is shown where nothing is built.
@@ -23,7 +23,7 @@ HERE = Path(__file__).parent
 EXAMPLE = HERE.parent / "examples" / "toss" / "release.py"
 INKS = {"light": ("#222222", "#ffffff"), "dark": ("#d8d8d8", "#131416")}
 """Text and background of a light and of a dark page."""
-SHOWN = {"x": "along the table: x (m)", "z": "height: z (m)"}
+SHOWN = {"x": "path: x (m)", "z": "height: z (m)"}
 NAMES = ("impact 1", "impact 2", "impact 3", "impact 4", "lies flat", "rests")
 
 
@@ -52,15 +52,14 @@ def write_numbers(estimate: sf.Estimate) -> list[str]:
 
 
 def draw_fit(estimate: sf.Estimate, ink: str, paper: str) -> Figure:
-    """Draw height and path over time, with the modes shaded, and the numbers beside them."""
+    """Draw height and path over time, with the modes shaded, and the numbers below: readable on a phone too."""
     trajectory, comparison = estimate.trajectories[0], estimate.comparisons[0][0]
-    figure = Figure(figsize=(8.6, 3.6), layout="constrained", facecolor=paper)
-    side = figure.add_gridspec(1, 2, width_ratios=[2.6, 1.0])
-    upper, lower = side[0, 0].subgridspec(2, 1, hspace=0.08).subplots(sharex=True)
-    errors = estimate.corrected_standard_errors[: len(NAMES)]
+    times, errors = estimate.transition_times[0], estimate.corrected_standard_errors[: len(NAMES)]
+    figure = Figure(figsize=(6.4, 4.6), layout="constrained", facecolor=paper)
+    upper, lower, below = figure.subplots(3, 1, height_ratios=(1.0, 1.0, 0.72))
     for ax, channel in ((upper, "z"), (lower, "x")):
         plot_modes(trajectory, ax, labels=False)
-        plot_transitions(estimate.transition_times[0], errors, ax)
+        plot_transitions(times, errors, ax)
         plot_comparison(comparison, trajectory, comparison.names.index(channel), ax)
         ax.set_ylabel(SHOWN[channel], color=ink)
         ax.tick_params(colors=ink)
@@ -68,27 +67,26 @@ def draw_fit(estimate: sf.Estimate, ink: str, paper: str) -> Figure:
     upper.set_xlabel("")
     upper.tick_params(labelbottom=False)
     lower.set_xlabel("time (s)", color=ink)
-    spans = {"in flight": (0.0, estimate.transition_times[0][4]), "slides": tuple(estimate.transition_times[0][4:6])}
-    spans["sticks"] = (estimate.transition_times[0][5], trajectory.times[-1])
-    for name, (begin, end) in spans.items():
+    for name, begin, end in (("in flight", 0.0, times[4]), ("slides", *times[4:6])):
         place = {"transform": upper.get_xaxis_transform(), "ha": "center", "va": "bottom", "color": ink}
         upper.text((begin + end) / 2, 1.03, name, **place)
+    upper.text(1.0, 1.03, "sticks", transform=upper.transAxes, ha="right", va="bottom", color=ink)
     handles, labels = upper.get_legend_handles_labels()
-    upper.legend(handles, labels, loc="upper right", frameon=False, fontsize=9, labelcolor=INKS["light"][0])
-    text = figure.add_subplot(side[0, 1])
-    text.set_axis_off()
-    text.text(0.0, 0.97, "When did it switch?", weight="bold", color=ink, va="top", fontsize=11)
-    lines = write_numbers(estimate)
-    for k, line in enumerate(lines):
-        text.text(0.0, 0.84 - 0.092 * k, line, color=ink, va="top", family="monospace", fontsize=9)
-    text.text(
-        0.0,
-        0.84 - 0.092 * len(lines) - 0.03,
-        f"{len(comparison.times)} measured positions\n{len(estimate.theta)} unknowns, one fit",
-        color=ink,
-        va="top",
-        fontsize=9,
+    upper.legend(
+        handles,
+        labels,
+        loc="upper center",
+        bbox_to_anchor=(0.67, 1.0),
+        frameon=False,
+        labelcolor=INKS["light"][0],
+        ncols=2,
     )
+    below.set_axis_off()
+    for k, line in enumerate(write_numbers(estimate)):
+        column, row = divmod(k, 4)
+        below.text(0.53 * column, 0.95 - 0.25 * row, line, color=ink, va="top", family="monospace", fontsize=9.5)
+    known = f"{len(comparison.times)} positions, {len(estimate.theta)} unknowns, one fit"
+    below.text(0.53, 0.2, known, color=ink, va="top", fontsize=9.5, weight="bold")
     return figure
 
 

@@ -2,6 +2,7 @@
 
 import ast
 import re
+import runpy
 import shlex
 import shutil
 from functools import cache
@@ -25,6 +26,9 @@ PAGES = sorted(
 #: Pages that start processes.
 HEAVY = {"many-fits.md"}
 
+#: Blocks that are files and commands of one session; tests/test_first_ten_minutes.py runs them in order.
+SESSIONS = {"first-ten-minutes.md"}
+
 RUN = ("python", "sh", "console", "toml")
 NOT_CODE = ("text", "{image}", "{figure}", "{glossary}", "{include}", "{toctree}", "")
 """Kinds of blocks that are run, and those that are not: what was printed, pictures, diagrams."""
@@ -39,7 +43,7 @@ def pages_with(*kinds):
     return [
         pytest.param(page, id=page.relative_to(ROOT).as_posix(), marks=[pytest.mark.slow] * (page.name in HEAVY))
         for page in PAGES
-        if any(kind in kinds for kind, _ in blocks_of(page))
+        if page.name not in SESSIONS and any(kind in kinds for kind, _ in blocks_of(page))
     ]
 
 
@@ -130,3 +134,12 @@ def test_every_page_is_in_the_contents():
     pages = {path.stem for path in (ROOT / "docs").glob("*.md")}
     included = {"index", "coverage-results", "starts-results", "paper-results"}
     assert pages - included <= named
+
+
+def test_the_picture_of_the_readme_is_that_of_the_fit():
+    """Matplotlib writes each text of a figure as a comment into the SVG: the numbers are those of the fit."""
+    script = runpy.run_path(str(ROOT / "docs" / "idea_figures.py"))
+    picture = (ROOT / "docs" / "idea.svg").read_text(encoding="utf-8")
+    texts = re.findall("<!-- (.+?) -->", picture)
+    assert set(script["write_numbers"](script["fit"]())) <= set(texts), "run python docs/idea_figures.py"
+    assert len(picture) < 200_000

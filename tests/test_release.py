@@ -101,7 +101,8 @@ def test_what_the_distributions_hold(distributions):
     assert library <= packed, "files of the library that the wheel lacks"
     assert {path.partition("/")[0] for path in packed} == {"switchfit", f"{name}.dist-info"}
     assert f"{name}.dist-info/licenses/LICENSE" in packed
-    sources = {path.removeprefix(f"{name}/") for path in tarfile.open(source).getnames()}
+    with tarfile.open(source) as archive:
+        sources = {path.removeprefix(f"{name}/") for path in archive.getnames()}
     assert {
         "LICENSE",
         "CITATION.cff",
