@@ -9,19 +9,19 @@ sys.path.insert(0, str(Path(__file__).parent))
 import command_pages  # the modules beside this file are imported from here on
 
 HERE = Path(__file__).parent
-SOURCES = [*HERE.glob("*_figures.py"), *HERE.glob("*-results.*"), *HERE.parent.glob("src/**/*.py")]
+SOURCES = [*HERE.glob("*-results.*"), *HERE.parent.glob("src/**/*.py")]
 SOURCES += [*HERE.parent.glob("examples/**/*.py"), *HERE.parent.glob("examples/**/*.csv")]
-"""What the figures are made from: the library, the examples, stored results."""
+"""What figures are made from: the library, the examples, stored results."""
 
 
 def draw_figures(folder: Path) -> None:
-    """Draw every figure, unless nothing that they are made from has changed since."""
-    stamp = folder / ".drawn"
-    if stamp.exists() and stamp.stat().st_mtime > max(path.stat().st_mtime for path in SOURCES):
-        return
-    for path in sorted(HERE.glob("*_figures.py")):
-        importlib.import_module(path.stem).draw(folder)
-    stamp.touch()
+    """Draw the figures of which the sources or the script have changed since they were drawn."""
+    changed = max(path.stat().st_mtime for path in SOURCES)
+    for script in sorted(HERE.glob("*_figures.py")):
+        stamp = folder / f".{script.stem}"
+        if not stamp.exists() or stamp.stat().st_mtime < max(changed, script.stat().st_mtime):
+            importlib.import_module(script.stem).draw(folder)
+            stamp.touch()
 
 
 draw_figures(HERE / "_figures")

@@ -1,4 +1,4 @@
-"""Write room.csv, the log of the first ten minutes: a room that is heated for 43 minutes, with noise of 0.1 °C (seed 1)."""
+"""Write room.csv, the log of the first ten minutes: a room heated for 43 minutes, with noise of 0.1 °C (seed 1)."""
 
 from pathlib import Path
 
