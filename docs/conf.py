@@ -7,6 +7,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 import command_pages  # the modules beside this file are imported from here on
+from sphinx.application import Sphinx
 
 HERE = Path(__file__).parent
 SOURCES = [*HERE.glob("*-results.*"), *HERE.parent.glob("src/**/*.py")]
@@ -67,3 +68,14 @@ napoleon_google_docstring = False
 napoleon_use_ivar = True
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3  # links to headings, as README pages on the web have them
+
+
+def keep_first_line(app: Sphinx, what: str, name: str, item: object, options: object, lines: list[str]) -> None:
+    """Let the docstring of a property begin with an empty line: napoleon reads ``a: b`` in its first line as a type."""
+    if what == "property":
+        lines.insert(0, "")
+
+
+def setup(app: Sphinx) -> None:
+    """Connect what runs before napoleon, whose priority is 500."""
+    app.connect("autodoc-process-docstring", keep_first_line, priority=400)

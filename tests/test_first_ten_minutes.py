@@ -26,7 +26,7 @@ def read_steps(text):
     for match in re.finditer(r"^```(\w+)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
         kind, block = match.groups()
         if kind in ("python", "toml"):
-            name = re.search(r"Save this as `([\w.]+)`:\s*$", text[: match.start()])[1]
+            name = re.search(r"Save this as `([\w./]+)`:\s*$", text[: match.start()])[1]
             steps.append(("file", name, block))
         elif kind == "console":
             commands = re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]
