@@ -236,6 +236,9 @@ def _build_trajectory(problem: Problem, e: int, simulation: Simulation) -> Traje
     structure, system = problem.structures[e], problem.system
     moving = simulation.end > simulation.start
     counts = [1 + int(moving[rows].sum()) for rows in simulation.segments]
+    if structure.jumps:  # a mode goes on after a jump
+        starts = np.array(problem.experiments[e].drop_jumps(range(1, len(counts))), dtype=np.intp)
+        counts = np.add.reduceat(counts, np.insert(starts, 0, 0)).tolist()
     modes = np.repeat(problem.experiments[e].mode_sequence, counts)
     names = system.state_names or tuple(f"x{k + 1}" for k in range(structure.n))
     units = system.state_units or ("",) * structure.n
