@@ -205,8 +205,8 @@ def build_rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
     """Cut the cells between `nodes` (G + 1,) at `tau` (N,).
 
     Where tau_i equals a node, `side` = +1 lets segment i begin in the cell after it, so that derivatives are those
-    for tau_i increasing, and -1 in the cell before it. `side` is one number, or has one for each of tau (N,). Arrays are
-    those of `xp`, JAX or NumPy.
+    for tau_i increasing, and -1 in the cell before it. `side` is one number, or has one for each of tau (N,). Arrays
+    are those of `xp`, JAX or NumPy.
     """
     cells, N = nodes.shape[0] - 1, tau.shape[0]
     passed = count_passed(nodes, tau, side, xp)

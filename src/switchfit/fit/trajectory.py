@@ -26,7 +26,8 @@ class Trajectory:
     Attributes
     ----------
     times : (K,) array
-        All nodes, in `time_unit`; each transition time occurs twice, with the state before and after it.
+        All nodes, in `time_unit`; each transition time and the time of each jump occur twice, with the state before and
+        after.
     states : (K, n) array
     modes : (K,) array of str
         The mode that is active.
@@ -68,6 +69,16 @@ class Trajectory:
             (str(self.modes[a]), float(self.times[a]), float(self.times[b - 1]))
             for a, b in zip(self.segments[:-1], self.segments[1:], strict=True)
         ]
+
+    @property
+    def pieces(self) -> NDArray[np.intp]:
+        """Where the continuous pieces begin, and K: as `segments`, divided at jumps too."""
+        return np.union1d(self.segments, np.flatnonzero(np.diff(self.times) == 0) + 1)
+
+    @property
+    def jump_times(self) -> FloatArray:
+        """Times of the jumps at known times, those at transitions apart."""
+        return self.times[np.setdiff1d(self.pieces, self.segments)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from switchfit.problem.data import Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment, name_runs
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
-from switchfit.report.tables import format_table
+from switchfit.report.tables import format_table, list_jumps
 
 
 def describe(problem: Problem) -> str:
@@ -80,6 +80,8 @@ def _describe_experiment(experiment: Experiment) -> list[str]:
     if experiment.taken_from_data:
         horizon += f" ({' and '.join(experiment.taken_from_data)} from the data)"
     lines = [f"{sequence} on {horizon}, at {times}{unit}" if times else f"{sequence} on {horizon}"]
+    jumps = list_jumps(experiment.jump_times, experiment.time_unit)
+    lines += [jumps] if jumps else []
     for item in experiment.data:
         if isinstance(item, Measurements):
             step = np.median(np.diff(item.times)) if len(item.times) > 1 else np.nan

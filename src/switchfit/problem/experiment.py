@@ -311,8 +311,8 @@ class Experiment:
         outside = (acts < self.t0) | (acts >= last)
         if outside.any():
             raise ValueError(
-                f"A Jump must lie in [t0, tf) = [{self.t0}, {last}){unit}; got {shorten(acts[outside].tolist())}. Leave "
-                "it out, or move t0 or tf."
+                f"A Jump must lie in [t0, tf) = [{self.t0}, {last}){unit}; got {shorten(acts[outside].tolist())}. "
+                "Leave it out, or move t0 or tf."
             )
         for i, tau in enumerate(self._own_times, start=1):
             if not tau.fixed and np.any(acts == tau.value):

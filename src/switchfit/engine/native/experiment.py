@@ -50,8 +50,9 @@ def reason_for_jax(structure: Structure, arguments: Arguments, order: Order) -> 
 def places_in_library(structure: Structure) -> dict[str, NDArray[np.int64]]:
     """Return the index in the library of the mode of each segment, and of the functions of each transition.
 
-    Transitions without a function of a kind have -1. If there are jumps at known times, "jumps" is 1 for these. Idle segments, which the sequence does not need, have its last
-    mode and no functions. Each array ends with an unused -1, so that it is never empty.
+    Transitions without a function of a kind have -1. If there are jumps at known times, "jumps" is 1 for these. Idle
+    segments, which the sequence does not need, have its last mode and no functions. Each array ends with an unused -1,
+    so that it is never empty.
     """
     library, idle = structure.library, structure.transitions - structure.N
 
