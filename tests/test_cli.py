@@ -164,8 +164,10 @@ def test_check(folder):
 def test_check_fails_where_derivatives_are_wrong(folder, monkeypatch):
     class Wrong:
         passed = False
+        observed_orders = (1.0, 1.0, 1.0)
+        gradient_gap = hessian_gap = float("nan")
 
-    monkeypatch.setattr(sf, "check_derivatives", lambda problem: Wrong())
+    monkeypatch.setattr(sf, "check_derivatives", lambda problem, paper: Wrong())
     assert run("check", folder / "problem.toml").exit_code == 1
 
 
@@ -281,7 +283,7 @@ def test_ctrl_c_is_an_interrupt_wherever_it_comes(tmp_path):
 
 def test_ctrl_c_that_is_ignored_stays_so(folder, monkeypatch):
     """As in a background job of a shell script."""
-    monkeypatch.setattr(sf, "check_derivatives", lambda problem: signal.raise_signal(signal.SIGINT) or 1 / 0)
+    monkeypatch.setattr(sf, "check_derivatives", lambda problem, paper: signal.raise_signal(signal.SIGINT) or 1 / 0)
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         assert run("check", folder / "problem.toml").exit_code == 3
@@ -321,14 +323,14 @@ def test_model_that_raises_later(folder, monkeypatch):
     (folder / "late.py").write_text(ROOM + "\ndef late():\n    raise LookupError('not today')\n")
     (folder / "late.toml").write_text(PROBLEM.replace("room.py", "late.py"))
     late = load_problem(folder / "late.toml").problem.system.modes["on"].__globals__["late"]
-    monkeypatch.setattr(sf, "check_derivatives", lambda problem: late())
+    monkeypatch.setattr(sf, "check_derivatives", lambda problem, paper: late())
     result = run("check", folder / "late.toml")
     assert result.exit_code == 2
     assert "late.py, line 13, in late: LookupError: not today. (--debug shows the full traceback.)" in result.stderr
 
 
 def test_error_of_our_own_is_not_hidden(folder, monkeypatch):
-    def broken(problem):
+    def broken(problem, paper):
         raise ZeroDivisionError("ours")
 
     monkeypatch.setattr(sf, "check_derivatives", broken)

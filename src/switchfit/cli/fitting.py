@@ -12,14 +12,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from switchfit.cli.app import Debug, fail_for_refused, load
+from switchfit.cli.app import Debug, Json, Quiet, Verbose, complete_files, fail_for_refused, load
 from switchfit.cli.terminal import (
     BAD_INPUT,
     CONVERGED,
     NOT_CONVERGED,
     explain_write_errors,
     fail,
+    is_verbose,
     make_folder,
+    print_error,
+    print_json,
+    print_note,
     print_text,
     report_errors,
     stop_on_interrupt,
@@ -37,41 +41,63 @@ def fit(
             metavar="PROBLEM.toml",
             help="Problem file; with --problem, logs, each of which is fitted by itself.",
             show_default=False,
+            autocompletion=complete_files(".toml"),
         ),
     ],
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for report.html, report.txt, estimate.json, fit.png; runs.csv, unknowns.csv for many.",
+            metavar="DIR",
+            help="Folder for report.html, report.txt, estimate.json and fit.png; for runs.csv and unknowns.csv where "
+            "there are many. Left out, nothing is written.",
             show_default=False,
         ),
     ] = None,
     model: Annotated[
         Path | None,
         typer.Option(
-            "--problem", metavar="PROBLEM.toml", help="Problem file for the logs that are named.", show_default=False
+            "--problem",
+            metavar="PROBLEM.toml",
+            help="Problem file for the logs that are named.",
+            show_default=False,
+            autocompletion=complete_files(".toml"),
         ),
     ] = None,
     table: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.csv", help="With --problem: a line for each log.", show_default=False),
+        typer.Option(metavar="FILE.csv", help="With --problem: a table with a row for each log.", show_default=False),
     ] = None,
     strategy: Annotated[
         Literal["local", "auto", "thorough"] | None,
-        typer.Option(help="One fit, more if its verdict is not good, or all strategies.", show_default="auto"),
+        typer.Option(
+            help="local: one fit from the guess; auto, the default: more if the verdict is not good; thorough: all "
+            "strategies.",
+            show_default=False,
+        ),
     ] = None,
     time_budget: Annotated[
-        float | None, typer.Option(min=0.0, help="Seconds after which no further strategy begins.", show_default="none")
+        float | None,
+        typer.Option(
+            min=0.0,
+            metavar="SECONDS",
+            help="After so long no further strategy begins. Default: no limit.",
+            show_default=False,
+        ),
     ] = None,
     hessian: Annotated[
         Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"] | None,
-        typer.Option(help="Quadratic term of the optimizer.", show_default="auto"),
+        typer.Option(
+            help="Quadratic term of the optimizer. Default: auto, the exact Hessian in a trust region.",
+            show_default=False,
+        ),
     ] = None,
     tolerance: Annotated[
-        float | None, typer.Option(min=0.0, help="Optimality at which to stop.", show_default="the library's")
+        float | None,
+        typer.Option(min=0.0, metavar="NUMBER", help="Optimality at which to stop. Default: 1e-7.", show_default=False),
     ] = None,
     max_iterations: Annotated[
-        int | None, typer.Option(min=0, help="Most iterations.", show_default="the library's")
+        int | None,
+        typer.Option(min=0, metavar="COUNT", help="Most iterations of a fit. Default: 200.", show_default=False),
     ] = None,
     no_figures: Annotated[
         bool, typer.Option("--no-figures", help="Write no figures: neither fit.png nor report.html.")
@@ -82,17 +108,22 @@ def fit(
     full: Annotated[
         bool, typer.Option("--full", help="Report all runs, channels, unknowns and warnings, not one screen.")
     ] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Estimate transition times and parameters; report on the terminal, report and figure in --out.
+    """Estimate transition times and parameters, and report.
 
-    Options given here override those in the problem file. Ctrl-C stops after the current iteration and reports the
-    result so far. Exit code 0: converged, the verdict is good or doubtful; 1: not converged or bad, the result is still
-    written; 2: the input is wrong.
+    The report goes to the terminal, and with --out into a folder, with a page and a figure. Options override those in
+    the problem file. Ctrl-C stops after the current iteration and reports the result so far.
 
-    LOG ... --problem PROBLEM.toml fits each of the logs by itself, in place of the file that the data name. A pattern
-    or a folder stands for the logs in it. A log that cannot be used is reported, and the next one is fitted; the exit
-    code is that of the worst.
+    Exit code 0: converged, and the verdict is good or doubtful. 1: not converged or bad; the result is still written.
+    2: the input is wrong.
+
+    LOG ... --problem PROBLEM.toml fits each log by itself, in place of the file that the data name. A pattern or a
+    folder stands for the logs in it. A log that cannot be used is reported, and the next one is fitted; the exit code
+    is that of the worst.
     """
     given = {
         "strategy": strategy,
@@ -104,25 +135,27 @@ def fit(
     overrides = {key: value for key, value in given.items() if value is not None}
     output = Output(out, figures=out is not None and not no_figures, certificate=certificate, full=full)
     if model is not None:
-        with report_errors(debug):
+        with report_errors(debug, json=json, quiet=quiet, verbose=verbose):
             code = _fit_logs(problem, model, overrides, output, table)
         if code != CONVERGED:
             raise typer.Exit(code)
         return
     if len(problem) != 1 or table is not None:
         fail("name one problem file; to fit several logs by one, name it with --problem PROBLEM.toml.", BAD_INPUT)
-    with report_errors(debug):
+    with report_errors(debug, json=json, quiet=quiet, verbose=verbose):
         loaded = load(problem[0])
         if out is not None:
             make_folder(out)
         options = loaded.options | overrides
         estimate = estimate_problem(loaded, options, prepare_figures=output.figures)
         write_estimate(estimate, loaded, options, output, output.folder)
-    fail_for_refused(loaded.issues)
-    if not estimate.success:
-        reason = "" if estimate.status.successful else f"not converged. {estimate.message}"
-        print_text(f"switchfit: {reason or 'the fit is bad; the first line of the report says why.'}", err=True)
-        raise typer.Exit(NOT_CONVERGED)
+        print_json(_summarize(estimate, out))
+        fail_for_refused(loaded.issues)
+        if not estimate.success:
+            if not quiet:
+                reason = "" if estimate.status.successful else f"not converged. {estimate.message}"
+                print_error(reason or "the fit is bad; the first line of the report says why.")
+            raise typer.Exit(NOT_CONVERGED)
 
 
 def estimate_problem(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: bool) -> Any:
@@ -133,7 +166,32 @@ def estimate_problem(loaded: ProblemFile, options: dict[str, Any], *, prepare_fi
         os.environ.setdefault("MPLBACKEND", "Agg")
         threading.Thread(target=_import_figures, daemon=True).start()
     with stop_on_interrupt() as stopped:
-        return sf.estimate(loaded.problem, callback=lambda record: stopped(), **options)
+
+        def report(record: Any) -> bool:
+            if is_verbose():
+                numbers = f"J = {record.cost:.6g}, optimality {record.optimality:.1e}"
+                print_note(f"  iteration {record.iteration}: {numbers}")
+            return stopped()
+
+        estimate = sf.estimate(loaded.problem, callback=report, **options)
+    if is_verbose():
+        for line in _describe_course(estimate):
+            print_note(line)
+    return estimate
+
+
+def _describe_course(estimate: Any) -> list[str]:
+    """Return the engine and the strategies that were tried, a line each."""
+    lines = [str(estimate.engine)]
+    lines += [f"{step.strategy}: lowest J = {step.cost:.6g} after {step.seconds:.2g} s" for step in estimate.steps]
+    return [*lines, f"{estimate.iterations} iterations, {estimate.evaluations} evaluations, {estimate.seconds:.2g} s"]
+
+
+def _summarize(estimate: Any, folder: Path | None) -> dict[str, Any]:
+    """Return a fit for --json, and the folder with what was written."""
+    from switchfit.io.result_json import summarize_estimate
+
+    return summarize_estimate(estimate) | {"out": None if folder is None else str(folder)}
 
 
 def _choose_tables(estimate: Any, out: Path | None) -> dict[str, Path]:
@@ -196,7 +254,7 @@ def write_estimate(
         estimate.plot().savefig(figure, format="png", dpi=150)
         write_file(folder / "fit.png", figure.getvalue())
         _write_page(estimate, loaded, options, folder / "report.html")
-    print_text(f"written to {folder}", err=True)
+    print_note(f"written to {folder}")
 
 
 def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output: Output, table: Path | None) -> int:
@@ -206,7 +264,7 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
     logs = list_logs(paths)
     if table is not None:
         make_folder(table.parent)
-    results = ResultTable()
+    results, fitted = ResultTable(), []
     for name, path in logs:
         loaded, error = load_log(model, path)
         estimate = None
@@ -214,15 +272,18 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
             estimate, error = _estimate_log(loaded, overrides, output)
         results.add(str(path), estimate, error)
         print_text(results.describe_last())
-        if loaded is not None and estimate is not None and output.folder is not None:
-            make_folder(output.folder / name)
-            options = loaded.options | overrides
-            write_estimate(estimate, loaded, options, output, output.folder / name, show=False)
+        folder = None if output.folder is None else output.folder / name
+        refused = {"verdict": "refused", "message": error}
+        fitted.append({"log": str(path)} | (refused if estimate is None else _summarize(estimate, folder)))
+        if loaded is not None and estimate is not None and folder is not None:
+            make_folder(folder)
+            write_estimate(estimate, loaded, loaded.options | overrides, output, folder, show=False)
         if table is not None:  # after each log, so that an interrupted run leaves what it has
             write_file(table, results.write())
         if estimate is not None and estimate.status.name == "INTERRUPTED":
             break
-    print_text(results.summarize(len(logs)), err=True)
+    print_note(results.summarize(len(logs)))
+    print_json({"logs": fitted})
     return BAD_INPUT if results.refused else NOT_CONVERGED if results.failed or len(results) < len(logs) else CONVERGED
 
 
@@ -258,6 +319,6 @@ def _write_page(estimate: Any, loaded: ProblemFile, options: dict[str, Any], pat
     try:
         page = format_page(estimate, problem_file=loaded.path, options=options)
     except MissingExtraError as missing:
-        print_text(f"no {path.name}: {missing}", err=True)
+        print_note(f"no {path.name}: {missing}")
     else:
         write_file(path, page)

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from switchfit.cli.app import Debug
-from switchfit.cli.terminal import INTERRUPTED, fail, make_folder, print_text, report_errors
+from switchfit.cli.terminal import INTERRUPTED, fail, make_folder, print_note, print_text, report_errors
 
 
 def paper(
@@ -39,10 +39,10 @@ def paper(
 
         make_folder(out)
         try:
-            run(out, quick=quick, only=only, say=lambda text: print_text(text, err=True))
+            run(out, quick=quick, only=only, say=print_note)
         except KeyboardInterrupt:
             fail("interrupted; run the same command again to resume.", INTERRUPTED)
         except OSError as error:
             raise InputError(f"{out} cannot be written: {error.strerror}; name another with --out.") from error
         print_text((out / TABLE).read_text(encoding="utf-8"))
-        print_text(f"written to {out}", err=True)
+        print_note(f"written to {out}")

@@ -1,17 +1,25 @@
-"""The terminal: what is printed, errors in a sentence with an exit code, Ctrl-C, and files that are written."""
+"""The terminal: what is printed, errors in a sentence with an exit code, Ctrl-C, and files that are written.
+
+stdout has the result alone: a report, or with --json one JSON value. Notes and errors go to stderr.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import json
+import logging
+import math
 import os
 import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from contextvars import ContextVar
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import typer
 
@@ -20,7 +28,82 @@ CONVERGED, NOT_CONVERGED, BAD_INPUT, INTERNAL_ERROR, INTERRUPTED = 0, 1, 2, 3, 1
 # --- output -----------------------------------------------------------------------------------------------------------
 
 
-def print_text(text: object, *, err: bool = False) -> None:
+@dataclass(frozen=True)
+class Voice:
+    """What a command prints: of its result the text, the JSON or nothing, and notes about what it does."""
+
+    text: bool = True
+    json: bool = False
+    notes: bool = True
+    log: bool = False
+
+
+_TEXT = Voice()
+
+_voice: ContextVar[Voice] = ContextVar("what is printed", default=_TEXT)
+
+
+class _NoteHandler(logging.Handler):
+    """Prints the library's log as notes."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print_note(self.format(record))
+
+
+@contextlib.contextmanager
+def choose_voice(*, json: bool = False, quiet: bool = False, verbose: bool = False) -> Iterator[None]:
+    """Return a context in which the options --json, --quiet and --verbose hold."""
+    if quiet and verbose:
+        fail("--quiet and --verbose contradict each other; give one of them.", BAD_INPUT)
+    token = _voice.set(Voice(text=not (json or quiet), json=json, notes=not quiet, log=verbose))
+    logger, handler = logging.getLogger("switchfit"), _NoteHandler()
+    level = logger.level
+    if verbose:
+        logger.addHandler(handler)
+        logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+        _voice.reset(token)
+
+
+def is_verbose() -> bool:
+    """Return whether --verbose was given."""
+    return _voice.get().log
+
+
+def print_text(text: object) -> None:
+    """Print a part of the result as text."""
+    if _voice.get().text:
+        _print(text)
+
+
+def print_json(value: Any) -> None:
+    """Print the result as JSON, if it is asked for; numbers that are not finite are null."""
+    if _voice.get().json:
+        _print(json.dumps(_make_plain(value), ensure_ascii=False, allow_nan=False))
+
+
+def print_note(text: object) -> None:
+    """Print what the command does, to stderr."""
+    if _voice.get().notes:
+        _print(text, err=True)
+
+
+def _make_plain(value: Any) -> Any:
+    """Return a value of lists, dicts, text and finite numbers."""
+    if hasattr(value, "tolist"):  # arrays and numbers of NumPy
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): _make_plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_make_plain(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _print(text: object, *, err: bool = False) -> None:
     """Print to stdout or stderr; if its reader has closed it, as ``head`` does, print nothing from then on.
 
     The command continues: its files and its exit code do not depend on a reader.
@@ -46,10 +129,13 @@ def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
 
 
 @contextlib.contextmanager
-def report_errors(debug: bool) -> Iterator[None]:
-    """Turn exceptions into a sentence on stderr and an exit code, including any exception of a model file."""
+def report_errors(debug: bool, *, json: bool = False, quiet: bool = False, verbose: bool = False) -> Iterator[None]:
+    """Turn exceptions into a sentence on stderr and an exit code, including any exception of a model file.
+
+    The other options hold as in `choose_voice`.
+    """
     try:
-        with handle_interrupt(_interrupt):
+        with choose_voice(json=json, quiet=quiet, verbose=verbose), handle_interrupt(_interrupt):
             yield
     except BaseException as error:
         from switchfit.io.python_file import find_user_place
@@ -100,8 +186,13 @@ def handle_interrupt(handler: Callable[[int, FrameType | None], object]) -> Iter
 
 def fail(message: str, code: int) -> NoReturn:
     """Print a message to stderr and exit."""
-    print_text(f"switchfit: {message}", err=True)
+    print_error(message)
     raise typer.Exit(code)
+
+
+def print_error(message: object) -> None:
+    """Print what is wrong, to stderr."""
+    _print(f"switchfit: {message}", err=True)
 
 
 @contextlib.contextmanager
@@ -119,7 +210,7 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
             requested.set()
             raise CtrlC
         requested.set()
-        print_text("stopping after this iteration; Ctrl-C again to stop at once", err=True)
+        print_note("stopping after this iteration; Ctrl-C again to stop at once")
 
     with handle_interrupt(request):
         yield requested.is_set

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from switchfit.fit.evaluator import Evaluator
 from switchfit.optimize.algebra import EPS
 from switchfit.problem.data import FloatArray
-from switchfit.problem.experiment import Experiment
+from switchfit.problem.experiment import Experiment, drop_jumps
 from switchfit.problem.problem import Problem
 
 CHANGES = (0.1, -0.1)
@@ -116,7 +116,7 @@ def _find_collapsed(problem: Problem, theta: FloatArray, e: int) -> tuple[NDArra
 def _get_times(problem: Problem, theta: FloatArray, e: int) -> FloatArray:
     """Return the transition times of experiment e, and a free tf behind them: (N,), without jumps."""
     experiment, times = problem.experiments[e], problem.vectors(theta, e)[0]
-    return np.array(experiment.drop_jumps(times)) if len(experiment.jump_times) else times
+    return np.array(drop_jumps(experiment, times)) if len(experiment.jump_times) else times
 
 
 def _estimate_rounding(experiment: Experiment) -> float:

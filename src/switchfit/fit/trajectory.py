@@ -15,6 +15,7 @@ from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.experiment import drop_jumps
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_index, as_instance
 
@@ -248,7 +249,7 @@ def _build_trajectory(problem: Problem, e: int, simulation: Simulation) -> Traje
     moving = simulation.end > simulation.start
     counts = [1 + int(moving[rows].sum()) for rows in simulation.segments]
     if structure.jumps:  # a mode goes on after a jump
-        starts = np.array(problem.experiments[e].drop_jumps(range(1, len(counts))), dtype=np.intp)
+        starts = np.array(drop_jumps(problem.experiments[e], range(1, len(counts))), dtype=np.intp)
         counts = np.add.reduceat(counts, np.insert(starts, 0, 0)).tolist()
     modes = np.repeat(problem.experiments[e].mode_sequence, counts)
     names = system.state_names or tuple(f"x{k + 1}" for k in range(structure.n))

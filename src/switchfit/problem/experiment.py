@@ -225,26 +225,10 @@ class Experiment:
         """How many of `times` each jump comes after: (K,). One at the time of a fixed transition comes before it."""
         return np.searchsorted(self.initial_times, self.jump_times, "left")
 
-    def insert_jumps(self, of_times: Any, of_jumps: Any) -> Any:
-        """Return an array or a list with an entry for each of `times` with those of the jumps in between."""
-        if not len(self.jump_times):
-            return of_times
-        if isinstance(of_times, np.ndarray):
-            return np.insert(of_times, self.passed_by_jumps, of_jumps)
-        both: list[Any] = list(of_times)
-        for place, entry in reversed(list(zip(self.passed_by_jumps.tolist(), of_jumps, strict=True))):
-            both.insert(place, entry)
-        return both
-
-    def drop_jumps(self, of_all: Sequence[Any]) -> list[Any]:
-        """Return the entries of the transitions, of a sequence with one for each transition and jump."""
-        jumps = set((self.passed_by_jumps + np.arange(len(self.jump_times))).tolist())
-        return [entry for i, entry in enumerate(of_all) if i not in jumps]
-
     @cached_property
     def initial_times_with_jumps(self) -> FloatArray:
         """Guess of all of `times`, with the times of the jumps in between: what programs take, (N,)."""
-        return np.asarray(self.insert_jumps(self.initial_times, self.jump_times))
+        return np.asarray(insert_jumps(self, self.initial_times, self.jump_times))
 
     @property
     def initial_times(self) -> FloatArray:
@@ -364,6 +348,37 @@ def _propose_times(t0: float, tf: float, count: int, jumps: Sequence[float]) -> 
         later = [*(jump for jump in jumps if jump > time), time + step]
         proposed.append(time + 0.25 * (min(later) - time) if time in jumps else time)
     return proposed
+
+
+def insert_jumps(experiment: Experiment, of_times: Any, of_jumps: Any) -> Any:
+    """Return an array or a list with an entry for each of an experiment's `times`, with those of the jumps in between.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    of_times : (N,) array, or a sequence
+    of_jumps : a number, or one entry for each jump
+    """
+    if not len(experiment.jump_times):
+        return of_times
+    if isinstance(of_times, np.ndarray):
+        return np.insert(of_times, experiment.passed_by_jumps, of_jumps)
+    both: list[Any] = list(of_times)
+    for place, entry in reversed(list(zip(experiment.passed_by_jumps.tolist(), of_jumps, strict=True))):
+        both.insert(place, entry)
+    return both
+
+
+def drop_jumps(experiment: Experiment, of_all: Iterable[Any]) -> list[Any]:
+    """Return the entries of the transitions, of those of all transitions and jumps.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    of_all : iterable
+    """
+    jumps = set((experiment.passed_by_jumps + np.arange(len(experiment.jump_times))).tolist())
+    return [entry for i, entry in enumerate(of_all) if i not in jumps]
 
 
 def initial_state_of(system: HybridSystem, experiment: Experiment) -> Any:

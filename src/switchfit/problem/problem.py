@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.problem.constraints import Constraint
 from switchfit.problem.data import FloatArray, Measurements
-from switchfit.problem.experiment import Experiment, initial_state_of, name_runs
+from switchfit.problem.experiment import Experiment, drop_jumps, initial_state_of, insert_jumps, name_runs
 from switchfit.problem.lengths import choose_common_lengths
 from switchfit.problem.parameter import Parameter, as_parameter, unit_suffix
 from switchfit.problem.priors import PriorTerms
@@ -372,7 +372,7 @@ class Problem:
         names = []
         for prefix, structure, experiment in zip(self._prefixes, self.structures, self.experiments, strict=True):
             # of the user's transitions: those of the structure have the jumps in between
-            for i in np.flatnonzero(experiment.drop_jumps([g is not None for g in structure.guards])).tolist():
+            for i in np.flatnonzero(drop_jumps(experiment, [g is not None for g in structure.guards])).tolist():
                 before, after = experiment.mode_sequence[i : i + 2]
                 names.append(f"{prefix}guard of tau_{i + 1} ({before} -> {after})")
             names += [f"{prefix}terminal constraint {k + 1}" for k in range(structure.terminal_constraint_count)]
@@ -401,7 +401,7 @@ class Problem:
             free = [name for name, _, is_free in structure.parameters if is_free]
             spans = [unknowns.parameters[experiment.parameter_map.get(name, name)] for name in free]
             states = unknowns.initial_states[e]
-            times = experiment.insert_jumps(unknowns.times[e], -1)
+            times = insert_jumps(experiment, unknowns.times[e], -1)
             parts = [times, *(np.arange(s.start, s.stop) for s in spans), states[states >= 0]]
             found.append(np.concatenate(parts).astype(np.intp))
         return tuple(found)

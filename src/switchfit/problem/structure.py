@@ -24,7 +24,7 @@ from switchfit.problem.data import (
     TerminalCost,
     TransitionCost,
 )
-from switchfit.problem.experiment import Experiment, initial_state_of
+from switchfit.problem.experiment import Experiment, initial_state_of, insert_jumps
 from switchfit.problem.functions import Function, Shape, trace_function
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.system import HybridSystem
@@ -283,7 +283,7 @@ def trace_structure(
         own = list(pairwise(experiment.mode_sequence))
         here = given if transitions is not None else own
         traced = {pair: trace(g, at, shape, f"{what} {pair}", form) for pair, g in given.items() if pair in here}
-        found = experiment.insert_jumps([traced.get(pair) for pair in own], at_jumps or [None] * len(jump_maps))
+        found = insert_jumps(experiment, [traced.get(pair) for pair in own], at_jumps or [None] * len(jump_maps))
         return tuple(found), tuple(dict.fromkeys([*traced.values(), *filter(None, at_jumps)]))
 
     modes = tuple(trace(system.modes[name], in_mode, (n,), f"mode {name!r}", form, input_names) for name in names)
@@ -291,7 +291,7 @@ def trace_structure(
     # After a jump the mode is that before it.
     sequence = (
         own_modes[0],
-        *experiment.insert_jumps(own_modes[1:], [own_modes[i] for i in experiment.passed_by_jumps]),
+        *insert_jumps(experiment, own_modes[1:], [own_modes[i] for i in experiment.passed_by_jumps]),
     )
     jump_maps = [trace(jump, at, (n,), "the map of a Jump", "map(t, x, p)") for jump in experiment.jump_maps]
     end: tuple[None, ...] = ()
