@@ -78,7 +78,6 @@ def fit(
     time_budget: Annotated[
         float | None,
         typer.Option(
-            min=0.0,
             metavar="SECONDS",
             help="After so long no further strategy begins. Default: no limit.",
             show_default=False,
@@ -93,11 +92,11 @@ def fit(
     ] = None,
     tolerance: Annotated[
         float | None,
-        typer.Option(min=0.0, metavar="NUMBER", help="Optimality at which to stop. Default: 1e-7.", show_default=False),
+        typer.Option(metavar="NUMBER", help="Optimality at which to stop. Default: 1e-7.", show_default=False),
     ] = None,
     max_iterations: Annotated[
         int | None,
-        typer.Option(min=0, metavar="COUNT", help="Most iterations of a fit. Default: 200.", show_default=False),
+        typer.Option(metavar="COUNT", help="Most iterations of a fit. Default: 200.", show_default=False),
     ] = None,
     no_figures: Annotated[
         bool, typer.Option("--no-figures", help="Write no figures: neither fit.png nor report.html.")

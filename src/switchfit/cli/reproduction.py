@@ -27,11 +27,10 @@ def paper(
     ] = None,
     debug: Debug = False,
 ) -> None:
-    """Reproduce every experiment and figure of Miller and Murphey's paper, and compare its numbers with ours.
+    """Reproduce the paper's experiments and figures.
 
-    An interrupted run resumes when the same command is run again.
-    """
-    os.environ.setdefault("MPLBACKEND", "Agg")
+    Every experiment and figure of Miller and Murphey, with its numbers beside ours. An interrupted run resumes when
+    the same command is run again. """    os.environ.setdefault("MPLBACKEND", "Agg")
     with report_errors(debug):
         from switchfit.paper import run
         from switchfit.paper.runner import TABLE

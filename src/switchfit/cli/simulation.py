@@ -23,11 +23,10 @@ def simulate(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Integrate the model at the first guess, and write times, modes and states as CSV.
+    """Integrate the model at the first guess.
 
-    The column of times is named t, or for example "t (min)" if the experiments' time_unit is "min" instead of "s".
-    """
-    if out is None and not json:
+    Writes times, modes and states as CSV. The column of times is named t, or for example "t (min)" if the
+    experiments' time_unit is "min" instead of "s". """    if out is None and not json:
         fail("name the file to write with --out FILE.csv, or give --json to print the trajectories.", BAD_INPUT)
     with report_errors(debug, json=json, quiet=quiet):
         loaded = load(problem)

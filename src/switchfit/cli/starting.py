@@ -28,13 +28,12 @@ def init(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Create a folder with a problem file, a model and data, ready to fit.
+    """Create a problem to begin with, ready to fit.
 
-    With --from the time column and up to three channels of the log are chosen, with a first model that suits any log:
-    each channel approaches a level, another one from an estimated time on. Comments say what to change. A log of more
-    than 20 MB is not copied. Nothing is overwritten.
-    """
-    with report_errors(debug, quiet=quiet):
+    Writes a folder with a problem file, its model and data. With --from the time column and up to three channels of
+    the log are chosen, with a first model that suits any log: each channel approaches a level, another one from an
+    estimated time on. Comments say what to change. A log of more than 20 MB is not copied. Nothing is overwritten.
+    """    with report_errors(debug, quiet=quiet):
         from switchfit.io.first_problem import write_first_problem
         from switchfit.io.problem_file import load_problem
         from switchfit.io.summary import describe_experiments
@@ -75,7 +74,7 @@ def examples(
     name: Annotated[
         str | None,
         typer.Argument(
-            metavar="[NAME]",
+            metavar="NAME",
             help="Example to copy. Left out, all are listed.",
             show_default=False,
             autocompletion=_complete_examples,
@@ -83,13 +82,13 @@ def examples(
     ] = None,
     folder: Annotated[
         Path | None,
-        typer.Argument(metavar="[FOLDER]", help="Folder to create. Default: one of the name.", show_default=False),
+        typer.Argument(metavar="FOLDER", help="Folder to create. Default: one of the name.", show_default=False),
     ] = None,
     debug: Debug = False,
 ) -> None:
-    """List the examples, or copy one into a new folder.
+    """List the examples, or copy one.
 
-    Nothing is overwritten.
+    It is copied into a new folder. Nothing is overwritten.
     """
     with report_errors(debug):
         found = _list_examples()

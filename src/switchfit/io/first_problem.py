@@ -121,7 +121,8 @@ def plan_problem(log: Log) -> Plan:
     scale = SECONDS[log.time_unit] / SECONDS[unit] if log.time_unit else 1.0
     known = np.isfinite(log.times)
     steps = np.diff(log.times[known])
-    flaws = {"drop-missing-times": not known.all(), "sort": np.any(steps < 0), "drop-duplicates": np.any(steps == 0)}
+    twice = len(np.unique(log.times[known])) < known.sum()
+    flaws = {"drop-missing-times": not known.all(), "sort": np.any(steps < 0), "drop-duplicates": twice}
     order = np.flatnonzero(known)[np.argsort(log.times[known], kind="stable")]
     varying = [name for name in log.values if _varies(log.values[name][order])]
     if log.has_positions and {"east", "north"} <= set(varying):
@@ -207,6 +208,9 @@ initial_state = [   # <- a number for a state that is known
 [[experiments.data]]
 {data}
 # window = [0.0, 10.0]   # <- only rows whose time lies in between
+
+[options]
+time_budget = 20.0   # <- seconds after which no further search begins; leave it out once the model is yours
 """
 
 
@@ -236,7 +240,7 @@ def write_problem(plan: Plan, file: str) -> str:
     data.append(f"columns = [{_join(plan.channels)}]   # <- each measures the state of its name")
     if plan.others:
         data.append(f"# further channels: {', '.join(plan.others)}")
-    data += [f"# {issue}" for issue in log.issues]
+    data += [f"# {issue}".replace(log.source, Path(log.source).name) for issue in log.issues]
     if plan.repairs:
         data.append(f"repair = [{_join(plan.repairs)}]   # what may be changed of that")
     if several:
