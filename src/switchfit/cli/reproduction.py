@@ -30,7 +30,9 @@ def paper(
     """Reproduce the paper's experiments and figures.
 
     Every experiment and figure of Miller and Murphey, with its numbers beside ours. An interrupted run resumes when
-    the same command is run again. """    os.environ.setdefault("MPLBACKEND", "Agg")
+    the same command is run again.
+    """
+    os.environ.setdefault("MPLBACKEND", "Agg")
     with report_errors(debug):
         from switchfit.paper import run
         from switchfit.paper.runner import TABLE

@@ -26,7 +26,9 @@ def simulate(
     """Integrate the model at the first guess.
 
     Writes times, modes and states as CSV. The column of times is named t, or for example "t (min)" if the
-    experiments' time_unit is "min" instead of "s". """    if out is None and not json:
+    experiments' time_unit is "min" instead of "s".
+    """
+    if out is None and not json:
         fail("name the file to write with --out FILE.csv, or give --json to print the trajectories.", BAD_INPUT)
     with report_errors(debug, json=json, quiet=quiet):
         loaded = load(problem)

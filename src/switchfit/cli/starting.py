@@ -33,7 +33,8 @@ def init(
     Writes a folder with a problem file, its model and data. With --from the time column and up to three channels of
     the log are chosen, with a first model that suits any log: each channel approaches a level, another one from an
     estimated time on. Comments say what to change. A log of more than 20 MB is not copied. Nothing is overwritten.
-    """    with report_errors(debug, quiet=quiet):
+    """
+    with report_errors(debug, quiet=quiet):
         from switchfit.io.first_problem import write_first_problem
         from switchfit.io.problem_file import load_problem
         from switchfit.io.summary import describe_experiments
