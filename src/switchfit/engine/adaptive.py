@@ -233,14 +233,15 @@ def _adaptive_steps(
         raise _not_finite(f"initial_state at p = {_round_parameters(problem.split(theta)[1])}", x)
     for i, mode in enumerate(structure.mode_of_segment):
         if i > 0 and structure.reset_maps[i - 1] is not None:
-            names = tuple(experiment.mode_sequence[i - 1 : i + 1])
             if native is None:
                 value = _call_jax(after_reset, arguments, ends[i], x, p, structure=structure, i=i - 1)
             else:
                 value = native.after_reset(i - 1, ends[i], x, p)
             if not np.isfinite(value).all():
                 before = f"t = {ends[i]:.6g}{unit}, x = {x.tolist()}"
-                raise _not_finite(f"reset map {names} at {before}", np.asarray(value))
+                names = tuple(structure.mode_names[k] for k in structure.mode_of_segment[i - 1 : i + 1])
+                what = "the map of a Jump" if i - 1 in structure.jumps else f"reset map {names}"
+                raise _not_finite(f"{what} at {before}", np.asarray(value))
             x = np.asarray(value)
         knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
         stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])

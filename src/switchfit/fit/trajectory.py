@@ -15,6 +15,7 @@ from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.experiment import drop_jumps
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_index, as_instance
 
@@ -26,7 +27,8 @@ class Trajectory:
     Attributes
     ----------
     times : (K,) array
-        All nodes, in `time_unit`; each transition time occurs twice, with the state before and after it.
+        All nodes, in `time_unit`; each transition time and the time of each jump occur twice, with the state before and
+        after.
     states : (K, n) array
     modes : (K,) array of str
         The mode that is active.
@@ -68,6 +70,16 @@ class Trajectory:
             (str(self.modes[a]), float(self.times[a]), float(self.times[b - 1]))
             for a, b in zip(self.segments[:-1], self.segments[1:], strict=True)
         ]
+
+    @property
+    def pieces(self) -> NDArray[np.intp]:
+        """Where the continuous pieces begin, and K: as `segments`, divided at jumps too."""
+        return np.union1d(self.segments, np.flatnonzero(np.diff(self.times) == 0) + 1)
+
+    @property
+    def jump_times(self) -> FloatArray:
+        """Times of the jumps at known times, those at transitions apart."""
+        return self.times[np.setdiff1d(self.pieces, self.segments)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,6 +248,9 @@ def _build_trajectory(problem: Problem, e: int, simulation: Simulation) -> Traje
     structure, system = problem.structures[e], problem.system
     moving = simulation.end > simulation.start
     counts = [1 + int(moving[rows].sum()) for rows in simulation.segments]
+    if structure.jumps:  # a mode goes on after a jump
+        starts = np.array(drop_jumps(problem.experiments[e], range(1, len(counts))), dtype=np.intp)
+        counts = np.add.reduceat(counts, np.insert(starts, 0, 0)).tolist()
     modes = np.repeat(problem.experiments[e].mode_sequence, counts)
     names = system.state_names or tuple(f"x{k + 1}" for k in range(structure.n))
     units = system.state_units or ("",) * structure.n
