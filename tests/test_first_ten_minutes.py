@@ -84,7 +84,7 @@ def test_the_commands_print_what_the_page_shows(tmp_path):
                 pytest.fail(f"$ {line}\n{printed}\nThe page has:\n{text}")
             commands += 1
     assert commands > 8
-    assert "<html" in (folder / "out" / "report.html").read_text(encoding="utf-8")
+    assert "<html" in (folder / "room" / "out" / "report.html").read_text(encoding="utf-8")
 
 
 def test_the_log_is_what_its_script_writes(tmp_path):
