@@ -66,6 +66,7 @@ autosummary_generate = True
 autosummary_imported_members = True
 napoleon_google_docstring = False
 napoleon_use_ivar = True
+suppress_warnings = ["ref.python"]  # words in types of docstrings, such as "times", of which several classes have one
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3  # links to headings, as README pages on the web have them
 
