@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -48,6 +48,9 @@ from switchfit.uncertainty.sensitivity import (
     compute_sensitivity,
 )
 from switchfit.uncertainty.verdict import Verdict, judge
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 HESSIANS = get_args(HessianKind)
 
@@ -332,7 +335,7 @@ class Estimate(Fit):
     def _repr_html_(self) -> str:
         return format_html(self)
 
-    def plot(self, *, bands: bool = True, level: float = 0.95) -> Any:
+    def plot(self, *, bands: bool = True, level: float = 0.95) -> Figure:
         """Draw measured against fitted over time with the modes shaded, as a matplotlib Figure.
 
         Parameters
@@ -388,7 +391,7 @@ class Estimate(Fit):
         """Tests of the residuals, channel by channel: whiteness, normality, effective sample size."""
         return diagnose(self)
 
-    def plot_residuals(self) -> Any:
+    def plot_residuals(self) -> Figure:
         """Draw residuals in time, their autocorrelation and their quantiles, as a matplotlib Figure.
 
         See Also

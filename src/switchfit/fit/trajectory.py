@@ -252,8 +252,8 @@ def _build_trajectory(problem: Problem, e: int, simulation: Simulation) -> Traje
         starts = np.array(drop_jumps(problem.experiments[e], range(1, len(counts))), dtype=np.intp)
         counts = np.add.reduceat(counts, np.insert(starts, 0, 0)).tolist()
     modes = np.repeat(problem.experiments[e].mode_sequence, counts)
-    names = system.state_names or tuple(f"x{k + 1}" for k in range(structure.n))
-    units = system.state_units or ("",) * structure.n
+    names = tuple(system.state_names or (f"x{k + 1}" for k in range(structure.n)))
+    units = tuple(system.state_units or ("",) * structure.n)
     return Trajectory(
         select_visible(simulation, simulation.start, simulation.end),
         select_visible(simulation, simulation.before, simulation.after),
@@ -280,7 +280,7 @@ def _build_comparisons(
         first += q
         curve = curves[:, channels]
         default = trajectory.state_names if item.observe is None else tuple(f"y{k + 1}" for k in range(q))
-        label = item.names or default
+        label = tuple(item.names or default)
         if isinstance(item, ReferenceSignal):
             weights = np.diag(item.weights).copy()
             here = Comparison("reference", label, times, item.signal(times), curve, None, times, curve, None, weights)

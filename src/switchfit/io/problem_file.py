@@ -705,7 +705,7 @@ def _build_experiment(
     return Experiment(
         data=data,
         mode_sequence=tuple(table.mode_sequence),
-        transition_times=None if times is None else tuple(map(_build_parameter, times)),  # type: ignore[arg-type]
+        transition_times=None if times is None else tuple(map(_build_parameter, times)),
         t0=table.t0,  # type: ignore[arg-type]  # None: from the data
         tf=None if table.tf is None else _build_parameter(table.tf),  # type: ignore[arg-type]
         inputs=None

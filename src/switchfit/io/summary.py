@@ -132,7 +132,7 @@ def _describe_sensor(item: Measurements, unit: str) -> str:
     return "".join(f", {text}" for text in said if text)
 
 
-def _join_channel_names(names: tuple[str, ...] | None, units: tuple[str, ...] | None, channels: int) -> str:
+def _join_channel_names(names: Sequence[str] | None, units: Sequence[str] | None, channels: int) -> str:
     """Return names with their units, or the number of channels where they have no names."""
     if names is None:
         return f"{channels} channels"

@@ -40,12 +40,12 @@ class Experiment:
         `TerminalConstraint` beside them has to hold.
     mode_sequence : sequence of str
         Names of the modes in the order in which they are active; a mode may return.
-    transition_times : sequence of float or Parameter, or None
+    transition_times : sequence of float or Parameter, optional
         First guess of each transition, in the experiment's time unit, one fewer than modes, strictly increasing inside
         ``(t0, tf)``; an entry may be a `Parameter` with bounds, or fixed. Its unit, where given, must be `time_unit`.
         With ``scale="log"``, which all free times of an experiment then have, a free tf among them, the optimiser works
         in log(tau - t0): for times that may lie in other decades than their guess.
-        None: `estimate` looks for them all over the horizon; the guess is evenly spaced.
+        Left out, `estimate` looks for them all over the horizon; the guess is evenly spaced.
     t0 : float, optional
         Start of the horizon, in the experiment's time unit. Left out, the first time of the data: the first sample of
         the `Measurements` (less a delay that is a number) and the beginning of the reference signals, whichever is
@@ -109,8 +109,8 @@ class Experiment:
     """
 
     data: Any
-    mode_sequence: tuple[str, ...]
-    transition_times: tuple[Any, ...]
+    mode_sequence: Sequence[str]
+    transition_times: Any = None  # a tuple of Parameter after __post_init__
     t0: float = None  # type: ignore[assignment]  # a number after __post_init__, as is tf
     tf: float | Parameter = None  # type: ignore[assignment]
     inputs: Input | None = None
@@ -188,7 +188,7 @@ class Experiment:
 
     @property
     def _own_times(self) -> tuple[Parameter, ...]:
-        return (*self.transition_times, self.tf) if isinstance(self.tf, Parameter) else self.transition_times
+        return (*self.transition_times, *((self.tf,) if isinstance(self.tf, Parameter) else ()))
 
     @cached_property
     def times(self) -> tuple[Parameter, ...]:

@@ -454,7 +454,7 @@ def tabulate_fixed(fit: Fit) -> Table:
     fixed = [t for t in fit.transitions if t.index is None]
     rows = [[t.name, f"{t.time:.8g}", format_unit(t.unit), f"{t.before} -> {t.after}"] for t in fixed]
     for name in fit.fixed:
-        text = np.array2string(fit.parameters[name], precision=8, threshold=6, edgeitems=2, separator=", ")
+        text = np.array2string(np.asarray(fit.parameters[name]), precision=8, threshold=6, edgeitems=2, separator=", ")
         rows.append([name, " ".join(text.split()), format_unit(fit.parameter_units[name]), ""])
     return Table(rows, "<<<<")
 
