@@ -27,6 +27,7 @@ from switchfit.problem.data import (
     TransitionCost,
 )
 from switchfit.problem.experiment import Experiment, Parameter
+from switchfit.problem.jump import Jump
 from switchfit.problem.priors import LogNormal, Normal
 from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
@@ -66,6 +67,7 @@ __all__ = [
     "Identifiability",
     "Input",
     "Issue",
+    "Jump",
     "Kink",
     "Log",
     "LogNormal",

@@ -207,6 +207,6 @@ def _get_kind(problem: Problem) -> Any:
     unknowns = problem.unknowns
     numbers = [unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, *problem.places]
     numbers += [*unknowns.priors, *unknowns.variables]
-    times = [experiment.initial_times for experiment in problem.experiments]
-    fixed = [np.where(where < 0, t, 0.0) for where, t in zip(unknowns.times, times, strict=True)]
+    times = [experiment.initial_times_with_jumps for experiment in problem.experiments]
+    fixed = [np.where(where[: len(t)] < 0, t, 0.0) for where, t in zip(problem.places, times, strict=True)]
     return evaluator.structures, shapes, tuple(np.asarray(a).tobytes() for a in (*numbers, *fixed))

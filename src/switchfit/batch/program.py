@@ -201,7 +201,7 @@ def fit_chunk(
         given = (
             tuple(evaluator.arguments),
             tuple(_pad(value, size) for value in varying.values),
-            tuple(experiment.initial_times for experiment in problem.experiments),
+            tuple(experiment.initial_times_with_jumps for experiment in problem.experiments),
             read_sequences(layout, structures),
             Constraints(*map(jnp.asarray, constraints)),
             Unscaled(variables, unknowns.priors, unknowns.lower, unknowns.upper),
@@ -290,7 +290,7 @@ class Evaluations:
             given = (
                 self.base,
                 tuple(_pad(value, CHUNK) for value in self.varying.values),
-                tuple(experiment.initial_times for experiment in problem.experiments),
+                tuple(experiment.initial_times_with_jumps for experiment in problem.experiments),
                 read_sequences(layout, structures),
                 problem.unknowns.priors,
                 *(_pad(each, EVALUATIONS) for each in (fits, thetas, np.asarray(sides, dtype=float))),
@@ -441,7 +441,7 @@ def _total(
     d = theta.shape[0]
     J, g, H = jnp.zeros(()), jnp.zeros(d), jnp.zeros((d, d))
     extended = jnp.append(theta, 0.0)
-    for group in _group_alike(layout, arguments):
+    for group in _group_alike(layout, arguments, sequences):
         structure, N = layout.structures[group[0]], layout.transitions[group[0]]
         where = np.array([layout.places[e] for e in group])
         where = np.where(where < 0, d, where)  # what is fixed stands one past the last, and is dropped below
@@ -470,12 +470,15 @@ def _total(
     return J, g, H
 
 
-def _group_alike(layout: Layout, arguments: tuple[Arguments, ...]) -> list[list[int]]:
+def _group_alike(
+    layout: Layout, arguments: tuple[Arguments, ...], sequences: Sequence[Mapping[str, Any]]
+) -> list[list[int]]:
     """Return the groups of experiments that one program can take."""
     groups: dict[Any, list[int]] = {}
-    for e, (structure, N, own) in enumerate(zip(layout.structures, layout.transitions, arguments, strict=True)):
+    given = zip(layout.structures, layout.transitions, arguments, sequences, strict=True)
+    for e, (structure, N, own, sequence) in enumerate(given):
         shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(own))
-        groups.setdefault((structure, N, shapes), []).append(e)
+        groups.setdefault((structure, N, shapes, tuple(sorted(sequence))), []).append(e)
     return list(groups.values())
 
 

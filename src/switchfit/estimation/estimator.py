@@ -54,6 +54,7 @@ from switchfit.uncertainty.verdict import Verdict, judge
 if TYPE_CHECKING:
     import pandas
     import xarray
+    from matplotlib.figure import Figure
 
 HESSIANS = get_args(HessianKind)
 
@@ -353,7 +354,7 @@ class Estimate(Fit, Tabular):
     def _repr_html_(self) -> str:
         return format_html(self)
 
-    def plot(self, *, bands: bool = True, level: float = 0.95) -> Any:
+    def plot(self, *, bands: bool = True, level: float = 0.95) -> Figure:
         """Draw measured against fitted over time with the modes shaded, as a matplotlib Figure.
 
         Parameters
@@ -409,7 +410,7 @@ class Estimate(Fit, Tabular):
         """Tests of the residuals, channel by channel: whiteness, normality, effective sample size."""
         return diagnose(self)
 
-    def plot_residuals(self) -> Any:
+    def plot_residuals(self) -> Figure:
         """Draw residuals in time, their autocorrelation and their quantiles, as a matplotlib Figure.
 
         See Also

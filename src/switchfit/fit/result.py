@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 import scipy.special
@@ -21,6 +21,11 @@ from switchfit.problem.validation import as_choice, as_level
 from switchfit.runtime.issue import Issue
 
 CovarianceKind = Literal["exact", "gauss-newton"]
+
+if TYPE_CHECKING:  # a float or an array: what does arithmetic with both needs no cast
+    Values = Mapping[str, Any]
+else:  # what files are read as
+    Values = Mapping[str, FloatArray]
 
 
 @dataclass(frozen=True)
@@ -101,7 +106,7 @@ class Fit:
     transition_times : tuple of (N,) arrays, one per experiment, fixed ones included
     transition_places : tuple of (N,) int arrays, one per experiment
         Index in theta of each transition time; -1 if it is fixed.
-    parameters : dict of name -> array, fixed ones included
+    parameters : dict of name -> float, or array where there are several, fixed ones included
     parameter_units : dict of name -> str, fixed ones included
     fixed : tuple of str
         Names of the parameters that are fixed.
@@ -179,7 +184,7 @@ class Fit:
     run_names: tuple[str, ...]
     transition_times: tuple[FloatArray, ...]
     transition_places: tuple[NDArray[np.intp], ...]
-    parameters: Mapping[str, FloatArray]
+    parameters: Values
     parameter_units: Mapping[str, str]
     fixed: tuple[str, ...]
     cost: float
@@ -216,6 +221,10 @@ class Fit:
     starts: tuple[int, int, int] | None = None
     steps: tuple[Step, ...] = ()
     initial_cost: float = np.nan
+
+    def __post_init__(self) -> None:
+        plain = {name: float(v) if np.ndim(v) == 0 else np.asarray(v) for name, v in self.parameters.items()}
+        object.__setattr__(self, "parameters", plain)
 
     @property
     def termination(self) -> Termination:

@@ -16,6 +16,7 @@ from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.experiment import drop_jumps
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_choice, as_index, as_instance
@@ -29,7 +30,8 @@ class Trajectory(Tabular):
     Attributes
     ----------
     times : (K,) array
-        All nodes, in `time_unit`; each transition time occurs twice, with the state before and after it.
+        All nodes, in `time_unit`; each transition time and the time of each jump occur twice, with the state before and
+        after.
     states : (K, n) array
     modes : (K,) array of str
         The mode that is active.
@@ -76,6 +78,16 @@ class Trajectory(Tabular):
             for a, b in zip(self.segments[:-1], self.segments[1:], strict=True)
             if b > a
         ]
+
+    @property
+    def pieces(self) -> NDArray[np.intp]:
+        """Where the continuous pieces begin, and K: as `segments`, divided at jumps too."""
+        return np.union1d(self.segments, np.flatnonzero(np.diff(self.times) == 0) + 1)
+
+    @property
+    def jump_times(self) -> FloatArray:
+        """Times of the jumps at known times, those at transitions apart."""
+        return self.times[np.setdiff1d(self.pieces, self.segments)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,9 +312,12 @@ def _build_trajectory(problem: Problem, e: int, simulation: Simulation) -> Traje
     structure, system = problem.structures[e], problem.system
     moving = simulation.end > simulation.start
     counts = [1 + int(moving[rows].sum()) for rows in simulation.segments]
+    if structure.jumps:  # a mode goes on after a jump
+        starts = np.array(drop_jumps(problem.experiments[e], range(1, len(counts))), dtype=np.intp)
+        counts = np.add.reduceat(counts, np.insert(starts, 0, 0)).tolist()
     modes = np.repeat(problem.experiments[e].mode_sequence, counts)
-    names = system.state_names or tuple(f"x{k + 1}" for k in range(structure.n))
-    units = system.state_units or ("",) * structure.n
+    names = tuple(system.state_names or (f"x{k + 1}" for k in range(structure.n)))
+    units = tuple(system.state_units or ("",) * structure.n)
     return Trajectory(
         select_visible(simulation, simulation.start, simulation.end),
         select_visible(simulation, simulation.before, simulation.after),
@@ -329,7 +344,7 @@ def _build_comparisons(
         first += q
         curve = curves[:, channels]
         default = trajectory.state_names if item.observe is None else tuple(f"y{k + 1}" for k in range(q))
-        label = item.names or default
+        label = tuple(item.names or default)
         if isinstance(item, ReferenceSignal):
             weights = np.diag(item.weights).copy()
             here = Comparison("reference", label, times, item.signal(times), curve, None, times, curve, None, weights)

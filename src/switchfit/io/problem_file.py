@@ -33,6 +33,7 @@ from switchfit.io.sources import describe_sources
 from switchfit.models import BUILT_IN
 from switchfit.problem.data import FloatArray, Input, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment, Parameter
+from switchfit.problem.jump import Jump
 from switchfit.problem.priors import LogNormal, Normal, Prior
 from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
@@ -328,6 +329,23 @@ class InputTable(LogTable):
     kind: Literal["hold", "linear", "cubic"] = Field(default="hold", description="interpolation between samples")
 
 
+class ModelTable(_Table):
+    """The model: built in, or in a Python file."""
+
+    name: str = Field(description="a built-in model, or 'file.py:object' with a HybridSystem or a function making one")
+    arguments: dict[str, Any] = Field(default_factory=dict, description="arguments of the function")
+
+
+class JumpTable(_Table):
+    """A change of the state at known times."""
+
+    time: float | list[float] = Field(description="when, in the experiment's time_unit: a number, or several")
+    map: Annotated[ModelTable, pydantic.BeforeValidator(_name_as_table)] = Field(
+        description="'file.py:function' with map(t, x, p), which returns the state just after; or a table with the "
+        "name and arguments of a function that returns such a map"
+    )
+
+
 class ExperimentTable(_Table):
     """One run."""
 
@@ -358,14 +376,10 @@ class ExperimentTable(_Table):
         description="the model's name of a parameter = the name under [parameters] that this run uses for it",
     )
     inputs: InputTable | None = Field(default=None, description="a known input")
+    jumps: Annotated[list[JumpTable], pydantic.BeforeValidator(_table_as_list)] = Field(
+        default_factory=list, description="changes of the state at known times, such as doses"
+    )
     name: str | None = Field(default=None, description="used in the report if there are several experiments")
-
-
-class ModelTable(_Table):
-    """The model: built in, or in a Python file."""
-
-    name: str = Field(description="a built-in model, or 'file.py:object' with a HybridSystem or a function making one")
-    arguments: dict[str, Any] = Field(default_factory=dict, description="arguments of the function")
 
 
 class OptionsTable(_Table):
@@ -706,7 +720,7 @@ def _build_experiment(
     return Experiment(
         data=data,
         mode_sequence=tuple(table.mode_sequence),
-        transition_times=None if times is None else tuple(map(_build_parameter, times)),  # type: ignore[arg-type]
+        transition_times=None if times is None else tuple(map(_build_parameter, times)),
         t0=table.t0,  # type: ignore[arg-type]  # None: from the data
         tf=None if table.tf is None else _build_parameter(table.tf),  # type: ignore[arg-type]
         inputs=None
@@ -716,7 +730,24 @@ def _build_experiment(
         parameter_map=table.parameter_map,
         name=table.name,
         time_unit=table.time_unit,
+        jumps=[
+            _build_at(f"{where}.jumps[{k}]", _build_jump, folder, item, system, f"{where}.jumps[{k}].map")
+            for k, item in enumerate(table.jumps, start=1)
+        ],
     )
+
+
+def _build_jump(folder: Path, table: JumpTable, system: HybridSystem | None, where: str) -> Jump:
+    """Return a jump; without a system, one whose map was not loaded."""
+    if ".py" not in table.map.name:
+        raise ValueError(f"map must name a function of a Python file, 'file.py:function'; got {table.map.name!r}.")
+    if system is None:
+        find_object(table.map.name, folder, where)
+        return Jump(table.time, lambda t, x, p: x)
+    found = load_object(table.map.name, folder, where)
+    if table.map.arguments and callable(found):
+        found = call(found, f"{where} {table.map.name!r}", **_check_arguments(found, table.map, where))
+    return Jump(table.time, found)
 
 
 def _build_initial_state(table: ExperimentTable) -> list[Parameter] | list[float] | None:

@@ -11,17 +11,24 @@ from switchfit.problem.data import Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment, name_runs
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
-from switchfit.report.tables import format_table
+from switchfit.report.tables import format_table, list_jumps
+
+MOST_EXPERIMENTS = 3
+"""Experiments that are described on one screen."""
+
+MOST_UNKNOWNS = 10
 
 
-def describe(problem: Problem) -> str:
+def describe(problem: Problem, *, full: bool = False) -> str:
     """Return experiments, data and unknowns of a problem as text.
 
     Parameters
     ----------
     problem : Problem
+    full : bool
+        All of them, not one screen.
     """
-    lines = [describe_experiments(problem.experiments)]
+    lines = [describe_experiments(problem.experiments, full=full)]
     unknowns = problem.unknowns
     rows = []
     numbers = (unknowns.initial, unknowns.lower, unknowns.upper)
@@ -30,29 +37,39 @@ def describe(problem: Problem) -> str:
         bounds = "" if np.isinf(lower) and np.isinf(upper) else f"in [{lower:.6g}, {upper:.6g}]"
         known, scale = f"prior: {prior}" if prior else "", "(log scale)" if log else ""
         rows.append((name, f"{value:.6g}{unit_suffix(unit)}", bounds, known, scale))
+    if not full and len(rows) > MOST_UNKNOWNS:
+        kept = MOST_UNKNOWNS - 2
+        rows = [*rows[:kept], (f"and {len(rows) - kept} more", "", "", "", "")]
     return "\n".join([*lines, "Unknowns, first guess and bounds", *format_table(rows, "<<<<<")])
 
 
-def describe_experiments(experiments: Sequence[Experiment]) -> str:
+def describe_experiments(experiments: Sequence[Experiment], *, full: bool = False) -> str:
     """Return modes, horizon and data of experiments as text.
 
     Parameters
     ----------
     experiments : sequence of Experiment
+    full : bool
+        All of them, not one screen.
     """
     lines = []
     for k, experiment in enumerate(experiments, start=1):
         lines.append(f"Experiment {k}{f' ({experiment.name})' if experiment.name else ''}")
         lines += [f"  {line}" for line in _describe_experiment(experiment)]
+        if not full and k == MOST_EXPERIMENTS < len(experiments):
+            lines.append(f"and {len(experiments) - k} more experiments: --full lists them")
+            break
     return "\n".join(lines)
 
 
-def describe_steps(problem: Problem) -> str:
+def describe_steps(problem: Problem, *, full: bool = False) -> str:
     """Return which steps the integrator takes in each experiment at the first guess, how many, and why, as text.
 
     Parameters
     ----------
     problem : Problem
+    full : bool
+        For all of them, not one screen.
 
     Raises
     ------
@@ -67,6 +84,9 @@ def describe_steps(problem: Problem) -> str:
         reason = "" if mesh.stiffness is None else f"; {mesh.stiffness}"
         run = "" if len(problem.experiments) == 1 else f"{name}: "
         rows.append(f"  {run}{mesh.cells:,} {kind} steps{reason}")
+    if not full and len(rows) > MOST_EXPERIMENTS:
+        total = sum(mesh.cells for mesh in evaluator.meshes)
+        rows = [*rows[:MOST_EXPERIMENTS], f"  {total:,} steps in all {len(rows)} experiments"]
     return "\n".join(["Integration at the first guess", *rows])
 
 
@@ -80,6 +100,8 @@ def _describe_experiment(experiment: Experiment) -> list[str]:
     if experiment.taken_from_data:
         horizon += f" ({' and '.join(experiment.taken_from_data)} from the data)"
     lines = [f"{sequence} on {horizon}, at {times}{unit}" if times else f"{sequence} on {horizon}"]
+    jumps = list_jumps(experiment.jump_times, experiment.time_unit)
+    lines += [jumps] if jumps else []
     for item in experiment.data:
         if isinstance(item, Measurements):
             step = np.median(np.diff(item.times)) if len(item.times) > 1 else np.nan
@@ -110,7 +132,7 @@ def _describe_sensor(item: Measurements, unit: str) -> str:
     return "".join(f", {text}" for text in said if text)
 
 
-def _join_channel_names(names: tuple[str, ...] | None, units: tuple[str, ...] | None, channels: int) -> str:
+def _join_channel_names(names: Sequence[str] | None, units: Sequence[str] | None, channels: int) -> str:
     """Return names with their units, or the number of channels where they have no names."""
     if names is None:
         return f"{channels} channels"

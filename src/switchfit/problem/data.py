@@ -129,7 +129,7 @@ class Input:
     times: Any
     values: Any
     kind: Literal["hold", "linear", "cubic"] = "hold"
-    units: tuple[str, ...] | None = None
+    units: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
         kind = as_choice(self.kind, "Input kind", ("hold", "linear", "cubic"))
@@ -379,10 +379,10 @@ class ReferenceSignal:
     signal: PiecewisePolynomial
     observe: Observe | None = None
     weights: Any = None
-    names: tuple[str, ...] | None = None
+    names: Sequence[str] | None = None
     samples: tuple[FloatArray, FloatArray] | None = None
     lowpass_hz: float | None = None
-    units: tuple[str, ...] | None = None
+    units: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.signal, PiecewisePolynomial):
@@ -457,7 +457,7 @@ class ReferenceSignal:
         if lowpass_hz is not None:
             lowpass_hz = as_positive(lowpass_hz, "lowpass_hz")
             signal = _filter_lowpass(signal, lowpass_hz)
-        return cls(signal, observe, weights, names, (times, table), lowpass_hz, units)  # type: ignore[arg-type]  # made tuples there
+        return cls(signal, observe, weights, names, (times, table), lowpass_hz, units)
 
 
 @dataclass(frozen=True, eq=False)
@@ -530,11 +530,11 @@ class Measurements:
     values: Any
     observe: Observe | None = None
     sigma: Any = None
-    names: tuple[str, ...] | None = None
+    names: Sequence[str] | None = None
     loss: Literal["linear", "soft_l1", "huber", "cauchy"] = "linear"
     loss_scale: float = 1.0
     delay: float | str = 0.0
-    units: tuple[str, ...] | None = None
+    units: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
         names, units = _find_labels(self.values, self.names, self.units)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.problem.data import (
     Data,
@@ -20,8 +22,9 @@ from switchfit.problem.data import (
     TerminalCost,
     TransitionCost,
 )
+from switchfit.problem.jump import Jump
 from switchfit.problem.parameter import Parameter as Parameter
-from switchfit.problem.parameter import as_parameter
+from switchfit.problem.parameter import as_parameter, unit_suffix
 from switchfit.problem.system import HybridSystem, as_state
 from switchfit.problem.validation import as_instance, as_name, as_number, as_sequence, join_names, shorten
 
@@ -37,12 +40,12 @@ class Experiment:
         `TerminalConstraint` beside them has to hold.
     mode_sequence : sequence of str
         Names of the modes in the order in which they are active; a mode may return.
-    transition_times : sequence of float or Parameter, or None
+    transition_times : sequence of float or Parameter, optional
         First guess of each transition, in the experiment's time unit, one fewer than modes, strictly increasing inside
         ``(t0, tf)``; an entry may be a `Parameter` with bounds, or fixed. Its unit, where given, must be `time_unit`.
         With ``scale="log"``, which all free times of an experiment then have, a free tf among them, the optimiser works
         in log(tau - t0): for times that may lie in other decades than their guess.
-        None: `estimate` looks for them all over the horizon; the guess is evenly spaced.
+        Left out, `estimate` looks for them all over the horizon; the guess is evenly spaced.
     t0 : float, optional
         Start of the horizon, in the experiment's time unit. Left out, the first time of the data: the first sample of
         the `Measurements` (less a delay that is a number) and the beginning of the reference signals, whichever is
@@ -62,15 +65,17 @@ class Experiment:
         the problem's ``beta_run3`` under ``p["beta"]``. Names that are not in it mean themselves, and several names
         may mean one parameter.
     time_unit : str, optional
-        The unit of all times of this run: of its samples, inputs, t0, tf, transition times and delays. Reports, figures
-        and files print it; nothing is converted.
+        The unit of all times of this run: of its samples, inputs, t0, tf, transition times, jumps and delays. Reports,
+        figures and files print it; nothing is converted.
+    jumps : Jump or sequence of Jump, optional
+        Changes of the state at known times in ``[t0, tf)``, such as doses, without a change of mode.
 
     Raises
     ------
     ValueError
         If lengths do not match, times are unordered or outside the horizon, data lies outside it, t0 or tf is left out
-        and the data have no times to take it from, `time_unit` is empty, a transition time or tf has another unit, or a
-        free tf has bounds that do not fit.
+        and the data have no times to take it from, `time_unit` is empty, a transition time or tf has another unit, a
+        free tf has bounds that do not fit, or a jump lies outside the horizon or where a transition is guessed.
     TypeError
         If an argument is of the wrong type: times that are not numbers (dates among them), mode names that are no
         strings, data of another kind than those above.
@@ -87,7 +92,7 @@ class Experiment:
 
     See Also
     --------
-    Problem, HybridSystem, Measurements, Input
+    Problem, HybridSystem, Measurements, Input, Jump
 
     Examples
     --------
@@ -104,8 +109,8 @@ class Experiment:
     """
 
     data: Any
-    mode_sequence: tuple[str, ...]
-    transition_times: tuple[Any, ...]
+    mode_sequence: Sequence[str]
+    transition_times: Any = None  # a tuple of Parameter after __post_init__
     t0: float = None  # type: ignore[assignment]  # a number after __post_init__, as is tf
     tf: float | Parameter = None  # type: ignore[assignment]
     inputs: Input | None = None
@@ -113,6 +118,7 @@ class Experiment:
     name: str | None = None
     parameter_map: Any = None
     time_unit: str = "s"
+    jumps: Jump | Sequence[Jump] = ()
     is_guess_proposed: bool = field(init=False, default=False)
     taken_from_data: tuple[str, ...] = field(init=False, default=())  # which of "t0" and "tf" were left out
 
@@ -137,9 +143,14 @@ class Experiment:
         if not sequence:
             raise ValueError("mode_sequence is empty; name at least one mode.")
         object.__setattr__(self, "is_guess_proposed", self.transition_times is None and len(sequence) > 1)
+        jumps = (self.jumps,) if isinstance(self.jumps, Jump) else self.jumps
+        jumps = as_sequence(jumps, "jumps", "an sf.Jump or a sequence of them")
+        for jump in jumps:
+            as_instance(jump, "each of jumps", Jump, "an sf.Jump")
+        object.__setattr__(self, "jumps", jumps)
         given = self.transition_times
         if given is None:
-            given = np.linspace(t0, last, len(sequence) + 1)[1:-1].tolist()
+            given = _propose_times(t0, last, len(sequence) - 1, [time for jump in jumps for time in jump.times])
         several = isinstance(given, Iterable) and getattr(given, "ndim", 1) > 0
         given = as_sequence(given, "transition_times", "a sequence of numbers or sf.Parameter") if several else (given,)
         if len(given) != len(sequence) - 1:
@@ -160,6 +171,7 @@ class Experiment:
         object.__setattr__(self, "parameter_map", _check_map(self.parameter_map))
         self._check_time_unit()
         self._check_times()
+        self._check_jumps()
         self._check_data_inside()
         if self.inputs is not None:
             self.inputs.signal(t0, self.end)
@@ -175,14 +187,53 @@ class Experiment:
         return float(self.tf.upper) if isinstance(self.tf, Parameter) else self.tf
 
     @property
+    def _own_times(self) -> tuple[Parameter, ...]:
+        return (*self.transition_times, *((self.tf,) if isinstance(self.tf, Parameter) else ()))
+
+    @cached_property
     def times(self) -> tuple[Parameter, ...]:
-        """What programs take as their times: all transition times, then tf where it is free."""
-        return (*self.transition_times, self.tf) if isinstance(self.tf, Parameter) else self.transition_times
+        """All transition times, then tf where it is free; each bounded by the jumps between which its guess lies."""
+        acts = self.jump_times
+        bounded = []
+        for tau, before in zip(self._own_times, np.searchsorted(acts, self.initial_times, "right"), strict=True):
+            low = acts[before - 1] if before and acts[before - 1] > self.t0 else -np.inf
+            high = acts[before] if before < len(acts) else np.inf
+            inside = tau.fixed or (low <= tau.lower and tau.upper <= high)
+            bounded.append(
+                tau if inside else replace(tau, lower=np.maximum(low, tau.lower), upper=np.minimum(high, tau.upper))
+            )
+        return tuple(bounded)
+
+    @cached_property
+    def _acts(self) -> list[tuple[float, Callable[..., Any]]]:
+        """Time and map of each jump, in the order in which they act."""
+        acts = [(time, jump.map) for jump in self.jumps for time in jump.times.tolist()]  # type: ignore[union-attr]
+        return sorted(acts, key=lambda act: act[0])
+
+    @cached_property
+    def jump_times(self) -> FloatArray:
+        """Times of all jumps, ascending: (K,)."""
+        return np.array([time for time, _ in self._acts], dtype=np.float64)
+
+    @property
+    def jump_maps(self) -> list[Callable[..., Any]]:
+        """The map of each of `jump_times`."""
+        return [jump for _, jump in self._acts]
+
+    @cached_property
+    def passed_by_jumps(self) -> NDArray[np.intp]:
+        """How many of `times` each jump comes after: (K,). One at the time of a fixed transition comes before it."""
+        return np.searchsorted(self.initial_times, self.jump_times, "left")
+
+    @cached_property
+    def initial_times_with_jumps(self) -> FloatArray:
+        """Guess of all of `times`, with the times of the jumps in between: what programs take, (N,)."""
+        return np.asarray(insert_jumps(self, self.initial_times, self.jump_times))
 
     @property
     def initial_times(self) -> FloatArray:
         """Guess of all of `times`, fixed ones included: an ``(N,)`` array."""
-        return np.array([tau.value for tau in self.times], dtype=np.float64)
+        return np.array([tau.value for tau in self._own_times], dtype=np.float64)
 
     def ends_of_modes(self, times: FloatArray) -> FloatArray:
         """Return where each mode begins and the last one ends, one more than modes, for values of `times`.
@@ -238,6 +289,22 @@ class Experiment:
                 f"got {shorten(knots[1:-1])}."
             )
 
+    def _check_jumps(self) -> None:
+        acts, unit = self.jump_times, unit_suffix(self.time_unit)
+        last = self.t0 + self.initial_length
+        outside = (acts < self.t0) | (acts >= last)
+        if outside.any():
+            raise ValueError(
+                f"A Jump must lie in [t0, tf) = [{self.t0}, {last}){unit}; got {shorten(acts[outside].tolist())}. "
+                "Leave it out, or move t0 or tf."
+            )
+        for i, tau in enumerate(self._own_times, start=1):
+            if not tau.fixed and np.any(acts == tau.value):
+                raise ValueError(
+                    f"Transition time {i} is guessed at {tau.value}{unit}, the time of a jump. The two keep their "
+                    "order: give a guess a little before or after the jump."
+                )
+
     def _check_data_inside(self) -> None:
         for item in self.data:
             if isinstance(item, Measurements):
@@ -271,6 +338,47 @@ class Experiment:
     def earliest_end(self) -> float:
         """The earliest tf that there may be: tf, or the lower bound of a free tf, t0 where it has none."""
         return max(float(self.tf.lower), self.t0) if isinstance(self.tf, Parameter) else self.tf
+
+
+def _propose_times(t0: float, tf: float, count: int, jumps: Sequence[float]) -> list[float]:
+    """Return evenly spaced transition times, moved on a little from the time of a jump."""
+    step = (tf - t0) / (count + 1)
+    proposed = []
+    for time in np.linspace(t0, tf, count + 2)[1:-1].tolist():
+        later = [*(jump for jump in jumps if jump > time), time + step]
+        proposed.append(time + 0.25 * (min(later) - time) if time in jumps else time)
+    return proposed
+
+
+def insert_jumps(experiment: Experiment, of_times: Any, of_jumps: Any) -> Any:
+    """Return an array or a list with an entry for each of an experiment's `times`, with those of the jumps in between.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    of_times : (N,) array, or a sequence
+    of_jumps : a number, or one entry for each jump
+    """
+    if not len(experiment.jump_times):
+        return of_times
+    if isinstance(of_times, np.ndarray):
+        return np.insert(of_times, experiment.passed_by_jumps, of_jumps)
+    both: list[Any] = list(of_times)
+    for place, entry in reversed(list(zip(experiment.passed_by_jumps.tolist(), of_jumps, strict=True))):
+        both.insert(place, entry)
+    return both
+
+
+def drop_jumps(experiment: Experiment, of_all: Iterable[Any]) -> list[Any]:
+    """Return the entries of the transitions, of those of all transitions and jumps.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    of_all : iterable
+    """
+    jumps = set((experiment.passed_by_jumps + np.arange(len(experiment.jump_times))).tolist())
+    return [entry for i, entry in enumerate(of_all) if i not in jumps]
 
 
 def initial_state_of(system: HybridSystem, experiment: Experiment) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
@@ -94,8 +94,8 @@ class HybridSystem:
     modes: Mapping[str, VectorField]
     initial_state: Any
     reset_maps: Mapping[tuple[str, str], ResetMap] = field(default_factory=dict)
-    state_names: tuple[str, ...] | None = None
-    state_units: tuple[str, ...] | None = None
+    state_names: Sequence[str] | None = None
+    state_units: Sequence[str] | None = None
     guards: Mapping[tuple[str, str], Guard] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -15,7 +15,7 @@ from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report.numbers import format_count, format_rounded, format_unit, get_unit
-from switchfit.report.tables import Table, format_table, wrap_text
+from switchfit.report.tables import Table, format_table, list_jumps, wrap_text
 from switchfit.report.uncertainty import write_direction
 from switchfit.report.verdict import format_share, write_agreement
 from switchfit.runtime.presentation import format_text
@@ -157,6 +157,8 @@ def list_experiments(fit: Fit, most: int, where: str = "", *, full: bool) -> lis
     for name, trajectory, run in list(zip(names, fit.trajectories, fit.comparisons, strict=True))[:most]:
         sequence = " -> ".join(mode for mode, _, _ in trajectory.mode_spans)
         horizon = f"{trajectory.times[0]:.6g} to {trajectory.times[-1]:.6g}{unit_suffix(trajectory.time_unit)}"
+        jumps = list_jumps(trajectory.jump_times, trajectory.time_unit)
+        horizon += f", {jumps}" if jumps else ""
         data = [_format_data(comparison) for comparison in run] or ["no data: a cost of the trajectory"]
         if full or single:
             rows += [(name, f"{sequence}, {horizon}"), *(("", text) for text in data)]
@@ -465,7 +467,7 @@ def tabulate_fixed(fit: Fit) -> Table:
     fixed = [t for t in fit.transitions if t.index is None]
     rows = [[t.name, f"{t.time:.8g}", format_unit(t.unit), f"{t.before} -> {t.after}"] for t in fixed]
     for name in fit.fixed:
-        text = np.array2string(fit.parameters[name], precision=8, threshold=6, edgeitems=2, separator=", ")
+        text = np.array2string(np.asarray(fit.parameters[name]), precision=8, threshold=6, edgeitems=2, separator=", ")
         rows.append([name, " ".join(text.split()), format_unit(fit.parameter_units[name]), ""])
     return Table(rows, "<<<<")
 

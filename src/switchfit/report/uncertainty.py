@@ -96,8 +96,6 @@ def write_derivative_check(check: DerivativeCheck) -> str:
         orders = [""] * 3 if k == 0 else [_format_order(order) for order in check.orders[k - 1]]
         cells = [text for r, order in zip(remainders, orders, strict=True) for text in (f"{r:.2e}", order)]
         rows.append([f"{h:.1e}", *cells])
-    verdict = "passed" if check.passed else "FAILED: the derivatives do not belong to the cost"
-    observed = ", ".join(f"{order:.2f}" for order in check.observed_orders)
     lines = [
         "Taylor remainders of J along a random direction",
         "",
@@ -106,9 +104,21 @@ def write_derivative_check(check: DerivativeCheck) -> str:
         "Paper's equations (6)-(17) against the derivatives of the discretised cost, relative:",
         f"  gradient {_format_gap(check.gradient_gap)}, with half the steps {_format_gap(check.gradient_gap_halved)}",
         f"  Hessian  {_format_gap(check.hessian_gap)}, with half the steps {_format_gap(check.hessian_gap_halved)}",
-        f"Observed orders {observed} (1, 2, 3 expected): {verdict}.",
+        write_orders(check),
     ]
     return "\n".join(lines)
+
+
+def write_orders(check: DerivativeCheck) -> str:
+    """Return the observed orders of the Taylor remainders and the verdict, in a line.
+
+    Parameters
+    ----------
+    check : DerivativeCheck
+    """
+    verdict = "passed" if check.passed else "FAILED: the derivatives do not belong to the cost"
+    observed = ", ".join(f"{order:.2f}" for order in check.observed_orders)
+    return f"Observed orders {observed} (1, 2, 3 expected): {verdict}."
 
 
 def _format_order(order: float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Collection
 from dataclasses import replace
@@ -33,6 +34,8 @@ from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 from switchfit.uncertainty.quality import measure_quality
 from switchfit.uncertainty.residuals import are_uneven
 from switchfit.uncertainty.verdict import NEARLY_ALL, UNLIKELY
+
+logger = logging.getLogger("switchfit")
 
 Strategy = Literal["local", "auto", "thorough"]
 STRATEGIES = get_args(Strategy)
@@ -318,6 +321,7 @@ class Search:
 
     def _begin(self, name: str) -> None:
         """Say on the line of progress which strategy is under way, and the lowest J before it."""
+        logger.info("strategy: %s (lowest J so far: %.6g)", name, self.lowest)
         self.settings["callback"] = _write_to(self.line, f"{name}, fit of its end", self.callback)
         self.line.write(name, self.lowest)
 

@@ -26,6 +26,7 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.variation import assume_noise
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal, TerminalConstraint, TerminalCost
 from switchfit.problem.experiment import Experiment
+from switchfit.problem.jump import Jump
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.priors import LogNormal, Normal
 from switchfit.problem.problem import GIVEN, Problem
@@ -235,13 +236,13 @@ class GrowingRun:
         if self.is_whole:
             return self.run
         run, end = self.run, self.upto
-        taken = list(run.transition_times[:k])
+        taken = list(run.times[:k])
         if k and taken[-1].value >= end:  # guesses that are evenly spaced between the times that are fixed
             knots = np.array([run.t0, *(float(tau.value) for tau in taken), end])
             kept = np.flatnonzero([True, *(tau.fixed for tau in taken), True])
             times = np.interp(np.arange(k + 2), kept, knots[kept])[1:-1]
             taken = [
-                tau if tau.fixed else replace(tau, value=np.clip(time, tau.lower, tau.upper))
+                tau if tau.fixed else replace(tau, value=_place_inside(run, tau, time, end))
                 for tau, time in zip(taken, times, strict=True)
             ]
         return replace(
@@ -250,13 +251,22 @@ class GrowingRun:
             mode_sequence=run.mode_sequence[: k + 1],
             transition_times=tuple(taken),
             tf=end,
+            jumps=[Jump(time, jump) for time, jump in zip(run.jump_times, run.jump_maps, strict=True) if time < end],
         )
+
+
+def _place_inside(run: Experiment, tau: Parameter, time: float, end: float) -> float:
+    """Return a guess inside the bounds of a transition time; between the jumps that are bounds, not at one."""
+    low, high = float(tau.lower), float(tau.upper)
+    inside = float(np.clip(time, low, high))
+    return 0.5 * (max(low, run.t0) + min(high, end)) if inside in run.jump_times else inside
 
 
 def _build(problem: Problem, experiments: Any, parameters: dict[str, Parameter]) -> Problem:
     """Return a part of a problem, with room for as many transitions as it has, so that programs are shared."""
     given = {name: getattr(problem, name) for name in GIVEN}
-    most = max(problem.max_transitions or 0, *(len(run.transition_times) for run in problem.experiments))
+    each = (len(run.transition_times) + len(run.jump_times) for run in problem.experiments)
+    most = max(problem.max_transitions or 0, *each)
     return Problem(**given | {"experiments": experiments, "parameters": parameters, "max_transitions": most})
 
 
