@@ -541,6 +541,15 @@ class Estimate(Fit):
                     "are not converted. Files that were saved before there was a time_unit count as s: if it is one of "
                     "them, and its times are those of the problem, give the problem's experiments time_unit='s'."
                 )
+            origins = [trajectory.origin for trajectory in fit.trajectories]
+            for origin, experiment in zip(origins, problem.experiments, strict=True):
+                if (origin and origin.instant) != (experiment.origin and experiment.origin.instant):
+                    names = [
+                        "numbers" if one is None else f"times since {one.date}" for one in (origin, experiment.origin)
+                    ]
+                    raise ValueError(
+                        f"{path} holds {names[0]}, the problem has {names[1]}: give its experiments the same origin."
+                    )
         own = {f.name: getattr(fit, f.name) for f in fields(Fit)}
         return cls(**own, saved_certificate=certificate, problem=problem)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +16,7 @@ from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.dates import Origin
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_index, as_instance
 
@@ -35,6 +37,8 @@ class Trajectory:
     state_names, state_units : tuple of str
     time_unit : str
         Unit of the experiment's times.
+    origin : Origin or None
+        The date at which times are 0; None where they are no dates.
 
     See Also
     --------
@@ -60,6 +64,12 @@ class Trajectory:
     state_names: tuple[str, ...]
     state_units: tuple[str, ...]
     time_unit: str = "s"
+    origin: Origin | None = None
+
+    @property
+    def dates(self) -> list[datetime] | None:
+        """The times as dates in the experiment's time zone; None where they are no dates."""
+        return None if self.origin is None else self.origin.to_dates(self.times, self.time_unit)
 
     @property
     def mode_spans(self) -> list[tuple[str, float, float]]:
@@ -247,6 +257,7 @@ def _build_trajectory(problem: Problem, e: int, simulation: Simulation) -> Traje
         names,
         units,
         problem.experiments[e].time_unit,
+        problem.experiments[e].origin,
     )
 
 

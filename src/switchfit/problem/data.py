@@ -7,12 +7,13 @@ the integrator never steps across one, and the signal is one polynomial inside a
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.problem.dates import Dates, Origin, as_dates, is_dated
 from switchfit.problem.losses import LOSSES
 from switchfit.problem.tables import find_names, find_units
 from switchfit.problem.validation import (
@@ -87,8 +88,8 @@ class Input:
     Parameters
     ----------
     times : (K,) array_like
-        Increasing times in the experiment's time unit. They must cover its ``[t0, tf]``; for a held input it is enough
-        to start by t0, as its last value is held.
+        Increasing times in the experiment's time unit, or dates, which the experiment converts to it. They must cover
+        its ``[t0, tf]``; for a held input it is enough to start by t0, as its last value is held.
     values : (K,) or (K, q) array_like, or mapping of str to (K,) array_like
         The modes get a scalar u, or a ``(q,)`` array. With samples by name they get a dict of scalars, ``u["left"]``;
         likewise with a table whose columns all have names (strings): a DataFrame of pandas or polars, a Dataset of
@@ -105,7 +106,7 @@ class Input:
         For times that do not increase, values that are not finite or differ in length from times, too few
         samples, no name or an empty one, or an unknown kind.
     TypeError
-        If times or values are not numbers (dates are not), or a name is not a string.
+        If times are neither numbers nor dates, values are not numbers, or a name is not a string.
 
     See Also
     --------
@@ -165,6 +166,10 @@ class Input:
     def shape(self) -> tuple[int, ...]:
         """Shape of u: () or (q,). If its entries have names, q is their number."""
         return (len(self.values),) if self.names else tuple(self.values.shape[1:])
+
+    def count_from(self, origin: Origin, time_unit: str) -> Input:
+        """Return the input with its dates as numbers of a unit since the origin."""
+        return replace(self, times=_count_from(self.times, origin, time_unit))
 
     def signal(self, t0: float, tf: float) -> PiecewisePolynomial:
         """Return the input as a piecewise polynomial over ``[t0, tf]``.
@@ -355,7 +360,7 @@ class ReferenceSignal:
     names : sequence of str, optional
         One for each channel, for reports and plots.
     samples : (times, values), optional
-        Samples from which the signal was made.
+        Samples from which the signal was made; times are dates until an experiment has converted them.
     lowpass_hz : float, optional
         Cut-off with which it was filtered.
     units : sequence of str, optional
@@ -380,7 +385,7 @@ class ReferenceSignal:
     observe: Observe | None = None
     weights: Any = None
     names: tuple[str, ...] | None = None
-    samples: tuple[FloatArray, FloatArray] | None = None
+    samples: tuple[Any, FloatArray] | None = None
     lowpass_hz: float | None = None
     units: tuple[str, ...] | None = None
 
@@ -412,8 +417,9 @@ class ReferenceSignal:
         Parameters
         ----------
         times : (K,) array_like
-            Increasing sample times in the experiment's time unit, four or more. The spline is broken at a time that is
-            given twice, as at the transitions of a simulated trajectory; each part then needs four samples.
+            Increasing sample times in the experiment's time unit, or dates, which the experiment converts to it; four
+            or more. The spline is broken at a time that is given twice, as at the transitions of a simulated
+            trajectory; each part then needs four samples.
         values : (K,) or (K, q) array_like
             NaN marks a missing value, as does the mask of a masked array; it is bridged by the interpolation. Tables
             of pandas, polars and xarray, and a `Log`, bring their names and units.
@@ -431,7 +437,7 @@ class ReferenceSignal:
             For bad times or values, fewer than four samples in a channel, or a cut-off that is not positive or far
             above the sampling rate.
         TypeError
-            If times, values, weights or the cut-off are not numbers (dates are not).
+            If times are neither numbers nor dates, or values, weights or the cut-off are not numbers.
 
         See Also
         --------
@@ -447,17 +453,33 @@ class ReferenceSignal:
         array([[0.841471]])
         """
         names, units = _find_labels(values, names, units)
-        times, values = _check_samples(times, values, "ReferenceSignal", at_least=4, breaks=True, missing=True)
-        table = values.reshape(len(times), -1)
+        given, values = _check_samples(times, values, "ReferenceSignal", at_least=4, breaks=True, missing=True)
+        table = values.reshape(len(given), -1)
         if np.isinf(table).any():
             raise ValueError("ReferenceSignal values must be finite, or NaN where one is missing; got infinity.")
+        # Dates have no unit before the experiment: until then the signal is in seconds, and not filtered.
+        times = _count_seconds(given) if isinstance(given, Dates) else given
         cuts = np.flatnonzero(np.diff(times) == 0) + 1
         parts = zip(np.split(times, cuts), np.split(table, cuts), strict=True)
         signal = _join_signals([_fit_bridged_spline(part_times, part) for part_times, part in parts])
         if lowpass_hz is not None:
             lowpass_hz = as_positive(lowpass_hz, "lowpass_hz")
-            signal = _filter_lowpass(signal, lowpass_hz)
-        return cls(signal, observe, weights, names, (times, table), lowpass_hz, units)  # type: ignore[arg-type]  # made tuples there
+            if given is times:
+                signal = _filter_lowpass(signal, lowpass_hz)
+        return cls(signal, observe, weights, names, (given, table), lowpass_hz, units)  # type: ignore[arg-type]  # made tuples there
+
+    @property
+    def dates(self) -> Dates | None:
+        """Dates of the samples, until an experiment has converted them; None if their times are numbers."""
+        return self.samples[0] if self.samples is not None and isinstance(self.samples[0], Dates) else None
+
+    def count_from(self, origin: Origin, time_unit: str) -> ReferenceSignal:
+        """Return the signal with its dates as numbers of a unit since the origin."""
+        if self.dates is None or self.samples is None:
+            return self
+        times = origin.to_numbers(self.dates, time_unit)
+        own = {name: getattr(self, name) for name in ("observe", "lowpass_hz", "weights", "names", "units")}
+        return ReferenceSignal.from_samples(times, self.samples[1], **own)
 
 
 @dataclass(frozen=True, eq=False)
@@ -471,7 +493,9 @@ class Measurements:
     Parameters
     ----------
     times : (K,) array_like
-        Increasing sample times in the experiment's time unit; they may be irregular.
+        Increasing sample times in the experiment's time unit, or dates, which the experiment converts to it: text in
+        ISO 8601, datetime, datetime64, columns of pandas, polars or xarray, `Log.dates`, or what `from_epoch` returns.
+        They may be irregular.
     values : (K,) or (K, q) array_like
         Samples; NaN marks a missing one, as does the mask of a masked array. Tables of pandas, polars and xarray, and
         a `Log`, bring their names and units.
@@ -501,7 +525,7 @@ class Measurements:
         For times that do not increase, shapes that do not match, no sample at all, infinite values, a
         sigma that is not positive, an unknown loss, or a robust loss without sigma.
     TypeError
-        If times, values, sigma or another number is not a number (dates are not).
+        If times are neither numbers nor dates, or values, sigma or another number is not a number.
 
     See Also
     --------
@@ -556,6 +580,10 @@ class Measurements:
         else:
             delay = as_finite(as_number(self.delay, "delay (a number, or the name of a parameter)"), "delay")
         object.__setattr__(self, "delay", delay)
+
+    def count_from(self, origin: Origin, time_unit: str) -> Measurements:
+        """Return the samples with their dates as numbers of a unit since the origin."""
+        return replace(self, times=_count_from(self.times, origin, time_unit))
 
     @property
     def seen_times(self) -> FloatArray:
@@ -634,13 +662,14 @@ def _check_samples(
     breaks: bool = False,
     missing: bool = False,
     columns: bool = True,
-) -> tuple[FloatArray, FloatArray]:
-    """Return times (K,) and values (K,) or (K, q) as float64, checked against each other.
+) -> tuple[Any, FloatArray]:
+    """Return times (K,) and values (K,) or (K, q) as float64, checked against each other; dates remain dates.
 
     With `breaks`, a time may occur twice; with `missing`, masked values become NaN; without `columns`, the shape of the
     values must be (K,).
     """
-    times = as_array(times, f"{what} times", form="an array of numbers")
+    dates = as_dates(times, f"{what} times") if is_dated(times) else None
+    times = as_array(times, f"{what} times", form="an array of numbers") if dates is None else _count_seconds(dates)
     values = as_array(values, f"{what} values", form="an array of numbers", missing=missing)
     if times.ndim != 1 or values.ndim not in ((1, 2) if columns else (1,)):
         raise ValueError(
@@ -657,12 +686,23 @@ def _check_samples(
         wrong = (np.diff(times) < 0) | np.append(times[2:] == times[:-2], False)
     if wrong.any():
         k = int(np.argmax(wrong))
+        shown = times if dates is None else dates
         raise ValueError(
-            f"{what} times must increase strictly; got {times[k]} followed by {times[k + 1]} at index {k + 1}."
+            f"{what} times must increase strictly; got {shown[k]} followed by {shown[k + 1]} at index {k + 1}."
         )
     times.flags.writeable = False
     values.flags.writeable = False
-    return times, values
+    return times if dates is None else dates, values
+
+
+def _count_seconds(dates: Dates) -> FloatArray:
+    """Return the seconds since the first of dates."""
+    return np.asarray((dates.instants - dates.instants.min(initial=np.iinfo(np.int64).max)) * 1e-9)
+
+
+def _count_from(times: Any, origin: Origin, time_unit: str) -> Any:
+    """Return dates as numbers of a unit since the origin; numbers as they are."""
+    return origin.to_numbers(times, time_unit) if isinstance(times, Dates) else times
 
 
 def _check_observe(observe: Any) -> None:

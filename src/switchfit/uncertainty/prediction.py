@@ -16,6 +16,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -24,9 +25,10 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.dates import Origin, as_dates, is_dated
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_array, as_index
+from switchfit.problem.validation import as_array, as_index, shorten
 from switchfit.uncertainty.sensitivity import Points, Sensitivity, compute_sensitivity
 
 NEAR = 2.0
@@ -52,6 +54,8 @@ class Prediction:
     near_transition : (K,) bool
         Whether a time is within two standard errors of a transition time, where the bands ignore the other mode.
     fit : Fit
+    origin : Origin or None
+        The date at which times are 0; None where they are no dates.
 
     See Also
     --------
@@ -83,6 +87,12 @@ class Prediction:
     time_unit: str
     near_transition: NDArray[np.bool_]
     fit: Fit = field(repr=False)
+    origin: Origin | None = None
+
+    @property
+    def dates(self) -> list[datetime] | None:
+        """The times as dates in the experiment's time zone; None where they are no dates."""
+        return None if self.origin is None else self.origin.to_dates(self.times, self.time_unit)
 
     def state_band(self, level: float = 0.95) -> FloatArray:
         """Return the confidence band of the states at each time: (K, n, 2).
@@ -156,7 +166,8 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
     ----------
     estimate : Estimate
     times : (K,) array_like, optional
-        In any order, inside [t0, tf], in the experiment's time unit; at a transition, values are those just before it.
+        In any order, inside [t0, tf], in the experiment's time unit, or dates where its times are dates; at a
+        transition, values are those just before it.
         If left out, all nodes of the mesh, each transition twice: with the state before and after it.
     experiment : int, optional
         Index of the experiment, from 0.
@@ -228,6 +239,7 @@ def _build_prediction(fit: Fit, problem: Problem, e: int, points: Points) -> Pre
         trajectory.time_unit,
         _is_near_transition(fit, problem, e, points.times),
         fit,
+        trajectory.origin,
     )
 
 
@@ -262,12 +274,18 @@ def _is_near_transition(fit: Fit, problem: Problem, e: int, times: FloatArray) -
 
 
 def _check_times(times: ArrayLike, problem: Problem, e: int, trajectory: Trajectory) -> FloatArray:
+    experiment = problem.experiments[e]
+    if is_dated(times):
+        if experiment.origin is None:
+            raise ValueError(f"times are dates ({shorten(times)}), but the times of the experiment are numbers.")
+        times = experiment.origin.to_numbers(as_dates(times, "times"), experiment.time_unit)
     asked = np.atleast_1d(as_array(times, "times"))
     t0, tf = trajectory.times[[0, -1]].tolist()
     if asked.ndim != 1 or asked.size == 0 or not np.isfinite(asked).all():
         raise ValueError(f"times must be finite numbers of shape (K,); got shape {asked.shape}.")
     outside = (asked < t0) | (asked > tf)
     if outside.any():
-        unit = unit_suffix(problem.experiments[e].time_unit)
-        raise ValueError(f"times must lie inside [t0, tf] = [{t0}, {tf}]{unit}; got {asked[outside][0]}.")
+        unit = unit_suffix(experiment.time_unit) if experiment.origin is None else ""
+        ends = f"[{experiment.show_time(t0)}, {experiment.show_time(tf)}]{unit}"
+        raise ValueError(f"times must lie inside [t0, tf] = {ends}; got {experiment.show_time(asked[outside][0])}.")
     return asked
