@@ -201,6 +201,7 @@ def simulate(
     """Integrate the model at the first guess and write time, mode and states as CSV.
 
     The column of times is named t, or for example "t (min)" if the experiments' time_unit is "min" instead of "s".
+    Where times are dates, a column "date" has them, in the time zone of the experiment.
     """
     with _report_errors(debug):
         loaded = _load(problem)
@@ -218,11 +219,14 @@ def simulate(
 
         text = io.StringIO()
         table = csv.writer(text, lineterminator="\r\n")
-        table.writerow(["experiment", "t" if unit == "s" else f"t ({unit})", "mode", *runs[0].state_names])
+        dated = any(run.origin is not None for run in runs)
+        times = ["t" if unit == "s" else f"t ({unit})", *(["date"] if dated else [])]
+        table.writerow(["experiment", *times, "mode", *runs[0].state_names])
         for k, run in enumerate(runs):
             name = loaded.problem.experiments[k].name or f"run{k + 1}"
-            for t, mode, x in zip(run.times.tolist(), run.modes, run.states.tolist(), strict=True):
-                table.writerow([name, t, mode, *x])
+            dates = [""] * len(run.times) if run.dates is None else [date.isoformat() for date in run.dates]
+            for t, date, mode, x in zip(run.times.tolist(), dates, run.modes, run.states.tolist(), strict=True):
+                table.writerow([name, t, *([date] if dated else []), mode, *x])
         _write(out, text.getvalue())
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from switchfit.estimation.estimator import Estimate
 from switchfit.io.logs.files import find_logs, name_logs
 from switchfit.io.problem_file import ProblemFile, load_problem
+from switchfit.report.dates import list_dated
 from switchfit.report.verdict import write_reason
 from switchfit.uncertainty.residuals import correct_errors
 
@@ -82,6 +83,9 @@ class ResultTable:
         for name, unit, value, error_of in zip(estimate.theta_names, units, estimate.theta, errors, strict=True):
             shown = f"{name} ({unit})" if unit and unit != "1" else name
             row |= {shown: repr(float(value)), f"{shown} std. error": repr(float(error_of))}
+        for name, value, run in zip(estimate.theta_names, estimate.theta, list_dated(estimate), strict=True):
+            date = None if run is None or run.origin is None else run.origin.find_date(value, run.time_unit)
+            row |= {} if date is None else {f"{name} (date)": date.isoformat()}
         self.rows.append({**row, "message": message})
 
     def describe_last(self) -> str:
@@ -93,7 +97,7 @@ class ResultTable:
         numbers = [
             f"{name} = {float(value):.6g} +- {float(row[f'{name} std. error']):.2g}"
             for name, value in row.items()
-            if name not in skipped and not name.endswith(" std. error")
+            if name not in skipped and not name.endswith((" std. error", " (date)"))
         ]
         message = f". {row['message']}" if row["message"] else ""
         return f"{row['log']}: {row['verdict']}. {', '.join(numbers)}{message}"

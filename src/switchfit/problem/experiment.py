@@ -148,9 +148,8 @@ class Experiment:
             t0, tf = as_number(self.t0, "t0"), _check_final_time(self.tf)
         last = float(tf.value) if isinstance(tf, Parameter) else tf
         if not (np.isfinite(t0) and np.isfinite(last) and t0 < last):
-            raise ValueError(
-                f"An experiment needs a finite horizon with t0 < tf; got ({self.show_time(t0)}, {self.show_time(last)})."
-            )
+            ends = f"({self.show_time(t0)}, {self.show_time(last)})"
+            raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got {ends}.")
         by_scale = isinstance(tf, Parameter) and tf.scale == "log" and tf.lower == 0
         if isinstance(tf, Parameter) and np.isfinite(tf.lower) and tf.lower <= t0 and not by_scale:
             raise ValueError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,6 +14,14 @@ from matplotlib.ticker import Formatter, Locator
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import SECONDS, Origin, normalize_time_unit
 from switchfit.report.dates import Timed, label_time
+
+MOST_TICKS, WIDTH = 8, 0.7
+"""Ticks at most, and how many inches each of them needs."""
+FORMATS = ["%Y", "%b", "%d %b", "%H:%M", "%H:%M", "%S.%f"]
+ZERO_FORMATS = ["", "%Y", "%d %b", "%d %b", "%H:%M", "%H:%M"]
+OFFSETS = ["", "%Y", "%Y", "%Y-%m-%d", "%Y-%m-%d", "%Y-%m-%d %H:%M"]
+"""Of years, months, days, hours, minutes and seconds, for ticks, for those where a larger unit begins, and for what
+all of them leave out."""
 
 LONGEST = 1000 * 365.25
 """Days from 1970 that an axis may reach."""
@@ -73,11 +82,16 @@ class DateLocator(Locator):
 
     def __init__(self, scale: _Scale) -> None:
         self.scale = scale
-        self.dates = AutoDateLocator(tz=scale.zone, minticks=3, maxticks=8)
+        self.dates = AutoDateLocator(tz=scale.zone, minticks=3, maxticks=MOST_TICKS)
 
     def __call__(self) -> Sequence[float]:
         """Return the ticks of what the axis shows."""
-        return self.tick_values(*self.axis.get_view_interval())  # type: ignore[union-attr]  # it is set by then
+        axes: Any = self.axis.axes  # type: ignore[union-attr]  # it is set by then
+        room = axes.bbox.width / axes.figure.dpi / WIDTH
+        most = int(np.clip(room, 3, MOST_TICKS))
+        self.dates.maxticks = dict.fromkeys(self.dates.maxticks, most)
+        self.dates.minticks = min(3, most)
+        return self.tick_values(*self.axis.get_view_interval())  # type: ignore[union-attr]
 
     def tick_values(self, vmin: float, vmax: float) -> Sequence[float]:
         """Return the ticks between two times."""
@@ -97,7 +111,9 @@ class DateFormatter(Formatter):
 
     def __init__(self, scale: _Scale, locator: DateLocator) -> None:
         self.scale = scale
-        self.dates = ConciseDateFormatter(locator.dates, tz=scale.zone)
+        self.dates = ConciseDateFormatter(
+            locator.dates, tz=scale.zone, formats=FORMATS, zero_formats=ZERO_FORMATS, offset_formats=OFFSETS
+        )
 
     def __call__(self, x: float, pos: int | None = None) -> str:
         """Return the label of one tick, or of a place under the pointer."""

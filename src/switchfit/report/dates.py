@@ -8,14 +8,16 @@ the zone show twice.
 from __future__ import annotations
 
 import datetime
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.dates import SECONDS, Origin, normalize_time_unit
+from switchfit.problem.experiment import Experiment
 from switchfit.problem.parameter import unit_suffix
+from switchfit.problem.problem import Problem
 
 ENOUGH = 5.0
 """Standard error in units of the last place that is shown, at least: 1.3 days are shown to the hour."""
@@ -127,3 +129,43 @@ def _tell_apart(date: datetime.datetime) -> str:
     if date.tzinfo is None or date.replace(fold=0).utcoffset() == date.replace(fold=1).utcoffset():
         return ""
     return f"{date:%z}"
+
+
+def describe_clock(origin: Origin, time_unit: str) -> dict[str, Any]:
+    """Return how a page's script shows times as dates: milliseconds since 1970 at 0, those of a unit, and the zone.
+
+    Browsers know names of zones, but not all of them know offsets: these are added to the start.
+
+    Parameters
+    ----------
+    origin : Origin
+    time_unit : str
+    """
+    offset = origin.zone.utcoffset(None) if isinstance(origin.zone, datetime.timezone) else None
+    shift = 0.0 if offset is None else 1e3 * offset.total_seconds()
+    zone = "UTC" if offset is not None else origin.time_zone or "UTC"
+    length = 1e3 * SECONDS[normalize_time_unit(time_unit)]
+    return {"start": origin.instant / 1e6 + shift, "length": length, "zone": zone}
+
+
+def list_dated_unknowns(problem: Problem) -> list[Experiment | None]:
+    """Return the experiment of each unknown of a problem that is a time and a date; None for every other."""
+    found: list[Experiment | None] = [None] * len(problem.theta_names)
+    for experiment, places in zip(problem.experiments, problem.unknowns.times, strict=True):
+        if experiment.origin is not None:
+            for place in places[places >= 0].tolist():
+                found[place] = experiment
+    return found
+
+
+def format_unknown(value: float, run: Timed | None, error: float = np.nan) -> str:
+    """Return the value of an unknown without its unit: a date if it is a time of a run with dates.
+
+    Parameters
+    ----------
+    value : float
+    run : Timed or None
+    error : float, optional
+        Its standard error.
+    """
+    return f"{value:.6g}" if run is None else format_time(value, run, error)
