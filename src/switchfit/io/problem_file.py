@@ -147,24 +147,30 @@ class _Table(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
+def _is_date(given: Any) -> bool:
+    """Return whether a value is a date: one of TOML's own, or text in ISO 8601."""
+    if not isinstance(given, (str, datetime.date)):
+        return False
+    try:
+        as_dates(given, "the time")
+    except ValueError:
+        return False
+    return True
+
+
 def _check_time(given: Any) -> Any:
-    """Return a number, or a date: one of TOML's own, or text in ISO 8601."""
+    """Return a number or a date."""
     if isinstance(given, (int, float)) and not isinstance(given, bool):
         return float(given)
-    if isinstance(given, (str, datetime.date)):
-        try:
-            as_dates(given, "the time")
-        except ValueError:
-            pass
-        else:
-            return given
-    raise PydanticCustomError("time_type", f"Input should be a number, or a date such as {EXAMPLES}")
+    if _is_date(given):
+        return given
+    raise PydanticCustomError("time_type", f"Input should be a number or a date such as {EXAMPLES}")
 
 
 def _check_date(given: Any) -> Any:
-    """Return a date, but no number."""
-    if isinstance(given, (str, datetime.date)):
-        return _check_time(given)
+    """Return a date."""
+    if _is_date(given):
+        return given
     raise PydanticCustomError("date_type", f"Input should be a date such as {EXAMPLES}")
 
 
@@ -176,7 +182,7 @@ Date = Annotated[Any, pydantic.PlainValidator(_check_date)]
 
 def _time_as_table(given: Any) -> Any:
     """Return ``{ value = 5.0 }`` for ``5.0``, and for a date: the guess of a transition time."""
-    return {"value": given} if isinstance(given, (str, datetime.date)) else _number_as_table(given)
+    return {"value": given} if _is_date(given) else _number_as_table(given)
 
 
 def _number_as_table(given: Any) -> Any:
@@ -191,10 +197,10 @@ def _known_as_table(given: Any) -> Any:
 
 def _end_as_table(given: Any) -> Any:
     """Return ``{ value = 6.0, fixed = true }`` for ``6.0``: a tf given as a number is known."""
-    if isinstance(given, (str, datetime.date)):
+    if _is_date(given):
         return {"value": given, "fixed": True}
     if given is not None and not isinstance(given, dict) and _known_as_table(given) is given:
-        raise PydanticCustomError("float_type", "Input should be a valid number")
+        raise PydanticCustomError("float_type", "Input should be a valid number or a date")
     return _known_as_table(given)
 
 
@@ -756,28 +762,43 @@ def _build_experiment(
 
 def _find_origin(table: ExperimentTable, logs: Sequence[Log]) -> Any:
     """Return the date at which times are 0: as stated, else t0, else the beginning of the earliest log with dates."""
-    if table.origin is not None or isinstance(table.t0, (str, datetime.date)):
+    if table.origin is not None or _is_date(table.t0):
         return table.origin
     dated = [log for item, log in zip(_list_log_tables(table), logs, strict=True) if _keep_dates(item, log, table)]
     zones = {log.time_zone for log in dated}
     if not dated or ("" in zones and len(zones) > 1 and table.time_zone is None):
         return None  # the experiment says which dates have zones and which have none
     zone = table.time_zone or (zones.pop() if len(zones) == 1 else "UTC")
-    starts = [log.dates.localize(zone, log.source) if zone else log.dates for log in dated if log.dates is not None]
-    return make_origin(min(int(dates.instants.min()) for dates in starts), zone)
+    starts = [
+        as_dates(log.start if log.time_zone else log.start.replace(tzinfo=None), "origin") for log in dated if log.start
+    ]
+    return make_origin(min(int((start.localize(zone, "origin") if zone else start).instants) for start in starts), zone)
 
 
 def _keep_dates(item: LogTable, log: Log, run: ExperimentTable) -> bool:
-    """Return whether the dates of a log are handed over as dates; time_offset and time_scale make numbers of them."""
+    """Return whether the times of a log are handed over as dates.
+
+    Those that are written as dates are, unless time_offset or time_scale makes numbers of them; the stamps of a
+    recorder, and numbers since 1970, only if the file says that they are dates, or gives a date to compare them with.
+    """
     if not log.offset:
         return False
-    kept = item.time_offset == 0.0 and item.time_scale is None
-    if not kept and (item.epoch is not None or run.origin is not None or run.time_zone is not None):
+    stated = item.epoch is not None or run.origin is not None or run.time_zone is not None or _has_dates(run)
+    if item.time_offset == 0.0 and item.time_scale is None:
+        return log.has_dates or stated
+    if stated:
         raise ValueError(
             f"{log.source} has dates, which are converted to time_unit by themselves: leave out time_offset and "
             "time_scale."
         )
-    return kept
+    return False
+
+
+def _has_dates(run: ExperimentTable) -> bool:
+    """Return whether a time of an experiment is given as a date."""
+    tables = [*(run.transition_times or ()), *([] if run.tf is None else [run.tf])]
+    times = [run.t0, *(time for table in tables for time in (table.value, table.lower, table.upper))]
+    return any(map(_is_date, times))
 
 
 def _build_initial_state(table: ExperimentTable) -> list[Parameter] | list[float] | None:
@@ -867,7 +888,7 @@ def _cut_log(
         (first, last), axis = _place_window(log, table, run)
         inside = (axis >= first) & (axis <= last)
         if not inside.any():
-            shown = log.dates if any(isinstance(end, (str, datetime.date)) for end in table.window) else None
+            shown = log.dates if any(map(_is_date, table.window)) else None
             least, most = (axis.min(), axis.max()) if shown is None else (repr(shown[0]), repr(shown[-1]))
             raise InputError(
                 f"{log.source}: no time in column {log.time_name!r} lies in the window [{table.window[0]}, "
@@ -886,7 +907,7 @@ def _cut_log(
 def _place_window(log: Log, table: LogTable, run: ExperimentTable) -> tuple[list[float], FloatArray]:
     """Return the ends of the window, and the times of a log (K,), both as numbers with one origin and one unit."""
     ends = table.window or []
-    dated = [isinstance(end, (str, datetime.date)) for end in ends]
+    dated = list(map(_is_date, ends))
     if not any(dated):
         return list(ends), log.times + log.offset if table.epoch is not None else log.times
     if not all(dated) or log.dates is None:

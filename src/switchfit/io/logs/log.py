@@ -63,6 +63,8 @@ class Log:
         What was subtracted from the file's times, where these are dates or count from 1970; otherwise 0.
     time_zone : str
         Zone of the file's dates, such as "UTC" or "+02:00"; "" where it states none.
+    has_dates : bool
+        Whether the file has dates that are written as such, not stamps of a recorder or numbers since 1970.
     origin : (latitude, longitude, altitude) or None
         Of the channels east, north and up, in degrees and metres.
     labels : mapping of str to str
@@ -108,6 +110,7 @@ class Log:
     time_name: str = "t"
     has_positions: bool = False
     time_zone: str = "UTC"
+    has_dates: bool = False
 
     @property
     def dates(self) -> Dates | None:

@@ -82,6 +82,7 @@ def build_log(
         place="row",
         time_name=time,
         time_zone=(zones or {}).get(time, "") if columns[time].dtype.kind == "M" else "UTC",
+        has_dates=columns[time].dtype.kind == "M",
     )
 
 
