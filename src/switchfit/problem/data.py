@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,6 +32,7 @@ from switchfit.problem.validation import (
 )
 
 FloatArray = NDArray[np.float64]
+T = TypeVar("T")
 MOST_FILTERED = 10**7
 """Largest number of points at which a signal is filtered."""
 OVERFLOW = (
@@ -166,10 +167,6 @@ class Input:
     def shape(self) -> tuple[int, ...]:
         """Shape of u: () or (q,). If its entries have names, q is their number."""
         return (len(self.values),) if self.names else tuple(self.values.shape[1:])
-
-    def count_from(self, origin: Origin, time_unit: str) -> Input:
-        """Return the input with its dates as numbers of a unit since the origin."""
-        return replace(self, times=_count_from(self.times, origin, time_unit))
 
     def signal(self, t0: float, tf: float) -> PiecewisePolynomial:
         """Return the input as a piecewise polynomial over ``[t0, tf]``.
@@ -473,14 +470,6 @@ class ReferenceSignal:
         """Dates of the samples, until an experiment has converted them; None if their times are numbers."""
         return self.samples[0] if self.samples is not None and isinstance(self.samples[0], Dates) else None
 
-    def count_from(self, origin: Origin, time_unit: str) -> ReferenceSignal:
-        """Return the signal with its dates as numbers of a unit since the origin."""
-        if self.dates is None or self.samples is None:
-            return self
-        times = origin.to_numbers(self.dates, time_unit)
-        own = {name: getattr(self, name) for name in ("observe", "lowpass_hz", "weights", "names", "units")}
-        return ReferenceSignal.from_samples(times, self.samples[1], **own)
-
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
@@ -581,10 +570,6 @@ class Measurements:
             delay = as_finite(as_number(self.delay, "delay (a number, or the name of a parameter)"), "delay")
         object.__setattr__(self, "delay", delay)
 
-    def count_from(self, origin: Origin, time_unit: str) -> Measurements:
-        """Return the samples with their dates as numbers of a unit since the origin."""
-        return replace(self, times=_count_from(self.times, origin, time_unit))
-
     @property
     def seen_times(self) -> FloatArray:
         """Times of the states that were measured, (K,); a delay that is a parameter is not subtracted."""
@@ -653,6 +638,18 @@ class Measurements:
 Data = RunningCost | TerminalCost | TerminalConstraint | ReferenceSignal | Measurements
 
 
+def count_from(item: T, origin: Origin, time_unit: str) -> T:
+    """Return data or an input with dates as numbers of a unit since the origin; anything else as it is."""
+    if isinstance(item, (Measurements, Input)) and isinstance(item.times, Dates):
+        what = f"times of {type(item).__name__}"
+        return replace(item, times=origin.to_numbers(item.times, time_unit, what))
+    if isinstance(item, ReferenceSignal) and item.samples is not None and item.dates is not None:
+        times = origin.to_numbers(item.dates, time_unit, "times of ReferenceSignal")
+        own = {name: getattr(item, name) for name in ("observe", "lowpass_hz", "weights", "names", "units")}
+        return ReferenceSignal.from_samples(times, item.samples[1], **own)  # type: ignore[return-value]  # of its type
+    return item
+
+
 def _check_samples(
     times: ArrayLike,
     values: ArrayLike,
@@ -698,11 +695,6 @@ def _check_samples(
 def _count_seconds(dates: Dates) -> FloatArray:
     """Return the seconds since the first of dates."""
     return np.asarray((dates.instants - dates.instants.min(initial=np.iinfo(np.int64).max)) * 1e-9)
-
-
-def _count_from(times: Any, origin: Origin, time_unit: str) -> Any:
-    """Return dates as numbers of a unit since the origin; numbers as they are."""
-    return origin.to_numbers(times, time_unit) if isinstance(times, Dates) else times
 
 
 def _check_observe(observe: Any) -> None:

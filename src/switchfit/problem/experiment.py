@@ -19,10 +19,11 @@ from switchfit.problem.data import (
     TerminalConstraint,
     TerminalCost,
     TransitionCost,
+    count_from,
 )
 from switchfit.problem.dates import Dates, Given, Origin, as_dates, as_time_zone, choose_origin, is_dated
 from switchfit.problem.parameter import Parameter as Parameter
-from switchfit.problem.parameter import as_parameter
+from switchfit.problem.parameter import as_parameter, count_parameter, list_dates
 from switchfit.problem.system import HybridSystem, as_state
 from switchfit.problem.validation import as_instance, as_name, as_number, as_sequence, join_names, shorten
 
@@ -148,7 +149,7 @@ class Experiment:
             t0, tf = as_number(self.t0, "t0"), _check_final_time(self.tf)
         last = float(tf.value) if isinstance(tf, Parameter) else tf
         if not (np.isfinite(t0) and np.isfinite(last) and t0 < last):
-            ends = f"({self.show_time(t0)}, {self.show_time(last)})"
+            ends = f"({show_time(self, t0)}, {show_time(self, last)})"
             raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got {ends}.")
         by_scale = isinstance(tf, Parameter) and tf.scale == "log" and tf.lower == 0
         if isinstance(tf, Parameter) and np.isfinite(tf.lower) and tf.lower <= t0 and not by_scale:
@@ -215,14 +216,11 @@ class Experiment:
 
         def count(value: Any, what: str) -> Any:
             if isinstance(value, Parameter):
-                return value.count_from(origin, unit, what)
+                return count_parameter(value, origin, unit, what)
             return origin.to_numbers(as_dates(value, what), unit, what) if is_dated(value) else value
 
-        timed = (Measurements, ReferenceSignal)
-        data = tuple(item.count_from(origin, unit) if isinstance(item, timed) else item for item in self.data)
-        object.__setattr__(self, "data", data)
-        if isinstance(self.inputs, Input):
-            object.__setattr__(self, "inputs", self.inputs.count_from(origin, unit))
+        object.__setattr__(self, "data", tuple(count_from(item, origin, unit) for item in self.data))
+        object.__setattr__(self, "inputs", count_from(self.inputs, origin, unit))
         for name in ("t0", "tf"):
             object.__setattr__(self, name, count(getattr(self, name), name))
         times = self.transition_times
@@ -244,18 +242,9 @@ class Experiment:
         others = [("a transition time", time) for time in times] if several else [("transition_times", times)]
         for what, value in [*others, ("t0", self.t0), ("tf", self.tf)]:
             if isinstance(value, Parameter):
-                yield from (Given(what, dates) for dates in value.dates)
+                yield from (Given(what, dates) for dates in list_dates(value))
             elif is_dated(value):
                 yield Given(what, as_dates(value, what))
-
-    def show_time(self, time: float) -> str:
-        """Return a time as text for a message: a date where times are dates."""
-        if self.origin is not None and np.isfinite(time):
-            try:
-                return str(self.origin.to_dates([time], self.time_unit)[0])
-            except ValueError:  # beyond the year 9999
-                pass
-        return str(time)
 
     @property
     def has_free_tf(self) -> bool:
@@ -327,12 +316,12 @@ class Experiment:
         knots = self.ends_of_modes(self.initial_times)
         if np.any(np.diff(knots) <= 0):
             raise ValueError(
-                f"transition_times must increase strictly inside (t0, tf) = ({self.show_time(self.t0)}, "
-                f"{self.show_time(knots[-1])}); got {self._show_times(knots[1:-1])}."
+                f"transition_times must increase strictly inside (t0, tf) = ({show_time(self, self.t0)}, "
+                f"{show_time(self, knots[-1])}); got {self._show_times(knots[1:-1])}."
             )
 
     def _show_times(self, times: FloatArray) -> str:
-        return shorten(times) if self.origin is None else shorten([self.show_time(time) for time in times])
+        return shorten(times) if self.origin is None else shorten([show_time(self, time) for time in times])
 
     def _check_data_inside(self) -> None:
         for item in self.data:
@@ -345,9 +334,9 @@ class Experiment:
                 if first > self.t0 or last < self.end:
                     bound = ", whose end is the upper bound of tf" if self.has_free_tf else ""
                     raise ValueError(
-                        f"A ReferenceSignal must reach over (t0, tf) = ({self.show_time(self.t0)}, "
-                        f"{self.show_time(self.end)}){bound}; this one is known from {self.show_time(first)} to "
-                        f"{self.show_time(last)}. Give t0 and tf inside that, or a longer signal."
+                        f"A ReferenceSignal must reach over (t0, tf) = ({show_time(self, self.t0)}, "
+                        f"{show_time(self, self.end)}){bound}; this one is known from {show_time(self, first)} to "
+                        f"{show_time(self, last)}. Give t0 and tf inside that, or a longer signal."
                     )
 
     def _require_inside(self, times: FloatArray, what: str) -> None:
@@ -356,20 +345,27 @@ class Experiment:
         outside = (times < self.t0) | (times > last)
         if not outside.any():
             return
-        count = f"{outside.sum()} of {len(times)} do not, the first is {self.show_time(times[outside][0])}."
+        count = f"{outside.sum()} of {len(times)} do not, the first is {show_time(self, times[outside][0])}."
         if self.has_free_tf and not np.any(times < self.t0):
             raise ValueError(
-                f"{what} must not lie after a free tf, at its earliest {self.show_time(last)}; {count} Give tf a lower "
-                f"bound of {self.show_time(times.max())} or more, or leave out later samples."
+                f"{what} must not lie after a free tf, at its earliest {show_time(self, last)}; {count} Give tf a "
+                f"lower bound of {show_time(self, times.max())} or more, or leave out later samples."
             )
         raise ValueError(
-            f"{what} must lie inside [t0, tf] = [{self.show_time(self.t0)}, {self.show_time(last)}]; {count}"
+            f"{what} must lie inside [t0, tf] = [{show_time(self, self.t0)}, {show_time(self, last)}]; {count}"
         )
 
     @property
     def earliest_end(self) -> float:
         """The earliest tf that there may be: tf, or the lower bound of a free tf, t0 where it has none."""
         return max(float(self.tf.lower), self.t0) if isinstance(self.tf, Parameter) else self.tf
+
+
+def show_time(experiment: Experiment, time: float) -> str:
+    """Return a time of an experiment as text for a message: a date where its times are dates."""
+    origin = experiment.origin
+    date = None if origin is None else origin.find_date(time, experiment.time_unit)
+    return str(time if date is None else date)
 
 
 def initial_state_of(system: HybridSystem, experiment: Experiment) -> Any:

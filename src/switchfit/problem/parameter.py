@@ -129,27 +129,6 @@ class Parameter:
         for name, entry in checked.items():
             object.__setattr__(self, name, entry)
 
-    @property
-    def dates(self) -> list[Dates]:
-        """Its value, bounds and mean of the prior, as far as they are dates."""
-        every = (self.value, self.lower, self.upper, getattr(self.prior, "mean", None))
-        return [entry for entry in every if isinstance(entry, Dates)]
-
-    def count_from(self, origin: Origin, time_unit: str, what: str) -> Parameter:
-        """Return the unknown with its dates as numbers of a unit since the origin; errors call it `what`."""
-        if not self.dates:
-            return self
-        entries = (self.value, self.lower, self.upper)
-        value, lower, upper = (
-            origin.to_numbers(entry, time_unit, what) if isinstance(entry, Dates) else entry for entry in entries
-        )
-        prior = self.prior
-        if isinstance(prior, Normal) and isinstance(prior.mean, Dates):
-            prior = Normal(origin.to_numbers(prior.mean, time_unit, what), prior.sd)
-        if not lower <= value <= upper:
-            raise ValueError(f"{what} {self.value!r} lies outside its bounds [{self.lower!r}, {self.upper!r}].")
-        return Parameter(value, lower, upper, self.unit, self.fixed, prior, self.scale)
-
     def _bound(self, name: str, shape: tuple[int, ...]) -> FloatArray:
         """Return a bound with one entry for each of the value."""
         bound = as_array(getattr(self, name), f"Parameter {name}")
@@ -234,9 +213,33 @@ def as_parameter(value: Any, what: str) -> Parameter:
         raise ValueError(f"{what} must be {form}: {error}") from error
 
 
+def list_dates(parameter: Parameter) -> list[Dates]:
+    """Return value, bounds and mean of the prior of an unknown, as far as they are dates."""
+    every = (parameter.value, parameter.lower, parameter.upper, getattr(parameter.prior, "mean", None))
+    return [entry for entry in every if isinstance(entry, Dates)]
+
+
+def count_parameter(parameter: Parameter, origin: Origin, time_unit: str, what: str) -> Parameter:
+    """Return an unknown with its dates as numbers of a unit since the origin; errors call it `what`."""
+    if not list_dates(parameter):
+        return parameter
+    value, lower, upper = (
+        origin.to_numbers(entry, time_unit, what) if isinstance(entry, Dates) else entry
+        for entry in (parameter.value, parameter.lower, parameter.upper)
+    )
+    if not lower <= value <= upper:
+        raise ValueError(
+            f"{what} {parameter.value!r} lies outside its bounds [{parameter.lower!r}, {parameter.upper!r}]."
+        )
+    prior = parameter.prior
+    if isinstance(prior, Normal) and isinstance(prior.mean, Dates):
+        prior = Normal(origin.to_numbers(prior.mean, time_unit, what), prior.sd)
+    return Parameter(value, lower, upper, parameter.unit, parameter.fixed, prior, parameter.scale)
+
+
 def refuse_dates(parameter: Parameter, what: str) -> None:
     """Raise for an unknown that is a date, where it is no time of an experiment; errors call it `what`."""
-    if parameter.dates:
+    if dates := list_dates(parameter):
         raise ValueError(
-            f"{what} must be a number; got the date {parameter.dates[0]!r}. Only transition times and tf may be dates."
+            f"{what} must be a number; got the date {dates[0]!r}. Only transition times and tf may be dates."
         )

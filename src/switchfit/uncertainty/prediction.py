@@ -26,6 +26,7 @@ from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.dates import Origin, as_dates, is_dated
+from switchfit.problem.experiment import show_time
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_index, shorten
@@ -286,6 +287,6 @@ def _check_times(times: ArrayLike, problem: Problem, e: int, trajectory: Traject
     outside = (asked < t0) | (asked > tf)
     if outside.any():
         unit = unit_suffix(experiment.time_unit) if experiment.origin is None else ""
-        ends = f"[{experiment.show_time(t0)}, {experiment.show_time(tf)}]{unit}"
-        raise ValueError(f"times must lie inside [t0, tf] = {ends}; got {experiment.show_time(asked[outside][0])}.")
+        ends = f"[{show_time(experiment, t0)}, {show_time(experiment, tf)}]{unit}"
+        raise ValueError(f"times must lie inside [t0, tf] = {ends}; got {show_time(experiment, asked[outside][0])}.")
     return asked

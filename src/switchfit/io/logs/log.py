@@ -61,10 +61,6 @@ class Log:
         Columns of text, as (time, channel, text) wherever the text changes.
     offset : float
         What was subtracted from the file's times, where these are dates or count from 1970; otherwise 0.
-    time_zone : str
-        Zone of the file's dates, such as "UTC" or "+02:00"; "" where it states none.
-    has_dates : bool
-        Whether the file has dates that are written as such, not stamps of a recorder or numbers since 1970.
     origin : (latitude, longitude, altitude) or None
         Of the channels east, north and up, in degrees and metres.
     labels : mapping of str to str
@@ -77,6 +73,10 @@ class Log:
         The column with the times.
     has_positions : bool
         Whether latitude and longitude are those of a format of positions, to which east and north are added.
+    time_zone : str
+        Zone of the file's dates, such as "UTC" or "+02:00"; "" where it states none.
+    has_dates : bool
+        Whether the file has dates that are written as such, not stamps of a recorder or numbers since 1970.
 
     See Also
     --------
