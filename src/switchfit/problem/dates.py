@@ -227,8 +227,9 @@ def from_epoch(numbers: ArrayLike, unit: str = "s") -> Dates:
     given = np.asarray(integers)
     if given.dtype.kind in "iu":  # doubles would round nanoseconds
         return Dates(given.astype(np.int64) * NANOSECONDS[key], "UTC")
-    whole = np.floor(array)
-    return Dates((whole * NANOSECONDS[key] + np.rint((array - whole) * NANOSECONDS[key])).astype(np.int64), "UTC")
+    whole = np.floor(array)  # times a length it would be beyond 2**53, where doubles are no longer exact
+    finer = np.rint((array - whole) * NANOSECONDS[key]).astype(np.int64)
+    return Dates(whole.astype(np.int64) * NANOSECONDS[key] + finer, "UTC")
 
 
 # --- the origin of an experiment --------------------------------------------------------------------------------------

@@ -15,8 +15,9 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import SECONDS, Origin, normalize_time_unit
 from switchfit.report.dates import Timed, label_time
 
-MOST_TICKS, WIDTH = 8, 0.7
-"""Ticks at most, and how many inches each of them needs."""
+FEWEST_TICKS, MOST_TICKS, WIDTH = 5, 8, 0.7
+"""Between which numbers of ticks the largest is chosen (with less than 5, matplotlib finds no interval for some spans),
+and how many inches each of them needs."""
 FORMATS = ["%Y", "%b", "%d %b", "%H:%M", "%H:%M", "%S.%f"]
 ZERO_FORMATS = ["", "%Y", "%d %b", "%d %b", "%H:%M", "%H:%M"]
 OFFSETS = ["", "%Y", "%Y", "%Y-%m-%d", "%Y-%m-%d", "%Y-%m-%d %H:%M"]
@@ -82,15 +83,14 @@ class DateLocator(Locator):
 
     def __init__(self, scale: _Scale) -> None:
         self.scale = scale
-        self.dates = AutoDateLocator(tz=scale.zone, minticks=3, maxticks=MOST_TICKS)
+        self.dates = AutoDateLocator(tz=scale.zone, minticks=2, maxticks=MOST_TICKS)
 
     def __call__(self) -> Sequence[float]:
         """Return the ticks of what the axis shows."""
         axes: Any = self.axis.axes  # type: ignore[union-attr]  # it is set by then
         room = axes.bbox.width / axes.figure.dpi / WIDTH
-        most = int(np.clip(room, 3, MOST_TICKS))
+        most = int(np.clip(room, FEWEST_TICKS, MOST_TICKS))
         self.dates.maxticks = dict.fromkeys(self.dates.maxticks, most)
-        self.dates.minticks = min(3, most)
         return self.tick_values(*self.axis.get_view_interval())  # type: ignore[union-attr]
 
     def tick_values(self, vmin: float, vmax: float) -> Sequence[float]:

@@ -67,7 +67,8 @@ const switchfitDates = (() => {
 
   // A date to the place that a step in the unit of the times needs.
   function show(time, step, start, length, zone) {
-    const date = new Date(Math.round(wall(start + time * length, zone)));
+    const place = step * length < SECOND ? 1 : step * length < MINUTE ? SECOND : MINUTE;
+    const date = new Date(Math.round(wall(start + time * length, zone) / place) * place);
     const day = `${date.getUTCFullYear()}-${pad(date.getUTCMonth() + 1)}-${pad(date.getUTCDate())}`;
     const seconds = step * length < MINUTE ? `:${pad(date.getUTCSeconds())}` : "";
     const finer = step * length < SECOND ? `.${pad(date.getUTCMilliseconds(), 3)}` : "";
