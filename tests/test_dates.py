@@ -4,6 +4,7 @@ import csv
 import datetime as dt
 import json
 import re
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from zoneinfo import ZoneInfo
@@ -27,7 +28,7 @@ from switchfit.io.result_tables import write_runs, write_unknowns
 from switchfit.io.summary import describe
 from switchfit.problem.dates import NANOSECONDS, Dates, Origin, as_dates, from_epoch, make_origin
 from switchfit.report.date_axis import DateLocator
-from switchfit.report.dates import format_date, format_time
+from switchfit.report.dates import add_dates, format_date, format_time
 from switchfit.runtime.errors import InputError
 
 matplotlib.use("agg")
@@ -260,8 +261,6 @@ def test_transition_times_in_any_form(times):
 
 
 def test_a_copy_keeps_its_origin():
-    from dataclasses import replace
-
     run = run_of(DAYS, time_zone="Europe/Berlin")
     copy = replace(run, data=log(["2020-03-29 12:00", "2020-03-30"]))
     assert copy.origin == run.origin
@@ -451,6 +450,25 @@ def test_the_report_shows_dates(fits):
     assert float(shown[3]) == pytest.approx(dated.theta[0], abs=0.01)
     assert "2020" not in str(plain)
     assert "2020-03-29" in dated.report(full=True)
+
+
+def test_sentences_have_dates_beside_numbers(fits):
+    dated, plain = fits
+    text = "Kinks: tau_1 = 9.5, where; tau_1 is at its lower bound 2. run.tau_1 = 3, tau_1 later, k = 3."
+    assert add_dates(text, dated) == (
+        "Kinks: tau_1 = 9.5 (2020-03-29 13:00), where; tau_1 is at its lower bound 2 (2020-03-22). run.tau_1 = 3, "
+        "tau_1 later, k = 3."
+    )
+    assert add_dates(text, plain) == text
+
+
+def test_a_bound_is_a_date():
+    problem = room(dated=True)
+    (run,) = problem.experiments
+    late = replace(run, transition_times=[sf.Parameter("2020-03-31", lower="2020-03-30T12:00")])
+    text = " ".join(sf.estimate(replace(problem, experiments=[late]), strategy="local").report(full=True).split())
+    assert "tau_1 is at its lower bound 10.4583 (2020-03-30 12:00): it has no standard error" in text
+    assert re.search(r"tau_1 +2020-03-30 12:00 .*AT LOWER BOUND", text)
 
 
 def test_tables_and_notebooks(fits):

@@ -8,6 +8,8 @@ the zone show twice.
 from __future__ import annotations
 
 import datetime
+import re
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -21,6 +23,7 @@ from switchfit.problem.problem import Problem
 
 ENOUGH = 5.0
 """Standard error in units of the last place that is shown, at least: 1.3 days are shown to the hour."""
+_NUMBER = r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?"
 LAST_PLACES = (("d", 86400.0), ("h", 3600.0), ("min", 60.0), ("s", 1.0))
 
 
@@ -122,6 +125,22 @@ def list_dated(fit: Fit) -> list[Trajectory | None]:
                 if place >= 0:
                     found[place] = trajectory
     return found
+
+
+def add_dates(text: str, fit: Fit) -> str:
+    """Return a sentence with the date behind each time that it gives as a number, as in ``tau_1 = 3.5``.
+
+    Sentences are made of issues, which know names and numbers, but not what date a number is.
+    """
+    for name, run in zip(fit.theta_names, list_dated(fit), strict=True):
+        if run is not None:
+            before = rf"(?<![\w.]){re.escape(name)} (?:=|is at its (?:lower|upper) bound) "
+            text = re.sub(rf"({before})({_NUMBER})", partial(_append_date, run=run), text)
+    return text
+
+
+def _append_date(match: re.Match[str], run: Timed) -> str:
+    return f"{match[0]} ({format_time(float(match[2]), run)})"
 
 
 def _tell_apart(date: datetime.datetime) -> str:

@@ -13,7 +13,7 @@ from switchfit.fit.result import Fit, Step, disagreement, interval
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
-from switchfit.report.dates import describe_origin, format_span, format_time, list_dated
+from switchfit.report.dates import add_dates, describe_origin, format_span, format_time, list_dated
 from switchfit.report.numbers import format_rounded, format_unit, get_unit
 from switchfit.report.tables import Table, format_table, wrap_text
 from switchfit.report.uncertainty import write_direction
@@ -211,7 +211,8 @@ def list_course(fit: Fit, *, full: bool) -> list[Row]:
     if fit.starts is not None and fit.starts[0]:
         ended = next((step.ended for step in reversed(fit.steps) if step.ended), "")
         rows.append(("starts", f"{write_agreement(*fit.starts)}{_ENDED.get(ended, '')}"))
-    rows.append(("status", fit.message if full or not fit.status.successful else _shorten_status(fit)))
+    message = fit.message if full or not fit.status.successful else _shorten_status(fit)
+    rows.append(("status", add_dates(message, fit)))
     return rows
 
 
@@ -555,7 +556,7 @@ def _format_warnings(fit: Fit, verdict: Verdict, most: int, *, full: bool) -> li
     """Return what to be wary of; on one screen without what the verdict has said."""
     said = set() if full else set().union(*(_SAID.get(reason.kind, set()) for reason in verdict.reasons))
     issues = [issue for issue in find_issues(fit) if issue.kind not in said]
-    lines = [line for issue in issues[:most] for line in wrap_text(str(issue), "  - ", "    ")]
+    lines = [line for issue in issues[:most] for line in wrap_text(add_dates(str(issue), fit), "  - ", "    ")]
     more = len(issues) - len(issues[:most])
     return lines + ([f"  and {_count(more, 'warning')} more"] if more else [])
 

@@ -19,7 +19,7 @@ from bokeh.resources import Resources
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report.dates import describe_clock, format_span, format_time, list_dated
+from switchfit.report.dates import add_dates, describe_clock, format_span, format_time, list_dated
 from switchfit.report.html.columns import FigureData, ModeSpan, TransitionLine, collect_diagnostics, collect_run
 from switchfit.report.html.curves import Curves, choose_points, collect_curves, list_places
 from switchfit.report.html.figures import (
@@ -156,7 +156,7 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
         "line": str(verdict),
         "reasons": [write_reason(reason) for reason in verdict.reasons],
         "steps": [write_step(step) for step in verdict.next_steps],
-        "warnings": [str(issue) for issue in find_issues(estimate)],
+        "warnings": [add_dates(str(issue), estimate) for issue in find_issues(estimate)],
         "unknowns": everything._replace(rows=[everything.rows[0], *rows]),
         "all_unknowns": everything,
         "more_unknowns": len(estimate.theta) - len(listed),
