@@ -279,6 +279,10 @@ def test_signals_and_inputs():
     np.testing.assert_array_equal(run.data[0].signal.knots, expected.signal.knots)
     np.testing.assert_array_equal(run.data[0].signal.coefficients, expected.signal.coefficients)
     assert (run.data[0].names, run.data[0].lowpass_hz) == (("x",), 0.1)
+    # A cut-off is in cycles per time unit: in Hz, this one would need ten million points.
+    days = np.datetime64("2020-03-01") + np.arange(30)
+    slow = sf.ReferenceSignal.from_samples(days, np.sin(np.arange(30.0)), lowpass_hz=0.45)
+    assert sf.Experiment(slow, ("on",), (), time_unit="d").data[0].signal.knots[-1] == 29.0
     np.testing.assert_array_equal(run.inputs.times, numbers)
     assert run.t0 == 0.0
 
