@@ -323,6 +323,8 @@ MIXED = (
         (lambda: run_of(DAYS, time_unit="week"), ValueError, "time_unit must be one of ns, us, ms, s, min, h, d where"),
         (lambda: run_of(DAYS, origin=3.0), TypeError, "origin must be a date, such as .*; got 3.0"),
         (lambda: run_of(DAYS, origin=DAYS), ValueError, "origin must be one date; got 4 dates from"),
+        (lambda: run_of(DAYS, t0=pd.DatetimeIndex(DAYS)), ValueError, "t0 must be one date; got 4 dates from"),
+        (lambda: run_of(DAYS, tf=DAYS), ValueError, "tf must be one date; got 4 dates from"),
         (lambda: run_of([0.0, 1.0], time_zone="UTC"), ValueError, "time_zone is 'UTC', but no time is a date: give"),
         (
             lambda: run_of([0.0, 9.0], ["2020-03-29"]),
@@ -552,6 +554,32 @@ def test_predictions_at_dates(fits):
     with pytest.raises(ValueError, match=r"times are dates .*, but the times of the experiment are numbers"):
         plain.predict(["2020-03-21"])
     assert plain.predict([1.0]).dates is None
+
+
+def test_simulations_at_dates(fits):
+    dated, plain = fits
+    problem, theta = dated.problem, dated.theta
+    found = sf.simulate(problem, theta, times=["2020-03-21", "2020-03-29T12:00"])
+    np.testing.assert_array_equal(found.states, sf.simulate(plain.problem, theta, times=[1.0, 9.5 - 1 / 24]).states)
+    assert [str(date) for date in found.dates] == ["2020-03-21 00:00:00+01:00", "2020-03-29 12:00:00+02:00"]
+    with pytest.raises(
+        ValueError, match=r"must lie inside \[t0, tf\] = \[2020-03-20 00:00:00\+01:00, .*; got 2019-01-01"
+    ):
+        sf.simulate(problem, theta, times="2019-01-01")
+    with pytest.raises(ValueError, match=r"times must be .*samples"):
+        sf.simulate(problem, theta, times="sampels")
+
+
+def test_frames_have_dates(fits):
+    dated, plain = fits
+    table = sf.simulate(dated.problem, dated.theta, times=["2020-03-21", "2020-03-29T12:00"]).to_pandas()
+    assert list(table["date (UTC)"]) == [pd.Timestamp("2020-03-20T23:00"), pd.Timestamp("2020-03-29T10:00")]
+    prediction = dated.predict(["2020-03-21"])
+    assert list(prediction.to_pandas()["date (UTC)"]) == [pd.Timestamp("2020-03-20T23:00")]
+    assert prediction.to_xarray()["date (UTC)"].dtype.kind == "M"
+    assert list(dated.to_pandas()["date"]) == [dated.transition_dates[0][0].isoformat(), ""]
+    assert "date" not in plain.to_pandas()
+    assert not [name for name in plain.predict([1.0]).to_pandas() if "date" in str(name)]
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------

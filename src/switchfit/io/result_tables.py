@@ -14,6 +14,7 @@ from switchfit.fit.trajectory import Trajectory
 from switchfit.optimize.arrow import ArrowLayout
 from switchfit.problem.problem import Problem
 from switchfit.report.dates import list_dated
+from switchfit.report.frames import list_holds
 from switchfit.uncertainty.quality import ChannelQuality, measure_quality
 from switchfit.uncertainty.residuals import correct_errors
 from switchfit.uncertainty.verdict import CLEARLY_OFF, UNLIKELY
@@ -48,7 +49,7 @@ def write_unknowns(fit: Fit) -> str:
     rows = []
     for i, name in enumerate(fit.theta_names):
         numbers = [fit.theta[i], errors[i], naive[i], *intervals[i], fit.initial_theta[i]]
-        held = "; ".join(_list_holds(fit, name))
+        held = "; ".join(list_holds(fit, name))
         dates = [_format_date(time, dated[i]) for time in (fit.theta[i], *intervals[i])] if any_dated else []
         rows.append([name, fit.theta_units[i], *map(_format, numbers), joins.get(i, ""), held, *dates])
     return _write(header, rows)
@@ -128,17 +129,8 @@ def _flag(fit: Fit, e: int, channels: Sequence[ChannelQuality], own: dict[str, i
             state = "collapsed" if constraint.kind == "collapsed" else "at its minimum duration"
             yield f"mode {constraint.mode} {state}"
     for column, i in own.items():
-        for hold in _list_holds(fit, fit.theta_names[i]):
+        for hold in list_holds(fit, fit.theta_names[i]):
             yield f"{column} {hold}"
-
-
-def _list_holds(fit: Fit, name: str) -> Iterator[str]:
-    """Yield what holds an unknown."""
-    if name in fit.idle:
-        yield "idle"
-    yield from (f"at {c.kind}" for c in fit.active if c.unknown == name and c.position is None)
-    if name in [kink.unknown for kink in fit.kinks]:
-        yield "at a kink"
 
 
 def _format_date(time: float, run: Trajectory | None) -> str:

@@ -176,6 +176,14 @@ def as_dates(value: Any, what: str) -> Dates:
     return Dates(np.array([instant for instant, _ in pairs], dtype=np.int64), zone)
 
 
+def as_date(value: Any, what: str) -> Dates:
+    """Return a single date, as `as_dates` reads it; ValueError for several."""
+    date = as_dates(value, what)
+    if date.shape != ():
+        raise ValueError(f"{what} must be one date; got {date!r}.")
+    return date
+
+
 def from_epoch(numbers: ArrayLike, unit: str = "s") -> Dates:
     """Return numbers that count from the beginning of 1970 (UTC) as dates.
 
@@ -441,6 +449,11 @@ def read_text(text: str) -> tuple[int, str] | None:
     except ValueError:
         return None
     return _count(date) + finer, _name_zone(date)
+
+
+def is_iso_date(text: str) -> bool:
+    """Return whether a text is a date in ISO 8601."""
+    return read_text(text) is not None
 
 
 def format_instant(instant: int, zone: str) -> str:

@@ -21,7 +21,7 @@ from switchfit.problem.data import (
     TransitionCost,
     count_from,
 )
-from switchfit.problem.dates import Dates, Given, Origin, as_dates, as_time_zone, choose_origin, is_dated
+from switchfit.problem.dates import Dates, Given, Origin, as_date, as_dates, as_time_zone, choose_origin, is_dated
 from switchfit.problem.parameter import Parameter as Parameter
 from switchfit.problem.parameter import as_parameter, count_parameter, list_dates
 from switchfit.problem.system import HybridSystem, as_state
@@ -200,15 +200,13 @@ class Experiment:
             start = start.date if isinstance(start, Origin) else start
             if not is_dated(start):
                 raise TypeError(f"origin must be a date, such as '2024-05-01T12:00+02:00'; got {shorten(self.origin)}.")
-            start = as_dates(start, "origin")
-            if start.shape != ():
-                raise ValueError(f"origin must be one date; got {start!r}.")
+            start = as_date(start, "origin")
         zone = None if self.time_zone is None else as_time_zone(self.time_zone)
         if start is None and not given:
             raise ValueError(
                 f"time_zone is {zone!r}, but no time is a date: give origin, the date at which times are 0."
             )
-        first = as_dates(self.t0, "t0") if is_dated(self.t0) else None
+        first = as_date(self.t0, "t0") if is_dated(self.t0) else None
         origin = choose_origin(given, start, zone, first, numbers=_find_numbers(self.data))
         object.__setattr__(self, "origin", origin)
         object.__setattr__(self, "time_zone", origin.time_zone or None)
@@ -244,7 +242,7 @@ class Experiment:
             if isinstance(value, Parameter):
                 yield from (Given(what, dates) for dates in list_dates(value))
             elif is_dated(value):
-                yield Given(what, as_dates(value, what))
+                yield Given(what, as_dates(value, what) if what == "transition_times" else as_date(value, what))
 
     @property
     def has_free_tf(self) -> bool:
@@ -366,6 +364,21 @@ def show_time(experiment: Experiment, time: float) -> str:
     origin = experiment.origin
     date = None if origin is None else origin.find_date(time, experiment.time_unit)
     return str(time if date is None else date)
+
+
+def count_times(experiment: Experiment, times: Any) -> Any:
+    """Return dates as numbers of an experiment's unit since its origin; anything else as it is.
+
+    Raises
+    ------
+    ValueError
+        For dates if the times of the experiment are numbers.
+    """
+    if not is_dated(times):
+        return times
+    if experiment.origin is None:
+        raise ValueError(f"times are dates ({shorten(times)}), but the times of the experiment are numbers.")
+    return experiment.origin.to_numbers(as_dates(times, "times"), experiment.time_unit)
 
 
 def initial_state_of(system: HybridSystem, experiment: Experiment) -> Any:

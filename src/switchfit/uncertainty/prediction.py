@@ -25,11 +25,12 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
-from switchfit.problem.dates import Origin, as_dates, is_dated
-from switchfit.problem.experiment import show_time
+from switchfit.problem.dates import Origin
+from switchfit.problem.experiment import count_times, show_time
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_array, as_index, shorten
+from switchfit.problem.validation import as_array, as_index
+from switchfit.runtime.frames import Tabular
 from switchfit.uncertainty.sensitivity import Points, Sensitivity, compute_sensitivity
 
 NEAR = 2.0
@@ -37,7 +38,7 @@ NEAR = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class Prediction(Tabular):
     """States and outputs of one experiment with their standard errors.
 
     Attributes
@@ -276,11 +277,7 @@ def _is_near_transition(fit: Fit, problem: Problem, e: int, times: FloatArray) -
 
 def _check_times(times: ArrayLike, problem: Problem, e: int, trajectory: Trajectory) -> FloatArray:
     experiment = problem.experiments[e]
-    if is_dated(times):
-        if experiment.origin is None:
-            raise ValueError(f"times are dates ({shorten(times)}), but the times of the experiment are numbers.")
-        times = experiment.origin.to_numbers(as_dates(times, "times"), experiment.time_unit)
-    asked = np.atleast_1d(as_array(times, "times"))
+    asked = np.atleast_1d(as_array(count_times(experiment, times), "times"))
     t0, tf = trajectory.times[[0, -1]].tolist()
     if asked.ndim != 1 or asked.size == 0 or not np.isfinite(asked).all():
         raise ValueError(f"times must be finite numbers of shape (K,); got shape {asked.shape}.")

@@ -29,6 +29,7 @@ from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
+from switchfit.runtime.frames import Tabular
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text
 
@@ -139,7 +140,7 @@ class ChannelResiduals:
 
 
 @dataclass(frozen=True, eq=False)
-class ResidualDiagnostics:
+class ResidualDiagnostics(Tabular):
     """Tests of the residuals of all channels; print it.
 
     Attributes
