@@ -135,7 +135,7 @@ def is_dated(value: Any) -> bool:
     kind = getattr(dtype, "kind", "")
     if kind == "O" and getattr(value, "ndim", 1) == 1:
         return any(issubclass(kind, (str, *_DATE_TYPES)) for kind in set(map(type, value)))
-    return kind in "MU"
+    return kind in ("M", "U")
 
 
 def as_dates(value: Any, what: str) -> Dates:
