@@ -472,6 +472,7 @@ def catalogue():
             words={"times": ("times", "samples", "known over"), "values": ("values", "rows", "mode", "samples")},
             inside={"times": lambda bad: [bad, *TIMES[1:]], "values": lambda bad: [bad, *TIMES[1:]]},
         ),
+        "from_epoch": Door(sf.from_epoch, {"numbers": [1.6e9, 1.7e9], "unit": "s"}, words={"unit": ("s", "ms")}),
         "read_log": Door(
             sf.read_log,
             {"path": log_file(), "columns": ["x", "yaw"], "time": "t", "time_unit": "ms", "topic": None}

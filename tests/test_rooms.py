@@ -36,7 +36,7 @@ APART = {"optimize": set(), "models": {"problem"}}
 """Rooms that may import less than all before them."""
 
 
-LOGS = {"runtime", "problem.validation"}
+LOGS = {"runtime", "problem.validation", "problem.dates"}
 """Rooms and modules of other rooms that `io.logs` may import: it knows no model, no fit and no report."""
 
 OPTIONAL = {"gpxpy", "h5py", "pandas", "polars", "pyarrow", "pymap3d", "pynmea2", "rosbags", "xarray"}

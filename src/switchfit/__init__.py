@@ -26,6 +26,7 @@ from switchfit.problem.data import (
     TerminalCost,
     TransitionCost,
 )
+from switchfit.problem.dates import from_epoch
 from switchfit.problem.experiment import Experiment, Parameter
 from switchfit.problem.jump import Jump
 from switchfit.problem.priors import LogNormal, Normal
@@ -97,6 +98,7 @@ __all__ = [
     "estimate_many",
     "evaluate",
     "evaluate_on_guards",
+    "from_epoch",
     "identifiability",
     "monte_carlo",
     "multistart",

@@ -23,6 +23,7 @@ from switchfit.fit.hidden import refuse_hidden_switches
 from switchfit.fit.result import interval
 from switchfit.fit.solution import is_sigma_known
 from switchfit.problem.data import FloatArray
+from switchfit.problem.dates import Origin
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_path
 from switchfit.runtime.frames import Tabular, Variable, build_arviz
@@ -84,6 +85,8 @@ class Fits(Tabular):
         From where these logarithms count: t0 for a transition time, otherwise 0.
     seconds : float
         Wall time of all.
+    date_origins : tuple of Origin or None, d of them
+        The date at which a time that is a date is 0; None for other unknowns, and where it is not the same in all fits.
 
     See Also
     --------
@@ -128,6 +131,7 @@ class Fits(Tabular):
     log_scaled: tuple[str, ...]
     log_origins: FloatArray
     seconds: float
+    date_origins: tuple[Origin | None, ...]
 
     def __len__(self) -> int:
         """Number of fits that were done."""
@@ -372,5 +376,15 @@ def _collect_fields(
         "log_scaled": problem.unknowns.log_names,
         "log_origins": problem.unknowns.origin,
         "seconds": seconds,
+        "date_origins": list_origins(problem),
         **found,
     }
+
+
+def list_origins(problem: Problem) -> tuple[Origin | None, ...]:
+    """Return the date at which each unknown that is a date is 0; None for every other."""
+    found: list[Origin | None] = [None] * len(problem.theta_names)
+    for experiment, places in zip(problem.experiments, problem.unknowns.times, strict=True):
+        for place in places[places >= 0].tolist():
+            found[place] = experiment.origin
+    return tuple(found)

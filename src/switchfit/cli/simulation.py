@@ -35,7 +35,8 @@ def simulate(
     """Integrate the model at the first guess.
 
     Writes times, modes and states as CSV. The column of times is named t, or for example "t (min)" if the
-    experiments' time_unit is "min" instead of "s".
+    experiments' time_unit is "min" instead of "s". Where times are dates, a column "date" has them, in the time zone of
+    the experiment.
     """
     if out is None and not json:
         fail("name the file to write with --out FILE.csv, or give --json to print the trajectories.", BAD_INPUT)
@@ -63,8 +64,11 @@ def simulate(
 
         text = io.StringIO()
         table = csv.writer(text, lineterminator="\r\n")
-        table.writerow(["experiment", "t" if unit == "s" else f"t ({unit})", "mode", *runs[0].state_names])
+        dated = any(run.origin is not None for run in runs)
+        columns = ["t" if unit == "s" else f"t ({unit})", *(["date"] if dated else [])]
+        table.writerow(["experiment", *columns, "mode", *runs[0].state_names])
         for name, run in zip(names, runs, strict=True):
-            for t, mode, x in zip(run.times.tolist(), run.modes, run.states.tolist(), strict=True):
-                table.writerow([name, t, mode, *x])
+            dates = [""] * len(run.times) if run.dates is None else [date.isoformat() for date in run.dates]
+            for t, date, mode, x in zip(run.times.tolist(), dates, run.modes, run.states.tolist(), strict=True):
+                table.writerow([name, t, *([date] if dated else []), mode, *x])
         write_file(out, text.getvalue())

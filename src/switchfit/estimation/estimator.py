@@ -664,6 +664,14 @@ def _check_loaded(fit: Fit, problem: Problem, path: str | Path) -> None:
             "are not converted. Files that were saved before there was a time_unit count as s: if it is one of "
             "them, and its times are those of the problem, give the problem's experiments time_unit='s'."
         )
+    for trajectory, experiment in zip(fit.trajectories, problem.experiments, strict=True):
+        origins = (trajectory.origin, experiment.origin)
+        instants = [None if origin is None else origin.instant for origin in origins]
+        if instants[0] != instants[1]:
+            names = ["numbers" if origin is None else f"times since {origin.date}" for origin in origins]
+            raise ValueError(
+                f"{path} holds {names[0]}, the problem has {names[1]}: give its experiments the same origin."
+            )
 
 
 def fit_locally(

@@ -1,9 +1,10 @@
 """Save fits as JSON files that can be read without switchfit, and load them without losing a bit.
 
-A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 5, "fit": {...}, "certificate": {...}}`` with
-the fields of `Verdict`, `Fit` and `Certificate` under their own names. The verdict, with its line of text, is meant for
-readers of the file; `load` computes it again from the rest. ``"provenance"`` holds the fields of `Provenance`: what the
-fit was made from. Files without it are read too, and an earlier switchfit that reads version 5 ignores it.
+A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 6, "fit": {...}, "certificate": {...}}`` with
+the fields of `Verdict`, `Fit` and `Certificate` under their own names. The verdict, with its line of text, and the
+"transition_dates" that a fit to dates has beside them are meant for readers of the file; `load` computes them again
+from the rest. ``"provenance"`` holds the fields of `Provenance`: what the fit was made from. Files without it are read
+too.
 
 - numbers are written with as many digits as it takes to read the same float64; JSON has no NaN and no infinities, so
   they are the strings ``"NaN"``, ``"Infinity"`` and ``"-Infinity"``;
@@ -13,7 +14,7 @@ fit was made from. Files without it are read too, and an earlier switchfit that 
 
 When a file is read, pydantic checks it against the types of the dataclasses' fields. Then all sizes and names are
 checked against one another (`_check_fit`), so that a loaded fit can be printed and plotted, and has intervals. Files of
-versions 2 and 3, which hold sentences in place of data, and of version 4 are upgraded to version 5 before that
+versions 2 and 3, which hold sentences in place of data, and of versions 4 and 5 are upgraded to version 6 before that
 (`_upgrade`).
 """
 
@@ -37,6 +38,7 @@ from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.problem.constraints import Constraint
 from switchfit.problem.data import FloatArray
+from switchfit.problem.dates import normalize_time_unit
 from switchfit.runtime.errors import get_first_line
 from switchfit.runtime.files import write_atomically
 from switchfit.uncertainty.certificate import Certificate
@@ -44,8 +46,8 @@ from switchfit.uncertainty.identification import analyse_solution
 from switchfit.uncertainty.verdict import Verdict, judge
 
 FORMAT = "switchfit fit"
-VERSION = 5
-READABLE = (2, 3, 4, 5)
+VERSION = 6
+READABLE = (2, 3, 4, 5, 6)
 
 DATA = 4
 """The first version that holds data in place of sentences."""
@@ -95,6 +97,7 @@ def write_fit(fit: Fit, certificate: Certificate) -> dict[str, Any]:
         "verdict": {"level": verdict.level, "text": str(verdict)} | to_json(verdict, Verdict),
         "format": FORMAT,
         "version": VERSION,
+        **_list_dates(fit),
         "fit": to_json(fit, Fit),
         "certificate": to_json(certificate, Certificate),
     }
@@ -164,6 +167,19 @@ def load_saved(path: Path) -> SavedFit:
         return SavedFit(fit, certificate, None if provenance is None else provenance.find_from(Path(path)))
     except (ValueError, OverflowError, RecursionError, MemoryError) as error:
         raise ValueError(f"{path} is damaged: {error}.") from error
+
+
+def _list_dates(fit: Fit) -> dict[str, Any]:
+    """Return the transition times that are dates by their names, for readers of the file; {} where none is."""
+    if all(trajectory.origin is None for trajectory in fit.trajectories):
+        return {}
+    dates = {}
+    for transition in fit.transitions:
+        origin = fit.trajectories[transition.experiment].origin
+        date = None if origin is None else origin.find_date(transition.time, transition.unit)
+        if date is not None:
+            dates[transition.name] = date.isoformat()
+    return {"transition_dates": dates}
 
 
 def parse_fit(content: Mapping[str, Any]) -> tuple[Fit, Certificate]:
@@ -435,7 +451,7 @@ def _describe_place(loc: Iterable[Any], content: Any, top: str) -> str:
 
 
 def _upgrade(content: dict[str, Any], version: int) -> None:
-    """Upgrade the content of a file of an earlier version to version 5, in place."""
+    """Upgrade the content of a file of an earlier version to version 6, in place."""
     try:
         if version < DATA:
             _upgrade_fit(content["fit"])
@@ -445,6 +461,8 @@ def _upgrade(content: dict[str, Any], version: int) -> None:
         content["fit"].setdefault("initial_cost", _read_first_cost(content["fit"]["history"]))
         for comparison in (comparison for run in content["fit"]["comparisons"] for comparison in run):
             comparison.setdefault("weights", None)
+        for trajectory in content["fit"]["trajectories"]:
+            trajectory.setdefault("origin", None)
     except (LookupError, TypeError, AttributeError) as error:
         raise ValueError(
             f"it does not match the format of version {content['version']} ({get_first_line(error)})"
@@ -572,6 +590,8 @@ def _check_fit(fit: Fit) -> None:
 def _check_trajectory(trajectory: Trajectory, transition_times: FloatArray, e: int) -> None:
     where = f"fit.trajectories[{e}]"
     _check_times(f"{where}.times", trajectory.times)
+    if trajectory.origin is not None:
+        normalize_time_unit(trajectory.time_unit)
     n, K = len(trajectory.state_names), len(trajectory.times)
     _check_size(f"{where}.state_units", trajectory.state_units, (n,), f"since its state_names has {n} entries")
     nodes = f"since its times has {K} entries"

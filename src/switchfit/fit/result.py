@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from datetime import datetime
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -235,6 +236,18 @@ class Fit:
     def message(self) -> str:
         """How the fit ended, in a sentence or two, and what to do next."""
         return str(self.termination)
+
+    @property
+    def transition_dates(self) -> tuple[tuple[datetime, ...] | None, ...]:
+        """`transition_times` as dates, one tuple per experiment; None for an experiment whose times are no dates.
+
+        They are `datetime.datetime`, which have a time zone and microseconds; the type of NumPy has no zone.
+        """
+        found: list[tuple[datetime, ...] | None] = []
+        for trajectory, times in zip(self.trajectories, self.transition_times, strict=True):
+            origin = trajectory.origin
+            found.append(None if origin is None else tuple(origin.to_dates(times, trajectory.time_unit)))
+        return tuple(found)
 
     @property
     def final_times(self) -> tuple[float, ...]:

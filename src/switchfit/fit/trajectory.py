@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from functools import cached_property
 from typing import Literal
 
@@ -16,7 +17,8 @@ from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
-from switchfit.problem.experiment import drop_jumps
+from switchfit.problem.dates import Origin, is_iso_date
+from switchfit.problem.experiment import count_times, drop_jumps, show_time
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_choice, as_index, as_instance
@@ -41,6 +43,8 @@ class Trajectory(Tabular):
     state_names, state_units : tuple of str
     time_unit : str
         Unit of the experiment's times.
+    origin : Origin or None
+        The date at which times are 0; None where they are no dates.
 
     See Also
     --------
@@ -66,6 +70,12 @@ class Trajectory(Tabular):
     state_names: tuple[str, ...]
     state_units: tuple[str, ...]
     time_unit: str = "s"
+    origin: Origin | None = None
+
+    @property
+    def dates(self) -> list[datetime] | None:
+        """The times as dates in the experiment's time zone; None where they are no dates."""
+        return None if self.origin is None else self.origin.to_dates(self.times, self.time_unit)
 
     @property
     def mode_spans(self) -> list[tuple[str, float, float]]:
@@ -164,9 +174,10 @@ def simulate(
     theta : (d,) array_like, optional
         In the order of ``problem.theta_names``; the initial guess if left out.
     times : (K,) array_like or "samples", optional
-        Times that increase, inside [t0, tf], at which states are returned; at a transition it is the state just before
-        it. "samples": the times of all samples of the experiment. All nodes of the mesh if left out, each transition
-        twice. The steps that the tolerances need are taken whatever these times are.
+        Times that increase, inside [t0, tf], at which states are returned, as numbers, or as dates where the times of
+        the experiment are dates; at a transition it is the state just before it. "samples": the times of all samples of
+        the experiment. All nodes of the mesh if left out, each transition twice. The steps that the tolerances need are
+        taken whatever these times are.
     experiment : int, optional
         Index of the experiment, from 0.
 
@@ -214,7 +225,7 @@ def _check_times(problem: Problem, e: int, theta: FloatArray, times: ArrayLike |
     """Return the times at which a simulation is asked for, (K,)."""
     experiment = problem.experiments[e]
     t0, tf = problem.ends_of_modes(theta)[e][[0, -1]].tolist()
-    if isinstance(times, str):
+    if isinstance(times, str) and not is_iso_date(times):
         as_choice(times, "times", ("samples",))
         found = [item.times for item in experiment.data if isinstance(item, Measurements)]
         found += [item.samples[0] for item in experiment.data if isinstance(item, ReferenceSignal) and item.samples]
@@ -223,7 +234,7 @@ def _check_times(problem: Problem, e: int, theta: FloatArray, times: ArrayLike |
         if not len(inside):
             raise ValueError(f"times='samples' needs data with samples, and experiment {e} has none; give times.")
         return inside
-    asked = np.atleast_1d(as_array(times, "times"))
+    asked = np.atleast_1d(as_array(count_times(experiment, times), "times"))
     if asked.ndim != 1 or asked.size == 0 or not np.isfinite(asked).all():
         raise ValueError(f"times must be finite numbers of shape (K,), or 'samples'; got shape {asked.shape}.")
     wrong = np.diff(asked) <= 0
@@ -232,8 +243,9 @@ def _check_times(problem: Problem, e: int, theta: FloatArray, times: ArrayLike |
         raise ValueError(f"times must increase strictly; got {asked[k + 1]} after {asked[k]}.")
     outside = (asked < t0) | (asked > tf)
     if outside.any():
-        unit = unit_suffix(experiment.time_unit)
-        raise ValueError(f"times must lie inside [t0, tf] = [{t0}, {tf}]{unit}; got {asked[outside][0]}.")
+        unit = unit_suffix(experiment.time_unit) if experiment.origin is None else ""
+        ends = f"[{show_time(experiment, t0)}, {show_time(experiment, tf)}]{unit}"
+        raise ValueError(f"times must lie inside [t0, tf] = {ends}; got {show_time(experiment, asked[outside][0])}.")
     return asked
 
 
@@ -326,6 +338,7 @@ def _build_trajectory(problem: Problem, e: int, simulation: Simulation) -> Traje
         names,
         units,
         problem.experiments[e].time_unit,
+        problem.experiments[e].origin,
     )
 
 

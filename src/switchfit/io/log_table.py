@@ -15,6 +15,7 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate
 from switchfit.io.logs.files import find_logs, name_logs
 from switchfit.io.problem_file import ProblemFile, load_problem
+from switchfit.report.dates import list_dated
 from switchfit.report.verdict import write_reason
 from switchfit.runtime.errors import InputError
 from switchfit.uncertainty.quality import measure_quality
@@ -143,6 +144,9 @@ class ResultTable:
             shown = f"{name} ({unit})" if unit and unit != "1" else name
             self.unknowns[shown] = unit
             row |= {shown: float(value), ERROR.format(shown): float(error_of)}
+        for name, value, run in zip(estimate.theta_names, estimate.theta, list_dated(estimate), strict=True):
+            date = None if run is None or run.origin is None else run.origin.find_date(value, run.time_unit)
+            row |= {} if date is None else {f"{name} (date)": date.isoformat()}
         self.rows.append({**row, "message": message})
 
     def describe_last(self) -> str:

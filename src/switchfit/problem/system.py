@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.parameter import Parameter
+from switchfit.problem.parameter import Parameter, refuse_dates
 from switchfit.problem.validation import (
     as_array,
     as_callable,
@@ -183,6 +183,7 @@ def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ..
         With `name` in the message.
     """
     if isinstance(value, Parameter):
+        refuse_dates(value, name)
         if len(value.shape) != 1:
             raise ValueError(f"{name} must have shape (n,), one entry for each state; got shape {value.shape}.")
         return value.entries()
@@ -200,6 +201,7 @@ def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ..
 def _as_entry(entry: Any, name: str) -> Parameter:
     """Return one entry of an initial state with unknown entries as a `Parameter`; a number is a fixed one."""
     if isinstance(entry, Parameter):
+        refuse_dates(entry, f"each entry of {name}")
         parameter = entry
     else:
         array = as_array(entry, f"each entry of {name}", form="a number or an sf.Parameter")

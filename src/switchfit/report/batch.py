@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,9 @@ from switchfit.batch.resampling import Bootstrap
 from switchfit.batch.simulated import MonteCarlo
 from switchfit.batch.starts import Multistart
 from switchfit.problem.data import FloatArray
+from switchfit.problem.dates import Origin
 from switchfit.problem.parameter import unit_suffix
+from switchfit.report.dates import format_unknown, label_time
 from switchfit.report.numbers import format_count, format_rounded
 from switchfit.report.tables import format_table, wrap_text
 from switchfit.runtime.presentation import draw_figure, format_text
@@ -137,7 +139,11 @@ def write_multistart(study: Multistart) -> str:
     for k in range(min(minima, LISTED_MINIMA)):
         here = np.flatnonzero(study.clusters == k)
         shown, at = _select_unknowns(study, LISTED_PLACES), study.theta[here[0]]
-        named = [f"{study.theta_names[i]} = {at[i]:.6g}{unit_suffix(study.theta_units[i])}" for i in shown]
+        named = [
+            f"{study.theta_names[i]} = {format_unknown(at[i], _find_clock(study, i))}"
+            f"{'' if _find_clock(study, i) else unit_suffix(study.theta_units[i])}"
+            for i in shown
+        ]
         more = len(at) - len(shown)
         place = ", ".join(named) + (f" and {more} more" if more else "")
         rows.append((f"J = {study.cost[here].min():.9g}", format_count(len(here), "start"), place))
@@ -173,7 +179,7 @@ def tabulate_monte_carlo(study: MonteCarlo) -> list[str]:
     rows: list[Sequence[str]] = [
         (
             _label(study, i),
-            f"{study.truth[i]:.6g}",
+            format_unknown(study.truth[i], _find_clock(study, i), spread[i]),
             f"{bias[i]:+.2e}",
             f"{spread[i] / np.sqrt(count):.1e}",
             f"{spread[i]:.3e}",
@@ -193,13 +199,28 @@ def tabulate_bootstrap(study: Bootstrap) -> list[str]:
     shown = _select_unknowns(study, LISTED_UNKNOWNS)
     bias, error, intervals = study.bias, study.standard_deviation, study.intervals()
     for k in shown:
-        label, value = _label(study, k), f"{study.estimate[k]:.6g}"
+        clock = _find_clock(study, k)
+        label, value = _label(study, k), format_unknown(study.estimate[k], clock, error[k])
         if not study.resampled[k]:
             rows.append((label, value, "-", "-", "of one run alone"))
             continue
         low, high = intervals[k]
-        rows.append((label, value, f"{bias[k]:+.2e}", f"{error[k]:.3e}", f"[{low:.6g}, {high:.6g}]"))
+        ends = [format_unknown(end, clock, error[k]) for end in (low, high)]
+        rows.append((label, value, f"{bias[k]:+.2e}", f"{error[k]:.3e}", f"[{ends[0]}, {ends[1]}]"))
     return format_table(rows, "<" + ">" * 4, indent="") + _count_rest(study, shown)
+
+
+class Clock(NamedTuple):
+    """What the numbers of one unknown are as dates, for `switchfit.report.dates`."""
+
+    origin: Origin
+    time_unit: str
+
+
+def _find_clock(fits: Fits, k: int) -> Clock | None:
+    """Return what the numbers of unknown k are as dates; None if they are no dates."""
+    origin = fits.date_origins[k]
+    return None if origin is None else Clock(origin, fits.theta_units[k])
 
 
 def _label(fits: Fits, k: int) -> str:
@@ -294,9 +315,15 @@ def _choose_limits(values: FloatArray, centre: float) -> tuple[float, float]:
 
 def _draw_histogram_axis(study: Fits, k: int, limits: tuple[float, float], ax: Axes) -> None:
     """Label the axis with the name and unit of unknown k, with few ticks."""
-    ax.set_xlabel(_label(study, k))
+    clock = _find_clock(study, k)
+    ax.set_xlabel(_label(study, k) if clock is None else label_time(clock).replace("time", study.theta_names[k], 1))
     ax.set_xlim(limits)
     ax.set_yticks([])
+    if clock is not None:
+        from switchfit.report.date_axis import put_ticks
+
+        put_ticks(ax, clock)
+        return
     ax.ticklabel_format(axis="x", useOffset=False)
     ax.locator_params(axis="x", nbins=4)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from datetime import UTC
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.dates import Origin
+from switchfit.report.dates import list_dated
 from switchfit.report.numbers import format_unit
 from switchfit.runtime.frames import Frame, Labels, Variable, describe_frame
 from switchfit.uncertainty.prediction import Prediction
@@ -64,6 +67,13 @@ def _describe_unknowns(estimate: Estimate) -> Frame:
         "transition": np.array([joins.get(i, "") for i in range(len(names))], dtype=str),
         "held": np.array(["; ".join(list_holds(estimate, name)) for name in names], dtype=str),
     }
+    dated = list_dated(estimate)
+    if any(run is not None for run in dated):
+        ends = zip(dated, estimate.theta, strict=True)
+        dates = [
+            None if run is None or run.origin is None else run.origin.find_date(t, run.time_unit) for run, t in ends
+        ]
+        columns["date"] = np.array(["" if date is None else date.isoformat() for date in dates], dtype=str)
     variables = [Variable(name, values, rows) for name, values in columns.items()]
     square = ("unknown", "unknown_2")
     variables += [
@@ -183,6 +193,23 @@ def _describe_history(fit: Fit) -> Frame:
     return Frame("iteration", index, (*variables, *_split(theta, rows, fit.theta_names, fit.theta_units)))
 
 
+def _list_dates(result: Trajectory | Prediction, rows: tuple[str]) -> list[Variable]:
+    """Return a column with the dates, in UTC if they have a zone; none where times are no dates."""
+    if result.origin is None:
+        return []
+    return [Variable(*_make_dates(result.times, result.origin, result.time_unit), rows)]
+
+
+def _make_dates(times: FloatArray, origin: Origin, time_unit: str) -> tuple[str, NDArray[Any]]:
+    """Return the name of a column of dates, and the dates as datetime64, which have no zone of their own."""
+    dates = [origin.find_date(time, time_unit) for time in times.tolist()]
+    bare = [
+        date if date is None or date.tzinfo is None else date.astimezone(UTC).replace(tzinfo=None) for date in dates
+    ]
+    name = "date (UTC)" if origin.time_zone else "date"
+    return name, np.array(bare, dtype="datetime64[us]").astype("datetime64[ns]")
+
+
 @describe_frame.register(Trajectory)
 def describe_trajectory(trajectory: Trajectory) -> Frame:
     """Return a row for each time.
@@ -192,7 +219,8 @@ def describe_trajectory(trajectory: Trajectory) -> Frame:
     trajectory : Trajectory
     """
     rows = ("time",)
-    variables = [Variable("mode", trajectory.modes, rows)]
+    variables = _list_dates(trajectory, rows)
+    variables.append(Variable("mode", trajectory.modes, rows))
     variables += _split(trajectory.states, rows, trajectory.state_names, trajectory.state_units)
     return Frame("time", (Variable("time", trajectory.times, rows, trajectory.time_unit),), tuple(variables))
 
@@ -244,6 +272,7 @@ def describe_prediction(prediction: Prediction) -> Frame:
     low, high = np.moveaxis(prediction.state_band(), -1, 0)
     output_low, output_high = np.moveaxis(prediction.output_band(), -1, 0)
     variables = (
+        *_list_dates(prediction, ("time",)),
         Variable("states", prediction.states, state),
         Variable("state_errors", prediction.state_errors, state, column=ERROR),
         Variable("states_low", low, state, column=LOW),

@@ -45,8 +45,3 @@ def get_unit(channel: str, trajectory: Trajectory) -> str:
     """Return the unit of a channel that is called like a state; "" for any other, and for a pure number."""
     units = dict(zip(trajectory.state_names, trajectory.state_units, strict=True))
     return format_unit(units.get(channel, ""))
-
-
-def label_time(unit: str) -> str:
-    """Return the label of an axis of times in a unit, such as "time (min)"."""
-    return f"time ({unit})" if format_unit(unit) else "time"

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.special
 
+from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report.numbers import format_rounded, label_time
+from switchfit.report.dates import describe_origin, format_time, label_time, list_dated
+from switchfit.report.numbers import format_rounded
 from switchfit.report.plot import turn_off_formulas
 from switchfit.report.sentences import join_words
 from switchfit.report.tables import Table, format_table, wrap_text
@@ -293,7 +295,17 @@ def write_profile(profile: Profile) -> str:
         f"  quadratic             {shown}",
         f"  points, fits          {len(profile.values)}, {profile.trace.fits}",
     ]
+    run = _find_run(profile)
+    if run is not None:
+        dates = [format_time(end, run, digits) if np.isfinite(end) else str(end) for end in (profile.value, low, high)]
+        lines.insert(1, f"  {'date':<20}  {dates[0]}, {percent} from {dates[1]} to {dates[2]}")
+        lines.append(f"  {'times':<20}  {describe_origin(run)}")
     return "\n".join([*lines, *(f"  - {note}" for note in list_profile_notes(profile))])
+
+
+def _find_run(profile: Profile) -> Trajectory | None:
+    """Return the trajectory of a profile of a time that is a date; None for any other."""
+    return list_dated(profile.fit)[profile.fit.theta_names.index(profile.name)]
 
 
 def _format_number(value: float, error: float) -> str:
@@ -419,10 +431,16 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(0.0, top)
     unit = f" ({profile.unit})" if profile.unit not in ("", "1") else ""
-    ax.set_xlabel(f"{profile.name}{unit}")
+    run = _find_run(profile)
+    ax.set_xlabel(f"{profile.name}{unit}" if run is None else label_time(run).replace("time", profile.name, 1))
     ax.set_ylabel("2 (J - J min)" if profile.fit.sigma_known else "2 (J - J min) / s²")
     ax.set_title(f"Profile likelihood of {profile.name}")
-    ax.ticklabel_format(axis="x", useOffset=False)
+    if run is None:
+        ax.ticklabel_format(axis="x", useOffset=False)
+    else:
+        from switchfit.report.date_axis import put_ticks
+
+        put_ticks(ax, run)
     ax.legend(frameon=False, fontsize=8, loc="upper center", ncols=2)
     return ax
 
@@ -451,10 +469,13 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics) -> Figure:
         row[0].set_ylabel(f"{label}\nresidual / sigma" if channel.sigma_known else f"{label}\nresidual / rms")
     for ax, title in zip(axes[0], ("Residuals in time", "Autocorrelation", "Quantiles"), strict=True):
         ax.set_title(title)
-    for k, ax in enumerate(axes[:, 0]):  # below all rows, or wherever the next row has times in another unit
-        unit = shown[k][1].time_unit
-        if k + 1 == len(shown) or shown[k + 1][1].time_unit != unit:
-            ax.set_xlabel(label_time(unit))
+    from switchfit.report.date_axis import put_ticks
+
+    for k, ax in enumerate(axes[:, 0]):  # below all rows, or wherever the next row has times of another kind
+        label = label_time(shown[k][1])
+        put_ticks(ax, shown[k][1])
+        if k + 1 == len(shown) or label_time(shown[k + 1][1]) != label:
+            ax.set_xlabel(label)
     for ax, label in zip(axes[-1, 1:], ("lag (samples)", "normal quantile"), strict=True):
         ax.set_xlabel(label)
     return turn_off_formulas(figure)

@@ -16,6 +16,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.dates import Origin
+from switchfit.problem.experiment import count_times, show_time
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_index
@@ -53,6 +56,8 @@ class Prediction(Tabular):
     near_transition : (K,) bool
         Whether a time is within two standard errors of a transition time, where the bands ignore the other mode.
     fit : Fit
+    origin : Origin or None
+        The date at which times are 0; None where they are no dates.
 
     See Also
     --------
@@ -84,6 +89,12 @@ class Prediction(Tabular):
     time_unit: str
     near_transition: NDArray[np.bool_]
     fit: Fit = field(repr=False)
+    origin: Origin | None = None
+
+    @property
+    def dates(self) -> list[datetime] | None:
+        """The times as dates in the experiment's time zone; None where they are no dates."""
+        return None if self.origin is None else self.origin.to_dates(self.times, self.time_unit)
 
     def state_band(self, level: float = 0.95) -> FloatArray:
         """Return the confidence band of the states at each time: (K, n, 2).
@@ -157,7 +168,8 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
     ----------
     estimate : Estimate
     times : (K,) array_like, optional
-        In any order, inside [t0, tf], in the experiment's time unit; at a transition, values are those just before it.
+        In any order, inside [t0, tf], in the experiment's time unit, or dates where its times are dates; at a
+        transition, values are those just before it.
         If left out, all nodes of the mesh, each transition twice: with the state before and after it.
     experiment : int, optional
         Index of the experiment, from 0.
@@ -229,6 +241,7 @@ def _build_prediction(fit: Fit, problem: Problem, e: int, points: Points) -> Pre
         trajectory.time_unit,
         _is_near_transition(fit, problem, e, points.times),
         fit,
+        trajectory.origin,
     )
 
 
@@ -263,12 +276,14 @@ def _is_near_transition(fit: Fit, problem: Problem, e: int, times: FloatArray) -
 
 
 def _check_times(times: ArrayLike, problem: Problem, e: int, trajectory: Trajectory) -> FloatArray:
-    asked = np.atleast_1d(as_array(times, "times"))
+    experiment = problem.experiments[e]
+    asked = np.atleast_1d(as_array(count_times(experiment, times), "times"))
     t0, tf = trajectory.times[[0, -1]].tolist()
     if asked.ndim != 1 or asked.size == 0 or not np.isfinite(asked).all():
         raise ValueError(f"times must be finite numbers of shape (K,); got shape {asked.shape}.")
     outside = (asked < t0) | (asked > tf)
     if outside.any():
-        unit = unit_suffix(problem.experiments[e].time_unit)
-        raise ValueError(f"times must lie inside [t0, tf] = [{t0}, {tf}]{unit}; got {asked[outside][0]}.")
+        unit = unit_suffix(experiment.time_unit) if experiment.origin is None else ""
+        ends = f"[{show_time(experiment, t0)}, {show_time(experiment, tf)}]{unit}"
+        raise ValueError(f"times must lie inside [t0, tf] = {ends}; got {show_time(experiment, asked[outside][0])}.")
     return asked

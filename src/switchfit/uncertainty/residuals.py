@@ -28,6 +28,7 @@ import scipy.special
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
+from switchfit.problem.dates import Origin
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text
@@ -73,6 +74,8 @@ class ChannelResiduals:
         Effective sample size.
     outliers : int
         Number of residuals beyond four standard deviations; 0.001 are expected in 16 samples.
+    origin : Origin or None
+        The date at which times are 0; None where they are no dates.
 
     See Also
     --------
@@ -105,6 +108,7 @@ class ChannelResiduals:
     kurtosis: float
     effective: float
     outliers: int
+    origin: Origin | None = None
 
     @property
     def correlation(self) -> float:
@@ -228,9 +232,10 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
         for comparison in comparisons:
             if comparison.kind != "measurements":
                 continue
+            run = fit.trajectories[e]
             for k, name in enumerate(comparison.names):
                 if np.isfinite(comparison.measured[:, k]).sum() > 0:
-                    channels.append(diagnose_channel(comparison, k, e, fit.trajectories[e].time_unit))
+                    channels.append(diagnose_channel(comparison, k, e, run.time_unit, run.origin))
                     names.append(name if single else f"{fit.run_names[e]} {name}")
     return ResidualDiagnostics(tuple(channels), tuple(names))
 
@@ -288,7 +293,9 @@ def measure_widening(fit: Fit) -> FloatArray:
     return each
 
 
-def diagnose_channel(comparison: Comparison, k: int, experiment: int = 0, time_unit: str = "s") -> ChannelResiduals:
+def diagnose_channel(
+    comparison: Comparison, k: int, experiment: int = 0, time_unit: str = "s", origin: Origin | None = None
+) -> ChannelResiduals:
     """Test one channel of a comparison.
 
     Parameters
@@ -298,7 +305,8 @@ def diagnose_channel(comparison: Comparison, k: int, experiment: int = 0, time_u
         Index of the channel, from 0.
     experiment : int, optional
     time_unit : str, optional
-        Both are stored in the result.
+    origin : Origin, optional
+        They are stored in the result.
     """
     raw = comparison.residuals[:, k]
     there = np.isfinite(raw)
@@ -328,6 +336,7 @@ def diagnose_channel(comparison: Comparison, k: int, experiment: int = 0, time_u
         times=comparison.times[there],
         values=z,
         time_unit=time_unit,
+        origin=origin,
         sigma_known=known,
         mean=float(z.mean()),
         rms=float(root),
