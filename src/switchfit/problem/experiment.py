@@ -274,8 +274,8 @@ class Experiment:
         if len(scales) > 1:
             raise ValueError(
                 "the transition times of an experiment that are estimated, and a free tf, must be on one scale, since "
-                f"their order is a constraint; got {shorten([tau.scale for tau in self._own_times])}. Give scale='log' to "
-                "all of them, or to none."
+                f"their order is a constraint; got {shorten([tau.scale for tau in self._own_times])}. Give scale='log' "
+                "to all of them, or to none."
             )
         if any(tau.shape != () for tau in self.transition_times):
             shapes = [tau.shape for tau in self.transition_times]
