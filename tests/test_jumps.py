@@ -414,6 +414,19 @@ def test_report_and_figure_show_the_jumps(values, tmp_path):
     np.testing.assert_array_equal(loaded.trajectory.jump_times, DOSES)
 
 
+def test_the_page_has_curves_that_sliders_can_move(values):
+    """Divided at the jumps, with derivatives: those of the nodes, not of a trajectory without them."""
+    from switchfit.report.html.curves import collect_curves
+
+    fit = sf.estimate(make_problem(values))
+    (curves, *_) = collect_curves(fit, 0, [0, 1], 2000)
+    breaks = np.flatnonzero(np.isnan(curves.times))
+    np.testing.assert_array_equal(curves.times[breaks - 1], DOSES)
+    np.testing.assert_array_equal(curves.times[breaks + 1], DOSES)
+    assert set(curves.tangents) == {0, 1}
+    assert set(curves.modes) == {"eliminate", ""}  # "" at the gaps
+
+
 def test_prediction_and_profile_know_the_jumps(values):
     fit = sf.estimate(make_problem(values))
     bands = sf.predict(fit, times=[7.999, 8.001])
