@@ -417,6 +417,7 @@ def test_report_and_figure_show_the_jumps(values, tmp_path):
 def test_the_page_has_curves_that_sliders_can_move(values):
     """Divided at the jumps, with derivatives: those of the nodes, not of a trajectory without them."""
     from switchfit.report.html.curves import collect_curves
+    from switchfit.report.html.sliders import measure_gap
 
     fit = sf.estimate(make_problem(values))
     (curves, *_) = collect_curves(fit, 0, [0, 1], 2000)
@@ -425,6 +426,8 @@ def test_the_page_has_curves_that_sliders_can_move(values):
     np.testing.assert_array_equal(curves.times[breaks + 1], DOSES)
     assert set(curves.tangents) == {0, 1}
     assert set(curves.modes) == {"eliminate", ""}  # "" at the gaps
+    near = fit.theta[0] + 0.1 * fit.standard_errors[0]
+    assert measure_gap(fit, {0: [curves]}, 0, (near,)) < 1e-4  # and no jump's size
 
 
 def test_prediction_and_profile_know_the_jumps(values):
