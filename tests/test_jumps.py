@@ -4,14 +4,17 @@ import dataclasses
 from itertools import pairwise
 
 import cloudpickle
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import switchfit as sf
+from switchfit.engine.native.foreign import foreign_derivatives
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.io.problem_file import load_problem, read_experiments
 from switchfit.io.summary import describe_experiments
+from switchfit.problem.functions import use_float64
 
 DOSES = np.array([0.0, 8.0, 16.0, 24.0])
 AMOUNT = 100.0
@@ -159,6 +162,19 @@ def test_the_sample_at_a_jump_is_of_the_state_before_on_both_sides_of_a_kink(eng
         assert found.gradient[0] == pytest.approx(slope, rel=1e-4)
     for matrix in ("adjoint", "forward"):
         np.testing.assert_allclose(evaluator(theta, -1, matrix).gradient, left.gradient, rtol=1e-6)
+
+
+def test_the_same_inside_the_programs_of_batches():
+    problem = make_changing(simulate_changing(13.3), guess=13.0)
+    evaluator, theta = Evaluator(problem), problem.initial_theta
+    (structure,), (arguments,), own = problem.structures, evaluator.arguments, problem.own_places[0][0]
+    with use_float64():
+        program = jax.jit(lambda tau, p, side: foreign_derivatives(structure, arguments, tau, p, side))
+        for side in (-1.0, 1.0):
+            J, g, _ = map(np.asarray, program(*problem.vectors(theta, 0), side))
+            expected = evaluator(theta, int(side))
+            assert float(J) == pytest.approx(expected.cost, rel=1e-12)
+            np.testing.assert_allclose(g[own], expected.gradient, rtol=1e-10)
 
 
 def test_a_transition_that_wants_past_a_jump_stops_there_and_says_so():
@@ -396,6 +412,22 @@ def test_report_and_figure_show_the_jumps(values, tmp_path):
     fit.save(tmp_path / "fit.json")
     loaded = sf.Estimate.load(tmp_path / "fit.json")
     np.testing.assert_array_equal(loaded.trajectory.jump_times, DOSES)
+
+
+def test_the_page_has_curves_that_sliders_can_move(values):
+    """Divided at the jumps, with derivatives: those of the nodes, not of a trajectory without them."""
+    from switchfit.report.html.curves import collect_curves
+    from switchfit.report.html.sliders import measure_gap
+
+    fit = sf.estimate(make_problem(values))
+    (curves, *_) = collect_curves(fit, 0, [0, 1], 2000)
+    breaks = np.flatnonzero(np.isnan(curves.times))
+    np.testing.assert_array_equal(curves.times[breaks - 1], DOSES)
+    np.testing.assert_array_equal(curves.times[breaks + 1], DOSES)
+    assert set(curves.tangents) == {0, 1}
+    assert set(curves.modes) == {"eliminate", ""}  # "" at the gaps
+    near = fit.theta[0] + 0.1 * fit.standard_errors[0]
+    assert measure_gap(fit, {0: [curves]}, 0, (near,)) < 1e-4  # and no jump's size
 
 
 def test_prediction_and_profile_know_the_jumps(values):

@@ -340,7 +340,7 @@ class Experiment:
 
     def _check_time_unit(self) -> None:
         unit = as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'")
-        for i, tau in enumerate(self.times, start=1):
+        for i, tau in enumerate(self._own_times, start=1):
             if tau.unit not in ("", unit):
                 is_tf = i > len(self.transition_times)
                 raise ValueError(
@@ -351,12 +351,12 @@ class Experiment:
                 )
 
     def _check_times(self) -> None:
-        scales = {tau.scale for tau in self.times if not tau.fixed}
+        scales = {tau.scale for tau in self._own_times if not tau.fixed}
         if len(scales) > 1:
             raise ValueError(
                 "the transition times of an experiment that are estimated, and a free tf, must be on one scale, since "
-                f"their order is a constraint; got {shorten([tau.scale for tau in self.times])}. Give scale='log' to "
-                "all of them, or to none."
+                f"their order is a constraint; got {shorten([tau.scale for tau in self._own_times])}. Give scale='log' "
+                "to all of them, or to none."
             )
         if any(tau.shape != () for tau in self.transition_times):
             shapes = [tau.shape for tau in self.transition_times]

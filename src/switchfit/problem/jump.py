@@ -52,11 +52,11 @@ class Jump:
     >>> import switchfit as sf
     >>> system = sf.HybridSystem({"eliminate": lambda t, x, p: -p["k"] * x}, [0.0])
     >>> doses = sf.Jump([0.0, 8.0, 16.0], lambda t, x, p: x + 100.0 / p["V"])
-    >>> log = sf.Measurements([1.0, 7.0, 12.0, 24.0], [9.1, 5.0, 10.2, 7.3], sigma=0.3)
+    >>> log = sf.Measurements([1.0, 7.0, 12.0, 24.0], [9.1, 4.9, 9.8, 7.4], sigma=0.3)
     >>> run = sf.Experiment(log, ["eliminate"], [], t0=0.0, time_unit="h", jumps=[doses])
     >>> fit = sf.estimate(sf.Problem(system, run, {"k": 0.2, "V": sf.Parameter(8.0, lower=1.0)}))
     >>> {name: round(value, 2) for name, value in zip(fit.theta_names, fit.theta.tolist())}
-    {'k': 0.1, 'V': 9.99}
+    {'k': 0.1, 'V': 9.92}
     """
 
     time: float | Sequence[float]
