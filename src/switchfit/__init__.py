@@ -2,6 +2,7 @@
 
 from switchfit.batch.fits import Fits
 from switchfit.batch.logs import estimate_many
+from switchfit.batch.posterior import LogPosterior, log_posterior
 from switchfit.batch.resampling import Bootstrap, bootstrap
 from switchfit.batch.simulated import MonteCarlo, monte_carlo
 from switchfit.batch.starts import Multistart, multistart
@@ -68,6 +69,7 @@ __all__ = [
     "Kink",
     "Log",
     "LogNormal",
+    "LogPosterior",
     "Measurements",
     "MonteCarlo",
     "Multistart",
@@ -95,6 +97,7 @@ __all__ = [
     "evaluate",
     "evaluate_on_guards",
     "identifiability",
+    "log_posterior",
     "monte_carlo",
     "multistart",
     "predict",
