@@ -20,6 +20,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -211,17 +212,29 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
     ----------
     fit : Fit
     """
-    single = len(fit.comparisons) == 1
-    channels, names = [], []
-    for e, comparisons in enumerate(fit.comparisons):
+    return diagnose_runs(fit.comparisons, fit.run_names, [trajectory.time_unit for trajectory in fit.trajectories])
+
+
+def diagnose_runs(
+    runs: Sequence[Sequence[Comparison]], names: Sequence[str], time_units: Sequence[str]
+) -> ResidualDiagnostics:
+    """Test the residuals of several experiments, channel by channel.
+
+    Parameters
+    ----------
+    runs : sequence of sequences of Comparison, one for each experiment
+    names, time_units : sequence of str, one for each experiment
+    """
+    channels, labels = [], []
+    for e, comparisons in enumerate(runs):
         for comparison in comparisons:
             if comparison.kind != "measurements":
                 continue
             for k, name in enumerate(comparison.names):
                 if np.isfinite(comparison.measured[:, k]).sum() > 0:
-                    channels.append(diagnose_channel(comparison, k, e, fit.trajectories[e].time_unit))
-                    names.append(name if single else f"{fit.run_names[e]} {name}")
-    return ResidualDiagnostics(tuple(channels), tuple(names))
+                    channels.append(diagnose_channel(comparison, k, e, time_units[e]))
+                    labels.append(name if len(runs) == 1 else f"{names[e]} {name}")
+    return ResidualDiagnostics(tuple(channels), tuple(labels))
 
 
 def correct_errors(fit: Fit) -> FloatArray:
