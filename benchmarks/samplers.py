@@ -35,7 +35,7 @@ class Run(NamedTuple):
 
 
 def vehicle(noise: float = 0.1) -> sf.Problem:
-    """The vehicle of the paper: positions at 10 Hz, so that a transition time has several samples within its interval."""
+    """The vehicle of the paper: positions at 10 Hz with noise of 0.1 m."""
     times = np.linspace(0.1, 15.0, 150)
     xy = states_at(simulate_drive(), times)[:, [0, 2]] + noise * np.random.default_rng(1).standard_normal((150, 2))
     return stick_slip(sf.Measurements(times, xy, observe=position, sigma=noise, names=("X", "Y")), TRUTH)
@@ -169,7 +169,7 @@ SAMPLERS = {
 
 def tabulate() -> Iterator[str]:
     """Yield the lines of the table."""
-    yield "| posterior | sampler | effective samples per second | R-hat | divergences | mean off (sd) | sd off | compiling |"
+    yield "| posterior | sampler | effective per second | R-hat | divergences | mean off (sd) | sd off | compiling |"
     yield "|---|---|---|---|---|---|---|---|"
     for name, build in PROBLEMS.items():
         fit = sf.estimate(build())

@@ -33,6 +33,8 @@ from switchfit.problem.system import HybridSystem
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.xla import compile_small_loops_whole
 from switchfit.strategy.choice import estimate
+from switchfit.strategy.comparison import ModelComparison, Nested, compare
+from switchfit.strategy.validation import InputCorrelation, Validation
 from switchfit.uncertainty.certificate import Certificate
 from switchfit.uncertainty.derivative_check import DerivativeCheck, check_derivatives
 from switchfit.uncertainty.identification import Direction, Identifiability, identifiability
@@ -65,14 +67,17 @@ __all__ = [
     "HybridSystem",
     "Identifiability",
     "Input",
+    "InputCorrelation",
     "Issue",
     "Kink",
     "Log",
     "LogNormal",
     "LogPosterior",
     "Measurements",
+    "ModelComparison",
     "MonteCarlo",
     "Multistart",
+    "Nested",
     "Normal",
     "Parameter",
     "Prediction",
@@ -89,9 +94,11 @@ __all__ = [
     "Termination",
     "Trajectory",
     "TransitionCost",
+    "Validation",
     "Verdict",
     "bootstrap",
     "check_derivatives",
+    "compare",
     "estimate",
     "estimate_many",
     "evaluate",

@@ -1,7 +1,7 @@
 """The log posterior of a problem as a function that JAX can trace, for samplers such as NUTS.
 
-J with its priors is the negative logarithm of the posterior density up to a constant. Its gradient and Hessian come from
-the engine, exactly: JAX gets them as derivative rules and differentiates nothing itself.
+J with its priors is the negative logarithm of the posterior density up to a constant. Its gradient and Hessian come
+from the engine, exactly: JAX gets them as derivative rules and differentiates nothing itself.
 
 Samplers work on vectors z without bounds. The map from z to theta goes through the unknowns in order: a transition
 time lies between a ``low`` that follows from the one before it and a ``high`` that leaves room for those after it, and
@@ -94,8 +94,8 @@ def link_times(problem: Problem) -> list[Link]:
 class LogPosterior:
     """The logarithm of a problem's posterior density, up to a constant: a pure function of theta, for samplers.
 
-    ``posterior(theta)`` and ``posterior.log_density(z)`` can be differentiated twice, compiled with `jax.jit` and mapped
-    with `jax.vmap`.
+    ``posterior(theta)`` and ``posterior.log_density(z)`` can be differentiated twice, compiled with `jax.jit` and
+    mapped with `jax.vmap`.
 
     Attributes
     ----------
@@ -332,7 +332,7 @@ class LogPosterior:
         arguments, structures = tuple(evaluator.arguments), evaluator.structures
         layout = choose_layout(self.problem, evaluator)
         times = tuple(experiment.initial_times for experiment in self.problem.experiments)
-        sequences = read_sequences(layout, structures)
+        sequences: Any = read_sequences(layout, structures)
 
         @jax.jit
         def evaluate(theta: Any) -> tuple[Any, Any, Any]:
@@ -371,7 +371,7 @@ def require_float64(given: Any) -> None:
     ----------
     given : array or tracer
     """
-    if isinstance(given, jax.core.Tracer) and not jax.config.jax_enable_x64:
+    if isinstance(given, jax.core.Tracer) and not jax.config.read("jax_enable_x64"):
         raise ValueError(
             "a log posterior inside jax.jit, jax.grad or jax.vmap needs float64, which is not enabled: call "
             'jax.config.update("jax_enable_x64", True), or numpyro.enable_x64(), before anything else.'
