@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from switchfit.problem.data import FloatArray
 from switchfit.report.numbers import format_rounded, label_time
 from switchfit.report.plot import (
     DATA,
@@ -134,8 +135,8 @@ def write_validation(found: Validation) -> str:
         kind = "" if found.sigma_known else f", F with {found.freedom} and {found.fit.freedom}"
         lines += [
             "",
-            f"chi² {found.chi_square:.4g} for {found.freedom} degrees of freedom, the error of the parameters included: "
-            f"P = {found.probability:.2g}{kind}",
+            f"chi² {found.chi_square:.4g} for {found.freedom} degrees of freedom, the error of the parameters "
+            f"included: P = {found.probability:.2g}{kind}",
         ]
     if found.inputs:
         rows = [["residuals of", "and input", "P(none)"]]
@@ -263,9 +264,7 @@ def write_comparison(found: ModelComparison) -> str:
             rows.append([pair.small, f"in {pair.large}", f"{pair.statistic:.2f}", f"{pair.freedom}", p])
         lines += ["", *format_table(rows, "<<>><")]
         if not all(pair.regular for pair in found.nested):
-            lines += wrap_text(
-                "* too small: where the smaller model is right, a mode of the larger one vanishes.", "  "
-            )
+            lines += wrap_text("* too small: if the smaller model is right, a mode of the larger one vanishes.", "  ")
     if found.folds:
         rows = [["runs left out", "-2 log L + 2 own", "", "fit (%)", ""]]
         total, spread = found.held_out.sum(axis=1), found.held_out_percent
@@ -300,9 +299,7 @@ def plot_models(found: ModelComparison) -> Figure:
     axes[0].barh(places + 0.2, found.delta_bic[order], height=0.36, color=FIT, label="BIC")
     axes[0].barh(places - 0.2, found.delta_aicc[order], height=0.36, color=BLUE, label="AICc")
     axes[0].set_xlabel("difference from the smallest")
-    if max(np.nanmax(found.delta_bic), np.nanmax(found.delta_aicc)) > 100:
-        axes[0].set_xscale("symlog", linthresh=10.0)
-    axes[0].set_xlim(left=0.0)
+    _limit_differences(axes[0], np.append(found.delta_bic, found.delta_aicc))
     axes[0].axvline(10.0, color=TRANSITION, linewidth=0.8, linestyle=":")
     axes[0].set_yticks(places, names)
     axes[0].legend(frameon=False, fontsize=9)
@@ -310,8 +307,15 @@ def plot_models(found: ModelComparison) -> Figure:
     axes[1].set_xlim(0.0, 1.0)
     axes[1].set_xlabel("Akaike weight")
     if found.folds:
-        scores = found.held_out - found.held_out.sum(axis=1).min() / len(found.folds)
-        axes[2].barh(places, scores.sum(axis=1)[order], height=0.5, color="#b9b9b9", label="sum")
+        total = found.held_out.sum(axis=1)
+        axes[2].barh(places, (total - total.min())[order], height=0.5, color="#9a9a9a")
         axes[2].set_xlabel("runs left out: -2 log L + 2 own,\nless the smallest")
-        axes[2].set_xlim(left=0.0)
+        _limit_differences(axes[2], total - total.min())
     return turn_off_formulas(figure)
+
+
+def _limit_differences(ax: Axes, values: FloatArray) -> None:
+    """Let an axis of differences begin at 0, and be logarithmic where a hopeless model would hide the others."""
+    if np.nanmax(values) > 100:
+        ax.set_xscale("symlog", linthresh=10.0)
+    ax.set_xlim(left=0.0)
