@@ -125,7 +125,7 @@ def run_blackjax_nuts(posterior: LogPosterior, starts: Any, key: Any) -> Run:
 
     def one(key: Any, start: Any) -> tuple[Any, Any]:
         warm, own = jax.random.split(key)
-        adapt = blackjax.window_adaptation(blackjax.nuts, posterior.log_density)
+        adapt = blackjax.window_adaptation(blackjax.nuts, posterior.log_density, is_mass_matrix_diagonal=False)
         (state, parameters), _ = adapt.run(warm, start, num_steps=WARMUP)
         kernel = blackjax.nuts(posterior.log_density, **parameters)
 
@@ -178,7 +178,7 @@ def _measure(posterior: LogPosterior, one: Callable[..., Any], starts: Any, key:
 
 
 SAMPLERS = {
-    "NUTS (NumPyro)": run_with_numpyro("NUTS"),
+    "NUTS (NumPyro)": run_with_numpyro("NUTS", dense_mass=True),
     "NUTS (BlackJAX)": run_blackjax_nuts,
     "random walk with the covariance of the fit (BlackJAX)": run_random_walk,
     "ensemble, AIES (NumPyro)": run_with_numpyro("AIES", WALKERS),
@@ -197,7 +197,7 @@ def tabulate() -> Iterator[str]:
         rng = np.random.default_rng(0)
         cloud = fit.theta + 0.5 * rng.standard_normal((WALKERS, len(fit.theta))) @ np.linalg.cholesky(fit.covariance).T
         starts = jnp.array([posterior.unconstrain(theta) for theta in cloud])
-        control = run_with_numpyro("NUTS")(Laplace.of(posterior), starts, jax.random.key(0))  # type: ignore[arg-type]
+        control = run_with_numpyro("NUTS", dense_mass=True)(Laplace.of(posterior), starts, jax.random.key(0))  # type: ignore[arg-type]
         table = posterior.to_arviz(control.theta)
         import arviz  # imported by to_arviz without its warning
 

@@ -256,6 +256,9 @@ def write_comparison(found: ModelComparison) -> str:
             ]
         )
     lines += ["", *format_table(rows, "<" + ">" * 7)]
+    ended = [name for name, fit in zip(found.names, found.estimates, strict=True) if not fit.status.successful]
+    if ended:
+        lines += wrap_text(f"Not converged: {', '.join(ended)}. Likelihoods of these may be too small.", "  ")
     if found.nested:
         rows = [["likelihood ratio", "", "2 log(L/L)", "unknowns", "P"]]
         for pair in found.nested:

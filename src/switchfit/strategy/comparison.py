@@ -39,7 +39,7 @@ from switchfit.problem.problem import GIVEN, Problem
 from switchfit.problem.validation import as_count, as_names, as_sequence, join_names, shorten
 from switchfit.runtime.presentation import draw_figure, format_text
 from switchfit.strategy.choice import estimate as fit_problem
-from switchfit.strategy.validation import Validation, validate
+from switchfit.strategy.validation import Validation, build_other_problem, validate_problem
 
 
 class Nested(NamedTuple):
@@ -213,8 +213,8 @@ def compare(
         are a part of the other's unknowns. That is a guess: functions of other models may use the same names.
     cross_validate : bool or int, optional
         True: leave each run out in turn, fit the others, and predict it, with its own transition times and initial
-        state estimated from it (`Estimate.validate`). A number: leave out so many groups of runs. It takes as many fits
-        of each model, and as many of the runs left out.
+        state estimated from it (`Estimate.validate`). A number: leave out so many groups of runs. Each fit begins at
+        the estimate of all runs.
 
     Returns
     -------
@@ -448,8 +448,9 @@ def _hold_out(estimate: Estimate, problem: Problem, fold: tuple[str, ...]) -> tu
     rest = [name for name in runs if name not in fold]
     train, test = problem.without_runs(*fold), problem.without_runs(*rest)
     start = _carry_theta(problem, estimate.theta, train, [runs.index(name) for name in rest])
-    fit = fit_problem(train, start=start)
-    found = validate(fit, _begin_at(test, _carry_theta(problem, estimate.theta, test, [runs.index(n) for n in fold])))
+    fit = fit_problem(train, start=start, strategy="local")  # from the fit of all runs, others are not looked for
+    begin = _begin_at(test, _carry_theta(problem, estimate.theta, test, [runs.index(name) for name in fold]))
+    found = validate_problem(fit, build_other_problem(fit, begin), None, "local")
     return score(found), found.percent
 
 

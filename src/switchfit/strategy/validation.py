@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import scipy.special
@@ -290,7 +290,23 @@ def validate(estimate: Estimate, other: Any, *, refit: Sequence[str] | None = No
     other : Experiment, list of Experiment, Problem, Measurements or Log
     refit : sequence of str, optional
     """
-    problem = build_other_problem(estimate, other)
+    return validate_problem(estimate, build_other_problem(estimate, other), refit, "auto")
+
+
+def validate_problem(
+    estimate: Estimate, problem: Problem, refit: Sequence[str] | None, strategy: Literal["auto", "local"]
+) -> Validation:
+    """Return how well the parameters of an estimate predict the runs of a problem, which has their values.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    problem : Problem
+        As from `build_other_problem`.
+    refit : sequence of str or None
+    strategy : {"auto", "local"}
+        Of the estimation of the own unknowns.
+    """
     spans = problem.unknowns.parameters
     kept = {
         problem.theta_names[i]: i
@@ -308,7 +324,8 @@ def validate(estimate: Estimate, other: Any, *, refit: Sequence[str] | None = No
         )
     theta, found = problem.initial_theta, None
     if asked:
-        found = fit_problem(fix_unknowns(problem, [name for name in problem.theta_names if name not in asked]))
+        held = [name for name in problem.theta_names if name not in asked]
+        found = fit_problem(fix_unknowns(problem, held), strategy=strategy)
         places = [problem.theta_names.index(name) for name in found.theta_names]
         theta[places] = found.theta
     return measure_validation(estimate, problem, theta, kept, found)
