@@ -9,20 +9,24 @@ import ball_figures  # these stand beside this file
 import covid_figures
 import heaters_figures
 import paper_figures
+import sampling_figures
 import speed_figures
 import starts_figures
 import tosses_figures
 import uncertainty_figures
+import validation_figures
 
 DRAWN_HERE = (
     ball_figures,
     covid_figures,
     heaters_figures,
     paper_figures,
+    sampling_figures,
     speed_figures,
     starts_figures,
     tosses_figures,
     uncertainty_figures,
+    validation_figures,
 )
 for pictures in DRAWN_HERE:
     pictures.draw(Path(__file__).parent / "_figures")

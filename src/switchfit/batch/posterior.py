@@ -9,14 +9,15 @@ time lies between a ``low`` that follows from the one before it and a ``high`` t
     theta_i = low_i + (high_i - low_i) / (1 + exp(-z_i)),        log |dtheta/dz| = sum_i log dtheta_i/dz_i,
 
 since dtheta/dz is triangular; with one bound ``theta_i = low + exp(z_i)`` or ``high - exp(z_i)``, without bounds
-``theta_i = z_i``.
+``theta_i = z_i``. For an estimate these are the entries of ``center + root z`` with the covariance ``root root'`` of the
+fit, so that z is nearly standard normal: the warm-up of samplers relies on unknowns of size 1.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -28,6 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.batch.program import choose_layout, evaluate_total, read_sequences
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.fit.result import Fit
 from switchfit.fit.solution import is_sigma_known
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.functions import use_float64
@@ -102,6 +104,10 @@ class LogPosterior:
     problem : Problem
     theta : (d,) array
         Where the mesh was refined: the estimate, or the first guess.
+    evaluator : Evaluator
+        The problem on the meshes on which J is evaluated.
+    center, root : (d,) and (d, d) arrays
+        Of the linear part of the change of variables; for an estimate its theta and a root of its covariance.
 
     See Also
     --------
@@ -119,13 +125,15 @@ class LogPosterior:
     >>> float(posterior(fit.theta)) == -fit.cost, float(posterior([7.0, 0.4]))
     (True, -inf)
     >>> z = posterior.unconstrain(fit.theta)
-    >>> posterior.constrain(z).round(3)
-    array([2.462, 0.393])
+    >>> z, posterior.constrain(z).round(3)
+    (array([0., 0.]), array([2.462, 0.393]))
     """
 
     problem: Problem
     theta: FloatArray
     evaluator: Evaluator = field(repr=False)
+    center: FloatArray = field(repr=False)
+    root: FloatArray = field(repr=False)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -229,7 +237,7 @@ class LogPosterior:
                 z[i] = np.log(max(at[i] - low[i], EDGE))
             elif np.isfinite(high[i]):
                 z[i] = -np.log(max(high[i] - at[i], EDGE))
-        return z
+        return np.asarray(np.linalg.solve(self.root, z - self.center), dtype=np.float64)
 
     def to_arviz(self, samples: ArrayLike) -> Any:
         """Return samples as ArviZ's InferenceData, with a variable for each unknown.
@@ -308,6 +316,7 @@ class LogPosterior:
         """Return theta at z (d,), and ``log |dtheta/dz|``."""
         unknowns = self.problem.unknowns
         lower, upper = unknowns.lower, unknowns.upper
+        z = self.center + jnp.asarray(self.root) @ z
         has_low, has_high = np.isfinite(lower), np.isfinite(upper)
         low, high = np.where(has_low, lower, 0.0), np.where(has_high, upper, 0.0)
         inside, log_slope = jax.nn.sigmoid(z), jax.nn.log_sigmoid(z) + jax.nn.log_sigmoid(-z)
@@ -323,7 +332,28 @@ class LogPosterior:
             first = link.low if link.before < 0 else jnp.maximum(link.low, theta[link.before] + link.gap)
             theta = theta.at[i].set(first + (link.high - first) * inside[i])
             slopes = slopes.at[i].set(jnp.log(link.high - first) + log_slope[i])
-        return theta, jnp.sum(slopes)
+        return theta, jnp.sum(slopes) + np.linalg.slogdet(self.root)[1]
+
+    def _scale_by(self, fit: Fit) -> LogPosterior:
+        """Return the same posterior with a z that is nearly standard normal, by the covariance of a fit.
+
+        An unknown that is held, by a kink or a bound, has the width of its interval, and 1 where it has none.
+        """
+        center = self.unconstrain(fit.theta)
+        with use_float64():
+            slope = np.array(jax.jacfwd(lambda z: self._transform(z)[0])(jnp.asarray(center)))
+        covariance = fit.covariance.copy()
+        if not np.isfinite(covariance).all():
+            return self
+        held = np.diag(covariance) <= 0
+        if held.any():
+            width = np.diff(fit.confidence_intervals(0.95), axis=1)[:, 0] / 4
+            width = np.where(np.isfinite(width) & (width > 0), width, np.abs(np.diag(slope)))
+            covariance[held, held] = width[held] ** 2
+        back = np.linalg.inv(slope)
+        scaled = back @ covariance @ back.T
+        root = np.asarray(np.linalg.cholesky((scaled + scaled.T) / 2), dtype=np.float64)
+        return replace(self, center=center, root=root)
 
     @cached_property
     def _cost(self) -> Callable[[Any], Any]:
@@ -388,7 +418,8 @@ def log_posterior(problem: Problem | Estimate) -> LogPosterior:
     Parameters
     ----------
     problem : Problem or Estimate
-        Of an estimate, the mesh and the start are those at its solution; of a problem, those at its first guess.
+        Of an estimate, the mesh and the start are those at its solution, and z is in units of its covariance, so that
+        samplers need no scales; of a problem, mesh and start are those at its first guess.
 
     Returns
     -------
@@ -423,7 +454,7 @@ def log_posterior(problem: Problem | Estimate) -> LogPosterior:
     >>> with jax.enable_x64(True):  # samplers need it throughout: jax.config.update("jax_enable_x64", True)
     ...     thetas = jax.numpy.array([[2.4, 0.4], [2.5, 0.4], [2.6, 0.4]])
     ...     jax.vmap(posterior)(thetas).round(1).tolist()
-    [-15.7, -8.4, -35.1]
+    [-50.2, -8.8, -80.0]
     """
     if isinstance(problem, Estimate):
         evaluator, theta = problem.evaluator_at_solution(), problem.theta
@@ -447,4 +478,6 @@ def log_posterior(problem: Problem | Estimate) -> LogPosterior:
             f"a posterior cannot have equality constraints; this problem has {join_names(own.constraint_names)}. Leave "
             "out the guard, or measure what it says with a sigma of its own."
         )
-    return LogPosterior(own, theta.copy(), evaluator)
+    d = len(theta)
+    posterior = LogPosterior(own, theta.copy(), evaluator, np.zeros(d), np.eye(d))
+    return posterior._scale_by(problem) if isinstance(problem, Estimate) else posterior
