@@ -56,7 +56,7 @@ def test_criteria_in_closed_form_with_sigma_known():
     rss = np.array([squares(count, values(0)) for count in k])
     log_l = -0.5 * rss / SIGMA**2 - n * np.log(SIGMA) - 0.5 * n * np.log(2 * np.pi)
     np.testing.assert_allclose(table.log_likelihood, log_l, rtol=1e-8)
-    assert table.unknowns.tolist() == [1, 2, 3]
+    assert table.unknown_counts.tolist() == [1, 2, 3]
     assert table.values == n
     np.testing.assert_allclose(table.aic, 2 * k - 2 * log_l, rtol=1e-8)
     np.testing.assert_allclose(table.aicc, 2 * k - 2 * log_l + 2 * k * (k + 1) / (n - k - 1), rtol=1e-8)
@@ -79,7 +79,7 @@ def test_criteria_in_closed_form_with_sigma_unknown():
     rss = np.array([squares(count, values(0)) for count in (1, 2)])
     log_l = -0.5 * n * (np.log(2 * np.pi * rss / n) + 1)
     np.testing.assert_allclose(table.log_likelihood, log_l, rtol=1e-8)
-    assert table.unknowns.tolist() == [2, 3]
+    assert table.unknown_counts.tolist() == [2, 3]
     assert table.names == ("model1", "model2")
     assert table.nested[0].statistic == pytest.approx(n * np.log(rss[0] / rss[1]), rel=1e-7)
     assert table.nested[0].freedom == 1
@@ -88,7 +88,7 @@ def test_criteria_in_closed_form_with_sigma_unknown():
 def test_a_sigma_that_is_a_parameter_is_the_same_as_one_left_out():
     table = sf.compare([fit(2, None), fit(2, "noise"), fit(2)], names=("left out", "parameter", "known"))
     assert table.log_likelihood[0] == pytest.approx(table.log_likelihood[1], rel=1e-9)
-    assert table.unknowns.tolist() == [3, 3, 2]
+    assert table.unknown_counts.tolist() == [3, 3, 2]
     assert table.log_likelihood[2] < table.log_likelihood[0]
 
 

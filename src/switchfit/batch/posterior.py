@@ -9,8 +9,8 @@ time lies between a ``low`` that follows from the one before it and a ``high`` t
     theta_i = low_i + (high_i - low_i) / (1 + exp(-z_i)),        log |dtheta/dz| = sum_i log dtheta_i/dz_i,
 
 since dtheta/dz is triangular; with one bound ``theta_i = low + exp(z_i)`` or ``high - exp(z_i)``, without bounds
-``theta_i = z_i``. For an estimate these are the entries of ``center + root z`` with the covariance ``root root'`` of the
-fit, so that z is nearly standard normal: the warm-up of samplers relies on unknowns of size 1.
+``theta_i = z_i``. For an estimate these are the entries of ``center + root z``, the covariance of the
+fit being ``root root'``, so that z is nearly standard normal: the warm-up of samplers relies on unknowns of size 1.
 """
 
 from __future__ import annotations

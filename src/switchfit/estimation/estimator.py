@@ -430,7 +430,7 @@ class Estimate(Fit):
         >>> noise = 0.2 * np.random.default_rng(1).normal(size=12)
         >>> found = fit.validate(sf.Measurements(times, exact + noise))
         >>> dict(zip(found.theta_names, found.theta.round(1).tolist()))
-        {'tau_1': 1.5}
+        {'tau_1': 1.5, 'k': 0.4}
         >>> found.verdict.level
         'good'
         """

@@ -246,7 +246,7 @@ def write_comparison(found: ModelComparison) -> str:
         rows.append(
             [
                 found.names[k],
-                f"{found.unknowns[k]}",
+                f"{found.unknown_counts[k]}",
                 f"{found.log_likelihood[k]:.2f}",
                 f"{found.aicc[k]:.2f}",
                 f"{found.delta_aicc[k]:.2f}",

@@ -88,7 +88,7 @@ class ModelComparison:
     names : tuple of str, one for each of the m models
     values : int
         Measured values, n.
-    unknowns : (m,) int array
+    unknown_counts : (m,) int array
         k, see `compare`.
     log_likelihood : (m,) array
         Natural logarithm of the largest likelihood, all constants included.
@@ -116,15 +116,15 @@ class ModelComparison:
     >>> known = dict(problem.parameters) | {"k": sf.Parameter(0.45, fixed=True)}
     >>> fits = [sf.estimate(sf.Problem(problem.system, problem.experiments, p)) for p in (known, problem.parameters)]
     >>> table = sf.compare(fits, names=("k known", "k estimated"))
-    >>> table.unknowns.tolist(), table.delta_bic.round(1).tolist()
-    ([1, 2], [106.8, 0.0])
+    >>> table.unknown_counts.tolist(), table.delta_bic.round(1).tolist()
+    ([1, 2], [104.7, 0.0])
     >>> table.best
     'k estimated'
     """
 
     names: tuple[str, ...]
     values: int
-    unknowns: NDArray[np.int64]
+    unknown_counts: NDArray[np.int64]
     log_likelihood: FloatArray
     nested: tuple[Nested, ...]
     folds: tuple[tuple[str, ...], ...]
@@ -135,19 +135,19 @@ class ModelComparison:
     @property
     def aic(self) -> FloatArray:
         """Akaike's information criterion: (m,)."""
-        return 2 * self.unknowns - 2 * self.log_likelihood
+        return 2 * self.unknown_counts - 2 * self.log_likelihood
 
     @property
     def aicc(self) -> FloatArray:
         """AIC corrected for few values: (m,); infinite with no more than k + 1 values."""
-        left = self.values - self.unknowns - 1
-        more = 2 * self.unknowns * (self.unknowns + 1) / np.where(left > 0, left, 1)
+        left = self.values - self.unknown_counts - 1
+        more = 2 * self.unknown_counts * (self.unknown_counts + 1) / np.where(left > 0, left, 1)
         return np.where(left > 0, self.aic + more, np.inf)
 
     @property
     def bic(self) -> FloatArray:
         """Schwarz's Bayesian information criterion: (m,)."""
-        return self.unknowns * np.log(self.values) - 2 * self.log_likelihood
+        return self.unknown_counts * np.log(self.values) - 2 * self.log_likelihood
 
     @property
     def delta_aicc(self) -> FloatArray:

@@ -272,8 +272,8 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
     The log ends at 6 h; after it the heater stays off:
 
     >>> sf.predict(fit, [6.0, 9.0, 12.0]).prediction_band(0.95).round(1)[:, 0]
-    array([[ 3.5,  4.4],
-           [ 0.8,  1.7],
+    array([[ 3.5,  4.3],
+           [ 0.8,  1.6],
            [-0. ,  0.8]])
     """
     fit: Fit = estimate
