@@ -228,6 +228,7 @@ def test_a_random_walk_finds_the_posterior_of_quadrature():
 
 
 @pytest.mark.slow
+@pytest.mark.promotes  # NumPyro itself does
 def test_nuts_finds_the_posterior_of_quadrature_without_divergences():
     numpyro = pytest.importorskip("numpyro")
     fit = sf.estimate(ramp())

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.result import Fit
+from switchfit.fit.result import Fit, inverse_on
 from switchfit.fit.solution import is_least_squares, is_sigma_known
 from switchfit.fit.trajectory import Comparison, SimulatedProblem, Trajectory
 from switchfit.problem.data import FloatArray, Measurements
@@ -595,7 +595,15 @@ def _whiten(
             here = (samples.experiment == e) & (samples.item == k)
             found[e][item][there] = (z[: len(sigma)] * sigma)[here]
     own = half - root @ (Q.T @ U)  # how own unknowns follow the error of the parameters
-    return _Whitened(found, float(z @ z), freedom, own @ own.T + root @ root.T)
+    alone = root @ root.T
+    if refit is not None:
+        # The exact Hessian, as of any fit: a transition time at which the vector field does not jump has no first
+        # derivative, and would have no error.
+        exact = inverse_on(refit.free_basis, refit.hessian) * noise**2
+        if np.isfinite(exact).all():
+            alone = np.zeros((d, d))
+            alone[np.ix_(where, where)] = exact
+    return _Whitened(found, float(z @ z), freedom, own @ own.T + alone)
 
 
 def is_least_squares_or_scaled(problem: Problem) -> bool:
