@@ -280,3 +280,19 @@ def test_an_array_parameter_is_refitted_as_a_whole():
     assert fit.validate(other).freedom == len(TEST) - 2
     with pytest.raises(ValueError, match="the entries of 'c' are estimated all together, or none of them"):
         fit.validate(other, refit=("c[0]",))
+
+
+def test_a_transition_at_which_the_vector_field_does_not_jump_has_the_error_of_the_exact_hessian():
+    """A block that slides until its speed is zero: to first order, the data do not depend on when it rests."""
+    system = sf.HybridSystem({"slide": lambda t, x, p: p["v"] - t + 0.0 * x, "rest": lambda t, x, p: 0.0 * x}, [0.0])
+    times = np.linspace(0.03, 2.0, 40)
+    exact = np.minimum(times, 1.0) - np.minimum(times, 1.0) ** 2 / 2
+    logs = [exact + 0.003 * np.random.default_rng(seed).standard_normal(40) for seed in (1, 2)]
+    runs = [
+        sf.Experiment(sf.Measurements(times, log, sigma=0.003), ("slide", "rest"), (0.95,), 0.0, 2.0) for log in logs
+    ]
+    found = sf.estimate(sf.Problem(system, runs[0], {"v": 1.1})).validate(runs[1])
+    assert found.theta_names == ("tau_1", "v")
+    assert not found.refit.kinks
+    assert found.standard_errors[0] >= found.refit.standard_errors[0] * (1 - 1e-9)
+    assert found.refit.standard_errors[0] > 0.005
