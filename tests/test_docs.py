@@ -8,6 +8,7 @@ import shutil
 from functools import cache
 from pathlib import Path
 
+import jax
 import matplotlib
 import pytest
 from typer.testing import CliRunner
@@ -61,7 +62,9 @@ def clone(tmp_path, monkeypatch):
     """A folder that has the examples, as a clone has, to work in."""
     shutil.copytree(ROOT / "examples", tmp_path / "examples", ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.chdir(tmp_path)
-    return tmp_path
+    before = jax.config.read("jax_enable_x64")  # a page on samplers turns it on
+    yield tmp_path
+    jax.config.update("jax_enable_x64", before)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())

@@ -39,7 +39,10 @@ APART = {"optimize": set(), "models": {"problem"}}
 LOGS = {"runtime", "problem.validation", "problem.dates"}
 """Rooms and modules of other rooms that `io.logs` may import: it knows no model, no fit and no report."""
 
-OPTIONAL = {"gpxpy", "h5py", "pandas", "polars", "pyarrow", "pymap3d", "pynmea2", "rosbags", "xarray"}
+OPTIONAL = {
+    "arviz", "blackjax", "gpxpy", "h5py", "numpyro", "pandas", "polars", "pyarrow", "pymap3d", "pynmea2", "rosbags",
+    "xarray",
+}  # fmt: skip
 """Libraries of the extras, which are imported where they are needed."""
 
 

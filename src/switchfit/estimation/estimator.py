@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -33,6 +33,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_choice, as_count, as_flag, as_instance, as_path, as_positive
+from switchfit.runtime.dispatch import validate_on
 from switchfit.runtime.files import write_atomically
 from switchfit.runtime.frames import Tabular, build_pandas, build_xarray, describe_frame
 from switchfit.runtime.presentation import draw_figure, format_html, format_page, format_text
@@ -404,6 +405,58 @@ class Estimate(Fit, Tabular):
                [8.6]])
         """
         return predict(self, times, experiment=experiment)
+
+    def validate(self, other: Any, *, refit: Sequence[str] | None = None) -> Any:
+        """Return how well the fitted parameters predict another run, as a `Validation`.
+
+        Parameters
+        ----------
+        other : Experiment, list of Experiment, Problem, Measurements or Log
+            The other run. An `Experiment` has the system and the parameters of this fit. Of a `Problem`, parameters
+            that this fit has too get its values. `Measurements` are another log of the only experiment of this fit;
+            what is left out in them (observe, sigma, delay, names) is as it was there, and so are the channels of a
+            `Log`.
+        refit : sequence of str, optional
+            Unknowns to estimate from the other run, by their names in its problem. If left out, all that are its own:
+            its transition times, the unknown entries of its initial state, and parameters that this fit does not have.
+            With ``()`` none, and they are what `other` gives: the guess of each transition time. The parameters of
+            this fit are never estimated again.
+
+        Returns
+        -------
+        Validation
+
+        Raises
+        ------
+        TypeError
+            If `other` is of another type.
+        ValueError
+            If this fit has an input or several runs, and `other` does not have its own; for an unknown name in
+            `refit`; for an estimate without its problem.
+
+        See Also
+        --------
+        Validation, predict, compare
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        The same heater on another day, switched off after 1.5 h:
+
+        >>> times = np.linspace(0.5, 6.0, 12)
+        >>> exact = 25 * (1 - np.exp(-0.4 * np.minimum(times, 1.5))) * np.exp(-0.4 * np.maximum(times - 1.5, 0))
+        >>> noise = 0.2 * np.random.default_rng(1).normal(size=12)
+        >>> found = fit.validate(sf.Measurements(times, exact + noise))
+        >>> dict(zip(found.theta_names, found.theta.round(1).tolist()))
+        {'tau_1': 1.5, 'k': 0.4}
+        >>> found.verdict.level
+        'good'
+        """
+        return validate_on(self, other, refit=refit)
 
     @property
     def residuals(self) -> ResidualDiagnostics:

@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -148,7 +149,6 @@ def measure_quality(fit: Fit) -> Quality:
     tests = iter(zip(residuals.channels, residuals.correlated, strict=True))
     single = len(fit.comparisons) == 1
     channels: list[ChannelQuality] = []
-    left = total = 0.0
     ratios = [np.zeros(0)]
     for e, run in enumerate(fit.comparisons):
         for comparison in run:
@@ -161,11 +161,9 @@ def measure_quality(fit: Fit) -> Quality:
                 if comparison.kind == "measurements":
                     tested, correlated = next(tests)
                     whiteness = tested.whiteness
-                squares, spread, size = _sum_squares(comparison, k)
+                squares, spread, _ = _sum_squares(comparison, k)
                 if not np.isfinite(squares):
                     continue
-                if spread > 0:
-                    left, total = left + squares / size, total + spread / size
                 ratios.append(_measure_ratios(comparison, k))
                 channels.append(
                     ChannelQuality(
@@ -185,7 +183,7 @@ def measure_quality(fit: Fit) -> Quality:
     judged = fit.sigma_known is True and np.isfinite(fit.residual_variance)
     return Quality(
         channels=tuple(channels),
-        explained=1 - left / total if total > 0 else np.nan,
+        explained=explain_all(fit.comparisons),
         chi_square=2 * fit.cost if judged else np.nan,
         freedom=fit.freedom,
         residuals=residuals,
@@ -207,6 +205,24 @@ def explain_channel(comparison: Comparison, k: int) -> float:
         return np.nan
     squares, spread, _ = _sum_squares(comparison, k)
     return 1 - squares / spread if spread > 0 else np.nan
+
+
+def explain_all(runs: Sequence[Sequence[Comparison]]) -> float:
+    """Return the share of the variance of all channels that is explained, see `Quality.explained`; NaN without data.
+
+    Parameters
+    ----------
+    runs : sequence of sequences of Comparison, one for each experiment
+    """
+    left = total = 0.0
+    for comparison in (comparison for run in runs for comparison in run):
+        for k in range(len(comparison.names)):
+            if comparison.weights is not None and comparison.weights[k] == 0:
+                continue
+            squares, spread, size = _sum_squares(comparison, k)
+            if np.isfinite(squares) and spread > 0:
+                left, total = left + squares / size, total + spread / size
+    return 1 - left / total if total > 0 else np.nan
 
 
 def _sum_squares(comparison: Comparison, k: int) -> tuple[float, float, float]:

@@ -20,13 +20,14 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.special
 
 from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import Comparison
+from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
 from switchfit.runtime.frames import Tabular
@@ -226,18 +227,32 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
     ----------
     fit : Fit
     """
-    single = len(fit.comparisons) == 1
-    channels, names = [], []
-    for e, comparisons in enumerate(fit.comparisons):
+    return diagnose_runs(fit.comparisons, fit.run_names, fit.trajectories)
+
+
+def diagnose_runs(
+    runs: Sequence[Sequence[Comparison]], names: Sequence[str], trajectories: Sequence[Trajectory]
+) -> ResidualDiagnostics:
+    """Test the residuals of several experiments, channel by channel.
+
+    Parameters
+    ----------
+    runs : sequence of sequences of Comparison, one for each experiment
+    names : sequence of str, one for each experiment
+    trajectories : sequence of Trajectory, one for each experiment
+        For the unit and the origin of the times.
+    """
+    channels, labels = [], []
+    for e, comparisons in enumerate(runs):
         for comparison in comparisons:
             if comparison.kind != "measurements":
                 continue
-            run = fit.trajectories[e]
+            run = trajectories[e]
             for k, name in enumerate(comparison.names):
                 if np.isfinite(comparison.measured[:, k]).sum() > 0:
                     channels.append(diagnose_channel(comparison, k, e, run.time_unit, run.origin))
-                    names.append(name if single else f"{fit.run_names[e]} {name}")
-    return ResidualDiagnostics(tuple(channels), tuple(names))
+                    labels.append(name if len(runs) == 1 else f"{names[e]} {name}")
+    return ResidualDiagnostics(tuple(channels), tuple(labels))
 
 
 def correct_errors(fit: Fit) -> FloatArray:
