@@ -1,6 +1,7 @@
 """Settings for all tests: the same examples in every run, strict promotion, programs that compile quickly."""
 
 import os
+import signal
 from pathlib import Path
 
 import jax
@@ -8,6 +9,7 @@ import llvmlite.binding
 import pytest
 from hypothesis import settings
 
+import switchfit as sf
 from switchfit.engine.native import llvm, program
 from switchfit.engine.native.program import drop_programs
 
@@ -83,6 +85,21 @@ def quick_processes(monkeypatch):
 
 MOST_MAPPINGS = 20_000
 """Pieces of memory that a process may map before compiled programs are dropped; the kernel allows 65,530."""
+
+
+@pytest.fixture
+def interrupted_fits(monkeypatch):
+    """Every fit of the command line is interrupted by Ctrl-C in its first iteration."""
+    real = sf.estimate
+
+    def estimate(problem, callback, **options):
+        def interrupted(record):
+            signal.raise_signal(signal.SIGINT)
+            return callback(record)
+
+        return real(problem, callback=interrupted, **options)
+
+    monkeypatch.setattr(sf, "estimate", estimate)
 
 
 @pytest.fixture(autouse=True)

@@ -12,6 +12,7 @@ from models import RAMP, STILL, curve
 
 import switchfit as sf
 from switchfit.batch.resampling import _compute_acceleration, _Draw, _Runs
+from switchfit.models import heater_problem
 
 TIMES = np.linspace(0.1, 4.0, 40)
 
@@ -100,6 +101,12 @@ def test_blocks_follow_noise_that_is_correlated():
     assert single.standard_deviation[0] == pytest.approx(fit.standard_errors[0], rel=0.1)
     assert "resampled: blocks of" in str(blocks)
     assert sf.bootstrap(fit, 5, resample="blocks", block=7).block == 7
+
+
+def test_without_fits_that_converged_the_figure_says_so():
+    study = sf.bootstrap(sf.estimate(heater_problem(), strategy="local"), 3, max_iterations=1)
+    assert not study.success.any()
+    assert study.plot().get_suptitle() == "Fewer than two fits converged: no statistics."
 
 
 def ramps(slopes, sigma=0.05, seed=0):

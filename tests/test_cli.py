@@ -121,17 +121,7 @@ def test_options_win_over_the_file(folder, tmp_path, monkeypatch):
     assert got == {"hessian": "gauss-newton", "tolerance": 1e-3, "max_iterations": 7}
 
 
-def test_interrupt_ends_the_fit_and_writes(folder, tmp_path, monkeypatch):
-    real = sf.estimate
-
-    def estimate(problem, callback, **options):
-        def interrupted(record):
-            signal.raise_signal(signal.SIGINT)
-            return callback(record)
-
-        return real(problem, callback=interrupted, **options)
-
-    monkeypatch.setattr(sf, "estimate", estimate)
+def test_interrupt_ends_the_fit_and_writes(folder, tmp_path, interrupted_fits):
     before = signal.getsignal(signal.SIGINT)
     result = run("fit", folder / "problem.toml", "--out", tmp_path, "--no-figures")
     assert result.exit_code == 1

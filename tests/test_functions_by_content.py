@@ -379,6 +379,17 @@ def test_other_functions_are_other(change):
     TRACED.append(own)
 
 
+@pytest.mark.parametrize(
+    "read",
+    [lambda p: p.pop("a"), lambda p: p.setdefault("a", 2.0), lambda p: p.popitem()[1], lambda p: p.copy()["a"]],
+    ids=["pop", "setdefault", "popitem", "copy"],
+)
+def test_a_function_may_read_its_parameters_by_any_method_of_a_dict(read):
+    found = sf.evaluate(problem_of(lambda t, x, p: -read(p) * x))
+    expected = sf.evaluate(problem_of(lambda t, x, p: -p["a"] * x))
+    np.testing.assert_allclose(found.gradient, expected.gradient, rtol=1e-13)
+
+
 def test_a_function_that_reads_plain_things_is_not_called_again(monkeypatch):
     calls = []
     real = functions._trace

@@ -102,7 +102,9 @@ def test_evaluations_row_by_row_are_the_same_bit_by_bit(row_by_row):
         ]
         simulated = orders[2].simulate(*given)
         seen = orders[2].outputs(simulated.times, simulated.states, given[1], simulated.tangents)
-        return [orders[0].cost(*given), *orders[1](*given, 1.0), *orders[2](*given, -1.0), *simulated[:-1], *seen]
+        first, second = orders[1](*given, 1.0), orders[2](*given, -1.0)
+        values = [value for one in (first, second) for value in (one.cost, one.gradient, one.hessian)]
+        return [orders[0].cost(*given), *values, *simulated[:-1], *seen]
 
     times = [0.413, 0.791, 1.336], NODES[[4, 4, 13]]
     expected = [found(tau) for tau in times]

@@ -189,19 +189,7 @@ def test_a_fit_that_raises_is_one_bad_log(folder, monkeypatch):
     assert "2 logs: 1 fitted, 0 not, 1 refused" in result.stderr
 
 
-def test_ctrl_c_ends_the_run_and_leaves_the_table(folder, monkeypatch):
-    import signal
-
-    real = sf.estimate
-
-    def estimate(problem, callback, **options):
-        def interrupted(record):
-            signal.raise_signal(signal.SIGINT)
-            return callback(record)
-
-        return real(problem, callback=interrupted, **options)
-
-    monkeypatch.setattr(sf, "estimate", estimate)
+def test_ctrl_c_ends_the_run_and_leaves_the_table(folder, interrupted_fits):
     table = folder / "table.csv"
     result = run("fit", folder / "logs", "--problem", folder / "problem.toml", "--table", table)
     assert result.exit_code == 1

@@ -19,7 +19,7 @@ from switchfit.discretization.mesh import CHUNK, Mesh, build_rows, count_chunks,
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import compute_path_cost, propagate
 from switchfit.discretization.tableaus import ADAPTIVE
-from switchfit.engine.adaptive import _solve, _solve_natively, list_fixed_nodes, refine_mesh
+from switchfit.engine.adaptive import _solve_in_python, _solve_natively, _Stretch, list_fixed_nodes, refine_mesh
 from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.native.scalars import Graph, Namespace, as_objects
 from switchfit.fit.evaluator import Evaluator
@@ -345,7 +345,7 @@ def test_both_engines_take_the_steps_of_scipy():
     coarse = Mesh.from_times(list_fixed_nodes(run))
     arguments = build_arguments(problem, 0, coarse)
     native = native_experiment(problem.structures[0], arguments, coarse.times, 0)
-    given = (problem, problem.structures[0], arguments.without_mesh(), arguments.signals, coarse)
+    given = arguments.without_mesh(), arguments.signals, coarse
     last = coarse.cells - 1
 
     def steps_of_scipy(mode, start, end, x):
@@ -362,8 +362,8 @@ def test_both_engines_take_the_steps_of_scipy():
     for mode, start, end, x in ((0, 0.0, 1.7, [0.0, 0.0]), (1, 1.7, 2.5, [0.4, 1.0]), (0, 2.9, 6.0, [0.1, -0.2])):
         expected, state = steps_of_scipy(mode, start, end, x)
         with use_float64():
-            natively = _solve_natively(problem, native, mode, start, end, np.array(x), np.zeros(0))
-            in_python = _solve(*given, mode, start, end, np.array(x), np.zeros(0))
+            stretch = _Stretch(problem, problem.structures[0], mode, start, end, np.array(x), np.zeros(0))
+            natively, in_python = _solve_natively(stretch, native), _solve_in_python(stretch, *given)
         for steps, after in (natively, in_python):
             assert len(steps) == len(expected) > 10
             np.testing.assert_allclose(steps, expected, rtol=0, atol=1e-4 * (end - start))

@@ -5,11 +5,12 @@ import sys
 import threading
 import time
 
+import pytest
 from test_strategy import FAR, thermostat
 
 import switchfit as sf
 from switchfit.runtime import progress
-from switchfit.runtime.progress import show_detail, show_line
+from switchfit.runtime.progress import show_detail, show_line, show_progress
 
 
 class Terminal(io.StringIO):
@@ -79,6 +80,19 @@ def test_nothing_without_a_terminal(monkeypatch):
         time.sleep(0.1)
     assert stream.getvalue() == ""
     show_detail("nowhere")
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_without_a_stderr_nothing_is_shown(monkeypatch, closed):
+    """Programs without a console have None in its place; a daemon may have closed it."""
+    stream = io.StringIO()
+    stream.close()
+    monkeypatch.setattr(sys, "stderr", stream if closed else None)
+    with show_line("begins"):
+        show_detail("more")
+    report, end = show_progress(None, "runs")
+    assert not report(1, 2)
+    end()
 
 
 def test_what_ends_at_once_shows_nothing(monkeypatch):

@@ -173,6 +173,7 @@ def test_a_real_fit_comes_back(tmp_path):
     with pytest.raises(ValueError, match=r"loaded without its model: load it with Estimate.load\(path, problem="):
         loaded.profile("v")
     with_model = sf.Estimate.load(tmp_path / "fit.json", problem=problem)
+    assert with_model.evaluator_at_solution() is with_model.evaluator_at_solution(), "its meshes are refined anew"
     np.testing.assert_allclose(with_model.predict([1.0]).outputs, estimate.predict([1.0]).outputs, rtol=1e-9)
     other = sf.Problem(RAMP, problem.experiments[0], {"v": sf.Parameter(2.0, fixed=True)})
     with pytest.raises(ValueError, match="holds the unknowns tau_1, v, the problem has tau_1: it is the fit of"):

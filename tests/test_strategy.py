@@ -12,7 +12,7 @@ import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.random_starts import draw_starts
 from switchfit.optimize import Status
-from switchfit.strategy.choice import Search, without_guards
+from switchfit.strategy.choice import FEW_STARTS, Search, without_guards
 from switchfit.strategy.horizon import can_grow, find_shared, grow_horizon
 from switchfit.strategy.quick import fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
@@ -89,13 +89,72 @@ def test_what_each_step_brought_is_told(far_fit):
     assert far_fit.seconds >= sum(step.seconds for step in far_fit.steps) > 0
 
 
-def test_where_the_model_is_doubted_two_searches_that_agree_are_enough(right):
+def test_where_the_model_is_doubted_and_two_searches_agree_a_few_starts_are_enough(right):
     """With sigma given too small nothing explains the data to the noise; many starts would not change that."""
     problem = thermostat(tuple(TRUTH[:5]), sigma=0.01)
     fit = sf.estimate(problem)
     assert fit.verdict.level == "doubtful"
-    assert [step.strategy for step in fit.steps] == ["local", "scan over sample intervals", "growing horizon"]
+    searches = ["local", "scan over sample intervals", "growing horizon", "many starts"]
+    assert [step.strategy for step in fit.steps] == searches
+    assert fit.starts is not None
+    assert fit.starts[0] < FEW_STARTS
     assert fit.cost == pytest.approx(4 * right.cost, rel=1e-6)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3])
+def test_the_horizon_grows_where_sigma_is_left_out_whatever_the_unit(unit):
+    """Parameters are kept near their guesses by priors, which a cost without sigma refuses, and whose weight beside the
+    data would depend on the unit."""
+    right, problem = logistic(19.2, r=0.904, K1=4.93, K2=13.2, x0=0.525)
+    (run,) = problem.experiments
+    (data,) = run.data
+    scaled = replace(data, values=data.values * unit, observe=lambda t, x, p: x * unit)
+    problem = replace(problem, experiments=replace(run, data=scaled))
+    end = grow_horizon(problem, problem.initial_theta)
+    assert end.evaluations > 100
+    assert end.cost == pytest.approx(right.cost * unit**2, rel=1e-4)
+
+
+def grow_logistically(capacity):
+    return lambda t, x, p: p["r"] * x * (1 - x / p[capacity])
+
+
+def logistic(guess, **parameters):
+    """Growth to one capacity, then to another; sigma unknown, and noise from a fixed seed."""
+    system = sf.HybridSystem(
+        modes={"narrow": grow_logistically("K1"), "wide": grow_logistically("K2")},
+        initial_state=lambda p: jnp.stack([p["x0"]]),
+    )
+    times = np.linspace(0, 20, 61)[1:]
+
+    def pose(values, tau, parameters):
+        data = sf.Measurements(times, values, observe=lambda t, x, p: x, sigma=None)
+        run = sf.Experiment(data=data, mode_sequence=("narrow", "wide"), transition_times=(tau,), t0=0.0, tf=20.0)
+        return sf.Problem(system, run, parameters=parameters)
+
+    truth = {"r": 0.909, "K1": 8.4, "K2": 20.0, "x0": 0.99}
+    states = sf.simulate(pose(np.zeros((60, 1)), 8.88, truth))
+    values = np.interp(times, states.times, states.states[:, 0])
+    noise = 0.2 * np.random.default_rng(1).standard_normal(60)
+    values = (values + noise)[:, None]
+    right = sf.estimate(pose(values, 8.88, truth), strategy="local")
+    bounds = {name: (value / 10, 10 * value) for name, value in truth.items()}
+    far = {name: sf.Parameter(parameters[name], lower=low, upper=high) for name, (low, high) in bounds.items()}
+    return right, pose(values, guess, far)
+
+
+def test_correlated_residuals_of_an_unknown_sigma_lead_to_a_search():
+    """A local fit ends where one capacity is at its bound, with thirty times the cost; the model explains 98 % there,
+    and without sigma nothing but the correlated residuals says that it is wrong.
+    """
+    right, problem = logistic(19.2, r=0.904, K1=4.93, K2=13.2, x0=0.525)
+    alone = sf.estimate(problem, strategy="local")
+    assert alone.cost > 10 * right.cost
+    assert alone.verdict.level == "doubtful"
+    assert "next: more starts" in [step.kind for step in alone.verdict.next_steps]
+    fit = sf.estimate(problem)
+    assert fit.cost == pytest.approx(right.cost, rel=1e-6)
+    assert fit.verdict.level == "good"
 
 
 def test_a_good_fit_tries_nothing_else(right):

@@ -12,7 +12,8 @@ from models import STILL, VEHICLE_TRUTH, curve, drive, positions
 from test_report import comparison_of, made, trajectory_of, warnings_of
 
 import switchfit as sf
-from switchfit.fit.evaluator import Evaluation, Evaluator, evaluator_of
+from switchfit.engine.protocol import Evaluation
+from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.result import disagreement
 from switchfit.optimize import Status
 from switchfit.report.text import report

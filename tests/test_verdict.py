@@ -27,6 +27,7 @@ from switchfit.models import heater_problem
 from switchfit.optimize import Status
 from switchfit.report.verdict import format_share
 from switchfit.runtime.issue import Issue
+from switchfit.uncertainty.quality import measure_quality
 
 TIMES = np.linspace(0.1, 10.0, 100)
 
@@ -203,6 +204,10 @@ def test_outliers_that_a_robust_loss_weighs_down_are_not_missed():
     assert right.verdict.reasons[0].figures["explained"] > 0.99
     wrong = fit(sf.Parameter(-0.2, fixed=True))  # nearly all samples are beyond the scale
     assert (wrong.verdict.level, kinds(wrong)) == ("bad", ["mostly outliers"])
+    near = fit(sf.Parameter(0.482, fixed=True))  # a third of them is, and the model explains 95 % of the others
+    assert (near.verdict.level, kinds(near)[0]) == ("doubtful", "large residuals")
+    assert "next: more starts" in steps(near)
+    assert "the typical residual of y1 is" in str(near.verdict)
 
 
 # --- corrected standard errors ----------------------------------------------------------------------------------------
@@ -372,6 +377,24 @@ def test_few_starts_that_agree_are_doubtful_where_nothing_confirms_the_fit():
     assert str(few.verdict) == "Doubtful: the lowest J was found from only 3 of 40 other starts."
     none = replace(fit, starts=(40, 0, 0))
     assert str(none.verdict) == "Doubtful: the lowest J was found from none of 40 other starts."
+
+
+def test_white_residuals_confirm_a_minimum_that_two_starts_have_found_where_sigma_is_unknown():
+    fit = straight(2.0 + 0.5 * TIMES + noise(0.01), sigma=None)
+    assert measure_quality(fit).channels[0].whiteness > 0.05
+    assert replace(fit, starts=(40, 0, 2)).verdict.level == "good"
+    assert replace(fit, starts=(40, 0, 1)).verdict.level == "doubtful"
+    loud = straight(2.0 + 0.5 * TIMES + noise(), sigma=None)  # much is left to explain
+    assert replace(loud, starts=(40, 0, 2)).verdict.level == "doubtful"
+
+
+def test_correlated_residuals_doubt_the_minimum_where_sigma_is_unknown():
+    fit = straight(2.0 + 0.5 * TIMES + 0.1 * np.sin(3 * TIMES), sigma=None)
+    assert (fit.verdict.level, kinds(fit)) == ("doubtful", ["correlated residuals"])
+    assert steps(fit) == ["next: more starts", "next: corrected errors", "next: look at the residuals"]
+    assert steps(replace(fit, starts=(40, 0, 40))) == ["next: corrected errors", "next: look at the residuals"]
+    slight = straight(2.0 + 0.5 * TIMES + 0.01 * np.sin(3 * TIMES), sigma=None)  # as most real logs at high precision
+    assert steps(slight) == ["next: corrected errors", "next: look at the residuals"]
 
 
 def test_more_starts_are_no_advice_where_none_was_better():
@@ -621,7 +644,7 @@ def test_the_verdict_costs_nothing_until_it_is_asked_for():
     ("share", "text"),
     [
         (1.0, "all"), (0.9999999, "all but 1e-6"), (0.99985999, "99.985 %"), (0.99499, "99.49 %"), (0.61, "61 %"),
-        (0.0, "none"), (-3.0, "none"), (0.95, "95.0 %"),
+        (0.0, "none"), (-3.0, "none"), (0.95, "95.0 %"), (0.29, "29 %"), (0.57, "57 %"),
     ],
 )  # fmt: skip
 def test_shares_are_never_rounded_up(share, text):

@@ -6,8 +6,9 @@ from switchfit.batch.resampling import Bootstrap, bootstrap
 from switchfit.batch.simulated import MonteCarlo, monte_carlo
 from switchfit.batch.starts import Multistart, multistart
 from switchfit.discretization.mesh import Stiffness
+from switchfit.engine.protocol import Evaluation
 from switchfit.estimation.estimator import Estimate
-from switchfit.fit.evaluator import Evaluation, evaluate
+from switchfit.fit.evaluator import evaluate
 from switchfit.fit.guards import GuardedEvaluation, evaluate_on_guards
 from switchfit.fit.result import Step
 from switchfit.fit.termination import Kink, Termination

@@ -16,7 +16,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
@@ -89,7 +89,9 @@ def fit(
     ] = None,
     table: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.csv", help="With --problem: a line for each log.", show_default=False),
+        typer.Option(
+            metavar="FILE.csv", help="With --problem: a line for each log; FILE.parquet too.", show_default=False
+        ),
     ] = None,
     strategy: Annotated[
         Literal["local", "auto", "thorough"] | None,
@@ -108,8 +110,9 @@ def fit(
     max_iterations: Annotated[
         int | None, typer.Option(min=0, help="Most iterations.", show_default="the library's")
     ] = None,
+    figures: Annotated[Literal["png", "pdf", "svg"], typer.Option(help="Format of the figure in --out.")] = "png",
     no_figures: Annotated[
-        bool, typer.Option("--no-figures", help="Write no figures: neither fit.png nor report.html.")
+        bool, typer.Option("--no-figures", help="Write no figures: neither fit.png (.pdf, .svg) nor report.html.")
     ] = False,
     certificate: Annotated[
         bool, typer.Option("--certificate", help="Check with the paper's equations too, and print the checks.")
@@ -137,7 +140,8 @@ def fit(
         "max_iterations": max_iterations,
     }
     overrides = {key: value for key, value in given.items() if value is not None}
-    output = _Output(out, figures=out is not None and not no_figures, certificate=certificate, full=full)
+    drawn = "" if out is None or no_figures else figures
+    output = _Output(out, figures=drawn, certificate=certificate, full=full)
     if model is not None:
         with _report_errors(debug):
             code = _fit_logs(problem, model, overrides, output, table)
@@ -151,7 +155,7 @@ def fit(
         if out is not None:
             _make_folder(out)
         options = loaded.options | overrides
-        estimate = _estimate(loaded, options, prepare_figures=output.figures)
+        estimate = _estimate(loaded, options, prepare_figures=bool(output.figures))
         _write_estimate(estimate, loaded, options, output, output.folder)
     _fail_for_refused(loaded.issues)
     if not estimate.success:
@@ -196,6 +200,14 @@ def check(
 def simulate(
     problem: ProblemPath,
     out: Annotated[Path, typer.Option(metavar="FILE.csv", help="CSV file to write.", show_default=False)],
+    times: Annotated[
+        str,
+        typer.Option(
+            metavar="STEP",
+            help="A step, such as 0.1: a grid from t0 to tf; or 'samples': the times of the data.",
+            show_default="the integrator's steps",
+        ),
+    ] = "",
     debug: Debug = False,
 ) -> None:
     """Integrate the model at the first guess and write time, mode and states as CSV.
@@ -205,8 +217,10 @@ def simulate(
     with _report_errors(debug):
         loaded = _load(problem)
         import switchfit as sf
+        from switchfit.io.grid import choose_times
 
-        runs = [sf.simulate(loaded.problem, experiment=e) for e in range(len(loaded.problem.experiments))]
+        given = [choose_times(times, experiment) for experiment in loaded.problem.experiments]
+        runs = [sf.simulate(loaded.problem, experiment=e, times=when) for e, when in enumerate(given)]
         units = {run.time_unit for run in runs}
         if len(units) > 1:
             raise ValueError(
@@ -224,6 +238,38 @@ def simulate(
             for t, mode, x in zip(run.times.tolist(), run.modes, run.states.tolist(), strict=True):
                 table.writerow([name, t, mode, *x])
         _write(out, text.getvalue())
+
+
+@app.command()
+def rerun(
+    saved: Annotated[
+        Path, typer.Argument(metavar="ESTIMATE.json", help="Written by switchfit fit --out.", show_default=False)
+    ],
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="Where data and models are.", show_default="where they were, seen from ESTIMATE.json"
+        ),
+    ] = None,
+    debug: Debug = False,
+) -> None:
+    """Fit again what a saved estimate was made from, and compare the answers.
+
+    The problem is the one that was saved with the estimate; data and models are read from where they were. What has
+    changed since, by its hash or its version, is said first. Exit code 0: the answer is the same; 1: it is another one;
+    2: it cannot be run again.
+    """
+    with _report_errors(debug):
+        from switchfit.io.rerun import compare_fits, prepare_rerun
+
+        prepared = prepare_rerun(saved, folder)
+        if prepared.changes:
+            _print("\n".join(["Changed since", *(f"  {change}" for change in prepared.changes), ""]))
+        estimate = _estimate(prepared.loaded, prepared.loaded.options, prepare_figures=False)
+        answers = compare_fits(prepared, estimate)
+        _print(answers)
+    if not answers.same:
+        raise typer.Exit(NOT_CONVERGED)
 
 
 @app.command()
@@ -422,10 +468,10 @@ def _write_report(estimate: Any, full: bool, tables: dict[str, Path]) -> str:
 
 @dataclass(frozen=True)
 class _Output:
-    """What is printed of a fit, and written."""
+    """What is printed of a fit, and written; the format of the figure, empty for none."""
 
     folder: Path | None
-    figures: bool
+    figures: str
     certificate: bool
     full: bool
 
@@ -451,21 +497,23 @@ def _write_estimate(
     _write(folder / "report.txt", report + "\n")
     _write_tables(estimate, tables)
     with _explain_write_errors(folder / "estimate.json") as path:
-        _save(estimate, path, complete=output.certificate)
+        provenance = estimate.describe_provenance(replace(loaded.provenance, options=options))
+        _save(estimate, path, provenance, complete=output.certificate)
     if output.figures:
         figure = io.BytesIO()
-        estimate.plot().savefig(figure, format="png", dpi=150)
-        _write(folder / "fit.png", figure.getvalue())
+        estimate.plot().savefig(figure, format=output.figures, dpi=150)
+        _write(folder / f"fit.{output.figures}", figure.getvalue())
         _write_page(estimate, loaded, options, folder / "report.html")
     _print(f"written to {folder}", err=True)
 
 
 def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output: _Output, table: Path | None) -> int:
     """Fit logs one by one, print a line for each, and return the exit code of the worst."""
-    from switchfit.io.log_table import ResultTable, list_logs, load_log
+    from switchfit.io.log_table import ResultTable, check_table, list_logs, load_log
 
     logs = list_logs(paths)
     if table is not None:
+        check_table(table)
         _make_folder(table.parent)
     results = ResultTable()
     for name, path in logs:
@@ -480,7 +528,7 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
             options = loaded.options | overrides
             _write_estimate(estimate, loaded, options, output, output.folder / name, show=False)
         if table is not None:  # after each log, so that an interrupted run leaves what it has
-            _write(table, results.write())
+            _write(table, results.write(table))
         if estimate is not None and estimate.status.name == "INTERRUPTED":
             break
     _print(results.summarize(len(logs)), err=True)
@@ -492,7 +540,7 @@ def _estimate_log(loaded: ProblemFile, overrides: dict[str, Any], output: _Outpu
     from switchfit.io.python_file import describe_error
 
     try:
-        return _estimate(loaded, loaded.options | overrides, prepare_figures=output.figures), ""
+        return _estimate(loaded, loaded.options | overrides, prepare_figures=bool(output.figures)), ""
     except Exception as error:
         return None, describe_error(error)
 
@@ -503,12 +551,13 @@ def _import_figures() -> None:
         import matplotlib.figure  # noqa: F401
 
 
-def _save(estimate: Any, path: Path, *, complete: bool) -> None:
+def _save(estimate: Any, path: Path, provenance: Any, *, complete: bool) -> None:
     """Save an estimate; unless `complete`, its certificate omits the paper's equations, which take seconds."""
     from switchfit.estimation.saved import save_fit
     from switchfit.uncertainty.certificate import certify
 
-    save_fit(estimate.complete(), estimate.certificate if complete else certify(estimate, None), path)
+    certificate = estimate.certificate if complete else certify(estimate, None)
+    save_fit(estimate.complete(), certificate, path, provenance)
 
 
 def _write_page(estimate: Any, loaded: ProblemFile, options: dict[str, Any], path: Path) -> None:

@@ -11,53 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.fit.solution import is_least_squares
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal, TerminalConstraint
-from switchfit.problem.experiment import Experiment
+from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
-from switchfit.uncertainty.quality import NO_VARIATION
-
-REFERENCE_POINTS = 400
-"""Points at which a reference signal is compared with its mean."""
 
 AT_END = 1e-9
 """Part of the horizon that a mode lasts, or of a bound, that counts as none."""
-
-
-def measure_variation(problem: Problem) -> FloatArray:
-    """Return J of data that are met by their means alone, one for each experiment: (E,).
-
-    NaN where J is anything but half a sum of squares of data (and priors): costs of the trajectory, a robust loss, a
-    sigma that is a parameter.
-    """
-    if not is_least_squares(problem):
-        return np.full(len(problem.experiments), np.nan)
-    found = []
-    for run in problem.experiments:
-        items = [item for item in run.data if not isinstance(item, TerminalConstraint)]
-        found.append(sum(_vary(item, run) for item in items) if items else np.nan)
-    return np.array(found, dtype=np.float64)
-
-
-def _vary(item: Any, run: Experiment) -> float:
-    if isinstance(item, Measurements):
-        return float(sum(_vary_channel(*pair) for pair in zip(item.values.T, item.weights.T, strict=True)))
-    if isinstance(item, ReferenceSignal):
-        times = np.linspace(run.t0, run.end, REFERENCE_POINTS)
-        followed = item.signal(times)
-        deviation = followed - followed.mean(axis=0)
-        return 0.5 * float(np.einsum("ki,ij,kj->", deviation, item.weights, deviation)) * float(times[1] - times[0])
-    return np.nan
-
-
-def _vary_channel(values: FloatArray, weights: FloatArray) -> float:
-    """Return half the weighted squares of a channel about its mean; about 0 where it does not vary."""
-    there = weights > 0
-    y, w = values[there], weights[there]
-    if not len(y):
-        return 0.0
-    about_mean, about_zero = float(w @ (y - w @ y / w.sum()) ** 2), float(w @ y**2)
-    return 0.5 * (about_mean if about_mean > NO_VARIATION**2 * about_zero else about_zero)
 
 
 def describe_ends(
@@ -72,7 +30,7 @@ def describe_ends(
     theta : (R, d)
     cost : (R,)
     variation : float or (R,)
-        Sum of `measure_variation` over the experiments.
+        Sum of `switchfit.fit.variation.measure_variation` over the experiments.
     """
     unknowns, priors = problem.unknowns, problem.unknowns.priors
     squares = cost - np.array([priors.evaluate(each)[0] for each in theta]) if priors.any else cost

@@ -42,7 +42,7 @@ from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
 from switchfit.batch.intervals import make_no_pieces
 from switchfit.batch.program import Varying, chunk_size, fit_chunk
-from switchfit.batch.quality import count_samples, describe_ends, measure_variation
+from switchfit.batch.quality import count_samples, describe_ends
 from switchfit.batch.simulated import fit_simulated
 from switchfit.batch.verdict import judge_study
 from switchfit.discretization.arguments import build_arguments
@@ -51,6 +51,7 @@ from switchfit.estimation.estimator import Estimate, check_settings
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import inverse_on
 from switchfit.fit.solution import is_plain_least_squares
+from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_count, as_level, as_seed
@@ -170,6 +171,36 @@ class Bootstrap(Fits):
             low, high = np.quantile(theta[:, k], parts)
             found[k] = (2 * self.estimate[k] - high, 2 * self.estimate[k] - low) if method == "basic" else (low, high)
         return found
+
+    def to_arviz(self) -> Any:
+        """Return the estimates of the fits that converged as draws of one chain, in the group that ArviZ plots.
+
+        They are draws of the estimate over resampled data, and not of a posterior. It is InferenceData for ArviZ up
+        to 0.23, and a DataTree for later versions.
+
+        Raises
+        ------
+        ImportError
+            If ArviZ or xarray is not installed.
+
+        See Also
+        --------
+        Bootstrap.to_pandas, Bootstrap.to_xarray
+
+        Examples
+        --------
+        >>> import warnings
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+
+        >>> study = sf.bootstrap(sf.estimate(heater_problem()), 20)
+        >>> with warnings.catch_warnings():
+        ...     warnings.simplefilter("ignore")  # ArviZ 0.23 warns of its next version
+        ...     draws = study.to_arviz()
+        >>> draws.posterior["k"].dims
+        ('chain', 'draw')
+        """
+        return self._collect_draws(f"bootstrap of {self.resample}", "estimate", self.estimate)
 
     def plot(self) -> Figure:
         """Draw a histogram of the estimates of each unknown with its interval, as a matplotlib Figure.

@@ -18,7 +18,7 @@ from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
 from switchfit.batch.intervals import trace_chunk
 from switchfit.batch.program import Evaluations, Varying, chunk_size, fit_chunk, with_errors
-from switchfit.batch.quality import count_samples, describe_ends, measure_variation
+from switchfit.batch.quality import count_samples, describe_ends
 from switchfit.batch.verdict import LEVEL, judge_study
 from switchfit.discretization.arguments import build_arguments, split_by_cell
 from switchfit.discretization.mesh import Mesh
@@ -28,6 +28,7 @@ from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.guards import place_on_near_guards
 from switchfit.fit.trajectory import compare
+from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_callable, as_count, as_instance, as_seed, shorten
@@ -116,6 +117,36 @@ class MonteCarlo(Fits):
         low, high = np.moveaxis(self.confidence_intervals(level)[self.success], 2, 0)
         inside = (low <= self.truth) & (self.truth <= high)
         return np.where(np.isnan(low).all(0), np.nan, inside.mean(0))
+
+    def to_arviz(self) -> Any:
+        """Return the estimates of the fits that converged as draws of one chain, in the group that ArviZ plots.
+
+        They are draws of the estimate over repetitions of the experiment, and not of a posterior. It is InferenceData
+        for ArviZ up to 0.23, and a DataTree for later versions.
+
+        Raises
+        ------
+        ImportError
+            If ArviZ or xarray is not installed.
+
+        See Also
+        --------
+        MonteCarlo.to_pandas, MonteCarlo.to_xarray
+
+        Examples
+        --------
+        >>> import warnings
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+
+        >>> study = sf.monte_carlo(heater_problem(), 20, theta=[2.5, 0.4])
+        >>> with warnings.catch_warnings():
+        ...     warnings.simplefilter("ignore")  # ArviZ 0.23 warns of its next version
+        ...     draws = study.to_arviz()
+        >>> draws.posterior["k"].dims
+        ('chain', 'draw')
+        """
+        return self._collect_draws("Monte Carlo", "truth", self.truth)
 
     def plot(self) -> Figure:
         """Draw a histogram of the estimates of each unknown with the truth, as a matplotlib Figure.

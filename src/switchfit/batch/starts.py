@@ -19,7 +19,7 @@ from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
 from switchfit.batch.intervals import trace_chunk
 from switchfit.batch.program import Evaluations, Varying, chunk_size, error_message, fit_chunk
-from switchfit.batch.quality import count_samples, describe_ends, measure_variation
+from switchfit.batch.quality import count_samples, describe_ends
 from switchfit.batch.verdict import judge_starts
 from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
@@ -27,6 +27,7 @@ from switchfit.estimation.estimator import Estimate, check_settings, fit_locally
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.random_starts import MOST_DRAWN, draw_starts
 from switchfit.fit.solution import constraints_of
+from switchfit.fit.variation import measure_variation
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem

@@ -1,20 +1,20 @@
-"""Choosing the mesh: how short the steps have to be, from one adaptive solve at a given theta.
+"""Choose the mesh from an adaptive solve at one or more thetas.
 
-The adaptive solve has the same order as the fixed steps that follow. It also integrates the running costs, so that
-they are resolved as well. Its steps are turned into a refinement of the intervals between the nodes that have to be
-there anyway; the mesh then stays as it is while theta moves.
+The adaptive solve has the same order as the fixed steps that follow. It integrates the running costs too, so that the
+mesh resolves them. Its step sizes determine into how many cells each interval between two required nodes is divided;
+the mesh is then frozen while theta moves.
 
-Explicit solves run in machine code if there is any: a hundred steps cost less than a tenth of a millisecond there, ten
-milliseconds in Python. The control of the step size is the same (`switchfit.discretization.step_size`). Python solves
-what has no machine code, and says what is wrong where a solve fails. SciPy's Radau solves stiff modes; where the
-problem leaves the choice, the explicit solve is watched (`switchfit.engine.stiffness`).
+Explicit solves run in machine code if possible: a hundred steps take less than a tenth of a millisecond there, and ten
+milliseconds in Python. Both use the step size control of `switchfit.discretization.step_size`. Python solves models
+without machine code, and repeats a solve that failed, for its error message. SciPy's Radau solves stiff modes; with
+``solver="auto"``, a `Watch` decides which modes are stiff (`switchfit.engine.stiffness`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple, TypeVar
@@ -53,16 +53,16 @@ from switchfit.runtime.errors import NotIntegrableError
 T = TypeVar("T")
 
 MAX_STEPS = 200_000
-"""Adaptive steps in one mode before it is called stiff."""
+"""Largest number of adaptive steps in one mode; a mode that needs more cannot be integrated."""
 
 PACE = 1000
-"""Steps over which the pace of a mode is measured; a stiff one is thus refused before it has cost much."""
+"""Steps over which the pace of a mode is measured, so that a stiff mode is refused early."""
 
 
 def list_fixed_nodes(experiment: Experiment) -> FloatArray:
     """Return the times that must be nodes: t0, tf, and samples and knots of signals inside the horizon.
 
-    Of a free tf it is the upper bound that is a node.
+    If tf is free, its upper bound is the last node.
     """
     t0, tf = experiment.t0, experiment.end
     times = [np.array([t0, tf])]
@@ -90,17 +90,15 @@ def refine_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1.
 
 
 def refine_if_unstable(problem: Problem, e: int, mesh: Mesh, *thetas: FloatArray) -> Mesh | None:
-    """Return a mesh with implicit steps that meets the tolerances at each of the thetas, if those of `mesh` fail there.
+    """Return a mesh with implicit steps that meets the tolerances at each theta, if explicit ones are unstable.
 
-    That is asked where a fit on it has failed, at the last theta, where it ended. None if the steps of the mesh are
-    implicit, or explicit because the problem insists on them; if they are stable; or if implicit ones are no better.
+    It is called after a fit on `mesh` has failed, at the last of the thetas. None if the steps of the mesh are implicit
+    already, or the problem sets the solver; if they are stable; or if implicit steps are hardly fewer.
     """
     if problem.solver != "auto" or mesh.stiffness is not None:
         return None
-    coarse, watch = (
-        Mesh.from_times(list_fixed_nodes(problem.experiments[e])),
-        Watch(between=STEPS_BETWEEN_AFTER_FAILURE),
-    )
+    coarse = Mesh.from_times(list_fixed_nodes(problem.experiments[e]))
+    watch = Watch(between=STEPS_BETWEEN_AFTER_FAILURE)
     with suppress(NotIntegrableError):
         _adaptive_steps(problem, problem.structures[e], e, thetas[-1], coarse, watch)
     unstable = watch.find_unstable(mesh)
@@ -121,10 +119,10 @@ def _build_mesh(coarse: Mesh, solutions: list[FloatArray], stiffness: Stiffness 
 def _solve_at(
     problem: Problem, e: int, thetas: Sequence[FloatArray], coarse: Mesh
 ) -> tuple[list[FloatArray], Stiffness | None]:
-    """Return the accepted times of an adaptive solve at each theta, by the method that the problem asks for.
+    """Return the accepted times of an adaptive solve at each theta, by the problem's solver.
 
-    Where it leaves the choice and explicit steps are hopeless at one of the thetas, all are solved by implicit steps;
-    with the reason.
+    With ``solver="auto"``, if a mode is stiff at one of the thetas, all are solved by implicit steps, and the reason is
+    returned too.
     """
     structure = problem.structures[e]
     if problem.solver != "auto":
@@ -208,12 +206,85 @@ def _grade_nodes(ends: FloatArray, steps: _Steps, pieces: int) -> FloatArray:
     return np.interp(np.linspace(0.0, 1.0, pieces + 1)[1:-1], density, times)
 
 
+@dataclass(frozen=True)
+class _Stretch:
+    """A part of the horizon without a transition or a knot of the inputs, to be solved adaptively.
+
+    Attributes
+    ----------
+    problem : Problem
+    structure : Structure
+        Its solver says whether steps are explicit or implicit.
+    mode : int
+        Index of the active mode.
+    start, end : float
+    x : (n,), state at the start
+    p : (M,), parameters of the experiment
+    unit : str
+        Suffix of times in messages.
+    watch : Watch or None
+        Counts the steps.
+    """
+
+    problem: Problem
+    structure: Structure
+    mode: int
+    start: float
+    end: float
+    x: FloatArray
+    p: FloatArray
+    unit: str = ""
+    watch: Watch | None = None
+
+    @property
+    def name(self) -> str:
+        """The name of the mode."""
+        return self.structure.mode_names[self.mode]
+
+    @property
+    def is_explicit(self) -> bool:
+        """Whether it is solved by explicit steps."""
+        return self.structure.solver == "explicit"
+
+    @property
+    def smallest_state(self) -> float:
+        """The size of a state at which the absolute and the relative tolerance count the same."""
+        return self.problem.atol / self.problem.rtol
+
+    def report_stuck(self, t: float, y: FloatArray, reason: str | None) -> NotIntegrableError:
+        """Return the error of a solve that cannot go on beyond t, where y (n + 1,) is the state and the cost."""
+        remedy = "use solver='stiff', or a better guess" if self.is_explicit else "use a better guess"
+        if self.problem.solver == "auto":
+            remedy = "use a better guess, or solver='stiff' if the mode is stiff"
+        return NotIntegrableError(
+            f"mode {self.name!r} cannot be integrated at the guess beyond t = {t:.6g}{self.unit}, where x = "
+            f"{y[:-1].tolist()} ({reason}): {remedy}."
+        )
+
+    def report_too_many_steps(self, accepted: Sequence[float] | FloatArray, y: FloatArray) -> NotIntegrableError:
+        """Return the error of a solve that needs too many steps, and note it in the watch."""
+        if self.watch is not None:
+            self.watch.give_up(self.name, _project_steps(accepted, self.end))
+        return self.report_stuck(accepted[-1], y, f"it needs more than {MAX_STEPS} steps")
+
+    def report_infinite_slope(self, t: float, y: FloatArray, value: FloatArray) -> NotIntegrableError:
+        """Return the error of a slope or a running cost, the last of the values (n + 1,), that is not finite."""
+        slope, density = value[:-1].tolist(), value[-1]
+        what = f"mode {self.name!r} returned {slope}"
+        if np.isfinite(slope).all():
+            what = f"a running cost in mode {self.name!r} returned {density}"
+        return NotIntegrableError(
+            f"{what} at t = {t:.6g}{self.unit}, x = {y[:-1].tolist()}: the guess leads to where the model is not "
+            "defined or grows without bound; use a better guess, or change the model there."
+        )
+
+
 def _adaptive_steps(
     problem: Problem, structure: Structure, e: int, theta: FloatArray, coarse: Mesh, watch: Watch | None = None
 ) -> FloatArray:
     """Return the accepted times of the adaptive solver from t0 to tf, strictly increasing.
 
-    The structure says by which method; a watch counts the steps.
+    The solver of the structure determines the method; a watch counts the steps.
     """
     experiment = problem.experiments[e]
     whole = build_arguments(problem, e, coarse)
@@ -224,37 +295,32 @@ def _adaptive_steps(
     inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
     steps = [np.array([experiment.t0])]
     native = native_experiment(structure, whole, coarse.times, order=Order.COST)
-    x = np.asarray(
-        _call_jax(initial_state, arguments, p, structure=structure.functions)
-        if native is None
-        else native.initial_state(p)
-    )
+    if native is None:
+        x = np.asarray(_call_jax(initial_state, arguments, p, structure=structure.functions))
+    else:
+        x = native.initial_state(p)
     if not np.isfinite(x).all():
-        raise _not_finite(f"initial_state at p = {_round_parameters(problem.split(theta)[1])}", x)
+        raise _report_infinite(f"initial_state at p = {_round_parameters(problem.split(theta)[1])}", x)
     for i, mode in enumerate(structure.mode_of_segment):
         if i > 0 and structure.reset_maps[i - 1] is not None:
             names = tuple(experiment.mode_sequence[i - 1 : i + 1])
             if native is None:
-                value = _call_jax(after_reset, arguments, ends[i], x, p, structure=structure, i=i - 1)
+                after = np.asarray(_call_jax(after_reset, arguments, ends[i], x, p, structure=structure, i=i - 1))
             else:
-                value = native.after_reset(i - 1, ends[i], x, p)
-            if not np.isfinite(value).all():
-                before = f"t = {ends[i]:.6g}{unit}, x = {x.tolist()}"
-                raise _not_finite(f"reset map {names} at {before}", np.asarray(value))
-            x = np.asarray(value)
+                after = np.asarray(native.after_reset(i - 1, ends[i], x, p))
+            if not np.isfinite(after).all():
+                raise _report_infinite(f"reset map {names} at t = {ends[i]:.6g}{unit}, x = {x.tolist()}", after)
+            x = after
         knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
         stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
         for start, end in pairwise(stops.tolist()):
             if end > start:
-                found = None
-                if native is not None:
-                    found = _solve_natively(problem, native, mode, start, end, x, p, unit, watch)
+                stretch = _Stretch(problem, structure, mode, start, end, x, p, unit, watch)
+                found = None if native is None else _solve_natively(stretch, native)
                 if found is None:
-                    found = _call_jax(
-                        _solve,
-                        *(problem, structure, arguments, signals, coarse, mode, start, end, x, p, unit),
-                        watch if native is None else None,  # machine code has counted its steps
-                    )
+                    if native is not None:
+                        stretch = replace(stretch, watch=None)  # machine code has counted its steps
+                    found = _call_jax(_solve_in_python, stretch, arguments, signals, coarse)
                 accepted, x = found
                 steps.append(accepted)
     return np.concatenate(steps)
@@ -266,96 +332,40 @@ def _call_jax(function: Callable[..., T], *given: Any, **settings: Any) -> T:
         return function(*given, **settings)
 
 
-def _solve(
-    problem: Problem,
-    structure: Structure,
-    arguments: Arguments,
-    signals: FloatArray,
-    coarse: Mesh,
-    mode: int,
-    start: float,
-    end: float,
-    x: FloatArray,
-    p: FloatArray,
-    unit: str = "",
-    watch: Watch | None = None,
+def _solve_in_python(
+    stretch: _Stretch, arguments: Arguments, signals: FloatArray, coarse: Mesh
 ) -> tuple[FloatArray, FloatArray]:
-    """Solve one mode adaptively; return the accepted times after `start` and the final state."""
-    name, explicit = structure.mode_names[mode], structure.solver == "explicit"
-    fields = (
-        structure.functions if explicit else replace(structure.functions, solver="explicit")
-    )  # one program for both
-    function = partial(_field_and_density, structure=fields, mode=mode)
-    last = len(coarse.times) - 2
+    """Return the accepted times after the start of a stretch, and the state at its end."""
+    problem, watch, name = stretch.problem, stretch.watch, stretch.name
+    functions = replace(stretch.structure.functions, solver="explicit")  # one program for both methods
+    function = partial(_field_and_density, structure=functions, mode=stretch.mode)
+    first, last = np.nextafter(stretch.start, stretch.end), np.nextafter(stretch.end, stretch.start)
 
     def right_hand_side(t: float, y: FloatArray) -> FloatArray:
-        inside = min(max(t, np.nextafter(start, end)), np.nextafter(end, start))
-        cell = min(int(np.searchsorted(coarse.times, inside, side="right")) - 1, last)
-        value = np.asarray(function(arguments, coarse.nodes[cell], signals[cell], t, y[:-1], p))
+        inside = min(max(t, first), last)
+        cell = min(int(np.searchsorted(coarse.times, inside, side="right")) - 1, len(coarse.times) - 2)
+        value = np.asarray(function(arguments, coarse.nodes[cell], signals[cell], t, y[:-1], stretch.p))
         if not np.isfinite(value).all():
-            slope, density = value[:-1].tolist(), value[-1]
-            finite = np.isfinite(slope).all()
-            what = (
-                f"a running cost in mode {name!r} returned {density}" if finite else f"mode {name!r} returned {slope}"
-            )
-            raise NotIntegrableError(
-                f"{what} at t = {t:.6g}{unit}, x = {y[:-1].tolist()}: the guess leads to where the model is not "
-                "defined or grows without bound; use a better guess, or change the model there."
-            )
+            raise stretch.report_infinite_slope(t, y, value)
         return value
 
-    method = ExplicitSolver if explicit else scipy.integrate.Radau
-    with np.errstate(all="ignore"):  # a slope of 1e300 is refused in words
-        solver = method(right_hand_side, start, np.append(x, 0.0), end, rtol=problem.rtol, atol=problem.atol)
-    accepted = [start]
+    method = ExplicitSolver if stretch.is_explicit else scipy.integrate.Radau
+    with np.errstate(all="ignore"):  # a slope of 1e300 is refused with a message
+        y = np.append(stretch.x, 0.0)
+        solver = method(right_hand_side, stretch.start, y, stretch.end, rtol=problem.rtol, atol=problem.atol)
+    accepted = [stretch.start]
     while solver.status == "running":
-        with np.errstate(
-            over="ignore", invalid="ignore", divide="ignore"
-        ):  # a state that overflows is refused in words
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a state that overflows is refused below
             message = solver.step()
         if solver.status == "failed":
-            raise _stuck(problem, name, solver.t, solver.y, message, unit, explicit)
-        if _has_too_many_steps(accepted, end):
-            raise _too_slow(problem, name, accepted, solver.y, end, unit, watch, explicit)
+            raise stretch.report_stuck(solver.t, solver.y, message)
+        if _has_too_many_steps(accepted, stretch.end):
+            raise stretch.report_too_many_steps(accepted, solver.y)
         accepted.append(float(solver.t))
-        if watch is not None and watch.add(name, 1) and explicit:
-            later = partial(_call_jax, right_hand_side)
-            watch.look(name, accepted[-1] - accepted[-2], later, accepted[-1], solver.y, _scale_of(problem))
+        if watch is not None and watch.add(name, 1) and stretch.is_explicit:
+            slope = partial(_call_jax, right_hand_side)  # it is called later, outside these contexts
+            watch.look(name, accepted[-1] - accepted[-2], slope, accepted[-1], solver.y, stretch.smallest_state)
     return np.array(accepted[1:]), np.asarray(solver.y[:-1])
-
-
-def _scale_of(problem: Problem) -> float:
-    """Return the size of a state at which the absolute and the relative tolerance count the same."""
-    return problem.atol / problem.rtol
-
-
-def _stuck(
-    problem: Problem, name: str, t: float, y: FloatArray, reason: str | None, unit: str, explicit: bool
-) -> NotIntegrableError:
-    """Return the error of a solve that cannot go on in a mode."""
-    remedy = "use solver='stiff', or a better guess" if explicit else "use a better guess"
-    if problem.solver == "auto":
-        remedy = "use a better guess, or solver='stiff' if the mode is stiff"
-    return NotIntegrableError(
-        f"mode {name!r} cannot be integrated at the guess beyond t = {t:.6g}{unit}, where x = "
-        f"{y[:-1].tolist()} ({reason}): {remedy}."
-    )
-
-
-def _too_slow(
-    problem: Problem,
-    name: str,
-    accepted: Sequence[float] | FloatArray,
-    y: FloatArray,
-    end: float,
-    unit: str,
-    watch: Watch | None,
-    explicit: bool,
-) -> NotIntegrableError:
-    """Return the error of a solve that needs too many steps, and note it in the watch."""
-    if watch is not None:
-        watch.give_up(name, _project_steps(accepted, end))
-    return _stuck(problem, name, accepted[-1], y, f"it needs more than {MAX_STEPS} steps", unit, explicit)
 
 
 class ExplicitSolver(scipy.integrate.OdeSolver):
@@ -400,38 +410,30 @@ STEPS_AT_ONCE = 256
 """Steps that the compiled solver accepts in one call, at most."""
 
 
-def _solve_natively(
-    problem: Problem,
-    native: NativeExperiment,
-    mode: int,
-    start: float,
-    end: float,
-    x: FloatArray,
-    p: FloatArray,
-    unit: str = "",
-    watch: Watch | None = None,
-) -> tuple[FloatArray, FloatArray] | None:
-    """Do what `_solve` does for explicit steps, in machine code; None if it fails: `_solve` then says why."""
-    y, at = np.append(x, 0.0), Adaptive()
+def _solve_natively(stretch: _Stretch, native: NativeExperiment) -> tuple[FloatArray, FloatArray] | None:
+    """Do what `_solve_in_python` does, in machine code; None if it fails: `_solve_in_python` then gives the reason."""
+    problem, watch, name = stretch.problem, stretch.watch, stretch.name
+    start, end = stretch.start, stretch.end
+    y, at = np.append(stretch.x, 0.0), Adaptive()
     state = np.zeros(at.size)
     state[at.t], state[at.end], state[at.rtol], state[at.atol] = start, end, problem.rtol, problem.atol
     state[at.low], state[at.high] = np.nextafter(start, end), np.nextafter(end, start)
 
     def slope(t: float, y: FloatArray) -> FloatArray:
-        return native.slope(mode, t, y, p)
+        return native.slope(stretch.mode, t, y, stretch.p)
 
     state[at.step] = first_step(slope, start, y, slope(start, y), end, Tolerances(problem.rtol, problem.atol))
-    accepted, name = np.array([start]), native.structure.mode_names[mode]
+    accepted = np.array([start])
     while state[at.t] < end and not state[at.stuck]:
         if _has_too_many_steps(accepted, end):
             if watch is None or not np.isfinite(y).all():
                 return None
-            raise _too_slow(problem, name, accepted, y, end, unit, watch, explicit=True)
+            raise stretch.report_too_many_steps(accepted, y)
         at_once = STEPS_AT_ONCE if watch is None else min(STEPS_AT_ONCE, watch.between)
-        more = native.adaptive_steps(mode, state, y, p, at_once)
+        more = native.adaptive_steps(stretch.mode, state, y, stretch.p, at_once)
         accepted = np.append(accepted, more)
         if watch is not None and watch.add(name, len(more)) and len(more):
-            watch.look(name, accepted[-1] - accepted[-2], slope, accepted[-1], y, _scale_of(problem))
+            watch.look(name, accepted[-1] - accepted[-2], slope, accepted[-1], y, stretch.smallest_state)
     return None if state[at.t] < end or not np.isfinite(y).all() else (accepted[1:], y[:-1])
 
 
@@ -445,7 +447,7 @@ def _project_steps(accepted: Sequence[float] | FloatArray, end: float) -> float:
     return len(accepted) + PACE * (end - accepted[-1]) / (accepted[-1] - accepted[-PACE - 1])
 
 
-def _not_finite(what: str, state: FloatArray) -> NotIntegrableError:
+def _report_infinite(what: str, state: FloatArray) -> NotIntegrableError:
     return NotIntegrableError(f"{what} returned {state.tolist()}, which is not finite: use a better guess.")
 
 

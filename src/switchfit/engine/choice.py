@@ -27,26 +27,15 @@ def engine_of(problem: Problem, e: int, arguments: Arguments, mesh: Mesh) -> Exp
         If ``engine="native"`` and the experiment cannot be compiled; the message gives the reason.
     """
     structure = get_structure_on(problem, e, mesh)
-    by_jax = JaxEngine(structure, arguments, mesh)
-    if problem.engine == "jax":
-        if mesh.stiffness is not None:
-            by_jax.reason += f"; {mesh.stiffness}"
-        return by_jax
-    return _choose_native(by_jax, structure, arguments, mesh, insist=problem.engine == "native")
-
-
-def _choose_native(
-    by_jax: JaxEngine, structure: Structure, arguments: Arguments, mesh: Mesh, *, insist: bool
-) -> ExperimentEngine:
-    reason = reason_for_jax(structure, arguments, Order.HESSIAN)
+    is_jax_set = problem.engine == "jax"
+    reason = "engine='jax' is set" if is_jax_set else reason_for_jax(structure, arguments, Order.HESSIAN)
     if reason is None:
-        return NativeEngine(structure, arguments, mesh, by_jax)
+        return NativeEngine(structure, arguments, mesh, JaxEngine(structure, arguments, mesh))
     if mesh.stiffness is not None:
-        reason = f"{mesh.stiffness}, which has no machine code"
-    if insist:
+        reason = f"{reason}; {mesh.stiffness}" if is_jax_set else f"{mesh.stiffness}, which has no machine code"
+    if problem.engine == "native":
         raise ValueError(f"engine='native' requires machine code, but {reason}. Leave engine out to evaluate with JAX.")
-    by_jax.reason = reason
-    return by_jax
+    return JaxEngine(structure, arguments, mesh, reason)
 
 
 def summarize(engines: Sequence[ExperimentEngine], names: Sequence[str]) -> Engine:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, Protocol
+from dataclasses import dataclass, field, replace
+from typing import Generic, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
+from switchfit.discretization.mesh import Stiffness
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 
@@ -42,29 +43,49 @@ class Engine:
         return "Evaluated in machine code." if self.reason is None else f"Evaluated by JAX: {self.reason}."
 
 
-class Derivatives(NamedTuple):
-    """J, its gradient (D,) and its Hessian (D, D), which is NaN if it was not requested."""
-
-    cost: float
-    gradient: FloatArray
-    hessian: FloatArray
+NO_CONSTRAINTS: FloatArray = np.zeros(0)
+NO_JACOBIAN: FloatArray = np.zeros((0, 0))
+H_co = TypeVar("H_co", covariant=True)
 
 
-class Constrained(NamedTuple):
-    """Cost and constraints.
+@dataclass(frozen=True, eq=False)
+class Evaluation(Generic[H_co]):
+    """Cost, constraints and their derivatives at one theta, of an experiment or of a whole problem.
 
     Attributes
     ----------
     cost : J
-    slope, hessian : (D,), (D, D), of ``J + weights . c``, the weights being ``multipliers + penalty c``
-    constraints, jacobian : c (m,) and its derivative (m, D)
+    gradient : (d,), J's derivative in theta
+    hessian : (d, d)
+        Of J; where constraints were evaluated with multipliers, of ``J + multipliers . constraints``. Inside the
+        optimizer, of many runs an arrow-shaped matrix.
+    constraints, jacobian : (m,), (m, d)
+        Guards and terminal constraints, in the order of ``problem.constraint_names``, and their derivatives in theta.
+        Empty if the problem has none.
+    stiffness : tuple of Stiffness
+        From `evaluate`: of each experiment in which ``solver="auto"`` chose implicit steps, why; empty if in none.
+
+    See Also
+    --------
+    evaluate, GuardedEvaluation
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> evaluation = sf.evaluate(problem)
+    >>> evaluation.gradient.shape, evaluation.hessian.shape
+    ((2,), (2, 2))
     """
 
     cost: float
-    slope: FloatArray
-    hessian: FloatArray
-    constraints: FloatArray
-    jacobian: FloatArray
+    gradient: FloatArray
+    hessian: H_co
+    constraints: FloatArray = field(default_factory=lambda: NO_CONSTRAINTS)
+    jacobian: FloatArray = field(default_factory=lambda: NO_JACOBIAN)
+    stiffness: tuple[Stiffness, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,14 +203,14 @@ class ExperimentEngine(Protocol):
         """Return J alone."""
         ...
 
-    def derivatives(self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix) -> Derivatives:
+    def derivatives(self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix) -> Evaluation[FloatArray]:
         """Return J and its derivatives; if a transition is at a node, those on its `side`, +1 or -1."""
         ...
 
     def constrained(
-        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
-    ) -> Constrained:
-        """Return J and its constraints; the multipliers and penalties are (m,)."""
+        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
+    ) -> Evaluation[FloatArray]:
+        """Return J and the constraints, with the Hessian of ``J + multipliers . c``; the multipliers are (m,)."""
         ...
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:

@@ -1,17 +1,17 @@
-"""Whether explicit steps are hopeless: ``Problem(solver="auto")`` takes implicit ones then.
+"""Detect stiff modes, for which ``Problem(solver="auto")`` takes implicit steps.
 
 The step of an explicit method is limited by accuracy, or by stability: ``|lambda| h`` has to stay inside the region of
 stability, which reaches to about 3.3 for the pair of Dormand and Prince, for every eigenvalue lambda of the Jacobian of
-the vector field, whether or not its component is there any more. A mode in which stability limits the step is stiff
-(Hairer and Wanner II, section IV.2). Explicit steps are then many, and have no slack: at a theta with a larger
-eigenvalue the same mesh is unstable.
+the vector field, even if its component has decayed. A mode in which stability limits the step is stiff (Hairer and
+Wanner II, section IV.2). Explicit steps are then many, and at the limit: at a theta with a larger eigenvalue the same
+mesh is unstable.
 
-The explicit solve is watched: of a mode that took many steps the eigenvalues are computed at every `STEPS_BETWEEN`
-of them. Where they say that stability limits a good part of the steps, the implicit method solves the experiment too,
-and is taken if it needs far fewer.
+A `Watch` counts the steps of the explicit solve. For a mode with many steps, the eigenvalues are computed at every
+`STEPS_BETWEEN` of them. If stability limits more than a quarter of the steps, the implicit method solves the experiment
+too, and is used if it needs far fewer steps.
 
-A fit may come to a theta where its modes are stiff, and the explicit steps of its mesh unstable: no step to where it
-should go is possible then. Where it has failed, the eigenvalues there are compared with the mesh.
+A fit may reach a theta where a mode is stiff and the explicit steps of its mesh are unstable: it then cannot go on.
+After such a failure, the eigenvalues at that theta are compared with the mesh.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from switchfit.runtime.errors import NotIntegrableError
 log = logging.getLogger("switchfit")
 
 STEPS_BETWEEN = 250
-"""Accepted steps in a mode between two looks at its eigenvalues."""
+"""Accepted steps in a mode between two states at which its eigenvalues are computed."""
 
 STEPS_BETWEEN_AFTER_FAILURE = 64
-"""The same where a fit has failed, and it is asked whether its mesh is to blame."""
+"""The same after a fit has failed, to find out whether its mesh is unstable."""
 
 FEW_STEPS = 1000
 """A mode with fewer steps is not called stiff, and its eigenvalues are not computed."""
@@ -45,12 +45,12 @@ damping ratio is above 0.3, to 2.1 for one of 0.02. Accuracy limits it to less: 
 oscillation."""
 
 FEWER = 5
-"""Times fewer steps that implicit ones have to be. An implicit step takes some hundred times as long as an explicit one
+"""Factor by which implicit steps must be fewer. An implicit step takes some hundred times as long as an explicit one
 in machine code, but explicit steps that stability limits fail as soon as theta moves (Van der Pol's oscillator with
 mu = 100 has seven times fewer; explicit steps make J NaN at the guess)."""
 
 FEWER_AFTER_FAILURE = 2
-"""The same where explicit steps have failed."""
+"""The same after explicit steps have failed."""
 
 
 class _Look(NamedTuple):
@@ -74,7 +74,7 @@ class _Look(NamedTuple):
 
 @dataclass
 class _ModeSteps:
-    """Accepted steps in one mode, by now and at the last look, and what a solve that was given up would have taken."""
+    """Accepted steps in one mode, so far and at the last look, and the projected total of a solve that was given up."""
 
     count: int = 0
     looked: int = 0
@@ -94,7 +94,7 @@ class _ModeSteps:
 
     @property
     def is_stiff(self) -> bool:
-        """Whether there are many steps, and stability limits a good part of them."""
+        """Whether there are many steps, and stability limits more than a quarter of them."""
         return self.total >= FEW_STEPS and 4 * len(self.limited) > len(self.looks)
 
     @property
@@ -104,7 +104,7 @@ class _ModeSteps:
 
 
 class Watch:
-    """Counts the accepted steps of one solve, mode by mode; of an explicit one with a look at the eigenvalues.
+    """Counts the accepted steps of one solve, mode by mode, and keeps the states at which to compute eigenvalues.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ class Watch:
         y: FloatArray,
         smallest: float,
     ) -> None:
-        """Note where the eigenvalues of a mode can be computed, if it comes to that.
+        """Keep a state of a mode, for its eigenvalues; they are computed only if the mode takes many steps.
 
         Parameters
         ----------
@@ -176,16 +176,16 @@ class Watch:
         slope : callable
             ``slope(t, y) -> (n + 1,)``: the vector field, and the running cost, which is left out.
         t, y : float, (n + 1,)
-            Where it ended.
+            The end of that step.
         smallest : float
-            A state below this size counts as of this size.
+            Smallest size of a state for the steps of the differences.
         """
         mode = self.modes[name]
         mode.looked = mode.count
         mode.looks.append(_Look(step, slope, t, y.copy(), smallest))
 
     def give_up(self, name: str, steps: float) -> None:
-        """Note that the solve of a mode was given up, and how many steps it would take at its pace."""
+        """Record that the solve of a mode was given up, and the steps that it would have taken at its pace."""
         self.modes[name].projected = steps
 
 
@@ -215,7 +215,7 @@ def _largest_decay(jacobian: FloatArray) -> float:
 
 
 def report_stiffness(found: tuple[str, float], explicit: Watch, implicit: Watch) -> Stiffness:
-    """Return why implicit steps are the better choice, and say it in the log; `found` is a mode and ``|lambda| h``."""
+    """Return why implicit steps are the better choice, and log it; `found` is the stiff mode and ``|lambda| h``."""
     name, stability = found
     stiffness = Stiffness(name, explicit.modes[name].total, implicit.modes[name].total, stability)
     text = str(stiffness)

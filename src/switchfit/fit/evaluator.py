@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Literal
 
@@ -15,7 +15,7 @@ from switchfit.discretization.mesh import Mesh, Stiffness, get_structure_on, pad
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import engine_of, summarize
 from switchfit.engine.jax.engine import JaxEngine
-from switchfit.engine.protocol import Derivatives, Engine, Matrix, Simulation
+from switchfit.engine.protocol import Engine, Evaluation, Matrix, Simulation
 from switchfit.optimize.arrow import Arrow, ArrowLayout
 from switchfit.paper_adjoint import evaluate_paper
 from switchfit.problem.data import FloatArray
@@ -28,70 +28,6 @@ from switchfit.runtime.cache import use_compilation_cache
 
 Method = Literal["auto", "forward", "discrete-adjoint", "adjoint", "autodiff"]
 METHODS = ("auto", "forward", "discrete-adjoint", "adjoint", "autodiff")
-
-
-@dataclass(frozen=True, eq=False)
-class Evaluation:
-    """Cost and derivatives at one theta.
-
-    Attributes
-    ----------
-    cost : J
-    gradient : (d,), J's derivative in theta
-    hessian : (d, d)
-    stiffness : tuple of Stiffness
-        From `evaluate`: of each experiment in which ``solver="auto"`` chose implicit steps, why; empty if in none.
-
-    See Also
-    --------
-    evaluate, GuardedEvaluation
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
-    >>> problem = heater_problem()
-
-    >>> evaluation = sf.evaluate(problem)
-    >>> evaluation.gradient.shape, evaluation.hessian.shape
-    ((2,), (2, 2))
-    """
-
-    cost: float
-    gradient: FloatArray
-    hessian: FloatArray
-    stiffness: tuple[Stiffness, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class ArrowEvaluation:
-    """Cost and derivatives of many runs: like `Evaluation`, with an arrow-shaped Hessian."""
-
-    cost: float
-    gradient: FloatArray
-    hessian: Arrow
-
-
-@dataclass(frozen=True, eq=False)
-class ConstrainedEvaluation:
-    """Cost and constraints at one theta.
-
-    Attributes
-    ----------
-    cost : J
-    gradient : (d,), J's derivative in theta
-    value, slope : the augmented Lagrangian and its derivative (d,)
-    hessian : (d, d), of the augmented Lagrangian
-    constraints, jacobian : c (m,) and its derivative (m, d)
-    """
-
-    cost: float
-    gradient: FloatArray
-    value: float
-    slope: FloatArray
-    hessian: FloatArray
-    constraints: FloatArray
-    jacobian: FloatArray
 
 
 class Evaluator:
@@ -134,7 +70,7 @@ class Evaluator:
 
     def __call__(
         self, theta: FloatArray, side: int = 1, method: Method = "auto", matrix: Matrix = "exact"
-    ) -> Evaluation:
+    ) -> Evaluation[FloatArray]:
         """Return the cost, gradient and Hessian; for a transition time on a node, the derivatives on its `side`.
 
         `matrix` selects the Hessian, the Gauss-Newton matrix in its place, or neither (NaN).
@@ -142,67 +78,62 @@ class Evaluator:
         d = len(theta)
         results = self._evaluate_experiments(theta, side, method, matrix)
         if self.problem.one_to_one:
-            total, gradient, hessian = float(results[0][0]), results[0][1], results[0][2]
+            whole = results[0]
         else:
-            total, gradient, hessian = 0.0, np.zeros(d), np.zeros((d, d))
-            for (J, g, H), (own, mine) in zip(results, self.problem.own_places, strict=True):
-                total += float(J)
+            cost, gradient, hessian = 0.0, np.zeros(d), np.zeros((d, d))
+            for one, (own, mine) in zip(results, self.problem.own_places, strict=True):
+                cost += one.cost
                 # Two names of the model may refer to one parameter: its index then occurs twice, and both count.
-                np.add.at(gradient, mine, g[own])
-                np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
-        if self._priors is not None:
-            J, g, h = self._priors.evaluate(theta, gauss_newton=matrix == "gauss-newton")
-            total, gradient, hessian = total + float(J), gradient + g, hessian + np.diag(h)
-        return Evaluation(total, gradient, hessian)
+                np.add.at(gradient, mine, one.gradient[own])
+                np.add.at(hessian, (mine[:, None], mine), one.hessian[own[:, None], own])
+            whole = Evaluation(cost, gradient, hessian)
+        return self._add_priors(whole, theta, gauss_newton=matrix == "gauss-newton")
 
-    def constrained(
-        self, theta: FloatArray, side: int = 1, multipliers: ArrayLike = 0.0, penalty: ArrayLike = 0.0
-    ) -> ConstrainedEvaluation:
-        """Return cost, constraints and the augmented Lagrangian with multipliers and penalties, (m,) or ()."""
+    def constrained(self, theta: FloatArray, side: int = 1, multipliers: ArrayLike = 0.0) -> Evaluation[FloatArray]:
+        """Return cost and constraints, with the Hessian of the Lagrangian for the multipliers, (m,) or ()."""
         d, count = len(theta), len(self.problem.constraint_names)
-        multipliers, penalty = np.full(count, multipliers, dtype=float), np.full(count, penalty, dtype=float)
-        cost, value, gradient, slope, hessian = 0.0, 0.0, np.zeros(d), np.zeros(d), np.zeros((d, d))
-        jacobian, c = np.zeros((count, d)), np.zeros(count)
-        last = 0
+        multipliers = np.full(count, multipliers, dtype=float)
+        if self.problem.one_to_one:
+            at = self.problem.vectors(theta, 0)
+            return self._add_priors(self.engines[0].constrained(*at, side, multipliers), theta)
+        cost, gradient, hessian = 0.0, np.zeros(d), np.zeros((d, d))
+        c, jacobian, last = np.zeros(count), np.zeros((count, d)), 0
         for e, (own, mine) in enumerate(self.problem.own_places):
             here = slice(last, last := last + self.problem.constraint_counts[e])
-            at = self.problem.vectors(theta, e)
-            J, L_d, H, c_e, A = self.engines[e].constrained(*at, side, multipliers[here], penalty[here])
-            weights = multipliers[here] + penalty[here] * c_e
-            if penalty.any():
-                H = H + (A.T * penalty[here]) @ A
-            cost += J
-            value += J + float(multipliers[here] @ c_e + 0.5 * penalty[here] @ c_e**2)
-            if self.problem.one_to_one:
-                gradient, slope, hessian, jacobian, c = L_d - weights @ A, L_d, H, A, c_e
-                break
-            np.add.at(gradient, mine, (L_d - weights @ A)[own])
-            np.add.at(slope, mine, L_d[own])
-            np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
-            np.add.at(jacobian[here].T, mine, A[:, own].T)
-            c[here] = c_e
-        if self._priors is not None:
-            J, g, h = self._priors.evaluate(theta)
-            cost, gradient = cost + float(J), gradient + g
-            value, slope, hessian = value + float(J), slope + g, hessian + np.diag(h)
-        return ConstrainedEvaluation(cost, gradient, value, slope, hessian, c, jacobian)
+            one = self.engines[e].constrained(*self.problem.vectors(theta, e), side, multipliers[here])
+            cost += one.cost
+            np.add.at(gradient, mine, one.gradient[own])
+            np.add.at(hessian, (mine[:, None], mine), one.hessian[own[:, None], own])
+            np.add.at(jacobian[here].T, mine, one.jacobian[:, own].T)
+            c[here] = one.constraints
+        return self._add_priors(Evaluation(cost, gradient, hessian, c, jacobian), theta)
 
-    def arrow(self, theta: FloatArray, side: int = 1, matrix: Matrix = "exact") -> ArrowEvaluation:
+    def _add_priors(
+        self, found: Evaluation[FloatArray], theta: FloatArray, *, gauss_newton: bool = False
+    ) -> Evaluation[FloatArray]:
+        """Return an evaluation with the priors in cost, gradient and Hessian."""
+        if self._priors is None:
+            return found
+        J, g, h = self._priors.evaluate(theta, gauss_newton=gauss_newton)
+        cost, gradient, hessian = found.cost + float(J), found.gradient + g, found.hessian + np.diag(h)
+        return replace(found, cost=cost, gradient=gradient, hessian=hessian)
+
+    def arrow(self, theta: FloatArray, side: int = 1, matrix: Matrix = "exact") -> Evaluation[Arrow]:
         """Evaluate by the method "auto", in time and memory that are linear in the number of experiments."""
         total, gradient, parts = 0.0, np.zeros(len(theta)), []
         size = self.layout.own.shape[1] + len(self.layout.shared)
         results = self._evaluate_experiments(theta, side, "auto", matrix)
-        for (J, g, H), (own, mine), slots in zip(results, self.problem.own_places, self._slots, strict=True):
-            total += float(J)
-            np.add.at(gradient, mine, g[own])
+        for one, (own, mine), slots in zip(results, self.problem.own_places, self._slots, strict=True):
+            total += one.cost
+            np.add.at(gradient, mine, one.gradient[own])
             part = np.zeros((size, size))
-            np.add.at(part, (slots[:, None], slots), H[own[:, None], own])
+            np.add.at(part, (slots[:, None], slots), one.hessian[own[:, None], own])
             parts.append(part)
         arrow = Arrow.of_runs(self.layout, parts)
         if self._priors is not None:
             J, g, h = self._priors.evaluate(theta, gauss_newton=matrix == "gauss-newton")
             total, gradient, arrow = total + float(J), gradient + g, arrow.plus_diagonal(h)
-        return ArrowEvaluation(total, gradient, arrow)
+        return Evaluation(total, gradient, arrow)
 
     @cached_property
     def layout(self) -> ArrowLayout:
@@ -240,7 +171,7 @@ class Evaluator:
 
     def cost(self, theta: FloatArray) -> float:
         """Return J alone."""
-        costs = [engine.cost(*self.problem.vectors(theta, e)) for e, engine in enumerate(self.engines)]
+        costs = [engine.cost(*at) for engine, at in zip(self.engines, self._vectors(theta), strict=True)]
         return sum(costs, 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0]))
 
     @property
@@ -250,13 +181,18 @@ class Evaluator:
 
     def simulate(self, theta: FloatArray, *, tangents: bool = False) -> list[Simulation]:
         """Simulate all experiments row by row, with derivatives in their own unknowns if `tangents`."""
-        vectors = (self.problem.vectors(theta, e) for e in range(len(self.engines)))
-        return [engine.simulate(*at, tangents=tangents) for engine, at in zip(self.engines, vectors, strict=True)]
+        each = zip(self.engines, self._vectors(theta), strict=True)
+        return [engine.simulate(*at, tangents=tangents) for engine, at in each]
 
-    def _evaluate_experiments(self, theta: FloatArray, side: int, method: Method, matrix: Matrix) -> list[Derivatives]:
+    def _vectors(self, theta: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+        """Return the transition times (N,) and parameters (M,) of each experiment."""
+        return [self.problem.vectors(theta, e) for e in range(len(self.engines))]
+
+    def _evaluate_experiments(
+        self, theta: FloatArray, side: int, method: Method, matrix: Matrix
+    ) -> list[Evaluation[FloatArray]]:
         """Return the cost, gradient and Hessian of each experiment in its own unknowns."""
-        theta = np.asarray(theta, dtype=np.float64)
-        vectors = [self.problem.vectors(theta, e) for e in range(len(self.engines))]
+        vectors = self._vectors(np.asarray(theta, dtype=np.float64))
         if method == "auto":
             return [engine.derivatives(*at, side, matrix) for engine, at in zip(self.engines, vectors, strict=True)]
         given = list(zip(self.structures, self.arguments, self.meshes, vectors, strict=True))
@@ -265,7 +201,7 @@ class Evaluator:
                 raise ValueError("the paper's equations have no TransitionCost: choose another method.")
             with use_float64(), use_compilation_cache():
                 found = [evaluate_paper(a, *at, float(side), structure=s) for s, a, _, at in given]
-            return [Derivatives(float(J), np.array(g), np.array(H)) for J, g, H in found]
+            return [Evaluation(float(J), np.array(g), np.array(H)) for J, g, H in found]
         return [JaxEngine(s, a, mesh).derivatives(*at, side, matrix, method) for s, a, mesh, at in given]
 
     def breakpoints(self) -> list[FloatArray]:
@@ -291,7 +227,7 @@ def evaluator_of(problem: Problem) -> Evaluator:
     return own
 
 
-def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method = "auto") -> Evaluation:
+def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method = "auto") -> Evaluation[FloatArray]:
     """Evaluate the cost, the exact gradient and the exact Hessian of a problem.
 
     Parameters
@@ -309,7 +245,8 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     Returns
     -------
     Evaluation
-        cost, gradient (d,), hessian (d, d).
+        cost, gradient (d,), hessian (d, d); constraints (m,) and jacobian (m, d) if there are guards or terminal
+        constraints.
 
     Raises
     ------
@@ -340,5 +277,9 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     as_instance(problem, "problem", Problem, "an sf.Problem")
     method = as_choice(method, "method", METHODS)
     evaluator = evaluator_of(problem)
-    found = evaluator(problem.check_theta(theta), method=method)
+    at = problem.check_theta(theta)
+    found = evaluator(at, method=method)
+    if problem.constraint_names:
+        held = evaluator.constrained(at)
+        found = replace(found, constraints=held.constraints, jacobian=held.jacobian)
     return replace(found, stiffness=evaluator.stiffness) if evaluator.stiffness else found

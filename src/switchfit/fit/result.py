@@ -497,7 +497,7 @@ UNDETERMINED = 1e-14
 """Eigenvalue of the Hessian, scaled to a diagonal of one, up to which a direction is not determined."""
 
 PART = 1e-6
-"""Component of an unknown in such a direction from which it has no standard error."""
+"""Component of an unknown in such a direction above which the unknown has no standard error."""
 
 
 def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:

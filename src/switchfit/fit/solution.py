@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.engine.protocol import Evaluation
 from switchfit.fit.collapsed import idle_unknowns
-from switchfit.fit.evaluator import ArrowEvaluation, ConstrainedEvaluation, Evaluation, Evaluator
+from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.hidden import refuse_hidden_switches, refuse_jumps
 from switchfit.fit.termination import linear_constraints_of
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
@@ -30,15 +31,6 @@ PERFECT_RESIDUAL = 1e-8
 
 TIME_REACH = 0.01
 """Largest change of a transition time in the first trust-region step, as a part of the horizon."""
-
-
-@dataclass(frozen=True, eq=False)
-class CostAndGradient:
-    """Evaluation without Hessian, for steepest descent."""
-
-    cost: float
-    gradient: FloatArray
-    hessian: None = None
 
 
 def constraints_of(problem: Problem) -> LinearConstraints:
@@ -74,11 +66,11 @@ def minimize_cost(
     identity = unknowns.variables.identity
     seen: list[bool] = []
 
-    def evaluate_theta(theta: Any, side: int) -> Evaluation | ArrowEvaluation | CostAndGradient:
+    def evaluate_theta(theta: Any, side: int) -> Evaluation[FloatArray | Arrow | None]:
         if hessian not in ("none", "descent-first") and by_blocks:
             return evaluator.arrow(theta, side, matrix)
         here = evaluator(theta, side, matrix=matrix)
-        return CostAndGradient(here.cost, here.gradient) if hessian == "none" else here
+        return Evaluation(here.cost, here.gradient, None) if hessian == "none" else here
 
     def evaluate(z: Any, side: int, multipliers: FloatArray | None = None) -> Any:
         theta = z if identity else change.to_theta(z)
@@ -138,17 +130,17 @@ def _compute_reach(problem: Problem) -> FloatArray:
 def _to_variables(variables: Variables, theta: FloatArray, here: Any) -> Any:
     """Convert an evaluation at theta to the optimizer's variables."""
     if here.hessian is None:
-        return CostAndGradient(here.cost, variables.slopes(theta)[0] * here.gradient)
+        return replace(here, gradient=variables.slopes(theta)[0] * here.gradient)
     if isinstance(here.hessian, Arrow):
         D, E = variables.slopes(theta)
         hessian = here.hessian.scale(1.0 / D).plus_diagonal(E * here.gradient)
-        return ArrowEvaluation(here.cost, D * here.gradient, hessian)
+        return replace(here, gradient=D * here.gradient, hessian=hessian)
     return Evaluation(here.cost, *variables.derivatives_inward(theta, here.gradient, here.hessian))
 
 
 def _to_constrained(
-    variables: Variables, theta: FloatArray, here: ConstrainedEvaluation, multipliers: FloatArray
-) -> ConstrainedEvaluation:
+    variables: Variables, theta: FloatArray, here: Evaluation[FloatArray], multipliers: FloatArray
+) -> Evaluation[FloatArray]:
     """Return an evaluation with constraints at theta in the optimizer's variables."""
     D, _ = variables.slopes(theta)
     slope = here.gradient + multipliers @ here.jacobian

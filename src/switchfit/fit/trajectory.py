@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,12 +16,14 @@ from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_index, as_instance
+from switchfit.problem.validation import as_array, as_choice, as_index, as_instance
+from switchfit.runtime.frames import Tabular
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class Trajectory(Tabular):
     """States over time.
 
     Attributes
@@ -31,7 +34,8 @@ class Trajectory:
     modes : (K,) array of str
         The mode that is active.
     segments : (N + 2,) int array
-        Entries ``segments[i]:segments[i + 1]`` belong to the i-th entry of the mode sequence.
+        Entries ``segments[i]:segments[i + 1]`` belong to the i-th entry of the mode sequence; at times that were asked
+        for there may be none.
     state_names, state_units : tuple of str
     time_unit : str
         Unit of the experiment's times.
@@ -63,15 +67,19 @@ class Trajectory:
 
     @property
     def mode_spans(self) -> list[tuple[str, float, float]]:
-        """Each mode of the sequence with the times at which it begins and ends."""
+        """Each mode of the sequence with the times at which it begins and ends.
+
+        Of a simulation at given times the first and the last of them in the mode, without modes that have none.
+        """
         return [
             (str(self.modes[a]), float(self.times[a]), float(self.times[b - 1]))
             for a, b in zip(self.segments[:-1], self.segments[1:], strict=True)
+            if b > a
         ]
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class Comparison(Tabular):
     """Measured and fitted values, for one of the data of one experiment.
 
     Attributes
@@ -129,7 +137,13 @@ class Comparison:
         return np.sqrt(squares.sum(0) / np.where(known.any(0), known.sum(0), np.nan))
 
 
-def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: int = 0) -> Trajectory:
+def simulate(
+    problem: Problem,
+    theta: ArrayLike | None = None,
+    *,
+    times: ArrayLike | Literal["samples"] | None = None,
+    experiment: int = 0,
+) -> Trajectory:
     """Integrate the model to the problem's tolerances.
 
     Parameters
@@ -137,6 +151,10 @@ def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: in
     problem : Problem
     theta : (d,) array_like, optional
         In the order of ``problem.theta_names``; the initial guess if left out.
+    times : (K,) array_like or "samples", optional
+        Times that increase, inside [t0, tf], at which states are returned; at a transition it is the state just before
+        it. "samples": the times of all samples of the experiment. All nodes of the mesh if left out, each transition
+        twice. The steps that the tolerances need are taken whatever these times are.
     experiment : int, optional
         Index of the experiment, from 0.
 
@@ -147,8 +165,8 @@ def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: in
     Raises
     ------
     ValueError
-        For a theta of the wrong shape or order, an experiment that does not exist, or a trajectory that
-        cannot be integrated.
+        For a theta of the wrong shape or order, times outside [t0, tf] or that do not increase, an experiment that does
+        not exist or has no samples, or a trajectory that cannot be integrated.
     TypeError
         If an argument is of the wrong type.
 
@@ -165,14 +183,60 @@ def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: in
     >>> path = sf.simulate(problem, [2.5, 0.4])
     >>> round(float(path.states.max()), 1)
     15.8
+    >>> sf.simulate(problem, [2.5, 0.4], times=[0.0, 2.0, 4.0, 6.0]).states[:, 0].round(1)
+    array([ 0. , 13.8,  8.7,  3.9])
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     experiment = as_index(experiment, "experiment", len(problem.experiments))
     checked = problem.check_theta(theta)
+    asked = None if times is None else _check_times(problem, experiment, checked, times)
     mesh = refine_mesh(problem, experiment, checked)
+    mesh = mesh if asked is None else mesh.insert(asked)
     engine = engine_of(problem, experiment, build_arguments(problem, experiment, mesh), mesh)
     simulation = engine.simulate(*problem.vectors(checked, experiment), tangents=False)
-    return _build_trajectory(problem, experiment, simulation)
+    trajectory = _build_trajectory(problem, experiment, simulation)
+    return trajectory if asked is None else _select_times(trajectory, asked)
+
+
+def _check_times(problem: Problem, e: int, theta: FloatArray, times: ArrayLike | Literal["samples"]) -> FloatArray:
+    """Return the times at which a simulation is asked for, (K,)."""
+    experiment = problem.experiments[e]
+    t0, tf = problem.ends_of_modes(theta)[e][[0, -1]].tolist()
+    if isinstance(times, str):
+        as_choice(times, "times", ("samples",))
+        found = [item.times for item in experiment.data if isinstance(item, Measurements)]
+        found += [item.samples[0] for item in experiment.data if isinstance(item, ReferenceSignal) and item.samples]
+        inside = np.unique(np.concatenate([np.zeros(0), *found]))
+        inside = inside[(t0 <= inside) & (inside <= tf)]
+        if not len(inside):
+            raise ValueError(f"times='samples' needs data with samples, and experiment {e} has none; give times.")
+        return inside
+    asked = np.atleast_1d(as_array(times, "times"))
+    if asked.ndim != 1 or asked.size == 0 or not np.isfinite(asked).all():
+        raise ValueError(f"times must be finite numbers of shape (K,), or 'samples'; got shape {asked.shape}.")
+    wrong = np.diff(asked) <= 0
+    if wrong.any():
+        k = int(wrong.argmax())
+        raise ValueError(f"times must increase strictly; got {asked[k + 1]} after {asked[k]}.")
+    outside = (asked < t0) | (asked > tf)
+    if outside.any():
+        unit = unit_suffix(experiment.time_unit)
+        raise ValueError(f"times must lie inside [t0, tf] = [{t0}, {tf}]{unit}; got {asked[outside][0]}.")
+    return asked
+
+
+def _select_times(trajectory: Trajectory, asked: FloatArray) -> Trajectory:
+    """Return a trajectory at some of its nodes (K,); at a transition, just before it."""
+    # The first of two nodes at one time; a free tf that rounding has put before the last time is the last node.
+    places = np.minimum(np.searchsorted(trajectory.times, asked), len(trajectory.times) - 1)
+    segments = np.searchsorted(places, trajectory.segments)
+    return replace(
+        trajectory,
+        times=trajectory.times[places],
+        states=trajectory.states[places],
+        modes=trajectory.modes[places],
+        segments=segments,
+    )
 
 
 class SimulatedProblem:

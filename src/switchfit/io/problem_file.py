@@ -23,11 +23,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 from pydantic_core import PydanticCustomError
 
+from switchfit.estimation.provenance import Provenance
 from switchfit.io.logs.files import find_logs, name_logs
 from switchfit.io.logs.log import Log
 from switchfit.io.logs.reader import align_starts, read_source
 from switchfit.io.logs.units import SECONDS, normalize_time_unit
 from switchfit.io.python_file import call, describe_error, find_object, find_user_place, load_object
+from switchfit.io.sources import describe_sources
 from switchfit.models import BUILT_IN
 from switchfit.problem.data import FloatArray, Input, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment, Parameter
@@ -54,6 +56,8 @@ class ProblemFile:
     problem : Problem
     options : dict
         Keyword arguments for `switchfit.estimate` that the file sets.
+    provenance : Provenance
+        The text of the file, and hashes of the files that it names: for `Estimate.save`.
     issues : tuple of Issue
         What is odd about the logs; of kind "log: refused" for those of many that could not be used.
     """
@@ -61,6 +65,7 @@ class ProblemFile:
     path: Path
     problem: Problem
     options: dict[str, Any]
+    provenance: Provenance
     issues: tuple[Issue, ...] = ()
 
 
@@ -78,7 +83,7 @@ class Runs(NamedTuple):
     issues: tuple[Issue, ...]
 
 
-def load_problem(path: str | Path, log: str | Path | None = None) -> ProblemFile:
+def load_problem(path: str | Path, log: str | Path | None = None, *, text: str | None = None) -> ProblemFile:
     """Read a problem file, the data files it names, and the Python file of its model.
 
     Parameters
@@ -87,6 +92,8 @@ def load_problem(path: str | Path, log: str | Path | None = None) -> ProblemFile
         A TOML file. Paths in it are relative to its folder.
     log : str or Path, optional
         Instead of the file that the data of the only experiment name; inputs and further data from other files stay.
+    text : str, optional
+        Instead of what the problem file contains, which then need not be there.
 
     Returns
     -------
@@ -99,13 +106,15 @@ def load_problem(path: str | Path, log: str | Path | None = None) -> ProblemFile
         given, and what to do.
     """
     path = Path(path)
-    contents = _validate(path, _parse(path))
+    text = _read(path) if text is None else text
+    contents = _validate(path, _parse(path, text))
     if log is not None:
         contents = _replace_log(path, contents, os.path.abspath(log))
     options = contents.options.model_dump(include=OPTIONS, exclude_none=True)
     build = _build_from_tables if contents.problem is None else _load_from_python
     problem, issues = build(path, contents)
-    return ProblemFile(path, problem, options, issues)
+    provenance = describe_sources(path, text, log, contents.model_dump(exclude_none=True), options)
+    return ProblemFile(path, problem, options, provenance, issues)
 
 
 def read_experiments(path: str | Path) -> Runs:
@@ -126,7 +135,7 @@ def read_experiments(path: str | Path) -> Runs:
         As in `load_problem`.
     """
     path = Path(path)
-    contents = _validate(path, _parse(path))
+    contents = _validate(path, _parse(path, _read(path)))
     if contents.problem is not None:
         find_object(contents.problem, path.parent, f"{path}: problem")
         return Runs((), ())
@@ -401,19 +410,25 @@ class Contents(_Table):
 # --- from text to checked tables --------------------------------------------------------------------------------------
 
 
-def _parse(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> str:
     if is_device(path):
         raise InputError(f"{path} is a device; name a problem file.")
     try:
-        with path.open("rb") as file:
-            return tomllib.load(file)
+        return path.read_bytes().decode()
     except FileNotFoundError:
         raise InputError(f"There is no problem file {path}; check the name and the folder.") from None
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not valid TOML: {error}.") from error
+
+
+def _parse(path: Path, text: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
     except RecursionError as error:
         raise InputError(f"{path} is not valid TOML: brackets are nested too deep.") from error
-    except ValueError as error:  # invalid TOML, invalid UTF-8, or a number with thousands of digits
+    except ValueError as error:  # invalid TOML, or a number with thousands of digits
         raise InputError(f"{path} is not valid TOML: {error}.") from error
 
 

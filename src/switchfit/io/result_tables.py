@@ -12,6 +12,7 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.optimize.arrow import ArrowLayout
 from switchfit.problem.problem import Problem
+from switchfit.report.frames import list_holds
 from switchfit.uncertainty.quality import ChannelQuality, measure_quality
 from switchfit.uncertainty.residuals import correct_errors
 from switchfit.uncertainty.verdict import CLEARLY_OFF, UNLIKELY
@@ -43,7 +44,7 @@ def write_unknowns(fit: Fit) -> str:
     rows = []
     for i, name in enumerate(fit.theta_names):
         numbers = [fit.theta[i], errors[i], naive[i], *intervals[i], fit.initial_theta[i]]
-        held = "; ".join(_list_holds(fit, name))
+        held = "; ".join(list_holds(fit, name))
         rows.append([name, fit.theta_units[i], *map(_format, numbers), joins.get(i, ""), held])
     return _write(header, rows)
 
@@ -119,17 +120,8 @@ def _flag(fit: Fit, e: int, channels: Sequence[ChannelQuality], own: dict[str, i
             state = "collapsed" if constraint.kind == "collapsed" else "at its minimum duration"
             yield f"mode {constraint.mode} {state}"
     for column, i in own.items():
-        for hold in _list_holds(fit, fit.theta_names[i]):
+        for hold in list_holds(fit, fit.theta_names[i]):
             yield f"{column} {hold}"
-
-
-def _list_holds(fit: Fit, name: str) -> Iterator[str]:
-    """Yield what holds an unknown."""
-    if name in fit.idle:
-        yield "idle"
-    yield from (f"at {c.kind}" for c in fit.active if c.unknown == name and c.position is None)
-    if name in [kink.unknown for kink in fit.kinks]:
-        yield "at a kink"
 
 
 def _format(value: float) -> str:

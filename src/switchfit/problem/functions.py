@@ -15,7 +15,8 @@ import threading
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from contextlib import nullcontext
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -142,12 +143,8 @@ def trace_function(
                 _traces.move_to_end(key)
                 return found
     given = _Call(arguments, parameters, hidden, what, form, shape, inputs)
-    with use_float64():
-        if key is None:
-            with _retracing(next(_turn)):
-                traced = _trace(function, given)
-        else:
-            traced = _trace(function, given)
+    with use_float64(), nullcontext() if key is not None else _retracing(next(_turn)):
+        traced = _trace(function, given)
     with _lock:
         traced = _known.setdefault(traced._key, traced)
         if key is not None:
@@ -164,25 +161,23 @@ def _without_jit(function: Any) -> Any:
     return function
 
 
-class _Call:
-    """Arguments with which a function is called, and the shape that it must return."""
+class _Call(NamedTuple):
+    """Arguments with which a function is called, and the shape that it must return: those of `trace_function`."""
 
-    def __init__(
-        self,
-        arguments: Sequence[Shape | None],
-        parameters: Mapping[str, Shape],
-        hidden: frozenset[str],
-        what: str,
-        form: str,
-        shape: Shape | None,
-        inputs: tuple[str, ...],
-    ) -> None:
-        self.arguments, self.parameters, self.hidden = arguments, parameters, hidden
-        self.what, self.form, self.shape, self.inputs = what, form, shape, inputs
+    arguments: Sequence[Shape | None]
+    parameters: Mapping[str, Shape]
+    hidden: frozenset[str]
+    what: str
+    form: str
+    shape: Shape | None
+    inputs: tuple[str, ...]
 
 
 def _trace(function: Callable[..., Any], given: _Call) -> Function:
-    """Trace with a dict that records which names are read; with an ordinary dict if the function accepts no other."""
+    """Trace with a dict that records which names are read; with an ordinary dict if the function accepts no other.
+
+    An error of the first attempt is not lost: if the function is wrong, the next one raises it too.
+    """
     shown = tuple(name for name in given.parameters if name not in given.hidden)
     try:
         return _trace_with(function, given, tuple(given.parameters), watch=True)
@@ -214,8 +209,18 @@ def _trace_with(function: Callable[..., Any], given: _Call, names: tuple[str, ..
     flat = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in given.arguments if shape is not None]
     values = [jax.ShapeDtypeStruct(given.parameters[name], jnp.float64) for name in names]
     closed = jax.make_jaxpr(call)(flat, values)
-    used = names if not watch else tuple(name for name in names if name in asked)
+    used = names
+    if watch:
+        read = _list_read_variables(closed.jaxpr)  # methods of dict, such as pop, read entries without asking
+        variables = zip(names, closed.jaxpr.invars[len(flat) :], strict=True)
+        used = tuple(name for name, variable in variables if name in asked or variable in read)
     return _build_function(closed, len(flat), names, used, function, given)
+
+
+def _list_read_variables(jaxpr: Any) -> set[Any]:
+    """Return the variables that the operations and results of a jaxpr read."""
+    atoms = [*jaxpr.outvars, *(atom for equation in jaxpr.eqns for atom in equation.invars)]
+    return {atom for atom in atoms if not hasattr(atom, "val")}
 
 
 def _build_function(
@@ -329,11 +334,11 @@ class _Text:
             self.lines.append(f"{name}=object {len(self.opaque)}")
             self.opaque.append(value)
         else:
-            said = repr(value)
-            if " at 0x" in said:
+            text = repr(value)
+            if " at 0x" in text:
+                text = f"object {len(self.opaque)}"
                 self.opaque.append(value)
-                said = f"object {len(self.opaque)}"
-            self.lines.append(f"{name}={said}")
+            self.lines.append(f"{name}={text}")
 
     def _array(self, value: Any) -> str:
         array = np.asarray(value)
@@ -412,10 +417,10 @@ def call_while_tracing(function: Callable[..., Any], arguments: tuple[Any, ...],
             "transition time."
         ) from error
     except Exception as error:
-        said = str(error).rstrip(".")
-        if "u)" in form and "string indexing" in said:  # u["left"] of an array
-            said += ". u has no names: give sf.Input a dict of name -> samples"
-        raise ValueError(f"{what}: {form} raised {type(error).__name__}: {said}.") from error
+        message = str(error).rstrip(".")
+        if "u)" in form and "string indexing" in message:  # u["left"] of an array
+            message += ". u has no names: give sf.Input a dict of name -> samples"
+        raise ValueError(f"{what}: {form} raised {type(error).__name__}: {message}.") from error
     try:
         return jnp.asarray(value)
     except (TypeError, ValueError) as error:

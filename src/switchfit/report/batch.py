@@ -14,6 +14,7 @@ from switchfit.batch.simulated import MonteCarlo
 from switchfit.batch.starts import Multistart
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
+from switchfit.report.numbers import format_count, format_rounded
 from switchfit.report.tables import format_table, wrap_text
 from switchfit.runtime.presentation import draw_figure, format_text
 
@@ -23,10 +24,18 @@ if TYPE_CHECKING:
 
 ESTIMATE, TRUTH, NORMAL = "#4a7fb5", "#b2182b", "#222222"
 CLUSTER_COLOURS = ("#b2182b", "#4a7fb5", "#e0a030", "#5c9e5c", "#8a5fa3", "#777777")
+LEVEL_COLOURS = {"good": "#1a7f4b", "doubtful": "#c07800", "bad": "#bb2a20"}
 COLUMNS = 3
 LISTED_MINIMA = 10
 LISTED_UNKNOWNS, LISTED_PLACES = 12, 6
-"""Unknowns in a table, and in the line of a minimum; of more, transition times are left out first."""
+"""Largest numbers of unknowns in a table, and in the line of a minimum; transition times are left out first."""
+LISTED_FITS, LISTED_WORST = 24, 12
+"""Fits up to which all are listed in their order; of more, the worst."""
+LISTED_COLUMNS = 4
+"""Unknowns in the line of a fit."""
+DRAWN_FITS, DRAWN_UNKNOWNS = 40, 6
+"""Fits and unknowns in a figure: the worst fits, and of more unknowns first those that are no transition times."""
+TOO_FEW = "Fewer than two fits converged: no statistics."
 BOOTSTRAP_TITLES = {
     "residuals": "Bootstrap of residuals",
     "wild": "Bootstrap of residuals with random signs",
@@ -45,7 +54,7 @@ def summarise(fits: Fits) -> list[str]:
     count, good = len(fits), int(fits.success.sum())
     each = 1e3 * fits.seconds / max(count, 1)
     lines = wrap_text(str(fits.verdict))
-    lines.append(f"{count} fits in {fits.seconds:.1f} s ({each:.2f} ms each), {good} converged")
+    lines.append(f"{format_count(count, 'fit')} in {fits.seconds:.1f} s ({each:.2f} ms each), {good} converged")
     if count < fits.requested:
         lines.append(f"STOPPED: {fits.requested - count} of {fits.requested} fits were not done")
     endings = Counter(fits.status.tolist()).most_common()
@@ -61,13 +70,35 @@ def summarise(fits: Fits) -> list[str]:
 
 @format_text.register(Fits)
 def write_fits(fits: Fits) -> str:
-    """Return the verdict, and how the fits ended.
+    """Return the verdict, how the fits ended, and a line for each of them; of many, for the worst.
 
     Parameters
     ----------
     fits : Fits
     """
-    return "\n".join(summarise(fits))
+    return "\n".join([*summarise(fits), "", *tabulate_fits(fits)])
+
+
+def tabulate_fits(fits: Fits) -> list[str]:
+    """Return a line for each fit: level, cost, and the unknowns with their standard errors; of many, the worst first.
+
+    Parameters
+    ----------
+    fits : Fits
+    """
+    most = len(fits) if len(fits) <= LISTED_FITS else LISTED_WORST
+    listed = range(most) if most == len(fits) else fits.worst_first[:most].tolist()
+    shown = _select_unknowns(fits, LISTED_COLUMNS)
+    header = ["run", "", "J", *(part for i in shown for part in (_label(fits, i), ""))]
+    errors = fits.standard_errors
+    rows = [header]
+    for k in listed:
+        cells = [part for i in shown for part in format_rounded(fits.theta[k, i], errors[k, i])[:2]]
+        rows.append([str(fits.runs[k]), str(fits.levels[k]), f"{fits.cost[k]:.6g}", *cells])
+    lines = format_table(rows, ">" + "<>" + "><" * len(shown), indent="")
+    if most < len(fits):
+        lines.append(f"the worst {most} of {len(fits)} fits; .to_pandas() has all of them")
+    return lines + _count_rest(fits, shown)
 
 
 @format_text.register(MonteCarlo)
@@ -109,12 +140,14 @@ def write_multistart(study: Multistart) -> str:
         named = [f"{study.theta_names[i]} = {at[i]:.6g}{unit_suffix(study.theta_units[i])}" for i in shown]
         more = len(at) - len(shown)
         place = ", ".join(named) + (f" and {more} more" if more else "")
-        rows.append((f"J = {study.cost[here].min():.9g}", f"{len(here)} starts", place))
-    return "\n".join([*summarise(study), "", f"{minima} minima:", *format_table(rows, "<><")])
+        rows.append((f"J = {study.cost[here].min():.9g}", format_count(len(here), "start"), place))
+    return "\n".join(
+        [*summarise(study), "", f"{format_count(minima, 'minimum', 'minima')}:", *format_table(rows, "<><")]
+    )
 
 
 def _select_unknowns(fits: Fits, most: int) -> list[int]:
-    """Return which unknowns are listed: of more than `most` first those that are no transition times."""
+    """Return the indices of the unknowns that are listed; of more than `most`, transition times are left out first."""
     names = fits.theta_names
     if len(names) <= most:
         return list(range(len(names)))
@@ -124,14 +157,14 @@ def _select_unknowns(fits: Fits, most: int) -> list[int]:
 
 def _count_rest(fits: Fits, shown: Sequence[int]) -> list[str]:
     more = len(fits.theta_names) - len(shown)
-    return [f"and {more} more unknowns"] if more else []
+    return [f"and {format_count(more, 'more unknown')}"] if more else []
 
 
 def tabulate_monte_carlo(study: MonteCarlo) -> list[str]:
-    """Return one line an unknown: truth, mean error with its own error, spread, standard error, coverage."""
+    """Return a line for each unknown: truth, mean error with its own error, spread, standard error, coverage."""
     count = int(study.success.sum())
     if count < 2:
-        return ["Fewer than two fits converged: no statistics."]
+        return [TOO_FEW]
     spread, bias, coverage = study.standard_deviation, study.bias, study.coverage()
     with np.errstate(invalid="ignore"):
         reported = np.median(study.standard_errors[study.success], axis=0)
@@ -153,9 +186,9 @@ def tabulate_monte_carlo(study: MonteCarlo) -> list[str]:
 
 
 def tabulate_bootstrap(study: Bootstrap) -> list[str]:
-    """Return one line an unknown: estimate, bias, bootstrap standard error, 95 % interval (BCa)."""
+    """Return a line for each unknown: estimate, bias, bootstrap standard error, 95 % interval (BCa)."""
     if int(study.success.sum()) < 2:
-        return ["Fewer than two fits converged: no statistics."]
+        return [TOO_FEW]
     rows: list[Sequence[str]] = [("", "estimate", "bias", "standard error", "95 % interval (BCa)")]
     shown = _select_unknowns(study, LISTED_UNKNOWNS)
     bias, error, intervals = study.bias, study.standard_deviation, study.intervals()
@@ -175,11 +208,51 @@ def _label(fits: Fits, k: int) -> str:
     return fits.theta_names[k] + (f" ({unit})" if unit and unit != "1" else "")
 
 
-@draw_figure.register(Bootstrap)
-def plot_bootstrap(study: Bootstrap) -> Figure:
-    """Draw a histogram an unknown: estimates of the resampled data, the estimate, and its 95 % interval."""
+@draw_figure.register(Fits)
+def plot_fits(fits: Fits) -> Figure:
+    """Draw unknowns with their 95 % intervals, a row for each fit, the worst on top.
+
+    Parameters
+    ----------
+    fits : Fits
+    """
     from matplotlib.figure import Figure
 
+    shown, order = _select_unknowns(fits, DRAWN_UNKNOWNS), fits.worst_first[:DRAWN_FITS]
+    count, columns = len(order), max(len(shown), 1)
+    size = (1.2 + 2.6 * columns, 1.4 + 0.2 * max(count, 5))
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(1, columns, sharey=True, squeeze=False)[0]
+    places, intervals, levels = np.arange(count), fits.confidence_intervals(), fits.levels[order]
+    for ax, i in zip(axes, shown, strict=False):
+        for level, colour in LEVEL_COLOURS.items():
+            here = levels == level
+            if not here.any():
+                continue
+            value, (low, high) = fits.theta[order[here], i], intervals[order[here], i].T
+            ax.hlines(places[here], low, high, color=colour, linewidth=1.6, alpha=0.6)
+            ax.scatter(value, places[here], s=18, color=colour, label=level, zorder=2)
+        ax.set_xlabel(_label(fits, i))
+        ax.ticklabel_format(axis="x", useOffset=False)
+        ax.locator_params(axis="x", nbins=4)
+        ax.grid(axis="x", linewidth=0.4, alpha=0.6)
+    axes[0].set_yticks(places, [str(run) for run in fits.runs[order]])
+    axes[0].set_ylabel("run")
+    axes[0].set_ylim(max(count, 1) - 0.5, -0.5)
+    handles, labels = axes[0].get_legend_handles_labels()
+    if handles:
+        title = None if count == len(fits) else f"the worst {count} of {len(fits)} fits"
+        figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False, title=title)
+    return figure
+
+
+@draw_figure.register(Bootstrap)
+def plot_bootstrap(study: Bootstrap) -> Figure:
+    """Draw a histogram for each unknown: estimates of the resampled data, the estimate, its 95 % interval."""
+    from matplotlib.figure import Figure
+
+    if int(study.success.sum()) < 2:
+        return _draw_nothing()
     shown = np.flatnonzero(study.resampled)
     columns = max(min(len(shown), COLUMNS), 1)
     rows = max(-(-len(shown) // columns), 1)
@@ -203,15 +276,24 @@ def plot_bootstrap(study: Bootstrap) -> Figure:
     return figure
 
 
+def _draw_nothing() -> Figure:
+    """Return a figure that says that too few fits converged."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.0, 1.5), layout="constrained")
+    figure.suptitle(TOO_FEW)
+    return figure
+
+
 def _choose_limits(values: FloatArray, centre: float) -> tuple[float, float]:
-    """Return what a histogram of estimates shows: all but the farthest hundredth, with a margin."""
+    """Return the limits of a histogram of estimates: all but the farthest hundredth, with a margin."""
     middle = np.percentile(values, [0.5, 99.5])
     reach = max(float(np.ptp(middle)), 1e-12 * abs(centre), np.finfo(float).tiny)
     return float(middle[0] - 0.25 * reach), float(middle[1] + 0.25 * reach)
 
 
 def _draw_histogram_axis(study: Fits, k: int, limits: tuple[float, float], ax: Axes) -> None:
-    """Write name and unit of unknown k along the axis, with few ticks."""
+    """Label the axis with the name and unit of unknown k, with few ticks."""
     ax.set_xlabel(_label(study, k))
     ax.set_xlim(limits)
     ax.set_yticks([])
@@ -221,9 +303,11 @@ def _draw_histogram_axis(study: Fits, k: int, limits: tuple[float, float], ax: A
 
 @draw_figure.register(MonteCarlo)
 def plot_monte_carlo(study: MonteCarlo) -> Figure:
-    """Draw a histogram an unknown: estimates, truth, and the normal density of the reported standard error."""
+    """Draw a histogram for each unknown: estimates, truth, the normal density of the reported standard error."""
     from matplotlib.figure import Figure
 
+    if int(study.success.sum()) < 2:
+        return _draw_nothing()
     d = len(study.theta_names)
     columns = min(d, COLUMNS)
     rows = -(-d // columns)

@@ -15,6 +15,7 @@ import numpy as np
 from switchfit.batch.fits import Fits
 from switchfit.estimation.estimator import Estimate
 from switchfit.problem.problem import Problem
+from switchfit.report.batch import LEVEL_COLOURS
 from switchfit.report.numbers import format_unit
 from switchfit.report.plot import plot_fit
 from switchfit.report.tables import Table
@@ -26,7 +27,6 @@ from switchfit.uncertainty.profiles import Profile
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-LEVEL_COLOURS = {"good": "#1a7f4b", "doubtful": "#c07800", "bad": "#bb2a20"}
 DOTS = 64
 """Dots per inch of the figures."""
 LARGEST_FIGURE = 4

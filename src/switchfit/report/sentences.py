@@ -15,10 +15,10 @@ from switchfit.runtime.presentation import format_text
 from switchfit.uncertainty.identification import Combination
 
 LISTED = 6
-"""Channels that a sentence names."""
+"""Largest number of channels that a sentence names."""
 
 
-# --- small things -----------------------------------------------------------------------------------------------------
+# --- words, constraints, kinks ----------------------------------------------------------------------------------------
 
 
 def join_words(words: list[str] | tuple[str, ...]) -> str:
@@ -32,7 +32,7 @@ def _describe_mode(position: float, mode: str, run: str) -> str:
 
 @format_text.register(Constraint)
 def write_constraint(constraint: Constraint) -> str:
-    """Return what it says of a fit that this constraint is active."""
+    """Return which constraint is active."""
     if constraint.position is None:
         return f"{constraint.unknown} at its {constraint.kind} {constraint.value:g}"
     state = "has collapsed to nothing" if constraint.kind == "collapsed" else "is at its minimum duration"
@@ -59,7 +59,7 @@ def write_combination(combination: Combination) -> str:
 
 @format_text.register(Termination)
 def write_termination(ended: Termination) -> str:
-    """Return how a fit ended, the numbers that say so, what to do, and the active constraints."""
+    """Return how a fit ended, with its numbers, what to do next, and the active constraints."""
     if ended.reason is not None and ended.reason.kind == "message":
         return str(ended.reason)
     active = f" Active: {'; '.join(map(str, ended.active))}." if ended.active else ""
@@ -294,7 +294,7 @@ def _describe_near_kink(issue: Issue) -> str:
 
 
 def _add_delay_hint(sentence: Callable[[Issue], str]) -> Callable[[Issue], str]:
-    """Return the reason why a line search failed, and what an estimated delay may have to do with it."""
+    """Return a writer of why a line search failed, with a hint if a delay is estimated."""
 
     def write(issue: Issue) -> str:
         hint = (

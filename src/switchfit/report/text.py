@@ -14,7 +14,7 @@ from switchfit.fit.trajectory import Comparison
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report.numbers import format_rounded, format_unit, get_unit
+from switchfit.report.numbers import format_count, format_rounded, format_unit, get_unit
 from switchfit.report.tables import Table, format_table, wrap_text
 from switchfit.report.uncertainty import write_direction
 from switchfit.report.verdict import format_share, write_agreement
@@ -27,7 +27,7 @@ from switchfit.uncertainty.residuals import correct_errors, correct_intervals
 from switchfit.uncertainty.verdict import Verdict, judge
 
 ONE_SIDED = 1.2
-"""Ratio of the two sides of an interval above which it is said that they differ."""
+"""Ratio of the two sides of an interval above which the report calls it asymmetric."""
 LABEL = 18
 """Columns of the labels at the left."""
 
@@ -37,7 +37,7 @@ Row = tuple[str, str]
 
 
 class Limits(NamedTuple):
-    """How much of each section is shown; what is left out is counted."""
+    """Largest number of entries of each section; the others are counted."""
 
     experiments: int
     channels: int
@@ -75,23 +75,22 @@ def report(
     full: bool = False,
     files: Mapping[str, str] | None = None,
 ) -> str:
-    """Return the verdict, what was fitted, how it ended, how well it fits, the unknowns with their errors, and what to
-    be wary of.
+    """Return the report: the verdict, the problem, the course of the fit, its quality, the unknowns, the warnings.
 
     Parameters
     ----------
     fit : Fit
     certificate : Certificate, optional
-        What failed counts in the verdict; left out, what can be checked without the model is checked.
+        Its failures count in the verdict; if left out, only what can be checked without the model is checked.
     found : Identifiability, optional
-        Left out, what the Hessian alone tells.
+        If left out, that from the Hessian alone.
     verdict : Verdict, optional
-        Of this fit; judged here if left out.
+        Of this fit; computed if left out.
     full : bool
-        All experiments, channels, unknowns, correlations and directions, and all warnings in full; otherwise a screen,
-        without the warnings that the verdict gives already.
+        All experiments, channels, unknowns, correlations, directions and warnings; otherwise as much as fits on one
+        screen, without the warnings that the verdict covers.
     files : mapping of str to str, optional
-        Names of files that have all "runs" and all "unknowns", said where a screen has no room for them.
+        Names of the files with all "runs" and all "unknowns", for the lines that count what was left out.
 
     Returns
     -------
@@ -130,9 +129,7 @@ def write_fit(fit: Fit, *, full: bool = False) -> str:
 
 @format_text.register(Estimate)
 def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str, str] | None = None) -> str:
-    """Return the report of an estimate, with its certificate if that is known already, and J evaluated where it is
-    weak.
-    """
+    """Return the report of an estimate, with its certificate if it is known, and J evaluated along weak directions."""
     verdict = estimate.verdict
     found = estimate.identifiability
     return report(estimate, estimate.known_certificate, found, verdict=verdict, full=full, files=files)
@@ -148,11 +145,11 @@ def list_experiments(fit: Fit, most: int, where: str = "", *, full: bool) -> lis
     ----------
     fit : Fit
     most : int
-        Experiments that are listed; the others are counted.
+        Number of experiments that are listed; the others are counted.
     where : str, optional
-        Where the others are, as the end of a sentence.
+        Where to find the others, as the end of a sentence.
     full : bool
-        A row for each of an experiment's data, however many experiments there are.
+        Whether each of an experiment's data has a row of its own; it has one if there is a single experiment.
     """
     rows: list[Row] = []
     single = len(fit.trajectories) == 1
@@ -171,28 +168,28 @@ def list_experiments(fit: Fit, most: int, where: str = "", *, full: bool) -> lis
 
 
 def _format_data(comparison: Comparison) -> str:
-    """Return one of the data in words."""
+    """Return the description of one of the data."""
     names = ", ".join(comparison.names)
     if comparison.kind != "measurements":
         return f"{names}: reference signal"
     missing = int(np.isnan(comparison.measured).sum())
     note = f", {missing} of {comparison.measured.size} values missing" if missing else ""
     if comparison.downweighted is not None:
-        note += f", {_count(int(comparison.downweighted.sum()), 'outlier')} weighed down by the loss"
-    return f"{names}: {_count(len(comparison.times), 'sample')}{note}"
+        note += f", {format_count(int(comparison.downweighted.sum()), 'outlier')} weighed down by the loss"
+    return f"{names}: {format_count(len(comparison.times), 'sample')}{note}"
 
 
 def list_course(fit: Fit, *, full: bool) -> list[Row]:
-    """Return method, effort, the strategies with the lowest J after each, and how it ended.
+    """Return the method, the effort, the strategies with the lowest J after each, and how the fit ended.
 
     Parameters
     ----------
     fit : Fit
     full : bool
-        The message in full, and the engine in a row of its own.
+        Whether to give the whole message, and the engine in a row of its own.
     """
     rows = [("method", METHODS.get(fit.hessian_kind, fit.hessian_kind))]
-    iterations, evaluations = _count(fit.iterations, "iteration"), _count(fit.evaluations, "evaluation")
+    iterations, evaluations = format_count(fit.iterations, "iteration"), format_count(fit.evaluations, "evaluation")
     effort = f"{iterations}, {evaluations}, {fit.seconds:.3g} s"
     if fit.steps:  # the iterations of short fits are not counted, and the last fit has few
         effort = f"{evaluations}, {fit.seconds:.3g} s in all, {iterations} in the last fit"
@@ -218,14 +215,15 @@ _ENDED = {
 
 
 def _format_step(step: Step) -> str:
-    """Return a strategy and the lowest J after it; none where the model could not be integrated, or constraints are not
-    met."""
+    """Return a strategy and the lowest J after it: "failed" if the model could not be integrated, or constraints are
+    not met.
+    """
     cost = f"J = {step.cost:.6g}" if np.isfinite(step.cost) else "failed"
     return f"{step.strategy}: {cost} ({step.seconds:.2g} s)"
 
 
 def _shorten_status(fit: Fit) -> str:
-    """Return how a fit converged; what the verdict, the table of unknowns and the warnings say is left out."""
+    """Return how a fit converged, without what is in the verdict, the table of unknowns and the warnings."""
     below = fit.optimality <= fit.tolerance
     where = {
         Status.CONVERGED_AT_KINK: "Converged at a kink of the cost",
@@ -236,13 +234,13 @@ def _shorten_status(fit: Fit) -> str:
 
 
 def list_quality(fit: Fit, *, full: bool) -> list[Row]:
-    """Return cost, optimality (which the status says as well), residual variance, integration error.
+    """Return the cost, the optimality, the residual variance and the integration error.
 
     Parameters
     ----------
     fit : Fit
     full : bool
-        With the optimality.
+        Whether to include the optimality, which the status gives as well.
     """
     first = fit.initial_cost
     if np.isnan(first) and fit.history and not fit.steps:
@@ -253,9 +251,9 @@ def list_quality(fit: Fit, *, full: bool) -> list[Row]:
     if full:
         rows.append(("KKT residual", f"{fit.optimality:.1e}   (tolerance: {fit.tolerance:.1e})"))
     rows += [(name, f"{value:.1e}   (multiplier {multiplier:.6g})") for name, value, multiplier in fit.constraints]
-    variance, unknowns = fit.residual_variance, _count(fit.free_basis.shape[1], "free unknown")
+    variance, unknowns = fit.residual_variance, format_count(fit.free_basis.shape[1], "free unknown")
     if np.isfinite(variance):
-        priors = f" + {_count(len(fit.priors), 'prior')}" if fit.priors else ""
+        priors = f" + {format_count(len(fit.priors), 'prior')}" if fit.priors else ""
         origin = f"2 J / ({fit.samples} values{priors} - {unknowns})"
         if fit.sigma_known:
             rows.append(("reduced chi-square", f"{variance:.4g}   ({origin}; near 1 where sigma is right)"))
@@ -268,7 +266,7 @@ def list_quality(fit: Fit, *, full: bool) -> list[Row]:
 
 
 def _format_channels(fit: Fit, most: int, where: str) -> list[str]:
-    """Return the table of the channels as lines; of more than `most` those that are explained worst."""
+    """Return the table of the channels as lines; of more than `most`, those that are explained worst."""
     table, shares = tabulate_channels(fit)
     header, *rows = table.rows
     if not rows:
@@ -280,8 +278,10 @@ def _format_channels(fit: Fit, most: int, where: str) -> list[str]:
 
 
 def tabulate_channels(fit: Fit) -> tuple[Table, list[float]]:
-    """Return a table of the channels: root mean square of the residuals, in units and in sigmas, and the share of the
-    variance that is explained; and these shares, infinite where there is nothing to explain.
+    """Return the table of the channels, and the share of the variance of each that is explained.
+
+    The table has the root mean square of the residuals, in units and in sigmas. The share is infinite if a channel has
+    no variance.
 
     Parameters
     ----------
@@ -315,7 +315,7 @@ def _format_residuals(comparison: Comparison, k: int) -> tuple[str, str, str]:
 
 
 def _format_unknowns(fit: Fit, most: int, where: str) -> list[str]:
-    """Return the table of the unknowns as lines, those that are left out counted."""
+    """Return the table of the unknowns as lines; those that are left out are counted."""
     table, note = tabulate_unknowns(fit, shown := select_unknowns(fit, most))
     more = len(fit.theta) - len(shown)
     lines = format_table(*table) + ([f"  and {more} more unknowns{where}"] if more else [])
@@ -323,24 +323,25 @@ def _format_unknowns(fit: Fit, most: int, where: str) -> list[str]:
 
 
 def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> tuple[Table, str]:
-    """Return the table of the unknowns, and what the standard errors are; those that are corrected have the naive ones
-    beside them.
+    """Return the table of the unknowns, and a note on the standard errors.
+
+    Standard errors that are corrected for correlated residuals have the naive ones beside them.
 
     Parameters
     ----------
     fit : Fit
     shown : sequence of int
-        Which of them, by their places in theta.
+        Indices in theta of the unknowns in the table.
     ends : bool, optional
-        With the ends of the 95 % intervals, which allow for correlated residuals as the standard errors do.
+        Whether to add the ends of the 95 % intervals, corrected like the standard errors.
     """
     naive, errors = fit.standard_errors, correct_errors(fit)
     known = bool(np.isfinite(errors).any())
     corrected = known and not np.array_equal(naive, errors, equal_nan=True)
     joins = {t.index: f"{t.before} -> {t.after}" for t in fit.transitions}
-    rows = [["", "value", "std. error", "", "naive", "95 % from", "to", "", "first guess", ""]]
     intervals, plain_intervals = fit.confidence_intervals(), Fit.confidence_intervals(fit)
     wide = correct_intervals(fit) if ends else intervals
+    rows = []
     for i in shown:
         name = fit.theta_names[i]
         value, error, relative = format_rounded(fit.theta[i], np.nan if name in fit.idle else errors[i])
@@ -353,11 +354,21 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
         unit = format_unit(fit.theta_units[i])
         low, high = (format_end(end, wide[i]) for end in wide[i])
         rows.append([name, value, error, relative, plain, low, high, unit, f"{fit.initial_theta[i]:.6g}", note])
-    without = set() if known else {2, 3, 4, 5, 6}
-    without |= set() if corrected else {4}
-    without |= set() if ends else {5, 6}
-    columns = [k for k in range(10) if k not in without]
-    table = Table([[row[k] for k in columns] for row in rows], "".join("<><><>><><"[k] for k in columns))
+    columns = [  # title, alignment, whether it is shown
+        ("", "<", True),
+        ("value", ">", True),
+        ("std. error", "<", known),
+        ("", ">", known),
+        ("naive", "<", corrected),
+        ("95 % from", ">", known and ends),
+        ("to", ">", known and ends),
+        ("", "<", True),
+        ("first guess", ">", True),
+        ("", "<", True),
+    ]
+    kept = [k for k, (_, _, is_shown) in enumerate(columns) if is_shown]
+    cells = [[title for title, _, _ in columns], *rows]
+    table = Table([[row[k] for k in kept] for row in cells], "".join(columns[k][1] for k in kept))
     if not known:
         return table, ""
     if corrected:
@@ -367,7 +378,7 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
 
 
 def format_end(end: float, ends: FloatArray) -> str:
-    """Return an end of an interval to the third digit of its width; nothing for one that is not known.
+    """Return an end of an interval to the third digit of its width; "" if it is unknown.
 
     Parameters
     ----------
@@ -382,8 +393,10 @@ def format_end(end: float, ends: FloatArray) -> str:
 
 
 def select_unknowns(fit: Fit, most: int) -> list[int]:
-    """Return which unknowns are listed: of more than `most` first those at a bound, a kink or of a collapsed mode, then
-    parameters, then transition times; in the order of theta.
+    """Return the indices of the unknowns that are listed, in the order of theta.
+
+    If there are more than `most`, those at a bound, at a kink or of a collapsed mode come first, then parameters, then
+    transition times.
 
     Parameters
     ----------
@@ -396,7 +409,7 @@ def select_unknowns(fit: Fit, most: int) -> list[int]:
 
 
 def _compare_covariances(fit: Fit) -> str:
-    """Return how the other covariance compares."""
+    """Return how the standard errors from the Gauss-Newton matrix compare; "" if that is unknown or a warning."""
     found = disagreement(fit)
     if found is None:
         return ""
@@ -404,7 +417,7 @@ def _compare_covariances(fit: Fit) -> str:
 
 
 def _format_sides(ends: FloatArray, symmetric: FloatArray, value: float) -> str:
-    """Return the interval of a transition time that kinks at samples make longer to one side; else nothing."""
+    """Return the interval of a transition time that kinks at samples make asymmetric; "" for any other."""
     below, above = value - ends[0], ends[1] - value
     if not min(below, above) > 0 or np.array_equal(ends, symmetric):
         return ""
@@ -414,7 +427,7 @@ def _format_sides(ends: FloatArray, symmetric: FloatArray, value: float) -> str:
 
 
 def _format_log_scale(fit: Fit, i: int, errors: FloatArray) -> str:
-    """Return the interval of an unknown on a logarithmic scale, which its standard error does not say."""
+    """Return the interval of an unknown on a logarithmic scale, which its standard error does not give; else ""."""
     if fit.theta_names[i] not in fit.log_scaled:
         return ""
     low, high = fit.confidence_intervals()[i]
@@ -426,7 +439,7 @@ def _format_log_scale(fit: Fit, i: int, errors: FloatArray) -> str:
 
 
 def _mark_unknown(fit: Fit, name: str) -> str:
-    """Return what holds an unknown, in capitals."""
+    """Return what holds an unknown, in capitals; "" if nothing does."""
     if name in fit.idle:
         return "MODE COLLAPSED"
     bounds = [constraint.kind for constraint in fit.active if constraint.unknown == name]
@@ -436,7 +449,7 @@ def _mark_unknown(fit: Fit, name: str) -> str:
 
 
 def _format_fixed(fit: Fit, most: int) -> list[str]:
-    """Return the table of what was not estimated as lines."""
+    """Return the table of what was not estimated, as lines."""
     rows = tabulate_fixed(fit).rows
     more = len(rows) - len(rows[:most])
     return format_table(rows[:most], "<<<<") + ([f"  and {more} more"] if more else [])
@@ -458,7 +471,7 @@ def tabulate_fixed(fit: Fit) -> Table:
 
 
 def _format_correlations(fit: Fit, most: int, *, full: bool) -> list[str]:
-    """Return the largest correlations, in one line or all of them."""
+    """Return the largest correlations as lines: a row each if `full`, else one sentence."""
     above = list_correlations(fit)
     rows = [[f"{one}, {other}", f"{value:+.3f}"] for one, other, value in above[:most]]
     if full or not rows:
@@ -469,7 +482,7 @@ def _format_correlations(fit: Fit, most: int, *, full: bool) -> list[str]:
 
 
 def list_correlations(fit: Fit) -> list[tuple[str, str, float]]:
-    """Return the pairs of unknowns whose correlation is above `SMALL_CORRELATION`, the largest first.
+    """Return the pairs of unknowns with a correlation above `SMALL_CORRELATION` in size, the largest first.
 
     Parameters
     ----------
@@ -485,15 +498,15 @@ def list_correlations(fit: Fit) -> list[tuple[str, str, float]]:
 
 
 def _describe_weak(fit: Fit, found: Identifiability, most: int) -> list[str]:
-    """Return the combinations of unknowns that the data hardly see, if there are any."""
+    """Return the combinations of unknowns that the data hardly determine, as lines."""
     weak = list_weak(fit, found)
     lines = [line for sentence in weak[:most] for line in wrap_text(sentence, "  - ", "    ")]
     more = len(weak) - len(weak[:most])
-    return lines + ([f"  and {_count(more, 'direction')} more"] if more else [])
+    return lines + ([f"  and {format_count(more, 'direction')} more"] if more else [])
 
 
 def list_weak(fit: Fit, found: Identifiability) -> list[str]:
-    """Return the combinations of unknowns that the data of a fit hardly see, a sentence each.
+    """Return the combinations of unknowns that the data hardly determine, a sentence each.
 
     Parameters
     ----------
@@ -504,7 +517,7 @@ def list_weak(fit: Fit, found: Identifiability) -> list[str]:
     return [write_direction(found, direction) for direction in weak]
 
 
-_SAID = {
+_COVERED = {
     "a mode collapsed": {"mode collapsed", "idle times", "idle parameters"},
     "idle": {"idle times", "idle parameters"},
     "a mode is short": {"minimum duration"},
@@ -520,23 +533,23 @@ _SAID = {
     "correlated residuals": {"correlated residuals"},
     "integration error": {"large integration error"},
 }
-"""Kinds of warnings that a reason of the verdict says already."""
+"""Kinds of warnings whose content is in a reason of the verdict, by the kind of that reason."""
 
 
 def _format_warnings(fit: Fit, verdict: Verdict, most: int, *, full: bool) -> list[str]:
-    """Return what to be wary of; on one screen without what the verdict has said."""
-    said = set() if full else set().union(*(_SAID.get(reason.kind, set()) for reason in verdict.reasons))
-    issues = [issue for issue in find_issues(fit) if issue.kind not in said]
+    """Return the warnings as lines; on one screen without those that the verdict covers."""
+    covered = set() if full else set().union(*(_COVERED.get(reason.kind, set()) for reason in verdict.reasons))
+    issues = [issue for issue in find_issues(fit) if issue.kind not in covered]
     lines = [line for issue in issues[:most] for line in wrap_text(str(issue), "  - ", "    ")]
     more = len(issues) - len(issues[:most])
-    return lines + ([f"  and {_count(more, 'warning')} more"] if more else [])
+    return lines + ([f"  and {format_count(more, 'warning')} more"] if more else [])
 
 
 # --- layout -----------------------------------------------------------------------------------------------------------
 
 
 def _count_shown(count: int, most: int) -> int:
-    """Return how many rows are shown of a table that has room for `most`: fewer where the rest is to be counted."""
+    """Return how many rows are shown of a table with room for `most`: two fewer if a line counts the rest."""
     return count if count <= most else most - 2
 
 
@@ -553,7 +566,3 @@ def _format_row(label: str, text: str) -> list[str]:
     if len(label) > LABEL:
         return [f"  {label}", *wrap_text(text, " " * (LABEL + 4), " " * (LABEL + 4))]
     return wrap_text(text, f"  {label:<{LABEL}}  ", " " * (LABEL + 4))
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"

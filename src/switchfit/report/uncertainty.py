@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +11,7 @@ from switchfit.problem.parameter import unit_suffix
 from switchfit.report.numbers import format_rounded, label_time
 from switchfit.report.plot import turn_off_formulas
 from switchfit.report.sentences import join_words
-from switchfit.report.tables import Table, format_table
+from switchfit.report.tables import Table, format_table, wrap_text
 from switchfit.runtime.presentation import draw_figure, format_text
 from switchfit.uncertainty.certificate import Certificate
 from switchfit.uncertainty.derivative_check import DerivativeCheck
@@ -25,11 +24,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LINE, QUADRATIC, THRESHOLD, SHADE = "#b2182b", "#777777", "#333333", "#4a7fb5"
-WIDTH = 100
 LEVELS = (0.683, 0.95, 0.99)
-"""Whose thresholds a profile's figure shows, up to the one it was followed to."""
+"""Levels whose thresholds the figure of a profile shows, up to the level of the profile."""
 LARGEST_FIGURE = 10
-"""Channels that one figure shows."""
+"""Largest number of channels in one figure."""
 
 
 # --- certificate ------------------------------------------------------------------------------------------------------
@@ -156,15 +154,14 @@ def write_identifiability(found: Identifiability) -> str:
         many = found.undetermined - len(found.without)
         what = "one combination" if many == 1 else f"{many} combinations"
         sentences.append(f"{where} the data do not determine {what} of the {count} unknowns.")
-    lines = [line for sentence in sentences for line in textwrap.wrap(sentence, WIDTH)]
+    lines = [line for sentence in sentences for line in wrap_text(sentence, others="")]
     for direction in found.directions if count else ():
-        sentence = write_direction(found, direction)
-        lines += textwrap.wrap(sentence, WIDTH, initial_indent="  - ", subsequent_indent="    ")
+        lines += wrap_text(write_direction(found, direction), "  - ", "    ")
     return "\n".join(lines)
 
 
 def write_direction(found: Identifiability, direction: Direction) -> str:
-    """Return which unknowns trade off along a direction, the change that was tried, and by how much J rises.
+    """Return which unknowns trade off along a direction, the change that was tried, and the rise of J.
 
     Parameters
     ----------
@@ -172,7 +169,7 @@ def write_direction(found: Identifiability, direction: Direction) -> str:
     direction : Direction
         One of ``found.directions``.
     """
-    # A change that is described as its opposite where only that side is allowed.
+    # If only the opposite change was possible, describe that one.
     side = -1.0 if np.isnan(direction.rises[0]) and np.isfinite(direction.rises[1]) else 1.0
     places = [found.theta_names.index(name) for name in direction.names]
     moves = join_words([_format_move(found, i, side * float(direction.change[i])) for i in places])
@@ -186,19 +183,19 @@ def write_direction(found: Identifiability, direction: Direction) -> str:
 
 
 def _format_move(found: Identifiability, i: int, change: float) -> str:
-    """Return a change in words: later or earlier for a transition time, higher or lower for anything else."""
+    """Return a change in words: later or earlier for a transition time, higher or lower for other unknowns."""
     up, down = ("later", "earlier") if found.is_time[i] else ("higher", "lower")
     size = f"{abs(change):.2g}{unit_suffix(found.theta_units[i])}"
     return f"{found.theta_names[i]} {size} {up if change > 0 else down}"
 
 
 def _format_rises(direction: Direction, rise: str, cost: float) -> str:
-    """Return what was found on both sides of a change, the end of a sentence."""
+    """Return the rise of J on both sides of a change, as the end of a sentence."""
     finite = [r for r in direction.rises if np.isfinite(r)]
     if not finite:
         return ": J could not be evaluated there."
     worst = max(finite)
-    related = np.isfinite(cost) and abs(worst) < 10 * abs(cost)  # a part of a J near 0 says nothing
+    related = np.isfinite(cost) and abs(worst) < 10 * abs(cost)  # a ratio to a J near 0 means nothing
     relative = f" ({100 * worst / abs(cost):.2g} %)" if related else ""
     both = ", or the opposite," if len(finite) == 2 else ""
     return f"{both} raises J by {worst:.2g}{relative}" + (f"; {rise}." if rise else ".")
@@ -209,7 +206,7 @@ def _format_rises(direction: Direction, rise: str, cost: float) -> str:
 
 @format_text.register(ResidualDiagnostics)
 def write_diagnostics(diagnostics: ResidualDiagnostics) -> str:
-    """Return a line for each channel, and what fails.
+    """Return a line for each channel, and the tests that fail.
 
     Parameters
     ----------
@@ -255,7 +252,7 @@ def _format_probability(value: float) -> str:
 
 @format_text.register(Profile)
 def write_profile(profile: Profile) -> str:
-    """Return the estimate, both intervals, how each side ended, and what to be wary of.
+    """Return the estimate, both intervals, and the notes.
 
     Parameters
     ----------
@@ -297,7 +294,7 @@ def _format_number(value: float, error: float) -> str:
 
 
 def list_profile_notes(profile: Profile) -> list[str]:
-    """Return what is not as in the textbook, a sentence each.
+    """Return what limits the interpretation of a profile, a sentence each.
 
     Parameters
     ----------
@@ -331,7 +328,10 @@ def list_profile_notes(profile: Profile) -> list[str]:
         notes.append(f"{count} in the interval, where the slope of the profile may jump")
     if profile.trace.jumps:
         places = ", ".join(f"{value:.6g}" for value in sorted(set(profile.trace.jumps)))
-        notes.append(f"the profile jumps at {places}: the others have several minima, and the one followed ends there")
+        notes.append(
+            f"the profile jumps at {places}: the other unknowns have several minima, and the one that was followed "
+            "ends there"
+        )
     if profile.trace.coarse:
         notes.append("towards its ends the steps of the integration are too long: give the Problem a smaller rtol")
     if not profile.converged.all():
@@ -419,8 +419,7 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
 
 @draw_figure.register(ResidualDiagnostics)
 def plot_diagnostics(diagnostics: ResidualDiagnostics) -> Figure:
-    """Draw a row a channel: residuals in time, their autocorrelation, and their quantiles against those of a normal
-    one.
+    """Draw a row for each channel: residuals in time, their autocorrelation, their quantiles against normal ones.
 
     Parameters
     ----------

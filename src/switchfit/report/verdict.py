@@ -13,7 +13,7 @@ from switchfit.runtime.presentation import format_text
 from switchfit.uncertainty.verdict import LEVELS, Verdict
 
 LISTED_REASONS, LISTED_STEPS, LISTED_NAMES = 4, 2, 3
-"""Reasons, steps and names in the line; all are in the data."""
+"""Largest numbers of reasons, steps and names in the line; the data has all of them."""
 
 
 @format_text.register(Verdict)
@@ -60,14 +60,14 @@ def write_step(step: Issue) -> str:
 
 
 def write_agreement(tried: int, better: int, agreeing: int, *, few: bool = False) -> str:
-    """Return from how many of the other starts the lowest J was found, as a part of a sentence.
+    """Return how many of the other starts found the lowest J, as a part of a sentence.
 
     Parameters
     ----------
     tried, better, agreeing : int
         As in `Fit.starts`.
     few : bool
-        Whether the agreement is small enough to be doubted.
+        Whether so few starts agree that the minimum is doubtful.
     """
     if better > 0:
         return f"{better} of {tried} other starts are better"
@@ -81,7 +81,7 @@ def _figure(issue: Issue, name: str) -> float:
 
 
 def format_share(share: float) -> str:
-    """Return a share in per cent, with as many nines as it has and one digit more.
+    """Return a share in per cent, rounded down to one digit after its leading nines.
 
     Parameters
     ----------
@@ -93,11 +93,12 @@ def format_share(share: float) -> str:
     if 1 - share < 1e-6:
         return "all but 1e-6" if share < 1 - 1e-12 else "all"
     digits = 0 if share < 0.9 else max(int(np.ceil(-np.log10(1 - share))) - 1, 1)
-    return f"{np.floor(share * 10 ** (digits + 2)) / 10**digits:.{digits}f} %"
+    scaled = share * 10 ** (digits + 2)
+    return f"{np.floor(scaled + 1e-9 * scaled) / 10**digits:.{digits}f} %"  # 0.29 * 100 is below 29
 
 
 def _explain(issue: Issue) -> str:
-    """Return how much of the variance is explained, and chi-square where there is one."""
+    """Return how much of the variance is explained, and chi-square if it is known."""
     return f"the model explains {format_share(_figure(issue, 'explained'))} of the variance{_chi_square(issue)}"
 
 
@@ -109,7 +110,7 @@ def _chi_square(issue: Issue) -> str:
 
 
 def _explain_worst(issue: Issue) -> str:
-    """Return how much is explained of all, and of the worst channel where that is clearly less."""
+    """Return how much of the variance is explained, and how much of the worst channel if that is clearly less."""
     explained, worst = _figure(issue, "explained"), _figure(issue, "worst")
     text = _explain(issue)
     if issue.subjects and 1 - worst > 1.5 * (1 - explained):
@@ -118,7 +119,7 @@ def _explain_worst(issue: Issue) -> str:
 
 
 def _name(names: tuple[str, ...]) -> str:
-    """Return the first names, and how many more there are."""
+    """Return the first names, and the number of the others."""
     if len(names) <= LISTED_NAMES:
         return join_words(names) if names else "the unknowns"
     return f"{', '.join(names[:LISTED_NAMES])} and {len(names) - LISTED_NAMES} more"
@@ -159,27 +160,27 @@ def _describe_many(issue: Issue) -> str:
     """Return how many fits are of each level, and how much of the data they explain."""
     counts = {level: int(_figure(issue, level)) for level in LEVELS}
     total = sum(counts.values())
-    told = [f"{count} {'is' if count == 1 else 'are'} {level}" for level, count in counts.items() if count]
-    if len(told) == 1:
-        told = [told[0].replace(f"{total} ", "the only fit " if total == 1 else f"all {total} fits ", 1)]
+    parts = [f"{count} {'is' if count == 1 else 'are'} {level}" for level, count in counts.items() if count]
+    if len(parts) == 1:
+        parts = [parts[0].replace(f"{total} ", "the only fit " if total == 1 else f"all {total} fits ", 1)]
     else:
-        told[0] = told[0].replace(" ", f" of {total} fits ", 1)
+        parts[0] = parts[0].replace(" ", f" of {total} fits ", 1)
     worst = _figure(issue, "worst")
     if not np.isfinite(worst):
-        return join_words(told)
+        return join_words(parts)
     if total == 1:
-        return f"{told[0]} and explains {format_share(worst)} of the variance"
-    return f"{told[0]} and explain {format_share(worst)} of the variance or more (fit {issue.subjects[0]} least)"
+        return f"{parts[0]} and explains {format_share(worst)} of the variance"
+    return f"{parts[0]} and explain {format_share(worst)} of the variance or more (fit {issue.subjects[0]} least)"
 
 
 def _count_fits(issue: Issue) -> str:
-    """Return how many of the fits something is said of."""
+    """Return the number of fits that a reason is about."""
     count, total = int(_figure(issue, "count")), int(_figure(issue, "fits"))
     return "the only fit" if total == 1 else f"all {total} fits" if count == total else f"{count} of {total} fits"
 
 
 def _write_misfit(text: str) -> Callable[[Issue], str]:
-    """Return a writer that says in how many fits a text is true, and which of them explains least."""
+    """Return a writer of a text with the number of fits that it is about, and the one that explains least."""
 
     def write(issue: Issue) -> str:
         share = _figure(issue, "worst")
@@ -211,6 +212,9 @@ _REASONS: dict[str, Callable[[Issue], str]] = {
     "little explained": _explain,
     "mostly outliers": lambda issue: (
         f"the robust loss counts {100 * _figure(issue, 'share'):.0f} % of {_name(issue.subjects)} as outliers"
+    ),
+    "large residuals": lambda issue: (
+        f"the typical residual of {_name(issue.subjects)} is {_figure(issue, 'typical'):.2g} sigma of noise"
     ),
     "too few samples": lambda issue: (
         f"{_figure(issue, 'samples'):.0f} values for {_figure(issue, 'unknowns'):.0f} unknowns leave nothing to check "

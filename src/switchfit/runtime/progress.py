@@ -12,10 +12,18 @@ from contextvars import ContextVar
 from typing import Any
 
 DELAY = 1.0
-"""Seconds after which a line is shown: what ends sooner needs none."""
+"""Seconds after which the line of progress is shown; shorter calls show none."""
 
 Progress = Callable[[int, int], object]
 """``progress(done, total)``; a true return value stops the run."""
+
+
+def is_terminal(stream: Any) -> bool:
+    """Return whether a stream is a terminal; False if it is closed, or None as in a program without a console."""
+    try:
+        return stream is not None and bool(stream.isatty())
+    except ValueError:  # it is closed
+        return False
 
 
 def show_progress(callback: Progress | None, title: str) -> tuple[Progress, Callable[[], None]]:
@@ -33,15 +41,15 @@ def show_progress(callback: Progress | None, title: str) -> tuple[Progress, Call
     end : callable without arguments
         Removes the bar.
     """
-    if not sys.stderr.isatty():
+    if not is_terminal(sys.stderr):
         return (lambda done, total: callback is not None and callback(done, total)), lambda: None
     import rich.progress
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    # What a callback prints to a file must get there: only a terminal's output is led around the bar.
-    redirect = sys.stdout.isatty()
+    # What a callback prints to a file must reach it: only output to a terminal is redirected around the bar.
+    redirect = is_terminal(sys.stdout)
     bar = rich.progress.Progress(
         *columns, console=Console(stderr=True), transient=True, redirect_stdout=redirect, redirect_stderr=redirect
     )
@@ -56,9 +64,9 @@ def show_progress(callback: Progress | None, title: str) -> tuple[Progress, Call
 
 
 class Line:
-    """One line about what a long call does, with the seconds since it began; taken away at its end.
+    """One line about what a long call is doing, with the seconds since it began; removed at the end of the call.
 
-    It is drawn by threads of its own, so that it moves while machine code runs or something is compiled.
+    Threads of its own draw it, so that it is updated while machine code runs or a program is compiled.
     """
 
     def __init__(self, text: str) -> None:
@@ -70,22 +78,22 @@ class Line:
         self._timer: threading.Timer | None = None
 
     def write(self, text: str, lowest: float = math.inf) -> None:
-        """Say something else, and the lowest J so far if there is one."""
+        """Replace the text, and the lowest J so far; infinity shows none."""
         self.text, self.detail, self.lowest = text, "", lowest
 
     @property
     def is_started(self) -> bool:
-        """Whether it will be shown if the call lasts."""
+        """Whether the line is shown if the call takes longer than `DELAY`."""
         return self._timer is not None
 
     def start(self) -> None:
-        """Show the line from `DELAY` seconds on."""
+        """Show the line after `DELAY` seconds."""
         self._timer = threading.Timer(DELAY, self._show)
         self._timer.daemon = True
         self._timer.start()
 
     def end(self) -> None:
-        """Take the line away."""
+        """Remove the line."""
         if self._timer is None:
             return
         self._timer.cancel()
@@ -98,7 +106,7 @@ class Line:
         from rich.console import Console
         from rich.live import Live
 
-        console, redirect = Console(stderr=True), sys.stdout.isatty()
+        console, redirect = Console(stderr=True), is_terminal(sys.stdout)
         settings: dict[str, Any] = {"redirect_stdout": redirect, "redirect_stderr": redirect}
         with self._lock:
             if not self._ended:
@@ -118,11 +126,14 @@ _current: ContextVar[Line | None] = ContextVar("line of progress", default=None)
 
 @contextmanager
 def show_line(text: str) -> Iterator[Line]:
-    """Return a context that yields the line of a long call, on a terminal; calls inside another one show nothing."""
+    """Return a context that yields the line of a long call, shown on a terminal.
+
+    A call inside another one, or outside the main thread, gets a line that is not shown.
+    """
     line = Line(text)
     is_first = _current.get() is None and threading.current_thread() is threading.main_thread()
     token = _current.set(line)
-    if is_first and sys.stderr.isatty():
+    if is_first and is_terminal(sys.stderr):
         line.start()
     try:
         yield line
@@ -132,11 +143,12 @@ def show_line(text: str) -> Iterator[Line]:
 
 
 def show_detail(detail: str, cost: float = math.inf) -> None:
-    """Add to the line of the call under way how far it is, such as "window 3 of 9", and a J that may be the lowest.
+    """Add to the line of the running call how far it is, and a cost that may be the lowest.
 
     Parameters
     ----------
     detail : str
+        Such as "window 3 of 9".
     cost : float
     """
     line = _current.get()

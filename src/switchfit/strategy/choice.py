@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from switchfit.estimation.estimator import Estimate, fit_locally
 from switchfit.fit.result import Step
 from switchfit.fit.solution import is_least_squares, is_sigma_known, smallest_cost
+from switchfit.fit.variation import measure_variation
 from switchfit.optimize import IterationRecord, Status
 from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
@@ -21,13 +22,13 @@ from switchfit.problem.problem import GIVEN, Problem
 from switchfit.problem.validation import as_callable, as_choice, as_positive
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.runtime.progress import Line, show_line
-from switchfit.strategy.horizon import REFERENCE_POINTS, can_grow, grow_horizon
+from switchfit.strategy.horizon import can_grow, grow_horizon
 from switchfit.strategy.minimum_time import is_minimum_time, try_shorter_horizons
 from switchfit.strategy.quick import End, fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
 from switchfit.strategy.runs import fit_runs_alone, has_runs
 from switchfit.strategy.scan import can_scan, scan_intervals
-from switchfit.strategy.starts import SAME_COST, Starts, try_starts
+from switchfit.strategy.starts import MOST, SAME_COST, Starts, try_starts
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 from switchfit.uncertainty.quality import measure_quality
 from switchfit.uncertainty.verdict import UNLIKELY
@@ -50,6 +51,10 @@ REMESH = "new meshes"
 
 GROWTH_AGREES = "growing horizon agrees"
 """The growing horizon, which does not start from the guess, has ended at the same cost as the fit."""
+
+FEW_STARTS = 16
+"""Starts where the scan and the growing horizon have found nothing lower than the fit: it is the model that is doubted
+then, mostly, and each start of a model that is wrong takes long."""
 
 EVERYWHERE = frozenset({GROW, REINSERT, STARTS})
 """Strategies that look everywhere."""
@@ -197,8 +202,6 @@ def _is_enough(problem: Problem, fit: Estimate, tried: Collection[str] = ()) -> 
         return True
     if _is_confirmed(problem, fit):
         return True
-    if GROWTH_AGREES in tried and SCAN in tried and fit.status.successful:
-        return True  # what is doubted is the model: two searches that share no start have found the same minimum
     if is_doubted(fit) or (_is_coarse(fit) and REMESH not in tried):
         return False
     if any(run.is_guess_proposed for run in problem.experiments) and fit.sigma_known is not True:
@@ -230,16 +233,7 @@ def _is_confirmed(problem: Problem, fit: Estimate) -> bool:
 def _cost_of_means(problem: Problem) -> float:
     """Return J of references that are met by their means, kept with the problem."""
     if "cost_of_means" not in problem.__dict__:
-        total = 0.0
-        for run in problem.experiments:
-            for item in run.data:
-                times = np.linspace(run.t0, run.end, REFERENCE_POINTS)
-                followed = item.signal(times)
-                deviation = followed - followed.mean(axis=0)
-                total += (
-                    0.5 * float(np.einsum("ki,ij,kj->", deviation, item.weights, deviation)) * (times[1] - times[0])
-                )
-        object.__setattr__(problem, "cost_of_means", total)
+        object.__setattr__(problem, "cost_of_means", float(measure_variation(problem).sum()))
     return float(problem.__dict__["cost_of_means"])
 
 
@@ -299,6 +293,7 @@ class Search:
         self.steps = [Step(name, self.lowest, self.evaluations, time.perf_counter() - began)]
         self.first_cost = np.nan if best is None else best.initial_cost
         self.starts: Starts | None = None
+        self.tried: set[str] = set()
 
     @property
     def late(self) -> bool:
@@ -325,7 +320,7 @@ class Search:
         self.line.write(name, self.lowest)
 
     def _run(self) -> None:
-        tried: set[str] = set()
+        tried = self.tried
         try:
             if self.best is not None and _is_coarse(self.best):
                 self._fit_on_new_meshes(self.best)
@@ -335,8 +330,13 @@ class Search:
             for name, find in self._list_strategies():
                 if self.late:
                     break
+                if name == REINSERT and self._is_model_doubted:
+                    continue
+                before = self.lowest
                 agrees = self._try(name, find)
                 tried.add(name)
+                if name == STARTS and self.lowest < before and SCAN in tried and not self.late:
+                    self._try(SCAN, lambda theta: scan_intervals(self.problem, theta))
                 if agrees and name == GROW:
                     tried.add(GROWTH_AGREES)
                 if self.strategy == "auto" and self.best is not None and _is_enough(self.problem, self.best, tried):
@@ -415,6 +415,11 @@ class Search:
         return found
 
     @property
+    def _is_model_doubted(self) -> bool:
+        """Whether it is the model that is doubted, and not the minimum: two searches found nothing lower."""
+        return self.strategy == "auto" and {SCAN, GROWTH_AGREES} <= self.tried
+
+    @property
     def _time_left(self) -> float | None:
         left = self.budget - (time.perf_counter() - self.began)
         return None if left == np.inf else max(left, 1e-3)
@@ -423,7 +428,8 @@ class Search:
         if self.best is not None and is_minimum_time(self.problem, self.best):
             self.starts = try_shorter_horizons(self.problem, self.best, lambda: self.late)
         else:
-            self.starts = try_starts(self.problem, theta, stop=lambda: self.late)
+            most = FEW_STARTS if self._is_model_doubted else MOST
+            self.starts = try_starts(self.problem, theta, most=most, stop=lambda: self.late)
         return self.starts.end
 
     def _margin(self, cost: float) -> float:

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.variation import assume_noise
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal, TerminalConstraint, TerminalCost
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.parameter import Parameter
@@ -50,7 +51,7 @@ REFERENCE_POINTS = 100
 
 LOOSE = 1.0
 """Standard deviation of the priors that keep parameters near their guesses while nothing determines them, as a part of
-the guess, or of the way between its bounds. The last fit is without them."""
+the guess, or of the way between its bounds, beside noise of `assume_noise`. The last fit is without them."""
 
 
 TIED = 0.1
@@ -135,7 +136,8 @@ class GrowingRun:
     """One run: for each number of transitions the best fit of the part of its log that is looked at."""
 
     def __init__(self, problem: Problem, e: int, theta: FloatArray, shared: frozenset[str]) -> None:
-        self.problem, self.run, self.shared = problem, problem.experiments[e], shared
+        self.problem, self.run, self.shared = problem, _allow_priors(problem.experiments[e]), shared
+        self.noise = assume_noise(problem)
         self.free = problem.unknowns.times[e] >= 0
         ends = problem.ends_of_modes(theta)[e]
         self.guess, self.end = ends[1:-1], float(ends[-1])
@@ -214,9 +216,9 @@ class GrowingRun:
                 if name in self.shared:
                     span, before = self.problem.unknowns.parameters[name], _count_times(self.problem)
                     value = rest[span.start - before : span.stop - before].reshape(parameter.shape)
-                    parameters[name] = _loosen(replace(parameter, value=value, prior=None), TIED)
+                    parameters[name] = _loosen(replace(parameter, value=value, prior=None), TIED / self.noise)
                 elif not self.is_whole:
-                    parameters[name] = _loosen(parameter, LOOSE)
+                    parameters[name] = _loosen(parameter, LOOSE / self.noise)
             return _build(self.problem, self.cut(k), parameters)
         except ValueError:  # a transition that is fixed or bounded to be later, or no data yet
             return None
@@ -260,9 +262,9 @@ def _fit_together(problem: Problem, runs: list[GrowingRun], rest: FloatArray, *,
         number = len(run.best.times) - (run.is_whole and run.run.has_free_tf)
         cuts.append(run.cut(number))
     try:
-        joint = _build(
-            problem, cuts, {name: _loosen(parameter, LOOSE) for name, parameter in problem.parameters.items()}
-        )
+        loose = LOOSE / assume_noise(problem)
+        parameters = {name: _loosen(parameter, loose) for name, parameter in problem.parameters.items()}
+        joint = _build(problem, cuts, parameters)
     except ValueError:
         return rest, 0
     end = fit_briefly(joint, _assemble(joint, runs, rest), ITERATIONS)
@@ -344,6 +346,15 @@ def _cut(item: Any, end: float) -> Any:
     if isinstance(item, TerminalCost | TerminalConstraint):
         return None
     return item
+
+
+def _allow_priors(run: Experiment) -> Experiment:
+    """Return the run with 1 for a sigma that is left out: J is the same, and priors may be weighed against it."""
+    unscaled = [isinstance(item, Measurements) and item.sigma is None for item in run.data]
+    if not any(unscaled):
+        return run
+    data = [replace(item, sigma=1.0) if bare else item for item, bare in zip(run.data, unscaled, strict=True)]
+    return replace(run, data=data)
 
 
 def _loosen(parameter: Parameter, loose: float) -> Parameter:

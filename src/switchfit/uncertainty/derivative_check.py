@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.fit.evaluator import Evaluation, Evaluator, evaluator_of, is_covered_by_paper
+from switchfit.engine.protocol import Evaluation
+from switchfit.fit.evaluator import Evaluator, evaluator_of, is_covered_by_paper
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_instance, as_seed

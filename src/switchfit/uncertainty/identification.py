@@ -27,6 +27,7 @@ from switchfit.fit.hidden import refuse_hidden_switches
 from switchfit.fit.result import Fit, compute_scaled_spectrum
 from switchfit.fit.solution import is_least_squares
 from switchfit.fit.trajectory import compare
+from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.runtime.presentation import format_text
@@ -272,7 +273,7 @@ def _analyse_first_guess(problem: Problem) -> Identifiability:
         if all(item.sigma is not None for item in items):
             rise, meaning = 0.5 * float(scipy.special.ndtri(0.975)) ** 2, "noise"
         else:
-            rise, meaning = 1e-4 * _measure_variation(clean), "1 % of variation"
+            rise, meaning = 1e-4 * float(measure_variation(clean).sum()), "1 % of variation"
         base = np.nan
     else:
         evaluator = own
@@ -307,18 +308,6 @@ def _drop_noise(problem: Problem, evaluator: Evaluator) -> Problem:
         ]
         experiments.append(replace(experiment, data=data))
     return replace(problem, experiments=experiments)
-
-
-def _measure_variation(problem: Problem) -> float:
-    """Return half the weighted sum of squares of the measured values about the mean of their channel."""
-    total = 0.0
-    for experiment in problem.experiments:
-        for item in experiment.data:
-            weights = item.weights
-            values = np.nan_to_num(item.values)
-            mean = (weights * values).sum(0) / np.maximum(weights.sum(0), 1e-300)
-            total += 0.5 * float(np.sum(weights * (values - mean) ** 2))
-    return total
 
 
 def _limit_change(problem: Problem) -> Callable[[FloatArray], bool]:

@@ -27,6 +27,7 @@ from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_index
+from switchfit.runtime.frames import Tabular
 from switchfit.uncertainty.sensitivity import Points, Sensitivity, compute_sensitivity
 
 NEAR = 2.0
@@ -34,7 +35,7 @@ NEAR = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class Prediction(Tabular):
     """States and outputs of one experiment with their standard errors.
 
     Attributes

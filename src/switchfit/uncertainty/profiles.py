@@ -40,6 +40,7 @@ from switchfit.optimize import Status, solve_qp
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_name, join_names, shorten
+from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import draw_figure, format_html, format_text
 from switchfit.runtime.progress import Progress, show_progress
 
@@ -449,7 +450,7 @@ class Trace:
 
 
 @dataclass(frozen=True, eq=False)
-class Profile:
+class Profile(Tabular):
     """Profile likelihood of one unknown: print it, plot it, or get intervals at any level.
 
     Attributes

@@ -28,6 +28,7 @@ import scipy.special
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
+from switchfit.runtime.frames import Tabular
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text
 
@@ -135,7 +136,7 @@ class ChannelResiduals:
 
 
 @dataclass(frozen=True, eq=False)
-class ResidualDiagnostics:
+class ResidualDiagnostics(Tabular):
     """Tests of the residuals of all channels; print it.
 
     Attributes

@@ -81,7 +81,7 @@ WRONG_INTEGRATION = 1e-2
 
 AGREEING = 0.1
 """Share of other starts that end in the same minimum below which it is doubtful that there is no better one, unless
-chi-square confirms the fit."""
+what is left of the data is noise: by chi-square, or by white residuals where sigma is unknown."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ def judge(fit: Fit, certificate: Certificate | None = None) -> Verdict:
     # There is no better minimum than 0, and the integration error is all of a cost that is rounding.
     exact = quality is not None and 1 - quality.explained < NO_RESIDUALS
     if not exact:
-        found += _judge_starts(fit, confirmed=quality is not None and quality.has_chi_square and not fitting)
+        found += _judge_starts(fit, None if fitting else quality)
     if quality is not None:
         found += _find_undetermined(fit)
         found += _find_bounds(fit)
@@ -174,10 +174,13 @@ def judge(fit: Fit, certificate: Certificate | None = None) -> Verdict:
 ELSEWHERE = ("more starts", "look at the residuals")
 """What to do about a model that does not fit: the minimum may be a local one, or the model wrong."""
 
+CORRECTED = ("corrected errors", "look at the residuals")
+"""What to do about correlated residuals of the right minimum."""
+
 FIX = "fix or add data"
 """What to do about unknowns that are not determined, which are the subjects of this advice."""
 
-MISFITS = ("unexplained", "mostly outliers", "slightly wrong", "reference not followed")
+MISFITS = ("unexplained", "mostly outliers", "large residuals", "slightly wrong", "reference not followed")
 """Kinds of reasons that say that the model does not fit, other than by the size of the noise."""
 
 
@@ -214,6 +217,8 @@ def _judge_quality(fit: Fit, quality: Quality) -> Iterator[Finding]:
         reason = Issue("mostly outliers", (lost.label,), {"share": lost.outliers})
         yield Finding("bad", reason, ELSEWHERE)
         return
+    if fit.sigma_known:
+        yield from _judge_typical(quality, samples)
     too_small = quality.has_chi_square and quality.probability_below < UNLIKELY and quality.ratio < 1 - CLEARLY_OFF
     if quality.has_chi_square and not too_small:
         yield from _judge_chi_square(quality, samples)
@@ -255,7 +260,10 @@ def _judge_residuals(
         if worst.explained < EXPLAINED_UNKNOWN:
             yield Finding("bad", Issue("unexplained", (worst.label,), figures), ELSEWHERE)
         elif not sigma_too_large:
-            yield from _find_correlation(quality)
+            # Wrong ends explain up to 99.8 %, too, and leave correlated residuals: below `NEARLY_ALL` of all data the
+            # minimum is in doubt, not only the standard errors.
+            steps = CORRECTED if quality.explained >= NEARLY_ALL else ("more starts", *CORRECTED)
+            yield from (f._replace(steps=steps) for f in _find_correlation(quality))
         return
     if sigma_too_large:
         return
@@ -265,6 +273,15 @@ def _judge_residuals(
         yield Finding("bad", Issue("unexplained", (), figures), ELSEWHERE)
     elif quality.explained < (MOSTLY if untested else HALF):
         yield Finding("doubtful", Issue("little explained", (), figures), ("more starts", "more data"))
+
+
+def _judge_typical(quality: Quality, samples: tuple[ChannelQuality, ...]) -> Iterator[Finding]:
+    """Judge a fit with a robust loss, which has no chi-square, by the size of its typical residuals."""
+    robust = [c for c in samples if np.isfinite(c.typical)]
+    if quality.are_residuals_large or any(c.are_residuals_large for c in robust):
+        worst = max(robust, key=lambda c: c.typical)
+        figures = _describe_fit(quality) | {"worst": worst.explained, "typical": worst.typical}
+        yield Finding("doubtful", Issue("large residuals", (worst.label,), figures), (*ELSEWHERE, "check sigma"))
 
 
 def _judge_reference(quality: Quality, references: tuple[ChannelQuality, ...]) -> Iterator[Finding]:
@@ -284,7 +301,7 @@ def _find_correlation(quality: Quality) -> Iterator[Finding]:
     for issue in quality.residuals.issues:
         negligible = 1 - quality.explained < NO_RESIDUALS
         if issue.kind == "correlated residuals" and not negligible:
-            yield Finding("doubtful", issue, ("corrected errors", "look at the residuals"))
+            yield Finding("doubtful", issue, CORRECTED)
 
 
 def _condemn(finding: Finding) -> Finding:
@@ -312,15 +329,15 @@ def _find_collapsed(fit: Fit) -> Iterator[Finding]:
         yield Finding("doubtful", Issue("idle", fit.idle), ("more starts", "leave the mode out"))
 
 
-def _judge_starts(fit: Fit, *, confirmed: bool) -> Iterator[Finding]:
-    """Find out whether other starts ended lower, or elsewhere."""
+def _judge_starts(fit: Fit, quality: Quality | None) -> Iterator[Finding]:
+    """Find out whether other starts ended lower, or elsewhere; `quality` is that of a fit that explains its data."""
     if fit.starts is None:
         return
     tried, better, agreeing = fit.starts
     figures = {"tried": float(tried), "better": float(better), "agreeing": float(agreeing)}
     if better > 0:
         yield Finding("bad", Issue("other starts are better", figures=figures), ("more starts",))
-    elif tried > 0 and agreeing < AGREEING * tried and not confirmed:
+    elif tried > 0 and agreeing < AGREEING * tried and not (quality and _is_noise(quality, agreeing)):
         yield Finding("doubtful", Issue("few starts agree", figures=figures), ("more starts",))
 
 
@@ -378,6 +395,19 @@ def _describe_fit(quality: Quality) -> dict[str, float | tuple[float, ...]]:
         "freedom": float(quality.freedom),
         "probability": quality.probability,
     }
+
+
+def _is_noise(quality: Quality, agreeing: int) -> bool:
+    """Return whether what is left of the data is noise: sigma says so, or, where it is unknown, the residuals are white
+    and small, and a start at least has ended there as well: a minimum beside the best has been seen to leave white
+    residuals half as large again.
+    """
+    if quality.has_chi_square:
+        return True
+    if agreeing < 2:
+        return False
+    samples = [c for c in quality.channels if c.kind == "measurements"]
+    return bool(samples) and all(c.whiteness > WHITE and _share(c.explained) > EXPLAINED for c in samples)
 
 
 def _worst(channels: tuple[ChannelQuality, ...]) -> float:

@@ -11,7 +11,7 @@ from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.jax.programs import Method, derivatives, differentiate_constrained
 from switchfit.engine.jax.simulation import simulate_by_jax
-from switchfit.engine.protocol import Constrained, Derivatives, Engine, Matrix, Simulation
+from switchfit.engine.protocol import Engine, Evaluation, Matrix, Simulation
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
@@ -21,24 +21,27 @@ from switchfit.runtime.cache import use_compilation_cache
 class JaxEngine:
     """Evaluates one experiment on one mesh with JAX programs.
 
-    Attributes
+    Parameters
     ----------
-    reason : str
+    structure : Structure
+    arguments : Arguments
+    mesh : Mesh
+    reason : str, optional
         Why the experiment is not evaluated in machine code.
     """
 
-    def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh) -> None:
+    def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh, reason: str = "") -> None:
         self._structure, self._arguments, self._mesh = structure, arguments, mesh
+        self._reason = reason
         self._on_device: Arguments | None = None
         self._compiled: set[tuple[Method, Matrix]] = set()
         # The last simulation without tangents, since J and the trajectory are often requested at the same point.
         self._last: tuple[bytes, Simulation] | None = None
-        self.reason = "engine='jax' is set"
 
     @property
     def engine(self) -> Engine:
         """JAX, with the reason."""
-        return Engine("jax", self.reason)
+        return Engine("jax", self._reason)
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """Return J alone."""
@@ -46,7 +49,7 @@ class JaxEngine:
 
     def derivatives(
         self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix, method: Method = "discrete-adjoint"
-    ) -> Derivatives:
+    ) -> Evaluation[FloatArray]:
         """Return J and its derivatives, by one of the methods."""
         compiled = (method, matrix) in self._compiled
         with use_float64(), nullcontext() if compiled else use_compilation_cache():
@@ -54,16 +57,17 @@ class JaxEngine:
             found = derivatives(*given, structure=self._structure, method=method, matrix=matrix)
         self._compiled.add((method, matrix))
         J, g, H = found
-        return Derivatives(float(J), np.array(g), np.array(H))  # copies: arrays of JAX are read-only
+        return Evaluation(float(J), np.array(g), np.array(H))  # copies: arrays of JAX are read-only
 
     def constrained(
-        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
-    ) -> Constrained:
-        """Return J and its constraints."""
+        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
+    ) -> Evaluation[FloatArray]:
+        """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
         with use_float64(), use_compilation_cache():
-            given = self._given(), tau, p, float(side), multipliers, penalty
-            J, slope, H, c, A = differentiate_constrained(*given, structure=self._structure)
-        return Constrained(float(J), np.array(slope), np.array(H), np.array(c), np.array(A))
+            given = self._given(), tau, p, float(side), multipliers
+            found = differentiate_constrained(*given, structure=self._structure)
+        J, slope, H, c, A = map(np.array, found)
+        return Evaluation(float(J), slope - multipliers @ A, H, c, A)
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""

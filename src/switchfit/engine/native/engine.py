@@ -9,9 +9,8 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order
 from switchfit.engine.protocol import (
-    Constrained,
-    Derivatives,
     Engine,
+    Evaluation,
     ExperimentEngine,
     Matrix,
     Simulation,
@@ -62,19 +61,19 @@ class NativeEngine:
         found = None if native is None else native.cost(tau, p)
         return self._fallback.cost(tau, p) if found is None else found
 
-    def derivatives(self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix) -> Derivatives:
+    def derivatives(self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix) -> Evaluation[FloatArray]:
         """Return J and its derivatives."""
         native = self.at(ORDERS[matrix])
         found = None if native is None else native(tau, p, side)
         return self._fallback.derivatives(tau, p, side, matrix) if found is None else found
 
     def constrained(
-        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
-    ) -> Constrained:
-        """Return J and its constraints."""
+        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
+    ) -> Evaluation[FloatArray]:
+        """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
         native = self.at(Order.HESSIAN)
-        found = None if native is None else native.constrained(tau, p, side, multipliers, penalty)
-        return self._fallback.constrained(tau, p, side, multipliers, penalty) if found is None else found
+        found = None if native is None else native.constrained(tau, p, side, multipliers)
+        return self._fallback.constrained(tau, p, side, multipliers) if found is None else found
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""

@@ -27,7 +27,7 @@ from switchfit.engine.native.workspace import (
     pointers,
     sums,
 )
-from switchfit.engine.protocol import Constrained, Derivatives
+from switchfit.engine.protocol import Evaluation
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 
@@ -140,7 +140,7 @@ class NativeExperiment:
         rows = constraint_rows(library, sizes)
         own_rows = [rows[kind.name] + i for kind, i in list_constrained_transitions(structure)]
         self._constraint_rows = np.array([*own_rows, *range(rows["end"], rows["count"])], dtype=np.intp)
-        self._weights = np.zeros((2, max(rows["count"], 1)))  # multipliers and penalties
+        self._multipliers = np.zeros(max(rows["count"], 1))
         lengths = sums(library, sizes)
         self._sums = np.zeros(sum(lengths.values()))
         arrays: dict[str, Any] = {
@@ -150,8 +150,7 @@ class NativeExperiment:
             "p": self._p,
             "bounds": self._bounds,
             "first_cell": self._first_cell,
-            "multipliers": self._weights[0],
-            "penalties": self._weights[1],
+            "multipliers": self._multipliers,
             "units": units,
         }
         arrays |= places_in_library(structure)
@@ -180,7 +179,7 @@ class NativeExperiment:
         self._result = self._named["g"][:D], self._named["H"].reshape(D, width)[:, :D]
         self._delays = _find_delays(structure, arguments)
 
-    def __call__(self, tau: FloatArray, p: FloatArray, side: float) -> Derivatives | None:
+    def __call__(self, tau: FloatArray, p: FloatArray, side: float) -> Evaluation[FloatArray] | None:
         """Return J, its gradient (D,) and its Hessian (D, D), which is NaN at orders below the second.
 
         None if a finiteness check failed: the caller falls back to JAX.
@@ -193,28 +192,28 @@ class NativeExperiment:
             if not self._all_own:
                 g, H = g[self._own], H[np.ix_(self._own, self._own)]
             hessian = H.copy() if self._has_hessian else np.full(H.shape, np.nan)
-            return Derivatives(self._J.item(0), g.copy(), hessian)
+            return Evaluation(self._J.item(0), g.copy(), hessian)
 
     def constrained(
-        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
-    ) -> Constrained | None:
-        """Return the cost, the constraints and their derivatives; the multipliers and penalties are (m,).
+        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
+    ) -> Evaluation[FloatArray] | None:
+        """Return J and the constraints, with the Hessian of ``J + multipliers . c``; the multipliers are (m,).
 
         None if a finiteness check failed.
         """
         where = self._constraint_rows
         with self._workspace.lock:
-            self._weights[:, where] = multipliers, penalty
+            self._multipliers[where] = multipliers
             try:
                 self._run(tau, p, side)
             finally:
-                self._weights[:] = 0.0
+                self._multipliers[:] = 0.0
             if self._has_failed_check:
                 return None
             (g, H), own = self._result, self._own
             c = self._named["constraints"][where]
             A = self._named["jacobian"].reshape(-1, self.sizes.width)[where][:, own]
-            return Constrained(self._J.item(0), g[own], H[np.ix_(own, own)], c, A)
+            return Evaluation(self._J.item(0), g[own] - multipliers @ A, H[np.ix_(own, own)], c, A)
 
     def program_at(self, tau: FloatArray, p: FloatArray) -> Callable[[], object]:
         """Return a function that runs the machine code alone, for benchmarks."""
