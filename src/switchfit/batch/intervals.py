@@ -1,8 +1,7 @@
 """Intervals of transition times across sample times, of many fits: as of `switchfit.uncertainty.piecewise`.
 
-Where a sample lies within the interval of a transition time, or a kink holds it, the pieces of its profile are found
-while the fit's data are at hand, with an evaluation for each sample on the way, and kept: from them follows the
-interval at any level. Most fits have no sample so near, and cost nothing.
+Where a sample lies near a transition time, or a kink holds it, the pieces of its profile are found while the fit's data
+are at hand, and kept: from them follows the interval at any level. Most fits have no sample so near, and cost nothing.
 """
 
 from __future__ import annotations
