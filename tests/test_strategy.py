@@ -526,7 +526,7 @@ def test_a_budget_of_time_ends_the_search():
 def test_an_interrupted_search_keeps_the_best(monkeypatch):
     from switchfit.strategy import choice
 
-    def interrupted(problem, theta):
+    def interrupted(problem, theta, stop):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(choice, "grow_horizon", interrupted)

@@ -181,7 +181,7 @@ def _list_walks(problem: Problem, chunk: Chunk, k: int) -> list[_Walk]:
         samples = list_sample_times(problem, e)
         held = bool(chunk.status[k] == AT_KINK and variance[place] == 0)
         few = np.sum(np.abs(samples - theta[place]) <= reach[place]) <= MOST_SAMPLES
-        if not held and not (few and is_any_near(samples, theta[place], np.sqrt(variance[place]))):
+        if not held and not (few and is_any_near(samples, theta[place], reach[place] / quantile)):
             continue
         free = variance > 0
         free[place] = False
