@@ -137,7 +137,7 @@ def _run_on_cluster(work: Work, chunks: list[range], client: Any) -> Iterator[tu
     The work travels as bytes that are themselves the result of a task, so that they outlive the workers that hold
     them; a worker unpickles them once, or it would compile the model's functions anew for every chunk.
     """
-    import cloudpickle  # with dask: needed here only
+    import cloudpickle
     from distributed import as_completed
 
     blob = cloudpickle.dumps(work)

@@ -170,8 +170,8 @@ class Fits(Tabular):
     def confidence_intervals(self, level: float = 0.95) -> FloatArray:
         """Return intervals theta +- quantile x standard error of each fit: (R, d, 2).
 
-        Of a transition time with a few samples within its interval, or at a kink, from one parabola for each stretch
-        between samples, as `Estimate.confidence_intervals`. NaN for any other unknown that is held.
+        Of a transition time with a few samples near, or at a kink, the profile is followed from sample to sample, as by
+        `Estimate.confidence_intervals`. NaN for any other unknown that is held.
 
         See Also
         --------

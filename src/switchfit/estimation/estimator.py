@@ -292,11 +292,11 @@ class Estimate(Fit, Tabular):
         """Return intervals of all unknowns, cut off at the bounds: (d, 2).
 
         The interval is ``theta +- quantile x standard error``. For unknowns on a logarithmic scale, theta is multiplied
-        and divided by exp(quantile x relative standard error). For a transition time at a kink, or with sample times
-        inside that interval, it is the range in which 2 (J − J_min) of a piecewise quadratic profile stays below the
-        squared quantile: slope and curvature of the cost jump at every sample time, so that this interval is not
-        symmetric. An estimate that was loaded without its model, that has more than 15 experiments, guards or terminal
-        constraints, or that is one of many fits at once (`Fits`), has ``theta +- quantile x standard error`` only.
+        and divided by exp(quantile x relative standard error). For a transition time at a kink, or with a sample time
+        within five standard errors, it is the range in which 2 (J − J_min) of its profile, followed piece by piece,
+        stays below the squared quantile: slope and curvature of the cost jump at every sample time, so that this
+        interval is not symmetric. An estimate that was loaded without its model, or that has more than 15 experiments,
+        guards or terminal constraints, has ``theta +- quantile x standard error`` only.
         NaN for an unknown that is held by a bound, a collapsed mode or, without its model, a kink.
 
         Parameters

@@ -73,7 +73,7 @@ class Step:
     seconds : float
     ended : str
         Why the many starts ended: "settled", no further minimum was likely; "most", as many as are tried at most;
-        "time" or "interrupted". Empty for other strategies.
+        "time" or "interrupted". "time" for a growing horizon that the time budget ended. Otherwise empty.
 
     See Also
     --------

@@ -229,7 +229,8 @@ def _format_step(step: Step) -> str:
     not met.
     """
     cost = f"J = {step.cost:.6g}" if np.isfinite(step.cost) else "failed"
-    return f"{step.strategy}: {cost} ({step.seconds:.2g} s)"
+    ended = ", ended by time_budget" if step.ended == "time" else ""
+    return f"{step.strategy}: {cost} ({step.seconds:.2g} s{ended})"
 
 
 def _shorten_status(fit: Fit) -> str:

@@ -117,7 +117,7 @@ def estimate(
     start : (d,) array_like, optional
         Where to begin, in the order of ``problem.theta_names``; the problem's initial guess if left out.
     time_budget : float, optional
-        Seconds after which no further strategy begins, and the many starts end.
+        Seconds after which no further strategy begins; many starts and a growing horizon that are under way end.
 
     Returns
     -------
@@ -136,7 +136,7 @@ def estimate(
     -----
     On a terminal, a line on stderr says from a second on which strategy is under way, the lowest J, how far it is and
     for how long. Many starts that last are fitted by other processes as well, one a core, where the model runs in
-    machine code and cloudpickle is installed; what is found does not depend on them.
+    machine code and can be pickled; what is found does not depend on them.
 
     See Also
     --------
@@ -393,7 +393,7 @@ class Search:
             # Far from the data the intervals near by are hopeless; several runs have been fitted alone by then.
             far = best is None or best.verdict.level == "bad"
             place = 0 if far and not has_runs(problem) else len(found)
-            found.insert(place, (GROW, lambda theta: grow_horizon(problem, theta)))
+            found.insert(place, (GROW, lambda theta: grow_horizon(problem, theta, lambda: self.late)))
         if can_reinsert(problem):
             found.append((REINSERT, lambda theta: reinsert_modes(problem, theta)))
         return [*found, (STARTS, self._try_starts)]
@@ -469,6 +469,7 @@ class Search:
             if self.best is None or (fit.cost < before and not fit.violated) or self.best.violated:
                 self.best = fit
         self.evaluations += evaluations
-        ended = self.starts.ended if self.starts is not None and name == STARTS else ""
+        ended = "time" if name == GROW and self.late and end.failed else ""
+        ended = self.starts.ended if self.starts is not None and name == STARTS else ended
         self.steps.append(Step(name, self.lowest, evaluations, time.perf_counter() - began, ended))
         return bool(np.isfinite(before) and abs(end.cost - before) <= SAME_COST * abs(before))
