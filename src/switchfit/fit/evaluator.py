@@ -110,11 +110,9 @@ class Evaluator:
         self.problem = problem
         indices = range(len(problem.experiments))
         at = problem.initial_theta if theta is None else theta
-        given = list(meshes) if meshes is not None else [refine_mesh(problem, e, at) for e in indices]
-        self.meshes = given
-        self.replace_arguments(
-            [build_arguments(problem, e, m) for e, m in enumerate(pad_to_common_lengths(problem, given))]
-        )
+        self.meshes = list(meshes) if meshes is not None else [refine_mesh(problem, e, at) for e in indices]
+        padded = enumerate(pad_to_common_lengths(problem, self.meshes))
+        self._set_arguments([build_arguments(problem, e, mesh) for e, mesh in padded])
         self._priors = problem.unknowns.priors if problem.unknowns.priors.any else None
 
     def divide(self, parts: int) -> Evaluator:
@@ -231,10 +229,14 @@ class Evaluator:
     def replace_arguments(self, arguments: Sequence[Arguments]) -> None:
         """Replace data and constants; the meshes are those of the new nodes."""
         self.__dict__.pop("halved", None)
-        self.arguments = list(arguments)
         before = zip(self.meshes, arguments, strict=True)
         self.meshes = [Mesh.from_times(np.asarray(own.nodes), mesh.stiffness) for mesh, own in before]
         self.__dict__.pop("structures", None)
+        self._set_arguments(list(arguments))
+
+    def _set_arguments(self, arguments: list[Arguments]) -> None:
+        """Store the arguments on the meshes that the evaluator has, and choose the engines."""
+        self.arguments = arguments
         given = enumerate(zip(self.arguments, self.meshes, strict=True))
         self.engines = [engine_of(self.problem, e, own, mesh) for e, (own, mesh) in given]
 

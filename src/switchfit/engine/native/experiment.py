@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable, Sequence
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,12 +20,12 @@ from switchfit.engine.native.program import PREFIX, program_of
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes, constants_of
 from switchfit.engine.native.workspace import (
+    GIVEN,
     OF_SAMPLES,
     WHOLE_OF_SAMPLES,
     ZEROED,
     constraint_rows,
     memory,
-    pointers,
     sums,
 )
 from switchfit.engine.protocol import Constrained, Derivatives
@@ -162,8 +163,7 @@ class NativeExperiment:
         self._zeroed: list[FloatArray] = []
         self._memory = np.zeros(0)  # the workspace that the table points to
         self._named: dict[str, Any] = arrays
-        self._pointers = pointers(library, sizes, order)
-        self._arrays = [arrays.get(name, self._memory) for name in self._pointers]
+        self._arrays = [arrays[name] for name in GIVEN]
         self._late: list[tuple[int, str, FloatArray, Any, Any]] = []
         for k, (samples, count) in enumerate(zip(arguments.samples, counts, strict=True)):
             given: dict[str, Any] = {}
@@ -174,7 +174,11 @@ class NativeExperiment:
             if delay is not None:
                 self._late.append((k, delay, given["time"], given["cell"], given["segment"]))
             self._arrays += given.values()
-        self._table = np.array([a.__array_interface__["data"][0] for a in self._arrays], dtype=np.uintp)
+        addresses = [_get_address(a) for a in self._arrays]
+        own, of_samples = addresses[: len(GIVEN)], addresses[len(GIVEN) :]
+        of_memory = [0] * len(self._lengths)  # until `_bind`
+        self._table = np.array([*own, *_list_addresses(self._sums, lengths), *of_memory, *of_samples], dtype=np.uintp)
+        self._in_memory = slice(len(GIVEN) + len(lengths), len(self._table) - len(of_samples))
         self._address = self._table.ctypes.data
         self._progress = (ctypes.c_int64 * 3)()
         self._result = self._named["g"][:D], self._named["H"].reshape(D, width)[:, :D]
@@ -390,9 +394,7 @@ class NativeExperiment:
         found = _split_array(workspace, self._lengths)
         self._zeroed = [found[name] for name in ZEROED if found[name].size]
         self._named |= found
-        for k, name in enumerate(self._pointers):
-            if name in found:
-                self._table[k] = found[name].ctypes.data
+        self._table[self._in_memory] = _list_addresses(workspace, self._lengths)
 
     def _find_first_cells(self, tau: FloatArray, side: float) -> None:
         """Find the cells in which segments begin, as in `switchfit.discretization.mesh.rows`."""
@@ -411,8 +413,19 @@ class NativeExperiment:
 
 def _split_array(whole: FloatArray, lengths: dict[str, int]) -> dict[str, FloatArray]:
     """Return consecutive parts of an array by their names and lengths."""
-    ends = np.cumsum(list(lengths.values())).tolist()
+    ends = accumulate(lengths.values())
     return {name: whole[end - length : end] for (name, length), end in zip(lengths.items(), ends, strict=True)}
+
+
+def _list_addresses(whole: FloatArray, lengths: dict[str, int]) -> list[int]:
+    """Return the addresses of consecutive parts of an array."""
+    first, begins = _get_address(whole), accumulate(lengths.values(), initial=0)
+    return [first + whole.itemsize * begin for _, begin in zip(lengths, begins, strict=False)]
+
+
+def _get_address(array: NDArray[Any]) -> int:
+    address: int = array.__array_interface__["data"][0]  # a third of the time of array.ctypes.data
+    return address
 
 
 def _find_delays(structure: Structure, arguments: Arguments) -> dict[str, tuple[int | None, float]]:
