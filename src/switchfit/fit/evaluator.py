@@ -17,6 +17,7 @@ from switchfit.engine.choice import engine_of, summarize
 from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.protocol import Derivatives, Engine, Matrix, Simulation
 from switchfit.optimize.arrow import Arrow, ArrowLayout
+from switchfit.optimize.problem import Breakpoints
 from switchfit.paper_adjoint import evaluate_paper
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
@@ -228,10 +229,10 @@ class Evaluator:
 
     def replace_arguments(self, arguments: Sequence[Arguments]) -> None:
         """Replace data and constants; the meshes are those of the new nodes."""
-        self.__dict__.pop("halved", None)
+        for name in ("halved", "structures", "sorted_breakpoints"):
+            self.__dict__.pop(name, None)
         before = zip(self.meshes, arguments, strict=True)
         self.meshes = [Mesh.from_times(np.asarray(own.nodes), mesh.stiffness) for mesh, own in before]
-        self.__dict__.pop("structures", None)
         self._set_arguments(list(arguments))
 
     def _set_arguments(self, arguments: list[Arguments]) -> None:
@@ -269,6 +270,11 @@ class Evaluator:
                 found = [evaluate_paper(a, *at, float(side), structure=s) for s, a, _, at in given]
             return [Derivatives(float(J), np.array(g), np.array(H)) for J, g, H in found]
         return [JaxEngine(s, a, mesh).derivatives(*at, side, matrix, method) for s, a, mesh, at in given]
+
+    @cached_property
+    def sorted_breakpoints(self) -> Breakpoints:
+        """The breakpoints of theta in the optimizer's form."""
+        return Breakpoints.of(self.breakpoints(), len(self.problem.theta_names))
 
     def breakpoints(self) -> list[FloatArray]:
         """Return the nodes at which derivatives may jump for each entry of theta: an empty array for parameters."""

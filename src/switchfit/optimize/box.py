@@ -14,6 +14,8 @@ References
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from switchfit.optimize.algebra import NOISE, FloatArray
@@ -32,7 +34,7 @@ POOR, GOOD = 0.25, 0.75
 
 def measure(problem: Problem, step: FloatArray) -> float:
     """Return the radius of the smallest box that holds a step (d,)."""
-    return float(np.max(np.abs(step) / problem.reach))
+    return float((np.abs(step) / problem.reach).max())
 
 
 def next_radius(
@@ -41,7 +43,8 @@ def next_radius(
     """Return the radius that follows an accepted step (d,) from the cost `before` to the cost `after`."""
     if predicted <= NOISE * abs(before):
         return radius
-    ratio, length = (before - after) / predicted, measure(problem, step)
+    ratio = (before - after) / predicted
     if ratio < POOR:
-        return min(radius, SHRINK * length)
-    return radius * GROW if ratio > GOOD and length > 0.9 * radius else radius
+        return min(radius, SHRINK * measure(problem, step))
+    grows = ratio > GOOD and radius < math.inf and measure(problem, step) > 0.9 * radius
+    return GROW * radius if grows else radius

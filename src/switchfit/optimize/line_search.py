@@ -71,18 +71,18 @@ def _search_in_box(oracle: Oracle, state: State, direction: Direction) -> Accept
     """
     problem, point = oracle.problem, state.point
     breakpoints, constraints = problem.breakpoints, problem.constraints
-    whole = box.measure(problem, direction.step)
+    whole = direction.step
     piece = None
     for k in range(MAX_BACKTRACKS):
         crossed = breakpoints.count_crossed(point.theta, direction.step)
         accepted = _attempt(oracle, state, direction, 1.0, ARMIJO_ACROSS if crossed else ARMIJO)
-        length = box.measure(problem, direction.step)
         if accepted is not None:
             trial = accepted.point
             radius = box.next_radius(
                 problem, direction.radius, direction.step, direction.reduction, point.cost, trial.cost
             )
-            return Accepted(trial, length / whole if k else 1.0, radius)
+            part = box.measure(problem, direction.step) / box.measure(problem, whole) if k else 1.0
+            return Accepted(trial, part, radius)
         corrected = _step_back(oracle, state, direction) if k == 0 and state.iteration >= PATIENCE else None
         if corrected is not None:
             return corrected
@@ -92,7 +92,7 @@ def _search_in_box(oracle: Oracle, state: State, direction: Direction) -> Accept
             piece = breakpoints.piece(point.theta, constraints.lower, constraints.upper)
             radius = direction.radius
         else:
-            radius = box.SHRINK * length
+            radius = box.SHRINK * box.measure(problem, direction.step)
         direction = find_direction(problem, replace(state, radius=radius), piece)
     return _blind_step(oracle, state, direction)
 

@@ -16,6 +16,7 @@ from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.constraints import LinearConstraints
 
 HessianKind = Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"]
+HESSIANS = get_args(HessianKind)
 
 
 REACH = 0.1
@@ -88,7 +89,7 @@ class Problem:
         evaluate: Evaluate,
         theta: FloatArray,
         constraints: LinearConstraints,
-        breakpoints: Sequence[ArrayLike] | None,
+        breakpoints: Breakpoints | Sequence[ArrayLike] | None,
         hessian: HessianKind,
         blocks: ArrayLike | None,
         tolerance: float,
@@ -104,8 +105,8 @@ class Problem:
             raise ValueError(f"theta0 has shape {theta.shape}, the constraints expect ({d},)")
         if d == 0:
             raise ValueError("there is nothing to minimise over: theta0 is empty")
-        if hessian not in get_args(HessianKind):
-            raise ValueError(f"hessian is {hessian!r}; choose one of {', '.join(get_args(HessianKind))}")
+        if hessian not in HESSIANS:
+            raise ValueError(f"hessian is {hessian!r}; choose one of {', '.join(HESSIANS)}")
         if equalities and hessian not in ("auto", "exact"):
             raise ValueError(f"equality constraints need the exact Hessian: hessian 'auto' or 'exact'; got {hessian!r}")
         if not tolerance >= 0.0 or max_iterations < 0:
@@ -113,14 +114,14 @@ class Problem:
         return cls(
             evaluate=evaluate,
             constraints=constraints,
-            breakpoints=Breakpoints.of(breakpoints, d),
+            breakpoints=breakpoints if isinstance(breakpoints, Breakpoints) else Breakpoints.of(breakpoints, d),
             hessian=hessian,
             labels=_labels(hessian, blocks, d),
             tolerance=tolerance,
             max_iterations=max_iterations,
-            size=np.zeros(d) if size is None else np.broadcast_to(np.asarray(size, dtype=float), (d,)),
+            size=np.zeros(d) if size is None else _as_vector(size, d),
             idle=idle,
-            reach=typical_reach(theta) if reach is None else np.broadcast_to(np.asarray(reach, dtype=float), (d,)),
+            reach=typical_reach(theta) if reach is None else _as_vector(reach, d),
             equalities=tuple(equalities),
         )
 
@@ -239,6 +240,12 @@ class Breakpoints:
         """Return the fraction of a step (d,) up to the first breakpoint that a coordinate meets, or infinity."""
         fractions = [_next(points, float(theta[i]), float(step[i])) for i, points in self.of_coordinates]
         return min(fractions, default=np.inf)
+
+
+def _as_vector(given: ArrayLike, d: int) -> FloatArray:
+    """Return one number for each of d coordinates, (d,), from as many or from one for all."""
+    array = np.asarray(given, dtype=float)
+    return array if array.shape == (d,) else np.broadcast_to(array, (d,))
 
 
 def _nearest(points: list[float], x: float) -> float:

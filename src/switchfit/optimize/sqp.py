@@ -39,7 +39,7 @@ from switchfit.optimize.line_search import search
 from switchfit.optimize.matrix import Curvature, Spectrum
 from switchfit.optimize.merit import is_stuck, search_merit
 from switchfit.optimize.point import MET, Oracle, Point
-from switchfit.optimize.problem import Evaluate, HessianKind, Idle, Problem
+from switchfit.optimize.problem import Breakpoints, Evaluate, HessianKind, Idle, Problem
 from switchfit.optimize.saddles import NEGATIVE_CURVATURE, close_gaps, escape
 from switchfit.optimize.state import State, curvature_at, idle_coordinates
 from switchfit.optimize.status import Callback, IterationRecord, Result, Status
@@ -56,7 +56,7 @@ def minimize(
     theta0: ArrayLike,
     *,
     constraints: LinearConstraints,
-    breakpoints: Sequence[ArrayLike] | None = None,
+    breakpoints: Breakpoints | Sequence[ArrayLike] | None = None,
     hessian: HessianKind = "exact",
     blocks: ArrayLike | None = None,
     tolerance: float = 1e-7,
@@ -82,8 +82,9 @@ def minimize(
         Start, feasible up to rounding.
     constraints : LinearConstraints
         ``A theta >= b`` and bounds.
-    breakpoints : sequence of d arrays, optional
-        Sorted values of each coordinate where the derivatives of J may jump. None: J is smooth.
+    breakpoints : sequence of d arrays, or Breakpoints, optional
+        Sorted values of each coordinate where the derivatives of J may jump; `Breakpoints` have been checked already.
+        None: J is smooth.
     hessian : {"auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"}
         What stands in the quadratic programme: the Hessian inside a trust region (`box`); the Hessian, made positive
         definite where needed, with a line search; the
