@@ -21,6 +21,7 @@ from switchfit.optimize.algebra import (
     EIGENVALUE_REPLACEMENT,
     EPS,
     FloatArray,
+    is_finite,
     positive_eigenvalues,
     press_on_bounds,
 )
@@ -60,7 +61,7 @@ class Dense:
     @property
     def finite(self) -> bool:
         """Whether all entries are."""
-        return bool(np.isfinite(self.array).all())
+        return is_finite(self.array)
 
     def dense(self) -> FloatArray:
         """Return the matrix in full: (d, d)."""
@@ -227,7 +228,7 @@ def solve_in_bounds(
     step, at_low, at_high = newton, newton < low, newton > high
     for _ in range(ACTIVE_SET_ROUNDS):
         step = np.where(at_low, low, np.where(at_high, high, 0.0))
-        free = (~(at_low | at_high)).nonzero()[0]
+        free = (at_low == at_high).nonzero()[0]  # at neither
         if free.size:
             rows = convex[free]
             _, _, step_back, singular = dgesv(rows[:, free], gradient[free] + rows @ step)
@@ -235,8 +236,8 @@ def solve_in_bounds(
                 return None
             step[free] = -step_back
         force = convex @ step + gradient
-        low_next, high_next = (step < low) | (at_low & (force > 0.0)), (step > high) | (at_high & (force < 0.0))
-        if (low_next == at_low).all() and (high_next == at_high).all():
+        low_next, high_next = np.where(at_low, force > 0.0, step < low), np.where(at_high, force < 0.0, step > high)
+        if not ((low_next ^ at_low) | (high_next ^ at_high)).any():
             break
         at_low, at_high = low_next, high_next
     else:

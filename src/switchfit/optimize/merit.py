@@ -13,8 +13,6 @@ References
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from switchfit.optimize import box
@@ -70,7 +68,7 @@ def search_merit(oracle: Oracle, state: State, direction: Direction) -> Accepted
             radius = direction.radius
         else:
             radius = SHRINK * length
-        direction = find_direction(problem, replace(state, radius=radius), piece)
+        direction = find_direction(problem, state._replace(radius=radius), piece)
     return None
 
 

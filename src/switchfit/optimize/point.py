@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import FloatArray, unit_rows
+from switchfit.optimize.algebra import FloatArray, is_finite, unit_rows
 from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.composite import Equalities, Rows
 from switchfit.optimize.constraints import NONE
@@ -36,8 +36,7 @@ LARGE_JUMP = 1e-6
 NO_FORCES: FloatArray = np.zeros(0)
 
 
-@dataclass(frozen=True, eq=False)
-class Sample:
+class Sample(NamedTuple):
     """One evaluation: cost, gradient, shape (d,), and Hessian, symmetric.
 
     If there are equality constraints, the Hessian is that of the Lagrangian with these multipliers, shape (k,).
@@ -206,7 +205,7 @@ class Oracle:
         cost, gradient = float(value.cost), np.asarray(value.gradient, dtype=float).reshape(d)
         given = np.full((d, d), np.nan) if value.hessian is None else value.hessian
         hessian: SymmetricMatrix = given if isinstance(given, Arrow) else Dense.of(given, d)
-        if not (math.isfinite(cost) and np.isfinite(gradient).all()):
+        if not (math.isfinite(cost) and is_finite(gradient)):
             return None
         if self.problem.uses_hessian and not hessian.finite:
             return None
@@ -215,7 +214,7 @@ class Oracle:
     def _scale(self, value: Any) -> Equalities | None:
         """Return the equality constraints of an evaluation in their units; None if they are not finite."""
         c, A = np.asarray(value.constraints, dtype=float), np.asarray(value.jacobian, dtype=float)
-        if not (np.isfinite(c).all() and np.isfinite(A).all()):
+        if not (is_finite(c) and is_finite(A)):
             return None
         if self.units is None:
             self.units = unit_rows(A * self.problem.reach)[1]
@@ -240,7 +239,7 @@ class Oracle:
 
     def first(self, trial: Trial) -> Sample | None:
         """Do the evaluation that suffices to judge the cost."""
-        kink, side = self._sides(trial.theta)
+        kink, side = self._sides(trial)
         return self.sample(trial.theta, -1 if kink is None and side is not self._no_side and (side < 0).any() else 1)
 
     def complete(self, trial: Trial, first: Sample, scale: FloatArray) -> Point | None:
@@ -249,7 +248,7 @@ class Oracle:
         `scale` (d,) is the size of the unknowns so far. None if the other side is not finite.
         """
         theta, slack = trial.theta, trial.slack
-        kink, side = self._sides(theta)
+        kink, side = self._sides(trial)
         problem, constraints = self.problem, self.problem.constraints
         active = NONE
         if not trial.far:
@@ -326,14 +325,14 @@ class Oracle:
         idle = self.problem.idle(theta.copy(), False)
         return idle if idle.any() else None
 
-    def _sides(self, theta: FloatArray) -> tuple[NDArray[np.bool_] | None, NDArray[np.int_]]:
-        """Return `Point.kink` and `Point.side` at theta."""
-        met = self.problem.breakpoints.find_met(theta)
-        if not met:
+    def _sides(self, trial: Trial) -> tuple[NDArray[np.bool_] | None, NDArray[np.int_]]:
+        """Return `Point.kink` and `Point.side` of a trial."""
+        if not trial.on_breakpoint:
             return None, self._no_side
+        theta = trial.theta
         kink, side = np.zeros(theta.size, dtype=bool), np.zeros(theta.size, dtype=int)
         lower, upper = self.problem.constraints.lower, self.problem.constraints.upper
-        for i in met:
+        for i in trial.on_breakpoint:
             room = int(theta[i] < upper[i]) - int(theta[i] > lower[i])
             kink[i], side[i] = room == 0 and lower[i] < upper[i], room
         return kink if kink.any() else None, side

@@ -207,11 +207,12 @@ class Breakpoints:
         Rounding is a part of what is added, and of the typical `size` (d,). Returns the coordinates that were near one.
         """
         found = []
+        values, starts, steps, sizes = moved.tolist(), theta.tolist(), step.tolist(), size.tolist()
         for i, points in self.of_coordinates:
-            x, by = float(moved[i]), float(step[i])
+            x, by = values[i], steps[i]
             mark = _nearest(points, x)
-            reach = max(abs(float(theta[i])), abs(by), abs(x)) if by != 0.0 else 0.0
-            if abs(mark - x) <= 8 * EPS * max(reach, float(size[i])):
+            reach = max(abs(starts[i]), abs(by), abs(x)) if by != 0.0 else 0.0
+            if abs(mark - x) <= 8 * EPS * max(reach, sizes[i]):
                 moved[i] = mark
                 found.append(i)
         return found

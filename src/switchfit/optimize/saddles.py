@@ -27,7 +27,7 @@ def close_gaps(oracle: Oracle, state: State) -> State:
     theta = snap_to_rows(problem, point.theta, np.zeros(point.theta.size, dtype=bool), NEGLIGIBLE_STEP)
     if np.array_equal(theta, point.theta):
         return state
-    closed = oracle.point(Trial.at(problem.constraints, theta), state.scale)
+    closed = oracle.point(Trial.at(problem, theta), state.scale)
     if closed is None or closed.cost > point.cost + NOISE * state.cost_scale or closed.violation > MET:
         return state
     after = state.advance(Accepted(closed, 1.0), problem.tolerance)

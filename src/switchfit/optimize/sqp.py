@@ -25,7 +25,6 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -159,9 +158,9 @@ def minimize(
             if state.iteration > before:
                 history.append(_record(oracle, state))
                 if callback is not None and callback(history[-1]):
-                    state = replace(state, status=Status.INTERRUPTED)
+                    state = state._replace(status=Status.INTERRUPTED)
     except KeyboardInterrupt:
-        state = replace(state, status=Status.INTERRUPTED)
+        state = state._replace(status=Status.INTERRUPTED)
     return _result(oracle, state, state.status or Status.INTERRUPTED, tuple(history))
 
 
@@ -172,9 +171,9 @@ def _step(oracle: Oracle, state: State) -> State:
     if _is_settled(problem, state, direction):
         return _finish(oracle, state, direction, Status.CONVERGED)
     if state.iteration >= problem.max_iterations:
-        return replace(state, status=Status.MAX_ITERATIONS)
+        return state._replace(status=Status.MAX_ITERATIONS)
     if problem.equalities and is_stuck(oracle, state):
-        return replace(state, status=Status.INFEASIBLE)
+        return state._replace(status=Status.INFEASIBLE)
     accepted = (search_merit if problem.equalities else search)(oracle, state, direction)
     if accepted is None:
         return _handle_stall(oracle, state, direction)
@@ -185,12 +184,12 @@ def _step(oracle: Oracle, state: State) -> State:
 def _measure_anew(oracle: Oracle, state: State) -> State:
     """Return the state with constraints in new units, in which penalty and violation begin anew."""
     theta = state.point.theta
-    point = oracle.point(Trial.at(oracle.problem.constraints, theta), state.scale)
+    point = oracle.point(Trial.at(oracle.problem, theta), state.scale)
     if point is None:
         return state
     fresh = State.at(point)
-    return replace(
-        state, point=point, penalty=fresh.penalty, steady_violation=fresh.steady_violation, stagnant=fresh.stagnant
+    return state._replace(
+        point=point, penalty=fresh.penalty, steady_violation=fresh.steady_violation, stagnant=fresh.stagnant
     )
 
 
@@ -208,7 +207,7 @@ def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
     if state.point.is_stationary(oracle.problem.tolerance):
         return _finish(oracle, state, direction, Status.CONVERGED)
     if state.point.violation > MET:
-        return replace(state, status=Status.INFEASIBLE)
+        return state._replace(status=Status.INFEASIBLE)
     floor = state.gradient_scale
     if oracle.problem.uses_hessian:
         floor = max(floor, float(np.max(abs(state.point.plus.hessian) @ state.scale)))
@@ -221,11 +220,11 @@ def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
         return state.advance(escaped, oracle.problem.tolerance)
     if state.restarts < RESTARTS and not state.careful:
         theta = state.point.theta
-        point = oracle.point(Trial.at(oracle.problem.constraints, theta), np.abs(theta))
+        point = oracle.point(Trial.at(oracle.problem, theta), np.abs(theta))
         if point is not None:
             fresh = State.at(point)
-            return replace(fresh, iteration=state.iteration, restarts=state.restarts + 1, careful=True)
-    return replace(state, status=Status.LINE_SEARCH_FAILED, reason=explain_failure(oracle, state, direction))
+            return fresh._replace(iteration=state.iteration, restarts=state.restarts + 1, careful=True)
+    return state._replace(status=Status.LINE_SEARCH_FAILED, reason=explain_failure(oracle, state, direction))
 
 
 def _finish(oracle: Oracle, state: State, direction: Direction, status: Status) -> State:
@@ -235,19 +234,19 @@ def _finish(oracle: Oracle, state: State, direction: Direction, status: Status) 
         closed = close_gaps(oracle, state)
         if closed is state and direction.regular:
             # The programme's matrix was H itself: its scaled eigenvalues are above EIGENVALUE_FLOOR.
-            return replace(state, status=status)
+            return state._replace(status=status)
         state = closed
         accepted = escape(oracle, state) if state.iteration < problem.max_iterations else None
         if accepted is not None:
             return state.advance(accepted, problem.tolerance)
         curvature = curvature_at(problem, state, state.point.active)
         if curvature.smallest < NEGATIVE_CURVATURE:
-            return replace(state, status=Status.SADDLE)
+            return state._replace(status=Status.SADDLE)
         if curvature.smallest <= EIGENVALUE_FLOOR:
-            return replace(state, status=Status.SINGULAR)
+            return state._replace(status=Status.SINGULAR)
         if state.point.idle is not None or curvature.idle is not None:
-            return replace(state, status=Status.COLLAPSED)
-    return replace(state, status=Status.CONVERGED_AT_KINK if state.genuine_kinks.any() else status)
+            return state._replace(status=Status.COLLAPSED)
+    return state._replace(status=Status.CONVERGED_AT_KINK if state.genuine_kinks.any() else status)
 
 
 def _record(oracle: Oracle, state: State) -> IterationRecord:
@@ -303,8 +302,8 @@ def _with_own_multipliers(oracle: Oracle, state: State) -> State:
     ):
         return state
     oracle.multipliers = point.forces
-    again = oracle.point(Trial.at(oracle.problem.constraints, point.theta), state.scale)
-    return state if again is None else replace(state, point=again)
+    again = oracle.point(Trial.at(oracle.problem, point.theta), state.scale)
+    return state if again is None else state._replace(point=again)
 
 
 def _list_violated(oracle: Oracle, point: Point) -> tuple[tuple[str, float], ...]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,10 @@ FIRST_PENALTY = 10.0
 falls at first at their cost, and modes collapse on the way: of 30 starts of the pendulum 11 end right, not 16."""
 
 
-@dataclass(frozen=True, eq=False)
-class State:
+NO_SCALE: FloatArray = np.zeros(0)
+
+
+class State(NamedTuple):
     """The best point so far, and what has been seen.
 
     Attributes
@@ -61,7 +64,7 @@ class State:
     step_length: float = 0.0
     metric: float = 1.0
     settled: int = 0
-    scale: FloatArray = field(default_factory=lambda: np.zeros(0))
+    scale: FloatArray = NO_SCALE
     cost_scale: float = 0.0
     gradient_scale: float = 0.0
     lowest_cost: float = np.inf
@@ -128,8 +131,7 @@ class State:
         return np.asarray(point.kink & (jump > 1e-12 * self.gradient_scale))
 
 
-@dataclass(frozen=True, eq=False)
-class Accepted:
+class Accepted(NamedTuple):
     """The point of an accepted step, the fraction of the proposed step that it took, the next radius and penalty."""
 
     point: Point

@@ -128,7 +128,7 @@ class NativeExperiment:
         pointer, number = ctypes.c_void_p, ctypes.c_int64
         self._program = program  # keeps its code alive
         self._evaluate = program.function(f"{self._prefix}evaluate", pointer, pointer, *[number] * len(counts))
-        self.times, self._cells, self._counts = times, cells, counts
+        self.times, self._inner_nodes, self._cells, self._counts = times, times[1:-1], cells, counts
         constants = [np.ravel(np.asarray(a, dtype=np.float64)) for a in constants_of(arguments)]
         units = np.zeros((D + 1, width))
         units[1:, :D] = np.eye(D)
@@ -181,6 +181,7 @@ class NativeExperiment:
         self._in_memory = slice(len(GIVEN) + len(lengths), len(self._table) - len(of_samples))
         self._address = self._table.ctypes.data
         self._progress = (ctypes.c_int64 * 3)()
+        self._progress_address = ctypes.addressof(self._progress)
         self._result = self._named["g"][:D], self._named["H"].reshape(D, width)[:, :D]
         self._delays = _find_delays(structure, arguments)
 
@@ -382,11 +383,11 @@ class NativeExperiment:
 
     def _call_in_pieces(self, function: Callable[..., object], *given: Any) -> None:
         """Call a function of the driver until it has finished; Ctrl-C is handled after each call."""
-        progress, address = self._progress, ctypes.addressof(self._progress)
+        progress = self._progress
         progress[0] = progress[1] = 0
         while progress[0] >= 0:
             progress[2] = BUDGET
-            function(self._address, address, *given)
+            function(self._address, self._progress_address, *given)
 
     def _bind(self, workspace: FloatArray) -> None:
         """Store the addresses of another workspace in the table."""
@@ -399,8 +400,7 @@ class NativeExperiment:
     def _find_first_cells(self, tau: FloatArray, side: float) -> None:
         """Find the cells in which segments begin, as in `switchfit.discretization.mesh.rows`."""
         if len(tau):
-            passed = self.times.searchsorted(tau, "right" if side > 0 else "left")
-            self._begins[:] = np.minimum(np.maximum(passed - 1, 0), self._cells - 1)
+            self._begins[:] = self._inner_nodes.searchsorted(tau, "right" if side > 0 else "left")
 
     def _find_late_cells(self, p: FloatArray) -> None:
         """Find the cells and segments of the late samples: those of the rows with ``start < t - delay <= end``."""
