@@ -138,14 +138,14 @@ class Evaluator:
 
         `matrix` selects the Hessian, the Gauss-Newton matrix in its place, or neither (NaN).
         """
-        d = len(theta)
         results = self._evaluate_experiments(theta, side, method, matrix)
         if self.problem.one_to_one:
-            total, gradient, hessian = float(results[0][0]), results[0][1], results[0][2]
+            total, gradient, hessian = results[0]
         else:
+            d = len(theta)
             total, gradient, hessian = 0.0, np.zeros(d), np.zeros((d, d))
             for (J, g, H), (own, mine) in zip(results, self.problem.own_places, strict=True):
-                total += float(J)
+                total += J
                 # Two names of the model may refer to one parameter: its index then occurs twice, and both count.
                 np.add.at(gradient, mine, g[own])
                 np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
@@ -259,9 +259,10 @@ class Evaluator:
     def _evaluate_experiments(self, theta: FloatArray, side: int, method: Method, matrix: Matrix) -> list[Derivatives]:
         """Return the cost, gradient and Hessian of each experiment in its own unknowns."""
         theta = np.asarray(theta, dtype=np.float64)
-        vectors = [self.problem.vectors(theta, e) for e in range(len(self.engines))]
         if method == "auto":
-            return [engine.derivatives(*at, side, matrix) for engine, at in zip(self.engines, vectors, strict=True)]
+            find = self.problem.vectors
+            return [engine.derivatives(*find(theta, e), side, matrix) for e, engine in enumerate(self.engines)]
+        vectors = [self.problem.vectors(theta, e) for e in range(len(self.engines))]
         given = list(zip(self.structures, self.arguments, self.meshes, vectors, strict=True))
         if method == "adjoint":
             if not is_covered_by_paper(self.problem):

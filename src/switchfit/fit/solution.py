@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.engine.protocol import Matrix
 from switchfit.fit.collapsed import idle_unknowns
 from switchfit.fit.evaluator import ArrowEvaluation, ConstrainedEvaluation, Evaluation, Evaluator
 from switchfit.fit.hidden import refuse_hidden_switches, refuse_jumps
@@ -69,7 +70,7 @@ def minimize_cost(
     problem = evaluator.problem
     names = problem.constraint_names
     unknowns = problem.unknowns
-    matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
+    matrix: Matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
     if by_blocks is None:
         many = len(problem.experiments) >= MANY_RUNS and not names
         by_blocks = many and 2 * len(evaluator.layout.shared) < len(theta)
@@ -77,18 +78,22 @@ def minimize_cost(
     change = None if unknowns.variables.identity else _Change.of(problem, constraints, evaluator.breakpoints())
     seen: list[bool] = []
 
-    def evaluate_theta(theta: Any, side: int) -> Evaluation | ArrowEvaluation | CostAndGradient:
-        if hessian not in ("none", "descent-first") and by_blocks:
-            return evaluator.arrow(theta, side, matrix)
+    def without_hessian(theta: FloatArray, side: int, *, matrix: Matrix) -> CostAndGradient:
         here = evaluator(theta, side, matrix=matrix)
-        return CostAndGradient(here.cost, here.gradient) if hessian == "none" else here
+        return CostAndGradient(here.cost, here.gradient)
+
+    evaluate_theta: Callable[..., Evaluation | ArrowEvaluation | CostAndGradient] = evaluator
+    if hessian == "none":
+        evaluate_theta = without_hessian
+    elif by_blocks and hessian != "descent-first":
+        evaluate_theta = evaluator.arrow
 
     def evaluate(z: Any, side: int, multipliers: FloatArray | None = None) -> Any:
         theta = z if change is None else change.to_theta(z)
         if multipliers is not None:
             held = evaluator.constrained(theta, side, multipliers)
             return held if change is None else _to_constrained(change.variables, theta, held, multipliers)
-        here = evaluate_theta(theta, side)
+        here = evaluate_theta(theta, side, matrix=matrix)
         if not seen:
             seen.append(True)
             refuse_hidden_switches(evaluator, theta, here.gradient)
