@@ -96,9 +96,9 @@ IN_NATIVE: dict[str, tuple[str, Replacements]] = {
             )
         ],
     ),
-    "the penalty in the weight of a constraint": (
+    "the multiplier of a terminal constraint": (
         KERNELS,
-        [('graph.loads("multiplier", count) + graph.loads("penalty", count) * c', 'graph.loads("multiplier", count)')],
+        [('graph.loads("multiplier", self.sizes.m)', 'graph.loads("constraint", self.sizes.m)')],
     ),
     "half of the mixed entries in Z' S Z": (
         KERNELS,

@@ -107,9 +107,9 @@ def test_simulations_of_late_samples_are_the_same(name):
 def test_constraints_are_the_same():
     data = [samples(), sf.TerminalConstraint(lambda x, p: jnp.array([x[0] * x[1] - 0.3, p["k"] * x[1] ** 2]))]
     given = problem(data, system=sf.HybridSystem(MODES, [0.4, 0.1], BOUNCE, guards=GUARDS))
-    multipliers, penalty = np.array([0.7, -1.3, 0.4]), np.array([2.0, 0.5, 3.0])
-    found, expected = (each.constrained(given.initial_theta, 1, multipliers, penalty) for each in both(given))
-    for name in ("cost", "gradient", "value", "slope", "hessian", "constraints", "jacobian"):
+    multipliers = np.array([0.7, -1.3, 0.4])
+    found, expected = (each.constrained(given.initial_theta, 1, multipliers) for each in both(given))
+    for name in ("cost", "gradient", "hessian", "constraints", "jacobian"):
         one, other = getattr(found, name), getattr(expected, name)
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-10, err_msg=name)
 
@@ -213,7 +213,7 @@ def test_sequences_of_any_length_run_in_a_program_with_room_for_them(data):
         native = Evaluator(room, meshes=own.meshes)
         theta = room.initial_theta
         found, cost, simulations = native(theta), native.cost(theta), native.simulate(theta, tangents=True)
-        constrained = native.constrained(theta, 1, 0.7, 2.0) if room.constraint_names else None
+        constrained = native.constrained(theta, 1, 0.7) if room.constraint_names else None
         compiled.append(programs() - before)
         for other in others:
             expected = other(theta)
@@ -226,7 +226,7 @@ def test_sequences_of_any_length_run_in_a_program_with_room_for_them(data):
                 slopes = slopes_of(native, one), slopes_of(other, its)
                 np.testing.assert_allclose(*slopes, rtol=1e-10, atol=1e-11)
             if constrained is not None:
-                expected = other.constrained(theta, 1, 0.7, 2.0)
+                expected = other.constrained(theta, 1, 0.7)
                 np.testing.assert_allclose(constrained.jacobian, expected.jacobian, rtol=1e-10, atol=1e-11)
                 np.testing.assert_allclose(constrained.hessian, expected.hessian, rtol=1e-9, atol=1e-8)
     assert not any(compiled[1:]), "a sequence needs a program of its own"

@@ -56,7 +56,7 @@ class Constrained(NamedTuple):
     Attributes
     ----------
     cost : J
-    slope, hessian : (D,), (D, D), of ``J + weights . c``, the weights being ``multipliers + penalty c``
+    slope, hessian : (D,), (D, D), of the Lagrangian ``J + multipliers . c``
     constraints, jacobian : c (m,) and its derivative (m, D)
     """
 
@@ -186,10 +186,8 @@ class ExperimentEngine(Protocol):
         """Return J and its derivatives; if a transition is at a node, those on its `side`, +1 or -1."""
         ...
 
-    def constrained(
-        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
-    ) -> Constrained:
-        """Return J and its constraints; the multipliers and penalties are (m,)."""
+    def constrained(self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray) -> Constrained:
+        """Return J and its constraints; the multipliers are (m,)."""
         ...
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:

@@ -81,15 +81,12 @@ class ConstrainedEvaluation:
     ----------
     cost : J
     gradient : (d,), J's derivative in theta
-    value, slope : the augmented Lagrangian and its derivative (d,)
-    hessian : (d, d), of the augmented Lagrangian
+    hessian : (d, d), of the Lagrangian
     constraints, jacobian : c (m,) and its derivative (m, d)
     """
 
     cost: float
     gradient: FloatArray
-    value: float
-    slope: FloatArray
     hessian: FloatArray
     constraints: FloatArray
     jacobian: FloatArray
@@ -154,37 +151,32 @@ class Evaluator:
             total, gradient, hessian = total + float(J), gradient + g, hessian + np.diag(h)
         return Evaluation(total, gradient, hessian)
 
-    def constrained(
-        self, theta: FloatArray, side: int = 1, multipliers: ArrayLike = 0.0, penalty: ArrayLike = 0.0
-    ) -> ConstrainedEvaluation:
-        """Return cost, constraints and the augmented Lagrangian with multipliers and penalties, (m,) or ()."""
-        d, count = len(theta), len(self.problem.constraint_names)
-        multipliers, penalty = np.full(count, multipliers, dtype=float), np.full(count, penalty, dtype=float)
-        cost, value, gradient, slope, hessian = 0.0, 0.0, np.zeros(d), np.zeros(d), np.zeros((d, d))
-        jacobian, c = np.zeros((count, d)), np.zeros(count)
-        last = 0
-        for e, (own, mine) in enumerate(self.problem.own_places):
-            here = slice(last, last := last + self.problem.constraint_counts[e])
-            at = self.problem.vectors(theta, e)
-            J, L_d, H, c_e, A = self.engines[e].constrained(*at, side, multipliers[here], penalty[here])
-            weights = multipliers[here] + penalty[here] * c_e
-            if penalty.any():
-                H = H + (A.T * penalty[here]) @ A
-            cost += J
-            value += J + float(multipliers[here] @ c_e + 0.5 * penalty[here] @ c_e**2)
-            if self.problem.one_to_one:
-                gradient, slope, hessian, jacobian, c = L_d - weights @ A, L_d, H, A, c_e
-                break
-            np.add.at(gradient, mine, (L_d - weights @ A)[own])
-            np.add.at(slope, mine, L_d[own])
-            np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
-            np.add.at(jacobian[here].T, mine, A[:, own].T)
-            c[here] = c_e
+    def constrained(self, theta: FloatArray, side: int = 1, multipliers: ArrayLike = 0.0) -> ConstrainedEvaluation:
+        """Return the cost, the constraints and the Hessian of the Lagrangian with multipliers, (m,) or one for all."""
+        count = len(self.problem.constraint_names)
+        weights = np.zeros(count)
+        weights[:] = multipliers
+        if self.problem.one_to_one:
+            cost, slope, hessian, c, jacobian = self.engines[0].constrained(
+                *self.problem.vectors(theta, 0), side, weights
+            )
+            gradient = slope - weights @ jacobian
+        else:
+            d, last = len(theta), 0
+            cost, gradient, hessian = 0.0, np.zeros(d), np.zeros((d, d))
+            c, jacobian = np.zeros(count), np.zeros((count, d))
+            for e, (own, mine) in enumerate(self.problem.own_places):
+                here = slice(last, last := last + self.problem.constraint_counts[e])
+                at = self.problem.vectors(theta, e)
+                J, slope, H, c[here], A = self.engines[e].constrained(*at, side, weights[here])
+                cost += J
+                np.add.at(gradient, mine, (slope - weights[here] @ A)[own])
+                np.add.at(hessian, (mine[:, None], mine), H[own[:, None], own])
+                np.add.at(jacobian[here].T, mine, A[:, own].T)
         if self._priors is not None:
             J, g, h = self._priors.evaluate(theta)
-            cost, gradient = cost + float(J), gradient + g
-            value, slope, hessian = value + float(J), slope + g, hessian + np.diag(h)
-        return ConstrainedEvaluation(cost, gradient, value, slope, hessian, c, jacobian)
+            cost, gradient, hessian = cost + float(J), gradient + g, hessian + np.diag(h)
+        return ConstrainedEvaluation(cost, gradient, hessian, c, jacobian)
 
     def arrow(self, theta: FloatArray, side: int = 1, matrix: Matrix = "exact") -> ArrowEvaluation:
         """Evaluate by the method "auto", in time and memory that are linear in the number of experiments."""

@@ -21,7 +21,6 @@ References
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -66,7 +65,10 @@ class Equalities(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """The factorisation Aᵀ P = Q R of a Jacobian A (k, d), which may have dependent rows: Q is (d, d), R (d, k)."""
+    """The factorisation Aᵀ P = Q R of a Jacobian A (k, d), which may have dependent rows: Q is (d, d).
+
+    R is the upper triangle of `triangular`, (d, k); what is below it is left of the factorisation.
+    """
 
     jacobian: FloatArray
     orthogonal: FloatArray
@@ -80,7 +82,7 @@ class Rows:
         packed, order, tau, _, _ = dgeqp3(jacobian.T)
         full = np.zeros((d, d), order="F")
         full[:, : min(k, d)] = packed[:, : min(k, d)]
-        return cls(jacobian, dorgqr(full, tau)[0], np.triu(packed), order - 1)
+        return cls(jacobian, dorgqr(full, tau)[0], packed, order - 1)
 
     @cached_property
     def rank(self) -> int:
@@ -211,10 +213,5 @@ def _find_normal_step(
         left = np.concatenate([offsets, np.full(2 * d, -radius)])
     left = np.minimum(left, 0.0)
     slope = A.T @ equalities.values
-    found = None
-    if radius < np.inf:
-        with suppress(np.linalg.LinAlgError):
-            found = solve_in_bounds(slope, matrix, shortest, inside, left)
-    if found is not None:
-        return found[0]
-    return solve_qp(slope, matrix, inside, left).step
+    found = solve_in_bounds(slope, matrix, shortest, inside, left) if radius < np.inf else None
+    return solve_qp(slope, matrix, inside, left).step if found is None else found[0]

@@ -56,12 +56,10 @@ class JaxEngine:
         J, g, H = found
         return Derivatives(float(J), np.array(g), np.array(H))  # copies: arrays of JAX are read-only
 
-    def constrained(
-        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
-    ) -> Constrained:
+    def constrained(self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray) -> Constrained:
         """Return J and its constraints."""
         with use_float64(), use_compilation_cache():
-            given = self._given(), tau, p, float(side), multipliers, penalty
+            given = self._given(), tau, p, float(side), multipliers
             J, slope, H, c, A = differentiate_constrained(*given, structure=self._structure)
         return Constrained(float(J), np.array(slope), np.array(H), np.array(c), np.array(A))
 

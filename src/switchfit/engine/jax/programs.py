@@ -63,23 +63,21 @@ def differentiate_constrained(
     p: Array,
     side: Array,
     multipliers: Array,
-    penalty: Array,
     *,
     structure: Structure,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Differentiate ``J + weights . c`` of one experiment, the weights being ``multipliers + penalty c``.
+    """Differentiate the Lagrangian ``J + multipliers . c`` of one experiment.
 
     Returns
     -------
-    cost, slope, hessian : J, and the derivatives of the sum (D,) and (D, D)
+    cost, slope, hessian : J, and the derivatives of the Lagrangian (D,) and (D, D)
     c, jacobian : the constraints (m,) and their derivatives (m, D)
     """
     model = Model(structure, arguments)
     first = forward_sweep(model, tau, p, side)
     c, A = constraints(model, first, p)
-    weights = multipliers + penalty * c
-    back = backward_sweep(model, first, p, weights)
-    return back.cost, back.gradient, adjoint_hessian(model, first, back, p, weights), c, A
+    back = backward_sweep(model, first, p, multipliers)
+    return back.cost, back.gradient, adjoint_hessian(model, first, back, p, multipliers), c, A
 
 
 def _autodiff(model: Model, tau: Array, p: Array, side: Array) -> tuple[Array, Array, Array]:

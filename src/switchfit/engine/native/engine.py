@@ -68,13 +68,11 @@ class NativeEngine:
         found = None if native is None else native(tau, p, side)
         return self._fallback.derivatives(tau, p, side, matrix) if found is None else found
 
-    def constrained(
-        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
-    ) -> Constrained:
+    def constrained(self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray) -> Constrained:
         """Return J and its constraints."""
         native = self.at(Order.HESSIAN)
-        found = None if native is None else native.constrained(tau, p, side, multipliers, penalty)
-        return self._fallback.constrained(tau, p, side, multipliers, penalty) if found is None else found
+        found = None if native is None else native.constrained(tau, p, side, multipliers)
+        return self._fallback.constrained(tau, p, side, multipliers) if found is None else found
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""

@@ -141,7 +141,7 @@ class NativeExperiment:
         rows = constraint_rows(library, sizes)
         own_rows = [rows[kind.name] + i for kind, i in list_constrained_transitions(structure)]
         self._constraint_rows = np.array([*own_rows, *range(rows["end"], rows["count"])], dtype=np.intp)
-        self._weights = np.zeros((2, max(rows["count"], 1)))  # multipliers and penalties
+        self._multipliers = np.zeros(max(rows["count"], 1))
         lengths = sums(library, sizes)
         self._sums = np.zeros(sum(lengths.values()))
         arrays: dict[str, Any] = {
@@ -151,8 +151,7 @@ class NativeExperiment:
             "p": self._p,
             "bounds": self._bounds,
             "first_cell": self._first_cell,
-            "multipliers": self._weights[0],
-            "penalties": self._weights[1],
+            "multipliers": self._multipliers,
             "units": units,
         }
         arrays |= places_in_library(structure)
@@ -194,32 +193,34 @@ class NativeExperiment:
             self._run(tau, p, side)
             if self._has_failed_check:
                 return None
-            g, H = self._result
-            if not self._all_own:
-                g, H = g[self._own], H[np.ix_(self._own, self._own)]
-            hessian = H.copy() if self._has_hessian else np.full(H.shape, np.nan)
-            return Derivatives(self._J.item(0), g.copy(), hessian)
+            g, H = self._read_derivatives()
+            return Derivatives(self._J.item(0), g, H if self._has_hessian else np.full(H.shape, np.nan))
 
-    def constrained(
-        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray, penalty: FloatArray
-    ) -> Constrained | None:
-        """Return the cost, the constraints and their derivatives; the multipliers and penalties are (m,).
+    def _read_derivatives(self) -> tuple[FloatArray, FloatArray]:
+        """Return copies of the gradient (D,) and the Hessian (D, D) in the experiment's unknowns."""
+        g, H = self._result
+        if self._all_own:
+            return g.copy(), H.copy()
+        return g[self._own], H[np.ix_(self._own, self._own)]
+
+    def constrained(self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray) -> Constrained | None:
+        """Return the cost, the constraints and their derivatives; the multipliers are (m,).
 
         None if a finiteness check failed.
         """
         where = self._constraint_rows
         with self._workspace.lock:
-            self._weights[:, where] = multipliers, penalty
+            self._multipliers[where] = multipliers
             try:
                 self._run(tau, p, side)
             finally:
-                self._weights[:] = 0.0
+                self._multipliers[:] = 0.0
             if self._has_failed_check:
                 return None
-            (g, H), own = self._result, self._own
+            g, H = self._read_derivatives()
             c = self._named["constraints"][where]
-            A = self._named["jacobian"].reshape(-1, self.sizes.width)[where][:, own]
-            return Constrained(self._J.item(0), g[own], H[np.ix_(own, own)], c, A)
+            A = self._named["jacobian"].reshape(-1, self.sizes.width)[where]
+            return Constrained(self._J.item(0), g, H, c, A[:, self._own])
 
     def program_at(self, tau: FloatArray, p: FloatArray) -> Callable[[], object]:
         """Return a function that runs the machine code alone, for benchmarks."""

@@ -93,7 +93,6 @@ def foreign_derivatives(
         "bounds": jnp.concatenate([nodes[:1], tau, jnp.repeat(nodes[-1:], idle + 1)]),
         "first_cell": jnp.concatenate([jnp.zeros(1, int), begins, jnp.full(idle + 1, cells - 1)]),
         "multipliers": np.zeros(count),
-        "penalties": np.zeros(count),
         "units": units,
     }
     given |= places

@@ -12,8 +12,8 @@ A straight-line function reads and writes through pointers. The name of a pointe
     psi, jump, late  costate; what nodes at the end of a row add to it; what late samples add to it at its start
     J, g, H         cost, gradient (width,), Hessian (D, width): sums
     time, y, Y      a time, the outputs of the sensors at it, and their derivatives
-    multiplier, penalty, constraint, jacobian
-                    of some constraints: (m,), (m,), their values (m,) and derivatives (m, width)
+    multiplier, constraint, jacobian
+                    of some constraints: (m,), their values (m,) and derivatives (m, width)
     moment          (t, first node of the cell), for the adaptive solver; its y is (x, running cost)
     entries         second derivatives at the stages of a row, (s, count)
     check           0, or NaN once a value that was presumed finite is not
@@ -78,7 +78,7 @@ RESET_BACK = ("c", "p", "time", "moves", "x", "Z", "psi", "g", "H", CHECKED)
 SAMPLE = ("c", "p", "time", "moves", "value", "weight", "x", "Z", "jump", "J", "g", "H", CHECKED)
 NODE = ("c", "p", "time", "moves", "x", "Z", "jump", "J", "g", "H", CHECKED)
 CONSTRAINT = (
-    *("c", "p", "time", "moves", "x", "Z", "jump", "g", "H", "multiplier", "penalty", "constraint", "jacobian"),
+    *("c", "p", "time", "moves", "x", "Z", "jump", "g", "H", "multiplier", "constraint", "jacobian"),
     CHECKED,
 )
 END_OF_LATE = ("psi", "late")
@@ -335,8 +335,7 @@ class Kernels:
         p, constants = self.inputs(graph)
         name, given = f"{kind.name}_{which}", (graph.load("time", 0), graph.loads("x", self.sizes.n), p)
         if kind.constraint:
-            weights = self._weights(graph, template, given, constants, 1)
-            found = template(graph, *given, weights, *constants, checked=True)
+            found = template(graph, *given, graph.loads("multiplier", 1), *constants, checked=True)
             self.module.write_straight_line(
                 name, CONSTRAINT, self._constraint(graph, found, moving=True) + graph.check()
             )
@@ -350,8 +349,7 @@ class Kernels:
         template, graph = self.templates.end_constraint(), Graph()
         p, constants = self.inputs(graph)
         given = graph.loads("x", self.sizes.n), p
-        weights = self._weights(graph, template, given, constants, self.sizes.m)
-        found = template(graph, *given, weights, *constants, checked=True)
+        found = template(graph, *given, graph.loads("multiplier", self.sizes.m), *constants, checked=True)
         self.module.write_straight_line(
             "end_constraint", CONSTRAINT, self._constraint(graph, found, moving=False) + graph.check()
         )
@@ -444,16 +442,8 @@ class Kernels:
         stores += _store("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])
         return stores + self._scalar(graph, derivatives, moving)
 
-    def _weights(
-        self, graph: Graph, template: Template, given: tuple[Any, ...], constants: list[Objects], count: int
-    ) -> Objects:
-        """Return ``multiplier + penalty c``: the weights of the constraints in the Lagrangian."""
-        zeros = np.full(count, graph.constant(0.0), dtype=object)
-        (c,) = template(graph, *given, zeros, *constants, only=(0,))
-        return graph.loads("multiplier", count) + graph.loads("penalty", count) * c
-
     def _constraint(self, graph: Graph, found: Sequence[Objects], moving: bool) -> list[Store]:
-        """Return stores of constraints and their tangents, and those that add ``weights . c`` to g, H and psi."""
+        """Return stores of constraints and their tangents, and those that add ``multiplier . c`` to g, H and psi."""
         stores = _store("constraint", 0, found[0])
         if self.order == Order.COST:
             return stores

@@ -245,7 +245,6 @@ def constraint_pointers(writer: Writer, found: dict[str, str], row: str) -> dict
     """Return pointers to the constraints from a row on."""
     return {
         "multiplier": writer.at(found["multipliers"], row),
-        "penalty": writer.at(found["penalties"], row),
         "constraint": writer.at(found["constraints"], row),
         "jacobian": writer.at(found["jacobian"], row, writer.sizes.width),
     }

@@ -17,11 +17,11 @@ from switchfit.problem.structure import Structure
 GIVEN = (
     *("nodes", "signals", "c", "p", "bounds", "first_cell", "modes", "resets"),
     *(kind.name for kind in AT_TRANSITIONS),
-    *("multipliers", "penalties", "units"),
+    *("multipliers", "units"),
 )
 """Arguments: nodes (G + 1,), signals (G, 4, S), constants, p (M,); the transition times between t0 and tf (N + 2,);
 the cell in which each segment begins, then the last cell (N + 2,); the mode of each segment (N + 1,); the index of the
-reset map and of the function of each kind at each transition, -1 without one (N,); multipliers and penalties of all
+reset map and of the function of each kind at each transition, -1 without one (N,); multipliers of all
 constraints; the derivatives of the transition times, after a row of zeros (D + 1, width)."""
 
 WHOLE_NUMBERS = ("first_cell", "modes", "resets", *(kind.name for kind in AT_TRANSITIONS))
