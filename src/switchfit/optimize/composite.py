@@ -21,8 +21,6 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -63,17 +61,27 @@ class Equalities(NamedTuple):
         return float(np.sqrt(left @ left))
 
 
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """The factorisation Aᵀ P = Q R of a Jacobian A (k, d), which may have dependent rows: Q is (d, d).
+class Rows(NamedTuple):
+    """The factorisation Aᵀ P = Q R of a Jacobian A (k, d), which may have dependent rows.
 
-    R is the upper triangle of `triangular`, (d, k); what is below it is left of the factorisation.
+    Attributes
+    ----------
+    jacobian : array, shape (k, d)
+    orthogonal : array, shape (d, d)
+        Q.
+    triangular : array, shape (d, k)
+        R is its upper triangle; below it is what the factorisation has left.
+    order : array, shape (k,)
+        P.
+    rank : int
+        Number of independent rows.
     """
 
     jacobian: FloatArray
     orthogonal: FloatArray
     triangular: FloatArray
     order: FloatArray
+    rank: int
 
     @classmethod
     def of(cls, jacobian: FloatArray) -> Rows:
@@ -82,37 +90,35 @@ class Rows:
         packed, order, tau, _, _ = dgeqp3(jacobian.T)
         full = np.zeros((d, d), order="F")
         full[:, : min(k, d)] = packed[:, : min(k, d)]
-        return cls(jacobian, dorgqr(full, tau)[0], packed, order - 1)
-
-    @cached_property
-    def rank(self) -> int:
-        """Number of independent rows."""
-        sizes = np.abs(self.triangular.diagonal())
-        return int(np.sum(sizes > DEPENDENT * sizes.max(initial=0.0)))
+        sizes = np.abs(packed.diagonal())
+        rank = int(np.count_nonzero(sizes > DEPENDENT * sizes.max(initial=0.0)))
+        return cls(jacobian, dorgqr(full, tau)[0], packed, order - 1, rank)
 
     @property
     def null(self) -> FloatArray:
         """Orthonormal basis of the null space of A: (d, d - rank)."""
         return self.orthogonal[:, self.rank :]
 
-    @cached_property
+    @property
     def _regular(self) -> FloatArray | None:
         k = len(self.order)
         return self.triangular[:k] if self.rank == k else None
 
     def solve(self, values: FloatArray) -> FloatArray:
         """Return the shortest v (d,) that minimises ‖values + A v‖₂."""
-        if self._regular is None:
+        regular = self._regular
+        if regular is None:
             return -np.asarray(np.linalg.lstsq(self.jacobian, values, rcond=DEPENDENT)[0])
-        inside = dtrtrs(self._regular, values[self.order], trans=1)[0]
+        inside = dtrtrs(regular, values[self.order], trans=1)[0]
         return -np.asarray(self.orthogonal[:, : self.rank] @ inside)
 
     def multipliers(self, force: FloatArray) -> FloatArray:
         """Return the lam (k,) that minimises ‖force + Aᵀ lam‖₂ ([1]_, section 18.3), the shortest of them."""
-        if self._regular is None:
+        regular = self._regular
+        if regular is None:
             return -np.asarray(np.linalg.lstsq(self.jacobian.T, force, rcond=DEPENDENT)[0])
         found = np.empty(len(self.order))
-        found[self.order] = -dtrtrs(self._regular, self.orthogonal[:, : self.rank].T @ force)[0]
+        found[self.order] = -dtrtrs(regular, self.orthogonal[:, : self.rank].T @ force)[0]
         return found
 
 
