@@ -21,6 +21,7 @@ References
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -53,12 +54,12 @@ class Equalities(NamedTuple):
     @property
     def violation(self) -> float:
         """‖c‖₂."""
-        return float(np.sqrt(self.values @ self.values))
+        return math.sqrt(self.values @ self.values)
 
     def predict(self, step: FloatArray) -> float:
         """Return ‖c + A d‖₂ for a step d (d,)."""
         left = self.values + self.jacobian @ step
-        return float(np.sqrt(left @ left))
+        return math.sqrt(left @ left)
 
 
 class Rows(NamedTuple):
@@ -88,8 +89,10 @@ class Rows(NamedTuple):
         """Factorise a Jacobian (k, d), k > 0."""
         k, d = jacobian.shape
         packed, order, tau, _, _ = dgeqp3(jacobian.T)
-        full = np.zeros((d, d), order="F")
-        full[:, : min(k, d)] = packed[:, : min(k, d)]
+        full = packed
+        if k != d:
+            full = np.zeros((d, d), order="F")
+            full[:, : min(k, d)] = packed[:, : min(k, d)]
         sizes = np.abs(packed.diagonal())
         rank = int(np.count_nonzero(sizes > DEPENDENT * sizes.max(initial=0.0)))
         return cls(jacobian, dorgqr(full, tau)[0], packed, order - 1, rank)

@@ -141,8 +141,7 @@ def _judge(
     conditions have to fall.
     """
     point, noise = state.point, _noise(state, penalty)
-    violation = 0.0 if first.equalities is None else first.equalities.violation
-    decrease = point.cost + penalty * point.violation - first.cost - penalty * violation
+    decrease = point.cost + penalty * point.violation - first.cost - penalty * first.violation
     below_noise = reduction <= noise
     if not (decrease >= -noise if below_noise else decrease >= fraction * reduction):
         return None

@@ -39,7 +39,8 @@ NO_FORCES: FloatArray = np.zeros(0)
 class Sample(NamedTuple):
     """One evaluation: cost, gradient, shape (d,), and Hessian, symmetric.
 
-    If there are equality constraints, the Hessian is that of the Lagrangian with these multipliers, shape (k,).
+    If there are equality constraints c, `violation` is ‖c‖₂ in the units of `Oracle.units`, and the Hessian is that of
+    the Lagrangian with these multipliers, shape (k,).
     """
 
     cost: float
@@ -47,6 +48,7 @@ class Sample(NamedTuple):
     hessian: SymmetricMatrix
     equalities: Equalities | None = None
     multipliers: FloatArray | None = None
+    violation: float = 0.0
 
     def lagrangian(self, multipliers: FloatArray) -> tuple[float, FloatArray]:
         """Return ``J + lam . c`` and its gradient (d,); J and its own where there are no equality constraints."""
@@ -109,7 +111,7 @@ class Point:
     @property
     def violation(self) -> float:
         """‖c‖₂ of the equality constraints in the units of `Oracle.units`; 0 where there are none."""
-        return 0.0 if self.plus.equalities is None else self.plus.equalities.violation
+        return self.plus.violation
 
     def is_stationary(self, tolerance: float) -> bool:
         """Return whether the optimality is below a tolerance, and the equality constraints are met."""
@@ -209,7 +211,8 @@ class Oracle:
             return None
         if self.problem.uses_hessian and not hessian.finite:
             return None
-        return Sample(cost, gradient, hessian, equalities, self.multipliers)
+        violation = 0.0 if equalities is None else equalities.violation
+        return Sample(cost, gradient, hessian, equalities, self.multipliers, violation)
 
     def _scale(self, value: Any) -> Equalities | None:
         """Return the equality constraints of an evaluation in their units; None if they are not finite."""

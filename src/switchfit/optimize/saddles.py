@@ -57,7 +57,7 @@ def escape(oracle: Oracle, state: State) -> Accepted | None:
 
 def _merit(sample: Sample, state: State) -> float:
     """Return J, with the penalty of the equality constraints if there are any."""
-    return sample.cost if sample.equalities is None else sample.cost + state.penalty * sample.equalities.violation
+    return sample.cost + state.penalty * sample.violation
 
 
 def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | None:
