@@ -14,8 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv
 
 from switchfit.fit.evaluator import Evaluator
+from switchfit.optimize.qp import is_definite
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.runtime.progress import show_detail
@@ -234,7 +236,7 @@ class Scan:
             if step == STEPS or -(g[:o] @ move) <= self.settled * abs(J):
                 break
             theta = theta.copy()
-            theta[own] = np.clip(theta[own] + move, lower, upper)
+            theta[own] = np.minimum(np.maximum(theta[own] + move, lower), upper)
         return None if best is None else self._option(best, o)
 
     def _option(self, best: tuple[Any, ...], o: int) -> Option:
@@ -254,10 +256,15 @@ def _solve_convex(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Return the solution of a linear system whose matrix is made positive definite if it is not."""
     size = np.abs(matrix.diagonal())
     scale = np.sqrt(np.where(size > EPS**2 * size.max(initial=0.0), size, 1.0))  # what J does not depend on stays
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    values = np.maximum(np.abs(values), SMALLEST_EIGENVALUE)
-    scaled = (right.T / scale).T
-    return np.asarray((vectors @ ((vectors.T @ scaled).T / values).T).T / scale).T
+    scaled, goal = matrix / (scale[:, None] * scale), (right.T / scale).T
+    least = SMALLEST_EIGENVALUE * np.eye(len(scaled))
+    if is_definite(scaled - least):
+        solution = dposv(scaled, goal)[1]
+    else:
+        values, vectors = np.linalg.eigh(scaled)
+        values = np.maximum(np.abs(values), SMALLEST_EIGENVALUE)
+        solution = vectors @ ((vectors.T @ goal).T / values).T
+    return np.asarray(solution.T / scale).T
 
 
 def _newton_in_bounds(
@@ -267,7 +274,9 @@ def _newton_in_bounds(
     step, held = np.zeros(len(g)), np.zeros(len(g), dtype=bool)
     for _ in range(3):
         moving = ~held
-        if moving.any():
+        if len(g) and not held.any():
+            step = -_solve_convex(H, g)
+        elif moving.any():
             rest = g[moving] + H[np.ix_(moving, held)] @ step[held]
             step[moving] = -_solve_convex(H[np.ix_(moving, moving)], rest)
         out = moving & ((step < lower) | (step > upper))
@@ -275,4 +284,4 @@ def _newton_in_bounds(
             break
         step[out] = np.clip(step[out], lower[out], upper[out])
         held |= out
-    return np.clip(step, lower, upper), held
+    return np.minimum(np.maximum(step, lower), upper), held
