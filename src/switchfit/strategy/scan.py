@@ -10,6 +10,7 @@ cost falls.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
 from switchfit.fit.evaluator import Evaluator
+from switchfit.optimize.algebra import is_finite
 from switchfit.optimize.qp import is_definite
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -133,7 +135,8 @@ class Scan:
         options = []
         for e in range(len(self.problem.experiments)):
             show_detail(f"run {e + 1} of {len(self.problem.experiments)}")
-            options.append(self._scan_run(e))
+            with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is left out
+                options.append(self._scan_run(e))
         move = np.zeros(len(self.shared))
         for _ in range(20):
             best = [min(own, key=lambda option: self._predict(option, move)) for own in options]
@@ -225,9 +228,8 @@ class Scan:
         for step in range(STEPS + 1):
             side = -1 if place >= 0 and theta[place] >= high else 1
             J, g, H = self._derivatives(theta, e, side)
-            with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is looked at below
-                g, H = sums @ g, sums @ H @ sums.T
-            if not (np.isfinite(J) and np.isfinite(g).all() and np.isfinite(H).all()):
+            g, H = sums @ g, sums @ H @ sums.T
+            if not (math.isfinite(J) and is_finite(g) and is_finite(H)):
                 break
             if best is not None and best[1] < J:
                 break

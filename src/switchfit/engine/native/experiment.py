@@ -24,9 +24,7 @@ from switchfit.engine.native.workspace import (
     OF_SAMPLES,
     WHOLE_OF_SAMPLES,
     ZEROED,
-    constraint_rows,
-    memory,
-    sums,
+    Layout,
 )
 from switchfit.engine.protocol import Constrained, Derivatives
 from switchfit.problem.data import FloatArray
@@ -138,11 +136,13 @@ class NativeExperiment:
         self._p = np.zeros(max(sizes.M, 1))
         self._own_p, self._tau = self._p[: sizes.M], self._bounds[1 : structure.N + 1]
         self._begins = self._first_cell[1 : structure.N + 1]
-        rows = constraint_rows(library, sizes)
+        if order not in program.layouts:
+            program.layouts[order] = Layout.of(library, sizes, order)
+        layout: Layout = program.layouts[order]
+        rows, lengths = layout.constraint_rows, layout.sums
         own_rows = [rows[kind.name] + i for kind, i in list_constrained_transitions(structure)]
         self._constraint_rows = np.array([*own_rows, *range(rows["end"], rows["count"])], dtype=np.intp)
         self._multipliers = np.zeros(max(rows["count"], 1))
-        lengths = sums(library, sizes)
         self._sums = np.zeros(sum(lengths.values()))
         arrays: dict[str, Any] = {
             "nodes": np.ascontiguousarray(times),
@@ -157,7 +157,7 @@ class NativeExperiment:
         arrays |= places_in_library(structure)
         arrays |= _split_array(self._sums, lengths)
         self._check, self._J = arrays[CHECKED], arrays["J"]
-        self._lengths = {name: length.at(cells + N) for name, length in memory(library, sizes, order).items()}
+        self._lengths = {name: length.at(cells + N) for name, length in layout.memory.items()}
         self._size = sum(self._lengths.values())
         self._zeroed: list[FloatArray] = []
         self._memory = np.zeros(0)  # the workspace that the table points to
@@ -182,7 +182,7 @@ class NativeExperiment:
         self._progress = (ctypes.c_int64 * 3)()
         self._progress_address = ctypes.addressof(self._progress)
         self._result = self._named["g"][:D], self._named["H"].reshape(D, width)[:, :D]
-        self._delays = _find_delays(structure, arguments)
+        self._delays = _find_delays(structure, arguments) if self._late else {}
 
     def __call__(self, tau: FloatArray, p: FloatArray, side: float) -> Derivatives | None:
         """Return J, its gradient (D,) and its Hessian (D, D), which is NaN at orders below the second.
