@@ -1,4 +1,4 @@
-"""The trust region: a box around the point, in which the quadratic model of the cost is believed.
+"""The trust region: a box around the point, in which the quadratic model of the cost is trusted.
 
 Far from the solution the Hessian is often indefinite. Where eigenvalues are replaced by their absolute values, a line
 search along the step goes far in directions in which the model says nothing. Inside a trust region the Hessian is

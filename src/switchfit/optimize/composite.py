@@ -1,14 +1,14 @@
 """The step of an iteration with equality constraints c(theta) = 0: towards them, and along them.
 
-The quadratic programme with linearised constraints
+The quadratic programme with linearized constraints
 
-    minimise  gᵀd + ½ dᵀHd   subject to   c + A d = 0,   N d >= offsets,   |d_i| <= radius reach_i
+    minimize  gᵀd + ½ dᵀHd   subject to   c + A d = 0,   N d >= offsets,   |d_i| <= radius reach_i
 
-need not have a feasible point: the linearisations may contradict one another, the inequalities or the trust region. The
+need not have a feasible point: the linearizations may contradict one another, the inequalities or the trust region. The
 composite step of Byrd and Omojokun ([1]_, section 18.5, algorithm 18.4) asks of c + A d what can be had:
 
-1. the *normal step* v minimises ‖c + A v‖₂ within a part of the trust region and the inequalities;
-2. the *tangential step* t minimises the model within ``A t = 0``, the rest of the trust region and the inequalities.
+1. the *normal step* v minimizes ‖c + A v‖₂ within a part of the trust region and the inequalities;
+2. the *tangential step* t minimizes the model within ``A t = 0``, the rest of the trust region and the inequalities.
 
 With an orthonormal basis Z of the null space of A the second is a programme in w, t = Z w, of which w = 0 is a feasible
 point, as `solve_qp` needs it; only ZᵀHZ has to be positive definite, and is shifted where it is not. Both are solved in
@@ -63,7 +63,7 @@ class Equalities(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """The factorisation Aᵀ P = Q R of a Jacobian A (k, d), which may have dependent rows.
+    """The factorization Aᵀ P = Q R of a Jacobian A (k, d), which may have dependent rows.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Rows(NamedTuple):
     orthogonal : array, shape (d, d)
         Q.
     triangular : array, shape (d, k)
-        R is its upper triangle; below it is what the factorisation has left.
+        R is its upper triangle; below it is what the factorization has left.
     order : array, shape (k,)
         P.
     rank : int
@@ -86,7 +86,7 @@ class Rows(NamedTuple):
 
     @classmethod
     def of(cls, jacobian: FloatArray) -> Rows:
-        """Factorise a Jacobian (k, d), k > 0."""
+        """Factorize a Jacobian (k, d), k > 0."""
         k, d = jacobian.shape
         packed, order, tau, _, _ = dgeqp3(jacobian.T)
         full = packed
@@ -108,7 +108,7 @@ class Rows(NamedTuple):
         return self.triangular[:k] if self.rank == k else None
 
     def solve(self, values: FloatArray) -> FloatArray:
-        """Return the shortest v (d,) that minimises ‖values + A v‖₂."""
+        """Return the shortest v (d,) that minimizes ‖values + A v‖₂."""
         regular = self._regular
         if regular is None:
             return -np.asarray(np.linalg.lstsq(self.jacobian, values, rcond=DEPENDENT)[0])
@@ -116,7 +116,7 @@ class Rows(NamedTuple):
         return -np.asarray(self.orthogonal[:, : self.rank] @ inside)
 
     def multipliers(self, force: FloatArray) -> FloatArray:
-        """Return the lam (k,) that minimises ‖force + Aᵀ lam‖₂ ([1]_, section 18.3), the shortest of them."""
+        """Return the lam (k,) that minimizes ‖force + Aᵀ lam‖₂ ([1]_, section 18.3), the shortest of them."""
         regular = self._regular
         if regular is None:
             return -np.asarray(np.linalg.lstsq(self.jacobian.T, force, rcond=DEPENDENT)[0])
@@ -198,7 +198,7 @@ def solve_composite(
 def find_normal_step(
     equalities: Equalities, normals: FloatArray, offsets: FloatArray, reach: FloatArray, radius: float
 ) -> FloatArray:
-    """Return the v (d,) that minimises ‖c + A v‖₂ in a trust region; arguments as of `solve_composite`."""
+    """Return the v (d,) that minimizes ‖c + A v‖₂ in a trust region; arguments as of `solve_composite`."""
     scaled = Equalities(equalities.values, equalities.jacobian * reach)
     kept = offsets > -np.inf
     within = normals[kept] * reach

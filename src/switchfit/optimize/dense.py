@@ -108,7 +108,7 @@ class Dense:
         floor: FloatArray | None,
         box: Box | None = None,
     ) -> ModelStep:
-        """Minimise ``gᵀd + ½ dᵀBd`` inside `room`; see `switchfit.optimize.matrix.SymmetricMatrix`."""
+        """Minimize ``gᵀd + ½ dᵀBd`` inside `room`; see `switchfit.optimize.matrix.SymmetricMatrix`."""
         if room.free is None:
             return _minimize(self.array, gradient, room.constraints.normals, room.offsets, pressed, floor, box)
         part = np.flatnonzero(room.free)
@@ -272,8 +272,8 @@ def split_space(normals: FloatArray) -> tuple[FloatArray, FloatArray]:
 def convexify(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None = None) -> FloatArray:
     """Return a positive definite B that equals H wherever H can be kept.
 
-    In scaled variables, with Z the directions free of the (presumably) active constraints and Y their normals: a
-    positive definite H is kept; otherwise ZᵀHZ is kept if it is positive definite, which leaves Newton's step on the
+    In scaled variables, with Z a basis of the null space of the constraints expected to be active and Y their normals:
+    a positive definite H is kept; otherwise ZᵀHZ is kept if it is positive definite, which leaves Newton's step on the
     face unspoiled, and only the Schur complement on Y has its eigenvalues replaced by their absolute values. If
     ZᵀHZ is not positive definite either, its eigenvalues are treated in the same way.
 
@@ -296,7 +296,7 @@ def convexify(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None
 def convexify_and_factor(
     hessian: FloatArray, normals: FloatArray, floor: FloatArray | None, reach: FloatArray | None = None
 ) -> tuple[FloatArray, CholeskyFactor]:
-    """Return the matrix B of `convexify` and its factorisation; d > 0.
+    """Return the matrix B of `convexify` and its factorization; d > 0.
 
     Inside a trust region with the half-widths `reach` (d,) eigenvalues are shifted instead of replaced.
     """

@@ -33,7 +33,7 @@ class Direction(NamedTuple):
 
     `regular`: no constraint is active, no coordinate is held or at a kink, and H is positive definite. `radius` is that
     of the trust region that it was found in. With equality constraints, `multipliers` are theirs, (k,), and `left` is
-    what their linearisation leaves of their violation.
+    what their linearization leaves of their violation.
     """
 
     step: FloatArray

@@ -1,4 +1,4 @@
-"""Steps that end inside the constraints, and exactly on what they reach: bounds, breakpoints and rows."""
+"""Feasible steps, which end exactly on the bounds, breakpoints and rows that they reach up to rounding."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ from switchfit.optimize.state import Accepted, State
 
 #: Part of the decrease of ``mu ‖c‖`` that the decrease of the model has to be, rho of [1]_, (18.36).
 SHARE = 0.1
-#: The penalty is raised beyond what is needed by this factor, or it would have to be again at the next step.
+#: Factor by which the penalty is raised beyond what is needed, so that the next step does not raise it again.
 RAISED = 1.1
 #: Radius of the trust region below which violated constraints count as stuck.
 SMALLEST_RADIUS = 1e-10

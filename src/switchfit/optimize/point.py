@@ -1,4 +1,4 @@
-"""Points of the minimisation: one or two evaluations of J, and the first-order conditions there.
+"""Points of the minimization: one or two evaluations of J, and the first-order conditions there.
 
 Along v, J changes at the rate J'(v) = Σ (g₊ max(v, 0) + g₋ min(v, 0)), with g₋ = g₊ off the kinks. A point is optimal
 when no feasible v has J'(v) < 0, and the steepest descent −J'(v) over ‖v‖₂ <= 1 measures how far it is from that.
@@ -25,11 +25,11 @@ from switchfit.optimize.kkt import kkt_residual
 from switchfit.optimize.matrix import Curvature, SymmetricMatrix
 from switchfit.optimize.problem import Problem
 
-#: Growth of a constraint's gradient from which it is measured anew.
+#: Growth of the gradient of a constraint that changes its unit.
 GROWN = 100.0
-#: Equality constraints count as met where they are below this, in their units.
+#: Equality constraints below this value, in their units, count as met.
 MET = 1e-8
-#: Jumps of a derivative above this part of the largest derivative are no errors of the integration.
+#: Jumps of a derivative larger than this part of the largest derivative are not integration errors.
 LARGE_JUMP = 1e-6
 
 
@@ -169,7 +169,7 @@ def _mix(right: FloatArray, left: FloatArray, sides: NDArray[np.int_]) -> FloatA
 
 
 class Oracle:
-    """The caller's function with a counter; turns unknowns into points and refuses what is not finite.
+    """Evaluates points by the caller's function, counts evaluations, and rejects values that are not finite.
 
     Attributes
     ----------
@@ -177,9 +177,9 @@ class Oracle:
     multipliers : array, shape (k,)
         Of the equality constraints, with which the Hessian of the Lagrangian is evaluated next.
     units : array, shape (k,), or None
-        What the equality constraints are measured by: the lengths of their gradients, over `Problem.reach`, at the
-        first point, or where these have grown by far. Constraints and multipliers are in these units everywhere but in
-        the caller's function.
+        Units of the equality constraints: the lengths of their gradients over `Problem.reach` at the first point, or
+        later if these have grown by a factor of `GROWN`. Constraints and multipliers are in these units everywhere
+        except in the caller's function.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -322,7 +322,7 @@ class Oracle:
         return None if first is None else self.complete(trial, first, scale)
 
     def _idle(self, theta: FloatArray, active: NDArray[np.intp]) -> NDArray[np.bool_] | None:
-        """Return the coordinates on which J does not depend while active rows stay so: (d,) of bool, or None."""
+        """Return the coordinates on which J does not depend while the active rows stay active: (d,) bool, or None."""
         if self.problem.idle is None or not self.problem.rows_hold(active):
             return None
         idle = self.problem.idle(theta.copy(), False)

@@ -1,4 +1,4 @@
-"""What follows at a stationary point: rows that all but hold are closed, saddles left along negative curvature."""
+"""Stationary points: make rows hold that nearly do, and leave saddles along negative curvature."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The state of a minimisation between two iterations."""
+"""State of a minimization between two iterations."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NO_SCALE: FloatArray = np.zeros(0)
 
 
 class State(NamedTuple):
-    """The best point so far, and what has been seen.
+    """The best point so far, and figures of the iterations before.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class State(NamedTuple):
     metric : float
         Steepest descent: B = I / metric, the first step length tried: 1, or twice the last one if that was above ½.
     settled : int
-        Iterations since the optimality fell below the tolerance.
+        Number of iterations since the optimality fell below the tolerance.
     scale : array, shape (d,)
         Largest ``|theta_i|`` seen.
     cost_scale, gradient_scale : float
@@ -45,18 +45,18 @@ class State(NamedTuple):
     lowest_cost : float
     restarts : int
     radius : float
-        Half-width of the trust region, in units of `Problem.reach`; infinite where there is none.
+        Half-width of the trust region, in units of `Problem.reach`; infinite without a trust region.
     penalty : float
         Of the equality constraints in the merit function.
     steady_violation : float
-        That of the equality constraints when it last changed by a tenth.
+        Violation of the equality constraints when it last changed by a tenth.
     stagnant : int
         Iterations since then.
     careful : bool
         The next step is taken with the diagonal of the Hessian alone.
     status : Status or None
     reason : Finding or None
-        Why it failed, where it did.
+        Why the line search failed, if it did.
     """
 
     point: Point
@@ -118,12 +118,12 @@ class State(NamedTuple):
 
     @property
     def floor(self) -> FloatArray:
-        """Curvature of each unknown that counts as none in the quadratic programme: (d,)."""
+        """Curvature of each unknown below which the quadratic programme takes it for zero: (d,)."""
         return np.asarray(algebra.curvature_floor(self.scale, self.cost_scale, self.point.largest_slopes))
 
     @property
     def genuine_kinks(self) -> NDArray[np.bool_]:
-        """Coordinates on a breakpoint whose derivative really jumps upwards there: (d,)."""
+        """Coordinates on a breakpoint at which the derivative jumps upwards by more than rounding: (d,)."""
         point = self.point
         if point.kink is None:
             return np.zeros(point.theta.size, dtype=bool)

@@ -4,7 +4,7 @@ Between two samples the cost is smooth in a transition time, and at each it has 
 intervals. Given the unknowns that runs share, the other unknowns of a run are few: Newton's method with the transition
 confined to an interval, begun at the end of the interval beside it, gives the least cost of each interval and, by the
 Schur complement of its Hessian, how that changes with the shared unknowns, as a parabola. The shared unknowns then
-minimise the sum over the runs of the lowest parabolas, a fit of all runs follows, and this is repeated as long as the
+minimize the sum over the runs of the lowest parabolas, a fit of all runs follows, and this is repeated as long as the
 cost falls.
 """
 
