@@ -91,8 +91,8 @@ IN_NATIVE: dict[str, tuple[str, Replacements]] = {
         [
             (
                 '        stores += _store("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])\n'
-                "        return stores + self._scalar(graph, derivatives, moving)\n\n    def _weights",
-                "        return stores + self._scalar(graph, derivatives, moving)\n\n    def _weights",
+                "        return stores + self._scalar(graph, derivatives, moving)\n\n    def _constraint(",
+                "        return stores + self._scalar(graph, derivatives, moving)\n\n    def _constraint(",
             )
         ],
     ),
