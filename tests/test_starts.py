@@ -18,7 +18,6 @@ from benchmarks.starts.study import REFERENCE, Job, Outcomes
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import constraints_of
 
-
 NO_TIMES = {"seconds": 0, "fitting": 0, "optimizing": 0}
 
 
