@@ -91,14 +91,14 @@ IN_NATIVE: dict[str, tuple[str, Replacements]] = {
         [
             (
                 '        stores += _store("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])\n'
-                "        return stores + self._scalar(graph, derivatives, moving)\n\n    def _constraint",
-                "        return stores + self._scalar(graph, derivatives, moving)\n\n    def _constraint",
+                "        return stores + self._scalar(graph, derivatives, moving)\n\n    def _constraint(",
+                "        return stores + self._scalar(graph, derivatives, moving)\n\n    def _constraint(",
             )
         ],
     ),
-    "the sign of a multiplier": (
+    "the multiplier of a terminal constraint": (
         KERNELS,
-        [('graph.loads("multiplier", 1)', '-graph.loads("multiplier", 1)')],
+        [('graph.loads("multiplier", self.sizes.m)', 'graph.loads("constraint", self.sizes.m)')],
     ),
     "half of the mixed entries in Z' S Z": (
         KERNELS,

@@ -25,6 +25,10 @@ class End:
         "good", "doubtful" or "bad"; empty where a fit gives none.
     status : str
     evaluations, iterations : int
+    fitting : float
+        Seconds of the whole fit to an answer whose integration error is checked; without its verdict.
+    optimizing : float
+        Seconds of these in the optimiser alone, on meshes that are ready.
     """
 
     theta: list[float]
@@ -34,6 +38,8 @@ class End:
     status: str
     evaluations: int
     iterations: int
+    fitting: float
+    optimizing: float
 
 
 def judge(problem: sf.Problem, theta: list[float]) -> dict[str, float]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -11,6 +14,8 @@ import switchfit as sf
 from benchmarks.starts import peers
 from benchmarks.starts.case import Case
 from benchmarks.starts.end import End
+from switchfit import optimize
+from switchfit.fit import solution
 
 Method = Callable[[Case, np.ndarray], End]
 
@@ -19,12 +24,31 @@ def fit_with(**settings: Any) -> Method:
     """Return the method that calls `sf.estimate` with these settings."""
 
     def fit(case: Case, start: np.ndarray) -> End:
-        return read_estimate(sf.estimate(case.problem, start=start, **settings))
+        began = time.perf_counter()
+        with time_optimizer() as seconds:
+            estimate = sf.estimate(case.problem, start=start, **settings)
+        return read_estimate(estimate, time.perf_counter() - began, sum(seconds))
 
     return fit
 
 
-def read_estimate(estimate: Any) -> End:
+@contextmanager
+def time_optimizer() -> Iterator[list[float]]:
+    """Return a context with the seconds of each minimisation inside it, in this process."""
+    seconds: list[float] = []
+
+    def minimize(*given: Any, **settings: Any) -> Any:
+        began = time.perf_counter()
+        try:
+            return optimize.minimize(*given, **settings)
+        finally:
+            seconds.append(time.perf_counter() - began)
+
+    with patch.object(solution, "minimize", minimize):
+        yield seconds
+
+
+def read_estimate(estimate: Any, fitting: float, optimizing: float) -> End:
     """Return what counts of an `sf.Estimate`."""
     level = estimate.verdict.level
     return End(
@@ -35,6 +59,8 @@ def read_estimate(estimate: Any) -> End:
         status=estimate.status.name,
         evaluations=int(estimate.evaluations),
         iterations=int(estimate.iterations),
+        fitting=fitting,
+        optimizing=optimizing,
     )
 
 

@@ -23,7 +23,8 @@ HEADER = (
     "errors",
     "evaluations, median",
     "evaluations, all",
-    "a start, median",
+    "a fit, median",
+    "in the optimizer",
     "all starts",
 )
 
@@ -58,9 +59,17 @@ def count(case: Case, best: float, outcomes: list[Outcome]) -> tuple[str, ...]:
         str(len(outcomes) - len(ends)),
         f"{statistics.median(evaluations):.0f}" if ends else "",
         str(sum(evaluations)),
-        f"{1e3 * statistics.median(seconds):.0f} ms",
+        *(write_milliseconds([end[name] for end in ends]) for name in ("fitting", "optimizing")),
         f"{sum(seconds):.1f} s",
     )
+
+
+def write_milliseconds(seconds: list[float]) -> str:
+    """Return the median of some times; nothing of none."""
+    if not seconds:
+        return ""
+    median = 1e3 * statistics.median(seconds)
+    return f"{median:.1f} ms" if median < 100 else f"{median:.0f} ms"
 
 
 def write_table(outcomes: Outcomes, problems: list[str], methods: list[str], number: int | None) -> list[str]:

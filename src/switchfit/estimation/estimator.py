@@ -771,7 +771,8 @@ def fit_locally(
         evaluations += result.evaluations
         theta = result.theta
         scale = max(first_cost, history[0].cost if history else 0.0)
-        fine, simulation, error, output = _judge_meshes(evaluator, result, scale, try_cells=attempt == 0)
+        values = [value for _, value, _ in result.equalities]
+        fine, simulation, error, output = judge_meshes(evaluator, theta, result.cost, scale, values, first=not attempt)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
         if attempt == REFINEMENTS or result.status is Status.INTERRUPTED:
             break
@@ -779,7 +780,7 @@ def fit_locally(
         stable = _stabilize(evaluator, first, theta) if failed else None
         if stable is None and (result.status in STOPPED or not excess > 1):
             break
-        evaluator = stable or _refine(fine, first, theta, excess)
+        evaluator = stable or refine_meshes(fine, first, theta, excess)
     if excess > 1 and result.status.successful and not problem.constraint_names:
         refuse_jumps(evaluator, theta)  # the error of steps across a jump does not vanish with their size
     found = _estimate(
@@ -806,20 +807,35 @@ def check_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:
     return as_positive(tolerance, "tolerance"), as_count(max_iterations, "max_iterations")
 
 
-def _judge_meshes(
-    evaluator: Evaluator, result: Result, first_cost: float, *, try_cells: bool
+def judge_meshes(
+    evaluator: Evaluator,
+    theta: FloatArray,
+    cost: float,
+    first_cost: float,
+    constraints: Sequence[float],
+    *,
+    first: bool,
 ) -> tuple[Evaluator, SimulatedProblem, float, str]:
-    """Return the problem with its steps halved, its simulation there, and the largest integration error and its output.
+    """Return the problem with its steps halved, its simulation at theta, the largest integration error and its output.
 
-    With `try_cells`, all cells are halved first, and the rows only if the error is small then. The first meshes of a
-    problem are mostly too coarse: halved cells show this as well as halved rows do, and their evaluator is cached for
-    the next fit of the same problem.
+    The first meshes are mostly too coarse. Halved cells show this as well as halved rows do, and their evaluator is
+    cached for the next fit of the same problem: they are tried first.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    theta : (d,)
+    cost, constraints : float, (m,)
+        J, guards and terminal constraints of the evaluator at theta.
+    first_cost : float
+        J at the start of the fit.
+    first : bool
+        Whether the meshes are those that the fit began with.
     """
-    constraints = [value for _, value, _ in result.equalities]
-    for halve in (lambda: evaluator.halved, lambda: evaluator.halve_rows(result.theta))[not try_cells :]:
+    for halve in (lambda: evaluator.halved, lambda: evaluator.halve_rows(theta))[not first :]:
         fine = halve()
-        simulation = SimulatedProblem(fine, result.theta)
-        error, output = worst_error(simulation, cost=result.cost, first_cost=first_cost, constraints=constraints)
+        simulation = SimulatedProblem(fine, theta)
+        error, output = worst_error(simulation, cost=cost, first_cost=first_cost, constraints=constraints)
         if error > max(LARGEST_INTEGRATION_ERROR, evaluator.problem.rtol):
             break
     return fine, simulation, error, output
@@ -837,8 +853,9 @@ def _stabilize(evaluator: Evaluator, start: FloatArray, theta: FloatArray) -> Ev
     return Evaluator(problem, meshes=[new or mesh for new, mesh in zip(found, evaluator.meshes, strict=True)])
 
 
-def _refine(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:
-    """Return the problem on finer meshes: the halved ones, or, if they are not enough, refined at the start and theta.
+def refine_meshes(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:
+    """Return the problem on finer meshes: cells cut in two, or, if that is not enough, refined at the start and at
+    theta.
 
     A mode that has become active in another part of the horizon may meet cells there that are far too long for it.
     """

@@ -14,6 +14,7 @@ divided by a scale of that output:
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from functools import partial
 from typing import NamedTuple
 
@@ -78,11 +79,12 @@ def worst_error(
         NaN counts as the largest error.
     """
     problem = fine.evaluator.problem
-    errors = [IntegrationError(cost_error(problem, fine.cost, cost, first_cost), COST)]
+    errors: list[IntegrationError] = []
     if problem.constraint_names:
         values, scales = constraint_values(fine.evaluator, fine.theta, fine.simulations)
         changes = np.abs(values - constraints) / np.where(scales > 0, scales, 1.0)
         errors += map(IntegrationError, changes.tolist(), problem.constraint_names)
+    errors = [IntegrationError(cost_error(problem, fine.cost, cost, first_cost), COST), *errors]
     return max(errors, key=lambda found: np.inf if np.isnan(found.error) else found.error)
 
 
@@ -101,8 +103,11 @@ def constraint_values(
             tau, p = problem.vectors(theta, e)
             ends = np.stack([simulation.after[rows][-1] for rows in simulation.segments])
             states = np.concatenate([simulation.before, simulation.after])
-            with use_float64(), use_compilation_cache():
+            # Entering the cache takes longer than the call, and programs that are compiled do not need it.
+            compiled = problem.__dict__.setdefault("compiled_constraints", set())
+            with use_float64(), nullcontext() if e in compiled else use_compilation_cache():
                 found = _evaluate_constraints(arguments.without_mesh(), tau, ends, p, structure=structure)
+            compiled.add(e)
             values.append(np.asarray(found[0]))
             scales.append(np.abs(found[1]) @ np.ptp(states, axis=0))
     return np.concatenate(values), np.concatenate(scales)

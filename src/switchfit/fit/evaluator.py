@@ -17,6 +17,7 @@ from switchfit.engine.choice import engine_of, summarize
 from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.protocol import Engine, Evaluation, Matrix, Simulation
 from switchfit.optimize.arrow import Arrow, ArrowLayout
+from switchfit.optimize.problem import Breakpoints
 from switchfit.paper_adjoint import evaluate_paper
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
@@ -46,11 +47,9 @@ class Evaluator:
         self.problem = problem
         indices = range(len(problem.experiments))
         at = problem.initial_theta if theta is None else theta
-        given = list(meshes) if meshes is not None else [refine_mesh(problem, e, at) for e in indices]
-        self.meshes = given
-        self.replace_arguments(
-            [build_arguments(problem, e, m) for e, m in enumerate(pad_to_common_lengths(problem, given))]
-        )
+        self.meshes = list(meshes) if meshes is not None else [refine_mesh(problem, e, at) for e in indices]
+        padded = enumerate(pad_to_common_lengths(problem, self.meshes))
+        self._set_arguments([build_arguments(problem, e, mesh) for e, mesh in padded])
         self._priors = problem.unknowns.priors if problem.unknowns.priors.any else None
 
     def divide(self, parts: int) -> Evaluator:
@@ -75,11 +74,11 @@ class Evaluator:
 
         `matrix` selects the Hessian, the Gauss-Newton matrix in its place, or neither (NaN).
         """
-        d = len(theta)
         results = self._evaluate_experiments(theta, side, method, matrix)
         if self.problem.one_to_one:
             whole = results[0]
         else:
+            d = len(theta)
             cost, gradient, hessian = 0.0, np.zeros(d), np.zeros((d, d))
             for one, (own, mine) in zip(results, self.problem.own_places, strict=True):
                 cost += one.cost
@@ -161,11 +160,15 @@ class Evaluator:
 
     def replace_arguments(self, arguments: Sequence[Arguments]) -> None:
         """Replace data and constants; the meshes are those of the new nodes."""
-        self.__dict__.pop("halved", None)
-        self.arguments = list(arguments)
+        for name in ("halved", "structures", "sorted_breakpoints"):
+            self.__dict__.pop(name, None)
         before = zip(self.meshes, arguments, strict=True)
         self.meshes = [Mesh.from_times(np.asarray(own.nodes), mesh.stiffness) for mesh, own in before]
-        self.__dict__.pop("structures", None)
+        self._set_arguments(list(arguments))
+
+    def _set_arguments(self, arguments: list[Arguments]) -> None:
+        """Store the arguments on the meshes that the evaluator has, and choose the engines."""
+        self.arguments = arguments
         given = enumerate(zip(self.arguments, self.meshes, strict=True))
         self.engines = [engine_of(self.problem, e, own, mesh) for e, (own, mesh) in given]
 
@@ -192,9 +195,11 @@ class Evaluator:
         self, theta: FloatArray, side: int, method: Method, matrix: Matrix
     ) -> list[Evaluation[FloatArray]]:
         """Return the cost, gradient and Hessian of each experiment in its own unknowns."""
-        vectors = self._vectors(np.asarray(theta, dtype=np.float64))
+        theta = np.asarray(theta, dtype=np.float64)
         if method == "auto":
-            return [engine.derivatives(*at, side, matrix) for engine, at in zip(self.engines, vectors, strict=True)]
+            find = self.problem.vectors
+            return [engine.derivatives(*find(theta, e), side, matrix) for e, engine in enumerate(self.engines)]
+        vectors = [self.problem.vectors(theta, e) for e in range(len(self.engines))]
         given = list(zip(self.structures, self.arguments, self.meshes, vectors, strict=True))
         if method == "adjoint":
             if not is_covered_by_paper(self.problem):
@@ -203,6 +208,11 @@ class Evaluator:
                 found = [evaluate_paper(a, *at, float(side), structure=s) for s, a, _, at in given]
             return [Evaluation(float(J), np.array(g), np.array(H)) for J, g, H in found]
         return [JaxEngine(s, a, mesh).derivatives(*at, side, matrix, method) for s, a, mesh, at in given]
+
+    @cached_property
+    def sorted_breakpoints(self) -> Breakpoints:
+        """The breakpoints of theta in the optimizer's form."""
+        return Breakpoints.of(self.breakpoints(), len(self.problem.theta_names))
 
     def breakpoints(self) -> list[FloatArray]:
         """Return the nodes at which derivatives may jump for each entry of theta: an empty array for parameters."""

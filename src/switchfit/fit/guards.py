@@ -168,7 +168,7 @@ def on_guards(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
 def place_on_near_guards(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     """Return `theta` on its guards as of `on_guards`, or as it is where there are none, or no such point is near.
 
-    The optimiser may find one that is farther off.
+    The optimizer may find one that is farther off.
     """
     if not any(structure.guarded for structure in evaluator.problem.structures):
         return theta

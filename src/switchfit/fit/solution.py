@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.engine.protocol import Evaluation
+from switchfit.engine.protocol import Evaluation, Matrix
 from switchfit.fit.collapsed import idle_unknowns
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.hidden import refuse_hidden_switches, refuse_jumps
@@ -34,9 +34,13 @@ TIME_REACH = 0.01
 
 
 def constraints_of(problem: Problem) -> LinearConstraints:
-    """Return the ordering, minimum durations and bounds of a problem in the optimizer's form."""
-    unknowns = problem.unknowns
-    return LinearConstraints(unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, linear_constraints_of(problem))
+    """Return the ordering, minimum durations and bounds of a problem in the optimizer's form, cached in the problem."""
+    if "constraints_of_fit" not in problem.__dict__:
+        given = problem.unknowns
+        built = LinearConstraints(given.A, given.b, given.lower, given.upper, linear_constraints_of(problem))
+        object.__setattr__(problem, "constraints_of_fit", built)
+    own: LinearConstraints = problem.__dict__["constraints_of_fit"]
+    return own
 
 
 def minimize_cost(
@@ -57,74 +61,80 @@ def minimize_cost(
     problem = evaluator.problem
     names = problem.constraint_names
     unknowns = problem.unknowns
-    matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
+    matrix: Matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
     if by_blocks is None:
         many = len(problem.experiments) >= MANY_RUNS and not names
         by_blocks = many and 2 * len(evaluator.layout.shared) < len(theta)
     constraints = constraints_of(problem) if constraints is None else constraints
-    change = _Change.of(problem, constraints, evaluator.breakpoints())
-    identity = unknowns.variables.identity
+    change = None if unknowns.variables.identity else _Change.of(problem, constraints, evaluator.breakpoints())
     seen: list[bool] = []
 
-    def evaluate_theta(theta: Any, side: int) -> Evaluation[FloatArray | Arrow | None]:
-        if hessian not in ("none", "descent-first") and by_blocks:
-            return evaluator.arrow(theta, side, matrix)
+    def without_hessian(theta: FloatArray, side: int, *, matrix: Matrix) -> Evaluation[Any]:
         here = evaluator(theta, side, matrix=matrix)
-        return Evaluation(here.cost, here.gradient, None) if hessian == "none" else here
+        return Evaluation(here.cost, here.gradient, None)
+
+    evaluate_theta: Callable[..., Evaluation[Any]] = evaluator
+    if hessian == "none":
+        evaluate_theta = without_hessian
+    elif by_blocks and hessian != "descent-first":
+        evaluate_theta = evaluator.arrow
 
     def evaluate(z: Any, side: int, multipliers: FloatArray | None = None) -> Any:
-        theta = z if identity else change.to_theta(z)
+        theta = z if change is None else change.to_theta(z)
         if multipliers is not None:
             held = evaluator.constrained(theta, side, multipliers)
-            return held if identity else _to_constrained(change.variables, theta, held, multipliers)
-        here = evaluate_theta(theta, side)
+            return held if change is None else _to_constrained(change.variables, theta, held, multipliers)
+        here = evaluate_theta(theta, side, matrix=matrix)
         if not seen:
             seen.append(True)
             refuse_hidden_switches(evaluator, theta, here.gradient)
-        return here if identity else _to_variables(change.variables, theta, here)
+        return here if change is None else _to_variables(change.variables, theta, here)
 
     def idle(z: FloatArray, everything: bool) -> NDArray[np.bool_]:
-        return idle_unknowns(evaluator, z if identity else change.to_theta(z), everything)
+        return idle_unknowns(evaluator, z if change is None else change.to_theta(z), everything)
 
     report = callback
-    if callback is not None and not identity:
+    if callback is not None and change is not None:
         report = lambda record: callback(change.convert_record(record))  # noqa: E731
     result = minimize(
         evaluate,
-        theta if identity else change.variables.inward(np.asarray(theta)),
-        constraints=constraints if identity else change.convert_constraints(problem.sizes),
-        breakpoints=change.points,
+        theta if change is None else change.variables.inward(np.asarray(theta)),
+        constraints=constraints if change is None else change.convert_constraints(problem.sizes),
+        breakpoints=evaluator.sorted_breakpoints if change is None else change.points,
         hessian="exact" if by_blocks and hessian == "auto" else hessian,  # a trust region's one radius suits no run
         blocks=unknowns.is_time.astype(int),
         tolerance=tolerance,
         max_iterations=max_iterations,
         callback=report,
-        size=problem.sizes if identity else change.variables.sizes_inward(problem.sizes),
+        size=problem.sizes if change is None else change.variables.sizes_inward(problem.sizes),
         idle=None if names else idle,
         reach=_compute_reach(problem),
         equalities=names,
     )
     if result.status is Status.LINE_SEARCH_FAILED and not names:
-        refuse_jumps(evaluator, result.theta if identity else change.to_theta(result.theta))
-    if identity:
+        refuse_jumps(evaluator, result.theta if change is None else change.to_theta(result.theta))
+    if change is None:
         return result
     converted = change.convert_result(result)
     return converted if not names else _convert_constrained(evaluator, converted)
 
 
 def _compute_reach(problem: Problem) -> FloatArray:
-    """Return how far each variable may move in the optimizer's first trust-region step: (d,).
+    """Return how far each variable may move in the optimizer's first trust-region step, (d,), cached in the problem.
 
     This is a part of the horizon for a transition time, and a part of the first guess for any other unknown; if the
     guess is zero, of the range between its bounds.
     """
-    unknowns = problem.unknowns
-    width = unknowns.upper - unknowns.lower
-    guess = np.abs(unknowns.initial)
-    reach = REACH * np.where(guess > 0, guess, np.where(np.isfinite(width) & (width > 0), width, 1.0))
-    for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
-        reach[where[where >= 0]] = TIME_REACH * experiment.initial_length
-    return np.where(unknowns.variables.log, REACH, reach / unknowns.variables.size)
+    if "first_reach" not in problem.__dict__:
+        unknowns = problem.unknowns
+        width = unknowns.upper - unknowns.lower
+        guess = np.abs(unknowns.initial)
+        reach = REACH * np.where(guess > 0, guess, np.where(np.isfinite(width) & (width > 0), width, 1.0))
+        for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
+            reach[where[where >= 0]] = TIME_REACH * experiment.initial_length
+        in_variables = np.where(unknowns.variables.log, REACH, reach / unknowns.variables.size)
+        object.__setattr__(problem, "first_reach", in_variables)
+    return np.asarray(problem.__dict__["first_reach"])
 
 
 def _to_variables(variables: Variables, theta: FloatArray, here: Any) -> Any:

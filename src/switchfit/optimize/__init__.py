@@ -1,4 +1,4 @@
-"""Minimisation of a piecewise smooth cost under linear constraints and equalities; knows no differential equation."""
+"""Minimize a piecewise smooth cost under linear constraints and equalities; independent of differential equations."""
 
 from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.problem import Evaluation, HessianKind

@@ -42,6 +42,11 @@ SMALLEST = 1e-150
 EQUILIBRATIONS = 20
 
 
+def is_finite(array: FloatArray) -> bool:
+    """Return whether all entries of an array are finite."""
+    return bool(np.isfinite(array).all())
+
+
 class HasConstraints(Protocol):
     """``A theta >= b`` and ``lower <= theta <= upper``, in arrays of NumPy or of JAX."""
 

@@ -8,7 +8,7 @@ Two unknowns of different runs never meet in one term of J, so that with the own
         ( G_1' ...  G_R'  C   )
 
 What the SQP does with a Hessian (`switchfit.optimize.matrix.SymmetricMatrix`) is done here block by block, at a cost
-that is linear in the number R of runs: products, the Cholesky factorisation (own unknowns first, then the Schur
+that is linear in the number R of runs: products, the Cholesky factorization (own unknowns first, then the Schur
 complement ``C - sum_e G_e' H_e^-1 G_e`` of the shared ones), the quadratic programme, and making H positive definite.
 Constraints join unknowns of one run at most, so that they keep this shape.
 
@@ -212,7 +212,7 @@ class Arrow:
         floor: FloatArray | None,
         box: Box | None = None,
     ) -> ModelStep:
-        """Minimise ``gᵀd + ½ dᵀBd`` inside `room`; see `switchfit.optimize.matrix.SymmetricMatrix`.
+        """Minimize ``gᵀd + ½ dᵀBd`` inside `room`; see `switchfit.optimize.matrix.SymmetricMatrix`.
 
         What is held keeps its place, with a step of zero.
         """
@@ -278,7 +278,7 @@ class ArrowFactor:
 
     @classmethod
     def of(cls, matrix: Arrow) -> ArrowFactor | None:
-        """Return the factorisation; None where the matrix is not positive definite."""
+        """Return the factorization; None where the matrix is not positive definite."""
         variances = matrix.diagonal()
         if not np.all(variances > 0.0):
             return None
@@ -322,7 +322,7 @@ class ArrowFactor:
 def solve_arrow_qp(
     gradient: FloatArray, matrix: Arrow, constraints: LinearConstraints, offsets: FloatArray
 ) -> QPSolution:
-    """Minimise ``gᵀd + ½ dᵀBd`` subject to ``C d >= c`` with B positive definite and d = 0 feasible.
+    """Minimize ``gᵀd + ½ dᵀBd`` subject to ``C d >= c`` with B positive definite and d = 0 feasible.
 
     As `switchfit.optimize.qp.solve_qp`; C are the rows and bounds of `constraints`. The programme is solved with the
     constraints that the step before has violated, until it violates no other: since it is strictly convex, that is the
@@ -361,8 +361,8 @@ def convexify_arrow(hessian: Arrow, normals: FloatArray, floor: FloatArray) -> A
     """Return a positive definite B of the same shape that equals H wherever H can be kept.
 
     A positive definite H is kept. Otherwise its blocks are made positive definite, each by `convexify`, and then the
-    Schur complement of the shared unknowns. With Z the directions free of the presumably active constraints: where
-    ZᵀHZ is positive definite ZᵀBZ is the same, so that Newton's step on that face is not spoiled. For this the
+    Schur complement of the shared unknowns. With Z a basis of the null space of the constraints expected to be active,
+    ZᵀBZ equals ZᵀHZ where that is positive definite, so that Newton's step on this face is unchanged. For this the
     directions of each run across its active constraints are made as stiff as it takes.
 
     Parameters

@@ -1,4 +1,4 @@
-"""The trust region: a box around the point, in which the quadratic model of the cost is believed.
+"""The trust region: a box around the point, in which the quadratic model of the cost is trusted.
 
 Far from the solution the Hessian is often indefinite. Where eigenvalues are replaced by their absolute values, a line
 search along the step goes far in directions in which the model says nothing. Inside a trust region the Hessian is
@@ -13,6 +13,8 @@ References
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -32,7 +34,7 @@ POOR, GOOD = 0.25, 0.75
 
 def measure(problem: Problem, step: FloatArray) -> float:
     """Return the radius of the smallest box that holds a step (d,)."""
-    return float(np.max(np.abs(step) / problem.reach))
+    return float((np.abs(step) / problem.reach).max())
 
 
 def next_radius(
@@ -41,7 +43,8 @@ def next_radius(
     """Return the radius that follows an accepted step (d,) from the cost `before` to the cost `after`."""
     if predicted <= NOISE * abs(before):
         return radius
-    ratio, length = (before - after) / predicted, measure(problem, step)
+    ratio = (before - after) / predicted
     if ratio < POOR:
-        return min(radius, SHRINK * length)
-    return radius * GROW if ratio > GOOD and length > 0.9 * radius else radius
+        return min(radius, SHRINK * measure(problem, step))
+    grows = ratio > GOOD and radius < math.inf and measure(problem, step) > 0.9 * radius
+    return GROW * radius if grows else radius

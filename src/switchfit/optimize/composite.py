@@ -1,14 +1,14 @@
 """The step of an iteration with equality constraints c(theta) = 0: towards them, and along them.
 
-The quadratic programme with linearised constraints
+The quadratic programme with linearized constraints
 
-    minimise  gᵀd + ½ dᵀHd   subject to   c + A d = 0,   N d >= offsets,   |d_i| <= radius reach_i
+    minimize  gᵀd + ½ dᵀHd   subject to   c + A d = 0,   N d >= offsets,   |d_i| <= radius reach_i
 
-need not have a feasible point: the linearisations may contradict one another, the inequalities or the trust region. The
+need not have a feasible point: the linearizations may contradict one another, the inequalities or the trust region. The
 composite step of Byrd and Omojokun ([1]_, section 18.5, algorithm 18.4) asks of c + A d what can be had:
 
-1. the *normal step* v minimises ‖c + A v‖₂ within a part of the trust region and the inequalities;
-2. the *tangential step* t minimises the model within ``A t = 0``, the rest of the trust region and the inequalities.
+1. the *normal step* v minimizes ‖c + A v‖₂ within a part of the trust region and the inequalities;
+2. the *tangential step* t minimizes the model within ``A t = 0``, the rest of the trust region and the inequalities.
 
 With an orthonormal basis Z of the null space of A the second is a programme in w, t = Z w, of which w = 0 is a feasible
 point, as `solve_qp` needs it; only ZᵀHZ has to be positive definite, and is shifted where it is not. Both are solved in
@@ -21,9 +21,7 @@ References
 
 from __future__ import annotations
 
-from contextlib import suppress
-from dataclasses import dataclass
-from functools import cached_property
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -56,61 +54,74 @@ class Equalities(NamedTuple):
     @property
     def violation(self) -> float:
         """‖c‖₂."""
-        return float(np.sqrt(self.values @ self.values))
+        return math.sqrt(self.values @ self.values)
 
     def predict(self, step: FloatArray) -> float:
         """Return ‖c + A d‖₂ for a step d (d,)."""
         left = self.values + self.jacobian @ step
-        return float(np.sqrt(left @ left))
+        return math.sqrt(left @ left)
 
 
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """The factorisation Aᵀ P = Q R of a Jacobian A (k, d), which may have dependent rows: Q is (d, d), R (d, k)."""
+class Rows(NamedTuple):
+    """The factorization Aᵀ P = Q R of a Jacobian A (k, d), which may have dependent rows.
+
+    Attributes
+    ----------
+    jacobian : array, shape (k, d)
+    orthogonal : array, shape (d, d)
+        Q.
+    triangular : array, shape (d, k)
+        R is its upper triangle; below it is what the factorization has left.
+    order : array, shape (k,)
+        P.
+    rank : int
+        Number of independent rows.
+    """
 
     jacobian: FloatArray
     orthogonal: FloatArray
     triangular: FloatArray
     order: FloatArray
+    rank: int
 
     @classmethod
     def of(cls, jacobian: FloatArray) -> Rows:
-        """Factorise a Jacobian (k, d), k > 0."""
+        """Factorize a Jacobian (k, d), k > 0."""
         k, d = jacobian.shape
         packed, order, tau, _, _ = dgeqp3(jacobian.T)
-        full = np.zeros((d, d), order="F")
-        full[:, : min(k, d)] = packed[:, : min(k, d)]
-        return cls(jacobian, dorgqr(full, tau)[0], np.triu(packed), order - 1)
-
-    @cached_property
-    def rank(self) -> int:
-        """Number of independent rows."""
-        sizes = np.abs(self.triangular.diagonal())
-        return int(np.sum(sizes > DEPENDENT * sizes.max(initial=0.0)))
+        full = packed
+        if k != d:
+            full = np.zeros((d, d), order="F")
+            full[:, : min(k, d)] = packed[:, : min(k, d)]
+        sizes = np.abs(packed.diagonal())
+        rank = int(np.count_nonzero(sizes > DEPENDENT * sizes.max(initial=0.0)))
+        return cls(jacobian, dorgqr(full, tau)[0], packed, order - 1, rank)
 
     @property
     def null(self) -> FloatArray:
         """Orthonormal basis of the null space of A: (d, d - rank)."""
         return self.orthogonal[:, self.rank :]
 
-    @cached_property
+    @property
     def _regular(self) -> FloatArray | None:
         k = len(self.order)
         return self.triangular[:k] if self.rank == k else None
 
     def solve(self, values: FloatArray) -> FloatArray:
-        """Return the shortest v (d,) that minimises ‖values + A v‖₂."""
-        if self._regular is None:
+        """Return the shortest v (d,) that minimizes ‖values + A v‖₂."""
+        regular = self._regular
+        if regular is None:
             return -np.asarray(np.linalg.lstsq(self.jacobian, values, rcond=DEPENDENT)[0])
-        inside = dtrtrs(self._regular, values[self.order], trans=1)[0]
+        inside = dtrtrs(regular, values[self.order], trans=1)[0]
         return -np.asarray(self.orthogonal[:, : self.rank] @ inside)
 
     def multipliers(self, force: FloatArray) -> FloatArray:
-        """Return the lam (k,) that minimises ‖force + Aᵀ lam‖₂ ([1]_, section 18.3), the shortest of them."""
-        if self._regular is None:
+        """Return the lam (k,) that minimizes ‖force + Aᵀ lam‖₂ ([1]_, section 18.3), the shortest of them."""
+        regular = self._regular
+        if regular is None:
             return -np.asarray(np.linalg.lstsq(self.jacobian.T, force, rcond=DEPENDENT)[0])
         found = np.empty(len(self.order))
-        found[self.order] = -dtrtrs(self._regular, self.orthogonal[:, : self.rank].T @ force)[0]
+        found[self.order] = -dtrtrs(regular, self.orthogonal[:, : self.rank].T @ force)[0]
         return found
 
 
@@ -187,7 +198,7 @@ def solve_composite(
 def find_normal_step(
     equalities: Equalities, normals: FloatArray, offsets: FloatArray, reach: FloatArray, radius: float
 ) -> FloatArray:
-    """Return the v (d,) that minimises ‖c + A v‖₂ in a trust region; arguments as of `solve_composite`."""
+    """Return the v (d,) that minimizes ‖c + A v‖₂ in a trust region; arguments as of `solve_composite`."""
     scaled = Equalities(equalities.values, equalities.jacobian * reach)
     kept = offsets > -np.inf
     within = normals[kept] * reach
@@ -211,10 +222,5 @@ def _find_normal_step(
         left = np.concatenate([offsets, np.full(2 * d, -radius)])
     left = np.minimum(left, 0.0)
     slope = A.T @ equalities.values
-    found = None
-    if radius < np.inf:
-        with suppress(np.linalg.LinAlgError):
-            found = solve_in_bounds(slope, matrix, shortest, inside, left)
-    if found is not None:
-        return found[0]
-    return solve_qp(slope, matrix, inside, left).step
+    found = solve_in_bounds(slope, matrix, shortest, inside, left) if radius < np.inf else None
+    return solve_qp(slope, matrix, inside, left).step if found is None else found[0]

@@ -129,16 +129,20 @@ class LinearConstraints:
 
     def rows(self, index: NDArray[np.intp]) -> FloatArray:
         """Return the normals at the given places, shape (k, d)."""
+        if index.size == 0:
+            return self._no_rows
         m, d = self.b.size, self.size
         chosen = np.zeros((index.size, d))
-        if index.size == 0:
-            return chosen
         in_A = index < m
         chosen[in_A] = self.A[index[in_A]]
         bounds = np.flatnonzero(~in_A)
         place = index[bounds] - m
         chosen[bounds, place % d] = np.where(place < d, 1.0, -1.0)
         return chosen
+
+    @cached_property
+    def _no_rows(self) -> FloatArray:
+        return np.zeros((0, self.size))
 
     @cached_property
     def row_norms(self) -> FloatArray:

@@ -14,12 +14,14 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr
+from scipy.linalg.lapack import dgesv
 
 from switchfit.optimize.algebra import (
     EIGENVALUE_FLOOR,
     EIGENVALUE_REPLACEMENT,
     EPS,
     FloatArray,
+    is_finite,
     positive_eigenvalues,
     press_on_bounds,
 )
@@ -59,7 +61,7 @@ class Dense:
     @property
     def finite(self) -> bool:
         """Whether all entries are."""
-        return bool(np.isfinite(self.array).all())
+        return is_finite(self.array)
 
     def dense(self) -> FloatArray:
         """Return the matrix in full: (d, d)."""
@@ -106,7 +108,7 @@ class Dense:
         floor: FloatArray | None,
         box: Box | None = None,
     ) -> ModelStep:
-        """Minimise ``gᵀd + ½ dᵀBd`` inside `room`; see `switchfit.optimize.matrix.SymmetricMatrix`."""
+        """Minimize ``gᵀd + ½ dᵀBd`` inside `room`; see `switchfit.optimize.matrix.SymmetricMatrix`."""
         if room.free is None:
             return _minimize(self.array, gradient, room.constraints.normals, room.offsets, pressed, floor, box)
         part = np.flatnonzero(room.free)
@@ -225,15 +227,17 @@ def solve_in_bounds(
     low, high = offsets[m : m + d], -offsets[m + d :]
     step, at_low, at_high = newton, newton < low, newton > high
     for _ in range(ACTIVE_SET_ROUNDS):
-        held = at_low | at_high
         step = np.where(at_low, low, np.where(at_high, high, 0.0))
-        free = ~held
-        if free.any():
+        free = (at_low == at_high).nonzero()[0]  # at neither
+        if free.size:
             rows = convex[free]
-            step[free] = -np.linalg.solve(rows[:, free], gradient[free] + rows @ step)
+            _, _, step_back, singular = dgesv(rows[:, free], gradient[free] + rows @ step)
+            if singular:
+                return None
+            step[free] = -step_back
         force = convex @ step + gradient
-        low_next, high_next = (step < low) | (at_low & (force > 0.0)), (step > high) | (at_high & (force < 0.0))
-        if (low_next == at_low).all() and (high_next == at_high).all():
+        low_next, high_next = np.where(at_low, force > 0.0, step < low), np.where(at_high, force < 0.0, step > high)
+        if not ((low_next ^ at_low) | (high_next ^ at_high)).any():
             break
         at_low, at_high = low_next, high_next
     else:
@@ -268,8 +272,8 @@ def split_space(normals: FloatArray) -> tuple[FloatArray, FloatArray]:
 def convexify(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None = None) -> FloatArray:
     """Return a positive definite B that equals H wherever H can be kept.
 
-    In scaled variables, with Z the directions free of the (presumably) active constraints and Y their normals: a
-    positive definite H is kept; otherwise ZᵀHZ is kept if it is positive definite, which leaves Newton's step on the
+    In scaled variables, with Z a basis of the null space of the constraints expected to be active and Y their normals:
+    a positive definite H is kept; otherwise ZᵀHZ is kept if it is positive definite, which leaves Newton's step on the
     face unspoiled, and only the Schur complement on Y has its eigenvalues replaced by their absolute values. If
     ZᵀHZ is not positive definite either, its eigenvalues are treated in the same way.
 
@@ -292,7 +296,7 @@ def convexify(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None
 def convexify_and_factor(
     hessian: FloatArray, normals: FloatArray, floor: FloatArray | None, reach: FloatArray | None = None
 ) -> tuple[FloatArray, CholeskyFactor]:
-    """Return the matrix B of `convexify` and its factorisation; d > 0.
+    """Return the matrix B of `convexify` and its factorization; d > 0.
 
     Inside a trust region with the half-widths `reach` (d,) eigenvalues are shifted instead of replaced.
     """
@@ -301,18 +305,23 @@ def convexify_and_factor(
         # A positive definite matrix needs no more than Jacobi's scaling.
         scaling = np.sqrt(square)
         scaled = hessian / (scaling[:, None] * scaling)
-        factor = CholeskyFactor.of_scaled(scaled, scaling) if is_definite(_shift(scaled)) else None
+        factor = CholeskyFactor.of_scaled(scaled, scaling) if _has_curvature(scaled) else None
         if factor is not None:
             return hessian, factor
     convex = _convex(hessian, normals, floor, reach)
     return convex, CholeskyFactor.of(convex)
 
 
-def _shift(matrix: FloatArray) -> FloatArray:
-    """Return the matrix less what counts as no curvature on its diagonal."""
-    shifted = matrix.copy()
-    shifted.reshape(-1)[:: len(matrix) + 1] -= EIGENVALUE_FLOOR
-    return shifted
+def _add_to_diagonal(matrix: FloatArray, amount: float) -> FloatArray:
+    """Return the matrix with an amount added to each entry of its diagonal."""
+    changed = matrix.copy()
+    changed.reshape(-1)[:: len(matrix) + 1] += amount
+    return changed
+
+
+def _has_curvature(scaled: FloatArray) -> bool:
+    """Return whether all eigenvalues of a scaled matrix are above `EIGENVALUE_FLOOR`."""
+    return is_definite(_add_to_diagonal(scaled, -EIGENVALUE_FLOOR))
 
 
 def _convex(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None, reach: FloatArray | None) -> FloatArray:
@@ -323,7 +332,7 @@ def _convex(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None, 
     scaling = diagonal_scaling(Dense(hessian), floor)
     weight = scaling[:, None] * scaling
     scaled = hessian / weight
-    if is_definite(_shift(scaled)):
+    if _has_curvature(scaled):
         return hessian
     return _convex_on_face(scaled, normals / scaling, _absolute) * weight
 
@@ -332,6 +341,8 @@ def _convex_on_face(
     scaled: FloatArray, normals: FloatArray, make_definite: Callable[[FloatArray], FloatArray]
 ) -> FloatArray:
     """Return a positive definite matrix that differs from a scaled one across the normals alone if that is enough."""
+    if not len(normals):
+        return make_definite(scaled)
     free, blocked = split_space(normals)
     if blocked.shape[1] == 0 or free.shape[1] == 0:
         return make_definite(scaled)
@@ -351,12 +362,15 @@ def _convex_on_face(
 def make_positive(matrix: FloatArray, least: float = 0.0) -> FloatArray:
     """Return the matrix with all eigenvalues raised until the smallest is positive, or `least`; itself if it is."""
     symmetric = 0.5 * (matrix + matrix.T)
+    if not matrix.size:
+        return symmetric
     values = np.linalg.eigvalsh(symmetric)
-    margin = max(EIGENVALUE_FLOOR * float(np.max(np.abs(values), initial=0.0)), least)
-    if values.size == 0 or values[0] > margin:
+    lowest, highest = float(values[0]), float(values[-1])
+    margin = max(EIGENVALUE_FLOOR * max(abs(lowest), abs(highest)), least)
+    if lowest > margin:
         return symmetric
     margin = margin or EIGENVALUE_REPLACEMENT  # without any curvature nothing says how large it is
-    return np.asarray(symmetric + (margin - RAISED * values[0]) * np.eye(len(values)))
+    return _add_to_diagonal(symmetric, margin - RAISED * lowest)
 
 
 def _absolute(matrix: FloatArray) -> FloatArray:

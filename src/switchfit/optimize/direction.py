@@ -33,7 +33,7 @@ class Direction(NamedTuple):
 
     `regular`: no constraint is active, no coordinate is held or at a kink, and H is positive definite. `radius` is that
     of the trust region that it was found in. With equality constraints, `multipliers` are theirs, (k,), and `left` is
-    what their linearisation leaves of their violation.
+    what their linearization leaves of their violation.
     """
 
     step: FloatArray
@@ -120,20 +120,24 @@ def _solve_constrained(
     """Do the work of `_solve_on_sides` where there are equality constraints."""
     equalities = state.point.equalities(sides)
     radius = FIRST_CONSTRAINED_RADIUS if state.radius == np.inf else state.radius
-    d = gradient.size
-    part = np.arange(d) if room.free is None else np.flatnonzero(room.free)
     full = np.diag(np.abs(hessian.diagonal())) if state.careful else hessian.dense()
-    step = np.zeros(d)
-    found = solve_composite(
-        gradient[part],
-        full[np.ix_(part, part)],
-        Equalities(equalities.values, equalities.jacobian[:, part]),
-        problem.constraints.normals[:, part],
-        room.offsets,
-        problem.reach[part],
-        radius,
-    )
-    step[part] = found.step
+    normals, offsets = problem.constraints.normals, room.offsets
+    if room.free is None:
+        found = solve_composite(gradient, full, equalities, normals, offsets, problem.reach, radius)
+        step = found.step
+    else:
+        part = np.flatnonzero(room.free)
+        found = solve_composite(
+            gradient[part],
+            full[np.ix_(part, part)],
+            Equalities(equalities.values, equalities.jacobian[:, part]),
+            normals[:, part],
+            offsets,
+            problem.reach[part],
+            radius,
+        )
+        step = np.zeros(gradient.size)
+        step[part] = found.step
     step = press_on_bounds(step, *room.bounds, found.inequalities)
     product = full @ step
     slope = float(gradient @ step)

@@ -1,4 +1,4 @@
-"""Steps that end inside the constraints, and exactly on what they reach: bounds, breakpoints and rows."""
+"""Feasible steps, which end exactly on the bounds, breakpoints and rows that they reach up to rounding."""
 
 from __future__ import annotations
 
@@ -31,16 +31,20 @@ def feasible_start(problem: Problem, theta: FloatArray) -> Trial:
 
 
 class Trial(NamedTuple):
-    """A feasible theta (d,) with its slack (m + 2 d,), and whether it is known to be far from all constraints."""
+    """A feasible theta (d,) with its slack (m + 2 d,), and whether it is known to be far from all constraints.
+
+    `on_breakpoint` lists the coordinates that sit exactly on one of their breakpoints.
+    """
 
     theta: FloatArray
     slack: FloatArray
     far: bool
+    on_breakpoint: list[int]
 
     @classmethod
-    def at(cls, constraints: LinearConstraints, theta: FloatArray) -> Trial:
+    def at(cls, problem: Problem, theta: FloatArray) -> Trial:
         """Return the trial at a theta (d,) that is feasible."""
-        return cls(theta, constraints.slack(theta), False)
+        return cls(theta, problem.constraints.slack(theta), False, problem.breakpoints.find_met(theta))
 
 
 def move(problem: Problem, theta: FloatArray, step: FloatArray, scale: FloatArray) -> Trial:
@@ -55,16 +59,16 @@ def move(problem: Problem, theta: FloatArray, step: FloatArray, scale: FloatArra
     on_breakpoint = problem.breakpoints.snap(moved, theta, step, problem.size)
     slack = constraints.slack(moved)
     if constraints.are_far(slack, float((scale + np.abs(step)).max()) + problem.largest_size):
-        return Trial(moved, slack, True)
+        return Trial(moved, slack, True, on_breakpoint)
     lower, upper = constraints.lower, constraints.upper
     reach = np.maximum(np.maximum(np.abs(theta), np.abs(step)), np.abs(moved))
     near = np.maximum((8 * EPS) * ((step != 0.0) * reach), problem.rounding)
     moved = np.where(moved - near <= lower, lower, np.where(moved + near >= upper, upper, moved))
     if (constraints.A @ moved - constraints.b > problem.row_rounding).all():
-        return Trial.at(constraints, moved)
+        return Trial.at(problem, moved)
     pinned = (moved == lower) | (moved == upper)
     pinned[on_breakpoint] = True
-    return Trial.at(constraints, snap_to_rows(problem, _repair(constraints, moved, pinned), pinned))
+    return Trial.at(problem, snap_to_rows(problem, _repair(constraints, moved, pinned), pinned))
 
 
 def snap_to_rows(problem: Problem, theta: FloatArray, pinned: NDArray[np.bool_], reach: float = 16 * EPS) -> FloatArray:

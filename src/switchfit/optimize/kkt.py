@@ -77,8 +77,8 @@ def _box_projection(
     """Return the arguments of min over lam >= 0, 0 <= s <= width of ‖low + s − Nᵀ lam‖: lam and s.
 
     With s inside its interval a coordinate puts no condition on lam, at an end of it an ordinary one: nonnegative
-    least squares with the coordinates so labelled, until the labels agree with the solution. Should they cycle, a
-    general (less accurate) solver has its say too.
+    least squares with the coordinates so labelled, until the labels agree with the solution. In case they cycle, the
+    solution of a general, less accurate solver is compared too.
     """
     label = np.zeros(wide.size)  # −1 and +1: at the lower and upper end
     candidates = []

@@ -14,8 +14,6 @@ References
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from switchfit.optimize import box
@@ -71,18 +69,18 @@ def _search_in_box(oracle: Oracle, state: State, direction: Direction) -> Accept
     """
     problem, point = oracle.problem, state.point
     breakpoints, constraints = problem.breakpoints, problem.constraints
-    whole = box.measure(problem, direction.step)
+    whole = direction.step
     piece = None
     for k in range(MAX_BACKTRACKS):
         crossed = breakpoints.count_crossed(point.theta, direction.step)
         accepted = _attempt(oracle, state, direction, 1.0, ARMIJO_ACROSS if crossed else ARMIJO)
-        length = box.measure(problem, direction.step)
         if accepted is not None:
             trial = accepted.point
             radius = box.next_radius(
                 problem, direction.radius, direction.step, direction.reduction, point.cost, trial.cost
             )
-            return Accepted(trial, length / whole if k else 1.0, radius)
+            part = box.measure(problem, direction.step) / box.measure(problem, whole) if k else 1.0
+            return Accepted(trial, part, radius)
         corrected = _step_back(oracle, state, direction) if k == 0 and state.iteration >= PATIENCE else None
         if corrected is not None:
             return corrected
@@ -92,8 +90,8 @@ def _search_in_box(oracle: Oracle, state: State, direction: Direction) -> Accept
             piece = breakpoints.piece(point.theta, constraints.lower, constraints.upper)
             radius = direction.radius
         else:
-            radius = box.SHRINK * length
-        direction = find_direction(problem, replace(state, radius=radius), piece)
+            radius = box.SHRINK * box.measure(problem, direction.step)
+        direction = find_direction(problem, state._replace(radius=radius), piece)
     return _blind_step(oracle, state, direction)
 
 
@@ -107,7 +105,7 @@ def _step_back(oracle: Oracle, state: State, direction: Direction) -> Accepted |
     if trial is None:
         return None
     radius = min(direction.radius, box.measure(problem, direction.step))
-    second = find_direction(problem, replace(state, point=trial, radius=radius))
+    second = find_direction(problem, state._replace(point=trial, radius=radius))
     back = move(problem, trial.theta, second.step, state.scale)
     first = oracle.first(back)
     noise = NOISE * abs(point.cost)
@@ -150,12 +148,12 @@ def _descend(oracle: Oracle, state: State, direction: Direction) -> Accepted | N
         if accepted is not None or (k > 5 and -direction.slope < 0.01 * NOISE * abs(point.cost)):
             break
         alpha *= 0.5
-        longer, direction = direction, find_direction(problem, replace(state, metric=alpha * state.metric))
+        longer, direction = direction, find_direction(problem, state._replace(metric=alpha * state.metric))
     crossed = 0 if longer is direction else breakpoints.count_crossed(point.theta, longer.step)
     if accepted is None or 0 < crossed < MANY_BREAKPOINTS:
         piece = breakpoints.piece(point.theta, constraints.lower, constraints.upper)
         length = 1.0 if accepted is None else 2.0 * alpha
-        nearer = find_direction(problem, replace(state, metric=length * state.metric), piece)
+        nearer = find_direction(problem, state._replace(metric=length * state.metric), piece)
         stop = _attempt(oracle, state, nearer, 1.0, ARMIJO_ACROSS)
         if stop is not None and (accepted is None or stop.point.jumps):
             return Accepted(stop.point, alpha)

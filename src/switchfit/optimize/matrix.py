@@ -1,4 +1,4 @@
-"""What the SQP needs of a Hessian, whatever its shape: one protocol for full matrices and for arrows.
+"""Protocol of the Hessian in the SQP, for full matrices and for arrows.
 
 `switchfit.optimize.dense.Dense` and `switchfit.optimize.arrow.Arrow` have these methods; nothing else in the SQP looks
 at the entries of a matrix.
@@ -19,13 +19,13 @@ from switchfit.optimize.constraints import LinearConstraints
 
 
 class Room(NamedTuple):
-    """Where a step d from a point may go.
+    """Bounds on a step d from a point.
 
     Attributes
     ----------
     constraints : LinearConstraints
     offsets : array, shape (m + 2 d,)
-        Rows, lower and upper bounds leave ``N d >= offsets`` with their normals N; not positive.
+        Of ``N d >= offsets``, N being the normals of rows, lower and upper bounds; not positive.
     free : array of bool, shape (d,), or None
         Unknowns that may move at all; None if all may.
     """
@@ -128,7 +128,7 @@ class Curvature:
     basis : array, shape (d, k)
         Orthonormal basis of these directions.
     find_spectrum : callable
-        Returns the `Spectrum`, which is found when it is asked for: at an ordinary minimum nobody does.
+        Computes the `Spectrum` when it is first read, which is not needed at an ordinary minimum.
     idle : array of bool, shape (d,), or None
         Coordinates left out as idle, beside those of the point.
     """
@@ -198,7 +198,7 @@ class SymmetricMatrix(Protocol):
         box: Box | None = None,
         /,
     ) -> ModelStep:
-        """Minimise ``gᵀd + ½ dᵀBd`` inside `room`, where B is H made positive definite on the free unknowns.
+        """Minimize ``gᵀd + ½ dᵀBd`` inside `room`, where B is H made positive definite on the free unknowns.
 
         Parameters
         ----------

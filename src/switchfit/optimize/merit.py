@@ -13,8 +13,6 @@ References
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from switchfit.optimize import box
@@ -28,7 +26,7 @@ from switchfit.optimize.state import Accepted, State
 
 #: Part of the decrease of ``mu ‖c‖`` that the decrease of the model has to be, rho of [1]_, (18.36).
 SHARE = 0.1
-#: The penalty is raised beyond what is needed by this factor, or it would have to be again at the next step.
+#: Factor by which the penalty is raised beyond what is needed, so that the next step does not raise it again.
 RAISED = 1.1
 #: Radius of the trust region below which violated constraints count as stuck.
 SMALLEST_RADIUS = 1e-10
@@ -70,7 +68,7 @@ def search_merit(oracle: Oracle, state: State, direction: Direction) -> Accepted
             radius = direction.radius
         else:
             radius = SHRINK * length
-        direction = find_direction(problem, replace(state, radius=radius), piece)
+        direction = find_direction(problem, state._replace(radius=radius), piece)
     return None
 
 
@@ -143,8 +141,7 @@ def _judge(
     conditions have to fall.
     """
     point, noise = state.point, _noise(state, penalty)
-    violation = 0.0 if first.equalities is None else first.equalities.violation
-    decrease = point.cost + penalty * point.violation - first.cost - penalty * violation
+    decrease = point.cost + penalty * point.violation - first.cost - penalty * first.violation
     below_noise = reduction <= noise
     if not (decrease >= -noise if below_noise else decrease >= fraction * reduction):
         return None

@@ -1,4 +1,4 @@
-"""Points of the minimisation: one or two evaluations of J, and the first-order conditions there.
+"""Points of the minimization: one or two evaluations of J, and the first-order conditions there.
 
 Along v, J changes at the rate J'(v) = Σ (g₊ max(v, 0) + g₋ min(v, 0)), with g₋ = g₊ off the kinks. A point is optimal
 when no feasible v has J'(v) < 0, and the steepest descent −J'(v) over ‖v‖₂ <= 1 measures how far it is from that.
@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import FloatArray, unit_rows
+from switchfit.optimize.algebra import FloatArray, is_finite, unit_rows
 from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.composite import Equalities, Rows
 from switchfit.optimize.constraints import NONE
@@ -25,22 +25,22 @@ from switchfit.optimize.kkt import kkt_residual
 from switchfit.optimize.matrix import Curvature, SymmetricMatrix
 from switchfit.optimize.problem import Problem
 
-#: Growth of a constraint's gradient from which it is measured anew.
+#: Growth of the gradient of a constraint that changes its unit.
 GROWN = 100.0
-#: Equality constraints count as met where they are below this, in their units.
+#: Equality constraints below this value, in their units, count as met.
 MET = 1e-8
-#: Jumps of a derivative above this part of the largest derivative are no errors of the integration.
+#: Jumps of a derivative larger than this part of the largest derivative are not integration errors.
 LARGE_JUMP = 1e-6
 
 
 NO_FORCES: FloatArray = np.zeros(0)
 
 
-@dataclass(frozen=True, eq=False)
-class Sample:
+class Sample(NamedTuple):
     """One evaluation: cost, gradient, shape (d,), and Hessian, symmetric.
 
-    If there are equality constraints, the Hessian is that of the Lagrangian with these multipliers, shape (k,).
+    If there are equality constraints c, `violation` is ‖c‖₂ in the units of `Oracle.units`, and the Hessian is that of
+    the Lagrangian with these multipliers, shape (k,).
     """
 
     cost: float
@@ -48,6 +48,7 @@ class Sample:
     hessian: SymmetricMatrix
     equalities: Equalities | None = None
     multipliers: FloatArray | None = None
+    violation: float = 0.0
 
     def lagrangian(self, multipliers: FloatArray) -> tuple[float, FloatArray]:
         """Return ``J + lam . c`` and its gradient (d,); J and its own where there are no equality constraints."""
@@ -110,7 +111,7 @@ class Point:
     @property
     def violation(self) -> float:
         """‖c‖₂ of the equality constraints in the units of `Oracle.units`; 0 where there are none."""
-        return 0.0 if self.plus.equalities is None else self.plus.equalities.violation
+        return self.plus.violation
 
     def is_stationary(self, tolerance: float) -> bool:
         """Return whether the optimality is below a tolerance, and the equality constraints are met."""
@@ -168,7 +169,7 @@ def _mix(right: FloatArray, left: FloatArray, sides: NDArray[np.int_]) -> FloatA
 
 
 class Oracle:
-    """The caller's function with a counter; turns unknowns into points and refuses what is not finite.
+    """Evaluates points by the caller's function, counts evaluations, and rejects values that are not finite.
 
     Attributes
     ----------
@@ -176,9 +177,9 @@ class Oracle:
     multipliers : array, shape (k,)
         Of the equality constraints, with which the Hessian of the Lagrangian is evaluated next.
     units : array, shape (k,), or None
-        What the equality constraints are measured by: the lengths of their gradients, over `Problem.reach`, at the
-        first point, or where these have grown by far. Constraints and multipliers are in these units everywhere but in
-        the caller's function.
+        Units of the equality constraints: the lengths of their gradients over `Problem.reach` at the first point, or
+        later if these have grown by a factor of `GROWN`. Constraints and multipliers are in these units everywhere
+        except in the caller's function.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -206,16 +207,17 @@ class Oracle:
         cost, gradient = float(value.cost), np.asarray(value.gradient, dtype=float).reshape(d)
         given = np.full((d, d), np.nan) if value.hessian is None else value.hessian
         hessian: SymmetricMatrix = given if isinstance(given, Arrow) else Dense.of(given, d)
-        if not (math.isfinite(cost) and np.isfinite(gradient).all()):
+        if not (math.isfinite(cost) and is_finite(gradient)):
             return None
         if self.problem.uses_hessian and not hessian.finite:
             return None
-        return Sample(cost, gradient, hessian, equalities, self.multipliers)
+        violation = 0.0 if equalities is None else equalities.violation
+        return Sample(cost, gradient, hessian, equalities, self.multipliers, violation)
 
     def _scale(self, value: Any) -> Equalities | None:
         """Return the equality constraints of an evaluation in their units; None if they are not finite."""
         c, A = np.asarray(value.constraints, dtype=float), np.asarray(value.jacobian, dtype=float)
-        if not (np.isfinite(c).all() and np.isfinite(A).all()):
+        if not (is_finite(c) and is_finite(A)):
             return None
         if self.units is None:
             self.units = unit_rows(A * self.problem.reach)[1]
@@ -240,7 +242,7 @@ class Oracle:
 
     def first(self, trial: Trial) -> Sample | None:
         """Do the evaluation that suffices to judge the cost."""
-        kink, side = self._sides(trial.theta)
+        kink, side = self._sides(trial)
         return self.sample(trial.theta, -1 if kink is None and side is not self._no_side and (side < 0).any() else 1)
 
     def complete(self, trial: Trial, first: Sample, scale: FloatArray) -> Point | None:
@@ -249,7 +251,7 @@ class Oracle:
         `scale` (d,) is the size of the unknowns so far. None if the other side is not finite.
         """
         theta, slack = trial.theta, trial.slack
-        kink, side = self._sides(theta)
+        kink, side = self._sides(trial)
         problem, constraints = self.problem, self.problem.constraints
         active = NONE
         if not trial.far:
@@ -320,20 +322,20 @@ class Oracle:
         return None if first is None else self.complete(trial, first, scale)
 
     def _idle(self, theta: FloatArray, active: NDArray[np.intp]) -> NDArray[np.bool_] | None:
-        """Return the coordinates on which J does not depend while active rows stay so: (d,) of bool, or None."""
+        """Return the coordinates on which J does not depend while the active rows stay active: (d,) bool, or None."""
         if self.problem.idle is None or not self.problem.rows_hold(active):
             return None
         idle = self.problem.idle(theta.copy(), False)
         return idle if idle.any() else None
 
-    def _sides(self, theta: FloatArray) -> tuple[NDArray[np.bool_] | None, NDArray[np.int_]]:
-        """Return `Point.kink` and `Point.side` at theta."""
-        met = self.problem.breakpoints.find_met(theta)
-        if not met:
+    def _sides(self, trial: Trial) -> tuple[NDArray[np.bool_] | None, NDArray[np.int_]]:
+        """Return `Point.kink` and `Point.side` of a trial."""
+        if not trial.on_breakpoint:
             return None, self._no_side
+        theta = trial.theta
         kink, side = np.zeros(theta.size, dtype=bool), np.zeros(theta.size, dtype=int)
         lower, upper = self.problem.constraints.lower, self.problem.constraints.upper
-        for i in met:
+        for i in trial.on_breakpoint:
             room = int(theta[i] < upper[i]) - int(theta[i] > lower[i])
             kink[i], side[i] = room == 0 and lower[i] < upper[i], room
         return kink if kink.any() else None, side

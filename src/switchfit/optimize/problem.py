@@ -1,4 +1,4 @@
-"""What is minimised, as the steps of the SQP see it: the caller's function, constraints, breakpoints, settings."""
+"""The optimization problem: the caller's function, constraints, breakpoints and settings."""
 
 from __future__ import annotations
 
@@ -16,6 +16,18 @@ from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.constraints import LinearConstraints
 
 HessianKind = Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"]
+"""Matrix of the quadratic program:
+
+- "auto": the exact Hessian inside a trust region (`box`);
+- "exact": the exact Hessian, made positive definite where needed, with a line search;
+- "descent-first": the exact Hessian where it is positive definite, and steepest descent until then (Section II-A of the
+  paper);
+- "block-diagonal": "exact" without the entries between different blocks;
+- "gauss-newton": "exact", for a caller whose evaluations return the Gauss-Newton matrix;
+- "none": steepest descent in the metric of theta, as in the paper.
+"""
+
+HESSIANS = get_args(HessianKind)
 
 
 REACH = 0.1
@@ -43,9 +55,20 @@ class ConstrainedEvaluation(Evaluation, Protocol):
 
 
 Evaluate = Callable[..., Evaluation]
-"""``evaluate(theta, side)`` or ``evaluate(theta, side, multipliers)``, see `switchfit.optimize.minimize`."""
+"""``evaluate(theta, side)`` returns an `Evaluation`.
+
+`side` is +1 or -1: the one-sided derivatives to return for coordinates that sit exactly on a breakpoint. If the
+Hessian is an `Arrow`, the time of an iteration is linear in d. A cost or derivative that is not finite makes a point
+unacceptable. With equality constraints c, ``evaluate(theta, side, multipliers)`` returns a `ConstrainedEvaluation`,
+whose Hessian is that of the Lagrangian ``J + multipliers . c``.
+"""
+
 Idle = Callable[[FloatArray, bool], NDArray[np.bool_]]
-"""``idle(theta, everything)``, see `switchfit.optimize.minimize`."""
+"""``idle(theta, everything)`` returns which coordinates, (d,), may be held at a theta with active rows.
+
+J depends on none of them while these rows are active, whatever their derivatives are, which have the error of the
+evaluation. Unless `everything`, only those that are found without an evaluation are needed.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,10 +85,10 @@ class Problem:
         Labels of the blocks, where the Hessian is cut into blocks.
     tolerance, max_iterations : float, int
     size : array, shape (d,)
-        Typical size of each coordinate, zero where only its values tell.
+        Typical size of each coordinate; zero if only its values are known.
     idle : callable or None
     reach : array, shape (d,)
-        How far each coordinate may go in the first step inside a trust region.
+        Largest change of each coordinate in the first step inside a trust region.
     equalities : tuple of str
         Names of the equality constraints; empty if there are none.
     """
@@ -88,7 +111,7 @@ class Problem:
         evaluate: Evaluate,
         theta: FloatArray,
         constraints: LinearConstraints,
-        breakpoints: Sequence[ArrayLike] | None,
+        breakpoints: Breakpoints | Sequence[ArrayLike] | None,
         hessian: HessianKind,
         blocks: ArrayLike | None,
         tolerance: float,
@@ -103,9 +126,9 @@ class Problem:
         if theta.shape != (d,):
             raise ValueError(f"theta0 has shape {theta.shape}, the constraints expect ({d},)")
         if d == 0:
-            raise ValueError("there is nothing to minimise over: theta0 is empty")
-        if hessian not in get_args(HessianKind):
-            raise ValueError(f"hessian is {hessian!r}; choose one of {', '.join(get_args(HessianKind))}")
+            raise ValueError("there is nothing to minimize over: theta0 is empty")
+        if hessian not in HESSIANS:
+            raise ValueError(f"hessian is {hessian!r}; choose one of {', '.join(HESSIANS)}")
         if equalities and hessian not in ("auto", "exact"):
             raise ValueError(f"equality constraints need the exact Hessian: hessian 'auto' or 'exact'; got {hessian!r}")
         if not tolerance >= 0.0 or max_iterations < 0:
@@ -113,20 +136,20 @@ class Problem:
         return cls(
             evaluate=evaluate,
             constraints=constraints,
-            breakpoints=Breakpoints.of(breakpoints, d),
+            breakpoints=breakpoints if isinstance(breakpoints, Breakpoints) else Breakpoints.of(breakpoints, d),
             hessian=hessian,
             labels=_labels(hessian, blocks, d),
             tolerance=tolerance,
             max_iterations=max_iterations,
-            size=np.zeros(d) if size is None else np.broadcast_to(np.asarray(size, dtype=float), (d,)),
+            size=np.zeros(d) if size is None else _as_vector(size, d),
             idle=idle,
-            reach=typical_reach(theta) if reach is None else np.broadcast_to(np.asarray(reach, dtype=float), (d,)),
+            reach=typical_reach(theta) if reach is None else _as_vector(reach, d),
             equalities=tuple(equalities),
         )
 
     @cached_property
     def row_size(self) -> FloatArray:
-        """Size of what the rows of the constraints add up, of which rounding is a part: (m,)."""
+        """Size of the terms of each row of the constraints, to which rounding errors are relative: (m,)."""
         return np.asarray(self.constraints.sizes[0] @ self.size)
 
     @cached_property
@@ -141,17 +164,17 @@ class Problem:
 
     @cached_property
     def rounding(self) -> FloatArray:
-        """Rounding error of each coordinate, if it is of its typical size: (d,)."""
+        """Rounding error of each coordinate at its typical size: (d,)."""
         return np.asarray(8 * EPS * self.size)
 
     @property
     def has_box(self) -> bool:
-        """Whether steps are kept inside a trust region where the Hessian is indefinite or misjudges them."""
+        """Whether steps stay inside a trust region where the Hessian is indefinite or predicts badly."""
         return self.hessian == "auto"
 
     @property
     def uses_hessian(self) -> bool:
-        """Whether the Hessian stands in the quadratic programme."""
+        """Whether the quadratic programme uses the Hessian."""
         return self.hessian != "none"
 
     def rows_hold(self, active: NDArray[np.intp]) -> bool:
@@ -206,11 +229,12 @@ class Breakpoints:
         Rounding is a part of what is added, and of the typical `size` (d,). Returns the coordinates that were near one.
         """
         found = []
+        values, starts, steps, sizes = moved.tolist(), theta.tolist(), step.tolist(), size.tolist()
         for i, points in self.of_coordinates:
-            x, by = float(moved[i]), float(step[i])
+            x, by = values[i], steps[i]
             mark = _nearest(points, x)
-            reach = max(abs(float(theta[i])), abs(by), abs(x)) if by != 0.0 else 0.0
-            if abs(mark - x) <= 8 * EPS * max(reach, float(size[i])):
+            reach = max(abs(starts[i]), abs(by), abs(x)) if by != 0.0 else 0.0
+            if abs(mark - x) <= 8 * EPS * max(reach, sizes[i]):
                 moved[i] = mark
                 found.append(i)
         return found
@@ -241,6 +265,12 @@ class Breakpoints:
         return min(fractions, default=np.inf)
 
 
+def _as_vector(given: ArrayLike, d: int) -> FloatArray:
+    """Return one number for each of d coordinates, (d,), from as many or from one for all."""
+    array = np.asarray(given, dtype=float)
+    return array if array.shape == (d,) else np.broadcast_to(array, (d,))
+
+
 def _nearest(points: list[float], x: float) -> float:
     above = bisect_left(points, x)
     if above == len(points) or (above > 0 and x - points[above - 1] <= points[above] - x):
@@ -255,7 +285,7 @@ def _next(points: list[float], x: float, step: float) -> float:
 
 
 def typical_reach(theta: FloatArray) -> FloatArray:
-    """Return how far unknowns may go in a first step where nothing else is known: a part of their sizes, (d,)."""
+    """Return the default of the largest changes in a first step, a part of the unknowns' sizes: (d,)."""
     size = np.abs(theta)
     return REACH * np.where(size > 0.0, size, 1.0)
 

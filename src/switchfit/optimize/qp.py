@@ -2,14 +2,14 @@
 
 Every quadratic programme here is strictly convex with a feasible zero step,
 
-    minimise  gᵀd + ½ dᵀBd   subject to   C d >= c,   c <= 0,
+    minimize  gᵀd + ½ dᵀBd   subject to   C d >= c,   c <= 0,
 
 and is solved in stages. Newton's step −B⁻¹g, if it is feasible, is the solution. Otherwise:
 
 1. *whitening*: with B = D L Lᵀ D (D the root of the diagonal) and e = Lᵀ D d it becomes a least-distance problem,
-   minimise ½‖e + q‖² subject to G e >= c, with unit rows of G and ‖q‖ = 1, so that nothing has a scale any more;
+   minimize ½‖e + q‖² subject to G e >= c, with unit rows of G and ‖q‖ = 1, so that nothing has a scale any more;
 2. *identification*: the least-distance problem is a nonnegative least-squares problem (Lawson & Hanson, chapter 23);
-3. *polish*: on the active set so found the solution follows from one QR factorisation and one step of refinement.
+3. *polish*: on the active set so found the solution follows from one QR factorization and one step of refinement.
 
 If the second stage fails or its active set is not optimal, a primal active-set method started at d = 0 takes over.
 
@@ -64,7 +64,7 @@ class QPSolution:
 
 
 def solve_qp(gradient: FloatArray, matrix: FloatArray, normals: FloatArray, offsets: FloatArray) -> QPSolution:
-    """Minimise ``gᵀd + ½ dᵀBd`` subject to ``C d >= c`` with B positive definite and d = 0 feasible.
+    """Minimize ``gᵀd + ½ dᵀBd`` subject to ``C d >= c`` with B positive definite and d = 0 feasible.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def solve_qp(gradient: FloatArray, matrix: FloatArray, normals: FloatArray, offs
 
 
 class Factor(Protocol):
-    """A factorisation B = D L Lᵀ D, of a matrix whatever its shape."""
+    """A factorization B = D L Lᵀ D, of a matrix whatever its shape."""
 
     def whiten(self, vectors: FloatArray) -> FloatArray:
         """Return L⁻¹ D⁻¹ v for a vector or each of the rows v."""
@@ -132,7 +132,7 @@ def newton_step(gradient: FloatArray, matrix: Matrix, factor: Factor) -> FloatAr
 def solve_whitened(
     gradient: FloatArray, matrix: Matrix, factor: Factor, normals: FloatArray, offsets: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the step and multipliers of a quadratic programme whose matrix has been factorised, in white variables.
+    """Return the step and multipliers of a quadratic programme whose matrix has been factorized, in white variables.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def solve_whitened(
 
 @dataclass(frozen=True, eq=False)
 class CholeskyFactor:
-    """The factorisation B = D L Lᵀ D of a full matrix.
+    """The factorization B = D L Lᵀ D of a full matrix.
 
     Attributes
     ----------
@@ -165,7 +165,7 @@ class CholeskyFactor:
 
     @classmethod
     def of(cls, matrix: FloatArray) -> CholeskyFactor:
-        """Return the factorisation of a matrix (d, d); ValueError if it is not positive definite."""
+        """Return the factorization of a matrix (d, d); ValueError if it is not positive definite."""
         variances = matrix.diagonal()
         if np.all(variances > 0.0):
             diagonal = np.sqrt(variances)
@@ -176,7 +176,7 @@ class CholeskyFactor:
 
     @classmethod
     def of_scaled(cls, scaled: FloatArray, diagonal: FloatArray) -> CholeskyFactor | None:
-        """Return the factorisation of D S D (d, d) from S and D; None if S is not positive definite."""
+        """Return the factorization of D S D (d, d) from S and D; None if S is not positive definite."""
         lower, failed = dpotrf(scaled, lower=1)
         return None if failed else cls(diagonal, lower)
 
@@ -194,7 +194,7 @@ class CholeskyFactor:
 
 
 def is_definite(matrix: FloatArray) -> bool:
-    """Return whether a symmetric matrix (d, d) has a Cholesky factorisation."""
+    """Return whether a symmetric matrix (d, d) has a Cholesky factorization."""
     return not dpotrf(matrix, lower=1)[1]
 
 
@@ -206,7 +206,7 @@ def _solve_triangular(matrix: FloatArray, right: FloatArray, lower: int = 0, tra
 
 @dataclass(frozen=True, eq=False)
 class _White:
-    """The whitened problem: minimise ½‖e + target‖² subject to rows e >= offsets; d = length D⁻¹ L⁻ᵀ e."""
+    """The whitened problem: minimize ½‖e + target‖² subject to rows e >= offsets; d = length D⁻¹ L⁻ᵀ e."""
 
     factor: Factor
     length: float  # norm of L⁻¹ D⁻¹ g
@@ -236,7 +236,7 @@ def _whiten(gradient: FloatArray, factor: Factor, normals: FloatArray, offsets: 
 
 
 def _least_distance(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Minimise ½‖e + q‖² subject to G e >= c: e, shape (d,), and multipliers, shape (k,)."""
+    """Minimize ½‖e + q‖² subject to G e >= c: e, shape (d,), and multipliers, shape (k,)."""
     if offsets.size == 0:
         return -target, np.zeros(0)
     raw = _lawson_hanson(target, rows, offsets)
@@ -265,7 +265,7 @@ def _lawson_hanson(target: FloatArray, rows: FloatArray, offsets: FloatArray) ->
 
 
 def _equality_solution(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Minimise ½‖e + q‖² subject to G e = c for independent rows, by e = Q R⁻ᵀ c − (I − QQᵀ) q."""
+    """Minimize ½‖e + q‖² subject to G e = c for independent rows, by e = Q R⁻ᵀ c − (I − QQᵀ) q."""
     if offsets.size == 0:
         return -target, np.zeros(0)
     Q, R = np.linalg.qr(rows.T)

@@ -1,4 +1,4 @@
-"""What follows at a stationary point: rows that all but hold are closed, saddles left along negative curvature."""
+"""Stationary points: make rows hold that nearly do, and leave saddles along negative curvature."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def close_gaps(oracle: Oracle, state: State) -> State:
     theta = snap_to_rows(problem, point.theta, np.zeros(point.theta.size, dtype=bool), NEGLIGIBLE_STEP)
     if np.array_equal(theta, point.theta):
         return state
-    closed = oracle.point(Trial.at(problem.constraints, theta), state.scale)
+    closed = oracle.point(Trial.at(problem, theta), state.scale)
     if closed is None or closed.cost > point.cost + NOISE * state.cost_scale or closed.violation > MET:
         return state
     after = state.advance(Accepted(closed, 1.0), problem.tolerance)
@@ -57,7 +57,7 @@ def escape(oracle: Oracle, state: State) -> Accepted | None:
 
 def _merit(sample: Sample, state: State) -> float:
     """Return J, with the penalty of the equality constraints if there are any."""
-    return sample.cost if sample.equalities is None else sample.cost + state.penalty * sample.equalities.violation
+    return sample.cost + state.penalty * sample.violation
 
 
 def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | None:

@@ -1,21 +1,21 @@
 """Sequential quadratic programming for a piecewise smooth cost under linear constraints and equalities.
 
-The problem is to minimise J(theta) subject to A theta >= b and lower <= theta <= upper, where J is continuous and
+The problem is to minimize J(theta) subject to A theta >= b and lower <= theta <= upper, where J is continuous and
 smooth except where a coordinate passes one of its breakpoints: there its derivatives jump. (A transition time that
 passes a sample time is such a coordinate.) These constraints are linear, so every iterate satisfies them, and the line
-search looks at J alone. Beside them there may be nonlinear equality constraints c(theta) = 0, which are met in the end.
+search compares J alone. There may also be nonlinear equality constraints c(theta) = 0, which are met at the end.
 
 One iteration, `_step`, maps a state (`state`) at a point (`point`) to the next state:
 
 1. *direction* (`direction`): a convex quadratic programme (`qp`, with the matrices of `dense` or `arrow`), or with
    equality constraints a step composed of the solutions of two (`composite`);
 2. *line search* (`line_search`): the full step first, even across breakpoints, then inside the present smooth piece;
-   by default in a trust region that shrinks (`box`); with equality constraints it looks at a merit function (`merit`);
+   by default in a trust region that shrinks (`box`); with equality constraints it compares a merit function (`merit`);
    every trial is made feasible (`feasibility`);
 3. *kinks* (`kinks`): coordinates that sit on a breakpoint are held, or released to one side.
 
-At a stationary point the curvature tells a minimum from a saddle, which is left along negative curvature (`saddles`);
-where no step decreases J, `failure` looks for the reason.
+At a stationary point the curvature distinguishes a minimum from a saddle, which is left along negative curvature
+(`saddles`). If no step decreases J, `failure` finds the reason.
 
 References
 ----------
@@ -25,7 +25,6 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,15 +38,15 @@ from switchfit.optimize.line_search import search
 from switchfit.optimize.matrix import Curvature, Spectrum
 from switchfit.optimize.merit import is_stuck, search_merit
 from switchfit.optimize.point import MET, Oracle, Point
-from switchfit.optimize.problem import Evaluate, HessianKind, Idle, Problem
+from switchfit.optimize.problem import Breakpoints, Evaluate, HessianKind, Idle, Problem
 from switchfit.optimize.saddles import NEGATIVE_CURVATURE, close_gaps, escape
 from switchfit.optimize.state import State, curvature_at, idle_coordinates
 from switchfit.optimize.status import Callback, IterationRecord, Result, Status
 
-#: Times a minimisation begins anew from where its line search has failed.
+#: Number of restarts of a minimization from a point at which its line search has failed.
 RESTARTS = 3
 
-#: Relative change of the multipliers of equality constraints that is not worth another evaluation of the Hessian.
+#: Relative change of multipliers below which the Hessian of the Lagrangian is not evaluated again.
 SAME_MULTIPLIERS = 1e-9
 
 
@@ -56,7 +55,7 @@ def minimize(
     theta0: ArrayLike,
     *,
     constraints: LinearConstraints,
-    breakpoints: Sequence[ArrayLike] | None = None,
+    breakpoints: Breakpoints | Sequence[ArrayLike] | None = None,
     hessian: HessianKind = "exact",
     blocks: ArrayLike | None = None,
     tolerance: float = 1e-7,
@@ -67,54 +66,43 @@ def minimize(
     reach: ArrayLike | None = None,
     equalities: Sequence[str] = (),
 ) -> Result:
-    """Minimise a piecewise smooth cost under linear constraints, whose iterates all are feasible, and equalities.
+    """Minimize a piecewise smooth cost under linear constraints, which all iterates satisfy, and equality constraints.
 
     Parameters
     ----------
-    evaluate : callable
-        ``evaluate(theta, side)`` returns cost, gradient, shape (d,), and Hessian, shape (d, d), or a
-        `switchfit.optimize.arrow.Arrow`, with which the cost of an iteration is linear in d. `side` is +1 or -1: which
-        one-sided derivatives to return for coordinates that sit exactly on a breakpoint. A cost or derivative that is
-        not finite marks a point as unacceptable. With equality constraints ``evaluate(theta, side, multipliers)``
-        returns ``constraints`` c, shape (k,), and ``jacobian``, shape (k, d), too, and the Hessian of
-        ``J + multipliers . c``.
+    evaluate : Evaluate
+        Cost, gradient and Hessian, and equality constraints if there are any.
     theta0 : array, shape (d,)
         Start, feasible up to rounding.
     constraints : LinearConstraints
         ``A theta >= b`` and bounds.
-    breakpoints : sequence of d arrays, optional
-        Sorted values of each coordinate where the derivatives of J may jump. None: J is smooth.
-    hessian : {"auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"}
-        What stands in the quadratic programme: the Hessian inside a trust region (`box`); the Hessian, made positive
-        definite where needed, with a line search; the
-        Hessian where it is positive definite and steepest descent until then (the paper's scheme, Section II-A); the
-        first without the entries between different `blocks`; the same again, for a caller whose `evaluate` returns
-        Gauss-Newton's matrix; or nothing (steepest descent in the metric of theta, as in the paper).
+    breakpoints : sequence of d arrays, or Breakpoints, optional
+        Sorted values of each coordinate where the derivatives of J may jump; by default, J is smooth.
+    hessian : HessianKind
+        Matrix of the quadratic program.
     blocks : array of int, shape (d,), optional
         Label of each coordinate, for "block-diagonal".
     tolerance : float
-        Bound on the KKT residual. Unless `hessian` is "none", the next step has to be negligible too: a predicted
-        reduction of at most 1e-10 of the cost, or at most 1e-8 of each unknown.
+        Bound on the KKT residual. Unless `hessian` is "none", the next step has to be negligible too: at most 1e-10 of
+        the size of each unknown, or a few iterations later.
     max_iterations : int
     callback : callable, optional
-        Gets an `IterationRecord` after every iteration; a true return value stops with ``INTERRUPTED``.
+        Called with an `IterationRecord` after every iteration; a true return value stops with ``INTERRUPTED``.
     size : array, shape (d,), optional
-        Typical size of each unknown, of which rounding is a part: for a time, the length of the horizon, however
-        small the time itself. Left out, the unknown's own values say it.
-    idle : callable, optional
-        ``idle(theta, everything)`` says which coordinates, (d,) of bool, may be held at a theta with active rows,
-        because J depends on none of them while these rows are active, whatever derivatives say, which have the error
-        of its evaluation. Where `everything` is false, those that are found at no cost are enough.
+        Typical size of each unknown, to which rounding errors are relative. For a time this is the length of the
+        horizon, even if the time itself is small. By default, the size of the unknown's own values.
+    idle : Idle, optional
+        Finds the coordinates on which J does not depend.
     reach : array, shape (d,), optional
-        How far each unknown may move in the first step inside a trust region ("auto"); a tenth of its value if left
-        out.
+        Largest change of each unknown in the first step inside a trust region ("auto"); a tenth of its value by
+        default.
     equalities : sequence of str, optional
-        Names of the equality constraints c(theta) = 0, which the start need not meet.
+        Names of the equality constraints c(theta) = 0, which the start need not satisfy.
 
     Returns
     -------
     Result
-        Also after a KeyboardInterrupt, raised anywhere but in the evaluation of the start: the best point so far.
+        The best point found, also after a KeyboardInterrupt during any evaluation but the first.
 
     Raises
     ------
@@ -123,33 +111,31 @@ def minimize(
 
     Notes
     -----
-    One iteration costs one evaluation and a quadratic programme, and one more evaluation if a coordinate is on a
+    One iteration costs one evaluation and a quadratic program, and one more evaluation if a coordinate is on a
     breakpoint. The rate is quadratic with the exact Hessian if the second-order sufficient conditions hold.
     """
     start = np.atleast_1d(np.asarray(theta0, dtype=float)).copy()
-    problem = Problem.of(
-        evaluate,
-        start,
-        constraints,
-        breakpoints,
-        hessian,
-        blocks,
-        tolerance,
-        max_iterations,
-        size,
-        idle,
-        reach,
-        equalities,
-    )
-    trial = feasible_start(problem, start)
-    oracle = Oracle(problem)
-    point = oracle.point(trial, np.abs(trial.theta))
-    if point is not None and problem.equalities:
-        oracle.multipliers = point.forces  # the Hessian is to be that of the Lagrangian
-        point = oracle.point(trial, np.abs(trial.theta))
+    settings = hessian, blocks, tolerance, max_iterations, size, idle, reach, equalities
+    problem = Problem.of(evaluate, start, constraints, breakpoints, *settings)
+    trial, oracle = feasible_start(problem, start), Oracle(problem)
+    point = _evaluate_start(oracle, trial)
     if point is None:
         return _nonfinite_start(oracle, trial.theta)
-    state = State.at(point)
+    return _iterate(oracle, State.at(point), callback)
+
+
+def _evaluate_start(oracle: Oracle, trial: Trial) -> Point | None:
+    """Return the start with its derivatives; None if they are not finite."""
+    size = np.abs(trial.theta)
+    point = oracle.point(trial, size)
+    if point is None or not oracle.problem.equalities:
+        return point
+    oracle.multipliers = point.forces  # for the Hessian of the Lagrangian
+    return oracle.point(trial, size)
+
+
+def _iterate(oracle: Oracle, state: State, callback: Callback | None) -> Result:
+    """Do iterations until one ends with a status, and return the result."""
     history = [_record(oracle, state)]
     try:
         while state.status is None:
@@ -158,9 +144,9 @@ def minimize(
             if state.iteration > before:
                 history.append(_record(oracle, state))
                 if callback is not None and callback(history[-1]):
-                    state = replace(state, status=Status.INTERRUPTED)
+                    state = state._replace(status=Status.INTERRUPTED)
     except KeyboardInterrupt:
-        state = replace(state, status=Status.INTERRUPTED)
+        state = state._replace(status=Status.INTERRUPTED)
     return _result(oracle, state, state.status or Status.INTERRUPTED, tuple(history))
 
 
@@ -171,9 +157,9 @@ def _step(oracle: Oracle, state: State) -> State:
     if _is_settled(problem, state, direction):
         return _finish(oracle, state, direction, Status.CONVERGED)
     if state.iteration >= problem.max_iterations:
-        return replace(state, status=Status.MAX_ITERATIONS)
+        return state._replace(status=Status.MAX_ITERATIONS)
     if problem.equalities and is_stuck(oracle, state):
-        return replace(state, status=Status.INFEASIBLE)
+        return state._replace(status=Status.INFEASIBLE)
     accepted = (search_merit if problem.equalities else search)(oracle, state, direction)
     if accepted is None:
         return _handle_stall(oracle, state, direction)
@@ -182,19 +168,19 @@ def _step(oracle: Oracle, state: State) -> State:
 
 
 def _measure_anew(oracle: Oracle, state: State) -> State:
-    """Return the state with constraints in new units, in which penalty and violation begin anew."""
+    """Return the state with constraints in new units; penalty and violation are reset."""
     theta = state.point.theta
-    point = oracle.point(Trial.at(oracle.problem.constraints, theta), state.scale)
+    point = oracle.point(Trial.at(oracle.problem, theta), state.scale)
     if point is None:
         return state
     fresh = State.at(point)
-    return replace(
-        state, point=point, penalty=fresh.penalty, steady_violation=fresh.steady_violation, stagnant=fresh.stagnant
+    return state._replace(
+        point=point, penalty=fresh.penalty, steady_violation=fresh.steady_violation, stagnant=fresh.stagnant
     )
 
 
 def _is_settled(problem: Problem, state: State, direction: Direction) -> bool:
-    """Return whether the optimality is below the tolerance and, as J may be badly scaled, the next step negligible."""
+    """Return whether the optimality is below the tolerance and the next step negligible, for J may be badly scaled."""
     if not state.point.is_stationary(problem.tolerance):
         return False
     if not problem.uses_hessian or state.settled >= EXTRA_ITERATIONS:
@@ -203,28 +189,28 @@ def _is_settled(problem: Problem, state: State, direction: Direction) -> bool:
 
 
 def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
-    """Tell convergence and the limit of precision from failure where the line search found nothing."""
+    """Distinguish convergence and the limit of precision from failure after a line search that found no step."""
     if state.point.is_stationary(oracle.problem.tolerance):
         return _finish(oracle, state, direction, Status.CONVERGED)
     if state.point.violation > MET:
-        return replace(state, status=Status.INFEASIBLE)
+        return state._replace(status=Status.INFEASIBLE)
     floor = state.gradient_scale
     if oracle.problem.uses_hessian:
         floor = max(floor, float(np.max(abs(state.point.plus.hessian) @ state.scale)))
     below_rounding = direction.reduction <= 10 * NOISE * state.cost_scale
     if below_rounding and state.point.optimality <= 1e5 * EPS * floor:
         return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)
-    # Near a saddle, where slopes are lost in rounding, its negative curvature still leads away.
+    # Near a saddle slopes are below rounding, but negative curvature still gives a direction.
     escaped = escape(oracle, state) if oracle.problem.uses_hessian and below_rounding else None
     if escaped is not None:
         return state.advance(escaped, oracle.problem.tolerance)
     if state.restarts < RESTARTS and not state.careful:
         theta = state.point.theta
-        point = oracle.point(Trial.at(oracle.problem.constraints, theta), np.abs(theta))
+        point = oracle.point(Trial.at(oracle.problem, theta), np.abs(theta))
         if point is not None:
             fresh = State.at(point)
-            return replace(fresh, iteration=state.iteration, restarts=state.restarts + 1, careful=True)
-    return replace(state, status=Status.LINE_SEARCH_FAILED, reason=explain_failure(oracle, state, direction))
+            return fresh._replace(iteration=state.iteration, restarts=state.restarts + 1, careful=True)
+    return state._replace(status=Status.LINE_SEARCH_FAILED, reason=explain_failure(oracle, state, direction))
 
 
 def _finish(oracle: Oracle, state: State, direction: Direction, status: Status) -> State:
@@ -233,20 +219,20 @@ def _finish(oracle: Oracle, state: State, direction: Direction, status: Status) 
     if problem.uses_hessian or state.point.plus.hessian.finite:
         closed = close_gaps(oracle, state)
         if closed is state and direction.regular:
-            # The programme's matrix was H itself: its scaled eigenvalues are above EIGENVALUE_FLOOR.
-            return replace(state, status=status)
+            # The matrix of the programme was H itself: its scaled eigenvalues are above EIGENVALUE_FLOOR.
+            return state._replace(status=status)
         state = closed
         accepted = escape(oracle, state) if state.iteration < problem.max_iterations else None
         if accepted is not None:
             return state.advance(accepted, problem.tolerance)
         curvature = curvature_at(problem, state, state.point.active)
         if curvature.smallest < NEGATIVE_CURVATURE:
-            return replace(state, status=Status.SADDLE)
+            return state._replace(status=Status.SADDLE)
         if curvature.smallest <= EIGENVALUE_FLOOR:
-            return replace(state, status=Status.SINGULAR)
+            return state._replace(status=Status.SINGULAR)
         if state.point.idle is not None or curvature.idle is not None:
-            return replace(state, status=Status.COLLAPSED)
-    return replace(state, status=Status.CONVERGED_AT_KINK if state.genuine_kinks.any() else status)
+            return state._replace(status=Status.COLLAPSED)
+    return state._replace(status=Status.CONVERGED_AT_KINK if state.genuine_kinks.any() else status)
 
 
 def _record(oracle: Oracle, state: State) -> IterationRecord:
@@ -302,8 +288,8 @@ def _with_own_multipliers(oracle: Oracle, state: State) -> State:
     ):
         return state
     oracle.multipliers = point.forces
-    again = oracle.point(Trial.at(oracle.problem.constraints, point.theta), state.scale)
-    return state if again is None else replace(state, point=again)
+    again = oracle.point(Trial.at(oracle.problem, point.theta), state.scale)
+    return state if again is None else state._replace(point=again)
 
 
 def _list_violated(oracle: Oracle, point: Point) -> tuple[tuple[str, float], ...]:

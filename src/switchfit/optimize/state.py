@@ -1,8 +1,9 @@
-"""The state of a minimisation between two iterations."""
+"""State of a minimization between two iterations."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +22,11 @@ FIRST_PENALTY = 10.0
 falls at first at their cost, and modes collapse on the way: of 30 starts of the pendulum 11 end right, not 16."""
 
 
-@dataclass(frozen=True, eq=False)
-class State:
-    """The best point so far, and what has been seen.
+NO_SCALE: FloatArray = np.zeros(0)
+
+
+class State(NamedTuple):
+    """The best point so far, and figures of the iterations before.
 
     Attributes
     ----------
@@ -34,7 +37,7 @@ class State:
     metric : float
         Steepest descent: B = I / metric, the first step length tried: 1, or twice the last one if that was above ½.
     settled : int
-        Iterations since the optimality fell below the tolerance.
+        Number of iterations since the optimality fell below the tolerance.
     scale : array, shape (d,)
         Largest ``|theta_i|`` seen.
     cost_scale, gradient_scale : float
@@ -42,18 +45,18 @@ class State:
     lowest_cost : float
     restarts : int
     radius : float
-        Half-width of the trust region, in units of `Problem.reach`; infinite where there is none.
+        Half-width of the trust region, in units of `Problem.reach`; infinite without a trust region.
     penalty : float
         Of the equality constraints in the merit function.
     steady_violation : float
-        That of the equality constraints when it last changed by a tenth.
+        Violation of the equality constraints when it last changed by a tenth.
     stagnant : int
         Iterations since then.
     careful : bool
         The next step is taken with the diagonal of the Hessian alone.
     status : Status or None
     reason : Finding or None
-        Why it failed, where it did.
+        Why the line search failed, if it did.
     """
 
     point: Point
@@ -61,7 +64,7 @@ class State:
     step_length: float = 0.0
     metric: float = 1.0
     settled: int = 0
-    scale: FloatArray = field(default_factory=lambda: np.zeros(0))
+    scale: FloatArray = NO_SCALE
     cost_scale: float = 0.0
     gradient_scale: float = 0.0
     lowest_cost: float = np.inf
@@ -115,12 +118,12 @@ class State:
 
     @property
     def floor(self) -> FloatArray:
-        """Curvature of each unknown that counts as none in the quadratic programme: (d,)."""
+        """Curvature of each unknown below which the quadratic programme takes it for zero: (d,)."""
         return np.asarray(algebra.curvature_floor(self.scale, self.cost_scale, self.point.largest_slopes))
 
     @property
     def genuine_kinks(self) -> NDArray[np.bool_]:
-        """Coordinates on a breakpoint whose derivative really jumps upwards there: (d,)."""
+        """Coordinates on a breakpoint at which the derivative jumps upwards by more than rounding: (d,)."""
         point = self.point
         if point.kink is None:
             return np.zeros(point.theta.size, dtype=bool)
@@ -128,8 +131,7 @@ class State:
         return np.asarray(point.kink & (jump > 1e-12 * self.gradient_scale))
 
 
-@dataclass(frozen=True, eq=False)
-class Accepted:
+class Accepted(NamedTuple):
     """The point of an accepted step, the fraction of the proposed step that it took, the next radius and penalty."""
 
     point: Point

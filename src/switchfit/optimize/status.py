@@ -1,4 +1,4 @@
-"""What a minimisation returns: its status, its history and its result."""
+"""Status, history and result of a minimization."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from switchfit.optimize.matrix import Curvature
 
 
 class Status(Enum):
-    """How a minimisation ended, and what that means.
+    """How a minimization ended, and what that means.
 
     See Also
     --------
@@ -38,7 +38,7 @@ class Status(Enum):
         "above the tolerance."
     )
     CONVERGED_AT_KINK = (
-        "The one-sided derivatives have opposite signs at a kink of the cost: a minimiser where no gradient vanishes."
+        "The one-sided derivatives have opposite signs at a kink of the cost: a minimizer where no gradient vanishes."
     )
     MAX_ITERATIONS = "All iterations were done before the optimality was below the tolerance."
     LINE_SEARCH_FAILED = (
@@ -68,7 +68,7 @@ class Status(Enum):
 
     @property
     def is_strict_minimum(self) -> bool:
-        """Whether the point is the only minimiser nearby, as far as second-order conditions can tell."""
+        """Whether the point is the only minimizer nearby, as far as second-order conditions can tell."""
         return self in (Status.CONVERGED, Status.CONVERGED_PRECISION, Status.CONVERGED_AT_KINK)
 
 
@@ -94,14 +94,14 @@ class IterationRecord:
     evaluations: int
 
     def continue_from(self, last: IterationRecord | None) -> IterationRecord:
-        """Return this record of a resumed minimisation, counted on from the last one before (None: the first)."""
+        """Return this record of a resumed minimization, counted on from the last one before (None: the first)."""
         if last is None:
             return self
         return replace(self, iteration=self.iteration + last.iteration, evaluations=self.evaluations + last.evaluations)
 
 
 Callback = Callable[[IterationRecord], object]
-"""Gets each `IterationRecord`; a true return value stops the minimisation."""
+"""Gets each `IterationRecord`; a true return value stops the minimization."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,20 +131,20 @@ class Result:
     curvature : Curvature
         The Hessian on the directions left free by active constraints and kinks.
     tolerance : float
-        The tolerance asked for.
+        The given tolerance on the KKT residual.
     history : tuple of IterationRecord
         The start and every iteration.
     violated : tuple of (str, float)
         Equality constraints that are not met, with their values.
     idle : tuple of int
-        Coordinates on which J does not depend at theta, by the word of the caller's `idle`, and those that active rows
-        tie to them; they are not in `free_basis`.
+        Coordinates on which J does not depend at theta, as the caller's `idle` finds, and those that active rows tie to
+        them; they are not in `free_basis`.
     reason : Finding or None
-        What was seen where the line search failed; None where it did not.
+        Why the line search failed; None if it did not.
     equalities : tuple of (str, float, float)
         Name, value and multiplier of each equality constraint; the Hessian is that of ``J + multipliers . c``.
     earlier : int
-        How many of the iterations belong to minimisations before, which this one resumed.
+        Number of the iterations that were done before this minimization, which resumed another one.
     """
 
     theta: FloatArray

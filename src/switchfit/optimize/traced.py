@@ -118,7 +118,7 @@ class Breakpoints(NamedTuple):
 
     def piece(self, theta: Array, constraints: Constraints) -> tuple[Array, Array]:
         """Return the bounds (d,), (d,) narrowed to the next breakpoint on either side of theta."""
-        below, above = self._neighbours(theta)
+        below, above = self._neighbors(theta)
         where = np.array(self.coordinates, dtype=int)
         return constraints.lower.at[where].max(below), constraints.upper.at[where].min(above)
 
@@ -126,14 +126,14 @@ class Breakpoints(NamedTuple):
         """Return ``moved = theta + step``, exactly on the breakpoints that it reaches up to rounding: (d,)."""
         where = np.array(self.coordinates, dtype=int)
         x = moved[where]
-        below, above = self._neighbours(moved)
+        below, above = self._neighbors(moved)
         on = self.on_one(moved)[where]
         mark = jnp.where(on, x, jnp.where(x - below <= above - x, below, above))
         reach = jnp.maximum(jnp.maximum(jnp.abs(theta), jnp.abs(step)), jnp.abs(moved))
         near = jnp.abs(mark - x) <= 8 * EPS * jnp.maximum(jnp.where(step != 0.0, reach, 0.0), size)[where]
         return moved.at[where].set(jnp.where(near, mark, x))
 
-    def _neighbours(self, theta: Array) -> tuple[Array, Array]:
+    def _neighbors(self, theta: Array) -> tuple[Array, Array]:
         """Return the last breakpoint below each coordinate and the first one above, infinite if there is none."""
         x = theta[np.array(self.coordinates, dtype=int), None]
         below = jnp.max(jnp.where(self.points < x, self.points, -jnp.inf), axis=1, initial=-jnp.inf)
@@ -252,7 +252,7 @@ def minimize_traced(
     tolerance: float,
     max_iterations: int,
 ) -> Outcome:
-    """Minimise J subject to linear constraints from a feasible start, inside a JAX program.
+    """Minimize J subject to linear constraints from a feasible start, inside a JAX program.
 
     Parameters
     ----------
@@ -275,7 +275,7 @@ def minimize_traced(
         after = take_turn(state, evaluate, constraints, breakpoints, tolerance)
         return lax.cond(after.undirected & ~after.done, direct, lambda state: state, after)
 
-    return outcome_of(lax.while_loop(lambda state: ~state.done, turn, begin(start)), constraints)
+    return build_outcome(lax.while_loop(lambda state: ~state.done, turn, begin(start)), constraints)
 
 
 def take_turn(
@@ -387,7 +387,7 @@ def _find_step(
     return state._replace(step=step, slope=slope, undirected=jnp.zeros((), bool), stationary=stationary, done=done)
 
 
-def outcome_of(state: State, constraints: Constraints) -> Outcome:
+def build_outcome(state: State, constraints: Constraints) -> Outcome:
     """Return what was found where a fit is done."""
     interior = ~jnp.any(_active(constraints, state.theta, state.scale))
     jump = state.right.gradient - state.left.gradient
@@ -482,7 +482,7 @@ def _kkt_residual(constraints: Constraints, theta: Array, scale: Array, gradient
 
 
 def nonnegative_minimum(matrix: Array, vector: Array, allowed: Array) -> Array:
-    """Minimise ½ lamᵀ M lam + vᵀ lam over lam >= 0 with zeros outside `allowed`: (k,).
+    """Minimize ½ lamᵀ M lam + vᵀ lam over lam >= 0 with zeros outside `allowed`: (k,).
 
     Lawson and Hanson's active-set method with masks in place of index sets: the set of positive entries grows by the
     steepest one and loses those that a step would make negative.
@@ -569,7 +569,7 @@ def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints)
     newton = newton - solve(gradient + scaling * (matrix @ (scaling * newton)))
 
     def solve_constrained() -> Array:
-        # In white variables e = Lᵀ D d: minimise ½‖e − e_0‖² subject to G e >= c with unit rows, by its dual.
+        # In white variables e = Lᵀ D d: minimize ½‖e − e_0‖² subject to G e >= c with unit rows, by its dual.
         normals = constraints.normals
         rows = jax.scipy.linalg.solve_triangular(factor, (normals / scaling[None]).T, lower=True).T
         unit, norms = algebra.unit_rows(rows, jnp)

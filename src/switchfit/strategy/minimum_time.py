@@ -79,5 +79,5 @@ def shorten_horizon(problem: Problem, theta: FloatArray) -> Problem:
 
 
 def _is_unbounded(parameter: Parameter) -> bool:
-    """Return whether a transition time is free, and bounded by its neighbours alone."""
+    """Return whether a transition time is free, and bounded by its neighbors alone."""
     return not (parameter.fixed or np.isfinite(parameter.lower) or np.isfinite(parameter.upper) or parameter.prior)

@@ -55,7 +55,7 @@ def fit_briefly(
             result = minimize_cost(evaluator or Evaluator(problem, theta), theta, "auto", TOLERANCE, iterations)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return failed
-    if result.status is Status.INTERRUPTED:  # Ctrl-C, which the optimiser takes for the end of its own work
+    if result.status is Status.INTERRUPTED:  # Ctrl-C, which the optimizer takes for the end of its own work
         raise KeyboardInterrupt
     usable = np.isfinite(result.cost) and not result.violated
     return End(result.theta, result.cost if usable else np.inf, result.evaluations)

@@ -4,18 +4,22 @@ Between two samples the cost is smooth in a transition time, and at each it has 
 intervals. Given the unknowns that runs share, the other unknowns of a run are few: Newton's method with the transition
 confined to an interval, begun at the end of the interval beside it, gives the least cost of each interval and, by the
 Schur complement of its Hessian, how that changes with the shared unknowns, as a parabola. The shared unknowns then
-minimise the sum over the runs of the lowest parabolas, a fit of all runs follows, and this is repeated as long as the
+minimize the sum over the runs of the lowest parabolas, a fit of all runs follows, and this is repeated as long as the
 cost falls.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv
 
 from switchfit.fit.evaluator import Evaluator
+from switchfit.optimize.algebra import is_finite
+from switchfit.optimize.qp import is_definite
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.runtime.progress import show_detail
@@ -131,7 +135,8 @@ class Scan:
         options = []
         for e in range(len(self.problem.experiments)):
             show_detail(f"run {e + 1} of {len(self.problem.experiments)}")
-            options.append(self._scan_run(e))
+            with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is left out
+                options.append(self._scan_run(e))
         move = np.zeros(len(self.shared))
         for _ in range(20):
             best = [min(own, key=lambda option: self._predict(option, move)) for own in options]
@@ -223,9 +228,8 @@ class Scan:
         for step in range(STEPS + 1):
             side = -1 if place >= 0 and theta[place] >= high else 1
             J, g, H = self._derivatives(theta, e, side)
-            with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is looked at below
-                g, H = sums @ g, sums @ H @ sums.T
-            if not (np.isfinite(J) and np.isfinite(g).all() and np.isfinite(H).all()):
+            g, H = sums @ g, sums @ H @ sums.T
+            if not (math.isfinite(J) and is_finite(g) and is_finite(H)):
                 break
             if best is not None and best[1] < J:
                 break
@@ -234,7 +238,7 @@ class Scan:
             if step == STEPS or -(g[:o] @ move) <= self.settled * abs(J):
                 break
             theta = theta.copy()
-            theta[own] = np.clip(theta[own] + move, lower, upper)
+            theta[own] = np.minimum(np.maximum(theta[own] + move, lower), upper)
         return None if best is None else self._option(best, o)
 
     def _option(self, best: tuple[Any, ...], o: int) -> Option:
@@ -254,10 +258,15 @@ def _solve_convex(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Return the solution of a linear system whose matrix is made positive definite if it is not."""
     size = np.abs(matrix.diagonal())
     scale = np.sqrt(np.where(size > EPS**2 * size.max(initial=0.0), size, 1.0))  # what J does not depend on stays
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    values = np.maximum(np.abs(values), SMALLEST_EIGENVALUE)
-    scaled = (right.T / scale).T
-    return np.asarray((vectors @ ((vectors.T @ scaled).T / values).T).T / scale).T
+    scaled, goal = matrix / (scale[:, None] * scale), (right.T / scale).T
+    least = SMALLEST_EIGENVALUE * np.eye(len(scaled))
+    if is_definite(scaled - least):
+        solution = dposv(scaled, goal)[1]
+    else:
+        values, vectors = np.linalg.eigh(scaled)
+        values = np.maximum(np.abs(values), SMALLEST_EIGENVALUE)
+        solution = vectors @ ((vectors.T @ goal).T / values).T
+    return np.asarray(solution.T / scale).T
 
 
 def _newton_in_bounds(
@@ -267,7 +276,9 @@ def _newton_in_bounds(
     step, held = np.zeros(len(g)), np.zeros(len(g), dtype=bool)
     for _ in range(3):
         moving = ~held
-        if moving.any():
+        if len(g) and not held.any():
+            step = -_solve_convex(H, g)
+        elif moving.any():
             rest = g[moving] + H[np.ix_(moving, held)] @ step[held]
             step[moving] = -_solve_convex(H[np.ix_(moving, moving)], rest)
         out = moving & ((step < lower) | (step > upper))
@@ -275,4 +286,4 @@ def _newton_in_bounds(
             break
         step[out] = np.clip(step[out], lower[out], upper[out])
         held |= out
-    return np.clip(step, lower, upper), held
+    return np.minimum(np.maximum(step, lower), upper), held

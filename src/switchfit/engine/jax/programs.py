@@ -70,7 +70,7 @@ def differentiate_constrained(
 
     Returns
     -------
-    cost, slope, hessian : J, and the derivatives of the sum (D,) and (D, D)
+    cost, slope, hessian : J, and the derivatives of the Lagrangian (D,) and (D, D)
     c, jacobian : the constraints (m,) and their derivatives (m, D)
     """
     model = Model(structure, arguments)

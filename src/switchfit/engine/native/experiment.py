@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable, Sequence
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,13 +20,11 @@ from switchfit.engine.native.program import PREFIX, program_of
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes, constants_of
 from switchfit.engine.native.workspace import (
+    GIVEN,
     OF_SAMPLES,
     WHOLE_OF_SAMPLES,
     ZEROED,
-    constraint_rows,
-    memory,
-    pointers,
-    sums,
+    Layout,
 )
 from switchfit.engine.protocol import Evaluation
 from switchfit.problem.data import FloatArray
@@ -130,7 +129,7 @@ class NativeExperiment:
         pointer, number = ctypes.c_void_p, ctypes.c_int64
         self._program = program  # keeps its code alive
         self._evaluate = program.function(f"{self._prefix}evaluate", pointer, pointer, *[number] * len(counts))
-        self.times, self._cells, self._counts = times, cells, counts
+        self.times, self._inner_nodes, self._cells, self._counts = times, times[1:-1], cells, counts
         constants = [np.ravel(np.asarray(a, dtype=np.float64)) for a in constants_of(arguments)]
         units = np.zeros((D + 1, width))
         units[1:, :D] = np.eye(D)
@@ -140,11 +139,13 @@ class NativeExperiment:
         self._p = np.zeros(max(sizes.M, 1))
         self._own_p, self._tau = self._p[: sizes.M], self._bounds[1 : structure.N + 1]
         self._begins = self._first_cell[1 : structure.N + 1]
-        rows = constraint_rows(library, sizes)
+        if order not in program.layouts:
+            program.layouts[order] = Layout.of(library, sizes, order)
+        layout: Layout = program.layouts[order]
+        rows, lengths = layout.constraint_rows, layout.sums
         own_rows = [rows[kind.name] + i for kind, i in list_constrained_transitions(structure)]
         self._constraint_rows = np.array([*own_rows, *range(rows["end"], rows["count"])], dtype=np.intp)
         self._multipliers = np.zeros(max(rows["count"], 1))
-        lengths = sums(library, sizes)
         self._sums = np.zeros(sum(lengths.values()))
         arrays: dict[str, Any] = {
             "nodes": np.ascontiguousarray(times),
@@ -159,13 +160,12 @@ class NativeExperiment:
         arrays |= places_in_library(structure)
         arrays |= _split_array(self._sums, lengths)
         self._check, self._J = arrays[CHECKED], arrays["J"]
-        self._lengths = {name: length.at(cells + N) for name, length in memory(library, sizes, order).items()}
+        self._lengths = {name: length.at(cells + N) for name, length in layout.memory.items()}
         self._size = sum(self._lengths.values())
         self._zeroed: list[FloatArray] = []
         self._memory = np.zeros(0)  # the workspace that the table points to
         self._named: dict[str, Any] = arrays
-        self._pointers = pointers(library, sizes, order)
-        self._arrays = [arrays.get(name, self._memory) for name in self._pointers]
+        self._arrays = [arrays[name] for name in GIVEN]
         self._late: list[tuple[int, str, FloatArray, Any, Any]] = []
         for k, (samples, count) in enumerate(zip(arguments.samples, counts, strict=True)):
             given: dict[str, Any] = {}
@@ -176,11 +176,16 @@ class NativeExperiment:
             if delay is not None:
                 self._late.append((k, delay, given["time"], given["cell"], given["segment"]))
             self._arrays += given.values()
-        self._table = np.array([a.__array_interface__["data"][0] for a in self._arrays], dtype=np.uintp)
+        addresses = [_get_address(a) for a in self._arrays]
+        own, of_samples = addresses[: len(GIVEN)], addresses[len(GIVEN) :]
+        of_memory = [0] * len(self._lengths)  # until `_bind`
+        self._table = np.array([*own, *_list_addresses(self._sums, lengths), *of_memory, *of_samples], dtype=np.uintp)
+        self._in_memory = slice(len(GIVEN) + len(lengths), len(self._table) - len(of_samples))
         self._address = self._table.ctypes.data
         self._progress = (ctypes.c_int64 * 3)()
+        self._progress_address = ctypes.addressof(self._progress)
         self._result = self._named["g"][:D], self._named["H"].reshape(D, width)[:, :D]
-        self._delays = _find_delays(structure, arguments)
+        self._delays = _find_delays(structure, arguments) if self._late else {}
 
     def __call__(self, tau: FloatArray, p: FloatArray, side: float) -> Evaluation[FloatArray] | None:
         """Return J, its gradient (D,) and its Hessian (D, D), which is NaN at orders below the second.
@@ -191,11 +196,15 @@ class NativeExperiment:
             self._run(tau, p, side)
             if self._has_failed_check:
                 return None
-            g, H = self._result
-            if not self._all_own:
-                g, H = g[self._own], H[np.ix_(self._own, self._own)]
-            hessian = H.copy() if self._has_hessian else np.full(H.shape, np.nan)
-            return Evaluation(self._J.item(0), g.copy(), hessian)
+            g, H = self._read_derivatives()
+            return Evaluation(self._J.item(0), g, H if self._has_hessian else np.full(H.shape, np.nan))
+
+    def _read_derivatives(self) -> tuple[FloatArray, FloatArray]:
+        """Return copies of the gradient (D,) and the Hessian (D, D) in the experiment's unknowns."""
+        g, H = self._result
+        if self._all_own:
+            return g.copy(), H.copy()
+        return g[self._own], H[np.ix_(self._own, self._own)]
 
     def constrained(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
@@ -213,10 +222,10 @@ class NativeExperiment:
                 self._multipliers[:] = 0.0
             if self._has_failed_check:
                 return None
-            (g, H), own = self._result, self._own
+            g, H = self._read_derivatives()
             c = self._named["constraints"][where]
-            A = self._named["jacobian"].reshape(-1, self.sizes.width)[where][:, own]
-            return Evaluation(self._J.item(0), g[own] - multipliers @ A, H[np.ix_(own, own)], c, A)
+            A = self._named["jacobian"].reshape(-1, self.sizes.width)[where][:, self._own]
+            return Evaluation(self._J.item(0), g - multipliers @ A, H, c, A)
 
     def program_at(self, tau: FloatArray, p: FloatArray) -> Callable[[], object]:
         """Return a function that runs the machine code alone, for benchmarks."""
@@ -380,11 +389,11 @@ class NativeExperiment:
 
     def _call_in_pieces(self, function: Callable[..., object], *given: Any) -> None:
         """Call a function of the driver until it has finished; Ctrl-C is handled after each call."""
-        progress, address = self._progress, ctypes.addressof(self._progress)
+        progress = self._progress
         progress[0] = progress[1] = 0
         while progress[0] >= 0:
             progress[2] = BUDGET
-            function(self._address, address, *given)
+            function(self._address, self._progress_address, *given)
 
     def _bind(self, workspace: FloatArray) -> None:
         """Store the addresses of another workspace in the table."""
@@ -392,19 +401,18 @@ class NativeExperiment:
         found = _split_array(workspace, self._lengths)
         self._zeroed = [found[name] for name in ZEROED if found[name].size]
         self._named |= found
-        for k, name in enumerate(self._pointers):
-            if name in found:
-                self._table[k] = found[name].ctypes.data
+        self._table[self._in_memory] = _list_addresses(workspace, self._lengths)
 
     def _find_first_cells(self, tau: FloatArray, side: float) -> None:
         """Find the cells in which segments begin, as in `switchfit.discretization.mesh.rows`."""
         if len(tau):
-            passed = self.times.searchsorted(tau, "right" if side > 0 else "left")
+            nodes = self._inner_nodes
+            begins = nodes.searchsorted(tau, "right" if side > 0 else "left")
             if side <= 0 and self.structure.jumps:  # as in `Structure.fix_sides` and `count_passed`
                 jumps = list(self.structure.jumps)
-                passed[jumps] = self.times.searchsorted(tau[jumps], "right")
-                passed = np.maximum.accumulate(passed)
-            self._begins[:] = np.minimum(np.maximum(passed - 1, 0), self._cells - 1)
+                begins[jumps] = nodes.searchsorted(tau[jumps], "right")
+                begins = np.maximum.accumulate(begins)
+            self._begins[:] = begins
 
     def _find_late_cells(self, p: FloatArray) -> None:
         """Find the cells and segments of the late samples: those of the rows with ``start < t - delay <= end``."""
@@ -417,8 +425,19 @@ class NativeExperiment:
 
 def _split_array(whole: FloatArray, lengths: dict[str, int]) -> dict[str, FloatArray]:
     """Return consecutive parts of an array by their names and lengths."""
-    ends = np.cumsum(list(lengths.values())).tolist()
+    ends = accumulate(lengths.values())
     return {name: whole[end - length : end] for (name, length), end in zip(lengths.items(), ends, strict=True)}
+
+
+def _list_addresses(whole: FloatArray, lengths: dict[str, int]) -> list[int]:
+    """Return the addresses of consecutive parts of an array."""
+    first, begins = _get_address(whole), accumulate(lengths.values(), initial=0)
+    return [first + whole.itemsize * begin for _, begin in zip(lengths, begins, strict=False)]
+
+
+def _get_address(array: NDArray[Any]) -> int:
+    address: int = array.__array_interface__["data"][0]  # a third of the time of array.ctypes.data
+    return address
 
 
 def _find_delays(structure: Structure, arguments: Arguments) -> dict[str, tuple[int | None, float]]:

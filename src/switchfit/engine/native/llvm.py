@@ -217,11 +217,14 @@ class Program:
     key : str
         Hash of the module, the same in every process.
     workspace : Workspace
+    layouts : dict
+        Layout of the memory that each order of derivatives works on, built by its first experiment.
     """
 
     def __init__(self, engine: Any, key: str) -> None:
         self._engine, self.key = engine, key
         self.workspace = Workspace()
+        self.layouts: dict[int, Any] = {}
         self._functions: dict[str, Any] = {}
 
     def address(self, name: str) -> int:

@@ -100,6 +100,19 @@ def memory(library: Structure, sizes: Sizes, order: Order) -> dict[str, Length]:
     }
 
 
+class Layout(NamedTuple):
+    """What `constraint_rows`, `sums` and `memory` return for one program and order."""
+
+    constraint_rows: dict[str, int]
+    sums: dict[str, int]
+    memory: dict[str, Length]
+
+    @classmethod
+    def of(cls, library: Structure, sizes: Sizes, order: Order) -> Layout:
+        """Build the layout of a program's order."""
+        return cls(constraint_rows(library, sizes), sums(library, sizes), memory(library, sizes, order))
+
+
 ZEROED = ("jumps", "late")
 """Parts of the scratch space that start at zero."""
 
