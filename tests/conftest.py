@@ -12,6 +12,7 @@ from hypothesis import settings
 import switchfit as sf
 from switchfit.engine.native import llvm, program
 from switchfit.engine.native.program import drop_programs
+from switchfit.strategy import workers
 
 settings.register_profile("switchfit", derandomize=True, deadline=None)
 settings.load_profile("switchfit")
@@ -113,6 +114,14 @@ def _promotion(request):
     yield
     for name, (strict, _) in PROMOTION.items():
         jax.config.update(name, strict)
+
+
+@pytest.fixture(autouse=True)
+def _fit_in_this_process(monkeypatch):
+    """Many starts start no processes, which would import JAX and compile with optimisation what this one has compiled
+    without; test_workers.py asks for processes by their number.
+    """
+    monkeypatch.setattr(workers, "count_cores", lambda: 1)
 
 
 @pytest.fixture(scope="module", autouse=True)
