@@ -50,7 +50,7 @@ def both(**settings):
 @pytest.mark.parametrize("kind", ["hold", "linear", "cubic"])
 def test_names_and_positions_agree_to_the_bit(engine, kind):
     named, plain = both(engine=engine, kind=kind)
-    for method in ("auto", "autodiff", "adjoint") if kind == "linear" else ("auto",):
+    for method in ("auto", "adjoint") if (engine, kind) == ("jax", "linear") else ("auto",):
         one, other = (sf.evaluate(problem, method=method) for problem in (named, plain))
         assert one.cost == other.cost
         np.testing.assert_array_equal(one.gradient, other.gradient)
