@@ -44,8 +44,7 @@ def closed_cost(theta):
     return grown + top**2 * (1 - jnp.exp(-2 * k * rest)) / (2 * k) + tf**2 / 2 + (top * jnp.exp(-k * rest) - 0.5) ** 2
 
 
-@pytest.mark.parametrize("engine", ["native", "jax"])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("method", "engine"), [("auto", "native"), *((method, "jax") for method in METHODS)])
 def test_cost_gradient_and_hessian_are_those_of_the_closed_form(method, engine):
     problem = closed_problem(engine=engine)
     assert problem.theta_names == ("tau_1", "tf", "a", "k")
