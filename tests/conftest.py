@@ -1,5 +1,6 @@
 """Settings for all tests: the same examples in every run, strict promotion, programs that compile quickly."""
 
+import gc
 import os
 import signal
 from pathlib import Path
@@ -12,6 +13,10 @@ from hypothesis import settings
 import switchfit as sf
 from switchfit.engine.native import llvm, program
 from switchfit.engine.native.program import drop_programs
+from switchfit.strategy import workers
+
+# Tracing allocates so much that the default of 700 has the collector at work for a sixth of the time of such tests.
+gc.set_threshold(50_000, 20, 10)
 
 settings.register_profile("switchfit", derandomize=True, deadline=None)
 settings.load_profile("switchfit")
@@ -83,7 +88,7 @@ def quick_processes(monkeypatch):
     monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
 
-MOST_MAPPINGS = 20_000
+MOST_MAPPINGS = 40_000
 """Pieces of memory that a process may map before compiled programs are dropped; the kernel allows 65,530."""
 
 
@@ -113,6 +118,14 @@ def _promotion(request):
     yield
     for name, (strict, _) in PROMOTION.items():
         jax.config.update(name, strict)
+
+
+@pytest.fixture(autouse=True)
+def _fit_in_this_process(monkeypatch):
+    """Many starts start no processes, which would import JAX and compile with optimisation what this one has compiled
+    without; test_workers.py asks for processes by their number.
+    """
+    monkeypatch.setattr(workers, "count_cores", lambda: 1)
 
 
 @pytest.fixture(scope="module", autouse=True)

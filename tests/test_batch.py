@@ -690,14 +690,17 @@ def _(primals, tangents):
     return table(*primals), tangents[0]
 
 
-FAILING = sf.HybridSystem({"on": lambda t, x, p: 1.0 - table(p["k"]) * x, "off": decay}, [0.2])
+FAILING = sf.HybridSystem({"on": lambda t, x, p: p["h"] - table(p["k"]) * x}, [0.2])
 
 
-def failing_room(values, guess=(1.7, 1.0)):
-    """On coarse meshes: those of most guesses are then padded to the same length, and share programs."""
-    data = sf.Measurements(TIMES, values, sigma=0.01)
-    run = sf.Experiment(data, ("on", "off"), guess[:1], 0.0, 6.0)
-    return sf.Problem(FAILING, run, {"k": sf.Parameter(guess[1], lower=0.1, upper=9.0)}, rtol=1e-5, atol=1e-7)
+def failing_room(seed, guess=(0.9, 1.0)):
+    """A room that is heated all the time, on coarse meshes: those of most guesses are then padded to the same length,
+    and share programs."""
+    k = TRUTH[1]
+    values = (1 - (1 - 0.2 * k) * np.exp(-k * TIMES)) / k + 0.01 * np.random.default_rng(seed).standard_normal(24)
+    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=0.01), ("on",), (), 0.0, 6.0)
+    parameters = {"h": guess[0], "k": sf.Parameter(guess[1], lower=0.1, upper=9.0)}
+    return sf.Problem(FAILING, run, parameters, rtol=1e-5, atol=1e-7)
 
 
 def measured_room(seed):
@@ -716,7 +719,7 @@ def limit(monkeypatch):
 
 def test_a_start_that_raises_an_error_is_listed(limit):
     limit(4.0)
-    study = sf.multistart(failing_room(measured_room(0)), [[2.0, 0.9], [2.0, 5.0], [1.5, 0.7]])
+    study = sf.multistart(failing_room(0), [[1.2, 0.9], [1.2, 5.0], [0.8, 0.7]])
     assert study.status.tolist() == ["CONVERGED", "ERROR", "CONVERGED"]
     ((run, message),) = study.failures
     assert run == 1
@@ -749,7 +752,7 @@ def test_the_lowest_end_may_raise_an_error_when_it_is_fitted_again(monkeypatch):
 
 
 def test_a_replicate_that_raises_an_error_is_listed(limit):
-    found = sf.estimate(failing_room(measured_room(0)))
+    found = sf.estimate(failing_room(0))
     plain = sf.bootstrap(found, 8, seed=1)
     order = np.sort(plain.theta[:, 1])
     limit(0.5 * (order[-2] + order[-1]))  # the highest estimate of k is out of reach, the others are not
@@ -787,14 +790,12 @@ def test_a_run_whose_noise_raises_an_error_is_listed():
 
 def test_a_log_that_raises_an_error_is_listed(limit, tmp_path):
     limit(4.0)
-    problems = [
-        failing_room(measured_room(seed), guess) for seed, guess in enumerate([(1.7, 1.0), (1.7, 5.0), (2.0, 0.9)])
-    ]
+    problems = [failing_room(seed, guess) for seed, guess in enumerate([(0.9, 1.0), (0.9, 5.0), (1.2, 0.9)])]
     fits = sf.estimate_many(problems, folder=tmp_path)
     assert fits.status.tolist() == ["CONVERGED", "ERROR", "CONVERGED"]
     assert "the table ends below this k" in fits.failures[0][1]
-    np.testing.assert_array_equal(fits.start[1], [1.7, 5.0])
-    first = sf.estimate_many([failing_room(measured_room(1), (1.7, 5.0)), problems[0]])
+    np.testing.assert_array_equal(fits.start[1], [0.9, 5.0])
+    first = sf.estimate_many([failing_room(1, (0.9, 5.0)), problems[0]])
     assert first.status.tolist() == ["ERROR", "CONVERGED"]
 
 

@@ -21,7 +21,7 @@ from switchfit.problem.functions import use_float64
 ROWS = 22
 
 
-@pytest.mark.parametrize("reference", [False, True])
+@pytest.mark.parametrize("reference", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_casadi_and_switchfit_agree(reference):
     problem = vehicle.with_reference(ROWS - 2) if reference else vehicle.without_reference()
     evaluator = vehicle.evaluator_with(problem, ROWS - 2)

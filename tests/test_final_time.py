@@ -44,8 +44,7 @@ def closed_cost(theta):
     return grown + top**2 * (1 - jnp.exp(-2 * k * rest)) / (2 * k) + tf**2 / 2 + (top * jnp.exp(-k * rest) - 0.5) ** 2
 
 
-@pytest.mark.parametrize("engine", ["native", "jax"])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("method", "engine"), [("auto", "native"), *((method, "jax") for method in METHODS)])
 def test_cost_gradient_and_hessian_are_those_of_the_closed_form(method, engine):
     problem = closed_problem(engine=engine)
     assert problem.theta_names == ("tau_1", "tf", "a", "k")
@@ -106,12 +105,11 @@ def hard_problem(tf=2.4, **settings):
 def test_both_engines_agree(tf):
     native, jax_ = (Evaluator(hard_problem(tf, engine=engine)) for engine in ("native", "jax"))
     theta = native.problem.initial_theta
-    for matrix in ("exact", "gauss-newton", "none"):
+    for matrix in ("exact", "gauss-newton"):
         one, other = native(theta, matrix=matrix), jax_(theta, matrix=matrix)
         assert one.cost == pytest.approx(other.cost, rel=1e-12)
         np.testing.assert_allclose(one.gradient, other.gradient, rtol=1e-11, atol=1e-12)
-        if matrix != "none":
-            np.testing.assert_allclose(one.hessian, other.hessian, rtol=1e-10, atol=1e-11)
+        np.testing.assert_allclose(one.hessian, other.hessian, rtol=1e-10, atol=1e-11)
     multipliers = np.array([0.7, -1.3, 0.4])
     one, other = (e.constrained(theta, 1, multipliers) for e in (native, jax_))
     np.testing.assert_allclose(one.constraints, other.constraints, rtol=1e-12, atol=1e-13)

@@ -425,7 +425,7 @@ def test_names_do_no_harm():
 
 
 def test_many_runs_stay_small_and_the_worst_come_first():
-    fit = sf.estimate(sf.Problem(RAMP, ramps(45, sigma=0.02), {"v": 0.9}))
+    fit = sf.estimate(sf.Problem(RAMP, ramps(45, sigma=0.02), {"v": 0.9}), strategy="local")
     text = format_page(fit)
     reader = check_alone(text)
     payload = payload_of(text)

@@ -50,7 +50,7 @@ def both(**settings):
 @pytest.mark.parametrize("kind", ["hold", "linear", "cubic"])
 def test_names_and_positions_agree_to_the_bit(engine, kind):
     named, plain = both(engine=engine, kind=kind)
-    for method in ("auto", "autodiff", "adjoint") if kind == "linear" else ("auto",):
+    for method in ("auto", "adjoint") if (engine, kind) == ("jax", "linear") else ("auto",):
         one, other = (sf.evaluate(problem, method=method) for problem in (named, plain))
         assert one.cost == other.cost
         np.testing.assert_array_equal(one.gradient, other.gradient)
@@ -79,7 +79,7 @@ def test_a_fit_and_all_that_follows(tmp_path):
     again = cloudpickle.loads(cloudpickle.dumps(named))
     assert again.experiments[0].inputs.names == ("left", "right")
     assert again.structures == named.structures
-    np.testing.assert_array_equal(sf.estimate(again).theta, one.theta)
+    np.testing.assert_array_equal(sf.estimate(again, strategy="local").theta, one.theta)
 
 
 def test_many_fits_and_studies():
