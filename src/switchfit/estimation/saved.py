@@ -1,6 +1,6 @@
 """Save fits as JSON files that can be read without switchfit, and load them without losing a bit.
 
-A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 5, "fit": {...}, "certificate": {...}}`` with
+A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 6, "fit": {...}, "certificate": {...}}`` with
 the fields of `Verdict`, `Fit` and `Certificate` under their own names. The verdict, with its line of text, is meant for
 readers of the file; `load` computes it again from the rest.
 
@@ -12,7 +12,7 @@ readers of the file; `load` computes it again from the rest.
 
 When a file is read, pydantic checks it against the types of the dataclasses' fields. Then all sizes and names are
 checked against one another (`_check_fit`), so that a loaded fit can be printed and plotted, and has intervals. Files of
-versions 2 and 3, which hold sentences in place of data, and of version 4 are upgraded to version 5 before that
+versions 2 and 3, which hold sentences in place of data, and of versions 4 and 5 are upgraded to version 6 before that
 (`_upgrade`).
 """
 
@@ -42,8 +42,8 @@ from switchfit.uncertainty.identification import analyse_solution
 from switchfit.uncertainty.verdict import Verdict, judge
 
 FORMAT = "switchfit fit"
-VERSION = 5
-READABLE = (2, 3, 4, 5)
+VERSION = 6
+READABLE = (2, 3, 4, 5, 6)
 
 DATA = 4
 """The first version that holds data in place of sentences."""
@@ -367,7 +367,7 @@ def _describe_place(loc: Iterable[Any], content: Any, top: str) -> str:
 
 
 def _upgrade(content: dict[str, Any], version: int) -> None:
-    """Upgrade the content of a file of an earlier version to version 5, in place."""
+    """Upgrade the content of a file of an earlier version to version 6, in place."""
     try:
         if version < DATA:
             _upgrade_fit(content["fit"])
@@ -377,6 +377,7 @@ def _upgrade(content: dict[str, Any], version: int) -> None:
         content["fit"].setdefault("initial_cost", _read_first_cost(content["fit"]["history"]))
         for comparison in (comparison for run in content["fit"]["comparisons"] for comparison in run):
             comparison.setdefault("weights", None)
+            comparison.setdefault("units", [])
     except (LookupError, TypeError, AttributeError) as error:
         raise ValueError(
             f"it does not match the format of version {content['version']} ({get_first_line(error)})"
@@ -527,6 +528,8 @@ def _check_comparison(comparison: Comparison, where: str) -> None:
     for name in ("measured", "fitted", "sigma", "downweighted"):
         if getattr(comparison, name) is not None:
             _check_size(f"{where}.{name}", getattr(comparison, name), (K, q), sizes)
+    if comparison.units:
+        _check_size(f"{where}.units", comparison.units, (q,), f"since its names has {q} entries")
     if comparison.weights is not None:
         _check_size(f"{where}.weights", comparison.weights, (q,), f"since its names has {q} entries")
     _check_size(f"{where}.curve", comparison.curve, (L, q), f"since its curve_times has {L} entries and its names {q}")

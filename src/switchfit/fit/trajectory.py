@@ -87,6 +87,8 @@ class Comparison:
         Which residuals a robust loss treats as outliers: those larger than its `loss_scale`; None without such a loss.
     weights : (q,) or None
         Weights of the channels of a reference signal, the diagonal of its weight matrix; None for measurements.
+    units : tuple of str
+        Unit of each channel: as given with the data, or else that of the state of the same name; "" if unknown.
 
     See Also
     --------
@@ -115,6 +117,7 @@ class Comparison:
     curve: FloatArray
     downweighted: NDArray[np.bool_] | None = None
     weights: FloatArray | None = None
+    units: tuple[str, ...] = ()
 
     @property
     def residuals(self) -> FloatArray:
@@ -256,6 +259,7 @@ def _build_comparisons(
     """Compare measured with fitted for each reference signal and each Measurements."""
     data, times = problem.experiments[e].data, trajectory.times
     curves = select_visible(simulation, simulation.y_before, simulation.y_after)
+    known = dict(zip(trajectory.state_names, trajectory.state_units, strict=True))
     comparisons = []
     items = [d for d in data if isinstance(d, ReferenceSignal)] + [d for d in data if isinstance(d, Measurements)]
     first = measured = 0
@@ -266,9 +270,12 @@ def _build_comparisons(
         curve = curves[:, channels]
         default = trajectory.state_names if item.observe is None else tuple(f"y{k + 1}" for k in range(q))
         label = item.names or default
+        units = item.units or tuple(known.get(name, "") for name in label)
         if isinstance(item, ReferenceSignal):
             weights = np.diag(item.weights).copy()
-            here = Comparison("reference", label, times, item.signal(times), curve, None, times, curve, None, weights)
+            here = Comparison(
+                "reference", label, times, item.signal(times), curve, None, times, curve, None, weights, units
+            )
         else:
             named = problem.name_parameters(theta, e)
             fitted = simulation.seen[measured][: len(item.times)]
@@ -279,6 +286,8 @@ def _build_comparisons(
             if item.loss != "linear" and sigma is not None:
                 beyond = np.abs(np.nan_to_num(item.values - fitted)) > item.loss_scale * sigma
             moments = times + delay  # time stamps of the sensor
-            here = Comparison("measurements", label, item.times, item.values, fitted, sigma, moments, curve, beyond)
+            here = Comparison(
+                "measurements", label, item.times, item.values, fitted, sigma, moments, curve, beyond, None, units
+            )
         comparisons.append(here)
     return tuple(comparisons)

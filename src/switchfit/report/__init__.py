@@ -4,6 +4,6 @@ Its modules register how each kind of result is written and drawn (`switchfit.ru
 `switchfit` imports all of them. Imports `batch` and the rooms before it.
 """
 
-from switchfit.report import batch, html, notebook, plot, sentences, text, uncertainty, verdict
+from switchfit.report import batch, gallery, html, notebook, plot, sentences, text, uncertainty, verdict
 
-__all__ = ["batch", "html", "notebook", "plot", "sentences", "text", "uncertainty", "verdict"]
+__all__ = ["batch", "gallery", "html", "notebook", "plot", "sentences", "text", "uncertainty", "verdict"]

@@ -26,7 +26,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,7 @@ from switchfit.runtime.presentation import draw_figure, format_html, format_text
 from switchfit.runtime.progress import Progress, show_progress
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 End = Literal["crossed", "limit", "flat", "failed", "stopped"]
@@ -598,8 +599,17 @@ class Profile:
     def _repr_html_(self) -> str:
         return format_html(self)
 
-    def plot(self) -> Figure:
+    @overload
+    def plot(self, *, ax: None = ...) -> Figure: ...
+    @overload
+    def plot(self, *, ax: Axes) -> Axes: ...
+    def plot(self, *, ax: Axes | None = None) -> Axes | Figure:
         """Draw the likelihood ratio with its thresholds, and the quadratic approximation.
+
+        Parameters
+        ----------
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned.
 
         See Also
         --------
@@ -615,7 +625,7 @@ class Profile:
         >>> len(figure.axes) > 0
         True
         """
-        return draw_figure(self)
+        return draw_figure(self, ax=ax)
 
 
 def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress | None = None) -> Profile:
@@ -672,7 +682,7 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     if callback is not None:
         as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
     evaluator = estimate.evaluator_at_solution()
-    _check(fit)
+    check_has_profile(fit)
     threshold = fit.quantile(level)
     index = fit.theta_names.index(name)
     times = _list_sample_times(evaluator, index)
@@ -715,7 +725,8 @@ def _wrap_callback(report: Progress, trace: Trace) -> bool:
     return bool(report(trace.fits, max(2 * (STEPS + LOOK_AHEAD + 2), trace.fits)))
 
 
-def _check(fit: Fit) -> None:
+def check_has_profile(fit: Fit) -> None:
+    """Raise ValueError unless a fit is a minimum with a noise model, as profiles and regions need."""
     if not fit.status.successful:
         raise ValueError(f"a profile begins at a minimum, and this fit has not found one: {fit.message}")
     if fit.constraints:
