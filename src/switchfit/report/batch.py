@@ -339,6 +339,7 @@ def _draw_waterfall(study: Multistart, ax: Axes) -> Axes:
     top = float(np.nanmax(height, initial=floor))
     ax.set_ylim(floor / 3, max(3 * top, 1e3 * floor))  # all in one minimum: a few decades, not one tick
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set_xlim(0.5, len(order) + 0.5)
     ax.set_xlabel("starts, in the order of the cost at their end")
     ax.set_ylabel("cost above the best")
     ax.legend(frameon=False, fontsize=SMALL, loc="upper left")

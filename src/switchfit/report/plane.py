@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -12,13 +12,11 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_index, join_names, shorten
 from switchfit.report.numbers import get_unit
-from switchfit.report.plot import break_at_gaps, choose_mode_colours, draw_dots
+from switchfit.report.plot import choose_mode_colours, draw_dots
 from switchfit.report.style import (
     DATA,
-    FIT,
     LINE,
     REFERENCE,
-    SHADE,
     SMALL,
     THIN,
     draw_on,
@@ -147,33 +145,25 @@ def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, str] | None) 
 
 
 def _draw_plane(estimate: Estimate, e: int, plane: Plane, threshold: float, level: float, ax: Axes) -> Axes:
-    from matplotlib.lines import Line2D
-
     trajectory, comparison = estimate.trajectories[e], estimate.comparisons[e][plane.data]
     both = [plane.x, plane.y]
     if comparison.kind == "measurements":
         ax.plot(*comparison.measured[:, both].T, label="measured", zorder=2, **draw_dots(len(comparison.times)))
     else:
         ax.plot(*comparison.measured[:, both].T, "--", color=REFERENCE, linewidth=LINE, label="reference signal")
-    _, x = break_at_gaps(comparison.curve_times, comparison.curve[:, plane.x], trajectory)
-    _, y = break_at_gaps(comparison.curve_times, comparison.curve[:, plane.y], trajectory)
-    colours = choose_mode_colours([trajectory])
-    for mode, first, last in zip(
-        [mode for mode, _, _ in trajectory.mode_spans], trajectory.segments[:-1], trajectory.segments[1:], strict=True
-    ):
-        ax.plot(
-            *comparison.curve[first:last, both].T, color=colours[mode], linewidth=9, zorder=1, solid_capstyle="butt"
-        )
-    ax.plot(x, y, "-", color=FIT, linewidth=LINE, label="fitted", zorder=4)
+    colours = choose_mode_colours([trajectory], lines=True)
+    named: set[str] = set()
+    segments = zip(trajectory.mode_spans, trajectory.segments[:-1], trajectory.segments[1:], strict=True)
+    for (mode, begin, end), first, last in segments:
+        label = f"fitted: {mode}" if end > begin and mode not in named else ""
+        ax.plot(*comparison.curve[first:last, both].T, color=colours[mode], linewidth=2 * LINE, zorder=4, label=label)
+        named |= {mode} if label else set()
     ends = comparison.curve[trajectory.segments[1:-1] - 1][:, both]
     if len(ends):
-        ax.plot(
-            *ends.T, "D", color=FIT, markeredgecolor=DATA, markersize=6, label="transition", zorder=5, linestyle="none"
-        )
+        style: dict[str, Any] = {"color": "white", "markeredgecolor": DATA, "markersize": 6, "linestyle": "none"}
+        ax.plot(*ends.T, "D", label="transition", zorder=5, **style)
     _draw_ellipses(estimate, e, plane, threshold, level, ax)
-    handles = ax.get_legend_handles_labels()[0]
-    handles += [Line2D([], [], color=colours[mode], linewidth=9, label=mode) for mode in colours]
-    ax.legend(handles=handles, fontsize=SMALL, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
+    ax.legend(fontsize=SMALL, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
     ax.set_xlabel(label_quantity(comparison.names[plane.x], get_unit(comparison, plane.x, trajectory)))
     ax.set_ylabel(label_quantity(comparison.names[plane.y], get_unit(comparison, plane.y, trajectory)))
     ax.set_aspect("equal", adjustable="datalim")
@@ -195,7 +185,7 @@ def _draw_ellipses(estimate: Estimate, e: int, plane: Plane, threshold: float, l
         if ellipse is None:
             continue
         outline = (centre + factor * ellipse).T
-        ax.fill(*outline, facecolor=SHADE, alpha=0.35, edgecolor=SHADE, linewidth=THIN, zorder=3, label=label)
+        ax.fill(*outline, facecolor=REFERENCE, alpha=0.35, edgecolor=REFERENCE, linewidth=THIN, zorder=3, label=label)
         label = ""
 
 

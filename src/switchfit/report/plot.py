@@ -24,6 +24,7 @@ from switchfit.report.style import (
     DATA,
     FIT,
     LINE,
+    LINE_COLOURS,
     MODE_COLOURS,
     REFERENCE,
     TEXT,
@@ -197,7 +198,7 @@ def plot_comparison(comparison: Comparison, trajectory: Trajectory, channel: int
         _mark_outliers(comparison, measured, channel, ax)
     else:
         ax.plot(comparison.times, measured, "--", color=REFERENCE, linewidth=LINE, label="reference signal", zorder=3)
-    times, curve = break_at_gaps(comparison.curve_times, comparison.curve[:, channel], trajectory)
+    times, curve = _break_at_gaps(comparison.curve_times, comparison.curve[:, channel], trajectory)
     with draw_within(ax, curve):
         ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label="fitted", zorder=4)
     ax.set_ylabel(label_quantity(comparison.names[channel], get_unit(comparison, channel, trajectory)))
@@ -236,7 +237,7 @@ def plot_residuals(comparison: Comparison, trajectory: Trajectory, channel: int,
         ax.plot(comparison.times, residual, zorder=3, **draw_dots(len(residual)))
         _mark_outliers(comparison, residual, channel, ax)
     else:
-        times, line = break_at_gaps(comparison.times, residual, trajectory)
+        times, line = _break_at_gaps(comparison.times, residual, trajectory)
         ax.plot(times, line, "-", color=REFERENCE, linewidth=THIN, zorder=3)
     if comparison.sigma is not None:
         sigma = _replace_infinities(comparison.sigma[:, channel])
@@ -273,7 +274,7 @@ def plot_state(trajectory: Trajectory, state: int, ax: Axes) -> Axes:
     >>> plot_state(fit.trajectory, 0, ax) is ax
     True
     """
-    times, curve = break_at_gaps(trajectory.times, trajectory.states[:, state], trajectory)
+    times, curve = _break_at_gaps(trajectory.times, trajectory.states[:, state], trajectory)
     ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label="fitted", zorder=4)
     ax.set_ylabel(label_quantity(trajectory.state_names[state], trajectory.state_units[state]))
     return _label_time_axis(ax, trajectory)
@@ -398,9 +399,9 @@ def plot_convergence(history: Sequence[IterationRecord], ax: Axes, *, tolerance:
         ax.axhline(tolerance, color=REFERENCE, linestyle="--", linewidth=THIN)
         ax.annotate(
             "tolerance",
-            (0.99, tolerance),
+            (0.01, tolerance),  # on the left, where the curve is far above it
             xycoords=("axes fraction", "data"),
-            ha="right",
+            ha="left",
             va="bottom",
             color=REFERENCE,
             fontsize=TEXT,
@@ -486,15 +487,18 @@ def _draw_timeline(fit: Fit, intervals: FloatArray, level: float, ax: Axes) -> A
     return ax
 
 
-def choose_mode_colours(trajectories: Sequence[Trajectory]) -> dict[str, str]:
+def choose_mode_colours(trajectories: Sequence[Trajectory], *, lines: bool = False) -> dict[str, str]:
     """Return a colour for each mode that occurs, in the order of first occurrence.
 
     Parameters
     ----------
     trajectories : sequence of Trajectory
+    lines : bool, optional
+        Whether they are for lines, which need stronger colours than what is shaded.
     """
+    palette = LINE_COLOURS if lines else MODE_COLOURS
     names = dict.fromkeys(mode for trajectory in trajectories for mode, _, _ in trajectory.mode_spans)
-    return {name: MODE_COLOURS[k % len(MODE_COLOURS)] for k, name in enumerate(names)}
+    return {name: palette[k % len(palette)] for k, name in enumerate(names)}
 
 
 # --- the figure of a fit ----------------------------------------------------------------------------------------------
@@ -660,7 +664,7 @@ def _replace_infinities(values: FloatArray) -> FloatArray:
     return np.where(np.abs(values) < LARGEST_DRAWN, values, np.nan)
 
 
-def break_at_gaps(times: FloatArray, values: FloatArray, trajectory: Trajectory) -> tuple[FloatArray, FloatArray]:
+def _break_at_gaps(times: FloatArray, values: FloatArray, trajectory: Trajectory) -> tuple[FloatArray, FloatArray]:
     """Return a curve over the trajectory's nodes with a gap at each transition, where a reset map may make it jump."""
     values = _replace_infinities(values)
     if len(times) != len(trajectory.times):

@@ -26,6 +26,8 @@ Drawn = TypeVar("Drawn", "Axes", "Figure")
 
 MODE_COLOURS = ("#eef4fb", "#f9dfbf", "#e2f2df", "#e9d0e2", "#faf7d4", "#c9dfe1", "#ececec", "#dcc9b6")
 """Light, and of different lightness one after the other, so that they differ in grey too."""
+LINE_COLOURS = ("#3b82c4", "#e08a1e", "#3f9b4b", "#9b5fb5", "#b8a400", "#1f9aa0", "#8a8a8a", "#a0643c")
+"""Of the same modes in the same hues, for lines and for thin shades: to be told apart on white and on black."""
 FIT, DATA, REFERENCE, TRANSITION, SHADE = "#b2182b", "#222222", "#777777", "#333333", "#4a7fb5"
 """What is fitted, what was measured, what it is compared with, lines in time, and regions of confidence."""
 GROUP_COLOURS = ("#b2182b", "#4a7fb5", "#e0a030", "#5c9e5c", "#8a5fa3", "#777777")

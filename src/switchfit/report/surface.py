@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 LEVELS = 12
 """Contours of the cost."""
+FINE = 200
+"""Points along each axis between which a contour is drawn."""
 
 
 def plot_cost(
@@ -63,7 +65,8 @@ def draw_cost(grid: CostGrid, ax: Axes) -> Axes:
     top = float(np.nanmax(rise, initial=0.0))
     if top > 0:
         levels = grid.cost + top * np.linspace(0, 1, LEVELS + 1) ** 2
-        filled = ax.contourf(grid.x, grid.y, grid.costs, levels=levels, cmap="Blues_r", extend="min")
+        lowest = min(float(np.nanmin(grid.costs)), grid.cost)
+        filled = ax.contourf(grid.x, grid.y, grid.costs, levels=[lowest, *levels[1:]], cmap="Blues_r")
         ax.contour(grid.x, grid.y, grid.costs, levels=levels[1:], colors="white", linewidths=0.5)
         bar = ax.figure.colorbar(filled, ax=ax, ticks=levels[:: LEVELS // 4], format="%.4g")
         bar.set_label("cost J")
@@ -127,10 +130,9 @@ def draw_region(region: JointRegion, intervals: FloatArray, ax: Axes) -> Axes:
     from matplotlib.patches import Patch
 
     grid, percent = region.grid, f"{100 * region.level:g} %"
-    # The root of the ratio is nearly linear, so that contours between the points of the grid lie where they should.
-    root, edge = np.sqrt(np.maximum(region.ratio, 0.0)), float(np.sqrt(region.threshold))
-    ax.contourf(grid.x, grid.y, root, levels=[-1.0, edge], colors=[SHADE], alpha=0.25)
-    ax.contour(grid.x, grid.y, root, levels=[edge], colors=[FIT], linewidths=LINE)
+    x, y, ratio = _refine(region)
+    ax.contourf(x, y, ratio, levels=[-np.inf, region.threshold], colors=[SHADE], alpha=0.25)
+    ax.contour(x, y, ratio, levels=[region.threshold], colors=[FIT], linewidths=LINE)
     handles: list[Any] = [
         Patch(facecolor=SHADE, alpha=0.25, edgecolor=FIT, linewidth=LINE, label=f"{percent} region, likelihood ratio")
     ]
@@ -149,6 +151,20 @@ def draw_region(region: JointRegion, intervals: FloatArray, ax: Axes) -> Axes:
     handles += _draw_bounds(grid, ax)
     ax.legend(handles=handles, fontsize=SMALL, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
     return _label_axes(grid, ax)
+
+
+def _refine(region: JointRegion) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the likelihood ratio on a finer grid: nearly a parabola, which a cubic spline follows.
+
+    Where parts of the grid are missing, the grid is left as it is.
+    """
+    from scipy.interpolate import RectBivariateSpline
+
+    grid, ratio = region.grid, region.ratio
+    if not np.isfinite(ratio).all():
+        return grid.x, grid.y, ratio
+    x, y = (np.linspace(values[0], values[-1], FINE) for values in (grid.x, grid.y))
+    return x, y, RectBivariateSpline(grid.y, grid.x, ratio)(y, x)
 
 
 def _draw_bounds(grid: CostGrid, ax: Axes) -> list[Any]:

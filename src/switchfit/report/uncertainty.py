@@ -430,7 +430,7 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     ax.set_ylabel("2 (J - J min)" if profile.fit.sigma_known else "2 (J - J min) / s²")
     ax.set_title(f"Profile likelihood of {profile.name}")
     ax.ticklabel_format(axis="x", useOffset=False)
-    ax.legend(frameon=False, fontsize=SMALL, loc="upper center", ncols=2)
+    ax.legend(fontsize=SMALL, loc="upper center", ncols=2, edgecolor="none")
     return ax
 
 

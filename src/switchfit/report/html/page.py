@@ -32,6 +32,7 @@ from switchfit.report.html.figures import (
 from switchfit.report.html.inputs import collect_inputs
 from switchfit.report.html.sliders import Slider, build_sliders
 from switchfit.report.numbers import format_rounded, format_unit
+from switchfit.report.plot import choose_mode_colours
 from switchfit.report.sentences import join_words
 from switchfit.report.tables import Table
 from switchfit.report.text import (
@@ -52,8 +53,6 @@ from switchfit.uncertainty.issues import find_issues
 from switchfit.uncertainty.quality import explain_channel, explain_worst, rank_runs
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals, diagnose
 
-MODE_COLOURS = ("#3b82c4", "#e08a1e", "#3f9b4b", "#9b5fb5", "#b8a400", "#1f9aa0", "#8a8a8a", "#a0643c")
-"""Drawn so thin that they can be told apart on white and on black."""
 MOST_RUNS = 12
 """Experiments whose figures are in a page, those that are explained worst."""
 MOST_CHANNELS = 6
@@ -216,7 +215,7 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[Run], dict[str, Any]]:
     points = choose_points(estimate, order, max((len(own) for own in places.values()), default=0))
     curves = {e: collect_curves(estimate, e, places[e], points) for e in order}
     wide = correct_intervals(estimate)
-    colours = _choose_colours(estimate)
+    colours = choose_mode_colours(estimate.trajectories, lines=True)
     diagnostics = diagnose(estimate)
     runs: list[Run] = []
     drawn: dict[str, Any] = {}
@@ -270,11 +269,6 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[Run], dict[str, Any]]:
 def _moves(curves: Mapping[int, Sequence[Curves]], place: int) -> bool:
     """Return whether an unknown has derivatives in some curve."""
     return any(place in own.tangents for run in curves.values() for own in run)
-
-
-def _choose_colours(fit: Fit) -> dict[str, str]:
-    names = dict.fromkeys(mode for trajectory in fit.trajectories for mode, _, _ in trajectory.mode_spans)
-    return {name: MODE_COLOURS[k % len(MODE_COLOURS)] for k, name in enumerate(names)}
 
 
 def _describe_run(
