@@ -55,7 +55,7 @@ each transition time by less than this part of the horizon. Modes that have coll
 where they sit is arbitrary."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Multistart(Fits):
     """Result of `multistart`: everything in `Fits`, the minima that were found, and the best. Print it for the table.
 

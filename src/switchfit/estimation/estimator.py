@@ -33,7 +33,7 @@ from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_choice, as_count, as_flag, as_instance, as_path, as_positive
 from switchfit.runtime.files import write_atomically
-from switchfit.runtime.presentation import draw_figure, format_html, format_page, format_text
+from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_page, format_text, join_first
 from switchfit.runtime.progress import Progress
 from switchfit.uncertainty.certificate import Certificate, certify
 from switchfit.uncertainty.identification import Identifiability, identifiability
@@ -100,6 +100,10 @@ class Estimate(Fit):
     saved_certificate: Certificate | None = None
     problem: Problem | None = None
     evaluator: Evaluator | None = None
+
+    def __repr__(self) -> str:
+        unknowns = (f"{name} = {value:.4g}" for name, value in zip(self.theta_names, self.theta, strict=True))
+        return format_line(self, self.verdict.level, f"J = {self.cost:.6g}", join_first(unknowns))
 
     def simulate_later(self, simulation: SimulatedProblem) -> None:
         """Compute `trajectories` and `comparisons` from a simulation at the first access; many fits never need them.

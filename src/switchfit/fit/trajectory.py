@@ -15,8 +15,10 @@ from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_index, as_instance
+from switchfit.runtime.presentation import format_line, join_first
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +62,11 @@ class Trajectory:
     state_names: tuple[str, ...]
     state_units: tuple[str, ...]
     time_unit: str = "s"
+
+    def __repr__(self) -> str:
+        modes = join_first((str(self.modes[k]) for k in self.segments[:-1] if k < len(self.modes)), 8)
+        ends = f"{self.times[0]:.6g} to {self.times[-1]:.6g}{unit_suffix(self.time_unit)}" if len(self.times) else ""
+        return format_line(self, join_first(self.state_names), f"modes {modes}", ends, f"{len(self.times)} nodes")
 
     @property
     def mode_spans(self) -> list[tuple[str, float, float]]:
@@ -118,6 +125,9 @@ class Comparison:
     downweighted: NDArray[np.bool_] | None = None
     weights: FloatArray | None = None
     units: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        return format_line(self, self.kind, join_first(self.names), f"{len(self.times)} times")
 
     @property
     def residuals(self) -> FloatArray:

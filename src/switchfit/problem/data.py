@@ -29,6 +29,7 @@ from switchfit.problem.validation import (
     as_text,
     shorten,
 )
+from switchfit.runtime.presentation import format_line, join_first
 
 FloatArray = NDArray[np.float64]
 MOST_FILTERED = 10**7
@@ -57,6 +58,9 @@ class PiecewisePolynomial:
 
     knots: FloatArray
     coefficients: FloatArray
+
+    def __repr__(self) -> str:
+        return format_line(self, f"{len(self.knots)} knots", f"{self.channels} channels")
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.coefficients).all():
@@ -130,6 +134,9 @@ class Input:
     values: Any
     kind: Literal["hold", "linear", "cubic"] = "hold"
     units: tuple[str, ...] | None = None
+
+    def __repr__(self) -> str:
+        return format_line(self, join_first(self.names or ()), self.kind, f"{len(self.times)} times")
 
     def __post_init__(self) -> None:
         kind = as_choice(self.kind, "Input kind", ("hold", "linear", "cubic"))
@@ -384,6 +391,9 @@ class ReferenceSignal:
     lowpass_hz: float | None = None
     units: tuple[str, ...] | None = None
 
+    def __repr__(self) -> str:
+        return format_line(self, join_first(self.names or ()), f"{self.signal.channels} channels")
+
     def __post_init__(self) -> None:
         if not isinstance(self.signal, PiecewisePolynomial):
             raise TypeError(
@@ -535,6 +545,10 @@ class Measurements:
     loss_scale: float = 1.0
     delay: float | str = 0.0
     units: tuple[str, ...] | None = None
+
+    def __repr__(self) -> str:
+        channels = join_first(self.names) if self.names else f"{self.values.shape[1]} channels"
+        return format_line(self, channels, f"{len(self.times)} times")
 
     def __post_init__(self) -> None:
         names, units = _find_labels(self.values, self.names, self.units)

@@ -27,6 +27,7 @@ from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_index
+from switchfit.runtime.presentation import format_line, join_first
 from switchfit.uncertainty.sensitivity import Points, Sensitivity, compute_sensitivity
 
 NEAR = 2.0
@@ -83,6 +84,12 @@ class Prediction:
     time_unit: str
     near_transition: NDArray[np.bool_]
     fit: Fit = field(repr=False)
+
+    def __repr__(self) -> str:
+        times = f"{len(self.times)} times"
+        if len(self.times):
+            times += f" from {self.times.min():.6g} to {self.times.max():.6g}{unit_suffix(self.time_unit)}"
+        return format_line(self, join_first(self.output_names or self.state_names), times)
 
     def state_band(self, level: float = 0.95) -> FloatArray:
         """Return the confidence band of the states at each time: (K, n, 2).

@@ -38,9 +38,10 @@ from switchfit.fit.result import Fit
 from switchfit.fit.solution import constraints_of, minimize_cost
 from switchfit.optimize import Status, solve_qp
 from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_name, join_names, shorten
-from switchfit.runtime.presentation import draw_figure, format_html, format_text
+from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text
 from switchfit.runtime.progress import Progress, show_progress
 
 if TYPE_CHECKING:
@@ -491,6 +492,10 @@ class Profile:
     fit: Fit
     sample_times: FloatArray
     trace: Trace
+
+    def __repr__(self) -> str:
+        value = f"{self.name} = {self.value:.6g} ± {self.standard_error:.2g}{unit_suffix(self.unit)}"
+        return format_line(self, value, f"{len(self.trace.points)} points")
 
     @property
     def values(self) -> FloatArray:

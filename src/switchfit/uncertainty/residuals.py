@@ -29,7 +29,7 @@ from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import format_text
+from switchfit.runtime.presentation import format_line, format_text, join_first
 
 UNLIKELY = 1e-3
 """Probability below which a test counts as failed: with ten channels, one false alarm in fifty fits. For the verdict it
@@ -105,6 +105,9 @@ class ChannelResiduals:
     effective: float
     outliers: int
 
+    def __repr__(self) -> str:
+        return format_line(self, self.name, f"{len(self.values)} values", f"rms = {self.rms:.3g}")
+
     @property
     def correlation(self) -> float:
         """Correlation of neighboring residuals, at lag 1; 0 if there are too few residuals."""
@@ -160,6 +163,9 @@ class ResidualDiagnostics:
 
     channels: tuple[ChannelResiduals, ...]
     labels: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        return format_line(self, join_first(self.labels) or "no channels")
 
     @property
     def passed(self) -> bool:

@@ -14,6 +14,7 @@ from switchfit.io.logs.units import SECONDS
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.issue import Issue
+from switchfit.runtime.presentation import format_line, join_first
 
 FloatArray = NDArray[np.float64]
 
@@ -104,6 +105,9 @@ class Log:
     place: str = "line"
     time_name: str = "t"
     has_positions: bool = False
+
+    def __repr__(self) -> str:
+        return format_line(self, self.source, join_first(self.values), f"{len(self.times)} times")
 
     @property
     def channels(self) -> tuple[str, ...]:
