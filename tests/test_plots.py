@@ -22,7 +22,6 @@ from switchfit.models import heater_problem
 from switchfit.report.batch import plot_parameters
 from switchfit.report.plot import plot_fit, plot_timeline
 from switchfit.report.style import FIT, LINE_COLOURS, MODE_COLOURS
-from switchfit.report.text import write_report
 from switchfit.runtime import progress
 from switchfit.uncertainty.quality import explain_worst, rank_runs
 from switchfit.uncertainty.regions import compute_cost_grid, compute_joint_threshold, compute_region
@@ -90,7 +89,7 @@ def test_axes_given_are_drawn_in_and_returned_and_a_figure_is_made_without(name,
     figure = PLOTS[name](car, starts)
     assert isinstance(figure, Figure)
     assert isinstance(figure.axes[0], Axes)
-    with pytest.raises(TypeError, match="ax must be a matplotlib Axes; got Figure"):
+    with pytest.raises(TypeError, match="ax must be a matplotlib Axes; got NotebookFigure"):
         PLOTS[name](car, starts, ax=figure)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -121,7 +120,7 @@ def test_units_of_channels_are_in_labels_and_tables(car, tmp_path):
     ]  # fmt: skip
     assert car.plot_plane().axes[0].get_xlabel() == "east (m)"
     assert car.comparisons[0][0].units == ("m", "m")
-    line = next(line for line in write_report(car).splitlines() if line.split()[:2] == ["east", "80"])
+    line = next(line for line in car.report().splitlines() if line.split()[:2] == ["east", "80"])
     assert line.split()[3] == "m"
     car.save(tmp_path / "fit.json")
     assert sf.Estimate.load(tmp_path / "fit.json").comparisons[0][0].units == ("m", "m")
@@ -239,9 +238,7 @@ def test_ellipses_along_a_path_are_the_covariance_of_predictions(car):
 def test_channels_of_a_plane_can_be_named_and_must_exist(car, heater):
     ax = car.plot_plane(channels=("north", "east")).axes[0]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("north (m)", "east (m)")
-    with pytest.raises(
-        ValueError, match=r"no two channels of the same data are \('up', 'east'\); they are east, north"
-    ):
+    with pytest.raises(ValueError, match=r"no two channels of the same data are .*they are .?east.?, .?north"):
         car.plot_plane(channels=("up", "east"))
     with pytest.raises(ValueError, match="no two channels of the same data are positions in a plane"):
         heater.plot_plane()
@@ -268,7 +265,8 @@ def test_cost_over_two_unknowns(car):
 
 def test_bounds_are_drawn_where_they_are_in_the_map():
     problem = heater_problem()
-    tight = sf.Problem(problem.system, problem.experiments, {"k": sf.Parameter(0.39, lower=0.385, upper=3.0)})
+    limits = {**problem.parameters, "k": sf.Parameter(0.39, lower=0.385, upper=3.0, unit="1/h")}
+    tight = sf.Problem(problem.system, problem.experiments, limits)
     ax = sf.estimate(tight).plot_cost("tau_1", "k", points=9).axes[0]
     assert ax.get_ylim()[0] == 0.385
     (bound,) = [line for line in ax.lines if line.get_label() == "bound"]
@@ -318,7 +316,7 @@ def test_the_region_agrees_with_the_profile(car):
 
 
 def test_a_region_needs_two_unknowns_that_are_determined(car):
-    with pytest.raises(ValueError, match=r"there is no unknown 'x'; the unknowns are 'tau_1'"):
+    with pytest.raises(ValueError, match=r"there is no unknown 'x'; the unknowns are tau_1, tau_2"):
         car.plot_region("x", "v")
     with pytest.raises(ValueError, match="first and second must be two different unknowns; got 'v' twice"):
         car.plot_cost("v", "v")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 import sys
 import threading
@@ -64,12 +65,12 @@ class NotebookBar:
             self._show("")
 
     def _show(self, html: str) -> None:
-        from IPython.display import HTML, display
+        shown = importlib.import_module("IPython.display")  # is there in a notebook alone
 
         if self._handle is None:
-            self._handle = display(HTML(html), display_id=True)
+            self._handle = shown.display(shown.HTML(html), display_id=True)
         else:
-            self._handle.update(HTML(html))
+            self._handle.update(shown.HTML(html))
 
 
 def show_progress(callback: Progress | None, title: str) -> tuple[Progress, Callable[[], None]]:
