@@ -174,7 +174,7 @@ def _draw_bounds(grid: CostGrid, ax: Axes) -> list[Any]:
         for bound in bounds:
             if values[0] <= bound <= values[-1]:
                 label = "" if found else "bound"
-                found.append(draw(bound, color=TRANSITION, linewidth=2 * LINE, label=label, zorder=3))
+                found.append(draw(bound, color=TRANSITION, linewidth=2 * LINE, label=label, zorder=3, clip_on=False))
     return found[:1]
 
 
