@@ -247,6 +247,10 @@ def test_channels_of_a_plane_can_be_named_and_must_exist(car, heater):
         car.plot_plane(channels=("up", "east"))
     with pytest.raises(ValueError, match="no two channels of the same data are positions in a plane"):
         heater.plot_plane()
+    with pytest.raises(ValueError, match="channels must be two names; got"):
+        car.plot_plane(channels=("east",))
+    with pytest.raises(TypeError, match="channels must be"):
+        car.plot_plane(channels=5)
     assert not replace(car, problem=None).plot_plane().axes[0].patches  # no model, no ellipses
 
 
@@ -320,6 +324,17 @@ def test_the_region_agrees_with_the_profile(car):
     assert min(part.min() for part in edge) > region.threshold
 
 
+def test_a_region_that_is_stopped_is_left_out_beyond_what_was_fitted(car):
+    region = compute_region(car, "tau_1", "w", points=5, callback=lambda done, total: done == 7)
+    assert np.isfinite(region.grid.costs).sum() == 7
+    small = replace(car, hessian=100 * car.hessian)  # whose first grid must be enlarged
+    assert (
+        np.isfinite(compute_region(small, "v", "w", points=5, callback=lambda done, total: done == 24).grid.costs).sum()
+        == 24
+    )
+    car.plot_region("tau_1", "w", points=5, callback=lambda done, total: done == 7).draw_without_rendering()
+
+
 def test_a_region_needs_two_unknowns_that_are_determined(car):
     with pytest.raises(ValueError, match=r"there is no unknown 'x'; the unknowns are tau_1, tau_2"):
         car.plot_region("x", "v")
@@ -327,6 +342,10 @@ def test_a_region_needs_two_unknowns_that_are_determined(car):
         car.plot_cost("v", "v")
     with pytest.raises(ValueError, match="points must be 5 or more; got 2"):
         car.plot_cost("v", "w", points=2)
+    with pytest.raises(ValueError, match="level must lie between 0 and 1; got 2"):
+        car.plot_region("v", "w", level=2)
+    with pytest.raises(TypeError, match="callback must be a function"):
+        car.plot_region("v", "w", callback=3)
     with pytest.raises(ValueError, match="loaded without its model"):
         replace(car, problem=None, evaluator=None).plot_cost("v", "w")
 

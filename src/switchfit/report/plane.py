@@ -10,7 +10,7 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.problem.data import FloatArray
-from switchfit.problem.validation import as_index, join_names, shorten
+from switchfit.problem.validation import as_index, as_names, join_names, shorten
 from switchfit.report.numbers import get_unit
 from switchfit.report.plot import choose_mode_colours, draw_dots
 from switchfit.report.style import (
@@ -122,6 +122,11 @@ def plot_plane(
     True
     """
     experiment = as_index(experiment, "experiment", len(estimate.trajectories))
+    if channels is not None:
+        names = as_names(channels, "channels", "two names of channels")
+        if len(names) != 2:
+            raise ValueError(f"channels must be two names; got {shorten(channels)}.")
+        channels = names[0], names[1]
     plane = _choose_plane(estimate, experiment, channels)
     threshold = compute_joint_threshold(estimate, level)
     return draw_on(ax, lambda ax: _draw_plane(estimate, experiment, plane, threshold, level, ax), (6.4, 5.6))

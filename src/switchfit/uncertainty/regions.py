@@ -21,7 +21,7 @@ from switchfit.fit.solution import constraints_of, minimize_cost
 from switchfit.optimize import Status
 from switchfit.optimize.constraints import LinearConstraints
 from switchfit.problem.data import FloatArray
-from switchfit.problem.validation import as_count, as_level, as_name, join_names, shorten
+from switchfit.problem.validation import as_callable, as_count, as_level, as_name, join_names, shorten
 from switchfit.runtime.progress import Progress, show_progress
 from switchfit.uncertainty.profiles import check_has_profile
 
@@ -233,20 +233,29 @@ def compute_region(
     pair = find_pair(fit, first, second)
     points = as_count(points, "points", at_least=FEWEST_POINTS)
     threshold = compute_joint_threshold(fit, level)
+    if callback is not None:
+        as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
     evaluator = estimate.evaluator_at_solution()
     check_has_profile(fit)
     spans = [_find_reach(estimate, k, level, threshold) for k in pair]
     bounds = [(float(fit.lower[k]), float(fit.upper[k])) for k in pair]
     scale = fit.residual_variance if fit.sigma_known is False else 1.0
     report, end = show_progress(callback, f"Region of {first} and {second}")
+    stopped: list[bool] = []
+
+    def stops(done: int, total: int) -> bool:
+        if report(done, total):
+            stopped.append(True)
+        return bool(stopped)
+
     try:
         for attempt in range(ENLARGEMENTS + 1):
             axes = [np.linspace(*span, points) for span in spans]
-            costs = _fit_grid(fit, evaluator, pair, axes, report)
+            costs = _fit_grid(fit, evaluator, pair, axes, stops)
             inside = 2 * (costs - fit.cost) / scale <= threshold
             open_sides = [[inside[:, 0].any(), inside[:, -1].any()], [inside[0].any(), inside[-1].any()]]
             wider = [_enlarge(*part) for part in zip(spans, bounds, open_sides, strict=True)]
-            if wider == spans or attempt == ENLARGEMENTS:
+            if wider == spans or stopped or attempt == ENLARGEMENTS:
                 break
             spans = wider
     finally:
