@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: help demo test test-slow fuzz coverage check format bench starts speed paper docs clean
+.PHONY: help demo test test-slow fuzz coverage check format bench starts speed paper docs release-check clean
 
 help:
 	@echo "make demo       fit a measured toss and the paper's simulated vehicle: reports, figures in out/"
@@ -15,7 +15,9 @@ help:
 	@echo "make bench      measure speed;  make speed: and put the figures into the documentation"
 	@echo "make starts     from which starts the right answer is found, for many problems and methods (an hour; goes on)"
 	@echo "make paper      every experiment and figure of the paper, into out/paper and the documentation (ten minutes)"
-	@echo "make docs       build the documentation;  make clean: remove what was built"
+	@echo "make docs       build the documentation, into out/docs"
+	@echo "make release-check  build wheel and sdist, install them into new environments and fit there (minutes)"
+	@echo "make clean      remove what was built"
 
 demo: $(VENV)/.installed-report
 	$(BIN)/switchfit fit examples/toss/problem.toml --out out/demo
@@ -58,6 +60,9 @@ paper: $(VENV)/.installed
 	$(BIN)/switchfit paper --out out/paper
 	cp out/paper/table.md docs/paper-results.md
 	cp out/paper/results.json docs/paper-results.json
+
+release-check: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest tests/test_release.py -m "slow or not slow" -s
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/sphinx-build -W --keep-going -q docs out/docs

@@ -3,6 +3,9 @@
 A state rests at 0 and rises to 1 with the time constant 1/8 s from tau on; it is sampled every 0.1 s, so that most of
 what is known about tau comes from the one or two samples after it. ``python benchmarks/coverage.py [RUNS]`` prints the
 table of ``docs/coverage-results.md``.
+
+The last column is computed apart, without switchfit: the region where twice the rise of the profile stays below the
+quantile of chi², from the solution in closed form on a grid of tau and k. It is what the likelihood ratio can do.
 """
 
 from __future__ import annotations
@@ -17,18 +20,21 @@ from switchfit.fit.result import Fit
 
 TIMES = np.arange(1, 41) / 10
 RATE, SIGMA, RUNS = 8.0, 0.05, 1000
+CHI2 = 3.841458820694124
+"""95 % quantile of chi² with one degree of freedom."""
 PLACES = {2.0: "on a sample", 2.01: "0.01 s beside it", 2.05: "between two samples"}
 
 
 class Coverage(NamedTuple):
-    """Parts of the intervals that hold the truth, of single fits and of `estimate_many`, and of the fits that end at a
-    kink.
+    """Parts of the intervals that hold the truth, of single fits and of `estimate_many`, of the fits that end at a
+    kink, and of the regions of the likelihood ratio that hold the truth.
     """
 
     quadratic: float
     piecewise: float
     many: float
     at_kink: float
+    exact: float
 
 
 def rest(t: Any, x: Any, p: Any) -> Any:
@@ -56,19 +62,41 @@ def measure_coverage(tau: float, runs: int, *, rate_known: bool, seed: int = 5) 
     logs = [(clean + SIGMA * rng.standard_normal(len(TIMES)))[:, None] for _ in range(runs)]
     problems = [build_problem(values, tau, rate_known=rate_known) for values in logs]
     counts = np.zeros(4)
+    exact = float(np.mean(compare_likelihoods(np.array(logs)[:, :, 0], tau, rate_known=rate_known) <= CHI2))
     together = sf.estimate_many(problems).confidence_intervals()[:, 0]
     for problem, (least, most) in zip(problems, together, strict=True):
         fit = sf.estimate(problem, strategy="local")
         (low, high), (lower, upper) = Fit.confidence_intervals(fit)[0], fit.confidence_intervals()[0]
         counts += low <= tau <= high, lower <= tau <= upper, least <= tau <= most, bool(fit.kinks)
-    return Coverage(*(counts / runs))
+    return Coverage(*(counts / runs), exact)
+
+
+def compare_likelihoods(logs: np.ndarray, tau: float, *, rate_known: bool) -> np.ndarray:
+    """Return twice the rise of the profile at the true tau above its lowest minimum, for each log: (R,).
+
+    Parameters
+    ----------
+    logs : (R, K)
+    tau : float
+    rate_known : bool
+    """
+    taus = np.unique(np.append(np.linspace(tau - 0.25, tau + 0.25, 501), tau))
+    rates = np.array([RATE]) if rate_known else np.geomspace(2.0, 40.0, 400)
+    after = np.maximum(TIMES - taus[:, None], 0.0)
+    profiles = np.full((len(taus), len(logs)), np.inf)
+    for k in rates:
+        outputs = 1 - np.exp(-k * after)
+        costs = 0.5 * np.sum(outputs**2, axis=1)[:, None] - outputs @ logs.T
+        np.minimum(profiles, costs, out=profiles)
+    here = int(np.searchsorted(taus, tau))
+    return 2 * (profiles[here] - profiles.min(axis=0)) / SIGMA**2
 
 
 def main(runs: int = RUNS) -> None:
     """Print the table."""
     kinds = "theta ± quantile x standard error | piecewise | of `estimate_many`"
-    print(f"| true transition time | rate | {kinds} | fits at a kink |")
-    print("|---|---|---|---|---|---|")
+    print(f"| true transition time | rate | {kinds} | fits at a kink | likelihood ratio, computed apart |")
+    print("|---|---|---|---|---|---|---|")
     for tau, place in PLACES.items():
         for known in (True, False):
             found = measure_coverage(tau, runs, rate_known=known)

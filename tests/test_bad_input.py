@@ -129,7 +129,7 @@ def test_state_names_are_counted_where_the_initial_state_is_a_function():
         (lambda: samples([0.0, 1.0], [1.0]), ValueError, ["one row of values for each time; got 2 times, 1 rows"]),
         (lambda: samples([], []), ValueError, ["Measurements needs 1 sample(s) or more; got 0"]),
         (lambda: samples([math.nan], [1.0]), ValueError, ["Measurements times must be finite; got nan at index [0]"]),
-        (lambda: samples("a", "b"), ValueError, ["Measurements times must be an array of numbers; got 'a'"]),
+        (lambda: samples("a", "b"), ValueError, ["Measurements times must be a number or a date; got 'a'"]),
         (lambda: samples([0.0], [[[1.0]]]), ValueError, ["values of shape (K,) or (K, q)", "(1,) and (1, 1, 1)"]),
         (lambda: samples([0.0], [math.inf]), ValueError, ["must be finite, or NaN where a sample is missing"]),
         (lambda: samples([0.0], [math.nan]), ValueError, ["Measurements values are all NaN: there is nothing to fit"]),
@@ -190,7 +190,7 @@ def test_data(build, error, said):
 @pytest.mark.parametrize(
     ("build", "said"),
     [
-        (lambda: sf.Parameter("a"), ["Parameter value must be a number or an array of numbers; got 'a'"]),
+        (lambda: sf.Parameter("a"), ["Parameter value must be a number or a date; got 'a'"]),
         (lambda: sf.Parameter([1.0, 2.0], lower=[1, 2, 3]), ["Parameter needs numbers", "lower [1.0, 2.0, 3.0]"]),
         (lambda: sf.Parameter([]), ["Parameter value must have one entry or more"]),
         (lambda: sf.Parameter(math.nan), ["Parameter value must be finite; got nan"]),
@@ -673,7 +673,7 @@ PRIOR = {"k": sf.Parameter(1.0, prior=sf.Normal(1.0, 0.1))}
             ["must stay positive", "lower bound -inf"],
         ),
         (lambda: sf.Normal(0.0, 0.0), ValueError, ["Normal sd must be positive; got 0.0"]),
-        (lambda: sf.Normal("a", 1.0), ValueError, ["Normal mean must be a number or an array of numbers; got 'a'"]),
+        (lambda: sf.Normal("a", 1.0), ValueError, ["Normal mean must be a number or a date; got 'a'"]),
         (lambda: sf.Normal(0.0, math.inf), ValueError, ["Normal sd must be finite; got inf"]),
         (lambda: sf.LogNormal(0.0, 1.0), ValueError, ["LogNormal median must be positive; got 0.0"]),
     ],

@@ -154,8 +154,10 @@ def test_check(folder):
 def test_check_fails_where_derivatives_are_wrong(folder, monkeypatch):
     class Wrong:
         passed = False
+        observed_orders = (1.0, 1.0, 1.0)
+        gradient_gap = hessian_gap = float("nan")
 
-    monkeypatch.setattr(sf, "check_derivatives", lambda problem: Wrong())
+    monkeypatch.setattr(sf, "check_derivatives", lambda problem, paper: Wrong())
     assert run("check", folder / "problem.toml").exit_code == 1
 
 
@@ -178,7 +180,8 @@ def test_version_and_help():
     result = run("--version")
     assert result.exit_code == 0
     assert result.stdout == f"switchfit {sf.__version__}\n"
-    for arguments in (["--help"], ["fit", "--help"], ["check", "--help"], ["simulate", "--help"]):
+    for name in ("", "init", "fit", "check", "simulate", "examples", "paper"):
+        arguments = [name, "--help"] if name else ["--help"]
         result = run(*arguments)
         assert result.exit_code == 0
         assert "Usage" in result.stdout
@@ -271,7 +274,7 @@ def test_ctrl_c_is_an_interrupt_wherever_it_comes(tmp_path):
 
 def test_ctrl_c_that_is_ignored_stays_so(folder, monkeypatch):
     """As in a background job of a shell script."""
-    monkeypatch.setattr(sf, "check_derivatives", lambda problem: signal.raise_signal(signal.SIGINT) or 1 / 0)
+    monkeypatch.setattr(sf, "check_derivatives", lambda problem, paper: signal.raise_signal(signal.SIGINT) or 1 / 0)
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         assert run("check", folder / "problem.toml").exit_code == 3
@@ -311,14 +314,14 @@ def test_model_that_raises_later(folder, monkeypatch):
     (folder / "late.py").write_text(ROOM + "\ndef late():\n    raise LookupError('not today')\n")
     (folder / "late.toml").write_text(PROBLEM.replace("room.py", "late.py"))
     late = load_problem(folder / "late.toml").problem.system.modes["on"].__globals__["late"]
-    monkeypatch.setattr(sf, "check_derivatives", lambda problem: late())
+    monkeypatch.setattr(sf, "check_derivatives", lambda problem, paper: late())
     result = run("check", folder / "late.toml")
     assert result.exit_code == 2
     assert "late.py, line 13, in late: LookupError: not today. (--debug shows the full traceback.)" in result.stderr
 
 
 def test_error_of_our_own_is_not_hidden(folder, monkeypatch):
-    def broken(problem):
+    def broken(problem, paper):
         raise ZeroDivisionError("ours")
 
     monkeypatch.setattr(sf, "check_derivatives", broken)
@@ -355,6 +358,150 @@ def test_a_full_disk_leaves_the_old_file_and_says_so(folder, tmp_path, monkeypat
     assert f"{tmp_path / 'report.txt'} cannot be written: No space left on device; name another" in result.stderr
     assert (tmp_path / "report.txt").read_text() == "before"
     assert list(tmp_path.iterdir()) == [tmp_path / "report.txt"]
+
+
+# --- for scripts, and for those who watch -----------------------------------------------------------------------------
+
+
+def read_json(result):
+    """The one JSON value on stdout, without NaN and infinity, which are no JSON."""
+
+    def refuse(constant):
+        raise ValueError(constant)
+
+    return json.loads(result.stdout, parse_constant=refuse)
+
+
+def test_fit_as_json(folder, tmp_path):
+    result = run("fit", folder / "problem.toml", "--json", "--out", tmp_path, "--no-figures")
+    assert result.exit_code == 0, result.output
+    found = read_json(result)
+    assert found["verdict"] == "good"
+    assert found["converged"] is True
+    assert found["engine"] == {"name": "native", "reason": None}
+    assert found["out"] == str(tmp_path)
+    unknowns = {entry["name"]: entry for entry in found["unknowns"]}
+    assert unknowns["tau_1"]["value"] == pytest.approx(3.2, rel=1e-5)
+    assert unknowns["tau_1"]["low"] < 3.2 < unknowns["tau_1"]["high"]
+    assert unknowns["tau_1"]["unit"] == "s"
+    assert [mode["mode"] for mode in found["runs"][0]["modes"]] == ["on", "off"]
+    assert (tmp_path / "estimate.json").is_file()
+    result = run("fit", folder / "problem.toml", "--json", "--max-iterations", 1)
+    assert result.exit_code == 1
+    assert read_json(result)["converged"] is False
+    assert "not converged" in result.stderr
+
+
+def test_many_logs_as_json(folder, tmp_path):
+    (tmp_path / "bad.csv").write_text("t,T\n0,1\nx,2\n")
+    result = run("fit", folder / "log.csv", tmp_path / "bad.csv", "--problem", folder / "problem.toml", "--json")
+    assert result.exit_code == 2
+    good, bad = read_json(result)["logs"]
+    assert (good["log"], good["verdict"]) == (str(folder / "log.csv"), "good")
+    assert bad["verdict"] == "refused"
+    assert "bad.csv" in bad["message"]
+
+
+def test_check_as_json(folder):
+    found = read_json(run("check", folder / "problem.toml", "--json"))
+    assert found["derivatives"]["passed"] is True
+    np.testing.assert_allclose(found["derivatives"]["orders"], [1, 2, 3], atol=0.2)
+    assert found["derivatives"]["gradient_gap"] is None  # the paper's equations are for --full
+    assert found["identifiability"]["undetermined"] == 0
+    assert [entry["name"] for entry in found["unknowns"]] == ["tau_1", "heating"]
+    assert found["unknowns"][1]["upper"] is None
+    full = read_json(run("check", folder / "problem.toml", "--json", "--full"))
+    assert full["derivatives"]["gradient_gap"] < 1e-4
+    assert read_json(run("check", folder / "problem.toml", "--json", "--no-run"))["issues"] == []
+
+
+def test_simulate_as_json(folder, tmp_path):
+    result = run("simulate", folder / "problem.toml", "--json")
+    assert result.exit_code == 0, result.output
+    (found,) = read_json(result)["runs"]
+    assert set(found["modes"]) == {"on", "off"}
+    assert len(found["times"]) == len(found["states"]["T"])
+    assert found["states"]["T"][0] == 0.0
+    result = run("simulate", folder / "problem.toml")
+    assert result.exit_code == 2
+    assert "name the file to write with --out FILE.csv, or give --json" in result.stderr
+
+
+@pytest.mark.parametrize("command", [["fit"], ["check"]])
+def test_quiet_prints_nothing(folder, tmp_path, command):
+    result = run(*command, folder / "problem.toml", "--quiet")
+    assert (result.exit_code, result.output) == (0, "")
+    result = run("fit", folder / "problem.toml", "--quiet", "--max-iterations", 1, "--out", tmp_path, "--no-figures")
+    assert (result.exit_code, result.output) == (1, "")
+    result = run(*command, folder / "none.toml", "--quiet")
+    assert result.exit_code == 2
+    assert "There is no problem file" in result.stderr
+    result = run(*command, folder / "problem.toml", "--quiet", "--verbose")
+    assert result.exit_code == 2
+    assert "contradict each other" in result.stderr
+
+
+def test_verbose_says_what_is_done(folder):
+    result = run("fit", folder / "problem.toml", "--verbose", "--strategy", "thorough")
+    assert result.exit_code == 0, result.output
+    assert "iteration 1: J = " in result.stderr
+    assert "strategy: scan over sample intervals (lowest J so far: " in result.stderr
+    assert "Evaluated in machine code." in result.stderr
+    assert "iteration" not in result.stdout.replace("iterations", "")
+    assert run("fit", folder / "problem.toml").stderr == ""  # the log of the library is quiet again
+
+
+def test_check_is_one_screen_of_many_runs(tmp_path, folder):
+    """And needs no JAX program: the paper's equations take longer than a fit to compile."""
+    (tmp_path / "room.py").write_text(ROOM)
+    (tmp_path / "log.csv").write_text((folder / "log.csv").read_text())
+    head, run_table = PROBLEM.split("[[experiments]]")
+    parts = [f'[[experiments]]\nname = "r{k}"\n{run_table.strip()}' for k in range(12)]
+    (tmp_path / "problem.toml").write_text("\n\n".join([head, *parts]))
+    result = run("check", tmp_path / "problem.toml")
+    assert result.exit_code == 0, result.output
+    lines = result.stdout.splitlines()
+    assert len(lines) < 50
+    assert "and 9 more experiments: --full lists them" in result.stdout
+    assert "and 5 more" in result.stdout
+    assert "in all 12 experiments" in result.stdout
+    assert "Paper's equations" not in result.stdout
+    result = run("check", tmp_path / "problem.toml", "--full")
+    assert "Experiment 12 (r11)" in result.stdout
+    assert "Paper's equations" in result.stdout
+
+
+# --- completion -------------------------------------------------------------------------------------------------------
+
+
+def complete(words, cwd):
+    """What the shell is told for the last of the words."""
+    program = "from switchfit.cli import main; main()"
+    asked = {"_SWITCHFIT_COMPLETE": "complete_bash", "COMP_WORDS": " ".join(words), "COMP_CWORD": str(len(words) - 1)}
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=os.environ | asked, cwd=cwd, capture_output=True, text=True, check=False
+    )
+    return done.stdout.split()
+
+
+def test_problem_files_options_and_examples_are_completed(folder, tmp_path):
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "two.toml").write_text("")
+    (tmp_path / "problem.toml").write_text("")
+    (tmp_path / "notes.txt").write_text("")
+    assert complete(["switchfit", "fit", ""], tmp_path) == ["runs/", "problem.toml"]
+    assert complete(["switchfit", "check", "runs/t"], tmp_path) == ["runs/two.toml"]
+    assert complete(["switchfit", "examples", "to"], tmp_path) == ["toss", "tosses"]
+    assert complete(["switchfit", "fit", "--ver"], tmp_path) == ["--verbose"]
+    assert complete(["switchfit", "si"], tmp_path) == ["simulate"]
+
+
+def test_completion_can_be_installed(tmp_path):
+    result = subprocess.run(
+        [sys.executable, "-c", "from switchfit.cli import main; main()", "--show-completion", "bash"],
+        capture_output=True, text=True, check=False, env=os.environ | {"HOME": str(tmp_path)},
+    )  # fmt: skip
+    assert "_SWITCHFIT_COMPLETE" in result.stdout, result.stderr
 
 
 # --- progress, and all of it ------------------------------------------------------------------------------------------

@@ -1,14 +1,19 @@
 """The blocks of code in README.md and on the pages, run as they stand: a page's blocks in order, in an empty folder."""
 
+import ast
 import re
+import runpy
 import shlex
 import shutil
+from functools import cache
 from pathlib import Path
 
+import jax
 import matplotlib
 import pytest
 from typer.testing import CliRunner
 
+import switchfit as sf
 from switchfit import cli
 from switchfit.io.problem_file import load_problem
 
@@ -22,8 +27,11 @@ PAGES = sorted(
 #: Pages that start processes.
 HEAVY = {"many-fits.md"}
 
+#: Blocks that are files and commands of one session; tests/test_first_ten_minutes.py runs them in order.
+SESSIONS = {"first-ten-minutes.md"}
+
 RUN = ("python", "sh", "console", "toml")
-NOT_CODE = ("text", "{image}", "{figure}", "{include}", "{toctree}", "")
+NOT_CODE = ("text", "{image}", "{figure}", "{glossary}", "{include}", "{toctree}", "")
 """Kinds of blocks that are run, and those that are not: what was printed, pictures, diagrams."""
 
 
@@ -36,14 +44,16 @@ def pages_with(*kinds):
     return [
         pytest.param(page, id=page.relative_to(ROOT).as_posix(), marks=[pytest.mark.slow] * (page.name in HEAVY))
         for page in PAGES
-        if any(kind in kinds for kind, _ in blocks_of(page))
+        if page.name not in SESSIONS and any(kind in kinds for kind, _ in blocks_of(page))
     ]
 
 
 def commands_of(page):
-    """Command lines of a page, without prompts and comments."""
-    text = "".join(block for kind, block in blocks_of(page) if kind in ("sh", "console"))
-    lines = [line.removeprefix("$ ") for line in text.splitlines()]
+    """Command lines of a page, without prompts, comments, and what commands print."""
+    blocks = blocks_of(page)
+    lines = [line for kind, block in blocks if kind == "sh" for line in block.splitlines()]
+    shown = [line for kind, block in blocks if kind == "console" for line in block.splitlines()]
+    lines += [line.removeprefix("$ ") for line in shown if line.startswith("$ ")]
     return [command for line in lines if (command := shlex.split(line, comments=True))]
 
 
@@ -52,7 +62,9 @@ def clone(tmp_path, monkeypatch):
     """A folder that has the examples, as a clone has, to work in."""
     shutil.copytree(ROOT / "examples", tmp_path / "examples", ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.chdir(tmp_path)
-    return tmp_path
+    before = jax.config.read("jax_enable_x64")  # a page on samplers turns it on
+    yield tmp_path
+    jax.config.update("jax_enable_x64", before)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
@@ -88,3 +100,49 @@ def test_problem_files_can_be_read(page, clone):
             file = clone / "examples" / "toss" / f"block_{k}.toml"
             file.write_text(block)
             assert load_problem(file).problem.theta_names
+
+
+@cache
+def read_texts():
+    """Return every text in the library, with a mark where an f-string puts a value; neighbouring literals are one."""
+    texts = []
+    for path in (ROOT / "src").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.JoinedStr):
+                texts.append("".join(part.value if isinstance(part, ast.Constant) else "…" for part in node.values))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                texts.append(node.value)
+    return "\n".join(texts)
+
+
+@pytest.mark.parametrize("name", ["troubleshooting.md", "what-now.md"])
+def test_messages_that_are_quoted_exist(name):
+    """In the first column of a table, what stands in quotation marks is a part of a message of the library."""
+    rows = re.findall(r"^\| (.+?) \|", (ROOT / "docs" / name).read_text(), re.MULTILINE)
+    quoted = [part for row in rows for message in re.findall(r'"([^"]+)"', row) for part in message.split("...")]
+    parts = [part.strip() for part in quoted if part.strip()]
+    assert len(parts) > 3
+    assert not [part for part in parts if part not in read_texts()]
+
+
+def test_every_public_name_is_in_the_reference():
+    listed = set(re.findall(r"^   (\w+)$", (ROOT / "docs" / "api.rst").read_text(), re.MULTILINE))
+    assert set(sf.__all__) <= listed, "add them to docs/api.rst, each to its topic"
+
+
+def test_every_page_is_in_the_contents():
+    """A page that no list of contents names is not found; a list that is added here has a place for each page."""
+    contents = re.findall(r"^```\{toctree\}\n(.*?)^```$", (ROOT / "docs" / "index.md").read_text(), re.M | re.S)
+    named = {line for block in contents for line in block.splitlines() if line and not line.startswith(":")}
+    pages = {path.stem for path in (ROOT / "docs").glob("*.md")}
+    included = {"index", "coverage-results", "starts-results", "paper-results"}
+    assert pages - included <= named
+
+
+def test_the_picture_of_the_readme_is_that_of_the_fit():
+    """Matplotlib writes each text of a figure as a comment into the SVG: the numbers are those of the fit."""
+    script = runpy.run_path(str(ROOT / "docs" / "idea_figures.py"))
+    picture = (ROOT / "docs" / "idea.svg").read_text(encoding="utf-8")
+    texts = re.findall("<!-- (.+?) -->", picture)
+    assert set(script["write_numbers"](script["fit"]())) <= set(texts), "run python docs/idea_figures.py"
+    assert len(picture) < 200_000

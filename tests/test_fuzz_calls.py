@@ -375,8 +375,10 @@ def catalogue():
             build_experiment,
             {"data": measurements()}
             | RUN
-            | {"inputs": None, "initial_state": [1.0, 0.5], "name": "drive", "parameter_map": {"k": "k"}},
+            | {"inputs": None, "initial_state": [1.0, 0.5], "name": "drive", "parameter_map": {"k": "k"}}
+            | {"jumps": [sf.Jump(0.7, reset)]},
             words={
+                "jumps": ("jump", "Jump"),
                 "transition_times": ("transition", "tau"),
                 "t0": ("t0", "at t ="),
                 "tf": ("tf", "t ="),
@@ -391,7 +393,14 @@ def catalogue():
                 "transition_times": lambda bad: [bad],
                 "initial_state": lambda bad: [1.0, bad],
                 "parameter_map": lambda bad: {"k": bad},
+                "jumps": lambda bad: [bad],
             },
+        ),
+        "Jump": Door(
+            lambda **given: used(problem(experiment(jumps=[sf.Jump(**given)]))),
+            {"time": [0.2, 0.7], "map": reset},
+            words={"time": ("Jump",), "map": ("Jump",)},
+            inside={"time": lambda bad: [0.2, bad]},
         ),
         "Problem": Door(
             build_problem,
@@ -472,6 +481,7 @@ def catalogue():
             words={"times": ("times", "samples", "known over"), "values": ("values", "rows", "mode", "samples")},
             inside={"times": lambda bad: [bad, *TIMES[1:]], "values": lambda bad: [bad, *TIMES[1:]]},
         ),
+        "from_epoch": Door(sf.from_epoch, {"numbers": [1.6e9, 1.7e9], "unit": "s"}, words={"unit": ("s", "ms")}),
         "read_log": Door(
             sf.read_log,
             {"path": log_file(), "columns": ["x", "yaw"], "time": "t", "time_unit": "ms", "topic": None}

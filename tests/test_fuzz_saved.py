@@ -45,15 +45,15 @@ def saved() -> list[dict[str, Any]]:
 
 
 def _content(fit: Fit) -> dict[str, Any]:
-    from switchfit.estimation.saved import FORMAT, VERSION, _to_json
+    from switchfit.estimation.saved import FORMAT, VERSION, to_json
 
     return json.loads(
         json.dumps(
             {
                 "format": FORMAT,
                 "version": VERSION,
-                "fit": _to_json(fit, Fit),
-                "certificate": _to_json(CERTIFICATE, Certificate),
+                "fit": to_json(fit, Fit),
+                "certificate": to_json(CERTIFICATE, Certificate),
             }
         )
     )

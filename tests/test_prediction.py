@@ -99,6 +99,18 @@ def test_gradient_and_gauss_newton_matrix_follow_from_those_at_the_samples(name)
     assert len(samples.time) == problem.experiments[0].data[0].count
 
 
+def test_samples_with_a_known_delay_are_those_of_earlier_states():
+    """x = exp(-k (t - delay)): the derivative in k, and the matrix that the engine sums by itself."""
+    times, delay = np.linspace(1.0, 6.0, 11), 0.37
+    data = sf.Measurements(times, np.exp(-0.5 * (times - delay)), sigma=SIGMA, delay=delay)
+    system = sf.HybridSystem({"decay": lambda t, x, p: -p["k"] * x}, [1.0])
+    fit = sf.estimate(sf.Problem(system, sf.Experiment(data, ("decay",), (), 0.0, 7.0), {"k": 0.4}))
+    samples = collect_sample_derivatives(fit.problem, fit.sensitivities)
+    seen = times - delay
+    np.testing.assert_allclose(samples.derivative[:, 0], -seen * np.exp(-fit.theta[0] * seen), rtol=1e-6)
+    np.testing.assert_allclose(fit.gauss_newton, fit.evaluator(fit.theta, matrix="gauss-newton").hessian, rtol=1e-9)
+
+
 def test_several_experiments_have_their_own_transition_times():
     data = sf.Measurements(TIMES, temperature(TIMES, 2.1, 1.0, 0.4), sigma=SIGMA)
     fixed = sf.Parameter(2.4, fixed=True)
@@ -171,8 +183,8 @@ def test_left_out_times_are_the_nodes_with_each_transition_twice():
 
 def test_what_cannot_be_predicted():
     fit = sf.estimate(noisy())
-    with pytest.raises(ValueError, match=r"times must lie inside \[t0, tf\] = \[0.0, 6.0\] s; got 6.5"):
-        fit.predict([1.0, 6.5])
+    with pytest.raises(ValueError, match=r"times must not lie before t0 = 0.0 s, .*; got -0.5"):
+        fit.predict([1.0, -0.5])
     with pytest.raises(ValueError, match="times must be finite numbers of shape"):
         fit.predict([np.nan])
     with pytest.raises(ValueError, match=r"experiment must lie in 0..0; got 1"):
@@ -184,6 +196,68 @@ def test_what_cannot_be_predicted():
     without = sf.estimate(sf.Problem(ROOM, run, {"power": 1.0, "k": sf.Parameter(0.4, fixed=True)}))
     with pytest.raises(ValueError, match="There are no bands without a covariance"):
         without.predict()
+
+
+# Beyond tf
+
+
+def test_after_tf_the_last_mode_goes_on_in_closed_form():
+    fit = sf.estimate(noisy())
+    times = np.array([1.0, 6.0, 6.5, 9.0, 20.0])
+    found = fit.predict(times)
+    X = slopes(times, *fit.theta)
+    errors = np.sqrt(np.einsum("ki,ij,kj->k", X, fit.covariance, X))
+    np.testing.assert_allclose(found.states[:, 0], temperature(times, *fit.theta), rtol=1e-8)
+    np.testing.assert_allclose(found.output_errors[:, 0], errors, rtol=1e-5, atol=1e-9)
+    np.testing.assert_array_equal(found.noise, SIGMA)
+    inside = fit.predict(times[:2])
+    np.testing.assert_allclose(found.outputs[:2], inside.outputs, rtol=1e-9)
+    np.testing.assert_allclose(found.output_errors[:2], inside.output_errors, rtol=1e-9)
+
+
+def test_after_tf_of_one_of_several_runs():
+    data = sf.Measurements(TIMES, temperature(TIMES, 2.1, 1.0, 0.4), sigma=SIGMA)
+    runs = [sf.Experiment(data, ("on", "off"), (tau,), 0.0, 6.0) for tau in (2.0, 2.2)]
+    fit = sf.estimate(sf.Problem(ROOM, runs, {"power": 1.0, "k": 0.4}))
+    found = fit.predict([8.0], experiment=1)
+    assert found.experiment == 1
+    X = slopes(np.array([8.0]), *fit.theta[1:])[0]
+    assert found.output_errors[0, 0] == pytest.approx(np.sqrt(X @ fit.covariance[1:, 1:] @ X), rel=1e-5)
+
+
+def test_after_tf_a_held_input_keeps_its_last_value_and_any_other_must_be_known():
+    def driven(t, x, p, u):
+        return -p["k"] * x + u
+
+    def fit(kind):
+        inputs = sf.Input(np.arange(7.0), np.ones(7), kind=kind)
+        values = 2.5 * (1 - np.exp(-0.4 * TIMES))
+        run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("on",), (), 0.0, 6.0, inputs=inputs)
+        return sf.estimate(sf.Problem(sf.HybridSystem({"on": driven}, [0.0]), run, {"k": 0.3}))
+
+    assert fit("hold").predict([9.0]).outputs[0, 0] == pytest.approx(2.5 * (1 - np.exp(-3.6)), rel=1e-6)
+    with pytest.raises(ValueError, match=r"cannot be continued from tf = 6 to 9 s: Input must be known.*Input that"):
+        fit("linear").predict([9.0])
+
+
+def test_after_a_tf_that_is_estimated_there_is_nothing():
+    system = sf.HybridSystem({"on": lambda t, x, p: p["power"] + 0.0 * x}, [0.0])
+    data = sf.Measurements(TIMES, TIMES, sigma=SIGMA)
+    run = sf.Experiment(data, ("on",), (), 0.0, sf.Parameter(7.0, 6.5, 8.0, prior=sf.Normal(7.0, 0.1)))
+    fit = sf.estimate(sf.Problem(system, run, {"power": 1.1}))
+    with pytest.raises(ValueError, match=r"times must not lie after tf where tf is estimated.*; got 9"):
+        fit.predict([9.0])
+
+
+def test_the_figure_of_a_forecast():
+    fit = sf.estimate(noisy())
+    figure = fit.predict(np.linspace(0.0, 9.0, 60)).plot(level=0.9)
+    (panel,) = figure.axes
+    assert panel.get_xlim()[1] >= 9.0
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert {"measured", "90 % prediction", "90 % confidence"} <= set(labels)
+    assert any(line.get_label() == "end of the data" for line in panel.lines)
+    figure.draw_without_rendering()
 
 
 def test_bands_in_the_figure():

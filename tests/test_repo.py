@@ -6,7 +6,6 @@ import inspect
 import pkgutil
 import re
 import subprocess
-import tomllib
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,6 @@ from switchfit.io import problem_file
 
 ROOT = Path(__file__).parent.parent
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
 def tracked():
@@ -114,11 +112,6 @@ def test_defaults_in_the_reference_are_those_of_the_library():
         assert any(
             line.startswith(f"| {key}") and line.endswith(f"| {default} |") for line in reference.splitlines()
         ), key
-
-
-def test_versions_agree():
-    assert sf.__version__ == PROJECT["project"]["version"]
-    assert f"version: {sf.__version__}\n" in (ROOT / "CITATION.cff").read_text()
 
 
 def test_links_in_the_pages_lead_somewhere():

@@ -10,7 +10,7 @@ from models import decay
 from typer.testing import CliRunner
 
 import switchfit as sf
-from switchfit.batch.program import Layout, _total, read_sequences
+from switchfit.batch.program import Layout, evaluate_total, read_sequences
 from switchfit.cli import app
 from switchfit.discretization.mesh import choose_common_lengths, pad_length
 from switchfit.engine.native.program import _program_of
@@ -510,7 +510,7 @@ def test_a_batch_of_runs_with_times_that_are_known():
         times = tuple(run.initial_times for run in problem.experiments)
         with jax.enable_x64(True):
             given_here = layout, tuple(evaluator.arguments), times, read_sequences(layout, problem.structures)
-            found = jax.jit(lambda theta, here=given_here: _total(*here, theta, jnp.ones(())))(theta)
+            found = jax.jit(lambda theta, here=given_here: evaluate_total(*here, theta, jnp.ones(())))(theta)
         expected = evaluator(theta)
         for one, other in zip(found, (expected.cost, expected.gradient, expected.hessian), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-8)

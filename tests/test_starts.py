@@ -179,6 +179,20 @@ def test_ipopt_finds_the_same_answer():
     assert peers.why_no_ipopt(build_case("ball"))
 
 
+@pytest.mark.parametrize("name", ["paper-positions", "two-turns", "two-turns-anywhere"])
+def test_ipopt_between_samples_minimizes_the_same_cost(name):
+    pytest.importorskip("casadi")
+    case = build_case(name)
+    assert not peers.why_no_ipopt(case)
+    end = peers.fit_with_ipopt(case, case.near)
+    there = judge(case.problem, end.theta)
+    assert end.claims
+    assert end.said == pytest.approx(there["cost"], rel=1e-4)
+    best = sf.estimate(case.problem, start=case.near).cost
+    assert case.is_right(there["cost"], best)
+    assert there["cost"] <= best * (1 + 1e-4)
+
+
 def test_verdicts_count_where_there_are_any():
     fit = sf.estimate(build_case("linear").problem, strategy="local")
     assert methods.read_estimate(fit).claims

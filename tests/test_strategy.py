@@ -12,6 +12,7 @@ import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.random_starts import draw_starts
 from switchfit.optimize import Status
+from switchfit.strategy import choice, horizon
 from switchfit.strategy.choice import FEW_STARTS, Search, without_guards
 from switchfit.strategy.horizon import can_grow, find_shared, grow_horizon
 from switchfit.strategy.quick import fit_briefly
@@ -113,6 +114,23 @@ def test_the_horizon_grows_where_sigma_is_left_out_whatever_the_unit(unit):
     end = grow_horizon(problem, problem.initial_theta)
     assert end.evaluations > 100
     assert end.cost == pytest.approx(right.cost * unit**2, rel=1e-4)
+
+
+def test_the_horizon_grows_where_a_delay_is_a_parameter():
+    """Samples are taken in by the least delay that they may have."""
+    times = TIMES[:-1]
+    values = temperatures(times - 0.1, TRUTH[:5], *TRUTH[5:])
+
+    def pose(guess):
+        data = sf.Measurements(times, values, sigma=0.02, delay="late")
+        run = sf.Experiment(data, ("on", "off") * 3, tuple(guess), 0.0, 10.0)
+        late = sf.Parameter(0.05, lower=0.0, upper=0.2)
+        return sf.Problem(HEATER, run, {"power": 1.2, "k": 0.6, "late": late})
+
+    problem = pose(FAR)
+    end = grow_horizon(problem, problem.initial_theta)
+    assert end.evaluations > 100
+    np.testing.assert_allclose(end.theta, [*TRUTH, 0.1], atol=1e-4)
 
 
 def grow_logistically(capacity):
@@ -490,6 +508,29 @@ def test_a_guess_that_cannot_be_integrated_is_a_bad_start():
     np.testing.assert_allclose(found.theta, [1.0, 0.5], atol=0.02)
 
 
+def test_a_budget_of_time_ends_a_growing_horizon_under_way(monkeypatch):
+    """The clock of the search is one of fits: each takes a second."""
+    clock, fitted = [0.0], []
+
+    def fit(*given, **settings):
+        clock[0] += 1.0
+        fitted.append(clock[0])
+        return fit_briefly(*given, **settings)
+
+    monkeypatch.setattr(horizon, "fit_briefly", fit)
+    monkeypatch.setattr(choice.time, "perf_counter", lambda: clock[0])
+    whole = sf.estimate(thermostat(FAR))
+    step = next(step for step in whole.steps if step.strategy == choice.GROW)
+    assert (len(fitted) > 10, step.ended) == (True, "")
+    clock[0], fitted[:] = 0.0, []
+    found = sf.estimate(thermostat(FAR), time_budget=4.5)
+    assert len(fitted) <= 5 + horizon.TRIED
+    assert found.steps[-1].strategy == choice.GROW
+    assert found.steps[-1].ended == "time"
+    assert "ended by time_budget" in " ".join(str(found).split())
+    assert found.cost == sf.estimate(thermostat(FAR), strategy="local").cost
+
+
 def test_a_budget_of_time_ends_the_search():
     found = sf.estimate(thermostat(FAR), time_budget=1e-6)
     assert [step.strategy for step in found.steps] == ["local"]
@@ -502,7 +543,7 @@ def test_a_budget_of_time_ends_the_search():
 def test_an_interrupted_search_keeps_the_best(monkeypatch):
     from switchfit.strategy import choice
 
-    def interrupted(problem, theta):
+    def interrupted(problem, theta, stop):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(choice, "grow_horizon", interrupted)

@@ -19,7 +19,7 @@ from switchfit.optimize import Status
 from switchfit.report.text import report
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.identification import analyse
-from switchfit.uncertainty.residuals import diagnose, diagnose_channel
+from switchfit.uncertainty.residuals import _compare_sizes, are_uneven, diagnose, diagnose_channel
 
 TIMES = np.linspace(0.25, 6.0, 24)
 
@@ -413,3 +413,28 @@ def test_a_profile_of_the_sparse_vehicle_is_the_lowest_cost_there_is():
             for mu in (0.4, 0.7, 1.1):
                 other = found.trace._fit(point.value, np.array([tau_1, point.value, mu]))
                 assert other is None or other.cost >= point.cost - 1e-6
+
+
+def test_sizes_of_parts_are_compared_as_by_scipy():
+    random = np.random.default_rng(0)
+    parts = [random.normal(0.0, size, count) for size, count in ((1.0, 30), (1.4, 12), (0.8, 50))]
+    assert _compare_sizes(parts) == pytest.approx(scipy.stats.levene(*parts, center="median").pvalue, rel=1e-12)
+    assert _compare_sizes(parts[:1]) == 1.0
+
+
+def test_a_short_misfit_that_whiteness_misses_is_seen():
+    """In the last quarter the residuals are twice as large, one by one independent."""
+    system = sf.HybridSystem({"a": lambda t, x, p: 0.0 * x, "b": lambda t, x, p: 0.0 * x}, [0.0])
+    times = np.linspace(0.1, 8.0, 80)
+
+    def fit(size):
+        noise = np.random.default_rng(2).standard_normal(80) * np.where(times > 6.0, size, 1.0)
+        data = sf.Measurements(times, 2.0 + noise, observe=lambda t, x, p: p["level"] + x)
+        tau = sf.Parameter(6.0, fixed=True)
+        run = sf.Experiment(data, ("a", "b"), (tau,), 0.0, 8.1)
+        return sf.estimate(sf.Problem(system, run, {"level": 1.0}), strategy="local")
+
+    assert not are_uneven(fit(1.0))
+    short = fit(2.5)
+    assert short.residuals.channels[0].whiteness > 0.05
+    assert are_uneven(short)

@@ -204,6 +204,10 @@ def test_outliers_that_a_robust_loss_weighs_down_are_not_missed():
     assert right.verdict.reasons[0].figures["explained"] > 0.99
     wrong = fit(sf.Parameter(-0.2, fixed=True))  # nearly all samples are beyond the scale
     assert (wrong.verdict.level, kinds(wrong)) == ("bad", ["mostly outliers"])
+    near = fit(sf.Parameter(0.482, fixed=True))  # a third of them is, and the model explains 95 % of the others
+    assert (near.verdict.level, kinds(near)[0]) == ("doubtful", "large residuals")
+    assert "next: more starts" in steps(near)
+    assert "the typical residual of y1 is" in str(near.verdict)
 
 
 # --- corrected standard errors ----------------------------------------------------------------------------------------

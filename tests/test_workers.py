@@ -18,8 +18,6 @@ from switchfit.strategy import workers
 from switchfit.strategy.quick import fit_briefly
 from switchfit.strategy.starts import try_starts
 
-pytest.importorskip("cloudpickle")
-
 
 @pytest.fixture
 def started(monkeypatch):

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.stats import qmc
@@ -51,6 +52,29 @@ class Collocated:
 
 
 @dataclass(frozen=True, eq=False)
+class Sampled:
+    """What `benchmarks.peers.casadi_samples` makes a program of; all else follows from the problem.
+
+    Attributes
+    ----------
+    problem : of one experiment and one `Measurements`, its own parameters in the order of theta
+    field : ``field(mode, x, p, u, functions) -> list``, the vector fields entry by entry
+    observed : places of the observed states
+    input_times, inputs : times (L,) from which inputs (L, m) are held
+    resets : ``reset(x, functions) -> list`` by pair of modes
+    elements : elements of the collocation between two samples
+    """
+
+    problem: sf.Problem
+    field: Callable[..., list[Any]]
+    observed: tuple[int, ...]
+    input_times: tuple[float, ...] = ()
+    inputs: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    resets: Mapping[tuple[str, str], Callable[..., list[Any]]] = field(default_factory=dict)
+    elements: int = 1
+
+
+@dataclass(frozen=True, eq=False)
 class Case:
     """One problem with its starts.
 
@@ -73,7 +97,7 @@ class Case:
     near: np.ndarray
     starts: np.ndarray
     noisy: bool = False
-    collocation: Collocated | None = None
+    collocation: Collocated | Sampled | None = None
 
     @cached_property
     def cost_near(self) -> float:

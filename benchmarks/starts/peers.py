@@ -16,7 +16,7 @@ import numpy as np
 import scipy.optimize
 
 import switchfit as sf
-from benchmarks.starts.case import PERFECT, Case
+from benchmarks.starts.case import PERFECT, Case, Sampled
 from benchmarks.starts.end import End, judge
 from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, REFINEMENTS
 from switchfit.fit.evaluator import Evaluator
@@ -146,12 +146,41 @@ def fit_with_ipopt(case: Case, start: np.ndarray) -> End:
 @lru_cache(maxsize=4)
 def _collocate(case: Case) -> Any:
     """Return the program of a case, built once."""
-    from benchmarks.peers.casadi_collocation import Collocation  # CasADi need not be there
+    # CasADi need not be there.
+    from benchmarks.peers.casadi_collocation import Collocation
+    from benchmarks.peers.casadi_samples import SampledCollocation
 
     given = case.collocation
     if given is None:
         raise ValueError("this case has no model for a collocation.")
+    if isinstance(given, Sampled):
+        return SampledCollocation(_sample_model(given))
     return Collocation(given.model, ELEMENTS, given.bounds, given.reference)
+
+
+def _sample_model(given: Sampled) -> Any:
+    """Return the model of a case for the collocation between samples."""
+    from benchmarks.peers.casadi_samples import SampledModel
+
+    problem = given.problem
+    (run,) = problem.experiments
+    (data,) = run.data
+    parameters = ~problem.unknowns.is_time
+    return SampledModel(
+        field=given.field,
+        sequence=run.mode_sequence,
+        horizon=(run.t0, run.end),
+        x0=tuple(np.asarray(problem.system.initial_state, dtype=float).tolist()),
+        bounds=(problem.unknowns.lower[parameters], problem.unknowns.upper[parameters]),
+        times=data.times,
+        values=data.values,
+        observed=given.observed,
+        sigma=float(np.ravel(data.sigma)[0]),
+        input_times=given.input_times,
+        inputs=given.inputs,
+        resets=given.resets,
+        elements=given.elements,
+    )
 
 
 def why_no_ipopt(case: Case) -> str:

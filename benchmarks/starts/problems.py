@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
-from benchmarks.starts import bounces, logs, minimum_time, switching, vehicles
+from benchmarks.starts import bounces, logs, minimum_time, switching, unknown_noise, vehicles
 from benchmarks.starts.case import Case, Make
 
 PROBLEMS: dict[str, Make] = {
@@ -23,6 +23,9 @@ PROBLEMS: dict[str, Make] = {
     "epidemic": logs.epidemic,
     "runs": logs.many_runs,
     "enzyme": logs.enzyme,
+    "spring": unknown_noise.spring,
+    "growth": unknown_noise.growth,
+    "predators": unknown_noise.predators,
     "rest-to-rest": minimum_time.rest_to_rest,
     "pendulum": minimum_time.pendulum,
     "van-der-pol": minimum_time.van_der_pol,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import numpy as np
 
 import switchfit as sf
 from benchmarks import many, models, vehicle
-from benchmarks.starts.case import Case, Collocated, draw_anywhere, sample_states
+from benchmarks.starts.case import Case, Collocated, Sampled, draw_anywhere, sample_states
 from switchfit.models import skid_steer
 
 LENGTH, WIDTH, GRAVITY, MASS = 0.25, 0.23, 9.81, 80.0
@@ -33,7 +34,7 @@ def two_turns(count: int = 40) -> Case:
         [*np.sort(TWO_TURNS[:4] + random.uniform(-0.5, 0.5, 4)), *random.uniform(0.4, 1.2, 2), random.uniform(0.2, 2.0)]
         for _ in range(count)
     ]
-    return Case(problem, TWO_TURNS, np.array(starts), noisy=True)
+    return Case(problem, TWO_TURNS, np.array(starts), noisy=True, collocation=_sample_two_turns(problem))
 
 
 def two_turns_anywhere(count: int = 40) -> Case:
@@ -43,7 +44,8 @@ def two_turns_anywhere(count: int = 40) -> Case:
         [*np.sort(random.uniform(0.0, END, 4)), *random.uniform(0.4, 1.2, 2), random.uniform(0.2, 2.0)]
         for _ in range(count)
     ]
-    return Case(two_turns_problem(), TWO_TURNS, np.array(starts), noisy=True)
+    problem = two_turns_problem()
+    return Case(problem, TWO_TURNS, np.array(starts), noisy=True, collocation=_sample_two_turns(problem))
 
 
 def two_turns_problem(noise: int | None = 1) -> sf.Problem:
@@ -110,6 +112,40 @@ def grip(t: Any, x: Any, p: Any) -> Any:
     return jnp.stack([x[0], along * cos, x[2], along * sin, x[4], 0.0 * x[5]])
 
 
+def move_on_axles(mode: str, x: Sequence[Any], p: Sequence[Any], u: Sequence[Any], functions: Any) -> list[Any]:
+    """Return `stick` and `slip` entry by entry, as the peers take them."""
+    _, dX, _, dY, angle, turn = x
+    mu_f, mu_r, c = p
+    sin, cos, force = functions.sin(angle), functions.cos(angle), u[0] + u[1] + u[2] + u[3]
+    if mode == "stick":
+        return [dX, (force * cos - c * dX) / MASS, dY, (force * sin - c * dY) / MASS, turn, 0.0 * turn]
+    sideways = -sin * dX + cos * dY
+    front = -mu_f * GRAVITY * MASS / 2 * (sideways + LENGTH * turn)
+    rear = -mu_r * GRAVITY * MASS / 2 * (sideways - LENGTH * turn)
+    ddX = (force * cos - DRAG * dX - (front + rear) * sin) / MASS
+    ddY = (force * sin - DRAG * dY + (front + rear) * cos) / MASS
+    return [dX, ddX, dY, ddY, turn, (WIDTH * (u[0] - u[1] - u[2] + u[3]) + LENGTH * (front - rear)) / INERTIA]
+
+
+def grip_axles(x: Sequence[Any], functions: Any) -> list[Any]:
+    """Return `grip` entry by entry."""
+    sin, cos = functions.sin(x[4]), functions.cos(x[4])
+    along = cos * x[1] + sin * x[3]
+    return [x[0], along * cos, x[2], along * sin, x[4], 0.0 * x[5]]
+
+
+def _sample_two_turns(problem: sf.Problem) -> Sampled:
+    """Return the two turns for a collocation."""
+    return Sampled(
+        problem,
+        move_on_axles,
+        observed=(0, 2),
+        input_times=FORCES[0],
+        inputs=np.array(FORCES[1]),
+        resets={("slip", "stick"): grip_axles},
+    )
+
+
 SLIPPING_AXLES = sf.HybridSystem(
     {"stick": stick, "slip": slip},
     np.zeros(6),
@@ -139,4 +175,9 @@ def paper_positions(count: int = 64) -> Case:
 
     positions = sample_states(build(np.zeros((len(times), 2))), PAPER, times)[:, [0, 2]]
     problem = build(positions + np.random.default_rng(1).normal(0.0, SIGMA, positions.shape))
-    return Case(problem, PAPER, draw_anywhere(problem, count, seed=5), noisy=True)
+    collocated = Sampled(problem, _move_of_paper, observed=(0, 2), elements=2)
+    return Case(problem, PAPER, draw_anywhere(problem, count, seed=5), noisy=True, collocation=collocated)
+
+
+def _move_of_paper(mode: str, x: Sequence[Any], p: Sequence[Any], u: Sequence[Any], functions: Any) -> list[Any]:
+    return models.VEHICLE.field(mode, x, p, functions)

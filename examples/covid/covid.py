@@ -8,7 +8,6 @@ infected at the start and the weekly rhythm of reporting are fitted to the daily
 
 import argparse
 import csv
-import datetime
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -20,13 +19,15 @@ POPULATION = 83e6
 RECOVERY = 1 / 8  # 1/day, mu
 DELAY = 11.0  # days from an infection to its report: all dates move by as much as this does
 ADAPTATION = 1.5  # days in which people follow a change; the mean delay of a straight line over three days
-FIRST = datetime.date(2020, 2, 29)  # t = 1.0 is the beginning of 1 March
+ORIGIN = "2020-02-29"  # t = 1.0 is the beginning of 1 March
+DAY, NOON = np.timedelta64(24, "h"), np.timedelta64(12, "h")
 PUBLISHED = {  # Dehning et al., Science 369 (2020)
-    "tau_1": 7, "tau_2": 16, "tau_3": 24, "lambda[0]": 0.43, "lambda[1]": 0.25, "lambda[2]": 0.15, "lambda[3]": 0.09,
+    "tau_1": "2020-03-07", "tau_2": "2020-03-16", "tau_3": "2020-03-24",
+    "lambda[0]": 0.43, "lambda[1]": 0.25, "lambda[2]": 0.15, "lambda[3]": 0.09,
 }  # fmt: skip
-LEAST_SQUARES = dict(
-    zip(PUBLISHED, (9, 17, 24, 0.382, 0.238, 0.171, 0.091), strict=True)
-)  # the same SIR, other software
+LEAST_SQUARES = dict(  # the same SIR, other software
+    zip(PUBLISHED, ("2020-03-09", "2020-03-17", "2020-03-24", 0.382, 0.238, 0.171, 0.091), strict=True)
+)
 
 
 def phase(k):
@@ -67,30 +68,30 @@ GERMANY = sf.HybridSystem(
 
 
 def read():
-    """Days of March (K,) and the cases that were new on them (K,): 2 March to 21 April."""
+    """Days (K,), as dates, and the cases that were new on them (K,): 2 March to 21 April."""
     with Path(__file__).with_name("germany.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    days = [(datetime.date.fromisoformat(row["date"]) - FIRST).days for row in rows]
-    return np.array(days[1:]), np.diff([float(row["cumulative_confirmed"]) for row in rows])
+    days = np.array([row["date"] for row in rows[1:]], dtype="datetime64[D]")
+    return days, np.diff([float(row["cumulative_confirmed"]) for row in rows])
 
 
-def make_problem(*, until=52, adaptation=ADAPTATION):
-    """The fit; t is the day of March on which people are infected, DELAY before they are counted.
+def make_problem(*, until="2020-04-21", adaptation=ADAPTATION):
+    """The fit; dates are those on which people are infected, DELAY before they are counted.
 
-    Counts after day `until` are left out; day 52 of March is 21 April.
+    Counts after `until` are left out. Counts per day have dates without a time zone: every day has 24 hours.
     """
     days, counts = read()
-    used = np.where(days <= until, counts, np.nan)
-    noon = days + 0.5 - DELAY
+    used = np.where(days <= np.datetime64(until), counts, np.nan)
+    noon = days + NOON - int(DELAY) * DAY
+    latest = np.datetime64(until) - int(DELAY) * DAY - 2 * DAY - NOON
     run = sf.Experiment(
         sf.Measurements(noon, np.sqrt(used), observe=root_of_count, names=("root of count",)),
         mode_sequence=tuple(GERMANY.modes),
-        transition_times=[
-            sf.Parameter(PUBLISHED[f"tau_{k}"], lower=-4.0, upper=until - DELAY - 2.5) for k in (1, 2, 3)
-        ],
-        t0=noon[0] - 0.5,
-        tf=noon[-1] + 0.5,
+        transition_times=[sf.Parameter(PUBLISHED[f"tau_{k}"], lower="2020-02-25", upper=latest) for k in (1, 2, 3)],
+        t0=noon[0] - NOON,
+        tf=noon[-1] + NOON,
         time_unit="d",
+        origin=ORIGIN,
     )
     return sf.Problem(
         GERMANY,
@@ -121,12 +122,19 @@ def uncertainties(estimate, runs=400):
     )
 
 
-def date(*times):
+def find_dates(estimate, times):
+    """Times as dates, for tables and for matplotlib."""
+    return estimate.trajectory.origin.to_dates(times, "d")
+
+
+def date(estimate, *times):
     """Times as days of a month: "7.0 Mar" is the beginning of 7 March."""
-    shift, month = (0, "Mar") if round(times[-1], 1) < 32 else (31, "Apr")
-    if round(times[0], 1) < 32 and shift:
-        return f"{date(times[0])} to {date(times[-1])}"
-    return " to ".join(f"{t - shift:.1f}" for t in times) + f" {month}"
+    found = find_dates(estimate, times)
+    months = {f"{one:%b}" for one in found}
+    days = [f"{one.day + one.hour / 24 + one.minute / 1440:.1f}" for one in found]
+    if len(months) > 1:
+        days = [f"{day} {one:%b}" for day, one in zip(days, found, strict=True)]
+    return " to ".join(days) + (f" {months.pop()}" if len(months) == 1 else "")
 
 
 def table(estimate, intervals):
@@ -136,10 +144,17 @@ def table(estimate, intervals):
     rows = [header]
     for name in sorted(PUBLISHED):
         is_date = name.startswith("tau")
-        others = [f"{there[name]} Mar" if is_date else f"{there[name]:.3f}" for there in (PUBLISHED, LEAST_SQUARES)]
+        others = [there[name] if is_date else f"{there[name]:.3f}" for there in (PUBLISHED, LEAST_SQUARES)]
         ranges = [by[name] for by in intervals]
         if is_date:
-            rows.append((f"change {name[-1]}", date(shown[name]), *(date(*ends) for ends in ranges), *others))
+            rows.append(
+                (
+                    f"change {name[-1]}",
+                    date(estimate, shown[name]),
+                    *(date(estimate, *ends) for ends in ranges),
+                    *others,
+                )
+            )
         else:
             written = [f"{low:.3f} to {high:.3f}" for low, high in ranges]
             rows.append((name, f"{shown[name]:.3f}", *written, *others))
@@ -149,7 +164,7 @@ def table(estimate, intervals):
 
 def plot(estimate, dates):
     """Counts with the fit above, the spreading rate below; `dates` are the intervals of tau_1, tau_2, tau_3."""
-    from matplotlib.dates import DateFormatter, WeekdayLocator
+    from matplotlib.dates import DateFormatter, WeekdayLocator, date2num
     from matplotlib.figure import Figure
 
     days, counts = read()
@@ -157,7 +172,7 @@ def plot(estimate, dates):
     above, below = figure.subplots(2, 1, height_ratios=(3, 2))
     times = np.linspace(estimate.trajectory.times[0], estimate.trajectory.times[-1], 400)
     fitted = estimate.predict(times)
-    reported, infected = calendar(times + DELAY), calendar(times)
+    reported, infected = find_dates(estimate, times + DELAY), find_dates(estimate, times)
     for band, shade, what in (
         (fitted.prediction_band(), "#f4d3d3", "95 % of the counts"),
         (fitted.output_band(), "#dd8888", "95 % band of the fit"),
@@ -165,7 +180,7 @@ def plot(estimate, dates):
         low, high = np.maximum(band[:, 0].T, 0.0) ** 2
         above.fill_between(reported, low, high, color=shade, linewidth=0, label=what)
     above.plot(reported, fitted.outputs[:, 0] ** 2, color="#b2182b", label="fitted")
-    above.plot(calendar(days + 0.5), counts, "o", color="#222222", markersize=4, label="new cases")
+    above.plot(days + NOON, counts, "o", color="#222222", markersize=4, label="new cases")
     above.set(
         ylabel="new cases per day", ylim=(0, None), xlabel=f"day of the report, {DELAY:g} days after the infection"
     )
@@ -174,30 +189,24 @@ def plot(estimate, dates):
     low, high = fitted.state_band()[:, 2].T
     below.fill_between(infected, low, high, color="#dd8888", linewidth=0)
     below.plot(infected, fitted.states[:, 2], color="#b2182b", label="fitted, with 95 % band")
-    edges = [times[0], *(PUBLISHED[f"tau_{k}"] + 0.5 for k in (1, 2, 3)), times[-1]]
+    noons = [np.datetime64(PUBLISHED[f"tau_{k}"]) + NOON for k in (1, 2, 3)]
+    edges = date2num([infected[0], *noons, infected[-1]])
     rates = [PUBLISHED[f"lambda[{k}]"] for k in range(4)]
-    below.stairs(rates, calendar(edges), baseline=None, color="#4a7fb5", linestyle="--", label="published")
+    below.stairs(rates, edges, baseline=None, color="#4a7fb5", linestyle="--", label="published")
     below.axhline(RECOVERY, color="#777777", linewidth=0.8)
     below.annotate("recovery rate", (infected[0], RECOVERY), (2, 3), textcoords="offset points", color="#777777")
     below.set(ylabel="spreading rate λ (1/day)", ylim=(0, 0.55), xlabel="day of the infection")
     for k, tau in enumerate(estimate.transition_times[0], 1):
         for ax, shift in ((above, DELAY), (below, 0.0)):
-            ax.axvline(calendar(tau + shift), color="#333333", linewidth=0.8)
-            ends = calendar(np.array(dates[f"tau_{k}"]) + shift)
-            ax.axvspan(*ends, color="#333333", alpha=0.1, linewidth=0)
+            ax.axvline(*find_dates(estimate, [tau + shift]), color="#333333", linewidth=0.8)
+            ends = np.array(dates[f"tau_{k}"]) + shift
+            ax.axvspan(*find_dates(estimate, ends), color="#333333", alpha=0.1, linewidth=0)
     below.legend(loc="upper right", frameon=False)
     for ax, shown in ((above, reported), (below, infected)):
         ax.set_xlim(shown[0], shown[-1])
         ax.xaxis.set_major_locator(WeekdayLocator(0))
         ax.xaxis.set_major_formatter(DateFormatter("%d %b"))
     return figure
-
-
-def calendar(t):
-    """Times as matplotlib's dates."""
-    from matplotlib.dates import date2num
-
-    return date2num(FIRST) + np.asarray(t)
 
 
 def main(folder=None):
@@ -215,12 +224,12 @@ def main(folder=None):
     for what, changed in (
         ("adaptation 1 day", {"adaptation": 1.0}),
         ("adaptation 2 days", {"adaptation": 2.0}),
-        ("reports until 9 April", {"until": 40}),
+        ("reports until 9 April", {"until": "2020-04-09"}),
     ):
         other = sf.multistart(make_problem(**changed), 96).best
-        dates = ", ".join(date(t) for t in other.transition_times[0])
+        dates = ", ".join(date(other, t) for t in other.transition_times[0])
         rate = other.parameters["lambda"][3]
-        third = date(*other.profile("tau_3").interval())
+        third = date(other, *other.profile("tau_3").interval())
         print(f"  {what:<22} {dates} ({third}), lambda[3] {rate:.3f}, J = {other.cost:.1f}")
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)

@@ -2,6 +2,7 @@
 
 from switchfit.batch.fits import Fits
 from switchfit.batch.logs import estimate_many
+from switchfit.batch.posterior import LogPosterior, log_posterior
 from switchfit.batch.resampling import Bootstrap, bootstrap
 from switchfit.batch.simulated import MonteCarlo, monte_carlo
 from switchfit.batch.starts import Multistart, multistart
@@ -26,13 +27,17 @@ from switchfit.problem.data import (
     TerminalCost,
     TransitionCost,
 )
+from switchfit.problem.dates import from_epoch
 from switchfit.problem.experiment import Experiment, Parameter
+from switchfit.problem.jump import Jump
 from switchfit.problem.priors import LogNormal, Normal
 from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.xla import compile_small_loops_whole
 from switchfit.strategy.choice import estimate
+from switchfit.strategy.comparison import ModelComparison, Nested, compare
+from switchfit.strategy.validation import InputCorrelation, Validation
 from switchfit.uncertainty.certificate import Certificate
 from switchfit.uncertainty.derivative_check import DerivativeCheck, check_derivatives
 from switchfit.uncertainty.identification import Direction, Identifiability, identifiability
@@ -65,13 +70,18 @@ __all__ = [
     "HybridSystem",
     "Identifiability",
     "Input",
+    "InputCorrelation",
     "Issue",
+    "Jump",
     "Kink",
     "Log",
     "LogNormal",
+    "LogPosterior",
     "Measurements",
+    "ModelComparison",
     "MonteCarlo",
     "Multistart",
+    "Nested",
     "Normal",
     "Parameter",
     "Prediction",
@@ -88,14 +98,18 @@ __all__ = [
     "Termination",
     "Trajectory",
     "TransitionCost",
+    "Validation",
     "Verdict",
     "bootstrap",
     "check_derivatives",
+    "compare",
     "estimate",
     "estimate_many",
     "evaluate",
     "evaluate_on_guards",
+    "from_epoch",
     "identifiability",
+    "log_posterior",
     "monte_carlo",
     "multistart",
     "predict",

@@ -11,7 +11,7 @@ import hashlib
 import io
 import json
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from fnmatch import fnmatch
@@ -137,7 +137,7 @@ def _run_on_cluster(work: Work, chunks: list[range], client: Any) -> Iterator[tu
     The work travels as bytes that are themselves the result of a task, so that they outlive the workers that hold
     them; a worker unpickles them once, or it would compile the model's functions anew for every chunk.
     """
-    import cloudpickle  # with dask: needed here only
+    import cloudpickle
     from distributed import as_completed
 
     blob = cloudpickle.dumps(work)
@@ -172,8 +172,9 @@ def _run_remotely(blob: bytes, start: int, stop: int) -> Arrays:
 class _Store:
     """A folder with ``chunk-<first run>.npz`` files, and ``run.json``, which says what they belong to.
 
-    Each chunk also holds the fingerprint of its run and a digest of everything in it (`_seal`), so that a chunk that
-    was cut off, edited or copied here from elsewhere is recognised, and ``run.json`` can be written anew if it is lost.
+    Each chunk also holds the fingerprint of its run and a digest of everything in it (`compute_seal`), so that a chunk
+    that was cut off, edited or copied here from elsewhere is recognised, and ``run.json`` can be written anew if it is
+    lost.
     """
 
     def __init__(self, folder: Path, fingerprint: str, size: int) -> None:
@@ -232,7 +233,7 @@ class _Store:
         runs = np.array([chunk.start, chunk.stop])
         whole: Arrays = {**arrays, "fingerprint": np.array(self.fingerprint), "runs": runs}
         buffer = io.BytesIO()
-        np.savez(buffer, **whole, seal=np.array(_seal(whole)))  # type: ignore[arg-type]
+        np.savez(buffer, **whole, seal=np.array(compute_seal(whole)))  # type: ignore[arg-type]
         write_atomically(buffer.getvalue(), self._path(chunk))
 
     def _path(self, chunk: range) -> Path:
@@ -273,13 +274,18 @@ def _read_chunk(path: Path) -> tuple[Arrays | None, str]:
         seal = str(arrays.pop("seal", ""))
     except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds on what they cannot read
         return None, f"it cannot be read ({get_first_line(error)})"
-    if seal != _seal(arrays) or not {"fingerprint", "runs"} <= arrays.keys():
+    if seal != compute_seal(arrays) or not {"fingerprint", "runs"} <= arrays.keys():
         return None, "its content is not what was written"
     return arrays, ""
 
 
-def _seal(arrays: Arrays) -> str:
-    """Return a digest of names, types, shapes and numbers."""
+def compute_seal(arrays: Mapping[str, NDArray[Any]]) -> str:
+    """Return a digest of names, types, shapes and numbers.
+
+    Parameters
+    ----------
+    arrays : mapping of str to array
+    """
     return compute_fingerprint(*(part for name in sorted(arrays) for part in (name, np.asarray(arrays[name]))))
 
 

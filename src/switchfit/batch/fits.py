@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import scipy.special
@@ -16,24 +16,30 @@ from numpy.typing import NDArray
 from switchfit.batch.chunks import Work, run_chunks
 from switchfit.batch.intervals import list_places, replace_intervals
 from switchfit.batch.quality import count_priors
+from switchfit.batch.saved import load_fits, save_fits
 from switchfit.batch.verdict import find_levels, has_converged, judge_many
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.hidden import refuse_hidden_switches
 from switchfit.fit.result import interval
 from switchfit.fit.solution import is_sigma_known
 from switchfit.problem.data import FloatArray
+from switchfit.problem.dates import Origin
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_path
-from switchfit.runtime.presentation import format_html, format_line, format_text, join_first
+from switchfit.runtime.frames import Tabular, Variable, build_arviz
+from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text, join_first
 from switchfit.runtime.progress import show_progress
-from switchfit.uncertainty.verdict import Verdict
+from switchfit.uncertainty.verdict import LEVELS, Verdict
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 CHUNK_FORMAT = "fits 2"
 """Part of every fingerprint: it changes where the arrays of a chunk do, so that folders of before are not used."""
 
 
 @dataclass(frozen=True, eq=False)
-class Fits:
+class Fits(Tabular):
     """Many fits of one model; R of them, d unknowns in the order of `theta_names`.
 
     Attributes
@@ -79,6 +85,8 @@ class Fits:
         From where these logarithms count: t0 for a transition time, otherwise 0.
     seconds : float
         Wall time of all.
+    date_origins : tuple of Origin or None, d of them
+        The date at which a time that is a date is 0; None for other unknowns, and where it is not the same in all fits.
 
     See Also
     --------
@@ -123,6 +131,7 @@ class Fits:
     log_scaled: tuple[str, ...]
     log_origins: FloatArray
     seconds: float
+    date_origins: tuple[Origin | None, ...]
 
     def __repr__(self) -> str:
         levels = (f"{np.sum(self.levels == level)} {level}" for level in ("good", "doubtful", "bad"))
@@ -168,8 +177,8 @@ class Fits:
     def confidence_intervals(self, level: float = 0.95) -> FloatArray:
         """Return intervals theta +- quantile x standard error of each fit: (R, d, 2).
 
-        Of a transition time with a few samples within its interval, or at a kink, from one parabola for each stretch
-        between samples, as `Estimate.confidence_intervals`. NaN for any other unknown that is held.
+        Of a transition time with a few samples near, or at a kink, the profile is followed from sample to sample, as by
+        `Estimate.confidence_intervals`. NaN for any other unknown that is held.
 
         See Also
         --------
@@ -193,11 +202,99 @@ class Fits:
         scale = np.ones(len(self)) if self.sigma_known else 2 * self.cost / freedom
         return replace_intervals(found, self.pieces, self.piece_places, 0.5 * quantile**2 * scale)
 
+    @property
+    def worst_first(self) -> NDArray[np.intp]:
+        """Places of the fits, (R,): bad ones, then doubtful ones, then good ones; of each the largest misfit first.
+
+        The misfit is the cost per sample; fits that did not converge come before all others.
+        """
+        ranks = np.array([LEVELS.index(level) for level in self.levels.tolist()], dtype=np.intp)
+        misfit = self.cost / np.maximum(self.samples, 1)
+        return np.lexsort((-np.nan_to_num(misfit, nan=np.inf), -ranks, self.success))
+
     def __str__(self) -> str:
         return format_text(self)
 
     def _repr_html_(self) -> str:
         return format_html(self)
+
+    def plot(self) -> Figure:
+        """Draw the unknowns of each fit with their 95 % intervals, the worst fits first, as a matplotlib Figure.
+
+        See Also
+        --------
+        Fits.worst_first, Fits.to_pandas
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fits = sf.estimate_many([heater_problem(), heater_problem()])
+
+        >>> [axes.get_xlabel() for axes in fits.plot().axes]
+        ['tau_1 (h)', 'k (1/h)']
+        """
+        return draw_figure(self)
+
+    def save(self, path: str | Path) -> None:
+        """Write all fits to one file, atomically: a NumPy archive that `load` reads.
+
+        See Also
+        --------
+        Fits.load, Fits.to_pandas
+
+        Examples
+        --------
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fits = sf.estimate_many([heater_problem(), heater_problem()])
+
+        >>> with TemporaryDirectory() as folder:
+        ...     fits.save(Path(folder) / "fits.npz")
+        ...     loaded = sf.Fits.load(Path(folder) / "fits.npz")
+        >>> bool((loaded.theta == fits.theta).all())
+        True
+        """
+        save_fits(self, as_path(path, "path"))
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read what `save` wrote; ``sf.Fits.load`` returns whatever kind of fits it was.
+
+        Raises
+        ------
+        ValueError
+            If the file is not one of switchfit's, is damaged, or holds another kind of fits.
+
+        See Also
+        --------
+        Fits.save
+
+        Examples
+        --------
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+
+        >>> with TemporaryDirectory() as folder:
+        ...     sf.multistart(heater_problem(), 8).save(Path(folder) / "starts.npz")
+        ...     loaded = sf.Fits.load(Path(folder) / "starts.npz")
+        >>> type(loaded).__name__, loaded.best.status.name
+        ('Multistart', 'CONVERGED')
+        """
+        return load_fits(cls, as_path(path, "path"))
+
+    def _collect_draws(self, what: str, centre_name: str, centre: FloatArray) -> Any:
+        """Return the estimates of the fits that converged as draws for ArviZ, and where they are drawn around."""
+        units = [unit if unit != "1" else "" for unit in self.theta_units]
+        named = list(zip(self.theta_names, units, strict=True))
+        good = self.theta[self.success]
+        draws = [Variable(name, good[:, k], ("draw",), unit) for k, (name, unit) in enumerate(named)]
+        constants = [Variable(f"{name} {centre_name}", centre[k], (), unit) for k, (name, unit) in enumerate(named)]
+        return build_arviz(draws, constants, {"inference_library": "switchfit", "draws": what})
 
 
 def check_long_run(client: Any, folder: Any, callback: Any) -> None:
@@ -286,5 +383,15 @@ def _collect_fields(
         "log_scaled": problem.unknowns.log_names,
         "log_origins": problem.unknowns.origin,
         "seconds": seconds,
+        "date_origins": list_origins(problem),
         **found,
     }
+
+
+def list_origins(problem: Problem) -> tuple[Origin | None, ...]:
+    """Return the date at which each unknown that is a date is 0; None for every other."""
+    found: list[Origin | None] = [None] * len(problem.theta_names)
+    for experiment, places in zip(problem.experiments, problem.unknowns.times, strict=True):
+        for place in places[places >= 0].tolist():
+            found[place] = experiment.origin
+    return tuple(found)

@@ -1,8 +1,7 @@
 """Intervals of transition times across sample times, of many fits: as of `switchfit.uncertainty.piecewise`.
 
-Where a sample lies within the interval of a transition time, or a kink holds it, the pieces of its profile are found
-while the fit's data are at hand, with an evaluation for each sample on the way, and kept: from them follows the
-interval at any level. Most fits have no sample so near, and cost nothing.
+Where a sample lies near a transition time, or a kink holds it, the pieces of its profile are found while the fit's data
+are at hand, and kept: from them follows the interval at any level. Most fits have no sample so near, and cost nothing.
 """
 
 from __future__ import annotations
@@ -23,22 +22,29 @@ from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.uncertainty.piecewise import (
+    HIGHEST_LEVEL,
+    MOST_HALVINGS,
+    MOST_REPEATS,
     MOST_RUNS,
+    RIGHT,
     Piece,
-    find_end,
+    find_ends,
+    find_halfway,
+    is_any_near,
+    is_end_inside,
     list_sample_times,
     list_stops,
     list_transitions,
 )
 
-MOST_KEPT = 6
-"""Pieces that are kept for one side. With more samples than that within an interval one parabola is taken: their kinks
-begin to average out, and the pieces of all fits would be most of what is kept."""
+MOST_SAMPLES = 5
+"""With more samples than that within an interval one parabola is taken: their kinks begin to average out, and the
+pieces of all fits would be most of what is kept."""
+
+MOST_KEPT = MOST_SAMPLES + 1 + MOST_HALVINGS
+"""Pieces that are kept for one side."""
 
 AT_KINK = Status.CONVERGED_AT_KINK.name
-
-HIGHEST_LEVEL = 0.99
-"""Pieces are found as far as intervals of this level reach; beyond, the last one goes on."""
 
 Derivatives = tuple[FloatArray, FloatArray, FloatArray]
 """Costs (n,), gradients (n, d) and Hessians (n, d, d)."""
@@ -131,6 +137,28 @@ class _Walk:
     lower: FloatArray
     upper: FloatArray
     threshold: float
+    halvings: int = 0
+    repeats: int = 0
+    count: int = 0  # of pieces
+    before: Piece | None = None
+
+    def must_repeat(self, decrement: float) -> bool:
+        """Return whether the other unknowns need a further Newton step at the same place."""
+        more = self.repeats < MOST_REPEATS and abs(decrement) > RIGHT * self.threshold
+        self.repeats = self.repeats + 1 if more else 0
+        return more
+
+    def cut(self, piece: Piece) -> tuple[Piece, bool]:
+        """Cut a piece off as `trace_profile` does, or use up its stop; and return whether it is the last."""
+        more = self.halvings < MOST_HALVINGS
+        halfway = find_halfway(piece, self.before, self.threshold, self.side) if more else None
+        if halfway is None:
+            self.stops.pop(0)
+        else:
+            piece, self.halvings = piece._replace(stop=halfway), self.halvings + 1
+        self.before, self.count = piece, self.count + 1
+        ended = halfway is None and is_end_inside(piece, self.threshold, self.side)
+        return piece, ended or not self.stops
 
 
 def _list_walks(problem: Problem, chunk: Chunk, k: int) -> list[_Walk]:
@@ -152,9 +180,8 @@ def _list_walks(problem: Problem, chunk: Chunk, k: int) -> list[_Walk]:
             continue
         samples = list_sample_times(problem, e)
         held = bool(chunk.status[k] == AT_KINK and variance[place] == 0)
-        if not held and not (
-            reach[place] > 0 and 0 < np.sum(np.abs(samples - theta[place]) <= reach[place]) < MOST_KEPT
-        ):
+        few = np.sum(np.abs(samples - theta[place]) <= reach[place]) <= MOST_SAMPLES
+        if not held and not (few and is_any_near(samples, theta[place], reach[place] / quantile)):
             continue
         free = variance > 0
         free[place] = False
@@ -172,14 +199,14 @@ def _walk_all(
 ) -> None:
     """Go all ways together, sample by sample, and write their pieces into `found`; as of `trace_profile`."""
     theta = {id(walk): chunk.theta[walk.fit].copy() for walk in walks}
-    for p in range(MOST_KEPT):
-        if not walks:
-            return
+    began = False
+    while walks:
         fits = np.array([walk.fit for walk in walks])
         at = np.array([theta[id(walk)] for walk in walks])
         sides = np.array([walk.side for walk in walks])
         # J is smooth where the estimate is at no kink, and known there.
-        new = np.array([p > 0 or chunk.status[walk.fit] == AT_KINK for walk in walks])
+        new = np.array([began or chunk.status[walk.fit] == AT_KINK for walk in walks])
+        began = True
         J, g, H = chunk.cost[fits], chunk.gradient[fits], chunk.hessian[fits]
         if new.any():
             J[new], g[new], H[new] = evaluate(fits[new], at[new], sides[new])
@@ -191,31 +218,35 @@ def _walk_all(
         rest = np.stack([np.where(free, g, 0.0), np.where(free, column, 0.0)], axis=2)
         solved = np.linalg.solve(np.where(both, H, np.eye(d)), rest)
         newton, follow = solved[:, :, 0], solved[:, :, 1]
-        rise = J - 0.5 * np.sum(np.where(free, g, 0.0) * newton, axis=1) - chunk.cost[fits]
+        decrement = 0.5 * np.sum(np.where(free, g, 0.0) * newton, axis=1)
+        rise = J - decrement - chunk.cost[fits]
         slope = g[each, places] - np.sum(column * newton, axis=1)
         curvature = H[each, places, places] - np.sum(column * follow, axis=1)
         left = []
         for s, walk in enumerate(walks):
-            here = Piece(at[s, walk.place], walk.stops[p], rise[s], walk.side * slope[s], curvature[s])
-            last = (
-                p == len(walk.stops) - 1
-                or p == MOST_KEPT - 1
-                or find_end([here], walk.threshold, walk.side) != here.stop
-            )
-            found[walk.fit, walk.row, (walk.side + 1) // 2, p] = here._replace(stop=walk.stops[-1]) if last else here
-            if not last:
+            if walk.must_repeat(decrement[s]):
+                forward = np.clip(at[s] - newton[s], walk.lower, walk.upper)
+            else:
+                limit = walk.stops[-1]
+                here = Piece(at[s, walk.place], walk.stops[0], rise[s], walk.side * slope[s], curvature[s])
+                here, ended = walk.cut(here)
+                last = ended or walk.count == MOST_KEPT
+                stored = here._replace(stop=limit) if last else here
+                found[walk.fit, walk.row, (walk.side + 1) // 2, walk.count - 1] = stored
+                if last:
+                    continue
                 forward = at[s] - newton[s] - follow[s] * (here.stop - here.start)
                 forward = np.clip(forward, walk.lower, walk.upper)
                 forward[walk.place] = here.stop
-                theta[id(walk)] = forward
-                left.append(walk)
+            theta[id(walk)] = forward
+            left.append(walk)
         walks = left
 
 
 def replace_intervals(
     intervals: FloatArray, pieces: FloatArray, places: NDArray[np.intp], thresholds: FloatArray
 ) -> FloatArray:
-    """Return intervals (R, d, 2) with those of transition times with samples inside, or at a kink, from their pieces.
+    """Return intervals (R, d, 2) with those of transition times with samples near, or at a kink, from their pieces.
 
     Parameters
     ----------
@@ -231,29 +262,8 @@ def replace_intervals(
     found = intervals.copy()
     if not len(places):
         return found
-    low, high = np.moveaxis(found[:, places], 2, 0)
-    several = ~np.isnan(pieces[:, :, :, 1, 0])
-    first = pieces[:, :, :, 0, 1]
-    inside = (several[:, :, 0] & (first[:, :, 0] >= low)) | (several[:, :, 1] & (first[:, :, 1] <= high))
-    replaced = ~np.isnan(pieces[:, :, 0, 0, 0]) & (inside | np.isnan(low))
+    replaced = ~np.isnan(pieces[:, :, 0, 0, 0])
     for end, side in enumerate((-1, 1)):
-        ends = _find_ends(pieces[:, :, end], thresholds[:, None], side)
+        ends = find_ends(pieces[:, :, end], thresholds[:, None], side)
         found[:, places, end] = np.where(replaced, ends, found[:, places, end])
-    return found
-
-
-def _find_ends(pieces: FloatArray, thresholds: FloatArray, side: int) -> FloatArray:
-    """Return where profiles (..., P, 5) reach thresholds (...), as `find_end`; NaN where there are no pieces."""
-    found = np.full(pieces.shape[:-2], np.nan)
-    searched = np.ones(found.shape, dtype=bool)
-    for piece in np.moveaxis(pieces, -2, 0):
-        start, stop, rise, slope, curvature = np.moveaxis(piece, -1, 0)
-        height = thresholds - rise
-        with np.errstate(invalid="ignore", divide="ignore"):
-            root = slope + np.sqrt(slope**2 + 2 * curvature * height)
-            reach = np.where(root > 0, 2 * height / root, np.inf)
-        above, within = height <= 0, reach <= side * (stop - start)
-        searched &= ~np.isnan(start)
-        found = np.where(searched, np.where(above, start, np.where(within, start + side * reach, stop)), found)
-        searched &= ~(above | within)
     return found

@@ -14,7 +14,7 @@ import numpy as np
 
 from switchfit.batch.again import adopt, differ, is_resolved, redo_doubted
 from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
+from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, list_origins, repeat
 from switchfit.batch.intervals import make_no_pieces, trace_chunk
 from switchfit.batch.program import Chunk, Evaluations, Varying, chunk_size, error_message, fit_chunk, make_failed_chunk
 from switchfit.batch.quality import count_samples, describe_ends
@@ -92,7 +92,9 @@ def estimate_many(
             )
     began = time.perf_counter()
     work = _Work(problems, tolerance, max_iterations)
-    return Fits(**repeat(first, work, len(problems), "Logs", began, client=client, folder=folder, callback=callback))
+    found = repeat(first, work, len(problems), "Logs", began, client=client, folder=folder, callback=callback)
+    every = zip(*map(list_origins, problems), strict=True)
+    return Fits(**found | {"date_origins": tuple(own[0] if len(set(own)) == 1 else None for own in every)})
 
 
 @dataclass
@@ -207,6 +209,6 @@ def _get_kind(problem: Problem) -> Any:
     unknowns = problem.unknowns
     numbers = [unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, *problem.places]
     numbers += [*unknowns.priors, *unknowns.variables]
-    times = [experiment.initial_times for experiment in problem.experiments]
-    fixed = [np.where(where < 0, t, 0.0) for where, t in zip(unknowns.times, times, strict=True)]
+    times = [experiment.initial_times_with_jumps for experiment in problem.experiments]
+    fixed = [np.where(where[: len(t)] < 0, t, 0.0) for where, t in zip(problem.places, times, strict=True)]
     return evaluator.structures, shapes, tuple(np.asarray(a).tobytes() for a in (*numbers, *fixed))

@@ -201,7 +201,7 @@ def fit_chunk(
         given = (
             tuple(evaluator.arguments),
             tuple(_pad(value, size) for value in varying.values),
-            tuple(experiment.initial_times for experiment in problem.experiments),
+            tuple(experiment.initial_times_with_jumps for experiment in problem.experiments),
             read_sequences(layout, structures),
             Constraints(*map(jnp.asarray, constraints)),
             Unscaled(variables, unknowns.priors, unknowns.lower, unknowns.upper),
@@ -250,7 +250,8 @@ class Evaluations:
         self.problem, self.varying = problem, varying
         self.evaluator = Evaluator(problem, meshes=meshes)
         self.base = tuple(self.evaluator.arguments)
-        self.quick = not in_lockstep() and problem.engine != "jax" and runs_natively(problem.structures, self.base)
+        self.layout = replace(choose_layout(problem, self.evaluator), varying=varying.places)
+        self.quick = self.layout.natively
 
     def __call__(
         self, fits: NDArray[np.intp], thetas: FloatArray, sides: NDArray[np.int64]
@@ -275,23 +276,13 @@ class Evaluations:
         return J, g, H
 
     def _run(self, fits: Any, thetas: FloatArray, sides: Any) -> tuple[FloatArray, ...]:
-        problem, structures = self.problem, self.problem.structures
-        layout = Layout(
-            tuple(structure.library for structure in structures),
-            tuple(structure.N for structure in structures),
-            tuple(tuple(int(k) for k in places) for places in problem.places),
-            self.varying.places,
-            lockstep=False,
-            natively=True,
-            tolerance=0.0,
-            max_iterations=0,
-        )
+        problem, layout = self.problem, self.layout
         with use_float64():
             given = (
                 self.base,
                 tuple(_pad(value, CHUNK) for value in self.varying.values),
-                tuple(experiment.initial_times for experiment in problem.experiments),
-                read_sequences(layout, structures),
+                tuple(experiment.initial_times_with_jumps for experiment in problem.experiments),
+                read_sequences(layout, self.evaluator.structures),
                 problem.unknowns.priors,
                 *(_pad(each, EVALUATIONS) for each in (fits, thetas, np.asarray(sides, dtype=float))),
                 len(fits),
@@ -320,7 +311,7 @@ def _evaluations(
 
     def one(s: jax.Array, found: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
         here = replace_leaves(arguments, layout.varying, [value[fits[s]] for value in values])
-        J, g, H = _total(layout, here, times, sequences, thetas[s], sides[s])
+        J, g, H = evaluate_total(layout, here, times, sequences, thetas[s], sides[s])
         prior, prior_g, prior_h = priors.evaluate(thetas[s], jnp)
         new = J + prior, g + prior_g, H + jnp.diag(prior_h)
         return tuple(all_.at[s].set(each) for all_, each in zip(found, new, strict=True))  # type: ignore[return-value]
@@ -373,7 +364,7 @@ def _fits(
 
         def evaluate(z: jax.Array, side: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             theta = unscaled.theta(z)
-            J, g, H = _total(layout, here, times, sequences, theta, side)
+            J, g, H = evaluate_total(layout, here, times, sequences, theta, side)
             prior, prior_g, prior_h = unscaled.priors.evaluate(theta, jnp)
             given = unscaled.variables.derivatives_inward(theta, g + prior_g, H + jnp.diag(prior_h), jnp)
             return J + prior, *given
@@ -404,6 +395,22 @@ def _fits(
     return lax.fori_loop(0, count, one, empty)
 
 
+def choose_layout(problem: Problem, evaluator: Evaluator) -> Layout:
+    """Return the layout of a program that evaluates a problem on given meshes, with its own numbers."""
+    lockstep, structures = in_lockstep(), evaluator.structures
+    natively = not lockstep and problem.engine != "jax" and runs_natively(structures, evaluator.arguments)
+    return Layout(
+        tuple(structure.library for structure in structures) if natively else structures,
+        tuple(structure.N for structure in structures),
+        tuple(tuple(int(k) for k in places) for places in problem.places),
+        varying=(),
+        lockstep=lockstep,
+        natively=natively,
+        tolerance=0.0,
+        max_iterations=0,
+    )
+
+
 def read_sequences(layout: Layout, structures: Sequence[Structure]) -> tuple[dict[str, NDArray[np.int64]], ...]:
     """Return what machine code reads at run time of the sequence of modes of each experiment; JAX is written for it."""
     if not layout.natively:
@@ -426,7 +433,7 @@ def _breakpoints(layout: Layout, arguments: tuple[Arguments, ...]) -> Breakpoint
     return Breakpoints(tuple(nodes), jnp.stack(padded))
 
 
-def _total(
+def evaluate_total(
     layout: Layout,
     arguments: tuple[Arguments, ...],
     times: tuple[jax.Array, ...],
@@ -441,7 +448,7 @@ def _total(
     d = theta.shape[0]
     J, g, H = jnp.zeros(()), jnp.zeros(d), jnp.zeros((d, d))
     extended = jnp.append(theta, 0.0)
-    for group in _group_alike(layout, arguments):
+    for group in _group_alike(layout, arguments, sequences):
         structure, N = layout.structures[group[0]], layout.transitions[group[0]]
         where = np.array([layout.places[e] for e in group])
         where = np.where(where < 0, d, where)  # what is fixed stands one past the last, and is dropped below
@@ -470,12 +477,15 @@ def _total(
     return J, g, H
 
 
-def _group_alike(layout: Layout, arguments: tuple[Arguments, ...]) -> list[list[int]]:
+def _group_alike(
+    layout: Layout, arguments: tuple[Arguments, ...], sequences: Sequence[Mapping[str, Any]]
+) -> list[list[int]]:
     """Return the groups of experiments that one program can take."""
     groups: dict[Any, list[int]] = {}
-    for e, (structure, N, own) in enumerate(zip(layout.structures, layout.transitions, arguments, strict=True)):
+    given = zip(layout.structures, layout.transitions, arguments, sequences, strict=True)
+    for e, (structure, N, own, sequence) in enumerate(given):
         shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(own))
-        groups.setdefault((structure, N, shapes), []).append(e)
+        groups.setdefault((structure, N, shapes, tuple(sorted(sequence))), []).append(e)
     return list(groups.values())
 
 

@@ -192,14 +192,24 @@ def count_chunks(cells: int, transitions: int) -> int:
     return (cells + transitions + (transitions + 1) * (CHUNK - 1)) // CHUNK
 
 
+def count_passed(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Any:
+    """Return how many nodes each of tau (N,) is past: (N,); a node at tau_i counts if its side, () or (N,), is +1."""
+    several = getattr(side, "ndim", 0) > 0
+    right = (side[:, None] if several else side) > 0
+    passed = xp.where(right, nodes[None] <= tau[:, None], nodes[None] < tau[:, None]).sum(1)
+    # Of two equal times with different sides, the later one must not begin in an earlier cell.
+    return xp.maximum.accumulate(passed) if several and tau.shape[0] else passed
+
+
 def build_rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
     """Cut the cells between `nodes` (G + 1,) at `tau` (N,).
 
     Where tau_i equals a node, `side` = +1 lets segment i begin in the cell after it, so that derivatives are those
-    for tau_i increasing, and -1 in the cell before it. Arrays are those of `xp`, JAX or NumPy.
+    for tau_i increasing, and -1 in the cell before it. `side` is one number, or has one for each of tau (N,). Arrays
+    are those of `xp`, JAX or NumPy.
     """
     cells, N = nodes.shape[0] - 1, tau.shape[0]
-    passed = xp.where(side > 0, nodes[None] <= tau[:, None], nodes[None] < tau[:, None]).sum(1)
+    passed = count_passed(nodes, tau, side, xp)
     real_cells = (nodes[1:] > nodes[:-1]).sum()  # without padding: tau = tf stays before the samples and costs at tf
     first_cell = xp.clip(passed - 1, 0, real_cells - 1)
     first_cell = xp.concatenate([xp.zeros(1, first_cell.dtype), first_cell])

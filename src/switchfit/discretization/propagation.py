@@ -77,7 +77,7 @@ def switch_mode(model: Model, segment: Array, branch: Callable[[int], Callable[.
 
 def propagate(model: Model, tau: Array, p: Array, side: Array) -> Path:
     """Integrate from t0 to tf: equation (1), with reset maps at the transitions."""
-    layout = build_rows(model.arguments.nodes, tau, side)
+    layout = build_rows(model.arguments.nodes, tau, model.structure.fix_sides(side, jnp))
     pieces = Piece(model.arguments.nodes[layout.cell], model.arguments.signals[layout.cell])
     stages = row_functions(model.tableau).stages
 

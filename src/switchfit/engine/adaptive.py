@@ -303,13 +303,15 @@ def _adaptive_steps(
         raise _report_infinite(f"initial_state at p = {_round_parameters(problem.split(theta)[1])}", x)
     for i, mode in enumerate(structure.mode_of_segment):
         if i > 0 and structure.reset_maps[i - 1] is not None:
-            names = tuple(experiment.mode_sequence[i - 1 : i + 1])
             if native is None:
                 after = np.asarray(_call_jax(after_reset, arguments, ends[i], x, p, structure=structure, i=i - 1))
             else:
                 after = np.asarray(native.after_reset(i - 1, ends[i], x, p))
             if not np.isfinite(after).all():
-                raise _report_infinite(f"reset map {names} at t = {ends[i]:.6g}{unit}, x = {x.tolist()}", after)
+                before = f"t = {ends[i]:.6g}{unit}, x = {x.tolist()}"
+                names = tuple(structure.mode_names[k] for k in structure.mode_of_segment[i - 1 : i + 1])
+                what = "the map of a Jump" if i - 1 in structure.jumps else f"reset map {names}"
+                raise _report_infinite(f"{what} at {before}", after)
             x = after
         knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
         stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])

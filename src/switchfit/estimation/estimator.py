@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args, overload
+from typing import TYPE_CHECKING, Any, Literal, get_args, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
-from switchfit.estimation.saved import load_fit, save_fit
+from switchfit.estimation.provenance import Provenance, describe_python_problem, digest_data
+from switchfit.estimation.saved import load_saved, save_fit
 from switchfit.fit.accuracy import worst_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.hidden import refuse_jumps
@@ -32,7 +33,9 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_choice, as_count, as_flag, as_instance, as_path, as_positive
+from switchfit.runtime.dispatch import validate_on
 from switchfit.runtime.files import write_atomically
+from switchfit.runtime.frames import Tabular, build_pandas, build_xarray, describe_frame
 from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_page, format_text, join_first
 from switchfit.runtime.progress import Progress
 from switchfit.uncertainty.certificate import Certificate, certify
@@ -50,10 +53,15 @@ from switchfit.uncertainty.sensitivity import (
 from switchfit.uncertainty.verdict import Verdict, judge
 
 if TYPE_CHECKING:
+    import pandas
+    import xarray
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 HESSIANS = get_args(HessianKind)
+
+TableKind = Literal["unknowns", "trajectories", "residuals", "history"]
+TABLES = get_args(TableKind)
 
 REFINEMENTS = 2
 """Largest number of times that the mesh is refined at the solution, and the fit resumed, for the integration error."""
@@ -73,8 +81,13 @@ ORDER = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate(Fit):
+class Estimate(Fit, Tabular):
     """Result of `estimate`: everything in `Fit`, with methods that need the model. Print it for the report.
+
+    Attributes
+    ----------
+    provenance : Provenance or None
+        What a loaded estimate was made from, if its file says so: problem file, hashes of data and models, versions.
 
     See Also
     --------
@@ -100,6 +113,7 @@ class Estimate(Fit):
     saved_certificate: Certificate | None = None
     problem: Problem | None = None
     evaluator: Evaluator | None = None
+    provenance: Provenance | None = None
 
     def __repr__(self) -> str:
         unknowns = (f"{name} = {value:.4g}" for name, value in zip(self.theta_names, self.theta, strict=True))
@@ -283,11 +297,11 @@ class Estimate(Fit):
         """Return intervals of all unknowns, cut off at the bounds: (d, 2).
 
         The interval is ``theta +- quantile x standard error``. For unknowns on a logarithmic scale, theta is multiplied
-        and divided by exp(quantile x relative standard error). For a transition time at a kink, or with sample times
-        inside that interval, it is the range in which 2 (J − J_min) of a piecewise quadratic profile stays below the
-        squared quantile: slope and curvature of the cost jump at every sample time, so that this interval is not
-        symmetric. An estimate that was loaded without its model, that has more than 15 experiments, guards or terminal
-        constraints, or that is one of many fits at once (`Fits`), has ``theta +- quantile x standard error`` only.
+        and divided by exp(quantile x relative standard error). For a transition time at a kink, or with a sample time
+        within five standard errors, it is the range in which 2 (J − J_min) of its profile, followed piece by piece,
+        stays below the squared quantile: slope and curvature of the cost jump at every sample time, so that this
+        interval is not symmetric. An estimate that was loaded without its model, or that has more than 15 experiments,
+        guards or terminal constraints, has ``theta +- quantile x standard error`` only.
         NaN for an unknown that is held by a bound, a collapsed mode or, without its model, a kink.
 
         Parameters
@@ -346,7 +360,7 @@ class Estimate(Fit):
     def _repr_html_(self) -> str:
         return format_html(self)
 
-    def plot(self, *, bands: bool = True, level: float = 0.95) -> Any:
+    def plot(self, *, bands: bool = True, level: float = 0.95) -> Figure:
         """Draw measured against fitted over time with the modes shaded, as a matplotlib Figure.
 
         Parameters
@@ -397,12 +411,64 @@ class Estimate(Fit):
         """
         return predict(self, times, experiment=experiment)
 
+    def validate(self, other: Any, *, refit: Sequence[str] | None = None) -> Any:
+        """Return how well the fitted parameters predict another run, as a `Validation`.
+
+        Parameters
+        ----------
+        other : Experiment, list of Experiment, Problem, Measurements or Log
+            The other run. An `Experiment` has the system and the parameters of this fit. Of a `Problem`, parameters
+            that this fit has too get its values. `Measurements` are another log of the only experiment of this fit;
+            what is left out in them (observe, sigma, delay, names) is as it was there, and so are the channels of a
+            `Log`.
+        refit : sequence of str, optional
+            Unknowns to estimate from the other run, by their names in its problem. If left out, all that are its own:
+            its transition times, the unknown entries of its initial state, and parameters that this fit does not have.
+            With ``()`` none, and they are what `other` gives: the guess of each transition time. The parameters of
+            this fit are never estimated again.
+
+        Returns
+        -------
+        Validation
+
+        Raises
+        ------
+        TypeError
+            If `other` is of another type.
+        ValueError
+            If this fit has an input or several runs, and `other` does not have its own; for an unknown name in
+            `refit`; for an estimate without its problem.
+
+        See Also
+        --------
+        Validation, predict, compare
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        The same heater on another day, switched off after 1.5 h:
+
+        >>> times = np.linspace(0.5, 6.0, 12)
+        >>> exact = 25 * (1 - np.exp(-0.4 * np.minimum(times, 1.5))) * np.exp(-0.4 * np.maximum(times - 1.5, 0))
+        >>> noise = 0.2 * np.random.default_rng(1).normal(size=12)
+        >>> found = fit.validate(sf.Measurements(times, exact + noise))
+        >>> dict(zip(found.theta_names, found.theta.round(1).tolist()))
+        {'tau_1': 1.5, 'k': 0.4}
+        >>> found.verdict.level
+        'good'
+        """
+        return validate_on(self, other, refit=refit)
+
     @property
     def residuals(self) -> ResidualDiagnostics:
         """Tests of the residuals, channel by channel: whiteness, normality, effective sample size."""
         return diagnose(self)
 
-    def plot_residuals(self) -> Any:
+    def plot_residuals(self) -> Figure:
         """Draw residuals in time, their autocorrelation and their quantiles, as a matplotlib Figure.
 
         See Also
@@ -637,8 +703,15 @@ class Estimate(Fit):
         """Which combinations of the unknowns the data determine badly, with J evaluated there."""
         return identifiability(self)
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, *, provenance: Provenance | None = None) -> None:
         """Write everything but the model to a JSON file, atomically; `load` reads it.
+
+        Parameters
+        ----------
+        path : path
+        provenance : Provenance, optional
+            What the fit was made from, ``load_problem("problem.toml").provenance``, so that ``switchfit rerun`` can run
+            it again. Left out, the file keeps hashes of the data, and versions.
 
         See Also
         --------
@@ -657,7 +730,35 @@ class Estimate(Fit):
         ...     (Path(folder) / "fit.json").read_text().splitlines()[1]
         '  "verdict": {'
         """
-        save_fit(self.complete(), self.certificate, as_path(path, "path"))
+        file = as_path(path, "path")
+        if provenance is not None:
+            as_instance(provenance, "provenance", Provenance, "the provenance of a problem file")
+        save_fit(self.complete(), self.certificate, file, self.describe_provenance(provenance))
+
+    def describe_provenance(self, given: Provenance | None = None) -> Provenance | None:
+        """Return what the file of the estimate keeps of its origin; None for one that was loaded from a file without.
+
+        Parameters
+        ----------
+        given : Provenance, optional
+            Of its problem file.
+
+        See Also
+        --------
+        Estimate.save
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> [digest.name for digest in fit.describe_provenance().data]
+        ['thermometer']
+        """
+        if given is not None:
+            return replace(given, data=digest_data(self))
+        return self.provenance if self.saved_certificate is not None else describe_python_problem(self)
 
     def save_report(self, path: str | Path, *, problem_file: str | Path | None = None) -> None:
         """Write the report as one HTML file, atomically: figures to zoom into, a slider for each unknown, the inputs.
@@ -697,6 +798,65 @@ class Estimate(Fit):
         file = as_path(path, "path")
         given = None if problem_file is None else as_path(problem_file, "problem_file")
         write_atomically(format_page(self, problem_file=given), file)
+
+    def to_pandas(self, what: TableKind = "unknowns") -> pandas.DataFrame:
+        """Return one of the tables of the fit as a DataFrame; units are in ``.attrs["units"]``.
+
+        Parameters
+        ----------
+        what : {"unknowns", "trajectories", "residuals", "history"}
+            A row for each unknown, with its standard error and 95 % interval; for each node of each run; for each value
+            that was measured; for each iteration.
+
+        Raises
+        ------
+        ImportError
+            If pandas is not installed.
+
+        See Also
+        --------
+        Estimate.to_xarray, Trajectory.to_pandas, Fits.to_pandas
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.to_pandas()[["value", "std_error"]].round(3).to_dict("index")
+        {'tau_1': {'value': 2.462, 'std_error': 0.018}, 'k': {'value': 0.393, 'std_error': 0.005}}
+        >>> fit.to_pandas("residuals").shape
+        (24, 6)
+        """
+        return build_pandas(describe_frame(self, what=as_choice(what, "what", TABLES)))
+
+    def to_xarray(self, what: TableKind = "unknowns") -> xarray.Dataset:
+        """Return one of the tables of the fit as a Dataset; that of the unknowns has covariance and Hessian too.
+
+        Parameters
+        ----------
+        what : {"unknowns", "trajectories", "residuals", "history"}
+            As in `to_pandas`.
+
+        Raises
+        ------
+        ImportError
+            If xarray is not installed.
+
+        See Also
+        --------
+        Estimate.to_pandas, Trajectory.to_xarray, Fits.to_xarray
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.to_xarray()["covariance"].sel(unknown="k", unknown_2="k").item() > 0
+        True
+        """
+        return build_xarray(describe_frame(self, what=as_choice(what, "what", TABLES)))
 
     def complete(self) -> Estimate:
         """Return the estimate with all fields that are saved: computes the Gauss-Newton matrix.
@@ -751,11 +911,12 @@ class Estimate(Fit):
         """
         if problem is not None:
             as_instance(problem, "problem", Problem, "an sf.Problem")
-        fit, certificate = load_fit(as_path(path, "path"))
+        found = load_saved(as_path(path, "path"))
+        fit = found.fit
         if problem is not None:
             _check_loaded(fit, problem, path)
         own = {f.name: getattr(fit, f.name) for f in fields(Fit)}
-        return cls(**own, saved_certificate=certificate, problem=problem)
+        return cls(**own, saved_certificate=found.certificate, problem=problem, provenance=found.provenance)
 
 
 def _check_loaded(fit: Fit, problem: Problem, path: str | Path) -> None:
@@ -773,6 +934,14 @@ def _check_loaded(fit: Fit, problem: Problem, path: str | Path) -> None:
             "are not converted. Files that were saved before there was a time_unit count as s: if it is one of "
             "them, and its times are those of the problem, give the problem's experiments time_unit='s'."
         )
+    for trajectory, experiment in zip(fit.trajectories, problem.experiments, strict=True):
+        origins = (trajectory.origin, experiment.origin)
+        instants = [None if origin is None else origin.instant for origin in origins]
+        if instants[0] != instants[1]:
+            names = ["numbers" if origin is None else f"times since {origin.date}" for origin in origins]
+            raise ValueError(
+                f"{path} holds {names[0]}, the problem has {names[1]}: give its experiments the same origin."
+            )
 
 
 def fit_locally(

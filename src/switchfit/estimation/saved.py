@@ -1,8 +1,10 @@
 """Save fits as JSON files that can be read without switchfit, and load them without losing a bit.
 
 A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 6, "fit": {...}, "certificate": {...}}`` with
-the fields of `Verdict`, `Fit` and `Certificate` under their own names. The verdict, with its line of text, is meant for
-readers of the file; `load` computes it again from the rest.
+the fields of `Verdict`, `Fit` and `Certificate` under their own names. The verdict, with its line of text, and the
+"transition_dates" that a fit to dates has beside them are meant for readers of the file; `load` computes them again
+from the rest. ``"provenance"`` holds the fields of `Provenance`: what the fit was made from. Files without it are read
+too.
 
 - numbers are written with as many digits as it takes to read the same float64; JSON has no NaN and no infinities, so
   they are the strings ``"NaN"``, ``"Infinity"`` and ``"-Infinity"``;
@@ -26,15 +28,17 @@ from enum import Enum
 from functools import cache, partial
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, NoReturn, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, NamedTuple, NoReturn, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.estimation.provenance import Provenance
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.problem.constraints import Constraint
 from switchfit.problem.data import FloatArray
+from switchfit.problem.dates import normalize_time_unit
 from switchfit.runtime.errors import get_first_line
 from switchfit.runtime.files import write_atomically
 from switchfit.uncertainty.certificate import Certificate
@@ -56,7 +60,7 @@ DTYPES = re.compile("[<>|=]?[bifuU][0-9]+", re.ASCII)
 """Types of arrays of numbers or text, as NumPy names them in a file."""
 
 
-def save_fit(fit: Fit, certificate: Certificate, path: Path) -> None:
+def save_fit(fit: Fit, certificate: Certificate, path: Path, provenance: Provenance | None = None) -> None:
     """Write a fit to a file, whole or not at all.
 
     Parameters
@@ -66,24 +70,59 @@ def save_fit(fit: Fit, certificate: Certificate, path: Path) -> None:
     certificate : Certificate
     path : Path
         An existing file is replaced.
+    provenance : Provenance, optional
+        What the fit was made from.
 
     Raises
     ------
     OSError
         If the file cannot be written; an existing one is then left as it was.
     """
-    verdict = judge(fit, certificate)
-    content = {
-        "verdict": {"level": verdict.level, "text": str(verdict)} | _to_json(verdict, Verdict),
-        "format": FORMAT,
-        "version": VERSION,
-        "fit": _to_json(fit, Fit),
-        "certificate": _to_json(certificate, Certificate),
-    }
+    content = write_fit(fit, certificate)
+    if provenance is not None:
+        content["provenance"] = to_json(provenance.place_beside(Path(path)), Provenance)
     write_atomically(_lay_out(content) + "\n", Path(path))
 
 
+def write_fit(fit: Fit, certificate: Certificate) -> dict[str, Any]:
+    """Return the content of the file of a fit, without its provenance.
+
+    Parameters
+    ----------
+    fit : Fit
+    certificate : Certificate
+    """
+    verdict = judge(fit, certificate)
+    return {
+        "verdict": {"level": verdict.level, "text": str(verdict)} | to_json(verdict, Verdict),
+        "format": FORMAT,
+        "version": VERSION,
+        **_list_dates(fit),
+        "fit": to_json(fit, Fit),
+        "certificate": to_json(certificate, Certificate),
+    }
+
+
+class SavedFit(NamedTuple):
+    """What a file holds; no provenance in files that were written before it was kept."""
+
+    fit: Fit
+    certificate: Certificate
+    provenance: Provenance | None
+
+
 def load_fit(path: Path) -> tuple[Fit, Certificate]:
+    """Return the fit and the certificate of a file, see `load_saved`.
+
+    Parameters
+    ----------
+    path : Path
+    """
+    saved = load_saved(path)
+    return saved.fit, saved.certificate
+
+
+def load_saved(path: Path) -> SavedFit:
     """Read what `save_fit` wrote; every field is equal, and arrays have the same bits, dtype and shape.
 
     Parameters
@@ -92,8 +131,7 @@ def load_fit(path: Path) -> tuple[Fit, Certificate]:
 
     Returns
     -------
-    fit : Fit
-    certificate : Certificate
+    SavedFit
 
     Raises
     ------
@@ -120,27 +158,65 @@ def load_fit(path: Path) -> tuple[Fit, Certificate]:
     try:
         if version < VERSION:
             _upgrade(content, version)
-        fit = _from_json(Fit, content.get("fit"), "fit")
-        certificate = _from_json(Certificate, content.get("certificate"), "certificate")
-        _check_fit(fit)
+        fit, certificate = parse_fit(content)
         if version < DATA:
             directions = analyse_solution(fit, None).directions
             certificate = replace(certificate, worst_unknowns=directions[0].names if directions else ())
-        return fit, certificate
+        given = content.get("provenance")
+        provenance = None if given is None else from_json(Provenance, given, "provenance")
+        return SavedFit(fit, certificate, None if provenance is None else provenance.find_from(Path(path)))
     except (ValueError, OverflowError, RecursionError, MemoryError) as error:
         raise ValueError(f"{path} is damaged: {error}.") from error
+
+
+def _list_dates(fit: Fit) -> dict[str, Any]:
+    """Return the transition times that are dates by their names, for readers of the file; {} where none is."""
+    if all(trajectory.origin is None for trajectory in fit.trajectories):
+        return {}
+    dates = {}
+    for transition in fit.transitions:
+        origin = fit.trajectories[transition.experiment].origin
+        date = None if origin is None else origin.find_date(transition.time, transition.unit)
+        if date is not None:
+            dates[transition.name] = date.isoformat()
+    return {"transition_dates": dates}
+
+
+def parse_fit(content: Mapping[str, Any]) -> tuple[Fit, Certificate]:
+    """Return a fit and its certificate from the content of a file of this version.
+
+    Parameters
+    ----------
+    content : mapping
+
+    Raises
+    ------
+    ValueError
+        If a field is missing, of a wrong type or of a size that does not match the others.
+    """
+    fit = from_json(Fit, content.get("fit"), "fit")
+    certificate = from_json(Certificate, content.get("certificate"), "certificate")
+    _check_fit(fit)
+    return fit, certificate
 
 
 # --- to JSON ----------------------------------------------------------------------------------------------------------
 
 
-def _to_json(record: Any, kind: type) -> Any:
-    """Return a dataclass by the fields of `kind` in terms of dict, list, str, int, finite float, bool and None."""
-    from pydantic_core import to_json  # imported here, since that takes longer than a small fit
+def to_json(record: Any, kind: type) -> Any:
+    """Return a dataclass by the fields of `kind` in terms of dict, list, str, int, finite float, bool and None.
+
+    Parameters
+    ----------
+    record : object
+    kind : type
+        Of the record, or a dataclass with some of its fields.
+    """
+    from pydantic_core import to_json as encode  # imported here, since that takes longer than a small fit
 
     values = {f.name: getattr(record, f.name) for f in fields(kind)}
     named = {name: value.name if isinstance(value, Enum) else value for name, value in values.items()}
-    return json.loads(to_json(named, inf_nan_mode="strings", fallback=_array_to_json))
+    return json.loads(encode(named, inf_nan_mode="strings", fallback=_array_to_json))
 
 
 def _array_to_json(value: Any) -> Any:
@@ -180,8 +256,16 @@ def _refuse_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def _from_json(kind: type, content: Any, where: str) -> Any:
-    """Return a dataclass from JSON; ValueError with the path of a wrong entry."""
+def from_json(kind: type, content: Any, where: str) -> Any:
+    """Return a dataclass from JSON; ValueError with the path of a wrong entry.
+
+    Parameters
+    ----------
+    kind : type
+    content : object
+    where : str
+        What the path begins with.
+    """
     import pydantic
 
     try:
@@ -378,6 +462,8 @@ def _upgrade(content: dict[str, Any], version: int) -> None:
         for comparison in (comparison for run in content["fit"]["comparisons"] for comparison in run):
             comparison.setdefault("weights", None)
             comparison.setdefault("units", [])
+        for trajectory in content["fit"]["trajectories"]:
+            trajectory.setdefault("origin", None)
     except (LookupError, TypeError, AttributeError) as error:
         raise ValueError(
             f"it does not match the format of version {content['version']} ({get_first_line(error)})"
@@ -455,7 +541,7 @@ def _list_possible_constraints(fit: dict[str, Any]) -> dict[str, dict[str, Any]]
             place = {"mode": mode, "position": i, "run": "" if single else run}
             found[f"{where} has collapsed to nothing"] = Constraint("collapsed", 0.0, **place)
             found[f"{where} is at its minimum duration"] = Constraint("minimum duration", np.nan, **place)
-    return {text: _to_json(constraint, Constraint) | {"multiplier": "NaN"} for text, constraint in found.items()}
+    return {text: to_json(constraint, Constraint) | {"multiplier": "NaN"} for text, constraint in found.items()}
 
 
 # --- sizes ------------------------------------------------------------------------------------------------------------
@@ -505,6 +591,8 @@ def _check_fit(fit: Fit) -> None:
 def _check_trajectory(trajectory: Trajectory, transition_times: FloatArray, e: int) -> None:
     where = f"fit.trajectories[{e}]"
     _check_times(f"{where}.times", trajectory.times)
+    if trajectory.origin is not None:
+        normalize_time_unit(trajectory.time_unit)
     n, K = len(trajectory.state_names), len(trajectory.times)
     _check_size(f"{where}.state_units", trajectory.state_units, (n,), f"since its state_names has {n} entries")
     nodes = f"since its times has {K} entries"

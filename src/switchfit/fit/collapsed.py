@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from switchfit.fit.evaluator import Evaluator
 from switchfit.optimize.algebra import EPS
 from switchfit.problem.data import FloatArray
-from switchfit.problem.experiment import Experiment
+from switchfit.problem.experiment import Experiment, drop_jumps
 from switchfit.problem.problem import Problem
 
 CHANGES = (0.1, -0.1)
@@ -55,7 +55,7 @@ def _list_idle_groups(problem: Problem, theta: FloatArray) -> Iterator[NDArray[n
     """Yield the indices in theta of transitions that coincide and may move together without effect.
 
     No transition among them is fixed or at an end of the horizon, the modes before and after them are the same, and no
-    reset map or guard lies in between.
+    reset map, guard or jump lies in between.
     """
     system = problem.system
     for e, experiment in enumerate(problem.experiments):
@@ -63,13 +63,14 @@ def _list_idle_groups(problem: Problem, theta: FloatArray) -> Iterator[NDArray[n
         for first, last in _list_coincident(problem, theta, e):
             passed = [*zip(sequence[first : last + 1], sequence[first + 1 : last + 2], strict=True)]
             smooth = all(system.reset_map(*pair) is None and system.guard(*pair) is None for pair in passed)
+            smooth = smooth and not np.any((experiment.passed_by_jumps > first) & (experiment.passed_by_jumps <= last))
             if smooth and sequence[first] == sequence[last + 1] and np.all(where[first : last + 1] >= 0):
                 yield where[first : last + 1]
 
 
 def _list_coincident(problem: Problem, theta: FloatArray, e: int) -> Iterator[tuple[int, int]]:
     """Yield the first and last of two or more transitions that coincide strictly inside the horizon."""
-    experiment, times = problem.experiments[e], problem.vectors(theta, e)[0]
+    experiment, times = problem.experiments[e], _get_times(problem, theta, e)
     if not np.any(times[1:] - times[:-1] <= _estimate_rounding(experiment)):  # the usual case: tested at every step
         return
     short, room = _find_collapsed(problem, theta, e)
@@ -86,7 +87,7 @@ def _open_modes(problem: Problem, theta: FloatArray) -> FloatArray:
     """Return theta with transition times moved so that every collapsed mode lasts a little, if there is room."""
     opened = theta.copy()
     for e, (experiment, where) in enumerate(zip(problem.experiments, problem.unknowns.times, strict=True)):
-        times, short = problem.vectors(theta, e)[0], _find_collapsed(problem, theta, e)[0]
+        times, short = _get_times(problem, theta, e), _find_collapsed(problem, theta, e)[0]
         if not short.any():
             continue
         gap = OPENED * experiment.initial_length * short
@@ -105,11 +106,17 @@ def _find_collapsed(problem: Problem, theta: FloatArray, e: int) -> tuple[NDArra
     A free tf counts as a transition at the end, to a mode that lasts.
     """
     experiment = problem.experiments[e]
-    times, rounding = problem.vectors(theta, e)[0], _estimate_rounding(experiment)
+    times, rounding = _get_times(problem, theta, e), _estimate_rounding(experiment)
     knots = experiment.ends_of_modes(times)
     at_end = (times - experiment.t0 <= rounding) | (knots[-1] - times <= rounding)
     short = np.diff(knots) <= rounding
     return np.append(short, [False] * (len(times) + 1 - len(short))), at_end
+
+
+def _get_times(problem: Problem, theta: FloatArray, e: int) -> FloatArray:
+    """Return the transition times of experiment e, and a free tf behind them: (N,), without jumps."""
+    experiment, times = problem.experiments[e], problem.vectors(theta, e)[0]
+    return np.array(drop_jumps(experiment, times)) if len(experiment.jump_times) else times
 
 
 def _estimate_rounding(experiment: Experiment) -> float:

@@ -192,7 +192,7 @@ def _fraction(problem: Problem, theta: FloatArray, step: FloatArray) -> float:
 
 def find_guarded_places(problem: Problem) -> NDArray[np.intp]:
     """Return the positions in theta of the guarded transition times, in the order of the guards."""
-    places = [problem.unknowns.times[e][list(s.guarded)] for e, s in enumerate(problem.structures)]
+    places = [problem.places[e][list(s.guarded)] for e, s in enumerate(problem.structures)]
     found = np.concatenate(places).astype(np.intp)
     if len(found) == 0:
         raise ValueError("This problem has no guards: give sf.HybridSystem(guards={(before, after): g}).")

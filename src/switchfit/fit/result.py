@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from datetime import datetime
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 import scipy.special
@@ -21,6 +22,11 @@ from switchfit.problem.validation import as_choice, as_level
 from switchfit.runtime.issue import Issue
 
 CovarianceKind = Literal["exact", "gauss-newton"]
+
+if TYPE_CHECKING:  # a float or an array: what does arithmetic with both needs no cast
+    Values = Mapping[str, Any]
+else:  # what files are read as
+    Values = Mapping[str, FloatArray]
 
 
 @dataclass(frozen=True)
@@ -67,7 +73,7 @@ class Step:
     seconds : float
     ended : str
         Why the many starts ended: "settled", no further minimum was likely; "most", as many as are tried at most;
-        "time" or "interrupted". Empty for other strategies.
+        "time" or "interrupted". "time" for a growing horizon that the time budget ended. Otherwise empty.
 
     See Also
     --------
@@ -101,7 +107,7 @@ class Fit:
     transition_times : tuple of (N,) arrays, one per experiment, fixed ones included
     transition_places : tuple of (N,) int arrays, one per experiment
         Index in theta of each transition time; -1 if it is fixed.
-    parameters : dict of name -> array, fixed ones included
+    parameters : dict of name -> float, or array where there are several, fixed ones included
     parameter_units : dict of name -> str, fixed ones included
     fixed : tuple of str
         Names of the parameters that are fixed.
@@ -179,7 +185,7 @@ class Fit:
     run_names: tuple[str, ...]
     transition_times: tuple[FloatArray, ...]
     transition_places: tuple[NDArray[np.intp], ...]
-    parameters: Mapping[str, FloatArray]
+    parameters: Values
     parameter_units: Mapping[str, str]
     fixed: tuple[str, ...]
     cost: float
@@ -217,6 +223,10 @@ class Fit:
     steps: tuple[Step, ...] = ()
     initial_cost: float = np.nan
 
+    def __post_init__(self) -> None:
+        plain = {name: float(v) if np.ndim(v) == 0 else np.asarray(v) for name, v in self.parameters.items()}
+        object.__setattr__(self, "parameters", plain)
+
     @property
     def termination(self) -> Termination:
         """How the fit ended, as data."""
@@ -226,6 +236,18 @@ class Fit:
     def message(self) -> str:
         """How the fit ended, in a sentence or two, and what to do next."""
         return str(self.termination)
+
+    @property
+    def transition_dates(self) -> tuple[tuple[datetime, ...] | None, ...]:
+        """`transition_times` as dates, one tuple per experiment; None for an experiment whose times are no dates.
+
+        They are `datetime.datetime`, which have a time zone and microseconds; the type of NumPy has no zone.
+        """
+        found: list[tuple[datetime, ...] | None] = []
+        for trajectory, times in zip(self.trajectories, self.transition_times, strict=True):
+            origin = trajectory.origin
+            found.append(None if origin is None else tuple(origin.to_dates(times, trajectory.time_unit)))
+        return tuple(found)
 
     @property
     def final_times(self) -> tuple[float, ...]:

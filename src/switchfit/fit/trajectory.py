@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import datetime
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,28 +17,35 @@ from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.dates import Origin, is_iso_date
+from switchfit.problem.experiment import count_times, drop_jumps, show_time
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_index, as_instance
+from switchfit.problem.validation import as_array, as_choice, as_index, as_instance
+from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import format_line, join_first
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class Trajectory(Tabular):
     """States over time.
 
     Attributes
     ----------
     times : (K,) array
-        All nodes, in `time_unit`; each transition time occurs twice, with the state before and after it.
+        All nodes, in `time_unit`; each transition time and the time of each jump occur twice, with the state before and
+        after.
     states : (K, n) array
     modes : (K,) array of str
         The mode that is active.
     segments : (N + 2,) int array
-        Entries ``segments[i]:segments[i + 1]`` belong to the i-th entry of the mode sequence.
+        Entries ``segments[i]:segments[i + 1]`` belong to the i-th entry of the mode sequence; at times that were asked
+        for there may be none.
     state_names, state_units : tuple of str
     time_unit : str
         Unit of the experiment's times.
+    origin : Origin or None
+        The date at which times are 0; None where they are no dates.
 
     See Also
     --------
@@ -62,6 +71,12 @@ class Trajectory:
     state_names: tuple[str, ...]
     state_units: tuple[str, ...]
     time_unit: str = "s"
+    origin: Origin | None = None
+
+    @property
+    def dates(self) -> list[datetime] | None:
+        """The times as dates in the experiment's time zone; None where they are no dates."""
+        return None if self.origin is None else self.origin.to_dates(self.times, self.time_unit)
 
     def __repr__(self) -> str:
         modes = join_first((str(self.modes[k]) for k in self.segments[:-1] if k < len(self.modes)), 8)
@@ -70,15 +85,29 @@ class Trajectory:
 
     @property
     def mode_spans(self) -> list[tuple[str, float, float]]:
-        """Each mode of the sequence with the times at which it begins and ends."""
+        """Each mode of the sequence with the times at which it begins and ends.
+
+        Of a simulation at given times the first and the last of them in the mode, without modes that have none.
+        """
         return [
             (str(self.modes[a]), float(self.times[a]), float(self.times[b - 1]))
             for a, b in zip(self.segments[:-1], self.segments[1:], strict=True)
+            if b > a
         ]
+
+    @property
+    def pieces(self) -> NDArray[np.intp]:
+        """Where the continuous pieces begin, and K: as `segments`, divided at jumps too."""
+        return np.union1d(self.segments, np.flatnonzero(np.diff(self.times) == 0) + 1)
+
+    @property
+    def jump_times(self) -> FloatArray:
+        """Times of the jumps at known times, those at transitions apart."""
+        return self.times[np.setdiff1d(self.pieces, self.segments)]
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class Comparison(Tabular):
     """Measured and fitted values, for one of the data of one experiment.
 
     Attributes
@@ -142,7 +171,13 @@ class Comparison:
         return np.sqrt(squares.sum(0) / np.where(known.any(0), known.sum(0), np.nan))
 
 
-def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: int = 0) -> Trajectory:
+def simulate(
+    problem: Problem,
+    theta: ArrayLike | None = None,
+    *,
+    times: ArrayLike | Literal["samples"] | None = None,
+    experiment: int = 0,
+) -> Trajectory:
     """Integrate the model to the problem's tolerances.
 
     Parameters
@@ -150,6 +185,11 @@ def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: in
     problem : Problem
     theta : (d,) array_like, optional
         In the order of ``problem.theta_names``; the initial guess if left out.
+    times : (K,) array_like or "samples", optional
+        Times that increase, inside [t0, tf], at which states are returned, as numbers, or as dates where the times of
+        the experiment are dates; at a transition it is the state just before it. "samples": the times of all samples of
+        the experiment. All nodes of the mesh if left out, each transition twice. The steps that the tolerances need are
+        taken whatever these times are.
     experiment : int, optional
         Index of the experiment, from 0.
 
@@ -160,8 +200,8 @@ def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: in
     Raises
     ------
     ValueError
-        For a theta of the wrong shape or order, an experiment that does not exist, or a trajectory that
-        cannot be integrated.
+        For a theta of the wrong shape or order, times outside [t0, tf] or that do not increase, an experiment that does
+        not exist or has no samples, or a trajectory that cannot be integrated.
     TypeError
         If an argument is of the wrong type.
 
@@ -178,14 +218,61 @@ def simulate(problem: Problem, theta: ArrayLike | None = None, *, experiment: in
     >>> path = sf.simulate(problem, [2.5, 0.4])
     >>> round(float(path.states.max()), 1)
     15.8
+    >>> sf.simulate(problem, [2.5, 0.4], times=[0.0, 2.0, 4.0, 6.0]).states[:, 0].round(1)
+    array([ 0. , 13.8,  8.7,  3.9])
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     experiment = as_index(experiment, "experiment", len(problem.experiments))
     checked = problem.check_theta(theta)
+    asked = None if times is None else _check_times(problem, experiment, checked, times)
     mesh = refine_mesh(problem, experiment, checked)
+    mesh = mesh if asked is None else mesh.insert(asked)
     engine = engine_of(problem, experiment, build_arguments(problem, experiment, mesh), mesh)
     simulation = engine.simulate(*problem.vectors(checked, experiment), tangents=False)
-    return _build_trajectory(problem, experiment, simulation)
+    trajectory = _build_trajectory(problem, experiment, simulation)
+    return trajectory if asked is None else _select_times(trajectory, asked)
+
+
+def _check_times(problem: Problem, e: int, theta: FloatArray, times: ArrayLike | Literal["samples"]) -> FloatArray:
+    """Return the times at which a simulation is asked for, (K,)."""
+    experiment = problem.experiments[e]
+    t0, tf = problem.ends_of_modes(theta)[e][[0, -1]].tolist()
+    if isinstance(times, str) and not is_iso_date(times):
+        as_choice(times, "times", ("samples",))
+        found = [item.times for item in experiment.data if isinstance(item, Measurements)]
+        found += [item.samples[0] for item in experiment.data if isinstance(item, ReferenceSignal) and item.samples]
+        inside = np.unique(np.concatenate([np.zeros(0), *found]))
+        inside = inside[(t0 <= inside) & (inside <= tf)]
+        if not len(inside):
+            raise ValueError(f"times='samples' needs data with samples, and experiment {e} has none; give times.")
+        return inside
+    asked = np.atleast_1d(as_array(count_times(experiment, times), "times"))
+    if asked.ndim != 1 or asked.size == 0 or not np.isfinite(asked).all():
+        raise ValueError(f"times must be finite numbers of shape (K,), or 'samples'; got shape {asked.shape}.")
+    wrong = np.diff(asked) <= 0
+    if wrong.any():
+        k = int(wrong.argmax())
+        raise ValueError(f"times must increase strictly; got {asked[k + 1]} after {asked[k]}.")
+    outside = (asked < t0) | (asked > tf)
+    if outside.any():
+        unit = unit_suffix(experiment.time_unit) if experiment.origin is None else ""
+        ends = f"[{show_time(experiment, t0)}, {show_time(experiment, tf)}]{unit}"
+        raise ValueError(f"times must lie inside [t0, tf] = {ends}; got {show_time(experiment, asked[outside][0])}.")
+    return asked
+
+
+def _select_times(trajectory: Trajectory, asked: FloatArray) -> Trajectory:
+    """Return a trajectory at some of its nodes (K,); at a transition, just before it."""
+    # The first of two nodes at one time; a free tf that rounding has put before the last time is the last node.
+    places = np.minimum(np.searchsorted(trajectory.times, asked), len(trajectory.times) - 1)
+    segments = np.searchsorted(places, trajectory.segments)
+    return replace(
+        trajectory,
+        times=trajectory.times[places],
+        states=trajectory.states[places],
+        modes=trajectory.modes[places],
+        segments=segments,
+    )
 
 
 class SimulatedProblem:
@@ -249,9 +336,12 @@ def _build_trajectory(problem: Problem, e: int, simulation: Simulation) -> Traje
     structure, system = problem.structures[e], problem.system
     moving = simulation.end > simulation.start
     counts = [1 + int(moving[rows].sum()) for rows in simulation.segments]
+    if structure.jumps:  # a mode goes on after a jump
+        starts = np.array(drop_jumps(problem.experiments[e], range(1, len(counts))), dtype=np.intp)
+        counts = np.add.reduceat(counts, np.insert(starts, 0, 0)).tolist()
     modes = np.repeat(problem.experiments[e].mode_sequence, counts)
-    names = system.state_names or tuple(f"x{k + 1}" for k in range(structure.n))
-    units = system.state_units or ("",) * structure.n
+    names = tuple(system.state_names or (f"x{k + 1}" for k in range(structure.n)))
+    units = tuple(system.state_units or ("",) * structure.n)
     return Trajectory(
         select_visible(simulation, simulation.start, simulation.end),
         select_visible(simulation, simulation.before, simulation.after),
@@ -260,6 +350,7 @@ def _build_trajectory(problem: Problem, e: int, simulation: Simulation) -> Traje
         names,
         units,
         problem.experiments[e].time_unit,
+        problem.experiments[e].origin,
     )
 
 
@@ -279,8 +370,8 @@ def _build_comparisons(
         first += q
         curve = curves[:, channels]
         default = trajectory.state_names if item.observe is None else tuple(f"y{k + 1}" for k in range(q))
-        label = item.names or default
-        units = item.units or tuple(known.get(name, "") for name in label)
+        label = tuple(item.names or default)
+        units = tuple(item.units or ()) or tuple(known.get(name, "") for name in label)
         if isinstance(item, ReferenceSignal):
             weights = np.diag(item.weights).copy()
             here = Comparison(

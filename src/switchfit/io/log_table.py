@@ -1,17 +1,24 @@
-"""Many logs fitted one by one: which they are, and a table with a line for each."""
+"""Many logs fitted one by one: which they are, and a table with a line for each, as CSV or Parquet."""
 
 from __future__ import annotations
 
 import csv
+import importlib
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.io.logs.files import find_logs, name_logs
 from switchfit.io.problem_file import ProblemFile, load_problem
+from switchfit.report.dates import list_dated
 from switchfit.report.verdict import write_reason
+from switchfit.runtime.errors import InputError
+from switchfit.uncertainty.quality import measure_quality
 from switchfit.uncertainty.residuals import correct_errors
 
 
@@ -48,11 +55,50 @@ def load_log(problem: Path, log: Path) -> tuple[ProblemFile | None, str]:
         return None, str(error)
 
 
+PARQUET = (".parquet", ".pq")
+"""Endings of tables that are written as Parquet; all others are CSV."""
+
+ERROR = "{} std. error"
+"""Name of the column beside that of an unknown."""
+
+
+def check_table(path: Path) -> None:
+    """Raise for a table that cannot be written, before any log is fitted.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    InputError
+        If it is to be Parquet, and pyarrow is not installed.
+    """
+    if path.suffix.lower() in PARQUET:
+        try:
+            importlib.import_module("pyarrow.parquet")
+        except ImportError as error:
+            raise InputError(
+                f"{path} is written with pyarrow, which cannot be imported ({error}): pip install "
+                "'switchfit[parquet]', or give the table a name that ends in .csv."
+            ) from error
+
+
 @dataclass
 class ResultTable:
-    """Results of fits to logs, in the order in which they were fitted."""
+    """Results of fits to logs, in the order in which they were fitted.
 
-    rows: list[dict[str, str]] = field(default_factory=list)
+    Attributes
+    ----------
+    rows : list of dict
+        Of each log its columns; a column that does not apply to it is left out.
+    unknowns : dict of str to str
+        Names of the columns of the unknowns of all logs, with the unit in parentheses, and their units.
+    refused, failed : int
+    """
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    unknowns: dict[str, str] = field(default_factory=dict)
     refused: int = 0
     failed: int = 0
 
@@ -76,12 +122,31 @@ class ResultTable:
         message = "" if estimate.status.successful else estimate.message
         if not message and not estimate.success:
             message = write_reason(estimate.verdict.reasons[0])
-        row = {"log": log, "verdict": estimate.verdict.level, "status": estimate.status.name}
-        row |= {"cost": repr(float(estimate.cost))}
+        quality = measure_quality(estimate)
+        trajectory = estimate.trajectories[0]
+        row: dict[str, Any] = {
+            "log": log,
+            "verdict": estimate.verdict.level,
+            "status": estimate.status.name,
+            "cost": float(estimate.cost),
+            "values": estimate.samples,
+            "chi2": float(quality.chi_square),
+            "degrees of freedom": quality.freedom,
+            "explained": float(quality.explained),
+            "t0": float(trajectory.times[0]),
+            "tf": float(trajectory.times[-1]),
+            "time unit": trajectory.time_unit,
+            "iterations": estimate.iterations,
+            "seconds": float(estimate.seconds),
+        }
         units, errors = estimate.theta_units, correct_errors(estimate)
         for name, unit, value, error_of in zip(estimate.theta_names, units, estimate.theta, errors, strict=True):
             shown = f"{name} ({unit})" if unit and unit != "1" else name
-            row |= {shown: repr(float(value)), f"{shown} std. error": repr(float(error_of))}
+            self.unknowns[shown] = unit
+            row |= {shown: float(value), ERROR.format(shown): float(error_of)}
+        for name, value, run in zip(estimate.theta_names, estimate.theta, list_dated(estimate), strict=True):
+            date = None if run is None or run.origin is None else run.origin.find_date(value, run.time_unit)
+            row |= {} if date is None else {f"{name} (date)": date.isoformat()}
         self.rows.append({**row, "message": message})
 
     def describe_last(self) -> str:
@@ -89,11 +154,8 @@ class ResultTable:
         row = self.rows[-1]
         if row["verdict"] == "refused":
             return f"{row['log']}: refused. {row['message']}"
-        skipped = ("log", "verdict", "status", "cost", "message")
         numbers = [
-            f"{name} = {float(value):.6g} +- {float(row[f'{name} std. error']):.2g}"
-            for name, value in row.items()
-            if name not in skipped and not name.endswith(" std. error")
+            f"{name} = {row[name]:.6g} +- {row[ERROR.format(name)]:.2g}" for name in self.unknowns if name in row
         ]
         message = f". {row['message']}" if row["message"] else ""
         return f"{row['log']}: {row['verdict']}. {', '.join(numbers)}{message}"
@@ -110,11 +172,38 @@ class ResultTable:
         fitted = len(self) - self.refused - self.failed
         return f"{total} logs: {fitted} fitted, {self.failed} not, {self.refused} refused{left}"
 
-    def write(self) -> str:
-        """Return the table as CSV, with the columns that any of the logs has."""
+    def write(self, path: Path) -> str | bytes:
+        """Return the content of the table's file, with the columns that any of the logs has.
+
+        Parameters
+        ----------
+        path : Path
+            Its ending says whether it is Parquet or CSV.
+        """
         columns = list(dict.fromkeys(name for row in self.rows for name in row if name != "message"))
+        columns.append("message")
+        return self._write_parquet(columns) if path.suffix.lower() in PARQUET else self._write_csv(columns)
+
+    def _write_csv(self, columns: Sequence[str]) -> str:
+        """Return CSV; numbers have the digits that it takes to read the same ones, and NaN is an empty cell."""
         text = io.StringIO()
-        table = csv.DictWriter(text, [*columns, "message"], restval="", lineterminator="\r\n")
+        table = csv.DictWriter(text, columns, restval="", lineterminator="\r\n")
         table.writeheader()
-        table.writerows(self.rows)
+        for row in self.rows:
+            table.writerow({name: "" if isinstance(x, float) and np.isnan(x) else x for name, x in row.items()})
         return text.getvalue()
+
+    def _write_parquet(self, columns: Sequence[str]) -> bytes:
+        """Return Parquet; an empty cell is null, and the fields of unknowns have their units as metadata."""
+        import pyarrow
+        import pyarrow.parquet
+
+        arrays, fields = [], []
+        for name in columns:
+            array = pyarrow.array([row.get(name) for row in self.rows])
+            unit = self.unknowns.get(name.removesuffix(ERROR.format("")), "")
+            arrays.append(array)
+            fields.append(pyarrow.field(name, array.type, metadata={"unit": unit} if unit else None))
+        file = io.BytesIO()
+        pyarrow.parquet.write_table(pyarrow.table(arrays, schema=pyarrow.schema(fields)), file)
+        return file.getvalue()

@@ -6,6 +6,7 @@ messages. ``docs/problem-file.md`` shows the format by example.
 
 from __future__ import annotations
 
+import datetime
 import difflib
 import functools
 import inspect
@@ -13,7 +14,7 @@ import os
 import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args
 
@@ -23,14 +24,18 @@ from numpy.typing import NDArray
 from pydantic import Field
 from pydantic_core import PydanticCustomError
 
+from switchfit.estimation.provenance import Provenance
 from switchfit.io.logs.files import find_logs, name_logs
 from switchfit.io.logs.log import Log
 from switchfit.io.logs.reader import align_starts, read_source
 from switchfit.io.logs.units import SECONDS, normalize_time_unit
 from switchfit.io.python_file import call, describe_error, find_object, find_user_place, load_object
+from switchfit.io.sources import describe_sources
 from switchfit.models import BUILT_IN
 from switchfit.problem.data import FloatArray, Input, Measurements, ReferenceSignal
+from switchfit.problem.dates import EXAMPLES, Dates, as_dates, make_origin
 from switchfit.problem.experiment import Experiment, Parameter
+from switchfit.problem.jump import Jump
 from switchfit.problem.priors import LogNormal, Normal, Prior
 from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
@@ -54,6 +59,8 @@ class ProblemFile:
     problem : Problem
     options : dict
         Keyword arguments for `switchfit.estimate` that the file sets.
+    provenance : Provenance
+        The text of the file, and hashes of the files that it names: for `Estimate.save`.
     issues : tuple of Issue
         What is odd about the logs; of kind "log: refused" for those of many that could not be used.
     """
@@ -61,6 +68,7 @@ class ProblemFile:
     path: Path
     problem: Problem
     options: dict[str, Any]
+    provenance: Provenance
     issues: tuple[Issue, ...] = ()
 
 
@@ -78,7 +86,7 @@ class Runs(NamedTuple):
     issues: tuple[Issue, ...]
 
 
-def load_problem(path: str | Path, log: str | Path | None = None) -> ProblemFile:
+def load_problem(path: str | Path, log: str | Path | None = None, *, text: str | None = None) -> ProblemFile:
     """Read a problem file, the data files it names, and the Python file of its model.
 
     Parameters
@@ -87,6 +95,8 @@ def load_problem(path: str | Path, log: str | Path | None = None) -> ProblemFile
         A TOML file. Paths in it are relative to its folder.
     log : str or Path, optional
         Instead of the file that the data of the only experiment name; inputs and further data from other files stay.
+    text : str, optional
+        Instead of what the problem file contains, which then need not be there.
 
     Returns
     -------
@@ -99,13 +109,15 @@ def load_problem(path: str | Path, log: str | Path | None = None) -> ProblemFile
         given, and what to do.
     """
     path = Path(path)
-    contents = _validate(path, _parse(path))
+    text = _read(path) if text is None else text
+    contents = _validate(path, _parse(path, text))
     if log is not None:
         contents = _replace_log(path, contents, os.path.abspath(log))
     options = contents.options.model_dump(include=OPTIONS, exclude_none=True)
     build = _build_from_tables if contents.problem is None else _load_from_python
     problem, issues = build(path, contents)
-    return ProblemFile(path, problem, options, issues)
+    provenance = describe_sources(path, text, log, contents.model_dump(exclude_none=True), options)
+    return ProblemFile(path, problem, options, provenance, issues)
 
 
 def read_experiments(path: str | Path) -> Runs:
@@ -126,7 +138,7 @@ def read_experiments(path: str | Path) -> Runs:
         As in `load_problem`.
     """
     path = Path(path)
-    contents = _validate(path, _parse(path))
+    contents = _validate(path, _parse(path, _read(path)))
     if contents.problem is not None:
         find_object(contents.problem, path.parent, f"{path}: problem")
         return Runs((), ())
@@ -145,6 +157,44 @@ class _Table(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
+def _is_date(given: Any) -> bool:
+    """Return whether a value is a date: one of TOML's own, or text in ISO 8601."""
+    if not isinstance(given, (str, datetime.date)):
+        return False
+    try:
+        as_dates(given, "the time")
+    except ValueError:
+        return False
+    return True
+
+
+def _check_time(given: Any) -> Any:
+    """Return a number or a date."""
+    if isinstance(given, (int, float)) and not isinstance(given, bool):
+        return float(given)
+    if _is_date(given):
+        return given
+    raise PydanticCustomError("time_type", f"Input should be a number or a date such as {EXAMPLES}")
+
+
+def _check_date(given: Any) -> Any:
+    """Return a date."""
+    if _is_date(given):
+        return given
+    raise PydanticCustomError("date_type", f"Input should be a date such as {EXAMPLES}")
+
+
+Time = Annotated[Any, pydantic.PlainValidator(_check_time)]
+"""A number in the experiment's time unit, or a date."""
+
+Date = Annotated[Any, pydantic.PlainValidator(_check_date)]
+
+
+def _time_as_table(given: Any) -> Any:
+    """Return ``{ value = 5.0 }`` for ``5.0``, and for a date: the guess of a transition time."""
+    return {"value": given} if _is_date(given) else _number_as_table(given)
+
+
 def _number_as_table(given: Any) -> Any:
     """Return ``{ value = 0.8 }`` for ``0.8``, the guess of an unknown."""
     return {"value": given} if isinstance(given, (int, float, list)) and not isinstance(given, bool) else given
@@ -157,8 +207,10 @@ def _known_as_table(given: Any) -> Any:
 
 def _end_as_table(given: Any) -> Any:
     """Return ``{ value = 6.0, fixed = true }`` for ``6.0``: a tf given as a number is known."""
+    if _is_date(given):
+        return {"value": given, "fixed": True}
     if given is not None and not isinstance(given, dict) and _known_as_table(given) is given:
-        raise PydanticCustomError("float_type", "Input should be a valid number")
+        raise PydanticCustomError("float_type", "Input should be a valid number or a date")
     return _known_as_table(given)
 
 
@@ -185,7 +237,7 @@ def _repair_as_list(given: Any) -> Any:
 class PriorTable(_Table):
     """A prior: normal with mean and sd, or log-normal with median and log_sd."""
 
-    mean: float | None = Field(default=None, description="mean of a normal prior")
+    mean: Time = Field(default=None, description="mean of a normal prior")
     sd: float | None = Field(default=None, description="standard deviation of a normal prior")
     median: float | None = Field(default=None, description="median of a log-normal prior")
     log_sd: float | None = Field(
@@ -210,9 +262,9 @@ class ParameterTable(_Table):
 class TransitionTable(_Table):
     """First guess of a transition time, or of tf, with bounds."""
 
-    value: float = Field(description="first guess of the transition time, in the experiment's time_unit")
-    lower: float = Field(default=-np.inf, description="earliest time")
-    upper: float = Field(default=np.inf, description="latest time")
+    value: Time = Field(description="first guess of the transition time, in the experiment's time_unit, or a date")
+    lower: Time = Field(default=-np.inf, description="earliest time")
+    upper: Time = Field(default=np.inf, description="latest time")
     unit: str = Field(default="", description="left out or the same as the experiment's time_unit")
     fixed: bool = Field(default=False, description="true if the time is known and not to be estimated")
     prior: PriorTable | None = Field(
@@ -255,8 +307,11 @@ class LogTable(_Table):
     range_error: float | None = Field(
         default=None, gt=0, description="standard deviation of the distance to a satellite in m; HDOP times it is sigma"
     )
-    window: Annotated[list[float], Field(min_length=2, max_length=2)] | None = Field(
-        default=None, description="[from, to]: only rows with the time column in between are used"
+    epoch: Literal["s", "ms", "us", "ns"] | None = Field(
+        default=None, description="the numbers in the time column count from 1970 (UTC) in this unit: they are dates"
+    )
+    window: Annotated[list[Time], Field(min_length=2, max_length=2)] | None = Field(
+        default=None, description="[from, to]: only rows with the time column, or the date, in between are used"
     )
     time_offset: Annotated[float | None, pydantic.BeforeValidator(_first_as_none)] = Field(
         default=0.0, description="subtracted from the time column; 'first': the time of the first row"
@@ -319,26 +374,52 @@ class InputTable(LogTable):
     kind: Literal["hold", "linear", "cubic"] = Field(default="hold", description="interpolation between samples")
 
 
+class ModelTable(_Table):
+    """The model: built in, or in a Python file."""
+
+    name: str = Field(description="a built-in model, or 'file.py:object' with a HybridSystem or a function making one")
+    arguments: dict[str, Any] = Field(default_factory=dict, description="arguments of the function")
+
+
+class JumpTable(_Table):
+    """A change of the state at known times."""
+
+    time: float | list[float] = Field(description="when, in the experiment's time_unit: a number, or several")
+    map: Annotated[ModelTable, pydantic.BeforeValidator(_name_as_table)] = Field(
+        description="'file.py:function' with map(t, x, p), which returns the state just after; or a table with the "
+        "name and arguments of a function that returns such a map"
+    )
+
+
 class ExperimentTable(_Table):
     """One run."""
 
     mode_sequence: list[str] = Field(min_length=1, description="names of the modes in the order of their activity")
-    transition_times: list[Annotated[TransitionTable, pydantic.BeforeValidator(_number_as_table)]] | None = Field(
+    transition_times: list[Annotated[TransitionTable, pydantic.BeforeValidator(_time_as_table)]] | None = Field(
         default=None,
-        description="first guess of each transition time, in time_unit, one fewer than modes; if left out, all of the "
-        "log is searched",
+        description="first guess of each transition time, in time_unit or as a date, one fewer than modes; if left "
+        "out, all of the log is searched",
     )
     time_unit: str = Field(
-        default="s", min_length=1, description="unit of all times of the run, for the report; nothing is converted"
+        default="s",
+        min_length=1,
+        description="unit of all times of the run; dates are converted to it, numbers are not",
+    )
+    origin: Date = Field(
+        default=None, description="date at which times are 0; left out, t0 if it is a date, else the first date"
+    )
+    time_zone: str | None = Field(
+        default=None,
+        description="zone of the dates that state none, and in which dates are shown, such as 'Europe/Berlin'",
     )
     data: Annotated[list[DataTable], pydantic.BeforeValidator(_table_as_list)] = Field(
         min_length=1, description="data to which the model is fitted; the costs of several tables are added"
     )
-    t0: float | None = Field(default=None, description="start of the horizon; left out, the first sample")
+    t0: Time = Field(default=None, description="start of the horizon, a number or a date; left out, the first sample")
     tf: Annotated[TransitionTable | None, pydantic.BeforeValidator(_end_as_table)] = Field(
         default=None,
-        description="end of the horizon; left out, the last sample. A number, or a table with value, lower and upper "
-        "if it is to be estimated",
+        description="end of the horizon; left out, the last sample. A number or a date, or a table with value, lower "
+        "and upper if it is to be estimated",
     )
     initial_state: list[Annotated[StateTable, pydantic.BeforeValidator(_known_as_table)]] | None = Field(
         default=None,
@@ -349,14 +430,10 @@ class ExperimentTable(_Table):
         description="the model's name of a parameter = the name under [parameters] that this run uses for it",
     )
     inputs: InputTable | None = Field(default=None, description="a known input")
+    jumps: Annotated[list[JumpTable], pydantic.BeforeValidator(_table_as_list)] = Field(
+        default_factory=list, description="changes of the state at known times, such as doses"
+    )
     name: str | None = Field(default=None, description="used in the report if there are several experiments")
-
-
-class ModelTable(_Table):
-    """The model: built in, or in a Python file."""
-
-    name: str = Field(description="a built-in model, or 'file.py:object' with a HybridSystem or a function making one")
-    arguments: dict[str, Any] = Field(default_factory=dict, description="arguments of the function")
 
 
 class OptionsTable(_Table):
@@ -401,19 +478,25 @@ class Contents(_Table):
 # --- from text to checked tables --------------------------------------------------------------------------------------
 
 
-def _parse(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> str:
     if is_device(path):
         raise InputError(f"{path} is a device; name a problem file.")
     try:
-        with path.open("rb") as file:
-            return tomllib.load(file)
+        return path.read_bytes().decode()
     except FileNotFoundError:
         raise InputError(f"There is no problem file {path}; check the name and the folder.") from None
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not valid TOML: {error}.") from error
+
+
+def _parse(path: Path, text: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
     except RecursionError as error:
         raise InputError(f"{path} is not valid TOML: brackets are nested too deep.") from error
-    except ValueError as error:  # invalid TOML, invalid UTF-8, or a number with thousands of digits
+    except ValueError as error:  # invalid TOML, or a number with thousands of digits
         raise InputError(f"{path} is not valid TOML: {error}.") from error
 
 
@@ -684,24 +767,84 @@ def _build_experiment(
 ) -> Experiment:
     places = [f"{where}.data[{k}]" for k in range(1, len(table.data) + 1)]
     data = [
-        _build_at(place, _build_data, folder, item, log, system, place, parameters, table.time_unit)
+        _build_at(place, _build_data, folder, item, log, system, place, parameters, table)
         for place, item, log in zip(places, table.data, logs, strict=False)  # that of the inputs comes after them
     ]
     times = table.transition_times
     return Experiment(
         data=data,
         mode_sequence=tuple(table.mode_sequence),
-        transition_times=None if times is None else tuple(map(_build_parameter, times)),  # type: ignore[arg-type]
-        t0=table.t0,  # type: ignore[arg-type]  # None: from the data
+        transition_times=None if times is None else tuple(map(_build_parameter, times)),
+        t0=table.t0,
         tf=None if table.tf is None else _build_parameter(table.tf),  # type: ignore[arg-type]
         inputs=None
         if table.inputs is None
-        else _build_at(f"{where}.inputs", _build_input, table.inputs, logs[-1], table.time_unit),
+        else _build_at(f"{where}.inputs", _build_input, table.inputs, logs[-1], table),
         initial_state=_build_initial_state(table),
         parameter_map=table.parameter_map,
         name=table.name,
         time_unit=table.time_unit,
+        jumps=[
+            _build_at(f"{where}.jumps[{k}]", _build_jump, folder, item, system, f"{where}.jumps[{k}].map")
+            for k, item in enumerate(table.jumps, start=1)
+        ],
+        origin=_find_origin(table, logs),
+        time_zone=table.time_zone,
     )
+
+
+def _build_jump(folder: Path, table: JumpTable, system: HybridSystem | None, where: str) -> Jump:
+    """Return a jump; without a system, one whose map was not loaded."""
+    if ".py" not in table.map.name:
+        raise ValueError(f"map must name a function of a Python file, 'file.py:function'; got {table.map.name!r}.")
+    if system is None:
+        find_object(table.map.name, folder, where)
+        return Jump(table.time, lambda t, x, p: x)
+    found = load_object(table.map.name, folder, where)
+    if table.map.arguments and callable(found):
+        found = call(found, f"{where} {table.map.name!r}", **_check_arguments(found, table.map, where))
+    return Jump(table.time, found)
+
+
+def _find_origin(table: ExperimentTable, logs: Sequence[Log]) -> Any:
+    """Return the date at which times are 0: as stated, else t0, else the beginning of the earliest log with dates."""
+    if table.origin is not None or _is_date(table.t0):
+        return table.origin
+    dated = [log for item, log in zip(_list_log_tables(table), logs, strict=True) if _keep_dates(item, log, table)]
+    zones = {log.time_zone for log in dated}
+    if not dated or ("" in zones and len(zones) > 1 and table.time_zone is None):
+        return None  # the experiment says which dates have zones and which have none
+    zone = table.time_zone or (zones.pop() if len(zones) == 1 else "UTC")
+    starts = [
+        as_dates(log.start if log.time_zone else log.start.replace(tzinfo=None), "origin") for log in dated if log.start
+    ]
+    return make_origin(min(int((start.localize(zone, "origin") if zone else start).instants) for start in starts), zone)
+
+
+def _keep_dates(item: LogTable, log: Log, run: ExperimentTable) -> bool:
+    """Return whether the times of a log are handed over as dates.
+
+    Those that are written as dates are, unless time_offset or time_scale makes numbers of them; the stamps of a
+    recorder, and numbers since 1970, only if the file says that they are dates, or gives a date to compare them with.
+    """
+    if not log.offset:
+        return False
+    stated = item.epoch is not None or run.origin is not None or run.time_zone is not None or _has_dates(run)
+    if item.time_offset == 0.0 and item.time_scale is None:
+        return log.has_dates or stated
+    if stated:
+        raise ValueError(
+            f"{log.source} has dates, which are converted to time_unit by themselves: leave out time_offset and "
+            "time_scale."
+        )
+    return False
+
+
+def _has_dates(run: ExperimentTable) -> bool:
+    """Return whether a time of an experiment is given as a date."""
+    tables = [*(run.transition_times or ()), *([] if run.tf is None else [run.tf])]
+    times = [run.t0, *(time for table in tables for time in (table.value, table.lower, table.upper))]
+    return any(map(_is_date, times))
 
 
 def _build_initial_state(table: ExperimentTable) -> list[Parameter] | list[float] | None:
@@ -720,7 +863,7 @@ def _build_data(
     system: HybridSystem | None,
     where: str,
     parameters: frozenset[str],
-    time_unit: str,
+    run: ExperimentTable,
 ) -> Measurements | ReferenceSignal:
     observe = _build_observe(folder, table, system, where)
     names = tuple(table.observe) if isinstance(table.observe, list) else tuple(table.columns)
@@ -730,7 +873,7 @@ def _build_data(
         for key, default in (("loss", "linear"), ("delay", 0.0)):
             if getattr(table, key) != default:
                 raise ValueError(f"{key} belongs to kind = 'measurements', not to a reference.")
-        times, values, units = _cut_log(log, table, table.columns, time_unit, "ReferenceSignal")
+        times, values, units = _cut_log(log, table, table.columns, run, "ReferenceSignal")
         return ReferenceSignal.from_samples(
             times, values, observe=observe, lowpass_hz=table.lowpass_hz, weights=table.weights, names=names, units=units
         )
@@ -738,7 +881,7 @@ def _build_data(
         if getattr(table, key) is not None:
             raise ValueError(f"{key} belongs to kind = 'reference'; measurements have sigma.")
     sigma_columns = _find_sigma_columns(table, parameters)
-    times, values, units = _cut_log(log, table, [*table.columns, *sigma_columns], time_unit, "Measurements")
+    times, values, units = _cut_log(log, table, [*table.columns, *sigma_columns], run, "Measurements")
     q = len(table.columns)
     sigma = values[:, q:] if sigma_columns else table.sigma
     return Measurements(
@@ -768,38 +911,60 @@ def _find_sigma_columns(table: DataTable, parameters: frozenset[str]) -> list[st
     return named
 
 
-def _build_input(table: InputTable, log: Log, time_unit: str) -> Input:
+def _build_input(table: InputTable, log: Log, run: ExperimentTable) -> Input:
     if isinstance(table.columns, dict):
-        times, values, units = _cut_log(log, table, list(table.columns.values()), time_unit, "Input")
+        times, values, units = _cut_log(log, table, list(table.columns.values()), run, "Input")
         named = dict(zip(table.columns, values.T, strict=True))
         ordered = tuple(unit for _, unit in sorted(zip(table.columns, units, strict=True)))
         return Input(times, named, kind=table.kind, units=ordered)
-    times, values, units = _cut_log(log, table, table.columns, time_unit, "Input")
+    times, values, units = _cut_log(log, table, table.columns, run, "Input")
     return Input(times, values[:, 0] if len(table.columns) == 1 else values, kind=table.kind, units=units)
 
 
 def _cut_log(
-    log: Log, table: LogTable, columns: Sequence[str], time_unit: str, what: str
-) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
-    """Return times (K,) and the values of some columns (K, q) in the rows inside the window, and their units.
+    log: Log, table: LogTable, columns: Sequence[str], run: ExperimentTable, what: str
+) -> tuple[FloatArray | Dates, FloatArray, tuple[str, ...]]:
+    """Return times (K,), which may be dates, and the values of some columns (K, q) in the rows inside the window, and
+    their units.
 
     `what` is made from them, for messages.
     """
     times, inside = log.times, np.ones(len(log), dtype=bool)
     if table.window is not None:
-        first, last = table.window
-        inside = (times >= first) & (times <= last)
+        (first, last), axis = _place_window(log, table, run)
+        inside = (axis >= first) & (axis <= last)
         if not inside.any():
+            shown = log.dates if any(map(_is_date, table.window)) else None
+            least, most = (axis.min(), axis.max()) if shown is None else (repr(shown[0]), repr(shown[-1]))
             raise InputError(
-                f"{log.source}: no time in column {log.time_name!r} lies in the window [{first}, {last}]; they reach "
-                f"from {times.min()} to {times.max()}."
+                f"{log.source}: no time in column {log.time_name!r} lies in the window [{table.window[0]}, "
+                f"{table.window[1]}]; they reach from {least} to {most}."
             )
     times = times[inside]
     _check_order(log, times, log.rows[inside], what)
     offset = times[0] if table.time_offset is None else table.time_offset
     values = np.stack([log[name][inside] for name in columns], axis=1)
     units = tuple(log.units[log.find_channel(name)] for name in columns)
-    return (times - offset) * _find_time_scale(log, table, time_unit), values, units
+    if log.dates is not None and _keep_dates(table, log, run):
+        return log.dates[inside], values, units
+    return (times - offset) * _find_time_scale(log, table, run.time_unit), values, units
+
+
+def _place_window(log: Log, table: LogTable, run: ExperimentTable) -> tuple[list[float], FloatArray]:
+    """Return the ends of the window, and the times of a log (K,), both as numbers with one origin and one unit."""
+    ends = table.window or []
+    dated = list(map(_is_date, ends))
+    if not any(dated):
+        return list(ends), log.times + log.offset if table.epoch is not None else log.times
+    if not all(dated) or log.dates is None:
+        other = "numbers" if log.dates is None else "dates, of which the window has one"
+        raise ValueError(f"window = [{ends[0]}, {ends[1]}] has dates, and {log.source} has {other}. Give both alike.")
+    zone = run.time_zone or log.time_zone
+    origin = make_origin(int(log.dates.instants[0]), log.time_zone) if not zone else None
+    if origin is None:
+        origin = make_origin(int(log.dates.localize(zone, log.source).instants[0]), zone)
+    limits = [float(origin.to_numbers(as_dates(end, "window"), "s", "window")) for end in ends]
+    return limits, origin.to_numbers(log.dates, "s", log.source)
 
 
 def _open_logs(folder: Path, table: ExperimentTable, where: str, parameters: frozenset[str]) -> list[Log]:
@@ -824,7 +989,7 @@ def _open_input(folder: Path, table: InputTable) -> Log:
 def _open_log(folder: Path, table: LogTable, columns: Sequence[str]) -> Log:
     if table.file is None:
         raise ValueError("the key 'file' is missing: name the log, or give logs: switchfit fit LOG ... --problem FILE.")
-    return read_source(
+    log = read_source(
         folder / table.file,
         columns=list(dict.fromkeys(columns)),
         time=table.time,
@@ -834,6 +999,19 @@ def _open_log(folder: Path, table: LogTable, columns: Sequence[str]) -> Log:
         repair=table.repair,
         keep_epoch=True,
     )
+    return log if table.epoch is None else _count_from_1970(log, table.epoch)
+
+
+def _count_from_1970(log: Log, unit: str) -> Log:
+    """Return a log whose times are numbers since 1970 as one with dates."""
+    if log.offset:
+        raise ValueError(f"{log.source} has dates already: leave out epoch = {unit!r}.")
+    if log.time_unit not in ("", unit):
+        raise ValueError(f"{log.source}: the times are in {log.time_unit}, but epoch is {unit!r}.")
+    first = float(log.times[0])
+    if not first > 0:
+        raise ValueError(f"{log.source}: epoch = {unit!r} needs numbers that count from 1970; the first is {first:g}.")
+    return replace(log, times=log.times - first, offset=first, time_unit=unit, time_zone="UTC")
 
 
 def _check_order(log: Log, times: FloatArray, rows: NDArray[np.intp], what: str) -> None:

@@ -10,8 +10,11 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
+from switchfit.fit.trajectory import Trajectory
 from switchfit.optimize.arrow import ArrowLayout
 from switchfit.problem.problem import Problem
+from switchfit.report.dates import list_dated
+from switchfit.report.frames import list_holds
 from switchfit.uncertainty.quality import ChannelQuality, measure_quality
 from switchfit.uncertainty.residuals import correct_errors
 from switchfit.uncertainty.verdict import CLEARLY_OFF, UNLIKELY
@@ -38,13 +41,17 @@ def write_unknowns(fit: Fit) -> str:
         "transition",
         "held",
     ]
+    dated = list_dated(fit)
+    any_dated = any(run is not None for run in dated)
+    header += ["date", "date low 95 %", "date high 95 %"] if any_dated else []
     joins = {transition.index: f"{transition.before} -> {transition.after}" for transition in fit.transitions}
     errors, naive, intervals = correct_errors(fit), fit.standard_errors, fit.confidence_intervals()
     rows = []
     for i, name in enumerate(fit.theta_names):
         numbers = [fit.theta[i], errors[i], naive[i], *intervals[i], fit.initial_theta[i]]
-        held = "; ".join(_list_holds(fit, name))
-        rows.append([name, fit.theta_units[i], *map(_format, numbers), joins.get(i, ""), held])
+        held = "; ".join(list_holds(fit, name))
+        dates = [_format_date(time, dated[i]) for time in (fit.theta[i], *intervals[i])] if any_dated else []
+        rows.append([name, fit.theta_units[i], *map(_format, numbers), joins.get(i, ""), held, *dates])
     return _write(header, rows)
 
 
@@ -63,6 +70,8 @@ def write_runs(estimate: Estimate) -> str:
     names = list(_name_own_unknowns(problem, estimate))
     columns = list(dict.fromkeys(column for own in names for column in own))
     header = ["run", "modes", "t0", "tf", "time unit", "values", "chi2", "explained", "flags"]
+    any_dated = any(trajectory.origin is not None for trajectory in estimate.trajectories)
+    header += ["origin"] if any_dated else []
     header += [part for column in columns for part in (column, f"{column} std. error")]
     rows = []
     for e, (own, trajectory) in enumerate(zip(names, estimate.trajectories, strict=True)):
@@ -78,6 +87,7 @@ def write_runs(estimate: Estimate) -> str:
             _format(min((c.explained for c in here if np.isfinite(c.explained)), default=np.nan)),
             "; ".join(_flag(estimate, e, here, own, len(quality.channels))),
         ]
+        row += ["" if trajectory.origin is None else trajectory.origin.date] if any_dated else []
         for column in columns:
             place = own.get(column)
             row += ["", ""] if place is None else [_format(estimate.theta[place]), _format(errors[place])]
@@ -119,17 +129,14 @@ def _flag(fit: Fit, e: int, channels: Sequence[ChannelQuality], own: dict[str, i
             state = "collapsed" if constraint.kind == "collapsed" else "at its minimum duration"
             yield f"mode {constraint.mode} {state}"
     for column, i in own.items():
-        for hold in _list_holds(fit, fit.theta_names[i]):
+        for hold in list_holds(fit, fit.theta_names[i]):
             yield f"{column} {hold}"
 
 
-def _list_holds(fit: Fit, name: str) -> Iterator[str]:
-    """Yield what holds an unknown."""
-    if name in fit.idle:
-        yield "idle"
-    yield from (f"at {c.kind}" for c in fit.active if c.unknown == name and c.position is None)
-    if name in [kink.unknown for kink in fit.kinks]:
-        yield "at a kink"
+def _format_date(time: float, run: Trajectory | None) -> str:
+    """Return a time as a date in ISO 8601; nothing where it is none."""
+    date = None if run is None or run.origin is None else run.origin.find_date(time, run.time_unit)
+    return "" if date is None else date.isoformat()
 
 
 def _format(value: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -11,48 +12,68 @@ from switchfit.problem.data import Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment, name_runs
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
-from switchfit.report.tables import format_table
+from switchfit.report.dates import describe_origin, format_time, format_unknown, list_dated_unknowns
+from switchfit.report.tables import format_table, list_jumps
+
+MOST_EXPERIMENTS = 3
+"""Experiments that are described on one screen."""
+
+MOST_UNKNOWNS = 10
 
 
-def describe(problem: Problem) -> str:
+def describe(problem: Problem, *, full: bool = False) -> str:
     """Return experiments, data and unknowns of a problem as text.
 
     Parameters
     ----------
     problem : Problem
+    full : bool
+        All of them, not one screen.
     """
-    lines = [describe_experiments(problem.experiments)]
+    lines = [describe_experiments(problem.experiments, full=full)]
     unknowns = problem.unknowns
     rows = []
     numbers = (unknowns.initial, unknowns.lower, unknowns.upper)
     columns = (unknowns.names, unknowns.units, *numbers, unknowns.priors.texts(), unknowns.log)
-    for name, unit, value, lower, upper, prior, log in zip(*columns, strict=True):
-        bounds = "" if np.isinf(lower) and np.isinf(upper) else f"in [{lower:.6g}, {upper:.6g}]"
+    dated = list_dated_unknowns(problem)
+    for run, (name, unit, value, lower, upper, prior, log) in zip(dated, zip(*columns, strict=True), strict=True):
+        ends = [format_unknown(end, run) for end in (lower, upper)]
+        bounds = "" if np.isinf(lower) and np.isinf(upper) else f"in [{ends[0]}, {ends[1]}]"
         known, scale = f"prior: {prior}" if prior else "", "(log scale)" if log else ""
-        rows.append((name, f"{value:.6g}{unit_suffix(unit)}", bounds, known, scale))
+        rows.append((name, f"{format_unknown(value, run)}{'' if run else unit_suffix(unit)}", bounds, known, scale))
+    if not full and len(rows) > MOST_UNKNOWNS:
+        kept = MOST_UNKNOWNS - 2
+        rows = [*rows[:kept], (f"and {len(rows) - kept} more", "", "", "", "")]
     return "\n".join([*lines, "Unknowns, first guess and bounds", *format_table(rows, "<<<<<")])
 
 
-def describe_experiments(experiments: Sequence[Experiment]) -> str:
+def describe_experiments(experiments: Sequence[Experiment], *, full: bool = False) -> str:
     """Return modes, horizon and data of experiments as text.
 
     Parameters
     ----------
     experiments : sequence of Experiment
+    full : bool
+        All of them, not one screen.
     """
     lines = []
     for k, experiment in enumerate(experiments, start=1):
         lines.append(f"Experiment {k}{f' ({experiment.name})' if experiment.name else ''}")
         lines += [f"  {line}" for line in _describe_experiment(experiment)]
+        if not full and k == MOST_EXPERIMENTS < len(experiments):
+            lines.append(f"and {len(experiments) - k} more experiments: --full lists them")
+            break
     return "\n".join(lines)
 
 
-def describe_steps(problem: Problem) -> str:
+def describe_steps(problem: Problem, *, full: bool = False) -> str:
     """Return which steps the integrator takes in each experiment at the first guess, how many, and why, as text.
 
     Parameters
     ----------
     problem : Problem
+    full : bool
+        For all of them, not one screen.
 
     Raises
     ------
@@ -67,32 +88,42 @@ def describe_steps(problem: Problem) -> str:
         reason = "" if mesh.stiffness is None else f"; {mesh.stiffness}"
         run = "" if len(problem.experiments) == 1 else f"{name}: "
         rows.append(f"  {run}{mesh.cells:,} {kind} steps{reason}")
+    if not full and len(rows) > MOST_EXPERIMENTS:
+        total = sum(mesh.cells for mesh in evaluator.meshes)
+        rows = [*rows[:MOST_EXPERIMENTS], f"  {total:,} steps in all {len(rows)} experiments"]
     return "\n".join(["Integration at the first guess", *rows])
 
 
 def _describe_experiment(experiment: Experiment) -> list[str]:
-    unit = unit_suffix(experiment.time_unit)
+    step_unit = unit_suffix(experiment.time_unit)
+    unit = step_unit if experiment.origin is None else ""
     ends = experiment.ends_of_modes(experiment.initial_times)
-    times = ", ".join(f"{t:.6g}" for t in ends[1:-1])
-    sequence, horizon = " -> ".join(experiment.mode_sequence), f"[{ends[0]:.6g}, {ends[-1]:.6g}]{unit}"
+    show = partial(format_time, run=experiment)
+    times = ", ".join(map(show, ends[1:-1]))
+    sequence, horizon = " -> ".join(experiment.mode_sequence), f"[{show(ends[0])}, {show(ends[-1])}]{unit}"
     if experiment.has_free_tf:
         horizon += " (tf is estimated)"
     if experiment.taken_from_data:
         horizon += f" ({' and '.join(experiment.taken_from_data)} from the data)"
     lines = [f"{sequence} on {horizon}, at {times}{unit}" if times else f"{sequence} on {horizon}"]
+    jumps = list_jumps(experiment.jump_times, experiment.time_unit)
+    lines += [jumps] if jumps else []
+    lines += [f"times in {text}"] if (text := describe_origin(experiment)) else []
     for item in experiment.data:
         if isinstance(item, Measurements):
             step = np.median(np.diff(item.times)) if len(item.times) > 1 else np.nan
             missing = item.values.size - item.count
             lines.append(
                 f"{len(item.times)} samples of {_join_channel_names(item.names, item.units, item.values.shape[1])}, "
-                f"{item.times[0]:.6g} to {item.times[-1]:.6g}{unit}, typically {step:.4g}{unit} apart, "
-                f"{missing} values missing{_describe_sensor(item, unit)}"
+                f"{show(item.times[0])} to {show(item.times[-1])}{unit}, typically {step:.4g}{step_unit} apart, "
+                f"{missing} values missing{_describe_sensor(item, step_unit)}"
             )
         elif isinstance(item, ReferenceSignal):
             knots = item.signal.knots
             names = _join_channel_names(item.names, item.units, item.signal.channels)
-            lines.append(f"reference signal of {names}, {knots[0]:.6g} to {knots[-1]:.6g}{unit}, {len(knots)} knots")
+            lines.append(
+                f"reference signal of {names}, {show(knots[0])} to {show(knots[-1])}{unit}, {len(knots)} knots"
+            )
         else:
             lines.append(type(item).__name__)
     return lines
@@ -110,7 +141,7 @@ def _describe_sensor(item: Measurements, unit: str) -> str:
     return "".join(f", {text}" for text in said if text)
 
 
-def _join_channel_names(names: tuple[str, ...] | None, units: tuple[str, ...] | None, channels: int) -> str:
+def _join_channel_names(names: Sequence[str] | None, units: Sequence[str] | None, channels: int) -> str:
     """Return names with their units, or the number of channels where they have no names."""
     if names is None:
         return f"{channels} channels"

@@ -7,12 +7,13 @@ the integrator never steps across one, and the signal is one polynomial inside a
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.problem.dates import Dates, Origin, as_dates, is_dated
 from switchfit.problem.losses import LOSSES
 from switchfit.problem.tables import find_names, find_units
 from switchfit.problem.validation import (
@@ -32,6 +33,7 @@ from switchfit.problem.validation import (
 from switchfit.runtime.presentation import format_line, join_first
 
 FloatArray = NDArray[np.float64]
+T = TypeVar("T")
 MOST_FILTERED = 10**7
 """Largest number of points at which a signal is filtered."""
 OVERFLOW = (
@@ -91,8 +93,8 @@ class Input:
     Parameters
     ----------
     times : (K,) array_like
-        Increasing times in the experiment's time unit. They must cover its ``[t0, tf]``; for a held input it is enough
-        to start by t0, as its last value is held.
+        Increasing times in the experiment's time unit, or dates, which the experiment converts to it. They must cover
+        its ``[t0, tf]``; for a held input it is enough to start by t0, as its last value is held.
     values : (K,) or (K, q) array_like, or mapping of str to (K,) array_like
         The modes get a scalar u, or a ``(q,)`` array. With samples by name they get a dict of scalars, ``u["left"]``;
         likewise with a table whose columns all have names (strings): a DataFrame of pandas or polars, a Dataset of
@@ -109,7 +111,7 @@ class Input:
         For times that do not increase, values that are not finite or differ in length from times, too few
         samples, no name or an empty one, or an unknown kind.
     TypeError
-        If times or values are not numbers (dates are not), or a name is not a string.
+        If times are neither numbers nor dates, values are not numbers, or a name is not a string.
 
     See Also
     --------
@@ -133,7 +135,7 @@ class Input:
     times: Any
     values: Any
     kind: Literal["hold", "linear", "cubic"] = "hold"
-    units: tuple[str, ...] | None = None
+    units: Sequence[str] | None = None
 
     def __repr__(self) -> str:
         return format_line(self, join_first(self.names or ()), self.kind, f"{len(self.times)} times")
@@ -362,7 +364,7 @@ class ReferenceSignal:
     names : sequence of str, optional
         One for each channel, for reports and plots.
     samples : (times, values), optional
-        Samples from which the signal was made.
+        Samples from which the signal was made; times are dates until an experiment has converted them.
     lowpass_hz : float, optional
         Cut-off with which it was filtered.
     units : sequence of str, optional
@@ -386,10 +388,10 @@ class ReferenceSignal:
     signal: PiecewisePolynomial
     observe: Observe | None = None
     weights: Any = None
-    names: tuple[str, ...] | None = None
-    samples: tuple[FloatArray, FloatArray] | None = None
+    names: Sequence[str] | None = None
+    samples: tuple[Any, FloatArray] | None = None
     lowpass_hz: float | None = None
-    units: tuple[str, ...] | None = None
+    units: Sequence[str] | None = None
 
     def __repr__(self) -> str:
         return format_line(self, join_first(self.names or ()), f"{self.signal.channels} channels")
@@ -422,8 +424,9 @@ class ReferenceSignal:
         Parameters
         ----------
         times : (K,) array_like
-            Increasing sample times in the experiment's time unit, four or more. The spline is broken at a time that is
-            given twice, as at the transitions of a simulated trajectory; each part then needs four samples.
+            Increasing sample times in the experiment's time unit, or dates, which the experiment converts to it; four
+            or more. The spline is broken at a time that is given twice, as at the transitions of a simulated
+            trajectory; each part then needs four samples.
         values : (K,) or (K, q) array_like
             NaN marks a missing value, as does the mask of a masked array; it is bridged by the interpolation. Tables
             of pandas, polars and xarray, and a `Log`, bring their names and units.
@@ -441,7 +444,7 @@ class ReferenceSignal:
             For bad times or values, fewer than four samples in a channel, or a cut-off that is not positive or far
             above the sampling rate.
         TypeError
-            If times, values, weights or the cut-off are not numbers (dates are not).
+            If times are neither numbers nor dates, or values, weights or the cut-off are not numbers.
 
         See Also
         --------
@@ -457,17 +460,25 @@ class ReferenceSignal:
         array([[0.841471]])
         """
         names, units = _find_labels(values, names, units)
-        times, values = _check_samples(times, values, "ReferenceSignal", at_least=4, breaks=True, missing=True)
-        table = values.reshape(len(times), -1)
+        given, values = _check_samples(times, values, "ReferenceSignal", at_least=4, breaks=True, missing=True)
+        table = values.reshape(len(given), -1)
         if np.isinf(table).any():
             raise ValueError("ReferenceSignal values must be finite, or NaN where one is missing; got infinity.")
+        # Dates have no unit before the experiment: until then the signal is in seconds, and not filtered.
+        times = _count_seconds(given) if isinstance(given, Dates) else given
         cuts = np.flatnonzero(np.diff(times) == 0) + 1
         parts = zip(np.split(times, cuts), np.split(table, cuts), strict=True)
         signal = _join_signals([_fit_bridged_spline(part_times, part) for part_times, part in parts])
         if lowpass_hz is not None:
             lowpass_hz = as_positive(lowpass_hz, "lowpass_hz")
-            signal = _filter_lowpass(signal, lowpass_hz)
-        return cls(signal, observe, weights, names, (times, table), lowpass_hz, units)  # type: ignore[arg-type]  # made tuples there
+            if given is times:
+                signal = _filter_lowpass(signal, lowpass_hz)
+        return cls(signal, observe, weights, names, (given, table), lowpass_hz, units)
+
+    @property
+    def dates(self) -> Dates | None:
+        """Dates of the samples, until an experiment has converted them; None if their times are numbers."""
+        return self.samples[0] if self.samples is not None and isinstance(self.samples[0], Dates) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -481,7 +492,9 @@ class Measurements:
     Parameters
     ----------
     times : (K,) array_like
-        Increasing sample times in the experiment's time unit; they may be irregular.
+        Increasing sample times in the experiment's time unit, or dates, which the experiment converts to it: text in
+        ISO 8601, datetime, datetime64, columns of pandas, polars or xarray, `Log.dates`, or what `from_epoch` returns.
+        They may be irregular.
     values : (K,) or (K, q) array_like
         Samples; NaN marks a missing one, as does the mask of a masked array. Tables of pandas, polars and xarray, and
         a `Log`, bring their names and units.
@@ -511,7 +524,7 @@ class Measurements:
         For times that do not increase, shapes that do not match, no sample at all, infinite values, a
         sigma that is not positive, an unknown loss, or a robust loss without sigma.
     TypeError
-        If times, values, sigma or another number is not a number (dates are not).
+        If times are neither numbers nor dates, or values, sigma or another number is not a number.
 
     See Also
     --------
@@ -540,11 +553,11 @@ class Measurements:
     values: Any
     observe: Observe | None = None
     sigma: Any = None
-    names: tuple[str, ...] | None = None
+    names: Sequence[str] | None = None
     loss: Literal["linear", "soft_l1", "huber", "cauchy"] = "linear"
     loss_scale: float = 1.0
     delay: float | str = 0.0
-    units: tuple[str, ...] | None = None
+    units: Sequence[str] | None = None
 
     def __repr__(self) -> str:
         channels = join_first(self.names) if self.names else f"{self.values.shape[1]} channels"
@@ -639,6 +652,18 @@ class Measurements:
 Data = RunningCost | TerminalCost | TerminalConstraint | ReferenceSignal | Measurements
 
 
+def count_from(item: T, origin: Origin, time_unit: str) -> T:
+    """Return data or an input with dates as numbers of a unit since the origin; anything else as it is."""
+    if isinstance(item, (Measurements, Input)) and isinstance(item.times, Dates):
+        what = f"times of {type(item).__name__}"
+        return replace(item, times=origin.to_numbers(item.times, time_unit, what))
+    if isinstance(item, ReferenceSignal) and item.samples is not None and item.dates is not None:
+        times = origin.to_numbers(item.dates, time_unit, "times of ReferenceSignal")
+        own = {name: getattr(item, name) for name in ("observe", "lowpass_hz", "weights", "names", "units")}
+        return ReferenceSignal.from_samples(times, item.samples[1], **own)  # type: ignore[return-value]  # of its type
+    return item
+
+
 def _check_samples(
     times: ArrayLike,
     values: ArrayLike,
@@ -648,13 +673,14 @@ def _check_samples(
     breaks: bool = False,
     missing: bool = False,
     columns: bool = True,
-) -> tuple[FloatArray, FloatArray]:
-    """Return times (K,) and values (K,) or (K, q) as float64, checked against each other.
+) -> tuple[Any, FloatArray]:
+    """Return times (K,) and values (K,) or (K, q) as float64, checked against each other; dates remain dates.
 
     With `breaks`, a time may occur twice; with `missing`, masked values become NaN; without `columns`, the shape of the
     values must be (K,).
     """
-    times = as_array(times, f"{what} times", form="an array of numbers")
+    dates = as_dates(times, f"{what} times") if is_dated(times) else None
+    times = as_array(times, f"{what} times", form="an array of numbers") if dates is None else _count_seconds(dates)
     values = as_array(values, f"{what} values", form="an array of numbers", missing=missing)
     if times.ndim != 1 or values.ndim not in ((1, 2) if columns else (1,)):
         raise ValueError(
@@ -671,12 +697,18 @@ def _check_samples(
         wrong = (np.diff(times) < 0) | np.append(times[2:] == times[:-2], False)
     if wrong.any():
         k = int(np.argmax(wrong))
+        shown = times if dates is None else dates
         raise ValueError(
-            f"{what} times must increase strictly; got {times[k]} followed by {times[k + 1]} at index {k + 1}."
+            f"{what} times must increase strictly; got {shown[k]} followed by {shown[k + 1]} at index {k + 1}."
         )
     times.flags.writeable = False
     values.flags.writeable = False
-    return times, values
+    return times if dates is None else dates, values
+
+
+def _count_seconds(dates: Dates) -> FloatArray:
+    """Return the seconds since the first of dates."""
+    return np.asarray((dates.instants - dates.instants.min(initial=np.iinfo(np.int64).max)) * 1e-9)
 
 
 def _check_observe(observe: Any) -> None:

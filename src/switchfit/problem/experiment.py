@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.problem.data import (
     Data,
@@ -19,9 +21,12 @@ from switchfit.problem.data import (
     TerminalConstraint,
     TerminalCost,
     TransitionCost,
+    count_from,
 )
+from switchfit.problem.dates import Dates, Given, Origin, as_date, as_dates, as_time_zone, choose_origin, is_dated
+from switchfit.problem.jump import Jump
 from switchfit.problem.parameter import Parameter as Parameter
-from switchfit.problem.parameter import as_parameter, unit_suffix
+from switchfit.problem.parameter import as_parameter, count_parameter, list_dates, unit_suffix
 from switchfit.problem.system import HybridSystem, as_state
 from switchfit.problem.validation import as_instance, as_name, as_number, as_sequence, join_names, shorten
 from switchfit.runtime.presentation import format_line, join_first
@@ -38,17 +43,17 @@ class Experiment:
         `TerminalConstraint` beside them has to hold.
     mode_sequence : sequence of str
         Names of the modes in the order in which they are active; a mode may return.
-    transition_times : sequence of float or Parameter, or None
+    transition_times : sequence of float, date or Parameter, optional
         First guess of each transition, in the experiment's time unit, one fewer than modes, strictly increasing inside
         ``(t0, tf)``; an entry may be a `Parameter` with bounds, or fixed. Its unit, where given, must be `time_unit`.
         With ``scale="log"``, which all free times of an experiment then have, a free tf among them, the optimiser works
         in log(tau - t0): for times that may lie in other decades than their guess.
-        None: `estimate` looks for them all over the horizon; the guess is evenly spaced.
-    t0 : float, optional
+        Left out, `estimate` looks for them all over the horizon; the guess is evenly spaced.
+    t0 : float or date, optional
         Start of the horizon, in the experiment's time unit. Left out, the first time of the data: the first sample of
         the `Measurements` (less a delay that is a number) and the beginning of the reference signals, whichever is
         first. Other costs have no times: where there are no others, t0 and tf must be given.
-    tf : float or Parameter, optional
+    tf : float, date or Parameter, optional
         End of the horizon. Left out, the last time of the data. A `Parameter` that is not fixed is estimated, and
         called "tf" among the unknowns: give it a finite upper bound, up to which inputs and reference signals must be
         known, and a lower bound where there are samples, none of which may lie after it.
@@ -63,18 +68,31 @@ class Experiment:
         the problem's ``beta_run3`` under ``p["beta"]``. Names that are not in it mean themselves, and several names
         may mean one parameter.
     time_unit : str, optional
-        The unit of all times of this run: of its samples, inputs, t0, tf, transition times and delays. Reports, figures
-        and files print it; nothing is converted.
+        The unit of all times of this run: of its samples, inputs, t0, tf, transition times, jumps and delays. Reports,
+        figures and files print it; numbers are not converted. Dates become numbers of this unit since `origin`; it is
+        then one of "ns", "us", "ms", "s", "min", "h" and "d".
+    jumps : Jump or sequence of Jump, optional
+        Changes of the state at known times in ``[t0, tf)``, such as doses, without a change of mode.
+    origin : date, optional
+        The date at which times are 0; reports and figures then show times as dates. Left out, t0 if that is a date,
+        else the earliest date of the data. As an attribute it is an `Origin` with the conversions, or None where times
+        are no dates.
+    time_zone : str, optional
+        Such as "Europe/Berlin" or "UTC": where clocks showed those dates that have no zone, and in which zone dates are
+        shown. Left out, dates without a zone stay so, with 24 hours to every day, and dates with zones are shown in
+        theirs, or in UTC if they differ.
 
     Raises
     ------
     ValueError
         If lengths do not match, times are unordered or outside the horizon, data lies outside it, t0 or tf is left out
-        and the data have no times to take it from, `time_unit` is empty, a transition time or tf has another unit, or a
-        free tf has bounds that do not fit.
+        and the data have no times to take it from, `time_unit` is empty, a transition time or tf has another unit, a
+        free tf has bounds that do not fit, or a jump lies outside the horizon or where a transition is guessed. For
+        dates of which some have a time zone and some have none, if `time_zone` does not say which; for numbers beside
+        dates whose origin is not stated.
     TypeError
-        If an argument is of the wrong type: times that are not numbers (dates among them), mode names that are no
-        strings, data of another kind than those above.
+        If an argument is of the wrong type: times that are neither numbers nor dates, mode names that are no strings,
+        data of another kind than those above.
 
     Notes
     -----
@@ -88,7 +106,7 @@ class Experiment:
 
     See Also
     --------
-    Problem, HybridSystem, Measurements, Input
+    Problem, HybridSystem, Measurements, Input, Jump
 
     Examples
     --------
@@ -102,11 +120,19 @@ class Experiment:
 
     >>> run.t0, run.tf
     (0.0, 4.0)
+
+    Times may be dates:
+
+    >>> days = ["2020-03-21", "2020-03-22", "2020-03-23", "2020-03-24"]
+    >>> log = sf.Measurements(days, [0.9, 1.8, 1.2, 0.7], sigma=0.1)
+    >>> run = sf.Experiment(log, ("on", "off"), ("2020-03-22T12:00",), time_unit="d")
+    >>> run.initial_times, run.origin.date
+    (array([1.5]), '2020-03-21T00:00:00')
     """
 
     data: Any
-    mode_sequence: tuple[str, ...]
-    transition_times: tuple[Any, ...]
+    mode_sequence: Sequence[str]
+    transition_times: Any = None  # a tuple of Parameter after __post_init__
     t0: float = None  # type: ignore[assignment]  # a number after __post_init__, as is tf
     tf: float | Parameter = None  # type: ignore[assignment]
     inputs: Input | None = None
@@ -114,6 +140,9 @@ class Experiment:
     name: str | None = None
     parameter_map: Any = None
     time_unit: str = "s"
+    jumps: Jump | Sequence[Jump] = ()
+    origin: Any = None
+    time_zone: str | None = None
     is_guess_proposed: bool = field(init=False, default=False)
     taken_from_data: tuple[str, ...] = field(init=False, default=())  # which of "t0" and "tf" were left out
 
@@ -125,7 +154,8 @@ class Experiment:
         )
 
     def __post_init__(self) -> None:
-        data = _check_data(self.data)
+        self._convert_dates()
+        data = self.data
         if self.t0 is None or self.tf is None:
             missing = tuple(name for name in ("t0", "tf") if getattr(self, name) is None)
             t0, tf = _choose_horizon(self.t0, self.tf, data, missing)
@@ -134,7 +164,8 @@ class Experiment:
             t0, tf = as_number(self.t0, "t0"), _check_final_time(self.tf)
         last = float(tf.value) if isinstance(tf, Parameter) else tf
         if not (np.isfinite(t0) and np.isfinite(last) and t0 < last):
-            raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got ({t0}, {last}).")
+            ends = f"({show_time(self, t0)}, {show_time(self, last)})"
+            raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got {ends}.")
         by_scale = isinstance(tf, Parameter) and tf.scale == "log" and tf.lower == 0
         if isinstance(tf, Parameter) and np.isfinite(tf.lower) and tf.lower <= t0 and not by_scale:
             raise ValueError(
@@ -145,9 +176,14 @@ class Experiment:
         if not sequence:
             raise ValueError("mode_sequence is empty; name at least one mode.")
         object.__setattr__(self, "is_guess_proposed", self.transition_times is None and len(sequence) > 1)
+        jumps = (self.jumps,) if isinstance(self.jumps, Jump) else self.jumps
+        jumps = as_sequence(jumps, "jumps", "an sf.Jump or a sequence of them")
+        for jump in jumps:
+            as_instance(jump, "each of jumps", Jump, "an sf.Jump")
+        object.__setattr__(self, "jumps", jumps)
         given = self.transition_times
         if given is None:
-            given = np.linspace(t0, last, len(sequence) + 1)[1:-1].tolist()
+            given = _propose_times(t0, last, len(sequence) - 1, [time for jump in jumps for time in jump.times])
         several = isinstance(given, Iterable) and getattr(given, "ndim", 1) > 0
         given = as_sequence(given, "transition_times", "a sequence of numbers or sf.Parameter") if several else (given,)
         if len(given) != len(sequence) - 1:
@@ -164,13 +200,70 @@ class Experiment:
             object.__setattr__(self, "initial_state", as_state(self.initial_state, "initial_state"))
         for name, value in (("t0", t0), ("tf", tf), ("mode_sequence", sequence), ("transition_times", times)):
             object.__setattr__(self, name, value)
-        object.__setattr__(self, "data", data)
         object.__setattr__(self, "parameter_map", _check_map(self.parameter_map))
         self._check_time_unit()
         self._check_times()
+        self._check_jumps()
         self._check_data_inside()
         if self.inputs is not None:
             self.inputs.signal(t0, self.end)
+
+    def _convert_dates(self) -> None:
+        """Replace all dates by numbers of the time unit since the origin, which is chosen here if it is left out."""
+        object.__setattr__(self, "data", _check_data(self.data))
+        if isinstance(self.transition_times, str):  # the only one
+            object.__setattr__(self, "transition_times", (self.transition_times,))
+        given = list(self._list_dates())
+        if self.origin is None and self.time_zone is None and not given:
+            return
+        start = self.origin
+        if start is not None:
+            start = start.date if isinstance(start, Origin) else start
+            if not is_dated(start):
+                raise TypeError(f"origin must be a date, such as '2024-05-01T12:00+02:00'; got {shorten(self.origin)}.")
+            start = as_date(start, "origin")
+        zone = None if self.time_zone is None else as_time_zone(self.time_zone)
+        if start is None and not given:
+            raise ValueError(
+                f"time_zone is {zone!r}, but no time is a date: give origin, the date at which times are 0."
+            )
+        first = as_date(self.t0, "t0") if is_dated(self.t0) else None
+        origin = choose_origin(given, start, zone, first, numbers=_find_numbers(self.data))
+        object.__setattr__(self, "origin", origin)
+        object.__setattr__(self, "time_zone", origin.time_zone or None)
+        unit = as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'")
+
+        def count(value: Any, what: str) -> Any:
+            if isinstance(value, Parameter):
+                return count_parameter(value, origin, unit, what)
+            return origin.to_numbers(as_dates(value, what), unit, what) if is_dated(value) else value
+
+        object.__setattr__(self, "data", tuple(count_from(item, origin, unit) for item in self.data))
+        object.__setattr__(self, "inputs", count_from(self.inputs, origin, unit))
+        for name in ("t0", "tf"):
+            object.__setattr__(self, name, count(getattr(self, name), name))
+        times = self.transition_times
+        if isinstance(times, (list, tuple)):
+            object.__setattr__(self, "transition_times", tuple(count(time, "a transition time") for time in times))
+        else:
+            object.__setattr__(self, "transition_times", count(times, "transition_times"))
+
+    def _list_dates(self) -> Iterator[Given]:
+        """Yield all dates among the arguments but the origin."""
+        for item in self.data:
+            dates = _get_times(item) if isinstance(item, (Measurements, ReferenceSignal)) else None
+            if isinstance(dates, Dates):
+                yield Given(f"times of {type(item).__name__}", dates, are_data=True)
+        if isinstance(self.inputs, Input) and isinstance(self.inputs.times, Dates):
+            yield Given("times of Input", self.inputs.times)
+        times = self.transition_times
+        several = isinstance(times, (list, tuple))
+        others = [("a transition time", time) for time in times] if several else [("transition_times", times)]
+        for what, value in [*others, ("t0", self.t0), ("tf", self.tf)]:
+            if isinstance(value, Parameter):
+                yield from (Given(what, dates) for dates in list_dates(value))
+            elif is_dated(value):
+                yield Given(what, as_dates(value, what) if what == "transition_times" else as_date(value, what))
 
     @property
     def has_free_tf(self) -> bool:
@@ -183,14 +276,53 @@ class Experiment:
         return float(self.tf.upper) if isinstance(self.tf, Parameter) else self.tf
 
     @property
+    def _own_times(self) -> tuple[Parameter, ...]:
+        return (*self.transition_times, *((self.tf,) if isinstance(self.tf, Parameter) else ()))
+
+    @cached_property
     def times(self) -> tuple[Parameter, ...]:
-        """What programs take as their times: all transition times, then tf where it is free."""
-        return (*self.transition_times, self.tf) if isinstance(self.tf, Parameter) else self.transition_times
+        """All transition times, then tf where it is free; each bounded by the jumps between which its guess lies."""
+        acts = self.jump_times
+        bounded = []
+        for tau, before in zip(self._own_times, np.searchsorted(acts, self.initial_times, "right"), strict=True):
+            low = acts[before - 1] if before and acts[before - 1] > self.t0 else -np.inf
+            high = acts[before] if before < len(acts) else np.inf
+            inside = tau.fixed or (low <= tau.lower and tau.upper <= high)
+            bounded.append(
+                tau if inside else replace(tau, lower=np.maximum(low, tau.lower), upper=np.minimum(high, tau.upper))
+            )
+        return tuple(bounded)
+
+    @cached_property
+    def _acts(self) -> list[tuple[float, Callable[..., Any]]]:
+        """Time and map of each jump, in the order in which they act."""
+        acts = [(time, jump.map) for jump in self.jumps for time in jump.times.tolist()]  # type: ignore[union-attr]
+        return sorted(acts, key=lambda act: act[0])
+
+    @cached_property
+    def jump_times(self) -> FloatArray:
+        """Times of all jumps, ascending: (K,)."""
+        return np.array([time for time, _ in self._acts], dtype=np.float64)
+
+    @property
+    def jump_maps(self) -> list[Callable[..., Any]]:
+        """The map of each of `jump_times`."""
+        return [jump for _, jump in self._acts]
+
+    @cached_property
+    def passed_by_jumps(self) -> NDArray[np.intp]:
+        """How many of `times` each jump comes after: (K,). One at the time of a fixed transition comes before it."""
+        return np.searchsorted(self.initial_times, self.jump_times, "left")
+
+    @cached_property
+    def initial_times_with_jumps(self) -> FloatArray:
+        """Guess of all of `times`, with the times of the jumps in between: what programs take, (N,)."""
+        return np.asarray(insert_jumps(self, self.initial_times, self.jump_times))
 
     @property
     def initial_times(self) -> FloatArray:
         """Guess of all of `times`, fixed ones included: an ``(N,)`` array."""
-        return np.array([tau.value for tau in self.times], dtype=np.float64)
+        return np.array([tau.value for tau in self._own_times], dtype=np.float64)
 
     def ends_of_modes(self, times: FloatArray) -> FloatArray:
         """Return where each mode begins and the last one ends, one more than modes, for values of `times`.
@@ -216,7 +348,7 @@ class Experiment:
 
     def _check_time_unit(self) -> None:
         unit = as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'")
-        for i, tau in enumerate(self.times, start=1):
+        for i, tau in enumerate(self._own_times, start=1):
             if tau.unit not in ("", unit):
                 is_tf = i > len(self.transition_times)
                 raise ValueError(
@@ -227,12 +359,12 @@ class Experiment:
                 )
 
     def _check_times(self) -> None:
-        scales = {tau.scale for tau in self.times if not tau.fixed}
+        scales = {tau.scale for tau in self._own_times if not tau.fixed}
         if len(scales) > 1:
             raise ValueError(
                 "the transition times of an experiment that are estimated, and a free tf, must be on one scale, since "
-                f"their order is a constraint; got {shorten([tau.scale for tau in self.times])}. Give scale='log' to "
-                "all of them, or to none."
+                f"their order is a constraint; got {shorten([tau.scale for tau in self._own_times])}. Give scale='log' "
+                "to all of them, or to none."
             )
         if any(tau.shape != () for tau in self.transition_times):
             shapes = [tau.shape for tau in self.transition_times]
@@ -242,9 +374,28 @@ class Experiment:
         knots = self.ends_of_modes(self.initial_times)
         if np.any(np.diff(knots) <= 0):
             raise ValueError(
-                f"transition_times must increase strictly inside (t0, tf) = ({self.t0}, {knots[-1]}); "
-                f"got {shorten(knots[1:-1])}."
+                f"transition_times must increase strictly inside (t0, tf) = ({show_time(self, self.t0)}, "
+                f"{show_time(self, knots[-1])}); got {self._show_times(knots[1:-1])}."
             )
+
+    def _show_times(self, times: FloatArray) -> str:
+        return shorten(times) if self.origin is None else shorten([show_time(self, time) for time in times])
+
+    def _check_jumps(self) -> None:
+        acts, unit = self.jump_times, unit_suffix(self.time_unit)
+        last = self.t0 + self.initial_length
+        outside = (acts < self.t0) | (acts >= last)
+        if outside.any():
+            raise ValueError(
+                f"A Jump must lie in [t0, tf) = [{self.t0}, {last}){unit}; got {shorten(acts[outside].tolist())}. "
+                "Leave it out, or move t0 or tf."
+            )
+        for i, tau in enumerate(self._own_times, start=1):
+            if not tau.fixed and np.any(acts == tau.value):
+                raise ValueError(
+                    f"Transition time {i} is guessed at {tau.value}{unit}, the time of a jump. The two keep their "
+                    "order: give a guess a little before or after the jump."
+                )
 
     def _check_data_inside(self) -> None:
         for item in self.data:
@@ -257,8 +408,9 @@ class Experiment:
                 if first > self.t0 or last < self.end:
                     bound = ", whose end is the upper bound of tf" if self.has_free_tf else ""
                     raise ValueError(
-                        f"A ReferenceSignal must reach over (t0, tf) = ({self.t0}, {self.end}){bound}; "
-                        f"this one is known from {first} to {last}. Give t0 and tf inside that, or a longer signal."
+                        f"A ReferenceSignal must reach over (t0, tf) = ({show_time(self, self.t0)}, "
+                        f"{show_time(self, self.end)}){bound}; this one is known from {show_time(self, first)} to "
+                        f"{show_time(self, last)}. Give t0 and tf inside that, or a longer signal."
                     )
 
     def _require_inside(self, times: FloatArray, what: str) -> None:
@@ -267,18 +419,83 @@ class Experiment:
         outside = (times < self.t0) | (times > last)
         if not outside.any():
             return
-        count = f"{outside.sum()} of {len(times)} do not, the first is {times[outside][0]}."
+        count = f"{outside.sum()} of {len(times)} do not, the first is {show_time(self, times[outside][0])}."
         if self.has_free_tf and not np.any(times < self.t0):
             raise ValueError(
-                f"{what} must not lie after a free tf, at its earliest {last}; {count} Give tf a lower bound of "
-                f"{times.max()} or more, or leave out later samples."
+                f"{what} must not lie after a free tf, at its earliest {show_time(self, last)}; {count} Give tf a "
+                f"lower bound of {show_time(self, times.max())} or more, or leave out later samples."
             )
-        raise ValueError(f"{what} must lie inside [t0, tf] = [{self.t0}, {last}]; {count}")
+        raise ValueError(
+            f"{what} must lie inside [t0, tf] = [{show_time(self, self.t0)}, {show_time(self, last)}]; {count}"
+        )
 
     @property
     def earliest_end(self) -> float:
         """The earliest tf that there may be: tf, or the lower bound of a free tf, t0 where it has none."""
         return max(float(self.tf.lower), self.t0) if isinstance(self.tf, Parameter) else self.tf
+
+
+def _propose_times(t0: float, tf: float, count: int, jumps: Sequence[float]) -> list[float]:
+    """Return evenly spaced transition times, moved on a little from the time of a jump."""
+    step = (tf - t0) / (count + 1)
+    proposed = []
+    for time in np.linspace(t0, tf, count + 2)[1:-1].tolist():
+        later = [*(jump for jump in jumps if jump > time), time + step]
+        proposed.append(time + 0.25 * (min(later) - time) if time in jumps else time)
+    return proposed
+
+
+def insert_jumps(experiment: Experiment, of_times: Any, of_jumps: Any) -> Any:
+    """Return an array or a list with an entry for each of an experiment's `times`, with those of the jumps in between.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    of_times : (N,) array, or a sequence
+    of_jumps : a number, or one entry for each jump
+    """
+    if not len(experiment.jump_times):
+        return of_times
+    if isinstance(of_times, np.ndarray):
+        return np.insert(of_times, experiment.passed_by_jumps, of_jumps)
+    both: list[Any] = list(of_times)
+    for place, entry in reversed(list(zip(experiment.passed_by_jumps.tolist(), of_jumps, strict=True))):
+        both.insert(place, entry)
+    return both
+
+
+def drop_jumps(experiment: Experiment, of_all: Iterable[Any]) -> list[Any]:
+    """Return the entries of the transitions, of those of all transitions and jumps.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    of_all : iterable
+    """
+    jumps = set((experiment.passed_by_jumps + np.arange(len(experiment.jump_times))).tolist())
+    return [entry for i, entry in enumerate(of_all) if i not in jumps]
+
+
+def show_time(experiment: Experiment, time: float) -> str:
+    """Return a time of an experiment as text for a message: a date where its times are dates."""
+    origin = experiment.origin
+    date = None if origin is None else origin.find_date(time, experiment.time_unit)
+    return str(time if date is None else date)
+
+
+def count_times(experiment: Experiment, times: Any) -> Any:
+    """Return dates as numbers of an experiment's unit since its origin; anything else as it is.
+
+    Raises
+    ------
+    ValueError
+        For dates if the times of the experiment are numbers.
+    """
+    if not is_dated(times):
+        return times
+    if experiment.origin is None:
+        raise ValueError(f"times are dates ({shorten(times)}), but the times of the experiment are numbers.")
+    return experiment.origin.to_numbers(as_dates(times, "times"), experiment.time_unit)
 
 
 def initial_state_of(system: HybridSystem, experiment: Experiment) -> Any:
@@ -364,3 +581,16 @@ def _check_final_time(given: Any) -> float | Parameter:
             f"model may be integrated; got the upper bound {given.upper}."
         )
     return given
+
+
+def _find_numbers(data: Sequence[Data]) -> str:
+    """Return which of the data have numbers for times, for a message; "" if none has."""
+    for item in data:
+        if isinstance(item, (Measurements, ReferenceSignal)) and not isinstance(_get_times(item), Dates):
+            return f"the {type(item).__name__}" if len(data) == 1 else f"a {type(item).__name__} beside it"
+    return ""
+
+
+def _get_times(item: Measurements | ReferenceSignal) -> Any:
+    """Return the times of samples, which are dates until they are converted."""
+    return item.times if isinstance(item, Measurements) else item.dates

@@ -8,8 +8,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.problem.dates import Dates, Origin, as_dates, is_dated
 from switchfit.problem.priors import LogNormal, Normal, Prior, PriorTerms
-from switchfit.problem.validation import as_array, as_choice, as_flag, as_text, shorten
+from switchfit.problem.validation import as_array, as_choice, as_flag, as_number, as_text, shorten
 
 FloatArray = NDArray[np.float64]
 
@@ -21,7 +22,8 @@ class Parameter:
     Parameters
     ----------
     value : float or array_like
-        Initial guess, or the value itself where `fixed`.
+        Initial guess, or the value itself where `fixed`. Of a transition time or a free tf it may be a date, as in
+        ``sf.Parameter("2020-03-23", lower="2020-03-16")``; its bounds, and the mean of a normal prior, are dates too.
     lower, upper : float or array_like, optional
         Bounds; broadcast to the shape of `value`.
     unit : str, optional
@@ -42,7 +44,7 @@ class Parameter:
         If a value is not finite, bounds cross, the guess lies outside them, a prior does not fit, or the scale or the
         prior is logarithmic and p not confined to positive numbers.
     TypeError
-        If a value or a bound is not a number, `unit` not a string, or `fixed` neither True nor False.
+        If a value or a bound is neither a number nor a date, `unit` not a string, or `fixed` neither True nor False.
 
     See Also
     --------
@@ -68,6 +70,16 @@ class Parameter:
     scale: Literal["linear", "log"] = "linear"
 
     def __post_init__(self) -> None:
+        if is_dated(self.value):
+            self._read_dates()
+            return
+        dated = [name for name in ("lower", "upper") if is_dated(getattr(self, name))]
+        if dated or isinstance(getattr(self.prior, "mean", None), Dates):
+            raise ValueError(
+                f"Parameter {dated[0] if dated else 'prior'} is a date, and its value a number: give dates for both, "
+                f"or numbers; got {shorten(getattr(self, dated[0]) if dated else self.prior)} and "
+                f"{shorten(self.value)}."
+            )
         value = as_array(self.value, "Parameter value")
         lower, upper = (self._bound(name, value.shape) for name in ("lower", "upper"))
         if value.size == 0:
@@ -91,6 +103,31 @@ class Parameter:
         for name, entry in checked.items():
             object.__setattr__(self, name, entry)
         self._check_prior()
+
+    def _read_dates(self) -> None:
+        """Read a value and bounds that are dates: an experiment converts them to numbers, and checks them then."""
+        value = as_dates(self.value, "Parameter value")
+        if value.shape != ():
+            raise ValueError(f"Parameter value must be one date, that of a transition or of tf; got {value!r}.")
+        checked: dict[str, Any] = {"value": value}
+        for name, none in (("lower", -np.inf), ("upper", np.inf)):
+            bound = getattr(self, name)
+            if is_dated(bound):
+                checked[name] = as_dates(bound, f"Parameter {name}")
+            elif as_number(bound, f"Parameter {name}") != none:
+                raise ValueError(
+                    f"Parameter value is a date, and its {name} bound a number: give dates for both, or numbers; got "
+                    f"{shorten(self.value)} and {shorten(bound)}."
+                )
+        if self.prior is not None and not isinstance(getattr(self.prior, "mean", None), Dates):
+            raise ValueError(
+                "Parameter value is a date: its prior must be an sf.Normal whose mean is a date, and whose sd is in "
+                f"the time unit of the experiment; got {shorten(self.prior)}."
+            )
+        checked |= {"unit": as_text(self.unit, "Parameter unit"), "fixed": as_flag(self.fixed, "Parameter fixed")}
+        checked["scale"] = as_choice(self.scale, "Parameter scale", ("linear", "log"))
+        for name, entry in checked.items():
+            object.__setattr__(self, name, entry)
 
     def _bound(self, name: str, shape: tuple[int, ...]) -> FloatArray:
         """Return a bound with one entry for each of the value."""
@@ -166,6 +203,7 @@ def unit_suffix(unit: str) -> str:
 def as_parameter(value: Any, what: str) -> Parameter:
     """Return `value` itself if it is a `Parameter`, otherwise a free one without bounds; errors call it `what`."""
     if isinstance(value, Parameter):
+        refuse_dates(value, what)
         return value
     form = "a number, an array or an sf.Parameter"
     array = as_array(value, what, form=form)
@@ -173,3 +211,35 @@ def as_parameter(value: Any, what: str) -> Parameter:
         return Parameter(array)
     except ValueError as error:
         raise ValueError(f"{what} must be {form}: {error}") from error
+
+
+def list_dates(parameter: Parameter) -> list[Dates]:
+    """Return value, bounds and mean of the prior of an unknown, as far as they are dates."""
+    every = (parameter.value, parameter.lower, parameter.upper, getattr(parameter.prior, "mean", None))
+    return [entry for entry in every if isinstance(entry, Dates)]
+
+
+def count_parameter(parameter: Parameter, origin: Origin, time_unit: str, what: str) -> Parameter:
+    """Return an unknown with its dates as numbers of a unit since the origin; errors call it `what`."""
+    if not list_dates(parameter):
+        return parameter
+    value, lower, upper = (
+        origin.to_numbers(entry, time_unit, what) if isinstance(entry, Dates) else entry
+        for entry in (parameter.value, parameter.lower, parameter.upper)
+    )
+    if not lower <= value <= upper:
+        raise ValueError(
+            f"{what} {parameter.value!r} lies outside its bounds [{parameter.lower!r}, {parameter.upper!r}]."
+        )
+    prior = parameter.prior
+    if isinstance(prior, Normal) and isinstance(prior.mean, Dates):
+        prior = Normal(origin.to_numbers(prior.mean, time_unit, what), prior.sd)
+    return Parameter(value, lower, upper, parameter.unit, parameter.fixed, prior, parameter.scale)
+
+
+def refuse_dates(parameter: Parameter, what: str) -> None:
+    """Raise for an unknown that is a date, where it is no time of an experiment; errors call it `what`."""
+    if dates := list_dates(parameter):
+        raise ValueError(
+            f"{what} must be a number; got the date {dates[0]!r}. Only transition times and tf may be dates."
+        )

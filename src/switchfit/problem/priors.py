@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.problem.dates import as_dates, is_dated
 from switchfit.problem.validation import as_array, shorten
 
 FloatArray = NDArray[np.float64]
@@ -24,7 +25,7 @@ class Normal:
     Parameters
     ----------
     mean : float or array_like
-        Mean, in the unit of the unknown.
+        Mean, in the unit of the unknown; a date for a transition time whose guess is one.
     sd : float or array_like
         Standard deviation, positive, in the same unit.
 
@@ -51,7 +52,11 @@ class Normal:
     sd: Any
 
     def __post_init__(self) -> None:
-        _check(self, "mean", "sd")
+        if is_dated(self.mean):
+            object.__setattr__(self, "mean", as_dates(self.mean, "Normal mean"))
+            _check(self, "sd", "sd")
+        else:
+            _check(self, "mean", "sd")
 
 
 @dataclass(frozen=True, eq=False)

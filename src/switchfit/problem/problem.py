@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.problem.constraints import Constraint
 from switchfit.problem.data import FloatArray, Measurements
-from switchfit.problem.experiment import Experiment, initial_state_of, name_runs
+from switchfit.problem.experiment import Experiment, drop_jumps, initial_state_of, insert_jumps, name_runs
 from switchfit.problem.lengths import choose_common_lengths
 from switchfit.problem.parameter import Parameter, as_parameter, unit_suffix
 from switchfit.problem.priors import PriorTerms
@@ -151,7 +151,7 @@ class Problem:
     max_transitions : int, optional
         Compile machine code for every sequence of the system's modes with up to so many transitions, so that problems
         with other sequences, but the same functions, data and `max_transitions`, need no compilation of their own.
-        Left out, for the transitions and modes of the mode sequences.
+        Left out, for the transitions and modes of the mode sequences. Jumps count as transitions.
 
     Raises
     ------
@@ -217,10 +217,11 @@ class Problem:
         object.__setattr__(self, "solver", as_choice(self.solver, "solver", SOLVERS))
         object.__setattr__(self, "engine", as_choice(self.engine, "engine", ("auto", "native", "jax")))
         if self.max_transitions is not None:
-            longest = max(len(e.transition_times) for e in experiments)
+            longest = max(len(e.transition_times) + len(e.jump_times) for e in experiments)
             most = as_count(self.max_transitions, "max_transitions")
             if most < longest:
-                raise ValueError(f"max_transitions is {most}, but a mode_sequence has {longest} transitions.")
+                jumps = " and jumps" if any(len(e.jump_times) for e in experiments) else ""
+                raise ValueError(f"max_transitions is {most}, but a mode_sequence has {longest} transitions{jumps}.")
             object.__setattr__(self, "max_transitions", most)
         for name in ("rtol", "atol"):
             object.__setattr__(self, name, as_positive(getattr(self, name), name))
@@ -374,7 +375,8 @@ class Problem:
         """What has to be zero: guards at transitions, then terminal constraints, experiment by experiment."""
         names = []
         for prefix, structure, experiment in zip(self._prefixes, self.structures, self.experiments, strict=True):
-            for i in structure.guarded:
+            # of the user's transitions: those of the structure have the jumps in between
+            for i in np.flatnonzero(drop_jumps(experiment, [g is not None for g in structure.guards])).tolist():
                 before, after = experiment.mode_sequence[i : i + 2]
                 names.append(f"{prefix}guard of tau_{i + 1} ({before} -> {after})")
             names += [f"{prefix}terminal constraint {k + 1}" for k in range(structure.terminal_constraint_count)]
@@ -393,14 +395,18 @@ class Problem:
 
     @cached_property
     def places(self) -> tuple[NDArray[np.intp], ...]:
-        """For each experiment the positions in theta of its N transition times and of its p (M,), -1 where fixed."""
+        """For each experiment the positions in theta of its N transition times and of its p (M,), -1 where fixed.
+
+        Jumps are among the N, as transitions at fixed times.
+        """
         unknowns = self.unknowns
         found = []
         for e, (structure, experiment) in enumerate(zip(self.structures, self.experiments, strict=True)):
             free = [name for name, _, is_free in structure.parameters if is_free]
             spans = [unknowns.parameters[experiment.parameter_map.get(name, name)] for name in free]
             states = unknowns.initial_states[e]
-            parts = [unknowns.times[e], *(np.arange(s.start, s.stop) for s in spans), states[states >= 0]]
+            times = insert_jumps(experiment, unknowns.times[e], -1)
+            parts = [times, *(np.arange(s.start, s.stop) for s in spans), states[states >= 0]]
             found.append(np.concatenate(parts).astype(np.intp))
         return tuple(found)
 
@@ -448,7 +454,8 @@ class Problem:
         return counted
 
     def vectors(self, theta: FloatArray, e: int) -> tuple[FloatArray, FloatArray]:
-        """Return what the compiled programs of experiment e take: its times (N,), a free tf last, and its p (M,).
+        """Return what the compiled programs of experiment e take: its times (N,), jumps among them and a free tf last,
+        and its p (M,).
 
         See Also
         --------
@@ -467,7 +474,7 @@ class Problem:
         if self.one_to_one:
             return theta[:N], theta[N:]
         where = places[:N]
-        tau = self.experiments[e].initial_times
+        tau = self.experiments[e].initial_times_with_jumps.copy()
         tau[where >= 0] = theta[where[where >= 0]]
         return tau, theta[places[N:]]
 

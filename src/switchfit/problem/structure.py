@@ -6,7 +6,7 @@ share one program, and nothing is recompiled when transition times, parameters o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise, product
@@ -24,7 +24,7 @@ from switchfit.problem.data import (
     TerminalCost,
     TransitionCost,
 )
-from switchfit.problem.experiment import Experiment, initial_state_of
+from switchfit.problem.experiment import Experiment, initial_state_of, insert_jumps
 from switchfit.problem.functions import Function, Shape, trace_function
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.system import HybridSystem
@@ -85,6 +85,8 @@ class Structure:
     guard_library: tuple[Function, ...]
     transition_costs: tuple[Function | None, ...] = ()
     transition_cost_library: tuple[Function, ...] = ()
+    jumps: tuple[int, ...] = ()
+    """The transitions (from 0) that are jumps at known times: samples at the same time are of the state before them."""
     has_free_tf: bool = False
     """Whether the last of `modes` is the rest after a free tf, in which the state is constant and costs are 0."""
 
@@ -121,6 +123,7 @@ class Structure:
             guard_library=(),
             transition_costs=(),
             transition_cost_library=(),
+            jumps=(),
         )
 
     @cached_property
@@ -135,12 +138,19 @@ class Structure:
             reset_maps=self.reset_library,
             guards=self.guard_library,
             transition_costs=self.transition_cost_library,
+            jumps=(),
         )
 
     @property
     def resets(self) -> tuple[int, ...]:
         """The transitions (from 0) at which a reset map acts."""
         return tuple(i for i, reset in enumerate(self.reset_maps) if reset is not None)
+
+    def fix_sides(self, side: Any, xp: Any) -> Any:
+        """Return the side of each transition time at a node: `side` (), or an array (N,) with +1 for the jumps."""
+        if not self.jumps:
+            return side
+        return xp.where(np.isin(np.arange(self.N), self.jumps), 1.0, side)
 
     @property
     def guarded(self) -> tuple[int, ...]:
@@ -263,23 +273,34 @@ def trace_structure(
     in_mode, form = (at, "f(t, x, p)") if inputs is None else ((*at, inputs), "f(t, x, p, u)")
 
     def at_transitions(
-        given: Mapping[tuple[str, str], Callable[..., Any]], shape: Shape, what: str, form: str
+        given: Mapping[tuple[str, str], Callable[..., Any]],
+        shape: Shape,
+        what: str,
+        form: str,
+        at_jumps: Sequence[Function | None] = (),
     ) -> tuple[tuple[Function | None, ...], tuple[Function, ...]]:
-        """Return the function of each transition, None for one without, and those of all possible transitions."""
+        """Return the function of each transition and jump, None for one without, and those of all possible ones."""
         own = list(pairwise(experiment.mode_sequence))
         here = given if transitions is not None else own
         traced = {pair: trace(g, at, shape, f"{what} {pair}", form) for pair, g in given.items() if pair in here}
-        return tuple(traced.get(pair) for pair in own), tuple(dict.fromkeys(traced.values()))
+        found = insert_jumps(experiment, [traced.get(pair) for pair in own], at_jumps or [None] * len(jump_maps))
+        return tuple(found), tuple(dict.fromkeys([*traced.values(), *filter(None, at_jumps)]))
 
     modes = tuple(trace(system.modes[name], in_mode, (n,), f"mode {name!r}", form, input_names) for name in names)
-    sequence = tuple(names.index(mode) for mode in experiment.mode_sequence)
+    own_modes = [names.index(mode) for mode in experiment.mode_sequence]
+    # After a jump the mode is that before it.
+    sequence = (
+        own_modes[0],
+        *insert_jumps(experiment, own_modes[1:], [own_modes[i] for i in experiment.passed_by_jumps]),
+    )
+    jump_maps = [trace(jump, at, (n,), "the map of a Jump", "map(t, x, p)") for jump in experiment.jump_maps]
     end: tuple[None, ...] = ()
     if experiment.has_free_tf:  # a free tf is the transition to one more mode, which has no other functions
         modes += (trace(stay_at_rest, in_mode, (n,), "the rest after tf", form, input_names),)
         names, sequence, end = (*names, REST), (*sequence, len(names)), (None,)
     references = ((item, item.signal.channels) for item in items(ReferenceSignal))
     measurements = ((item, item.values.shape[1]) for item in items(Measurements))
-    reset_maps, reset_library = at_transitions(system.reset_maps, (n,), "reset map", "R(t, x, p)")
+    reset_maps, reset_library = at_transitions(system.reset_maps, (n,), "reset map", "R(t, x, p)", jump_maps)
     guards, guard_library = at_transitions(system.guards, (), "guard", "g(t, x, p)")
     costs = _choose_transition_costs(items(TransitionCost), names)
     transition_costs, transition_cost_library = at_transitions(costs, (), "TransitionCost", "mu(t, x, p)")
@@ -305,6 +326,7 @@ def trace_structure(
         guard_library=guard_library,
         transition_costs=(*transition_costs, *end),
         transition_cost_library=transition_cost_library,
+        jumps=tuple((experiment.passed_by_jumps + np.arange(len(jump_maps))).tolist()),
         has_free_tf=experiment.has_free_tf,
     )
     return replace(structure, parameters=_select_parameters(trace, structure))

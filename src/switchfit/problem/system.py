@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.parameter import Parameter
+from switchfit.problem.parameter import Parameter, refuse_dates
 from switchfit.problem.validation import (
     as_array,
     as_callable,
@@ -95,8 +95,8 @@ class HybridSystem:
     modes: Mapping[str, VectorField]
     initial_state: Any
     reset_maps: Mapping[tuple[str, str], ResetMap] = field(default_factory=dict)
-    state_names: tuple[str, ...] | None = None
-    state_units: tuple[str, ...] | None = None
+    state_names: Sequence[str] | None = None
+    state_units: Sequence[str] | None = None
     guards: Mapping[tuple[str, str], Guard] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -188,6 +188,7 @@ def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ..
         With `name` in the message.
     """
     if isinstance(value, Parameter):
+        refuse_dates(value, name)
         if len(value.shape) != 1:
             raise ValueError(f"{name} must have shape (n,), one entry for each state; got shape {value.shape}.")
         return value.entries()
@@ -205,6 +206,7 @@ def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ..
 def _as_entry(entry: Any, name: str) -> Parameter:
     """Return one entry of an initial state with unknown entries as a `Parameter`; a number is a fixed one."""
     if isinstance(entry, Parameter):
+        refuse_dates(entry, f"each entry of {name}")
         parameter = entry
     else:
         array = as_array(entry, f"each entry of {name}", form="a number or an sf.Parameter")

@@ -89,6 +89,9 @@ class _Short(reprlib.Repr):
             f"<{type(x).__name__}>" if is_dataclass(x) and not isinstance(x, type) else super().repr_instance(x, level)
         )
 
+    def repr_Dates(self, x: Any, level: int) -> str:  # reprlib calls repr_<name of the type>
+        return repr(x)
+
     repr_ArrayImpl = repr_MaskedArray = repr_ndarray  # noqa: N815  # reprlib calls repr_<name of the type>
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,8 +13,10 @@ from switchfit.batch.resampling import Bootstrap
 from switchfit.batch.simulated import MonteCarlo
 from switchfit.batch.starts import Multistart
 from switchfit.problem.data import FloatArray
+from switchfit.problem.dates import Origin
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report.numbers import format_count
+from switchfit.report.dates import format_unknown, label_time
+from switchfit.report.numbers import format_count, format_rounded
 from switchfit.report.style import (
     DATA,
     FIT,
@@ -41,10 +43,17 @@ SAME = 1e-6
 """Relative spread of the ends of an unknown below which all starts ended at one value."""
 DRAWN_PLACES = 30
 """Largest number of unknowns in the figure of the starts' ends."""
+LEVEL_COLOURS = {"good": "#1a7f4b", "doubtful": "#c07800", "bad": "#bb2a20"}
 COLUMNS = 3
 LISTED_MINIMA = 10
 LISTED_UNKNOWNS, LISTED_PLACES = 12, 6
 """Largest numbers of unknowns in a table, and in the line of a minimum; transition times are left out first."""
+LISTED_FITS, LISTED_WORST = 24, 12
+"""Fits up to which all are listed in their order; of more, the worst."""
+LISTED_COLUMNS = 4
+"""Unknowns in the line of a fit."""
+DRAWN_FITS, DRAWN_UNKNOWNS = 40, 6
+"""Fits and unknowns in a figure: the worst fits, and of more unknowns first those that are no transition times."""
 TOO_FEW = "Fewer than two fits converged: no statistics."
 BOOTSTRAP_TITLES = {
     "residuals": "Bootstrap of residuals",
@@ -80,13 +89,35 @@ def summarise(fits: Fits) -> list[str]:
 
 @format_text.register(Fits)
 def write_fits(fits: Fits) -> str:
-    """Return the verdict, and how the fits ended.
+    """Return the verdict, how the fits ended, and a line for each of them; of many, for the worst.
 
     Parameters
     ----------
     fits : Fits
     """
-    return "\n".join(summarise(fits))
+    return "\n".join([*summarise(fits), "", *tabulate_fits(fits)])
+
+
+def tabulate_fits(fits: Fits) -> list[str]:
+    """Return a line for each fit: level, cost, and the unknowns with their standard errors; of many, the worst first.
+
+    Parameters
+    ----------
+    fits : Fits
+    """
+    most = len(fits) if len(fits) <= LISTED_FITS else LISTED_WORST
+    listed = range(most) if most == len(fits) else fits.worst_first[:most].tolist()
+    shown = _select_unknowns(fits, LISTED_COLUMNS)
+    header = ["run", "", "J", *(part for i in shown for part in (_label(fits, i), ""))]
+    errors = fits.standard_errors
+    rows = [header]
+    for k in listed:
+        cells = [part for i in shown for part in format_rounded(fits.theta[k, i], errors[k, i])[:2]]
+        rows.append([str(fits.runs[k]), str(fits.levels[k]), f"{fits.cost[k]:.6g}", *cells])
+    lines = format_table(rows, ">" + "<>" + "><" * len(shown), indent="")
+    if most < len(fits):
+        lines.append(f"the worst {most} of {len(fits)} fits; .to_pandas() has all of them")
+    return lines + _count_rest(fits, shown)
 
 
 @format_text.register(MonteCarlo)
@@ -125,7 +156,11 @@ def write_multistart(study: Multistart) -> str:
     for k in range(min(minima, LISTED_MINIMA)):
         here = np.flatnonzero(study.clusters == k)
         shown, at = _select_unknowns(study, LISTED_PLACES), study.theta[here[0]]
-        named = [f"{study.theta_names[i]} = {at[i]:.6g}{unit_suffix(study.theta_units[i])}" for i in shown]
+        named = [
+            f"{study.theta_names[i]} = {format_unknown(at[i], _find_clock(study, i))}"
+            f"{'' if _find_clock(study, i) else unit_suffix(study.theta_units[i])}"
+            for i in shown
+        ]
         more = len(at) - len(shown)
         place = ", ".join(named) + (f" and {more} more" if more else "")
         rows.append((f"J = {study.cost[here].min():.9g}", format_count(len(here), "start"), place))
@@ -161,7 +196,7 @@ def tabulate_monte_carlo(study: MonteCarlo) -> list[str]:
     rows: list[Sequence[str]] = [
         (
             _label(study, i),
-            f"{study.truth[i]:.6g}",
+            format_unknown(study.truth[i], _find_clock(study, i), spread[i]),
             f"{bias[i]:+.2e}",
             f"{spread[i] / np.sqrt(count):.1e}",
             f"{spread[i]:.3e}",
@@ -181,18 +216,71 @@ def tabulate_bootstrap(study: Bootstrap) -> list[str]:
     shown = _select_unknowns(study, LISTED_UNKNOWNS)
     bias, error, intervals = study.bias, study.standard_deviation, study.intervals()
     for k in shown:
-        label, value = _label(study, k), f"{study.estimate[k]:.6g}"
+        clock = _find_clock(study, k)
+        label, value = _label(study, k), format_unknown(study.estimate[k], clock, error[k])
         if not study.resampled[k]:
             rows.append((label, value, "-", "-", "of one run alone"))
             continue
         low, high = intervals[k]
-        rows.append((label, value, f"{bias[k]:+.2e}", f"{error[k]:.3e}", f"[{low:.6g}, {high:.6g}]"))
+        ends = [format_unknown(end, clock, error[k]) for end in (low, high)]
+        rows.append((label, value, f"{bias[k]:+.2e}", f"{error[k]:.3e}", f"[{ends[0]}, {ends[1]}]"))
     return format_table(rows, "<" + ">" * 4, indent="") + _count_rest(study, shown)
+
+
+class Clock(NamedTuple):
+    """What the numbers of one unknown are as dates, for `switchfit.report.dates`."""
+
+    origin: Origin
+    time_unit: str
+
+
+def _find_clock(fits: Fits, k: int) -> Clock | None:
+    """Return what the numbers of unknown k are as dates; None if they are no dates."""
+    origin = fits.date_origins[k]
+    return None if origin is None else Clock(origin, fits.theta_units[k])
 
 
 def _label(fits: Fits, k: int) -> str:
     """Return name and unit of unknown k."""
     return label_quantity(fits.theta_names[k], fits.theta_units[k])
+
+
+@draw_figure.register(Fits)
+def plot_fits(fits: Fits) -> Figure:
+    """Draw unknowns with their 95 % intervals, a row for each fit, the worst on top.
+
+    Parameters
+    ----------
+    fits : Fits
+    """
+    from matplotlib.figure import Figure
+
+    shown, order = _select_unknowns(fits, DRAWN_UNKNOWNS), fits.worst_first[:DRAWN_FITS]
+    count, columns = len(order), max(len(shown), 1)
+    size = (1.2 + 2.6 * columns, 1.4 + 0.2 * max(count, 5))
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(1, columns, sharey=True, squeeze=False)[0]
+    places, intervals, levels = np.arange(count), fits.confidence_intervals(), fits.levels[order]
+    for ax, i in zip(axes, shown, strict=False):
+        for level, colour in LEVEL_COLOURS.items():
+            here = levels == level
+            if not here.any():
+                continue
+            value, (low, high) = fits.theta[order[here], i], intervals[order[here], i].T
+            ax.hlines(places[here], low, high, color=colour, linewidth=1.6, alpha=0.6)
+            ax.scatter(value, places[here], s=18, color=colour, label=level, zorder=2)
+        ax.set_xlabel(_label(fits, i))
+        ax.ticklabel_format(axis="x", useOffset=False)
+        ax.locator_params(axis="x", nbins=4)
+        ax.grid(axis="x", linewidth=0.4, alpha=0.6)
+    axes[0].set_yticks(places, [str(run) for run in fits.runs[order]])
+    axes[0].set_ylabel("run")
+    axes[0].set_ylim(max(count, 1) - 0.5, -0.5)
+    handles, labels = axes[0].get_legend_handles_labels()
+    if handles:
+        title = None if count == len(fits) else f"the worst {count} of {len(fits)} fits"
+        figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False, title=title)
+    return figure
 
 
 @draw_figure.register(Bootstrap)
@@ -239,9 +327,15 @@ def _choose_limits(values: FloatArray, centre: float) -> tuple[float, float]:
 
 def _draw_histogram_axis(study: Fits, k: int, limits: tuple[float, float], ax: Axes) -> None:
     """Label the axis with the name and unit of unknown k, with few ticks."""
-    ax.set_xlabel(_label(study, k))
+    clock = _find_clock(study, k)
+    ax.set_xlabel(_label(study, k) if clock is None else label_time(clock).replace("time", study.theta_names[k], 1))
     ax.set_xlim(limits)
     ax.set_yticks([])
+    if clock is not None:
+        from switchfit.report.date_axis import put_ticks
+
+        put_ticks(ax, clock)
+        return
     ax.ticklabel_format(axis="x", useOffset=False)
     ax.locator_params(axis="x", nbins=4)
 

@@ -15,6 +15,8 @@ import numpy as np
 from switchfit.batch.fits import Fits
 from switchfit.estimation.estimator import Estimate
 from switchfit.problem.problem import Problem
+from switchfit.report.batch import LEVEL_COLOURS
+from switchfit.report.dates import describe_origin, format_time, format_unknown, list_dated_unknowns
 from switchfit.report.numbers import format_unit
 from switchfit.report.plot import plot_fit
 from switchfit.report.tables import Table
@@ -25,7 +27,6 @@ from switchfit.uncertainty.profiles import Profile
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-LEVEL_COLOURS = {"good": "#1a7f4b", "doubtful": "#c07800", "bad": "#bb2a20"}
 DOTS = 64
 """Dots per inch of the figures."""
 LARGEST_FIGURE = 4
@@ -67,9 +68,10 @@ def show_problem(problem: Problem) -> str:
         ends = experiment.ends_of_modes(experiment.initial_times)
         samples = sum(getattr(item, "count", 0) for item in experiment.data)
         modes = " → ".join(experiment.mode_sequence)
-        horizon = f"{ends[0]:.6g} to {ends[-1]:.6g}"
+        horizon = f"{format_time(ends[0], experiment)} to {format_time(ends[-1], experiment)}"
+        unit = describe_origin(experiment) or format_unit(experiment.time_unit)
         name = experiment.name or str(number)
-        runs.append([name, modes, horizon, format_unit(experiment.time_unit), f"{samples}" if samples else ""])
+        runs.append([name, modes, horizon, unit, f"{samples}" if samples else ""])
     unknowns = problem.unknowns
     rows = [["unknown", "first guess", "lower", "upper", "", "prior"]]
     columns = zip(
@@ -81,9 +83,9 @@ def show_problem(problem: Problem) -> str:
         unknowns.priors.texts(),
         strict=True,
     )
-    for name, value, lower, upper, unit, prior in columns:
-        bounds = [f"{bound:.6g}" if np.isfinite(bound) else "" for bound in (lower, upper)]
-        rows.append([name, f"{value:.6g}", *bounds, format_unit(unit), prior])
+    for run, (name, value, lower, upper, unit, prior) in zip(list_dated_unknowns(problem), columns, strict=True):
+        bounds = [format_unknown(bound, run) if np.isfinite(bound) else "" for bound in (lower, upper)]
+        rows.append([name, format_unknown(value, run), *bounds, "" if run else format_unit(unit), prior])
     parts = []
     for lines, most, alignment in ((runs, MOST_EXPERIMENTS, "<<<<>"), (rows, 2 * SCREEN.unknowns, "<>>><<")):
         parts.append(write_table(Table(lines[: most + 1], alignment)))

@@ -58,8 +58,3 @@ def get_unit(comparison: Comparison, channel: int, trajectory: Trajectory) -> st
         return format_unit(comparison.units[channel])
     units = dict(zip(trajectory.state_names, trajectory.state_units, strict=True))
     return format_unit(units.get(comparison.names[channel], ""))
-
-
-def label_time(unit: str) -> str:
-    """Return the label of an axis of times in a unit, such as "time (min)"."""
-    return f"time ({unit})" if format_unit(unit) else "time"

@@ -19,7 +19,7 @@ from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_flag
-from switchfit.report.numbers import get_unit, label_time
+from switchfit.report.numbers import get_unit
 from switchfit.report.style import (
     DATA,
     FIT,
@@ -535,6 +535,7 @@ def _draw_experiment(fit: Fit, e: int, block: Any, rows: int, colours: Mapping[s
         plot_transitions(times, spread, ax)
         if ax is not axes[-1]:
             ax.tick_params(labelbottom=False)
+            ax.xaxis.offsetText.set_visible(False)
             ax.set_xlabel("")
     block.align_ylabels(axes)
     if len(fit.trajectories) > 1:
@@ -675,6 +676,7 @@ def _break_at_gaps(times: FloatArray, values: FloatArray, trajectory: Trajectory
 
 def _label_time_axis(ax: Axes, trajectory: Trajectory) -> Axes:
     """Label the axis of times, and limit it to the experiment's horizon."""
+    from switchfit.report.date_axis import label_axis
+
     ax.set_xlim(float(trajectory.times[0]), float(trajectory.times[-1]))
-    ax.set_xlabel(label_time(trajectory.time_unit))
-    return ax
+    return label_axis(ax, trajectory)

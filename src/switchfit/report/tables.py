@@ -6,6 +6,9 @@ import textwrap
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from switchfit.problem.data import FloatArray
+from switchfit.problem.parameter import unit_suffix
+
 
 class Table(NamedTuple):
     """Cells as text.
@@ -29,6 +32,9 @@ class Table(NamedTuple):
 
 WIDTH = 100
 """Columns of a report, where names allow it."""
+
+MOST_JUMPS = 6
+"""Times of jumps that are listed; of more, the first ones and the last."""
 
 
 def format_table(rows: Sequence[Sequence[str]], alignment: str, *, indent: str = "  ") -> list[str]:
@@ -60,3 +66,18 @@ def wrap_text(text: str, first: str = "", others: str = "  ") -> list[str]:
     return textwrap.wrap(
         text, WIDTH, initial_indent=first, subsequent_indent=others, break_long_words=False, break_on_hyphens=False
     )
+
+
+def list_jumps(times: FloatArray, time_unit: str) -> str:
+    """Return how many jumps there are, and when; empty if there are none.
+
+    Parameters
+    ----------
+    times : (K,) array
+    time_unit : str
+    """
+    shown = [f"{time:.6g}" for time in times.tolist()]
+    if len(shown) > MOST_JUMPS:
+        shown = [*shown[: MOST_JUMPS - 2], "...", shown[-1]]
+    count = "1 jump" if len(times) == 1 else f"{len(times)} jumps"
+    return f"{count} at {', '.join(shown)}{unit_suffix(time_unit)}" if shown else ""

@@ -10,12 +10,12 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit, Step, disagreement, interval
-from switchfit.fit.trajectory import Comparison
+from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
-from switchfit.problem.parameter import unit_suffix
+from switchfit.report.dates import add_dates, describe_origin, format_span, format_time, list_dated
 from switchfit.report.numbers import format_count, format_rounded, format_unit, get_unit
-from switchfit.report.tables import Table, format_table, wrap_text
+from switchfit.report.tables import Table, format_table, list_jumps, wrap_text
 from switchfit.report.uncertainty import write_direction
 from switchfit.report.verdict import format_share, write_agreement
 from switchfit.runtime.presentation import format_text
@@ -156,7 +156,9 @@ def list_experiments(fit: Fit, most: int, where: str = "", *, full: bool) -> lis
     names = ["experiment"] if single else fit.run_names
     for name, trajectory, run in list(zip(names, fit.trajectories, fit.comparisons, strict=True))[:most]:
         sequence = " -> ".join(mode for mode, _, _ in trajectory.mode_spans)
-        horizon = f"{trajectory.times[0]:.6g} to {trajectory.times[-1]:.6g}{unit_suffix(trajectory.time_unit)}"
+        horizon = format_span(trajectory.times[0], trajectory.times[-1], trajectory)
+        jumps = list_jumps(trajectory.jump_times, trajectory.time_unit)
+        horizon += f", {jumps}" if jumps else ""
         data = [_format_data(comparison) for comparison in run] or ["no data: a cost of the trajectory"]
         if full or single:
             rows += [(name, f"{sequence}, {horizon}"), *(("", text) for text in data)]
@@ -164,6 +166,13 @@ def list_experiments(fit: Fit, most: int, where: str = "", *, full: bool) -> lis
             rows.append((name, "; ".join([f"{sequence}, {horizon}", *data])))
     if len(names) > most:
         rows.append(("", f"and {len(names) - most} more experiments{where}"))
+    origins = dict.fromkeys(filter(None, map(describe_origin, fit.trajectories)))
+    if len(origins) == 1:
+        rows.append(("times", next(iter(origins))))
+    elif origins and full:
+        rows += [(name, describe_origin(run)) for name, run in zip(names, fit.trajectories, strict=True) if run.origin]
+    elif origins:
+        rows.append(("times", "counted from a date of each experiment's own"))
     return rows
 
 
@@ -201,7 +210,8 @@ def list_course(fit: Fit, *, full: bool) -> list[Row]:
     if fit.starts is not None and fit.starts[0]:
         ended = next((step.ended for step in reversed(fit.steps) if step.ended), "")
         rows.append(("starts", f"{write_agreement(*fit.starts)}{_ENDED.get(ended, '')}"))
-    rows.append(("status", fit.message if full or not fit.status.successful else _shorten_status(fit)))
+    message = fit.message if full or not fit.status.successful else _shorten_status(fit)
+    rows.append(("status", add_dates(message, fit)))
     return rows
 
 
@@ -219,7 +229,8 @@ def _format_step(step: Step) -> str:
     not met.
     """
     cost = f"J = {step.cost:.6g}" if np.isfinite(step.cost) else "failed"
-    return f"{step.strategy}: {cost} ({step.seconds:.2g} s)"
+    ended = ", ended by time_budget" if step.ended == "time" else ""
+    return f"{step.strategy}: {cost} ({step.seconds:.2g} s{ended})"
 
 
 def _shorten_status(fit: Fit) -> str:
@@ -339,6 +350,7 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
     known = bool(np.isfinite(errors).any())
     corrected = known and not np.array_equal(naive, errors, equal_nan=True)
     joins = {t.index: f"{t.before} -> {t.after}" for t in fit.transitions}
+    dated = list_dated(fit)
     intervals, plain_intervals = fit.confidence_intervals(), Fit.confidence_intervals(fit)
     wide = correct_intervals(fit) if ends else intervals
     rows = []
@@ -347,13 +359,18 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
         value, error, relative = format_rounded(fit.theta[i], np.nan if name in fit.idle else errors[i])
         plain = format_rounded(fit.theta[i], np.nan if name in fit.idle else naive[i])[1]
         prior = f"prior: {fit.priors[name]}" if name in fit.priors else ""
-        sided = _format_sides(intervals[i], plain_intervals[i], fit.theta[i]) if i in joins and not ends else ""
-        log_scale = "" if ends else _format_log_scale(fit, i, errors)
-        notes = [joins.get(i, ""), prior, log_scale, sided, _mark_unknown(fit, name)]
+        run = dated[i]
+        counted = "" if run is None else f"t = {value}"
+        if run is not None:
+            value, relative = format_time(fit.theta[i], run, errors[i]), ""
+        sided = _format_sides(intervals[i], plain_intervals[i], fit.theta[i], run) if i in joins and not ends else ""
+        log_scale = "" if ends else _format_log_scale(fit, i, errors, run)
+        notes = [counted, joins.get(i, ""), prior, log_scale, sided, _mark_unknown(fit, name)]
         note = ", ".join(note for note in notes if note)
         unit = format_unit(fit.theta_units[i])
-        low, high = (format_end(end, wide[i]) for end in wide[i])
-        rows.append([name, value, error, relative, plain, low, high, unit, f"{fit.initial_theta[i]:.6g}", note])
+        low, high = (format_end(end, wide[i], run) for end in wide[i])
+        guess = f"{fit.initial_theta[i]:.6g}" if run is None else format_time(fit.initial_theta[i], run)
+        rows.append([name, value, error, relative, plain, low, high, unit, guess, note])
     columns = [  # title, alignment, whether it is shown
         ("", "<", True),
         ("value", ">", True),
@@ -377,18 +394,22 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
     return table, f"Standard errors from the exact Hessian{_compare_covariances(fit)}."
 
 
-def format_end(end: float, ends: FloatArray) -> str:
-    """Return an end of an interval to the third digit of its width; "" if it is unknown.
+def format_end(end: float, ends: FloatArray, run: Trajectory | None = None) -> str:
+    """Return an end of an interval to the third digit of its width, as a date if it is one; "" if it is unknown.
 
     Parameters
     ----------
     end : float
     ends : (2,)
         Both of them.
+    run : Trajectory, optional
+        Of the experiment with dates that this is a time of.
     """
     width = ends[1] - ends[0]
     if not (np.isfinite(end) and np.isfinite(width) and width > 0):
         return ""
+    if run is not None:
+        return format_time(end, run, width / 4)
     return format_rounded(end, width / 10)[0]
 
 
@@ -416,17 +437,23 @@ def _compare_covariances(fit: Fit) -> str:
     return f"; Gauss-Newton's are within {100 * (found.factor - 1):.2g} % of them" if found.factor < DIFFERENT else ""
 
 
-def _format_sides(ends: FloatArray, symmetric: FloatArray, value: float) -> str:
+def _format_sides(ends: FloatArray, symmetric: FloatArray, value: float, run: Trajectory | None) -> str:
     """Return the interval of a transition time that kinks at samples make asymmetric; "" for any other."""
     below, above = value - ends[0], ends[1] - value
     if not min(below, above) > 0 or np.array_equal(ends, symmetric):
         return ""
     if np.isfinite(symmetric).all() and max(below, above) < ONE_SIDED * min(below, above):
         return ""
-    return f"95 % in [{ends[0]:.4g}, {ends[1]:.4g}], not symmetric: samples make kinks"
+    return f"95 % in {_format_interval(ends, run)}, not symmetric: samples make kinks"
 
 
-def _format_log_scale(fit: Fit, i: int, errors: FloatArray) -> str:
+def _format_interval(ends: FloatArray, run: Trajectory | None) -> str:
+    if run is None:
+        return f"[{ends[0]:.4g}, {ends[1]:.4g}]"
+    return f"[{format_end(ends[0], ends, run)}, {format_end(ends[1], ends, run)}]"
+
+
+def _format_log_scale(fit: Fit, i: int, errors: FloatArray, run: Trajectory | None) -> str:
     """Return the interval of an unknown on a logarithmic scale, which its standard error does not give; else ""."""
     if fit.theta_names[i] not in fit.log_scaled:
         return ""
@@ -435,7 +462,7 @@ def _format_log_scale(fit: Fit, i: int, errors: FloatArray) -> str:
         half, origin = fit.quantile(0.95) * errors[i : i + 1], fit.log_origins[i]
         ends = interval(fit.theta[i : i + 1], half, np.ones(1, dtype=bool), origin)[0]
         low, high = np.clip(ends, fit.lower[i], fit.upper[i])
-    return f"95 % in [{low:.4g}, {high:.4g}]" if low < high else ""
+    return f"95 % in {_format_interval(np.array([low, high]), run)}" if low < high else ""
 
 
 def _mark_unknown(fit: Fit, name: str) -> str:
@@ -463,9 +490,13 @@ def tabulate_fixed(fit: Fit) -> Table:
     fit : Fit
     """
     fixed = [t for t in fit.transitions if t.index is None]
-    rows = [[t.name, f"{t.time:.8g}", format_unit(t.unit), f"{t.before} -> {t.after}"] for t in fixed]
+    rows = []
+    for t in fixed:
+        run = fit.trajectories[t.experiment]
+        time, unit = format_time(t.time, run, digits=8), format_unit(t.unit) if run.origin is None else ""
+        rows.append([t.name, time, unit, f"{t.before} -> {t.after}"])
     for name in fit.fixed:
-        text = np.array2string(fit.parameters[name], precision=8, threshold=6, edgeitems=2, separator=", ")
+        text = np.array2string(np.asarray(fit.parameters[name]), precision=8, threshold=6, edgeitems=2, separator=", ")
         rows.append([name, " ".join(text.split()), format_unit(fit.parameter_units[name]), ""])
     return Table(rows, "<<<<")
 
@@ -540,7 +571,7 @@ def _format_warnings(fit: Fit, verdict: Verdict, most: int, *, full: bool) -> li
     """Return the warnings as lines; on one screen without those that the verdict covers."""
     covered = set() if full else set().union(*(_COVERED.get(reason.kind, set()) for reason in verdict.reasons))
     issues = [issue for issue in find_issues(fit) if issue.kind not in covered]
-    lines = [line for issue in issues[:most] for line in wrap_text(str(issue), "  - ", "    ")]
+    lines = [line for issue in issues[:most] for line in wrap_text(add_dates(str(issue), fit), "  - ", "    ")]
     more = len(issues) - len(issues[:most])
     return lines + ([f"  and {format_count(more, 'warning')} more"] if more else [])
 

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.special
 
+from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report.numbers import format_rounded, label_time
+from switchfit.report.dates import describe_origin, format_time, label_time, list_dated
+from switchfit.report.numbers import format_rounded
 from switchfit.report.sentences import join_words
 from switchfit.report.style import (
     FIT,
@@ -107,8 +109,6 @@ def write_derivative_check(check: DerivativeCheck) -> str:
         orders = [""] * 3 if k == 0 else [_format_order(order) for order in check.orders[k - 1]]
         cells = [text for r, order in zip(remainders, orders, strict=True) for text in (f"{r:.2e}", order)]
         rows.append([f"{h:.1e}", *cells])
-    verdict = "passed" if check.passed else "FAILED: the derivatives do not belong to the cost"
-    observed = ", ".join(f"{order:.2f}" for order in check.observed_orders)
     lines = [
         "Taylor remainders of J along a random direction",
         "",
@@ -117,9 +117,21 @@ def write_derivative_check(check: DerivativeCheck) -> str:
         "Paper's equations (6)-(17) against the derivatives of the discretised cost, relative:",
         f"  gradient {_format_gap(check.gradient_gap)}, with half the steps {_format_gap(check.gradient_gap_halved)}",
         f"  Hessian  {_format_gap(check.hessian_gap)}, with half the steps {_format_gap(check.hessian_gap_halved)}",
-        f"Observed orders {observed} (1, 2, 3 expected): {verdict}.",
+        write_orders(check),
     ]
     return "\n".join(lines)
+
+
+def write_orders(check: DerivativeCheck) -> str:
+    """Return the observed orders of the Taylor remainders and the verdict, in a line.
+
+    Parameters
+    ----------
+    check : DerivativeCheck
+    """
+    verdict = "passed" if check.passed else "FAILED: the derivatives do not belong to the cost"
+    observed = ", ".join(f"{order:.2f}" for order in check.observed_orders)
+    return f"Observed orders {observed} (1, 2, 3 expected): {verdict}."
 
 
 def _format_order(order: float) -> str:
@@ -294,7 +306,17 @@ def write_profile(profile: Profile) -> str:
         f"  quadratic             {shown}",
         f"  points, fits          {len(profile.values)}, {profile.trace.fits}",
     ]
+    run = _find_run(profile)
+    if run is not None:
+        dates = [format_time(end, run, digits) if np.isfinite(end) else str(end) for end in (profile.value, low, high)]
+        lines.insert(1, f"  {'date':<20}  {dates[0]}, {percent} from {dates[1]} to {dates[2]}")
+        lines.append(f"  {'times':<20}  {describe_origin(run)}")
     return "\n".join([*lines, *(f"  - {note}" for note in list_profile_notes(profile))])
+
+
+def _find_run(profile: Profile) -> Trajectory | None:
+    """Return the trajectory of a profile of a time that is a date; None for any other."""
+    return list_dated(profile.fit)[profile.fit.theta_names.index(profile.name)]
 
 
 def _format_number(value: float, error: float) -> str:
@@ -426,10 +448,17 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
         ax.plot(inside, np.zeros(len(inside)), "|", color=TRANSITION, markersize=9, clip_on=False, label="sample times")
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(0.0, top)
-    ax.set_xlabel(label_quantity(profile.name, profile.unit))
+    run = _find_run(profile)
+    label = label_quantity(profile.name, profile.unit)
+    ax.set_xlabel(label if run is None else label_time(run).replace("time", profile.name, 1))
     ax.set_ylabel("2 (J - J min)" if profile.fit.sigma_known else "2 (J - J min) / s²")
     ax.set_title(f"Profile likelihood of {profile.name}")
-    ax.ticklabel_format(axis="x", useOffset=False)
+    if run is None:
+        ax.ticklabel_format(axis="x", useOffset=False)
+    else:
+        from switchfit.report.date_axis import put_ticks
+
+        put_ticks(ax, run)
     ax.legend(fontsize=SMALL, loc="upper center", ncols=2, edgecolor="none")
     return ax
 
@@ -469,10 +498,13 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics) -> Figure:
         row[0].set_ylabel(f"{label}\nresidual / sigma" if channel.sigma_known else f"{label}\nresidual / rms")
     for ax, title in zip(axes[0], ("Residuals in time", "Autocorrelation", "Quantiles"), strict=True):
         ax.set_title(title)
-    for k, ax in enumerate(axes[:, 0]):  # below all rows, or wherever the next row has times in another unit
-        unit = shown[k][1].time_unit
-        if k + 1 == len(shown) or shown[k + 1][1].time_unit != unit:
-            ax.set_xlabel(label_time(unit))
+    from switchfit.report.date_axis import put_ticks
+
+    for k, ax in enumerate(axes[:, 0]):  # below all rows, or wherever the next row has times of another kind
+        label = label_time(shown[k][1])
+        put_ticks(ax, shown[k][1])
+        if k + 1 == len(shown) or label_time(shown[k + 1][1]) != label:
+            ax.set_xlabel(label)
     for ax, label in zip(axes[-1, 1:], ("lag (samples)", "normal quantile"), strict=True):
         ax.set_xlabel(label)
     return turn_off_formulas(figure)

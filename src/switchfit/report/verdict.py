@@ -195,8 +195,27 @@ def _write_failures(issue: Issue) -> str:
     return f"{_count_fits(issue)} did not converge ({statuses})"
 
 
+def _write_prediction(issue: Issue) -> str:
+    """Return how much of another run is predicted."""
+    explained = _figure(issue, "explained")
+    if np.isnan(explained):
+        return "the other run does not vary"
+    chi_square = _chi_square(issue).removeprefix(" (").removesuffix(")")
+    figures = f"fit {_figure(issue, 'percent'):.1f} %{f'; {chi_square}' if chi_square else ''}"
+    if issue.kind == "predicts":
+        return f"the fitted parameters predict {format_share(explained)} of the variance ({figures})"
+    return f"the fitted parameters do not predict this run within the noise and their own error ({figures})"
+
+
 _REASONS: dict[str, Callable[[Issue], str]] = {
     "fits": _explain,
+    "predicts": _write_prediction,
+    "predicts badly": _write_prediction,
+    "prediction errors correlated": lambda issue: f"the residuals of {_name(issue.subjects)} are correlated",
+    "input not explained": lambda issue: (
+        f"the residuals depend on {_name(issue.subjects)}: the model misses a part of it"
+    ),
+    "own unknowns not converged": lambda issue: f"the estimation of {_name(issue.subjects)} did not converge",
     "a minimum": lambda issue: f"a minimum (KKT residual {_figure(issue, 'optimality'):.1e})",
     "starts agree": lambda issue: write_agreement(*_read_starts(issue)),
     "at kinks": lambda issue: f"{_name(issue.subjects)} at a kink of the cost",
@@ -212,6 +231,9 @@ _REASONS: dict[str, Callable[[Issue], str]] = {
     "little explained": _explain,
     "mostly outliers": lambda issue: (
         f"the robust loss counts {100 * _figure(issue, 'share'):.0f} % of {_name(issue.subjects)} as outliers"
+    ),
+    "large residuals": lambda issue: (
+        f"the typical residual of {_name(issue.subjects)} is {_figure(issue, 'typical'):.2g} sigma of noise"
     ),
     "too few samples": lambda issue: (
         f"{_figure(issue, 'samples'):.0f} values for {_figure(issue, 'unknowns'):.0f} unknowns leave nothing to check "
@@ -254,6 +276,8 @@ _REASONS: dict[str, Callable[[Issue], str]] = {
 }
 
 _STEPS = {
+    "look at plot": "look at .plot()",
+    "give a better guess": "give the other run a better guess of them",
     "more starts": "strategy='thorough'",
     "look at the residuals": "look at estimate.plot_residuals()",
     "check sigma": "check sigma",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Collection
 from dataclasses import replace
@@ -31,7 +32,10 @@ from switchfit.strategy.scan import can_scan, scan_intervals
 from switchfit.strategy.starts import MOST, SAME_COST, Starts, try_starts
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 from switchfit.uncertainty.quality import measure_quality
-from switchfit.uncertainty.verdict import UNLIKELY
+from switchfit.uncertainty.residuals import are_uneven
+from switchfit.uncertainty.verdict import NEARLY_ALL, UNLIKELY
+
+logger = logging.getLogger("switchfit")
 
 Strategy = Literal["local", "auto", "thorough"]
 STRATEGIES = get_args(Strategy)
@@ -113,7 +117,7 @@ def estimate(
     start : (d,) array_like, optional
         Where to begin, in the order of ``problem.theta_names``; the problem's initial guess if left out.
     time_budget : float, optional
-        Seconds after which no further strategy begins, and the many starts end.
+        Seconds after which no further strategy begins; many starts and a growing horizon that are under way end.
 
     Returns
     -------
@@ -132,7 +136,7 @@ def estimate(
     -----
     On a terminal, a line on stderr says from a second on which strategy is under way, the lowest J, how far it is and
     for how long. Many starts that last are fitted by other processes as well, one a core, where the model runs in
-    machine code and cloudpickle is installed; what is found does not depend on them.
+    machine code and can be pickled; what is found does not depend on them.
 
     See Also
     --------
@@ -195,8 +199,8 @@ def _is_enough(problem: Problem, fit: Estimate, tried: Collection[str] = ()) -> 
     """Return whether nothing more has to be tried: nothing that the verdict doubts could be better elsewhere.
 
     Where the size of the noise is not known, the residuals of a minimum near the lowest look as good as its own: the
-    intervals between samples have to have been `tried`. Where there is no noise at all, and the quality of the fit is
-    not perfect, a strategy that looks everywhere.
+    intervals between samples have to have been `tried`, and all strategies where residuals hint at a short misfit.
+    Where there is no noise at all, and the quality of the fit is not perfect, a strategy that looks everywhere.
     """
     if fit.status is Status.INTERRUPTED:
         return True
@@ -204,13 +208,14 @@ def _is_enough(problem: Problem, fit: Estimate, tried: Collection[str] = ()) -> 
         return True
     if is_doubted(fit) or (_is_coarse(fit) and REMESH not in tried):
         return False
-    if any(run.is_guess_proposed for run in problem.experiments) and fit.sigma_known is not True:
-        return not EVERYWHERE.isdisjoint(tried)
     if fit.sigma_known is True or not any(run.transition_times for run in problem.experiments):
         return True
+    elsewhere = not EVERYWHERE.isdisjoint(tried)
+    proposed = any(run.is_guess_proposed for run in problem.experiments)
     if all(any(comparison.kind == "measurements" for comparison in run) for run in fit.comparisons):
-        return SCAN in tried
-    return not EVERYWHERE.isdisjoint(tried) or measure_quality(fit).explained >= PERFECT
+        hidden = STARTS not in tried and measure_quality(fit).explained < NEARLY_ALL and are_uneven(fit)
+        return SCAN in tried and (elsewhere or not proposed) and not hidden
+    return elsewhere or (not proposed and measure_quality(fit).explained >= PERFECT)
 
 
 def _is_confirmed(problem: Problem, fit: Estimate) -> bool:
@@ -316,6 +321,7 @@ class Search:
 
     def _begin(self, name: str) -> None:
         """Say on the line of progress which strategy is under way, and the lowest J before it."""
+        logger.info("strategy: %s (lowest J so far: %.6g)", name, self.lowest)
         self.settings["callback"] = _write_to(self.line, f"{name}, fit of its end", self.callback)
         self.line.write(name, self.lowest)
 
@@ -387,7 +393,7 @@ class Search:
             # Far from the data the intervals near by are hopeless; several runs have been fitted alone by then.
             far = best is None or best.verdict.level == "bad"
             place = 0 if far and not has_runs(problem) else len(found)
-            found.insert(place, (GROW, lambda theta: grow_horizon(problem, theta)))
+            found.insert(place, (GROW, lambda theta: grow_horizon(problem, theta, lambda: self.late)))
         if can_reinsert(problem):
             found.append((REINSERT, lambda theta: reinsert_modes(problem, theta)))
         return [*found, (STARTS, self._try_starts)]
@@ -463,6 +469,7 @@ class Search:
             if self.best is None or (fit.cost < before and not fit.violated) or self.best.violated:
                 self.best = fit
         self.evaluations += evaluations
-        ended = self.starts.ended if self.starts is not None and name == STARTS else ""
+        ended = "time" if name == GROW and self.late and end.failed else ""
+        ended = self.starts.ended if self.starts is not None and name == STARTS else ended
         self.steps.append(Step(name, self.lowest, evaluations, time.perf_counter() - began, ended))
         return bool(np.isfinite(before) and abs(end.cost - before) <= SAME_COST * abs(before))

@@ -15,7 +15,7 @@ References
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -26,6 +26,7 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.variation import assume_noise
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal, TerminalConstraint, TerminalCost
 from switchfit.problem.experiment import Experiment
+from switchfit.problem.jump import Jump
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.priors import LogNormal, Normal
 from switchfit.problem.problem import GIVEN, Problem
@@ -74,7 +75,7 @@ def can_grow(problem: Problem) -> bool:
     return sum(map(len, along)) > FEWEST_WINDOWS
 
 
-def grow_horizon(problem: Problem, theta: FloatArray) -> End:
+def grow_horizon(problem: Problem, theta: FloatArray, stop: Callable[[], bool] = lambda: False) -> End:
     """Return where fits of growing parts of the logs end, all of them at last.
 
     Several runs grow together, each by as many windows as it has, with the parameters that they share kept near
@@ -86,6 +87,9 @@ def grow_horizon(problem: Problem, theta: FloatArray) -> End:
     problem : Problem
     theta : (d,)
         The first guess. Its transition times are tried among others, in every part of the log.
+    stop : callable
+        Asked before each fit of a window. True ends the search without an end: fits of parts of the logs say nothing
+        about the rest.
     """
     shared = find_shared(problem)
     rest = theta[_count_times(problem) :].copy()
@@ -95,8 +99,8 @@ def grow_horizon(problem: Problem, theta: FloatArray) -> End:
     for window in range(1, count + 1):
         show_detail(f"window {window} of {count}")
         for run in runs:
-            evaluations += run.grow(-(-window * len(run.windows) // count), rest)
-        if any(run.is_lost for run in runs):
+            evaluations += run.grow(-(-window * len(run.windows) // count), rest, stop)
+        if stop() or any(run.is_lost for run in runs):
             return End(theta, np.inf, evaluations)
         for run in runs:
             rest[run.places[run.own]] = run.best.rest[run.own]
@@ -174,7 +178,7 @@ class GrowingRun:
         """The end of the part that is looked at."""
         return self.windows[self.index - 1] if self.index else self.run.t0
 
-    def grow(self, index: int, rest: FloatArray) -> int:
+    def grow(self, index: int, rest: FloatArray, stop: Callable[[], bool] = lambda: False) -> int:
         """Take in the log up to a window, the shared parameters near those in `rest`; return the evaluations."""
         if index == self.index:
             return 0
@@ -185,7 +189,7 @@ class GrowingRun:
             self.known[k] = one._replace(rest=np.where(self.own, one.rest, rest[self.places]))
         for k in range(len(self.guess) + 1) if not self.is_whole else [len(self.guess)]:
             starts = list(_list_starts(self.known, k, self.guess, self.before, self.upto))
-            part = self._build_part(k, rest) if starts else None
+            part = self._build_part(k, rest) if starts and not stop() else None
             if part is None:
                 continue
             if self.is_whole and self.run.has_free_tf:
@@ -223,33 +227,49 @@ class GrowingRun:
         except ValueError:  # a transition that is fixed or bounded to be later, or no data yet
             return None
 
+    def _find_least_delay(self, item: Any) -> float:
+        """Return the lower bound of a delay that is a parameter; 0 of any other data."""
+        if not (isinstance(item, Measurements) and isinstance(item.delay, str)):
+            return 0.0
+        parameter = self.problem.parameters[self.run.parameter_map.get(item.delay, item.delay)]
+        return float(parameter.value if parameter.fixed else parameter.lower)
+
     def cut(self, k: int) -> Experiment:
         """Return the run up to the window with its first k transitions; ValueError if there is no such run."""
         if self.is_whole:
             return self.run
         run, end = self.run, self.upto
-        taken = list(run.transition_times[:k])
+        taken = list(run.times[:k])
         if k and taken[-1].value >= end:  # guesses that are evenly spaced between the times that are fixed
             knots = np.array([run.t0, *(float(tau.value) for tau in taken), end])
             kept = np.flatnonzero([True, *(tau.fixed for tau in taken), True])
             times = np.interp(np.arange(k + 2), kept, knots[kept])[1:-1]
             taken = [
-                tau if tau.fixed else replace(tau, value=np.clip(time, tau.lower, tau.upper))
+                tau if tau.fixed else replace(tau, value=_place_inside(run, tau, time, end))
                 for tau, time in zip(taken, times, strict=True)
             ]
         return replace(
             run,
-            data=[cut for item in run.data if (cut := _cut(item, end)) is not None],
+            data=[cut for item in run.data if (cut := _cut(item, end, self._find_least_delay(item))) is not None],
             mode_sequence=run.mode_sequence[: k + 1],
             transition_times=tuple(taken),
             tf=end,
+            jumps=[Jump(time, jump) for time, jump in zip(run.jump_times, run.jump_maps, strict=True) if time < end],
         )
+
+
+def _place_inside(run: Experiment, tau: Parameter, time: float, end: float) -> float:
+    """Return a guess inside the bounds of a transition time; between the jumps that are bounds, not at one."""
+    low, high = float(tau.lower), float(tau.upper)
+    inside = float(np.clip(time, low, high))
+    return 0.5 * (max(low, run.t0) + min(high, end)) if inside in run.jump_times else inside
 
 
 def _build(problem: Problem, experiments: Any, parameters: dict[str, Parameter]) -> Problem:
     """Return a part of a problem, with room for as many transitions as it has, so that programs are shared."""
     given = {name: getattr(problem, name) for name in GIVEN}
-    most = max(problem.max_transitions or 0, *(len(run.transition_times) for run in problem.experiments))
+    each = (len(run.transition_times) + len(run.jump_times) for run in problem.experiments)
+    most = max(problem.max_transitions or 0, *each)
     return Problem(**given | {"experiments": experiments, "parameters": parameters, "max_transitions": most})
 
 
@@ -333,10 +353,13 @@ def _fit_best(part: Problem, starts: list[Beginning], free: NDArray[np.bool_]) -
     return [fit_briefly(part, theta, ITERATIONS) for theta in thetas[:TRIED]], len(thetas)
 
 
-def _cut(item: Any, end: float) -> Any:
-    """Return one part of the data up to `end`; None if nothing is left. What is said of the end holds at tf alone."""
-    if isinstance(item, Measurements) and not isinstance(item.delay, str):
-        there = item.seen_times <= end
+def _cut(item: Any, end: float, delay: float) -> Any:
+    """Return one part of the data up to `end`; None if nothing is left. What is said of the end holds at tf alone.
+
+    Samples with a delay that is a parameter belong to the part if they do with its least value, `delay`.
+    """
+    if isinstance(item, Measurements):
+        there = item.seen_times - delay <= end
         if not there.any():
             return None
         sigma = item.sigma

@@ -74,11 +74,11 @@ def _pack(problem: Problem) -> bytes | None:
     """Return the problem as bytes; None where workers could not take it, or would have to compile it anew."""
     if not sys.executable or evaluator_of(problem).engine.name != "native":
         return None
-    try:
-        import cloudpickle
+    import cloudpickle  # here, since few fits need it
 
+    try:
         blob: bytes = cloudpickle.dumps(problem)
-    except Exception:  # cloudpickle is not installed, or the user's objects refuse in a way of their own
+    except Exception:  # the user's objects refuse in a way of their own
         return None
     return blob
 

@@ -8,6 +8,10 @@ At a transition X jumps (see `switchfit.uncertainty.sensitivity`): just before i
 transition time, just after it does. The linear approximation assumes that the active mode is that of the fit, which may
 be wrong within two standard errors of a transition time: `near_transition` marks these times.
 
+After tf the last mode goes on: the problem is simulated with a later tf. Bands there contain the uncertainty of the
+unknowns and the noise of a sample. They do not contain that of the model: no mode may follow, and the model has no
+process noise.
+
 References
 ----------
 .. [1] G. A. F. Seber, C. J. Wild, Nonlinear Regression, Wiley 1989, section 5.1.
@@ -15,27 +19,76 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.discretization.mesh import Mesh
+from switchfit.engine.adaptive import refine_mesh
 from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import Trajectory
+from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
-from switchfit.problem.parameter import unit_suffix
-from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_array, as_index
-from switchfit.runtime.presentation import format_line, join_first
-from switchfit.uncertainty.sensitivity import Points, Sensitivity, compute_sensitivity
+from switchfit.problem.dates import Origin
+from switchfit.problem.experiment import count_times, show_time
+from switchfit.problem.parameter import Parameter, unit_suffix
+from switchfit.problem.problem import GIVEN, Problem
+from switchfit.problem.validation import as_array, as_index, as_level
+from switchfit.runtime.frames import Tabular
+from switchfit.runtime.presentation import draw_figure, format_line, join_first
+from switchfit.uncertainty.sensitivity import Points, compute_sensitivity
 
 NEAR = 2.0
 """Distance from a transition time, in its standard errors, within which a band is unreliable."""
 
 
+class Predictor(Protocol):
+    """What bands are made of: a fit, or its validation on another run."""
+
+    @property
+    def theta(self) -> FloatArray:
+        """All unknowns: (d,)."""
+        ...
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Their covariance: (d, d)."""
+        ...
+
+    @property
+    def standard_errors(self) -> FloatArray:
+        """Their standard errors: (d,)."""
+        ...
+
+    @property
+    def trajectories(self) -> tuple[Trajectory, ...]:
+        """One for each experiment."""
+        ...
+
+    @property
+    def comparisons(self) -> tuple[tuple[Comparison, ...], ...]:
+        """Measured and fitted values, a tuple for each experiment."""
+        ...
+
+    @property
+    def sigma_known(self) -> bool | None:
+        """Whether the noise is known."""
+        ...
+
+    @property
+    def residual_variance(self) -> float:
+        """Variance of the noise where it is not."""
+        ...
+
+    def quantile(self, level: float) -> float:
+        """Return the two-sided quantile."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class Prediction(Tabular):
     """States and outputs of one experiment with their standard errors.
 
     Attributes
@@ -52,7 +105,12 @@ class Prediction:
         Unit of the experiment's times.
     near_transition : (K,) bool
         Whether a time is within two standard errors of a transition time, where the bands ignore the other mode.
-    fit : Fit
+    fit : Fit or Validation
+        With the covariance and the quantiles.
+    experiment : int
+        Index of the experiment, from 0.
+    origin : Origin or None
+        The date at which times are 0; None where they are no dates.
 
     See Also
     --------
@@ -83,7 +141,14 @@ class Prediction:
     output_names: tuple[str, ...]
     time_unit: str
     near_transition: NDArray[np.bool_]
-    fit: Fit = field(repr=False)
+    fit: Predictor = field(repr=False)
+    experiment: int = 0
+    origin: Origin | None = None
+
+    @property
+    def dates(self) -> list[datetime] | None:
+        """The times as dates in the experiment's time zone; None where they are no dates."""
+        return None if self.origin is None else self.origin.to_dates(self.times, self.time_unit)
 
     def __repr__(self) -> str:
         times = f"{len(self.times)} times"
@@ -151,6 +216,30 @@ class Prediction:
         """
         return _build_band(self.outputs, self.fit.quantile(level) * np.hypot(self.output_errors, self.noise))
 
+    def plot(self, *, level: float = 0.95) -> Any:
+        """Draw the outputs over time with both bands, beside what was measured, as a matplotlib Figure.
+
+        Parameters
+        ----------
+        level : float, between 0 and 1
+            Level of the bands.
+
+        See Also
+        --------
+        predict, Estimate.plot
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> len(fit.predict(np.linspace(0.0, 9.0, 200)).plot().axes)
+        1
+        """
+        return draw_figure(self, level=as_level(level))
+
 
 def _build_band(values: FloatArray, half: FloatArray) -> FloatArray:
     return np.stack([values - half, values + half], axis=-1)
@@ -163,8 +252,9 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
     ----------
     estimate : Estimate
     times : (K,) array_like, optional
-        In any order, inside [t0, tf], in the experiment's time unit; at a transition, values are those just before it.
-        If left out, all nodes of the mesh, each transition twice: with the state before and after it.
+        In any order, not before t0, in the experiment's time unit, or dates where its times are dates; at a transition,
+        values are those just before it. After tf the last mode goes on, with the noise of the last sample. If left out,
+        all nodes of the mesh up to tf, each transition twice: with the state before and after it.
     experiment : int, optional
         Index of the experiment, from 0.
 
@@ -177,8 +267,8 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
     TypeError
         If `estimate` is not an estimate, or an argument is of the wrong type.
     ValueError
-        For times outside the horizon, an experiment that does not exist, or an estimate without a problem or without
-        a covariance.
+        For times before t0, or after tf where an input is not known or the model cannot be integrated; for an
+        experiment that does not exist, or an estimate without a problem or without a covariance.
 
     See Also
     --------
@@ -196,6 +286,13 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
            [8.6]])
     >>> prediction.near_transition
     array([False, False])
+
+    The log ends at 6 h; after it the heater stays off:
+
+    >>> sf.predict(fit, [6.0, 9.0, 12.0]).prediction_band(0.95).round(1)[:, 0]
+    array([[ 3.5,  4.3],
+           [ 0.8,  1.6],
+           [-0. ,  0.8]])
     """
     fit: Fit = estimate
     if not isinstance(fit, Fit):
@@ -206,20 +303,28 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
     if times is None:
         points = estimate.sensitivities[experiment].nodes
     else:
-        asked = _check_times(times, problem, experiment, fit.trajectories[experiment])
-        mesh = evaluator.meshes[experiment].insert(asked)
-        found: Sensitivity = compute_sensitivity(problem, experiment, fit.theta, mesh)
-        points = found.at(asked)
-    return _build_prediction(fit, problem, experiment, points)
+        asked = _check_times(times, problem, experiment)
+        mesh = evaluator.meshes[experiment]
+        if asked.max() > fit.trajectories[experiment].times[-1]:
+            _require_covariance(fit)
+            points = _simulate_beyond(problem, experiment, fit.theta, mesh, asked)
+        else:
+            points = compute_sensitivity(problem, experiment, fit.theta, mesh.insert(asked)).at(asked)
+    return build_prediction(fit, problem, experiment, points)
 
 
-def _build_prediction(fit: Fit, problem: Problem, e: int, points: Points) -> Prediction:
-    covariance = fit.covariance
-    if not np.isfinite(covariance).all():
-        raise ValueError(
-            "There are no bands without a covariance: the cost must consist of Measurements alone, with more values "
-            "than unknowns, and the Hessian must be positive definite. The report says what is missing."
-        )
+def build_prediction(fit: Predictor, problem: Problem, e: int, points: Points) -> Prediction:
+    """Return the prediction of experiment e from its sensitivity at some points.
+
+    Parameters
+    ----------
+    fit : Predictor
+    problem : Problem
+        Whose theta the covariance is of.
+    e : int, from 0
+    points : Points
+    """
+    covariance = _require_covariance(fit)
     trajectory = fit.trajectories[e]
     names = [name for comparison in fit.comparisons[e] for name in comparison.names]
     return Prediction(
@@ -235,7 +340,46 @@ def _build_prediction(fit: Fit, problem: Problem, e: int, points: Points) -> Pre
         trajectory.time_unit,
         _is_near_transition(fit, problem, e, points.times),
         fit,
+        e,
+        trajectory.origin,
     )
+
+
+def _require_covariance(fit: Predictor) -> FloatArray:
+    """Return the covariance of a fit; raise ValueError if it has none."""
+    if not np.isfinite(fit.covariance).all():
+        raise ValueError(
+            "There are no bands without a covariance: the cost must consist of Measurements alone, with more values "
+            "than unknowns, and the Hessian must be positive definite. The report says what is missing."
+        )
+    return fit.covariance
+
+
+def _simulate_beyond(problem: Problem, e: int, theta: FloatArray, mesh: Mesh, times: FloatArray) -> Points:
+    """Return states and outputs at times (K,), some of them after tf, with their derivatives in theta.
+
+    Up to tf the mesh is that of the fit; after it, it is refined anew.
+    """
+    experiment = problem.experiments[e]
+    tf, last = experiment.end, float(times.max())
+    if isinstance(experiment.tf, Parameter):
+        raise ValueError(
+            f"times must not lie after tf where tf is estimated: the system stops there; got {last:.6g}"
+            f"{unit_suffix(experiment.time_unit)}."
+        )
+    try:
+        longer = replace(experiment, tf=last)
+    except ValueError as error:
+        raise ValueError(
+            f"the model cannot be continued from tf = {tf:.6g} to {last:.6g}{unit_suffix(experiment.time_unit)}: "
+            f"{error} Give the experiment an Input that reaches further, and fit again."
+        ) from error
+    runs = [longer if k == e else run for k, run in enumerate(problem.experiments)]
+    extended = Problem(**{name: getattr(problem, name) for name in GIVEN} | {"experiments": runs})
+    refined = refine_mesh(extended, e, theta)
+    after = refined.times[refined.times > tf]
+    whole = Mesh.from_times(np.concatenate([mesh.times, after, times]), refined.stiffness or mesh.stiffness)
+    return compute_sensitivity(extended, e, theta, whole).at(times)
 
 
 def _compute_errors(derivative: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -244,7 +388,7 @@ def _compute_errors(derivative: FloatArray, covariance: FloatArray) -> FloatArra
     return np.sqrt(np.maximum(variance, 0.0))
 
 
-def _get_noise(fit: Fit, problem: Problem, e: int, times: FloatArray) -> FloatArray:
+def _get_noise(fit: Predictor, problem: Problem, e: int, times: FloatArray) -> FloatArray:
     """Return the standard deviation of one sample of each output at each time: (K, q)."""
     columns = [np.full((len(times), q), np.nan) for _, q in problem.structures[e].references]
     for item, comparison in zip(_list_compared(problem, e), fit.comparisons[e], strict=True):
@@ -261,20 +405,20 @@ def _list_compared(problem: Problem, e: int) -> list[Any]:
     return [item for item in problem.experiments[e].data if isinstance(item, (Measurements, ReferenceSignal))]
 
 
-def _is_near_transition(fit: Fit, problem: Problem, e: int, times: FloatArray) -> NDArray[np.bool_]:
+def _is_near_transition(fit: Predictor, problem: Problem, e: int, times: FloatArray) -> NDArray[np.bool_]:
     where = problem.unknowns.times[e]
     free = where[where >= 0]
     reach = NEAR * fit.standard_errors[free]
     return np.asarray((np.abs(times[:, None] - fit.theta[free][None]) <= reach[None]).any(1))
 
 
-def _check_times(times: ArrayLike, problem: Problem, e: int, trajectory: Trajectory) -> FloatArray:
-    asked = np.atleast_1d(as_array(times, "times"))
-    t0, tf = trajectory.times[[0, -1]].tolist()
+def _check_times(times: ArrayLike, problem: Problem, e: int) -> FloatArray:
+    experiment = problem.experiments[e]
+    asked = np.atleast_1d(as_array(count_times(experiment, times), "times"))
     if asked.ndim != 1 or asked.size == 0 or not np.isfinite(asked).all():
         raise ValueError(f"times must be finite numbers of shape (K,); got shape {asked.shape}.")
-    outside = (asked < t0) | (asked > tf)
-    if outside.any():
-        unit = unit_suffix(problem.experiments[e].time_unit)
-        raise ValueError(f"times must lie inside [t0, tf] = [{t0}, {tf}]{unit}; got {asked[outside][0]}.")
+    if asked.min() < experiment.t0:
+        unit = unit_suffix(experiment.time_unit) if experiment.origin is None else ""
+        start, first = show_time(experiment, experiment.t0), show_time(experiment, asked.min())
+        raise ValueError(f"times must not lie before t0 = {start}{unit}, where the simulation begins; got {first}.")
     return asked

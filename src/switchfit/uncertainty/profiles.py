@@ -41,6 +41,7 @@ from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_name, join_names, shorten
+from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text
 from switchfit.runtime.progress import Progress, show_progress
 
@@ -451,7 +452,7 @@ class Trace:
 
 
 @dataclass(frozen=True, eq=False)
-class Profile:
+class Profile(Tabular):
     """Profile likelihood of one unknown: print it, plot it, or get intervals at any level.
 
     Attributes

@@ -154,7 +154,7 @@ def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensiti
         items = [item for item in experiment.data if isinstance(item, Measurements)]
         for k, item in enumerate(items):
             q = item.values.shape[1]
-            points = found.at(item.times)
+            points = found.at(item.seen_times)
             there = ~np.isnan(item.values)
             where = np.argwhere(there)
             fitted, slope = points.outputs[:, first : first + q], points.outputs_d[:, first : first + q]

@@ -180,7 +180,7 @@ CORRECTED = ("corrected errors", "look at the residuals")
 FIX = "fix or add data"
 """What to do about unknowns that are not determined, which are the subjects of this advice."""
 
-MISFITS = ("unexplained", "mostly outliers", "slightly wrong", "reference not followed")
+MISFITS = ("unexplained", "mostly outliers", "large residuals", "slightly wrong", "reference not followed")
 """Kinds of reasons that say that the model does not fit, other than by the size of the noise."""
 
 
@@ -217,6 +217,8 @@ def _judge_quality(fit: Fit, quality: Quality) -> Iterator[Finding]:
         reason = Issue("mostly outliers", (lost.label,), {"share": lost.outliers})
         yield Finding("bad", reason, ELSEWHERE)
         return
+    if fit.sigma_known:
+        yield from _judge_typical(quality, samples)
     too_small = quality.has_chi_square and quality.probability_below < UNLIKELY and quality.ratio < 1 - CLEARLY_OFF
     if quality.has_chi_square and not too_small:
         yield from _judge_chi_square(quality, samples)
@@ -271,6 +273,15 @@ def _judge_residuals(
         yield Finding("bad", Issue("unexplained", (), figures), ELSEWHERE)
     elif quality.explained < (MOSTLY if untested else HALF):
         yield Finding("doubtful", Issue("little explained", (), figures), ("more starts", "more data"))
+
+
+def _judge_typical(quality: Quality, samples: tuple[ChannelQuality, ...]) -> Iterator[Finding]:
+    """Judge a fit with a robust loss, which has no chi-square, by the size of its typical residuals."""
+    robust = [c for c in samples if np.isfinite(c.typical)]
+    if quality.are_residuals_large or any(c.are_residuals_large for c in robust):
+        worst = max(robust, key=lambda c: c.typical)
+        figures = _describe_fit(quality) | {"worst": worst.explained, "typical": worst.typical}
+        yield Finding("doubtful", Issue("large residuals", (worst.label,), figures), (*ELSEWHERE, "check sigma"))
 
 
 def _judge_reference(quality: Quality, references: tuple[ChannelQuality, ...]) -> Iterator[Finding]:

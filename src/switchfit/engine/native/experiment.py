@@ -50,8 +50,9 @@ def reason_for_jax(structure: Structure, arguments: Arguments, order: Order) -> 
 def places_in_library(structure: Structure) -> dict[str, NDArray[np.int64]]:
     """Return the index in the library of the mode of each segment, and of the functions of each transition.
 
-    Transitions without a function of a kind have -1. Idle segments, which the sequence does not need, have its last
-    mode and no functions. Each array ends with an unused -1, so that it is never empty.
+    Transitions without a function of a kind have -1. If there are jumps at known times, "jumps" is 1 for these. Idle
+    segments, which the sequence does not need, have its last mode and no functions. Each array ends with an unused -1,
+    so that it is never empty.
     """
     library, idle = structure.library, structure.transitions - structure.N
 
@@ -62,6 +63,8 @@ def places_in_library(structure: Structure) -> dict[str, NDArray[np.int64]]:
     found = {"modes": modes + modes[-1:] * idle, "resets": find(structure.reset_maps, library.reset_maps)}
     for kind in AT_TRANSITIONS:
         found[kind.name] = find(getattr(structure, kind.name), getattr(library, kind.name))
+    if structure.jumps:
+        found["jumps"] = [int(i in structure.jumps) for i in range(structure.N)] + [0] * idle
     return {name: np.array([*which, -1], dtype=np.int64) for name, which in found.items()}
 
 
@@ -397,6 +400,10 @@ class NativeExperiment:
         """Find the cells in which segments begin, as in `switchfit.discretization.mesh.rows`."""
         if len(tau):
             passed = self.times.searchsorted(tau, "right" if side > 0 else "left")
+            if side <= 0 and self.structure.jumps:  # as in `Structure.fix_sides` and `count_passed`
+                jumps = list(self.structure.jumps)
+                passed[jumps] = self.times.searchsorted(tau[jumps], "right")
+                passed = np.maximum.accumulate(passed)
             self._begins[:] = np.minimum(np.maximum(passed - 1, 0), self._cells - 1)
 
     def _find_late_cells(self, p: FloatArray) -> None:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from switchfit.discretization.arguments import Arguments
+from switchfit.discretization.mesh import count_passed
 from switchfit.engine.native.experiment import places_in_library
 from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.program import program_of
@@ -80,7 +81,9 @@ def foreign_derivatives(
     nodes = arguments.nodes
     cells = nodes.shape[0] - 1
     real_cells = jnp.sum(nodes[1:] > nodes[:-1])
-    passed = jnp.sum(jnp.where(side > 0.0, nodes[None] <= tau[:, None], nodes[None] < tau[:, None]), axis=1)
+    if "jumps" in places:  # as in `Structure.fix_sides`
+        side = jnp.where(places["jumps"][: tau.shape[0]] > 0, 1.0, side)
+    passed = count_passed(nodes, tau, side)
     begins = jnp.clip(passed - 1, 0, real_cells - 1)
     units = np.zeros((D + 1, width))
     units[1:, :D] = np.eye(D)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.io.logs.units import SECONDS
+from switchfit.problem.dates import NANOSECONDS, Dates
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.issue import Issue
@@ -73,6 +74,10 @@ class Log:
         The column with the times.
     has_positions : bool
         Whether latitude and longitude are those of a format of positions, to which east and north are added.
+    time_zone : str
+        Zone of the file's dates, such as "UTC" or "+02:00"; "" where it states none.
+    has_dates : bool
+        Whether the file has dates that are written as such, not stamps of a recorder or numbers since 1970.
 
     See Also
     --------
@@ -105,6 +110,20 @@ class Log:
     place: str = "line"
     time_name: str = "t"
     has_positions: bool = False
+    time_zone: str = "UTC"
+    has_dates: bool = False
+
+    @property
+    def dates(self) -> Dates | None:
+        """The times as dates, for `Measurements`, `Input` and `Experiment`; None where the file has no dates.
+
+        They have the time zone that the file states, or none.
+        """
+        if not self.offset:
+            return None
+        length = NANOSECONDS[self.time_unit or "s"]
+        start = round(self.offset * length / 1000) * 1000  # microseconds are what a float64 since 1970 holds
+        return Dates(start + np.rint(self.times * length).astype(np.int64), self.time_zone)
 
     def __repr__(self) -> str:
         return format_line(self, self.source, join_first(self.values), f"{len(self.times)} times")
@@ -126,7 +145,7 @@ class Log:
 
     @property
     def start(self) -> datetime | None:
-        """Date and time (UTC) of ``times == 0``; None where the file has no dates."""
+        """Date and time of ``times == 0``, dates without a zone taken for UTC; None where the file has no dates."""
         if not self.offset:
             return None
         return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=self.offset * SECONDS[self.time_unit or "s"])
@@ -225,7 +244,7 @@ class Log:
         """Return source, span, channels, origin and issues as text."""
         unit = f" {self.time_unit}" if self.time_unit else ""
         span = f", {self.times[0]:.6g} to {self.times[-1]:.6g}{unit}" if len(self) else ""
-        start = f" from {self.start:%Y-%m-%d %H:%M:%S} UTC" if self.start else ""
+        start = f" from {self.start:%Y-%m-%d %H:%M:%S}{' UTC' if self.time_zone else ''}" if self.start else ""
         names = [f"{name} ({self.units[name]})" if self.units.get(name) else name for name in self.values]
         lines = [f"{self.source}: {len(self)} samples{span}{start}", f"  channels: {', '.join(names) or 'none'}"]
         if self.origin:

@@ -30,7 +30,8 @@ def read_parquet(path: Path, time: str | None, keep_epoch: bool) -> Log:
         raise InputError(f"There is no file {path}; check the name and the folder.") from None
     except Exception as error:  # of Arrow, which has many
         raise InputError(f"{path} cannot be read as a Parquet file: {error}") from error
-    return build_log(str(path), columns, _find_units(table.schema), time, keep_epoch=keep_epoch)
+    zones = {field.name: getattr(field.type, "tz", None) or "" for field in table.schema}
+    return build_log(str(path), columns, _find_units(table.schema), time, keep_epoch=keep_epoch, zones=zones)
 
 
 def _to_numpy(column: Any) -> Any:

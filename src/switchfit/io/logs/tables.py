@@ -21,7 +21,13 @@ def stack_records(records: Sequence[Mapping[str, float]]) -> dict[str, FloatArra
 
 
 def build_log(
-    source: str, columns: Mapping[str, Any], units: Mapping[str, str], time: str | None, *, keep_epoch: bool
+    source: str,
+    columns: Mapping[str, Any],
+    units: Mapping[str, str],
+    time: str | None,
+    *,
+    keep_epoch: bool,
+    zones: Mapping[str, str] | None = None,
 ) -> Log:
     """Return a log from columns, one of which has the times.
 
@@ -36,6 +42,8 @@ def build_log(
         The column with the times; left out, it is found by its name.
     keep_epoch : bool
         Leave numbers that count from 1970 as they are.
+    zones : mapping of str to str, optional
+        Time zones of columns of dates, which are in UTC then.
 
     Raises
     ------
@@ -73,6 +81,8 @@ def build_log(
         rows=np.arange(1, len(times) + 1),
         place="row",
         time_name=time,
+        time_zone=(zones or {}).get(time, "") if columns[time].dtype.kind == "M" else "UTC",
+        has_dates=columns[time].dtype.kind == "M",
     )
 
 

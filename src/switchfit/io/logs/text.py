@@ -107,7 +107,7 @@ def read_text(
     column = _find_time(table) if time is None else _find_column(table, time)
     if drop_broken:
         table = _drop_text(table, column, wanted)
-    times, time_unit, offset = _read_times(table, column, keep_epoch)
+    times, time_unit, offset, zone = _read_times(table, column, keep_epoch)
     values: dict[str, FloatArray] = {}
     events: list[Event] = []
     issues = list(table.broken)
@@ -143,6 +143,8 @@ def read_text(
         labels=labels,
         rows=table.lines,
         time_name=names[column],
+        time_zone="UTC" if zone is None else zone,
+        has_dates=zone is not None,
     )
 
 
@@ -358,8 +360,8 @@ def _find_time(table: _Table) -> int:
     )
 
 
-def _read_times(table: _Table, column: int, keep_epoch: bool) -> tuple[FloatArray, str, float]:
-    """Return times, their unit, and what was subtracted from them."""
+def _read_times(table: _Table, column: int, keep_epoch: bool) -> tuple[FloatArray, str, float, str | None]:
+    """Return times, their unit, what was subtracted from them, and the time zone of dates, None if they are numbers."""
     cells = table.list_cells(column)
     sample = next((cell for cell in cells if not is_missing(cell)), "")
     if is_date(sample):
@@ -372,20 +374,22 @@ def _read_times(table: _Table, column: int, keep_epoch: bool) -> tuple[FloatArra
     )
     if offset and cells and all(map(_LONG_INTEGER.fullmatch, cells)):
         times, unit, offset = subtract_first(list(map(int, cells)), unit)
-    return times, unit, offset
+    return times, unit, offset, None
 
 
-def _parse_dated(table: _Table, column: int, cells: list[str], sample: str) -> tuple[FloatArray, str, float]:
+def _parse_dated(
+    table: _Table, column: int, cells: list[str], sample: str
+) -> tuple[FloatArray, str, float, str | None]:
     """Return seconds since the first of dates; those of times of day since midnight, unless a column has the date."""
     places = [f"{table.source}, line {line}, column {table.header.names[column]!r}" for line in table.lines]
     if "-" not in sample and "/" not in sample and sample.count(".") < 2:
         lower = [name.lower() for name in table.header.names]
         day = next((lower.index(name) for name in _DATE_NAMES if name in lower), None)
         if day is None:
-            return parse_clock(cells, places), "s", 0.0
+            return parse_clock(cells, places), "s", 0.0, None
         cells = [f"{date} {clock}" for date, clock in zip(table.list_cells(day), cells, strict=True)]
-    seconds, offset = parse_dates(cells, places)
-    return seconds, "s", offset
+    seconds, offset, zone = parse_dates(cells, places)
+    return seconds, "s", offset, zone
 
 
 def _parse_numbers(cells: Sequence[str], comma: bool) -> tuple[FloatArray, NDArray[np.bool_]]:

@@ -4,19 +4,8 @@ from __future__ import annotations
 
 import re
 
-SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
-"""Length of a unit of time in seconds."""
-
-_SPELLINGS = {
-    "ns": ("ns", "nsec", "nsecs", "nanosecond", "nanoseconds"),
-    "us": ("us", "µs", "μs", "usec", "usecs", "micros", "microsecond", "microseconds"),
-    "ms": ("ms", "msec", "msecs", "millis", "millisecond", "milliseconds"),
-    "s": ("s", "sec", "secs", "second", "seconds"),
-    "min": ("min", "mins", "minute", "minutes"),
-    "h": ("h", "hr", "hrs", "hour", "hours"),
-    "d": ("d", "day", "days"),
-}
-_TIME_UNITS = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings}
+from switchfit.problem.dates import SECONDS as SECONDS
+from switchfit.problem.dates import TIME_UNITS
 
 EPOCH_SECONDS = (9.4e8, 2.6e9)
 """Between which numbers seconds since 1970 lie: the years 1999 to 2052."""
@@ -67,13 +56,13 @@ def split_unit(name: str) -> tuple[str, str]:
 
 def normalize_time_unit(text: str) -> str:
     """Return the key of `SECONDS` that a text stands for, or the text itself if it is no unit of time."""
-    return _TIME_UNITS.get(strip_brackets(text).lower(), text)
+    return TIME_UNITS.get(strip_brackets(text).lower(), text)
 
 
 def find_spelled_unit(name: str) -> str:
     """Return the unit of time that is a word in a name, such as in ``seconds_elapsed`` or ``millis``; "" if none is."""
     words = re.split(r"[ _.\-/]", name.lower())
-    return next((_TIME_UNITS[word] for word in words if len(word) > 3 and word in _TIME_UNITS), "")
+    return next((TIME_UNITS[word] for word in words if len(word) > 3 and word in TIME_UNITS), "")
 
 
 def find_epoch_unit(time: float) -> str | None:

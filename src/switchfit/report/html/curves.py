@@ -118,9 +118,9 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
     nodes = None if sensitivity is None else sensitivity.nodes
     times = trajectory.times if nodes is None else nodes.times
     segments = np.concatenate([[0], np.flatnonzero(np.diff(times) == 0) + 1, [len(times)]])
-    if len(segments) != len(trajectory.segments):  # a mode without duration: other meshes have other nodes there
-        times, nodes, segments = trajectory.times, None, trajectory.segments
-    modes = np.array([trajectory.modes[start] for start in trajectory.segments[:-1]])
+    if len(segments) != len(trajectory.pieces):  # a mode without duration: other meshes have other nodes there
+        times, nodes, segments = trajectory.times, None, trajectory.pieces
+    modes = np.array([trajectory.modes[start] for start in trajectory.pieces[:-1]])
     kept, breaks = _thin(segments, points)
     all_modes = np.repeat(modes, np.diff(segments))[kept]
     covariance = estimate.covariance if np.isfinite(estimate.standard_errors).all() else None

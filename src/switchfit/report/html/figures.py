@@ -12,14 +12,24 @@ from typing import Any
 
 import numpy as np
 from bokeh.layouts import column
-from bokeh.models import ColumnDataSource, FactorRange, HoverTool, PlainText, PrintfTickFormatter, Range1d
+from bokeh.models import (
+    ColumnDataSource,
+    CustomJSHover,
+    CustomJSTicker,
+    CustomJSTickFormatter,
+    FactorRange,
+    HoverTool,
+    PlainText,
+    PrintfTickFormatter,
+    Range1d,
+)
 from bokeh.plotting import figure
 
 from switchfit.optimize import IterationRecord
 from switchfit.problem.data import FloatArray
+from switchfit.report.dates import Timed, describe_clock, label_time
 from switchfit.report.html.columns import FigureData
 from switchfit.report.html.curves import Curves
-from switchfit.report.numbers import label_time
 from switchfit.report.plane import find_plane
 
 FIT, DATA = "#d0392b", "#5b6470"
@@ -38,7 +48,7 @@ MOST_LABELLED = 12
 # --- a run ------------------------------------------------------------------------------------------------------------
 
 
-def draw_run(curves: Sequence[Curves], data: FigureData, *, time_unit: str) -> Any:
+def draw_run(curves: Sequence[Curves], data: FigureData, *, run: Timed) -> Any:
     """Return the figures of one run below one another: each channel with its residuals, and the path in the plane.
 
     Parameters
@@ -47,7 +57,7 @@ def draw_run(curves: Sequence[Curves], data: FigureData, *, time_unit: str) -> A
         Of one of the runs that share the drawing.
     data : FigureData
         Of the same run: the columns that there are.
-    time_unit : str
+    run : Timed
     """
     sources = {name: make_source(name, columns) for name, columns in data.sources.items()}
     times = _make_range("times", data)
@@ -60,23 +70,25 @@ def draw_run(curves: Sequence[Curves], data: FigureData, *, time_unit: str) -> A
             _draw_curve(panel, own, k, sources[f"curve-{c}"])
             parts = [panel]
             if own.kind != "states":
-                _draw_samples(panel, own, k, sources[f"samples-{c}"], time_unit)
+                _draw_samples(panel, own, k, sources[f"samples-{c}"], run)
                 below = _make_time_figure(RESIDUAL_HEIGHT, times, "residual")
                 below.yaxis.formatter = PrintfTickFormatter(format="%.2g")
                 _draw_modes(below, sources)
-                _draw_residuals(below, own, k, sources[f"samples-{c}"], time_unit)
+                _draw_residuals(below, own, k, sources[f"samples-{c}"], run)
                 panel.xaxis.visible = False
                 parts.append(below)
-            parts[-1].xaxis.axis_label = PlainText(text=label_time(time_unit))
+            for part in parts:
+                _put_dates(part, run)
+            parts[-1].xaxis.axis_label = PlainText(text=label_time(run))
             line = panel.select_one({"name": "fitted"})
-            _add_hover(panel, line, [("time", "t", time_unit), ("fitted", f"y{k}", ""), ("mode", "mode", "")])
+            _add_hover(panel, line, [("time", "t", run.time_unit), ("fitted", f"y{k}", ""), ("mode", "mode", "")], run)
             _put_legend_above(panel)
             blocks.append(
                 column(*parts, name=f"channel-{number}", sizing_mode="stretch_width", spacing=0, styles=UNBROKEN)
             )
             number += 1
         if (plane := find_plane(own.names, own.units)) is not None:
-            blocks.append(_draw_path(own, plane, sources[f"curve-{c}"], sources[f"samples-{c}"], time_unit))
+            blocks.append(_draw_path(own, plane, sources[f"curve-{c}"], sources[f"samples-{c}"], run))
     return column(*blocks, sizing_mode="stretch_width", spacing=6)
 
 
@@ -91,19 +103,19 @@ def make_source(name: str, columns: Any) -> ColumnDataSource:
     return ColumnDataSource({key: [] for key in columns}, name=name)
 
 
-def describe_layout(curves: Sequence[Curves], time_unit: str) -> tuple[Any, ...]:
+def describe_layout(curves: Sequence[Curves], run: Timed) -> tuple[Any, ...]:
     """Return what two runs have to share to be shown by the same drawing.
 
     Parameters
     ----------
     curves : sequence of Curves
-    time_unit : str
+    run : Timed
     """
     each = [
         (own.kind, own.names, own.units, own.band is None, own.sigma is None, own.outliers is None, _size_dots(own))
         for own in curves
     ]
-    return (time_unit, *each)
+    return (run.time_unit, run.origin, *each)
 
 
 def _make_range(name: str, data: FigureData) -> Range1d:
@@ -158,7 +170,18 @@ def _tag(renderer: Any, tag: str) -> Any:
     return renderer
 
 
-def _add_hover(plot: Any, renderer: Any, rows: Sequence[tuple[str, str, str]]) -> None:
+def _put_dates(plot: Any, run: Timed) -> None:
+    """Put the ticks of the horizontal axis at dates, where times are dates."""
+    if run.origin is not None:
+        clock = describe_clock(run.origin, run.time_unit)
+        code = "return switchfitDates.findTicks(cb_data.start, cb_data.end, start, length, zone)"
+        plot.xaxis.ticker = CustomJSTicker(args=clock, major_code=code)
+        plot.xaxis.formatter = CustomJSTickFormatter(
+            args=clock, code="return switchfitDates.label(tick, ticks, start, length, zone)"
+        )
+
+
+def _add_hover(plot: Any, renderer: Any, rows: Sequence[tuple[str, str, str]], run: Timed | None = None) -> None:
     """Show (label, column, unit) under the pointer. Bokeh escapes what is in columns, but neither labels nor units."""
     texts = ("mode", "name", "modes", "value", "interval", "x_name", "y_name")
     tips: list[tuple[str, str]] = []
@@ -166,6 +189,12 @@ def _add_hover(plot: Any, renderer: Any, rows: Sequence[tuple[str, str, str]]) -
     for label, name, unit in rows:
         if name in texts:
             tips.append((label, f"@{name}"))
+            continue
+        if name == "t" and run is not None and run.origin is not None:
+            tips.append((label, "@t{custom}"))
+            clock = describe_clock(run.origin, run.time_unit)
+            code = "return switchfitDates.show(value, 0.001, start, length, zone)"
+            formatters["@t"] = CustomJSHover(args=clock, code=code)
             continue
         plain = unit if unit.isalnum() and unit != "1" else ""
         tips.append((label, f"@{name}{{%.6g}} {plain}".rstrip()))
@@ -202,7 +231,7 @@ def _draw_curve(plot: Any, curves: Curves, k: int, source: ColumnDataSource) -> 
     plot.line("t", f"y{k}", source=source, line_color=FIT, line_width=2, legend_label="fitted", name="fitted")
 
 
-def _draw_samples(plot: Any, curves: Curves, k: int, source: ColumnDataSource, time_unit: str) -> None:
+def _draw_samples(plot: Any, curves: Curves, k: int, source: ColumnDataSource, run: Timed) -> None:
     """Draw what is measured: dots, or a dashed line of a reference signal."""
     if curves.kind == "reference":
         dashed: dict[str, Any] = {"line_color": DATA, "line_dash": "dashed", "line_width": 1.6}
@@ -213,10 +242,10 @@ def _draw_samples(plot: Any, curves: Curves, k: int, source: ColumnDataSource, t
     if curves.outliers is not None:
         rings: dict[str, Any] = {"size": 11, "fill_color": None, "line_color": FIT}
         plot.scatter("t", f"o{k}", source=source, legend_label="weighed down", **rings)
-    _add_hover(plot, drawn, [("time", "t", time_unit), ("measured", f"m{k}", ""), ("residual", f"y{k}", "")])
+    _add_hover(plot, drawn, [("time", "t", run.time_unit), ("measured", f"m{k}", ""), ("residual", f"y{k}", "")], run)
 
 
-def _draw_residuals(plot: Any, curves: Curves, k: int, source: ColumnDataSource, time_unit: str) -> None:
+def _draw_residuals(plot: Any, curves: Curves, k: int, source: ColumnDataSource, run: Timed) -> None:
     plot.hspan(y=0.0, line_color=FIT, line_width=1)
     if curves.kind == "reference":
         drawn = _tag(plot.line("t", f"y{k}", source=source, line_color=DATA, line_width=1.2), "ink")
@@ -226,11 +255,11 @@ def _draw_residuals(plot: Any, curves: Curves, k: int, source: ColumnDataSource,
         dots: dict[str, Any] = {"fill_color": DATA, "fill_alpha": 0.75, "line_color": None}
         size = 0.75 * _size_dots(curves)
         drawn = _tag(plot.scatter("t", f"y{k}", source=source, size=size, **dots), "ink")
-    _add_hover(plot, drawn, [("time", "t", time_unit), ("residual", f"y{k}", "")])
+    _add_hover(plot, drawn, [("time", "t", run.time_unit), ("residual", f"y{k}", "")], run)
 
 
 def _draw_path(
-    curves: Curves, plane: tuple[int, int], curve: ColumnDataSource, samples: ColumnDataSource, time_unit: str
+    curves: Curves, plane: tuple[int, int], curve: ColumnDataSource, samples: ColumnDataSource, run: Timed
 ) -> Any:
     """Draw two positions against one another, with the transitions on the fitted path."""
     x, y = plane
@@ -246,7 +275,7 @@ def _draw_path(
     line = plot.line(f"y{x}", f"y{y}", source=curve, line_color=FIT, line_width=2, legend_label="fitted")
     mark: dict[str, Any] = {"marker": "diamond", "size": "size", "fill_color": FIT, "line_color": DATA}
     _tag(plot.scatter(f"y{x}", f"y{y}", source=curve, legend_label="transition", **mark), "edge")
-    _add_hover(plot, line, [("time", "t", time_unit), ("mode", "mode", "")])
+    _add_hover(plot, line, [("time", "t", run.time_unit), ("mode", "mode", "")], run)
     _put_legend_above(plot)
     return plot
 

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import hashlib
-import platform
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from switchfit.estimation.provenance import describe_platform, find_version, find_versions
 from switchfit.fit.result import Fit
 
-PACKAGES = ("switchfit", "jax", "jaxlib", "llvmlite", "numpy", "scipy", "bokeh", "jinja2")
-"""Whose versions a page names."""
+DRAWN_BY = ("bokeh", "jinja2")
+"""Libraries whose versions a page names beside those that a fit depends on."""
 PYTHON_FILE = re.compile(r"(?P<file>[^:]+\.py):\w+")
 """How a problem file names an object in a Python file."""
 MOST_DATA = 100
@@ -94,8 +93,9 @@ def collect_inputs(fit: Fit, problem_file: Path | None = None, options: Mapping[
     else:
         digests = list(_digest_data(fit))
     listed = tuple(digests[:MOST_DATA])
-    system = f"{platform.platform()}, {platform.machine()}"
-    return Inputs(name, text, dict(options or {}), listed, len(digests) - len(listed), tuple(_find_versions()), system)
+    versions = (*find_versions().items(), *((package, find_version(package)) for package in DRAWN_BY))
+    more = len(digests) - len(listed)
+    return Inputs(name, text, dict(options or {}), listed, more, versions, describe_platform())
 
 
 def _list_files(contents: Any) -> Iterator[str]:
@@ -135,12 +135,3 @@ def _digest_data(fit: Fit) -> Iterator[Digest]:
                 label = ", ".join(comparison.names) if single else f"{run}: {', '.join(comparison.names)}"
                 rows, width = columns.shape
                 yield Digest(label, f"array of {rows} × {width}: times, then values", digest)
-
-
-def _find_versions() -> Iterator[tuple[str, str]]:
-    yield "Python", platform.python_version()
-    for package in PACKAGES:
-        try:
-            yield package, version(package)
-        except PackageNotFoundError:  # a copy of the sources that is not installed
-            yield package, "not installed as a package"

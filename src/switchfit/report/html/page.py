@@ -19,6 +19,7 @@ from bokeh.resources import Resources
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.problem.parameter import unit_suffix
+from switchfit.report.dates import add_dates, describe_clock, format_span, format_time, list_dated
 from switchfit.report.html.columns import FigureData, ModeSpan, TransitionLine, collect_diagnostics, collect_run
 from switchfit.report.html.curves import Curves, choose_points, collect_curves, list_places
 from switchfit.report.html.figures import (
@@ -154,7 +155,7 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
         "line": str(verdict),
         "reasons": [write_reason(reason) for reason in verdict.reasons],
         "steps": [write_step(step) for step in verdict.next_steps],
-        "warnings": [str(issue) for issue in find_issues(estimate)],
+        "warnings": [add_dates(str(issue), estimate) for issue in find_issues(estimate)],
         "unknowns": everything._replace(rows=[everything.rows[0], *rows]),
         "all_unknowns": everything,
         "more_unknowns": len(estimate.theta) - len(listed),
@@ -225,12 +226,12 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[Run], dict[str, Any]]:
     for number, e in enumerate(order):
         tested = [channel for channel in diagnostics.channels if channel.experiment == e][:MOST_DIAGNOSED]
         runs.append(_describe_run(estimate, e, number, curves[e], colours, tuple(channel.name for channel in tested)))
-        unit = estimate.trajectories[e].time_unit
-        template = layouts.setdefault(describe_layout(curves[e], unit), f"run-{len(layouts)}")
+        trajectory = estimate.trajectories[e]
+        template = layouts.setdefault(describe_layout(curves[e], trajectory), f"run-{len(layouts)}")
         spans, lines = _list_spans(estimate, e, colours), _list_lines(estimate, e, wide)
         data = collect_run(template, curves[e], spans, lines)
         if template not in drawn:
-            drawn[template] = draw_run(curves[e], data, time_unit=unit)
+            drawn[template] = draw_run(curves[e], data, run=trajectory)
         own = {f"run-{number}": data}
         for c, channel in enumerate(tested):
             own |= {f"residuals-{number}-{c}-{k}": part for k, part in enumerate(collect_diagnostics(channel))}
@@ -275,11 +276,7 @@ def _describe_run(
     fit: Fit, e: int, number: int, curves: Sequence[Curves], colours: Mapping[str, str], diagnosed: tuple[str, ...]
 ) -> Run:
     trajectory, worst = fit.trajectories[e], explain_worst(fit, e)
-    unit = format_unit(trajectory.time_unit)
-    modes = [
-        (mode, colours[mode], f"{begin:.6g} to {end:.6g}{f' {unit}' if unit else ''}")
-        for mode, begin, end in trajectory.mode_spans
-    ]
+    modes = [(mode, colours[mode], format_span(begin, end, trajectory)) for mode, begin, end in trajectory.mode_spans]
     labels = [
         (f"{name}, not measured" if own.kind == "states" and fit.comparisons[e] else name, own.kind == "states", own, k)
         for own in curves
@@ -335,9 +332,13 @@ def _list_lines(fit: Fit, e: int, intervals: Any) -> list[TransitionLine]:
         if t.experiment != e:
             continue
         ends = np.full(2, np.nan) if t.index is None else intervals[t.index]
-        value, error, _ = format_rounded(t.time, np.nan if t.index is None else errors[t.index])
+        spread = np.nan if t.index is None else errors[t.index]
+        value, error, _ = format_rounded(t.time, spread)
         unit = format_unit(t.unit)
-        low, high = (format_end(end, ends) for end in ends)
+        run = fit.trajectories[e] if fit.trajectories[e].origin is not None else None
+        if run is not None:
+            value, unit = format_time(t.time, run, spread), unit if error else ""
+        low, high = (format_end(end, ends, run) for end in ends)
         found.append(
             TransitionLine(
                 name=t.name,
@@ -357,11 +358,13 @@ def _describe_slider(
     estimate: Estimate, slider: Slider, order: Sequence[int], places: Mapping[int, Sequence[int]]
 ) -> dict[str, Any]:
     place = slider.place
+    run = list_dated(estimate)[place]
     return {
         "place": place,
         "name": estimate.theta_names[place],
         "unit": format_unit(estimate.theta_units[place]),
         "theta": float(estimate.theta[place]),
+        "clock": None if run is None or run.origin is None else describe_clock(run.origin, run.time_unit),
         "runs": [number for number, e in enumerate(order) if place in places[e]],
         "values": _numbers(slider.values),
         "costs": _numbers(slider.costs),

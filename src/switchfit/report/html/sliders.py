@@ -158,8 +158,11 @@ def measure_gap(estimate: Estimate, runs: dict[int, list[Curves]], place: int, e
                     exact = states[:, [names.index(name) for name in curves.names]]
                 else:
                     exact = outputs[:, first : (first := first + len(curves.names))]
-                there = np.isfinite(curves.times)
-                at = curves.times[there] - (curves.times[0] - estimate.trajectories[e].times[0])
+                trajectory = estimate.trajectories[e]
+                moments = curves.times - (curves.times[0] - trajectory.times[0])
+                # At a jump there are two values, of which interpolation takes either.
+                there = np.isfinite(moments) & ~np.isin(moments, trajectory.jump_times)
+                at = moments[there]
                 linear = curves.values[there] + (end - estimate.theta[place]) * curves.tangents[place][there]
                 for k in range(len(curves.names)):
                     extent = _find_extent(curves.values[:, k])

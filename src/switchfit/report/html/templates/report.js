@@ -1,4 +1,84 @@
 "use strict";
+// Dates: a time is a number of `length` milliseconds since `start`, and is shown as the clocks of a zone show it.
+const switchfitDates = (() => {
+  const SECOND = 1e3, MINUTE = 6e4, HOUR = 36e5, DAY = 864e5, MONTH = 30.44 * DAY;
+  const STEPS = [
+    ...[1, 2, 5, 10, 20, 50, 100, 200, 500], ...[1, 2, 5, 10, 15, 30].map((n) => n * SECOND),
+    ...[1, 2, 5, 10, 15, 30].map((n) => n * MINUTE), ...[1, 2, 3, 6, 12].map((n) => n * HOUR),
+    ...[1, 2, 7, 14].map((n) => n * DAY),
+  ];
+  const MONTHS = [1, 2, 3, 6, 12, 24, 60, 120, 240, 600];
+  const NAMES = ["Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec"];
+  const formats = new Map();
+  const pad = (number, size = 2) => String(number).padStart(size, "0");
+
+  // What the clocks of a zone show, as milliseconds since 1970.
+  function wall(ms, zone) {
+    if (!formats.has(zone)) {
+      const two = "2-digit";
+      formats.set(zone, new Intl.DateTimeFormat("en-GB", {
+        timeZone: zone, hourCycle: "h23", year: "numeric", month: two, day: two, hour: two, minute: two, second: two,
+      }));
+    }
+    const whole = Math.floor(ms / SECOND) * SECOND;
+    const at = Object.fromEntries(formats.get(zone).formatToParts(new Date(whole)).map((p) => [p.type, Number(p.value)]));
+    return Date.UTC(at.year, at.month - 1, at.day, at.hour, at.minute, at.second) + ms - whole;
+  }
+
+  function unwall(shown, zone) {
+    const near = 2 * shown - wall(shown, zone);
+    return shown - (wall(near, zone) - near);
+  }
+
+  function findTicks(from, to, start, length, zone) {
+    const [low, high] = [from, to].map((time) => wall(start + time * length, zone));
+    if (!(high > low)) return [];
+    const least = (high - low) / 7;
+    const step = STEPS.find((one) => one >= least);
+    const places = [];
+    if (step) {
+      const first = step >= 7 * DAY ? 4 * DAY : 0;  // 5 January 1970 was a Monday
+      for (let k = Math.ceil((low - first) / step); first + k * step <= high; k += 1) places.push(first + k * step);
+    } else {
+      const months = MONTHS.find((one) => one * MONTH >= least) || 1200;
+      const [begin, end] = [low, high].map((ms) => new Date(ms)).map((d) => 12 * d.getUTCFullYear() + d.getUTCMonth());
+      for (let k = Math.ceil(begin / months); k * months <= end; k += 1) {
+        const shown = Date.UTC(Math.floor((k * months) / 12), (k * months) % 12, 1);
+        if (shown >= low) places.push(shown);
+      }
+    }
+    return places.map((shown) => (unwall(shown, zone) - start) / length);
+  }
+
+  // The label of a tick: what differs from its neighbours, and below the first one what they share.
+  function label(tick, ticks, start, length, zone) {
+    const step = ticks.length > 1 ? Math.abs(ticks[1] - ticks[0]) * length : DAY;
+    const date = new Date(Math.round(wall(start + tick * length, zone)));
+    const [year, day] = [date.getUTCFullYear(), `${date.getUTCDate()} ${NAMES[date.getUTCMonth()]}`];
+    const first = tick === ticks[0];
+    if (step >= 27 * DAY) return first || date.getUTCMonth() === 0 ? `${NAMES[date.getUTCMonth()]}\n${year}` : NAMES[date.getUTCMonth()];
+    if (step >= 0.9 * DAY) return first ? `${day}\n${year}` : day;
+    const clock = `${pad(date.getUTCHours())}:${pad(date.getUTCMinutes())}`;
+    const seconds = step < 0.9 * MINUTE ? `:${pad(date.getUTCSeconds())}` : "";
+    const finer = step < 0.9 * SECOND ? `.${pad(date.getUTCMilliseconds(), 3)}` : "";
+    if (clock === "00:00" && !first && !seconds) return day;
+    return first ? `${clock}${seconds}${finer}\n${day} ${year}` : `${clock}${seconds}${finer}`;
+  }
+
+  // A date to the place that a step in the unit of the times needs.
+  function show(time, step, start, length, zone) {
+    const place = step * length < SECOND ? 1 : step * length < MINUTE ? SECOND : MINUTE;
+    const date = new Date(Math.round(wall(start + time * length, zone) / place) * place);
+    const day = `${date.getUTCFullYear()}-${pad(date.getUTCMonth() + 1)}-${pad(date.getUTCDate())}`;
+    const seconds = step * length < MINUTE ? `:${pad(date.getUTCSeconds())}` : "";
+    const finer = step * length < SECOND ? `.${pad(date.getUTCMilliseconds(), 3)}` : "";
+    return `${day} ${pad(date.getUTCHours())}:${pad(date.getUTCMinutes())}${seconds}${finer}`;
+  }
+
+  return { findTicks, label, show };
+})();
+window.switchfitDates = switchfitDates;
+
 (() => {
   const payload = JSON.parse(document.getElementById("payload").textContent);
   const sliders = payload.sliders;
@@ -193,7 +273,11 @@
       const step = (high - low) / 400;
       const output = document.querySelector(`[data-slider="${k}"] output`);
       const change = moved[k] ? ` (${moved[k] > 0 ? "+" : "−"}${digits(Math.abs(moved[k]), step)})` : "";
-      output.textContent = `${digits(slider.theta + moved[k], step)} ${slider.unit}`.trim() + change;
+      const value = slider.theta + moved[k];
+      const { start, length, zone } = slider.clock || {};
+      output.textContent = slider.clock
+        ? switchfitDates.show(value, step, start, length, zone) + change.replace(")", ` ${slider.unit})`)
+        : `${digits(value, step)} ${slider.unit}`.trim() + change;
     });
     const away = moved.flatMap((d, k) => (d === 0 ? [] : [k]));
     const one = away.length === 1 ? interpolate(away[0], sliders[away[0]].theta + moved[away[0]]) : null;

@@ -1,0 +1,483 @@
+"""The log posterior of a problem as a function that JAX can trace, for samplers such as NUTS.
+
+J with its priors is the negative logarithm of the posterior density up to a constant. Its gradient and Hessian come
+from the engine, exactly: JAX gets them as derivative rules and differentiates nothing itself.
+
+Samplers work on vectors z without bounds. The map from z to theta goes through the unknowns in order: a transition
+time lies between a ``low`` that follows from the one before it and a ``high`` that leaves room for those after it, and
+
+    theta_i = low_i + (high_i - low_i) / (1 + exp(-z_i)),        log |dtheta/dz| = sum_i log dtheta_i/dz_i,
+
+since dtheta/dz is triangular; with one bound ``theta_i = low + exp(z_i)`` or ``high - exp(z_i)``, without bounds
+``theta_i = z_i``. For an estimate these are the entries of ``center + root z``, the covariance of the
+fit being ``root root'``, so that z is nearly standard normal: the warm-up of samplers relies on unknowns of size 1.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from switchfit.batch.program import choose_layout, evaluate_total, read_sequences
+from switchfit.estimation.estimator import Estimate
+from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.fit.result import Fit
+from switchfit.fit.solution import is_sigma_known
+from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.functions import use_float64
+from switchfit.problem.problem import Problem
+from switchfit.problem.validation import as_array, join_names, shorten
+from switchfit.runtime.errors import MissingExtraError
+
+FLAT = -np.inf
+"""Logarithm of a density of zero."""
+
+
+class Link(NamedTuple):
+    """What limits one transition time, or a free tf.
+
+    Attributes
+    ----------
+    place : int
+        Its index in theta.
+    before : int
+        Index in theta of the time before it; -1 if that is fixed, or t0.
+    gap : float
+        Shortest time between the two.
+    low : float
+        Its lower bound; if `before` is -1, not less than the fixed time before it plus the gap.
+    high : float
+        Its upper bound, so that all times after it find room.
+    """
+
+    place: int
+    before: int
+    gap: float
+    low: float
+    high: float
+
+
+def link_times(problem: Problem) -> list[Link]:
+    """Return the limits of all free transition times, in the order of theta.
+
+    Parameters
+    ----------
+    problem : Problem
+    """
+    found, gap = [], problem.min_duration
+    unknowns = problem.unknowns
+    for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
+        times = experiment.initial_times
+        highs, high = np.zeros(len(where)), np.inf if experiment.has_free_tf else experiment.end - gap
+        for i in reversed(range(len(where))):
+            own = times[i] if where[i] < 0 else unknowns.upper[where[i]]
+            highs[i] = min(own, high)
+            high = highs[i] - gap
+        before, last = -1, experiment.t0
+        for i, place in enumerate(where.tolist()):
+            if place < 0:
+                before, last = -1, times[i]
+                continue
+            low = float(unknowns.lower[place])
+            found.append(Link(place, before, gap, low if before >= 0 else max(low, last + gap), float(highs[i])))
+            before = place
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class LogPosterior:
+    """The logarithm of a problem's posterior density, up to a constant: a pure function of theta, for samplers.
+
+    ``posterior(theta)`` and ``posterior.log_density(z)`` can be differentiated twice, compiled with `jax.jit` and
+    mapped with `jax.vmap`.
+
+    Attributes
+    ----------
+    problem : Problem
+    theta : (d,) array
+        Where the mesh was refined: the estimate, or the first guess.
+    evaluator : Evaluator
+        The problem on the meshes on which J is evaluated.
+    center, root : (d,) and (d, d) arrays
+        Of the linear part of the change of variables; for an estimate its theta and a root of its covariance.
+
+    See Also
+    --------
+    log_posterior : returns it.
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> posterior = sf.log_posterior(fit)
+    >>> posterior.names
+    ('tau_1', 'k')
+    >>> float(posterior(fit.theta)) == -fit.cost, float(posterior([7.0, 0.4]))
+    (True, -inf)
+    >>> z = posterior.unconstrain(fit.theta)
+    >>> z, posterior.constrain(z).round(3)
+    (array([0., 0.]), array([2.462, 0.393]))
+    """
+
+    problem: Problem
+    theta: FloatArray
+    evaluator: Evaluator = field(repr=False)
+    center: FloatArray = field(repr=False)
+    root: FloatArray = field(repr=False)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the unknowns, in the order of theta."""
+        return self.problem.theta_names
+
+    @property
+    def start(self) -> Any:
+        """The vector z of `theta`, a start for samplers: (d,)."""
+        return self.unconstrain(self.theta)
+
+    def __call__(self, theta: ArrayLike) -> Any:
+        """Return the log density of theta (d,): minus infinity outside the bounds, or with times out of order."""
+        require_float64(theta)
+        with use_float64():
+            at = jnp.asarray(theta, dtype=jnp.float64)
+            unknowns = self.problem.unknowns
+            inside = jnp.all((at >= unknowns.lower) & (at <= unknowns.upper)) & jnp.all(unknowns.A @ at >= unknowns.b)
+            inside &= self._is_inside_horizons(at)
+            found = self._compute_log_density(jnp.where(inside, at, self.theta))
+            return jnp.where(inside, found, FLAT)
+
+    def log_density(self, z: ArrayLike) -> Any:
+        """Return the log density of z (d,), whose entries have no bounds: that of theta plus ``log |dtheta/dz|``.
+
+        See Also
+        --------
+        LogPosterior.constrain
+
+        Examples
+        --------
+        >>> import jax
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+
+        >>> posterior = sf.log_posterior(heater_problem())
+        >>> with jax.enable_x64(True):
+        ...     jax.grad(posterior.log_density)(posterior.start).shape
+        (2,)
+        """
+        require_float64(z)
+        with use_float64():
+            theta, slope = self._transform(jnp.asarray(z, dtype=jnp.float64))
+            return self._compute_log_density(theta) + slope
+
+    def constrain(self, z: ArrayLike) -> Any:
+        """Return theta of z: (d,), or (..., d) of many; all bounds hold, and transition times are in order.
+
+        See Also
+        --------
+        LogPosterior.unconstrain
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+
+        >>> posterior = sf.log_posterior(heater_problem())
+        >>> posterior.constrain([[0.0, 0.0], [100.0, -100.0]])
+        array([[3.   , 2.505],
+               [6.   , 0.01 ]])
+        """
+        require_float64(z)
+        with use_float64():
+            theta = jnp.vectorize(lambda one: self._transform(one)[0], signature="(d)->(d)")
+            found = theta(jnp.asarray(z, dtype=jnp.float64))
+            return found if isinstance(found, jax.core.Tracer) else np.array(found)
+
+    def unconstrain(self, theta: ArrayLike) -> FloatArray:
+        """Return z of theta: (d,). A theta on a bound is moved inside by a millionth of the range.
+
+        Raises
+        ------
+        ValueError
+            For a theta of the wrong shape, or with transition times out of order.
+
+        See Also
+        --------
+        LogPosterior.constrain
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+
+        >>> posterior = sf.log_posterior(heater_problem())
+        >>> posterior.unconstrain([3.0, 2.505]).round(12)
+        array([0., 0.])
+        """
+        at, unknowns = self.problem.check_theta(theta), self.problem.unknowns
+        z = at.copy()
+        low, high = unknowns.lower.copy(), unknowns.upper.copy()
+        for link in self._links:
+            low[link.place] = link.low if link.before < 0 else max(link.low, at[link.before] + link.gap)
+            high[link.place] = link.high
+        for i in range(len(z)):
+            if np.isfinite([low[i], high[i]]).all():
+                part = np.clip((at[i] - low[i]) / (high[i] - low[i]) if high[i] > low[i] else 0.5, EDGE, 1 - EDGE)
+                z[i] = np.log(part / (1 - part))
+            elif np.isfinite(low[i]):
+                z[i] = np.log(max(at[i] - low[i], EDGE))
+            elif np.isfinite(high[i]):
+                z[i] = -np.log(max(high[i] - at[i], EDGE))
+        return np.asarray(np.linalg.solve(self.root, z - self.center), dtype=np.float64)
+
+    def to_arviz(self, samples: ArrayLike) -> Any:
+        """Return samples as ArviZ's InferenceData, with a variable for each unknown.
+
+        Parameters
+        ----------
+        samples : (chains, draws, d) or (draws, d) array_like
+            Of theta.
+
+        Raises
+        ------
+        MissingExtraError
+            If ArviZ is not installed: ``pip install 'switchfit[sampling]'``.
+        ValueError
+            For samples of another shape.
+
+        See Also
+        --------
+        LogPosterior.constrain
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+
+        >>> posterior = sf.log_posterior(heater_problem())
+        >>> table = posterior.to_arviz(np.random.default_rng(0).normal(size=(4, 100, 2)))
+        >>> list(table.posterior), table.posterior["k"].shape
+        (['tau_1', 'k'], (4, 100))
+        """
+        given = as_array(samples, "samples")
+        given = given[None] if given.ndim == 2 else given
+        if given.ndim != 3 or given.shape[-1] != len(self.names):
+            raise ValueError(
+                f"samples must have shape (chains, draws, {len(self.names)}): {join_names(self.names)}; got "
+                f"{np.shape(samples)}."
+            )
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", FutureWarning)  # ArviZ announces its next version when it is imported
+                import arviz
+        except ImportError as error:
+            raise MissingExtraError(
+                f"LogPosterior.to_arviz needs ArviZ, which cannot be imported ({error}): pip install "
+                "'switchfit[sampling]'."
+            ) from None
+        return arviz.from_dict(posterior={name: given[..., i] for i, name in enumerate(self.names)})
+
+    @cached_property
+    def _links(self) -> list[Link]:
+        return link_times(self.problem)
+
+    @cached_property
+    def _is_log(self) -> NDArray[np.bool_]:
+        """Which unknowns have a density over their logarithm: on a logarithmic scale, or with a log-normal prior."""
+        unknowns = self.problem.unknowns
+        return np.asarray(unknowns.log | unknowns.priors.log)
+
+    def _is_inside_horizons(self, theta: Any) -> Any:
+        """Return whether the last transition of each experiment is before tf and the first after t0."""
+        inside = jnp.asarray(True)
+        for experiment, where in zip(self.problem.experiments, self.problem.unknowns.times, strict=True):
+            free = theta[where[where >= 0]]
+            inside &= jnp.all((free >= experiment.t0) & (free <= experiment.end))
+        return inside
+
+    def _compute_log_density(self, theta: Any) -> Any:
+        unknowns = self.problem.unknowns
+        cost = self._cost(theta) + unknowns.priors.evaluate(theta, jnp)[0]
+        away = jnp.where(self._is_log, theta - unknowns.origin, 1.0)
+        found = -cost - jnp.sum(jnp.log(away))
+        return jnp.where(jnp.isfinite(found), found, FLAT)
+
+    def _transform(self, z: Any) -> tuple[Any, Any]:
+        """Return theta at z (d,), and ``log |dtheta/dz|``."""
+        unknowns = self.problem.unknowns
+        lower, upper = unknowns.lower, unknowns.upper
+        z = self.center + jnp.asarray(self.root) @ z
+        has_low, has_high = np.isfinite(lower), np.isfinite(upper)
+        low, high = np.where(has_low, lower, 0.0), np.where(has_high, upper, 0.0)
+        inside, log_slope = jax.nn.sigmoid(z), jax.nn.log_sigmoid(z) + jax.nn.log_sigmoid(-z)
+        width = np.where(has_low & has_high, high - low, 1.0)
+        one = has_low != has_high
+        away = jnp.exp(jnp.where(one, jnp.where(has_low, z, -z), 0.0))
+        theta = jnp.where(one, jnp.where(has_low, low + away, high - away), z)
+        theta = jnp.where(has_low & has_high, low + width * inside, theta)
+        slopes = jnp.where(one, jnp.where(has_low, z, -z), 0.0)
+        slopes = jnp.where(has_low & has_high, jnp.log(width) + log_slope, slopes)
+        for link in self._links:
+            i = link.place
+            first = link.low if link.before < 0 else jnp.maximum(link.low, theta[link.before] + link.gap)
+            theta = theta.at[i].set(first + (link.high - first) * inside[i])
+            slopes = slopes.at[i].set(jnp.log(link.high - first) + log_slope[i])
+        return theta, jnp.sum(slopes) + np.linalg.slogdet(self.root)[1]
+
+    def _scale_by(self, fit: Fit) -> LogPosterior:
+        """Return the same posterior with a z that is nearly standard normal, by the covariance of a fit.
+
+        An unknown that is held, by a kink or a bound, has the width of its interval, and 1 where it has none.
+        """
+        center = self.unconstrain(fit.theta)
+        with use_float64():
+            slope = np.array(jax.jacfwd(lambda z: self._transform(z)[0])(jnp.asarray(center)))
+        covariance = fit.covariance.copy()
+        if not np.isfinite(covariance).all():
+            return self
+        held = np.diag(covariance) <= 0
+        if held.any():
+            width = np.diff(fit.confidence_intervals(0.95), axis=1)[:, 0] / 4
+            width = np.where(np.isfinite(width) & (width > 0), width, np.abs(np.diag(slope)))
+            covariance[held, held] = width[held] ** 2
+        back = np.linalg.inv(slope)
+        scaled = back @ covariance @ back.T
+        root = np.asarray(np.linalg.cholesky((scaled + scaled.T) / 2), dtype=np.float64)
+        return replace(self, center=center, root=root)
+
+    @cached_property
+    def _cost(self) -> Callable[[Any], Any]:
+        """J without priors, with its derivatives as rules."""
+        evaluator = self.evaluator
+        arguments, structures = tuple(evaluator.arguments), evaluator.structures
+        layout = choose_layout(self.problem, evaluator)
+        times = tuple(experiment.initial_times for experiment in self.problem.experiments)
+        sequences: Any = read_sequences(layout, structures)
+
+        @jax.jit
+        def evaluate(theta: Any) -> tuple[Any, Any, Any]:
+            with use_float64():
+                J, g, H = evaluate_total(layout, arguments, times, sequences, theta, jnp.ones(()))
+                known = jnp.isfinite(J)
+                return J, jnp.where(known, g, 0.0), jnp.where(known, H, 0.0)
+
+        @jax.custom_jvp
+        def differentiate(theta: Any) -> tuple[Any, Any]:
+            return evaluate(theta)[:2]
+
+        @differentiate.defjvp
+        def push_derivatives(primals: tuple[Any], tangents: tuple[Any]) -> Any:
+            with use_float64():
+                J, g, H = evaluate(*primals)
+                return (J, g), (g @ tangents[0], H @ tangents[0])
+
+        @jax.custom_jvp
+        def cost(theta: Any) -> Any:
+            return evaluate(theta)[0]
+
+        @cost.defjvp
+        def push_cost(primals: tuple[Any], tangents: tuple[Any]) -> Any:
+            with use_float64():
+                J, g = differentiate(*primals)
+                return J, g @ tangents[0]
+
+        return cost
+
+
+def require_float64(given: Any) -> None:
+    """Raise ValueError inside a program that JAX compiles in single precision.
+
+    Parameters
+    ----------
+    given : array or tracer
+    """
+    if isinstance(given, jax.core.Tracer) and not jax.config.read("jax_enable_x64"):
+        raise ValueError(
+            "a log posterior inside jax.jit, jax.grad or jax.vmap needs float64, which is not enabled: call "
+            'jax.config.update("jax_enable_x64", True), or numpyro.enable_x64(), before anything else.'
+        )
+
+
+EDGE = 1e-6
+"""Part of the range by which a theta on a bound is moved inside, where z would be infinite."""
+
+
+def log_posterior(problem: Problem | Estimate) -> LogPosterior:
+    """Return the log posterior of a problem as a pure function of theta that JAX can differentiate, compile and map.
+
+    Parameters
+    ----------
+    problem : Problem or Estimate
+        Of an estimate, the mesh and the start are those at its solution, and z is in units of its covariance, so that
+        samplers need no scales; of a problem, mesh and start are those at its first guess.
+
+    Returns
+    -------
+    LogPosterior
+
+    Raises
+    ------
+    TypeError
+        If it is neither.
+    ValueError
+        If J is not the negative logarithm of a density: sigma is left out, or the cost has other terms than
+        `Measurements` and priors; for guards and terminal constraints; for an estimate without its problem.
+
+    Notes
+    -----
+    It is ``-J`` up to a constant: half the sum of squares in sigmas, or what a robust loss and a sigma that is a
+    parameter make of it, and the priors. An unknown without a prior is flat in theta within its bounds, and one with
+    ``scale="log"`` flat in its logarithm; a `LogNormal` prior is a density of the logarithm. J is continuous in a
+    transition time, but its slope jumps at each sample; the derivative given there is that for increasing it.
+
+    See Also
+    --------
+    LogPosterior, profile, bootstrap
+
+    Examples
+    --------
+    >>> import jax
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+
+    >>> posterior = sf.log_posterior(heater_problem())
+    >>> with jax.enable_x64(True):  # samplers need it throughout: jax.config.update("jax_enable_x64", True)
+    ...     thetas = jax.numpy.array([[2.4, 0.4], [2.5, 0.4], [2.6, 0.4]])
+    ...     jax.vmap(posterior)(thetas).round(1).tolist()
+    [-50.2, -8.8, -80.0]
+    """
+    if isinstance(problem, Estimate):
+        evaluator, theta = problem.evaluator_at_solution(), problem.theta
+    elif isinstance(problem, Problem):
+        evaluator, theta = evaluator_of(problem), problem.initial_theta
+    else:
+        raise TypeError(f"log_posterior needs an sf.Problem or the result of sf.estimate; got {shorten(problem)}.")
+    own = evaluator.problem
+    if not is_sigma_known(own):
+        items = [item for run in own.experiments for item in run.data]
+        missing = any(isinstance(item, Measurements) and item.sigma is None for item in items)
+        raise ValueError(
+            "a posterior needs the noise: sigma is left out in some Measurements. Give sigma a number, or the name of "
+            "a parameter to sample it with the others."
+            if missing
+            else "a posterior needs a cost of Measurements and priors alone; this one has other terms, which are no "
+            "probability."
+        )
+    if own.constraint_names:
+        raise ValueError(
+            f"a posterior cannot have equality constraints; this problem has {join_names(own.constraint_names)}. Leave "
+            "out the guard, or measure what it says with a sigma of its own."
+        )
+    d = len(theta)
+    posterior = LogPosterior(own, theta.copy(), evaluator, np.zeros(d), np.eye(d))
+    return posterior._scale_by(problem) if isinstance(problem, Estimate) else posterior

@@ -1,0 +1,23 @@
+"""The command line: ``switchfit init | fit | check | simulate | rerun | examples | paper``, a module for each group.
+
+Exit codes: 0 converged and the verdict is good or doubtful, 1 not converged or bad (the result is still written),
+2 wrong input, 3 an error of switchfit itself, 130 interrupted by Ctrl-C. Only typer is imported here; the numerical
+parts are imported when a command needs them, so that ``--help`` is fast.
+"""
+
+from switchfit.cli.app import app
+from switchfit.cli.checking import check
+from switchfit.cli.fitting import fit
+from switchfit.cli.reproduction import paper, rerun
+from switchfit.cli.simulation import simulate
+from switchfit.cli.starting import examples, init
+
+__all__ = ["app", "main"]
+
+for _command in (init, fit, check, simulate, rerun, examples, paper):  # in the order of --help
+    app.command()(_command)
+
+
+def main() -> None:
+    """Entry point of the ``switchfit`` command."""
+    app(prog_name="switchfit")

@@ -1,0 +1,96 @@
+"""The command itself, the arguments that several commands take, and problem files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from switchfit.cli.terminal import BAD_INPUT, print_error, print_text
+
+if TYPE_CHECKING:
+    from switchfit.io.problem_file import ProblemFile
+    from switchfit.runtime.issue import Issue
+
+app = typer.Typer(
+    name="switchfit",
+    help="""When did it switch, and what were the parameters? Fits switched models to logs.
+
+    Begin with `switchfit init NAME --from LOG`, or with one of `switchfit examples`.
+    """,
+    no_args_is_help=True,
+    add_completion=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+def complete_files(*endings: str) -> Callable[[str], list[str]]:
+    """Return a function that completes names of files with these endings, and of folders."""
+
+    def complete(incomplete: str) -> list[str]:
+        folder, _, _ = incomplete.rpartition("/")
+        base = Path(f"{folder}/" if folder or incomplete.startswith("/") else ".")
+        try:
+            found = sorted(base.iterdir())
+        except OSError:
+            return []
+        prefix = f"{folder}/" if "/" in incomplete else ""
+        names = [f"{prefix}{path.name}/" for path in found if path.is_dir() and not path.name.startswith(".")]
+        names += [f"{prefix}{path.name}" for path in found if path.is_file() and path.name.endswith(endings)]
+        return [name for name in names if name.startswith(incomplete)]
+
+    return complete
+
+
+ProblemPath = Annotated[
+    Path,
+    typer.Argument(
+        metavar="PROBLEM.toml", help="Problem file.", show_default=False, autocompletion=complete_files(".toml")
+    ),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else, to stdout.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors; the exit code tells the result.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say on stderr what is being done, step by step.")]
+Debug = Annotated[bool, typer.Option("--debug", help="Show the full traceback of an error.")]
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        print_text(f"switchfit {version('switchfit')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _collect_options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    pass
+
+
+def load(problem: Path) -> ProblemFile:
+    """Read a problem file."""
+    from switchfit.io.problem_file import load_problem
+
+    return load_problem(problem)
+
+
+def print_issues(issues: Sequence[Issue]) -> None:
+    """Print what is odd about logs."""
+    if issues:
+        print_text("\n".join(["Logs", *(f"  {issue}" for issue in issues), ""]))
+
+
+def fail_for_refused(issues: Sequence[Issue]) -> None:
+    """Name the logs that could not be used, and end with the exit code that says so."""
+    refused = [issue for issue in issues if issue.kind == "log: refused"]
+    for issue in refused:
+        print_error(issue)
+    if refused:
+        raise typer.Exit(BAD_INPUT)

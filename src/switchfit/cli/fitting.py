@@ -1,0 +1,335 @@
+"""``switchfit fit``: one problem, or many logs with one problem file."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import threading
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from switchfit.cli.app import Debug, Json, Quiet, Verbose, complete_files, fail_for_refused, load
+from switchfit.cli.terminal import (
+    BAD_INPUT,
+    CONVERGED,
+    NOT_CONVERGED,
+    explain_write_errors,
+    fail,
+    is_verbose,
+    make_folder,
+    print_error,
+    print_json,
+    print_note,
+    print_text,
+    report_errors,
+    stop_on_interrupt,
+    write_file,
+)
+
+if TYPE_CHECKING:
+    from switchfit.io.problem_file import ProblemFile
+
+
+def fit(
+    problem: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="PROBLEM.toml",
+            help="Problem file; with --problem, logs, each of which is fitted by itself.",
+            show_default=False,
+            autocompletion=complete_files(".toml"),
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder for report.html, report.txt, estimate.json and fit.png; for runs.csv and unknowns.csv where "
+            "there are many. Left out, nothing is written.",
+            show_default=False,
+        ),
+    ] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            "--problem",
+            metavar="PROBLEM.toml",
+            help="Problem file for the logs that are named.",
+            show_default=False,
+            autocompletion=complete_files(".toml"),
+        ),
+    ] = None,
+    table: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.csv",
+            help="With --problem: a table with a row for each log; FILE.parquet too.",
+            show_default=False,
+        ),
+    ] = None,
+    strategy: Annotated[
+        Literal["local", "auto", "thorough"] | None,
+        typer.Option(
+            help="local: one fit from the guess; auto, the default: more if the verdict is not good; thorough: all "
+            "strategies.",
+            show_default=False,
+        ),
+    ] = None,
+    time_budget: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            help="After so long no further strategy begins. Default: no limit.",
+            show_default=False,
+        ),
+    ] = None,
+    hessian: Annotated[
+        Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"] | None,
+        typer.Option(
+            help="Quadratic term of the optimizer. Default: auto, the exact Hessian in a trust region.",
+            show_default=False,
+        ),
+    ] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(metavar="NUMBER", help="Optimality at which to stop. Default: 1e-7.", show_default=False),
+    ] = None,
+    max_iterations: Annotated[
+        int | None,
+        typer.Option(metavar="COUNT", help="Most iterations of a fit. Default: 200.", show_default=False),
+    ] = None,
+    figures: Annotated[
+        Literal["png", "pdf", "svg"],
+        typer.Option(help="Format of the figure in --out. Default: png.", show_default=False),
+    ] = "png",
+    no_figures: Annotated[
+        bool, typer.Option("--no-figures", help="Write no figures: neither fit.png (.pdf, .svg) nor report.html.")
+    ] = False,
+    certificate: Annotated[
+        bool, typer.Option("--certificate", help="Check with the paper's equations too, and print the checks.")
+    ] = False,
+    full: Annotated[
+        bool, typer.Option("--full", help="Report all runs, channels, unknowns and warnings, not one screen.")
+    ] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    debug: Debug = False,
+) -> None:
+    """Estimate transition times and parameters, and report.
+
+    The report goes to the terminal, and with --out into a folder, with a page and a figure. Options override those in
+    the problem file. Ctrl-C stops after the current iteration and reports the result so far.
+
+    Exit code 0: converged, and the verdict is good or doubtful. 1: not converged or bad; the result is still written.
+    2: the input is wrong.
+
+    LOG ... --problem PROBLEM.toml fits each log by itself, in place of the file that the data name. A pattern or a
+    folder stands for the logs in it. A log that cannot be used is reported, and the next one is fitted; the exit code
+    is that of the worst.
+    """
+    given = {
+        "strategy": strategy,
+        "time_budget": time_budget,
+        "hessian": hessian,
+        "tolerance": tolerance,
+        "max_iterations": max_iterations,
+    }
+    overrides = {key: value for key, value in given.items() if value is not None}
+    drawn = "" if out is None or no_figures else figures
+    output = Output(out, figures=drawn, certificate=certificate, full=full)
+    if model is not None:
+        with report_errors(debug, json=json, quiet=quiet, verbose=verbose):
+            code = _fit_logs(problem, model, overrides, output, table)
+        if code != CONVERGED:
+            raise typer.Exit(code)
+        return
+    if len(problem) != 1 or table is not None:
+        fail("name one problem file; to fit several logs by one, name it with --problem PROBLEM.toml.", BAD_INPUT)
+    with report_errors(debug, json=json, quiet=quiet, verbose=verbose):
+        loaded = load(problem[0])
+        if out is not None:
+            make_folder(out)
+        options = loaded.options | overrides
+        estimate = estimate_problem(loaded, options, prepare_figures=bool(output.figures))
+        write_estimate(estimate, loaded, options, output, output.folder)
+        print_json(_summarize(estimate, out))
+        fail_for_refused(loaded.issues)
+        if not estimate.success:
+            if not quiet:
+                reason = "" if estimate.status.successful else f"not converged. {estimate.message}"
+                print_error(reason or "the fit is bad; the first line of the report says why.")
+            raise typer.Exit(NOT_CONVERGED)
+
+
+def estimate_problem(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: bool) -> Any:
+    """Call `switchfit.estimate`, which shows a line on a terminal; Ctrl-C ends a fit after the current iteration."""
+    import switchfit as sf
+
+    if prepare_figures:  # matplotlib, which must not look for a display, loads while XLA compiles
+        os.environ.setdefault("MPLBACKEND", "Agg")
+        threading.Thread(target=_import_figures, daemon=True).start()
+    with stop_on_interrupt() as stopped:
+
+        def report(record: Any) -> bool:
+            if is_verbose():
+                numbers = f"J = {record.cost:.6g}, optimality {record.optimality:.1e}"
+                print_note(f"  iteration {record.iteration}: {numbers}")
+            return stopped()
+
+        estimate = sf.estimate(loaded.problem, callback=report, **options)
+    if is_verbose():
+        for line in _describe_course(estimate):
+            print_note(line)
+    return estimate
+
+
+def _describe_course(estimate: Any) -> list[str]:
+    """Return the engine and the strategies that were tried, a line each."""
+    lines = [str(estimate.engine)]
+    lines += [f"{step.strategy}: lowest J = {step.cost:.6g} after {step.seconds:.2g} s" for step in estimate.steps]
+    return [*lines, f"{estimate.iterations} iterations, {estimate.evaluations} evaluations, {estimate.seconds:.2g} s"]
+
+
+def _summarize(estimate: Any, folder: Path | None) -> dict[str, Any]:
+    """Return a fit for --json, and the folder with what was written."""
+    from switchfit.io.result_json import summarize_estimate
+
+    return summarize_estimate(estimate) | {"out": None if folder is None else str(folder)}
+
+
+def _choose_tables(estimate: Any, out: Path | None) -> dict[str, Path]:
+    """Return the CSV files for what a screen of the report has no room for."""
+    from switchfit.report.text import SCREEN
+
+    counts = {"runs": len(estimate.run_names), "unknowns": len(estimate.theta)}
+    most = {"runs": SCREEN.experiments, "unknowns": SCREEN.unknowns}
+    return {} if out is None else {name: out / f"{name}.csv" for name in counts if counts[name] > most[name]}
+
+
+def _write_tables(estimate: Any, tables: dict[str, Path]) -> None:
+    from switchfit.io.result_tables import write_runs, write_unknowns
+
+    writers = {"runs": write_runs, "unknowns": write_unknowns}
+    for name, path in tables.items():
+        write_file(path, writers[name](estimate))
+
+
+def _write_report(estimate: Any, full: bool, tables: dict[str, Path]) -> str:
+    from switchfit.runtime.presentation import format_text
+
+    return str(format_text(estimate, full=full, files={name: str(path) for name, path in tables.items()}))
+
+
+@dataclass(frozen=True)
+class Output:
+    """What is printed of a fit, and written; the format of the figure, empty for none."""
+
+    folder: Path | None
+    figures: str
+    certificate: bool
+    full: bool
+
+
+def write_estimate(
+    estimate: Any,
+    loaded: ProblemFile,
+    options: dict[str, Any],
+    output: Output,
+    folder: Path | None,
+    *,
+    show: bool = True,
+) -> None:
+    """Print the report, and write report, page, estimate and figure into a folder."""
+    checked = f"\n\nCertificate\n{estimate.certificate}" if output.certificate else ""
+    tables = _choose_tables(estimate, folder)
+    # The report after the certificate, which is part of the verdict.
+    report = _write_report(estimate, output.full, tables) + checked
+    if show:
+        print_text(report)
+    if folder is None:
+        return
+    write_file(folder / "report.txt", report + "\n")
+    _write_tables(estimate, tables)
+    with explain_write_errors(folder / "estimate.json") as path:
+        provenance = estimate.describe_provenance(replace(loaded.provenance, options=options))
+        _save(estimate, path, provenance, complete=output.certificate)
+    if output.figures:
+        figure = io.BytesIO()
+        estimate.plot().savefig(figure, format=output.figures, dpi=150)
+        write_file(folder / f"fit.{output.figures}", figure.getvalue())
+        _write_page(estimate, loaded, options, folder / "report.html")
+    print_note(f"written to {folder}")
+
+
+def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output: Output, table: Path | None) -> int:
+    """Fit logs one by one, print a line for each, and return the exit code of the worst."""
+    from switchfit.io.log_table import ResultTable, check_table, list_logs, load_log
+
+    logs = list_logs(paths)
+    if table is not None:
+        check_table(table)
+        make_folder(table.parent)
+    results, fitted = ResultTable(), []
+    for name, path in logs:
+        loaded, error = load_log(model, path)
+        estimate = None
+        if loaded is not None:
+            estimate, error = _estimate_log(loaded, overrides, output)
+        results.add(str(path), estimate, error)
+        print_text(results.describe_last())
+        folder = None if output.folder is None else output.folder / name
+        refused = {"verdict": "refused", "message": error}
+        fitted.append({"log": str(path)} | (refused if estimate is None else _summarize(estimate, folder)))
+        if loaded is not None and estimate is not None and folder is not None:
+            make_folder(folder)
+            write_estimate(estimate, loaded, loaded.options | overrides, output, folder, show=False)
+        if table is not None:  # after each log, so that an interrupted run leaves what it has
+            write_file(table, results.write(table))
+        if estimate is not None and estimate.status.name == "INTERRUPTED":
+            break
+    print_note(results.summarize(len(logs)))
+    print_json({"logs": fitted})
+    return BAD_INPUT if results.refused else NOT_CONVERGED if results.failed or len(results) < len(logs) else CONVERGED
+
+
+def _estimate_log(loaded: ProblemFile, overrides: dict[str, Any], output: Output) -> tuple[Any, str]:
+    """Return the estimate for a log, or None and what is wrong."""
+    from switchfit.io.python_file import describe_error
+
+    try:
+        return estimate_problem(loaded, loaded.options | overrides, prepare_figures=bool(output.figures)), ""
+    except Exception as error:
+        return None, describe_error(error)
+
+
+def _import_figures() -> None:
+    with contextlib.suppress(ImportError):
+        import matplotlib.backends.backend_agg
+        import matplotlib.figure  # noqa: F401
+
+
+def _save(estimate: Any, path: Path, provenance: Any, *, complete: bool) -> None:
+    """Save an estimate; unless `complete`, its certificate omits the paper's equations, which take seconds."""
+    from switchfit.estimation.saved import save_fit
+    from switchfit.uncertainty.certificate import certify
+
+    certificate = estimate.certificate if complete else certify(estimate, None)
+    save_fit(estimate.complete(), certificate, path, provenance)
+
+
+def _write_page(estimate: Any, loaded: ProblemFile, options: dict[str, Any], path: Path) -> None:
+    """Write the report as an HTML file; without the libraries that it needs, say how to install them."""
+    from switchfit.runtime.errors import MissingExtraError
+    from switchfit.runtime.presentation import format_page
+
+    try:
+        page = format_page(estimate, problem_file=loaded.path, options=options)
+    except MissingExtraError as missing:
+        print_note(f"no {path.name}: {missing}")
+    else:
+        write_file(path, page)

@@ -1,0 +1,101 @@
+"""``switchfit rerun``, a saved fit once more, and ``switchfit paper``, the paper's experiments."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from switchfit.cli.app import Debug, Json, Quiet, complete_files
+from switchfit.cli.terminal import (
+    INTERRUPTED,
+    NOT_CONVERGED,
+    fail,
+    make_folder,
+    print_json,
+    print_note,
+    print_text,
+    report_errors,
+)
+
+
+def rerun(
+    saved: Annotated[
+        Path,
+        typer.Argument(
+            metavar="ESTIMATE.json",
+            help="Written by switchfit fit --out.",
+            show_default=False,
+            autocompletion=complete_files(".json"),
+        ),
+    ],
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Where data and models are. Default: where they were, seen from ESTIMATE.json.",
+            show_default=False,
+        ),
+    ] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Fit again what a saved estimate was made from, and compare the answers.
+
+    The problem is the one that was saved with the estimate; data and models are read from where they were. What has
+    changed since, by its hash or its version, is said first. Exit code 0: the answer is the same; 1: it is another one;
+    2: it cannot be run again.
+    """
+    with report_errors(debug, json=json, quiet=quiet):
+        from switchfit.cli.fitting import estimate_problem
+        from switchfit.io.rerun import compare_fits, prepare_rerun
+
+        prepared = prepare_rerun(saved, folder)
+        if prepared.changes:
+            print_text("\n".join(["Changed since", *(f"  {change}" for change in prepared.changes), ""]))
+        estimate = estimate_problem(prepared.loaded, prepared.loaded.options, prepare_figures=False)
+        answers = compare_fits(prepared, estimate)
+        print_text(answers)
+        print_json({"same": answers.same, "changes": list(prepared.changes), "text": str(answers)})
+        if not answers.same:
+            raise typer.Exit(NOT_CONVERGED)
+
+
+def paper(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for figures, results.json and table.md.")] = Path(
+        "paper"
+    ),
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer repetitions: two minutes instead of fifteen.")] = False,
+    only: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="One part: lti, magic-formula, convergence, noise, trials or horizon.",
+            show_default=False,
+        ),
+    ] = None,
+    debug: Debug = False,
+) -> None:
+    """Reproduce the paper's experiments and figures.
+
+    Every experiment and figure of Miller and Murphey, with its numbers beside ours. An interrupted run resumes when
+    the same command is run again.
+    """
+    os.environ.setdefault("MPLBACKEND", "Agg")
+    with report_errors(debug):
+        from switchfit.paper import run
+        from switchfit.paper.runner import TABLE
+        from switchfit.runtime.errors import InputError
+
+        make_folder(out)
+        try:
+            run(out, quick=quick, only=only, say=print_note)
+        except KeyboardInterrupt:
+            fail("interrupted; run the same command again to resume.", INTERRUPTED)
+        except OSError as error:
+            raise InputError(f"{out} cannot be written: {error.strerror}; name another with --out.") from error
+        print_text((out / TABLE).read_text(encoding="utf-8"))
+        print_note(f"written to {out}")

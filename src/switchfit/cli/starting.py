@@ -1,0 +1,124 @@
+"""``switchfit init`` and ``switchfit examples``: problems to begin with."""
+
+from __future__ import annotations
+
+import ast
+import shutil
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from switchfit.cli.app import Debug, Quiet, complete_files
+from switchfit.cli.terminal import BAD_INPUT, fail, print_note, print_text, report_errors
+
+
+def init(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Folder to create.", show_default=False)],
+    log: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="LOG",
+            help="Log to begin with: CSV, Parquet, MATLAB, GPX, NMEA, a ROS bag, MCAP. Default: an example.",
+            show_default=False,
+            autocompletion=complete_files(""),
+        ),
+    ] = None,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Create a problem to begin with, ready to fit.
+
+    Writes a folder with a problem file, its model and data. With --from the time column and up to three channels of
+    the log are chosen, with a first model that suits any log: each channel approaches a level, another one from an
+    estimated time on. Comments say what to change. A log of more than 20 MB is not copied. Nothing is overwritten.
+    """
+    with report_errors(debug, quiet=quiet):
+        from switchfit.io.first_problem import write_first_problem
+        from switchfit.io.problem_file import load_problem
+        from switchfit.io.summary import describe_experiments
+
+        folder = Path(name)
+        written = write_first_problem(folder, log)
+        loaded = load_problem(folder / "problem.toml")
+        print_text("\n".join(["Written", *(f"  {path}" for path in written), ""]))
+        print_text(describe_experiments(loaded.problem.experiments))
+        print_text(
+            f"\nNext\n  switchfit check {folder / 'problem.toml'}\n  switchfit fit {folder / 'problem.toml'} --out "
+            f"{folder / 'out'}\n\nThen put your own modes into {folder / 'model.py'}."
+        )
+
+
+def find_examples() -> Path:
+    """Return the folder of the examples: inside the installed package, or that of a clone."""
+    import switchfit
+
+    package = Path(switchfit.__file__).parent
+    return next(
+        (folder for folder in (package / "examples", package.parents[1] / "examples") if folder.is_dir()),
+        package / "examples",
+    )
+
+
+def _complete_examples(incomplete: str) -> list[str]:
+    return [name for name in _list_examples() if name.startswith(incomplete)]
+
+
+def _list_examples() -> dict[str, Path]:
+    """Return the examples by name: folders and single files."""
+    found = sorted(find_examples().glob("[!_.]*"))
+    return {path.stem: path for path in found if path.is_dir() or path.suffix == ".py"}
+
+
+def examples(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="NAME",
+            help="Example to copy. Left out, all are listed.",
+            show_default=False,
+            autocompletion=_complete_examples,
+        ),
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Argument(metavar="FOLDER", help="Folder to create. Default: one of the name.", show_default=False),
+    ] = None,
+    debug: Debug = False,
+) -> None:
+    """List the examples, or copy one.
+
+    It is copied into a new folder. Nothing is overwritten.
+    """
+    with report_errors(debug):
+        found = _list_examples()
+        if name is None:
+            width = max(map(len, found), default=0)
+            print_text("\n".join(f"{each:<{width}}  {_describe(path)}" for each, path in found.items()))
+            print_note("\nCopy one with: switchfit examples NAME")
+            return
+        if name not in found:
+            fail(f"there is no example {name!r}; there are {', '.join(found)}.", BAD_INPUT)
+        target = Path(name) if folder is None else folder
+        if target.exists() and (not target.is_dir() or any(target.iterdir())):
+            fail(f"{target} exists already, and nothing is overwritten: give another FOLDER.", BAD_INPUT)
+        source = found[name]
+        if source.is_dir():
+            shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"), dirs_exist_ok=True)
+        else:
+            target.mkdir(parents=True, exist_ok=True)
+            shutil.copy(source, target)
+        problems, scripts = sorted(target.glob("*.toml")), sorted(target.glob("*.py"))
+        commands = [f"switchfit fit {path}" for path in problems] or [f"python {path}" for path in scripts]
+        print_text("\n".join([f"Copied to {target}. Next", *(f"  {command}" for command in commands)]))
+
+
+def _describe(path: Path) -> str:
+    """Return what an example is about: the title of its README, or the first line of its problem file or script."""
+    readme = path / "README.md"
+    if readme.is_file():
+        return readme.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
+    script = path if path.is_file() else next(iter(sorted(path.glob("*.py"))), None)
+    text = "" if script is None else ast.get_docstring(ast.parse(script.read_text(encoding="utf-8"))) or ""
+    return text.partition("\n")[0]

@@ -1,0 +1,250 @@
+"""The terminal: what is printed, errors in a sentence with an exit code, Ctrl-C, and files that are written.
+
+stdout has the result alone: a report, or with --json one JSON value. Notes and errors go to stderr.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import math
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from contextvars import ContextVar
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn
+
+import typer
+
+CONVERGED, NOT_CONVERGED, BAD_INPUT, INTERNAL_ERROR, INTERRUPTED = 0, 1, 2, 3, 130
+
+# --- output -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Voice:
+    """What a command prints: of its result the text, the JSON or nothing, and notes about what it does."""
+
+    text: bool = True
+    json: bool = False
+    notes: bool = True
+    log: bool = False
+
+
+_TEXT = Voice()
+
+_voice: ContextVar[Voice] = ContextVar("what is printed", default=_TEXT)
+
+
+class _NoteHandler(logging.Handler):
+    """Prints the library's log as notes."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print_note(self.format(record))
+
+
+@contextlib.contextmanager
+def choose_voice(*, json: bool = False, quiet: bool = False, verbose: bool = False) -> Iterator[None]:
+    """Return a context in which the options --json, --quiet and --verbose hold."""
+    if quiet and verbose:
+        fail("--quiet and --verbose contradict each other; give one of them.", BAD_INPUT)
+    token = _voice.set(Voice(text=not (json or quiet), json=json, notes=not quiet, log=verbose))
+    logger, handler = logging.getLogger("switchfit"), _NoteHandler()
+    level = logger.level
+    if verbose:
+        logger.addHandler(handler)
+        logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+        _voice.reset(token)
+
+
+def is_verbose() -> bool:
+    """Return whether --verbose was given."""
+    return _voice.get().log
+
+
+def print_text(text: object) -> None:
+    """Print a part of the result as text."""
+    if _voice.get().text:
+        _print(text)
+
+
+def print_json(value: Any) -> None:
+    """Print the result as JSON, if it is asked for; numbers that are not finite are null."""
+    if _voice.get().json:
+        _print(json.dumps(_make_plain(value), ensure_ascii=False, allow_nan=False))
+
+
+def print_note(text: object) -> None:
+    """Print what the command does, to stderr."""
+    if _voice.get().notes:
+        _print(text, err=True)
+
+
+def _make_plain(value: Any) -> Any:
+    """Return a value of lists, dicts, text and finite numbers."""
+    if hasattr(value, "tolist"):  # arrays and numbers of NumPy
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): _make_plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_make_plain(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _print(text: object, *, err: bool = False) -> None:
+    """Print to stdout or stderr; if its reader has closed it, as ``head`` does, print nothing from then on.
+
+    The command continues: its files and its exit code do not depend on a reader.
+    """
+    try:
+        typer.echo(text, err=err)
+    except BrokenPipeError:
+        stream = sys.stderr if err else sys.stdout
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())  # buffered text is flushed there, at the latest when Python exits
+        os.close(nowhere)
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+
+class CtrlC(KeyboardInterrupt):
+    """Ctrl-C at the keyboard, and not a KeyboardInterrupt that a model file raises."""
+
+
+def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
+    raise CtrlC
+
+
+@contextlib.contextmanager
+def report_errors(debug: bool, *, json: bool = False, quiet: bool = False, verbose: bool = False) -> Iterator[None]:
+    """Turn exceptions into a sentence on stderr and an exit code, including any exception of a model file.
+
+    The other options hold as in `choose_voice`.
+    """
+    try:
+        with choose_voice(json=json, quiet=quiet, verbose=verbose), handle_interrupt(_interrupt):
+            yield
+    except BaseException as error:
+        from switchfit.io.python_file import find_user_place
+
+        users = find_user_place(error) is not None
+        if isinstance(error, typer.Exit) and not users:
+            raise
+        if debug:
+            traceback.print_exc()
+        if isinstance(error, CtrlC) or (isinstance(error, KeyboardInterrupt) and not users):
+            fail("interrupted before there was anything to write.", INTERRUPTED)
+        if not (users or isinstance(error, Exception)):
+            raise
+        _explain(error, users=users, debug=debug)
+
+
+def _explain(error: BaseException, *, users: bool, debug: bool) -> NoReturn:
+    """Print the error and exit; `users` is whether it was raised in a file of the user."""
+    from switchfit.io.python_file import describe_error
+    from switchfit.runtime.errors import InputError
+
+    if users and not isinstance(error, InputError):
+        fail(f"{describe_error(error)}. (--debug shows the full traceback.)", BAD_INPUT)
+    if isinstance(error, (ValueError, OSError)):
+        fail(str(error), BAD_INPUT)
+    if isinstance(error, MemoryError):
+        fail(f"not enough memory: {str(error) or 'the problem is too large'}.", BAD_INPUT)
+    if not debug:
+        traceback.print_exception(error)
+    fail("this is an error in switchfit itself; please report it with the lines above.", INTERNAL_ERROR)
+
+
+@contextlib.contextmanager
+def handle_interrupt(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
+    """Return a context in which Ctrl-C calls a handler; without effect if SIGINT is ignored, or outside the main
+    thread, which alone has signal handlers.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before in (signal.SIG_IGN, None):
+        yield
+        return
+    signal.signal(signal.SIGINT, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def fail(message: str, code: int) -> NoReturn:
+    """Print a message to stderr and exit."""
+    print_error(message)
+    raise typer.Exit(code)
+
+
+def print_error(message: object) -> None:
+    """Print what is wrong, to stderr."""
+    _print(f"switchfit: {message}", err=True)
+
+
+@contextlib.contextmanager
+def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
+    """Return a context in which the first Ctrl-C requests a stop, and the second raises KeyboardInterrupt.
+
+    During a search with strategies, which no callback can stop, the first one raises it: the search keeps its best fit.
+    """
+    from switchfit.strategy.choice import is_searching
+
+    requested = threading.Event()
+
+    def request(number: int, frame: FrameType | None) -> None:
+        if requested.is_set() or is_searching():
+            requested.set()
+            raise CtrlC
+        requested.set()
+        print_note("stopping after this iteration; Ctrl-C again to stop at once")
+
+    with handle_interrupt(request):
+        yield requested.is_set
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder, with those above it, unless it exists."""
+    from switchfit.runtime.errors import InputError
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"the folder {folder} cannot be created: {error.strerror}; name another with --out."
+        ) from error
+
+
+@contextlib.contextmanager
+def explain_write_errors(path: Path) -> Iterator[Path]:
+    """Return a context that turns an OSError into an InputError with the name of the file and the reason."""
+    from switchfit.runtime.errors import InputError
+
+    try:
+        yield path
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}; name another with --out.") from error
+
+
+def write_file(path: Path, content: str | bytes) -> None:
+    """Write a file atomically."""
+    from switchfit.runtime.files import write_atomically
+
+    with explain_write_errors(path):
+        write_atomically(content, path)

@@ -1,0 +1,396 @@
+"""A first problem file, with a model and data: what ``switchfit init`` writes."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from switchfit.io.logs.log import Log
+from switchfit.io.logs.reader import read_log
+from switchfit.io.logs.units import SECONDS
+from switchfit.problem.data import FloatArray
+from switchfit.runtime.errors import InputError
+
+LARGEST_COPY = 20_000_000
+"""Bytes of a log up to which it is copied; a larger one is referred to where it is."""
+
+MOST_CHANNELS = 3
+"""Channels that the first model has; the others are named in a comment."""
+
+MOST_POINTS = 4000
+"""Samples that are looked at for first guesses."""
+
+FEWEST_SAMPLES = 8
+
+
+def write_first_problem(folder: Path, log: Path | None) -> list[Path]:
+    """Write a problem file, its model and its data into a new folder; return what was written.
+
+    Parameters
+    ----------
+    folder : Path
+        It must not exist, or be empty.
+    log : Path or None
+        The data; None for an example.
+
+    Raises
+    ------
+    InputError
+        If the folder has something in it or cannot be created, or the log cannot be used.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder} exists already, and nothing is overwritten: give another NAME.")
+    if log is None:
+        files = make_example()
+    else:
+        plan = plan_problem(read_log(log))
+        size = log.stat().st_size if log.is_file() else LARGEST_COPY + 1
+        named = log.name if size <= LARGEST_COPY else Path(os.path.relpath(log, folder)).as_posix()
+        files = {"problem.toml": write_problem(plan, named), "model.py": write_model(plan, log.name)}
+        if size <= LARGEST_COPY:
+            files[log.name] = log
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in files.items():
+            if isinstance(content, Path):
+                shutil.copyfile(content, folder / name)
+            else:
+                with (folder / name).open("x", encoding="utf-8") as file:
+                    file.write(content)
+    except OSError as error:
+        raise InputError(f"{folder} cannot be written: {error.strerror}; give another NAME.") from error
+    return [folder / name for name in files]
+
+
+# --- from a log -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the first problem file says.
+
+    Attributes
+    ----------
+    log : Log
+    channels : list of str
+        Those of the model.
+    others : list of str
+        Channels of the log that vary, too.
+    time_unit : str
+    time_scale : float
+        From the log's times to `time_unit`.
+    repairs : list of str
+    tau, horizon : float
+        Guess of the transition, and the length of the log, in `time_unit`.
+    first, before, after, noise : (q,) arrays
+        Of each channel: where it begins, its level before and after the transition, and how far it is off these.
+    """
+
+    log: Log
+    channels: list[str]
+    others: list[str]
+    time_unit: str
+    time_scale: float
+    repairs: list[str]
+    tau: float
+    horizon: float
+    first: FloatArray
+    before: FloatArray
+    after: FloatArray
+    noise: FloatArray
+
+
+def plan_problem(log: Log) -> Plan:
+    """Choose the channels of a first model, and first guesses.
+
+    Parameters
+    ----------
+    log : Log
+
+    Raises
+    ------
+    InputError
+        If no channel of the log changes, or it is too short.
+    """
+    unit = log.time_unit if log.time_unit in ("s", "min", "h", "d") else "s"
+    scale = SECONDS[log.time_unit] / SECONDS[unit] if log.time_unit else 1.0
+    known = np.isfinite(log.times)
+    steps = np.diff(log.times[known])
+    twice = len(np.unique(log.times[known])) < known.sum()
+    flaws = {"drop-missing-times": not known.all(), "sort": np.any(steps < 0), "drop-duplicates": twice}
+    order = np.flatnonzero(known)[np.argsort(log.times[known], kind="stable")]
+    varying = [name for name in log.values if _varies(log.values[name][order])]
+    if log.has_positions and {"east", "north"} <= set(varying):
+        varying.sort(key=lambda name: name not in ("east", "north"))
+    usable = [name for name in varying if not name.startswith("sigma")]
+    if not usable:
+        raise InputError(
+            f"{log.source} has no channel with {FEWEST_SAMPLES} samples or more that changes; its channels are "
+            f"{', '.join(log.values) or 'none'}."
+        )
+    count = 2 if log.has_positions and usable[:2] == ["east", "north"] else MOST_CHANNELS
+    channels = usable[:count]
+    picked = order[:: -(-len(order) // MOST_POINTS)]
+    times = log.times[picked] * scale
+    values = np.stack([_fill_gaps(log.values[name][picked]) for name in channels], axis=1)
+    k = _find_change(values)
+    half = k + (len(values) - k) // 2
+    before, after = values[:k].mean(0), values[half:].mean(0)
+    off = np.concatenate([values[:k] - before, values[half:] - after]).std(0)
+    return Plan(
+        log=log,
+        channels=channels,
+        others=usable[count:],
+        time_unit=unit,
+        time_scale=scale,
+        repairs=[repair for repair, needed in flaws.items() if needed],
+        tau=float(0.5 * (times[k - 1] + times[k])),
+        horizon=float(times[-1] - times[0]),
+        first=values[0],
+        before=before,
+        after=after,
+        noise=np.where(off > 0, off, np.abs(after - before) * 1e-3 + 1e-12),
+    )
+
+
+def _varies(values: FloatArray) -> bool:
+    """Return whether a channel has enough samples, changes, and is no mere count of the rows."""
+    known = values[np.isfinite(values)]
+    if len(known) < FEWEST_SAMPLES or np.ptp(known) == 0:
+        return False
+    return bool(np.ptp(np.diff(known)) > 1e-9 * np.ptp(known))
+
+
+def _fill_gaps(values: FloatArray) -> FloatArray:
+    """Return values with missing samples interpolated."""
+    places, known = np.arange(len(values)), np.isfinite(values)
+    return np.interp(places, places[known], values[known]) if known.any() else np.zeros(len(values))
+
+
+def _find_change(values: FloatArray) -> int:
+    """Return the row before which and from which on the means explain most of the values (K, q), scaled alike."""
+    scaled = (values - values.mean(0)) / np.where(values.std(0) > 0, values.std(0), 1.0)
+    sums, count = np.cumsum(scaled, axis=0), len(values)
+    k = np.arange(1, count)
+    explained = (sums[:-1] ** 2).sum(1) * (1 / k + 1 / (count - k))
+    inside = slice(max(count // 20, 1), -max(count // 20, 1))
+    return int(k[inside][explained[inside].argmax()])
+
+
+PROBLEM = """\
+# When did the channels of {source} change, and how? To fit this first problem as it is:
+#
+#     switchfit check problem.toml
+#     switchfit fit problem.toml --out out
+#
+# What is marked with <- is yours to change.
+
+model = "model.py:system"
+
+[parameters]   # <- those that model.py reads as p[...]: first guess, bounds, unit
+level_before = {{ value = {before}{level_unit} }}
+level_after = {{ value = {after}{level_unit} }}
+T = {{ value = {T}, lower = {shortest}, upper = {longest}, scale = "log", unit = {unit} }}
+{noise}
+[[experiments]]
+mode_sequence = ["before", "after"]   # <- modes of model.py in their order; one may return
+transition_times = [{tau}]   # <- first guesses, one fewer than modes, in the time_unit
+time_unit = {unit}
+initial_state = [   # <- a number for a state that is known
+    {states}
+]
+
+[[experiments.data]]
+{data}
+# window = [0.0, 10.0]   # <- only rows whose time lies in between
+
+[options]
+time_budget = 20.0   # <- seconds after which no further search begins; leave it out once the model is yours
+"""
+
+
+def write_problem(plan: Plan, file: str) -> str:
+    """Return the problem file of a plan.
+
+    Parameters
+    ----------
+    plan : Plan
+    file : str
+        The log, relative to the problem file.
+    """
+    log, several = plan.log, len(plan.channels) > 1
+    of_level = "" if several else log.units.get(plan.channels[0], "")
+    sigmas = [f"sigma_{k}" for k in range(1, len(plan.channels) + 1)] if several else []
+    noise = [
+        f'{s} = {{ value = {_round(value)}, scale = "log" }}' for s, value in zip(sigmas, plan.noise, strict=False)
+    ]
+    states = [
+        f"{{ value = {_round(value)} }},  # {name}" for name, value in zip(plan.channels, plan.first, strict=True)
+    ]
+    data = [f"file = {_quote(file)}"]
+    if log.time_name and log.place in ("line", "row"):
+        data.append(f"time = {_quote(log.time_name)}")
+    if plan.time_scale != 1:
+        data.append(f"time_scale = {plan.time_scale:.12g}   # the times of the log are in {log.time_unit}")
+    data.append(f"columns = [{_join(plan.channels)}]   # <- each measures the state of its name")
+    if plan.others:
+        data.append(f"# further channels: {', '.join(plan.others)}")
+    data += [f"# {issue}".replace(log.source, Path(log.source).name) for issue in log.issues]
+    if plan.repairs:
+        data.append(f"repair = [{_join(plan.repairs)}]   # what may be changed of that")
+    if several:
+        data.append(f"sigma = [{_join(sigmas)}]   # <- standard deviations of the noise; numbers, if they are known")
+    else:
+        data.append("# sigma = 0.1   # <- standard deviation of the noise, if it is known")
+    step = plan.horizon / max(len(log) - 1, 1)
+    return PROBLEM.format(
+        source=Path(file).name,
+        before=_list(plan.before),
+        after=_list(plan.after),
+        level_unit=f", unit = {_quote(of_level)}" if of_level else "",
+        T=_list(np.full(len(plan.channels), 0.05 * plan.horizon)),
+        shortest=_round(0.1 * step),
+        longest=_round(10 * plan.horizon),
+        unit=_quote(plan.time_unit),
+        noise="".join(f"{line}\n" for line in noise),
+        tau=_round(plan.tau, 6),
+        states="\n    ".join(states),
+        data="\n".join(data),
+    )
+
+
+def write_model(plan: Plan, source: str) -> str:
+    """Return the Python file of the model of a plan.
+
+    Parameters
+    ----------
+    plan : Plan
+    source : str
+        Name of the log.
+    """
+    units = [plan.log.units.get(name, "") for name in plan.channels]
+    names, shown = _tuple(plan.channels), _tuple(units)
+    return f'''"""A first model of {source}: each channel approaches a level, another one in each of two modes.
+
+Replace it by what you know of the system: a mode is a function that returns dx/dt.
+"""
+
+import switchfit as sf
+
+
+def before(t, x, p):
+    """dx/dt before the transition. x has an entry for each state; p the parameters of problem.toml; t is the time."""
+    return (p["level_before"] - x) / p["T"]
+
+
+def after(t, x, p):
+    """dx/dt after it."""
+    return (p["level_after"] - x) / p["T"]
+
+
+system = sf.HybridSystem(
+    modes={{"before": before, "after": after}},
+    initial_state=[0.0] * {len(plan.channels)},  # overridden by problem.toml
+    state_names={names},
+    state_units={shown},
+)
+'''
+
+
+def _tuple(names: Sequence[str]) -> str:
+    return f"({', '.join(_quote(name) for name in names)}{',' if len(names) == 1 else ''})"
+
+
+def _join(names: Sequence[str]) -> str:
+    return ", ".join(map(_quote, names))
+
+
+def _quote(text: str) -> str:
+    """Return text as a string of TOML and Python."""
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'
+
+
+def _round(value: float, digits: int = 4) -> str:
+    """Return a number with a few digits, as a float of TOML."""
+    return repr(float(f"{value:.{digits}g}"))
+
+
+def _list(values: FloatArray) -> str:
+    """Return one number, or a list of several."""
+    shown = [_round(value) for value in values.tolist()]
+    return shown[0] if len(shown) == 1 else f"[{', '.join(shown)}]"
+
+
+# --- without a log ----------------------------------------------------------------------------------------------------
+
+EXAMPLE_PROBLEM = """\
+# A room is heated, and the heating is switched off: when, and how fast does the room lose heat? To fit it as it is:
+#
+#     switchfit check problem.toml
+#     switchfit fit problem.toml --out out
+#
+# What is marked with <- is yours to change.
+
+model = "model.py:room"
+
+[parameters]              # <- those that model.py reads as p[...]: first guess, bounds, unit
+heating = { value = 4.0, lower = 0.0, unit = "K/h" }
+loss = { value = 0.3, lower = 0.0, unit = "1/h" }
+
+[[experiments]]
+mode_sequence = ["on", "off"]         # <- modes of model.py in their order; one may return
+transition_times = [4.0]  # <- first guesses, one fewer than modes, in the time_unit
+time_unit = "h"
+initial_state = [
+    { value = 15.0 },     # T: estimated; a number alone is known
+]
+
+[[experiments.data]]
+file = "log.csv"          # <- your log: CSV, Parquet, MATLAB, GPX, NMEA, a ROS bag, MCAP
+time = "t"
+columns = ["T"]           # <- each measures the state of its name
+sigma = 0.1               # <- standard deviation of the noise; left out, it is estimated
+# window = [0.0, 10.0]    # <- only rows whose time lies in between
+"""
+
+EXAMPLE_MODEL = '''\
+"""The model: a mode is a function that returns dx/dt."""
+
+import switchfit as sf
+
+OUTSIDE = 10.0  # degC
+
+
+def on(t, x, p):
+    """dx/dt with heating. x has an entry for each state; p the parameters of problem.toml; t is the time."""
+    return p["heating"] - p["loss"] * (x - OUTSIDE)
+
+
+def off(t, x, p):
+    """dx/dt without."""
+    return -p["loss"] * (x - OUTSIDE)
+
+
+room = sf.HybridSystem(
+    modes={"on": on, "off": off},
+    initial_state=[15.0],  # overridden by problem.toml
+    state_names=("T",),
+    state_units=("degC",),
+)
+'''
+
+
+def make_example() -> dict[str, str | Path]:
+    """Return the files of the example: heating of 5 K/h until 5.3 h, a loss of 0.2 1/h, and noise of 0.1 K."""
+    times = np.arange(0.0, 12.01, 0.25)
+    warm = 35.0 - 20.0 * np.exp(-0.2 * np.minimum(times, 5.3))
+    values = 10.0 + (warm - 10.0) * np.exp(-0.2 * np.maximum(times - 5.3, 0.0))
+    noisy = values + 0.1 * np.random.default_rng(0).standard_normal(len(times))
+    rows = [f"{t:.2f},{T:.3f}\n" for t, T in zip(times.tolist(), noisy.tolist(), strict=True)]
+    return {"problem.toml": EXAMPLE_PROBLEM, "model.py": EXAMPLE_MODEL, "log.csv": "t,T\nh,degC\n" + "".join(rows)}

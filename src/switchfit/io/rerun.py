@@ -1,0 +1,256 @@
+"""Run a saved fit again: find what it was made from, say what has changed since, and compare the answers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pydantic
+
+from switchfit.estimation.provenance import (
+    FileDigest,
+    Provenance,
+    describe_platform,
+    digest_data,
+    find_versions,
+)
+from switchfit.estimation.saved import load_saved
+from switchfit.fit.result import Fit
+from switchfit.io.problem_file import OPTIONS, OptionsTable, ProblemFile, load_problem
+from switchfit.problem.data import FloatArray
+from switchfit.problem.parameter import unit_suffix
+from switchfit.report.numbers import format_count, format_rounded
+from switchfit.report.tables import format_table
+from switchfit.runtime.errors import InputError
+from switchfit.uncertainty.residuals import correct_errors
+
+SAME = 0.01
+"""Difference of an unknown, in its standard errors, up to which an answer is the same."""
+
+SAME_WITHOUT_ERROR = 1e-6
+"""Difference of an unknown that has no standard error, as a part of it, and of J, up to which they are the same."""
+
+INITIAL_PART = 1e-3
+"""Part of J at the first guess that counts as the size of J, where J is smaller: data without noise have J = 0."""
+
+MOST_LISTED = 12
+"""Unknowns, and changed files, that are listed."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A saved fit, and the problem that it was made from.
+
+    Attributes
+    ----------
+    fit : Fit
+        As it was saved.
+    provenance : Provenance
+    loaded : ProblemFile
+        The problem, with the options of the saved fit.
+    changes : tuple of str
+        What is not as it was.
+    """
+
+    fit: Fit
+    provenance: Provenance
+    loaded: ProblemFile
+    changes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Answers:
+    """A saved fit against the one that was run again; print it.
+
+    Attributes
+    ----------
+    same : bool
+    text : str
+    """
+
+    same: bool
+    text: str
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def prepare_rerun(path: Path, folder: Path | None = None) -> Prepared:
+    """Build the problem of a saved fit from the text that was saved with it, and the files that this names.
+
+    Parameters
+    ----------
+    path : Path
+        Of the saved estimate.
+    folder : Path, optional
+        Where the files are; left out, where the problem file was, from the folder of the saved estimate.
+
+    Raises
+    ------
+    InputError
+        If the estimate cannot be run again, or a file is missing or wrong.
+    """
+    try:
+        saved = load_saved(path)
+    except IsADirectoryError as error:
+        raise InputError(f"{path} is a folder; name the estimate.json in it.") from error
+    except FileNotFoundError as error:
+        raise InputError(f"There is no saved estimate {path}; check the name and the folder.") from error
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    given = saved.provenance
+    if given is None:
+        raise InputError(
+            f"{path} does not say what it was made from: it was saved by an earlier switchfit. Fit its problem file "
+            "again."
+        )
+    if not given.problem_file:
+        raise InputError(
+            f"{path} cannot be run again: its problem was built in Python, and functions are not saved, only hashes of "
+            "the data. Run the script again, and compare with sf.Estimate.load(...).theta. What can be run again is "
+            "saved by switchfit fit PROBLEM.toml --out DIR."
+        )
+    where = Path(given.folder) if folder is None else folder
+    options = _read_options(path, given.options)
+    problem_file = where / given.problem_file
+    log = where / given.log if given.log else None
+    try:
+        loaded = load_problem(problem_file, log, text=given.text)
+    except InputError as error:
+        missing = [digest.name for digest in given.files if not (where / digest.name).exists()]
+        if not missing:
+            raise
+        raise InputError(
+            f"{path} was made from {missing[0]}, which is not in {where}: put it there, or name the folder that it is "
+            "in with --folder."
+        ) from error
+    loaded = replace(loaded, options=options)
+    return Prepared(saved.fit, given, loaded, tuple(_list_changes(given, loaded, problem_file)))
+
+
+def _read_options(path: Path, given: Mapping[str, int | float | str]) -> dict[str, object]:
+    try:
+        return OptionsTable.model_validate(dict(given)).model_dump(include=OPTIONS, exclude_none=True)
+    except pydantic.ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        name = ".".join(map(str, first["loc"]))
+        raise InputError(
+            f"{path} is damaged: provenance.options.{name}: {first['msg']}; got {first['input']!r}."
+        ) from error
+
+
+def _list_changes(given: Provenance, loaded: ProblemFile, problem_file: Path) -> Iterator[str]:
+    """Yield what is not as it was when the fit was saved: files, then versions."""
+    try:
+        current = problem_file.read_bytes().decode()
+    except (OSError, ValueError):
+        current = given.text
+    if current != given.text:
+        yield f"{given.problem_file} has changed; what it was is fitted, and not what it is"
+    before = {digest.name: digest for digest in given.files}
+    now = {digest.name: digest for digest in loaded.provenance.files}
+    changes = [
+        change for name in {**before, **now} if (change := _describe_change(name, before.get(name), now.get(name)))
+    ]
+    yield from changes[:MOST_LISTED]
+    if len(changes) > MOST_LISTED:
+        yield f"and {format_count(len(changes) - MOST_LISTED, 'more file')}"
+    versions = find_versions()
+    for name, version in given.versions.items():
+        if versions.get(name, version) != version:
+            yield f"{name} was {version}, and is {versions[name]}"
+    if given.platform != describe_platform():
+        yield f"it was run on {given.platform}, and now on {describe_platform()}"
+
+
+def _describe_change(name: str, before: FileDigest | None, now: FileDigest | None) -> str:
+    if before is None:
+        return f"{name} is new"
+    if now is None:
+        return f"{name} is no longer there"
+    if before.sha256 == now.sha256:
+        return ""
+    return f"{name} has changed: {before.size:,} bytes with SHA-256 {before.sha256[:12]}..., now {now.size:,} bytes"
+
+
+def compare_fits(prepared: Prepared, again: Fit) -> Answers:
+    """Return whether a fit that was run again has the same answer, in words.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    again : Fit
+    """
+    saved = prepared.fit
+    if saved.theta_names != again.theta_names:
+        only = [name for name in saved.theta_names if name not in again.theta_names]
+        new = [name for name in again.theta_names if name not in saved.theta_names]
+        parts = [f"without {', '.join(only[:MOST_LISTED])}"] if only else []
+        parts += [f"with {', '.join(new[:MOST_LISTED])}"] if new else []
+        return Answers(False, f"Another problem: its unknowns are now {' and '.join(parts) or 'in another order'}.")
+    errors = correct_errors(saved)
+    known = np.isfinite(errors) & (errors > 0)
+    difference = again.theta - saved.theta
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scaled = np.where(known, difference / np.where(known, errors, 1.0), np.nan)
+        relative = np.abs(difference) / np.maximum(np.abs(saved.theta), np.finfo(float).tiny)
+    unlike = np.where(known, np.abs(scaled) / SAME, relative / SAME_WITHOUT_ERROR)
+    unlike = np.where(saved.theta == again.theta, 0.0, np.nan_to_num(unlike, nan=np.inf))
+    data_differ = {digest.sha256 for digest in prepared.provenance.data} != {d.sha256 for d in digest_data(again)}
+    size = np.nanmax([abs(saved.cost), INITIAL_PART * abs(saved.initial_cost), np.finfo(float).tiny])
+    either = np.array_equal(saved.cost, again.cost, equal_nan=True)
+    costs_differ = not (either or abs(again.cost - saved.cost) <= SAME_WITHOUT_ERROR * size)
+    same = bool((unlike <= 1.0).all()) and not costs_differ and saved.status.successful == again.status.successful
+    lines = [_say_outcome(saved, again, scaled, unlike, same, costs_differ)]
+    if data_differ:
+        lines.append("The values that were fitted are not those of the saved fit.")
+    if not np.array_equal(saved.theta, again.theta, equal_nan=True):
+        lines += ["", *_tabulate(saved, again, errors, scaled, unlike)]
+    return Answers(same, "\n".join(lines))
+
+
+def _say_outcome(saved: Fit, again: Fit, scaled: FloatArray, unlike: FloatArray, same: bool, costs_differ: bool) -> str:
+    """Return the sentence that says whether the answers are the same."""
+    worst = int(np.argmax(unlike)) if len(unlike) else -1
+    costs = f"J was {saved.cost:.9g}, and is {again.cost:.9g}"
+    if same and np.array_equal(saved.theta, again.theta) and saved.cost == again.cost:
+        return f"The same answer, to the last bit: {costs.partition(',')[0].replace('was', 'is')}."
+    how = ""
+    if worst >= 0 and np.isfinite(scaled[worst]):
+        how = f"{saved.theta_names[worst]} differs by {_format_count(abs(scaled[worst]))} standard errors"
+    elif worst >= 0:
+        how = f"{saved.theta_names[worst]} was {saved.theta[worst]:.9g}, and is {again.theta[worst]:.9g}"
+    if same:
+        return f"The same answer: {how}, and no unknown by more; {costs}." if how else f"The same answer: {costs}."
+    if saved.status.successful != again.status.successful:
+        ends = ["converged" if fit.status.successful else "did not converge" for fit in (saved, again)]
+        return f"Another answer: the saved fit {ends[0]}, this one {ends[1]}; {costs}."
+    if costs_differ and (not len(unlike) or unlike[worst] <= 1.0):
+        return f"Another cost at the same answer: {costs}."
+    return f"Another answer: {how}; {costs}."
+
+
+def _format_count(number: float) -> str:
+    """Return a number of standard errors to two digits, and large ones in full."""
+    return f"{number:.2g}" if number < 99.5 else f"{number:,.0f}"
+
+
+def _tabulate(saved: Fit, again: Fit, errors: FloatArray, scaled: FloatArray, unlike: FloatArray) -> list[str]:
+    """Return the unknowns that differ most, as lines."""
+    order = np.argsort(-unlike, kind="stable")[:MOST_LISTED]
+    rows = [("", "saved", "", "now", "", "difference")]
+    for i in sorted(order.tolist()):
+        value, error, _ = format_rounded(saved.theta[i], errors[i])
+        now = format_rounded(again.theta[i], errors[i])[0]
+        unit = unit_suffix(saved.theta_units[i]).strip()
+        apart = (
+            f"{'-' if scaled[i] < 0 else '+'}{_format_count(abs(scaled[i]))} std. errors"
+            if np.isfinite(scaled[i])
+            else f"{again.theta[i] - saved.theta[i]:+.2g}"
+        )
+        rows.append((saved.theta_names[i], value, error, now, unit, apart))
+    lines = format_table(rows, "<><><>")
+    more = len(saved.theta) - len(order)
+    return [*lines, f"  and {format_count(more, 'more unknown')} with smaller differences"] if more else lines

@@ -1,0 +1,145 @@
+"""Results as values that JSON can hold: what ``switchfit --json`` prints."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from switchfit.estimation.estimator import Estimate
+from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.trajectory import Trajectory
+from switchfit.problem.experiment import name_runs
+from switchfit.report.verdict import write_reason, write_step
+from switchfit.uncertainty.derivative_check import DerivativeCheck
+from switchfit.uncertainty.identification import Identifiability
+from switchfit.uncertainty.residuals import correct_errors, correct_intervals
+
+
+def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
+    """Return the verdict, the unknowns with their intervals, and how the fit went.
+
+    Standard errors and 95 % intervals are those of the report, which allow for correlated residuals.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    """
+    errors, intervals = correct_errors(estimate), correct_intervals(estimate)
+    held: dict[str, str] = {c.unknown: c.kind for c in estimate.active if c.unknown}
+    held |= dict.fromkeys(estimate.idle, "idle") | {kink.unknown: "kink" for kink in estimate.kinks}
+    unknowns = [
+        {
+            "name": name,
+            "unit": estimate.theta_units[i],
+            "value": estimate.theta[i],
+            "standard_error": errors[i],
+            "low": intervals[i][0],
+            "high": intervals[i][1],
+            "first_guess": estimate.initial_theta[i],
+            "held": held.get(name),
+        }
+        for i, name in enumerate(estimate.theta_names)
+    ]
+    verdict = estimate.verdict
+    return {
+        "verdict": verdict.level,
+        "summary": str(verdict),
+        "reasons": [write_reason(reason) for reason in verdict.reasons],
+        "next_steps": [write_step(step) for step in verdict.next_steps],
+        "status": estimate.status.name,
+        "converged": estimate.status.successful,
+        "message": estimate.message,
+        "cost": estimate.cost,
+        "iterations": estimate.iterations,
+        "evaluations": estimate.evaluations,
+        "seconds": estimate.seconds,
+        "engine": None if estimate.engine is None else {"name": estimate.engine.name, "reason": estimate.engine.reason},
+        "strategies": [{"strategy": s.strategy, "cost": s.cost, "seconds": s.seconds} for s in estimate.steps],
+        "unknowns": unknowns,
+        "fixed": {name: estimate.parameters[name] for name in estimate.fixed},
+        "runs": [
+            {
+                **summarize_run(run, trajectory),
+                "channels": [
+                    {"name": name, "samples": int(np.isfinite(c.measured[:, k]).sum()), "rmse": c.rmse[k]}
+                    for c in comparisons
+                    for k, name in enumerate(c.names)
+                ],
+            }
+            for run, trajectory, comparisons in zip(
+                estimate.run_names, estimate.trajectories, estimate.comparisons, strict=True
+            )
+        ],
+    }
+
+
+def summarize_run(name: str, trajectory: Trajectory) -> dict[str, Any]:
+    """Return the modes of a run and the times of its jumps.
+
+    Parameters
+    ----------
+    name : str
+    trajectory : Trajectory
+    """
+    return {
+        "name": name,
+        "time_unit": trajectory.time_unit,
+        "modes": [{"mode": mode, "begin": begin, "end": end} for mode, begin, end in trajectory.mode_spans],
+        "jumps": trajectory.jump_times,
+    }
+
+
+def tabulate_trajectory(name: str, trajectory: Trajectory) -> dict[str, Any]:
+    """Return all nodes of a trajectory.
+
+    Parameters
+    ----------
+    name : str
+    trajectory : Trajectory
+    """
+    states = {state: trajectory.states[:, k] for k, state in enumerate(trajectory.state_names)}
+    units = dict(zip(trajectory.state_names, trajectory.state_units, strict=True))
+    return {
+        "name": name,
+        "time_unit": trajectory.time_unit,
+        "times": trajectory.times,
+        "modes": trajectory.modes,
+        "states": states,
+        "units": units,
+    }
+
+
+def summarize_check(evaluator: Evaluator, derivatives: DerivativeCheck, found: Identifiability) -> dict[str, Any]:
+    """Return the unknowns of a problem, the steps of the integrator, and what was checked.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    derivatives : DerivativeCheck
+    found : Identifiability
+    """
+    problem = evaluator.problem
+    runs = zip(name_runs(problem.experiments), problem.experiments, evaluator.meshes, strict=True)
+    unknowns = problem.unknowns
+    numbers = zip(unknowns.names, unknowns.units, unknowns.initial, unknowns.lower, unknowns.upper, strict=True)
+    names = ("name", "unit", "first_guess", "lower", "upper")
+    return {
+        "unknowns": [dict(zip(names, entry, strict=True)) for entry in numbers],
+        "runs": [
+            {"name": name, "modes": list(run.mode_sequence), "t0": run.t0, "tf": run.end, "steps": mesh.cells}
+            for name, run, mesh in runs
+        ],
+        "engine": {"name": evaluator.engine.name, "reason": evaluator.engine.reason},
+        "derivatives": {
+            "passed": derivatives.passed,
+            "orders": derivatives.observed_orders,
+            "gradient_gap": derivatives.gradient_gap,
+            "hessian_gap": derivatives.hessian_gap,
+        },
+        "identifiability": {
+            "undetermined": found.undetermined,
+            "condition_number": found.condition_number,
+            "without_effect": found.without,
+        },
+    }

@@ -1,0 +1,190 @@
+"""Times as text: dates where the times of an experiment are dates, otherwise numbers with their unit.
+
+A date is written to a resolution that its standard error allows: days, hours, minutes, seconds and their fractions.
+The zone is said once, where the times of an experiment are introduced, and again only beside a date that the clocks of
+the zone show twice.
+"""
+
+from __future__ import annotations
+
+import datetime
+import re
+from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
+
+from switchfit.fit.result import Fit
+from switchfit.fit.trajectory import Trajectory
+from switchfit.problem.dates import SECONDS, Origin, normalize_time_unit
+from switchfit.problem.experiment import Experiment
+from switchfit.problem.parameter import unit_suffix
+from switchfit.problem.problem import Problem
+
+ENOUGH = 5.0
+"""Standard error in units of the last place that is shown, at least: 1.3 days are shown to the hour."""
+_NUMBER = r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?"
+LAST_PLACES = (("d", 86400.0), ("h", 3600.0), ("min", 60.0), ("s", 1.0))
+
+
+class Timed(Protocol):
+    """What has times: a trajectory, an experiment, residuals of a channel."""
+
+    @property
+    def origin(self) -> Origin | None:
+        """The date at which times are 0; None where they are no dates."""
+
+    @property
+    def time_unit(self) -> str:
+        """Unit of the times."""
+
+
+def format_time(time: float, run: Timed, error: float = np.nan, *, digits: int = 6) -> str:
+    """Return a time as text: a date, or a number without its unit.
+
+    Parameters
+    ----------
+    time : float
+    run : Timed
+    error : float, optional
+        Its standard error, from which the resolution of a date follows; if it is not known, a date is written to a
+        thousandth of the time unit, as far as there is something to be written.
+    digits : int, optional
+        Significant digits of a number.
+    """
+    date = None if run.origin is None else run.origin.find_date(time, run.time_unit)
+    if date is None:
+        return f"{time:.{digits}g}"
+    unit = SECONDS[normalize_time_unit(run.time_unit)]
+    if np.isfinite(error) and error > 0:
+        return format_date(date, error * unit)
+    return format_date(date, ENOUGH * unit / 1000, short=True)
+
+
+def format_date(date: datetime.datetime, error: float, *, short: bool = False) -> str:
+    """Return a date to the place that a standard error in seconds allows.
+
+    Parameters
+    ----------
+    date : datetime
+    error : float
+    short : bool, optional
+        Leave out hours, minutes and seconds that are zero.
+
+    Examples
+    --------
+    >>> import datetime
+    >>> date = datetime.datetime(2020, 3, 23, 17, 41, 12)
+    >>> [format_date(date, error) for error in (6 * 86400, 86400, 900, 20, 0.3)]
+    ['2020-03-23', '2020-03-23 18h', '2020-03-23 17:41', '2020-03-23 17:41:12', '2020-03-23 17:41:12.00']
+    """
+    place = next((name for name, seconds in LAST_PLACES if error >= ENOUGH * seconds), "")
+    finest = min(max(int(np.ceil(-np.log10(max(error, 1e-6) / ENOUGH))), 1), 6) if not place else 0
+    half = {"d": 0.0, "h": 1800.0, "min": 30.0, "s": 0.5}.get(place, 0.5 * 10.0**-finest)
+    rounded = date.replace(tzinfo=None) + datetime.timedelta(seconds=half)
+    fraction = f"{rounded.microsecond:06d}"[:finest]
+    texts = {"d": "", "h": f" {rounded:%H}h", "min": f" {rounded:%H:%M}", "s": f" {rounded:%H:%M:%S}"}
+    text = texts.get(place, f" {rounded:%H:%M:%S}.{fraction}")
+    if short and place != "h":
+        text = text.rstrip("0").rstrip(".") if "." in text else text
+        text = text[:6] if text.endswith(":00") and text.count(":") == 2 else text
+        text = "" if text == " 00:00" else text
+    elif short and text == " 00h":
+        text = ""
+    return f"{rounded:%Y-%m-%d}{text}{_tell_apart(date) if text else ''}"
+
+
+def format_span(first: float, last: float, run: Timed) -> str:
+    """Return two times as text: "0 to 6 h", or "2020-03-02 to 2020-04-21"."""
+    text = f"{format_time(first, run)} to {format_time(last, run)}"
+    return text if run.origin is not None else f"{text}{unit_suffix(run.time_unit)}"
+
+
+def describe_origin(run: Timed) -> str:
+    """Return what the numbers of dated times are, such as "d since 2020-02-29, Europe/Berlin"; "" for other times."""
+    if run.origin is None:
+        return ""
+    zone = f", {run.origin.time_zone}" if run.origin.time_zone else ", no time zone"
+    return f"{run.time_unit} since {format_time(0.0, run, 0.0)}{zone}"
+
+
+def label_time(run: Timed) -> str:
+    """Return the label of an axis of times, such as "time (min)"; with the zone where times are dates."""
+    if run.origin is not None:
+        return f"time ({run.origin.time_zone})" if run.origin.time_zone else "time"
+    unit = unit_suffix(run.time_unit).strip()
+    return f"time ({unit})" if unit else "time"
+
+
+def list_dated(fit: Fit) -> list[Trajectory | None]:
+    """Return the trajectory of each unknown that is a time of an experiment with dates; None for every other."""
+    found: list[Trajectory | None] = [None] * len(fit.theta_names)
+    for e, trajectory in enumerate(fit.trajectories):
+        if trajectory.origin is not None:
+            for place in (*fit.transition_places[e].tolist(), fit.final_places[e]):
+                if place >= 0:
+                    found[place] = trajectory
+    return found
+
+
+def add_dates(text: str, fit: Fit) -> str:
+    """Return a sentence with the date behind each time that it gives as a number, as in ``tau_1 = 3.5``.
+
+    Sentences are made of issues, which know names and numbers, but not what date a number is.
+    """
+    for name, run in zip(fit.theta_names, list_dated(fit), strict=True):
+        if run is not None:
+            before = rf"(?<![\w.]){re.escape(name)} (?:=|is at its (?:lower|upper) bound) "
+            text = re.sub(rf"({before})({_NUMBER})", partial(_append_date, run=run), text)
+    return text
+
+
+def _append_date(match: re.Match[str], run: Timed) -> str:
+    return f"{match[0]} ({format_time(float(match[2]), run)})"
+
+
+def _tell_apart(date: datetime.datetime) -> str:
+    """Return the offset from UTC of a date that the clocks of its zone show twice; "" for any other."""
+    if date.tzinfo is None or date.replace(fold=0).utcoffset() == date.replace(fold=1).utcoffset():
+        return ""
+    return f"{date:%z}"
+
+
+def describe_clock(origin: Origin, time_unit: str) -> dict[str, Any]:
+    """Return how a page's script shows times as dates: milliseconds since 1970 at 0, those of a unit, and the zone.
+
+    Browsers know names of zones, but not all of them know offsets: these are added to the start.
+
+    Parameters
+    ----------
+    origin : Origin
+    time_unit : str
+    """
+    offset = origin.zone.utcoffset(None) if isinstance(origin.zone, datetime.timezone) else None
+    shift = 0.0 if offset is None else 1e3 * offset.total_seconds()
+    zone = "UTC" if offset is not None else origin.time_zone or "UTC"
+    length = 1e3 * SECONDS[normalize_time_unit(time_unit)]
+    return {"start": origin.instant / 1e6 + shift, "length": length, "zone": zone}
+
+
+def list_dated_unknowns(problem: Problem) -> list[Experiment | None]:
+    """Return the experiment of each unknown of a problem that is a time and a date; None for every other."""
+    found: list[Experiment | None] = [None] * len(problem.theta_names)
+    for experiment, places in zip(problem.experiments, problem.unknowns.times, strict=True):
+        if experiment.origin is not None:
+            for place in places[places >= 0].tolist():
+                found[place] = experiment
+    return found
+
+
+def format_unknown(value: float, run: Timed | None, error: float = np.nan) -> str:
+    """Return the value of an unknown without its unit: a date if it is a time of a run with dates.
+
+    Parameters
+    ----------
+    value : float
+    run : Timed or None
+    error : float, optional
+        Its standard error.
+    """
+    return f"{value:.6g}" if run is None else format_time(value, run, error)

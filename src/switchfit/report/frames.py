@@ -1,0 +1,350 @@
+"""The numbers of results as tables: their names, dimensions and units, for pandas, xarray and ArviZ."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from datetime import UTC
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.batch.fits import Fits
+from switchfit.batch.resampling import Bootstrap
+from switchfit.batch.simulated import MonteCarlo
+from switchfit.batch.starts import Multistart
+from switchfit.estimation.estimator import Estimate
+from switchfit.fit.result import Fit
+from switchfit.fit.trajectory import Comparison, Trajectory
+from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.dates import Origin
+from switchfit.report.dates import list_dated
+from switchfit.report.numbers import format_unit
+from switchfit.runtime.frames import Frame, Labels, Variable, describe_frame
+from switchfit.uncertainty.prediction import Prediction
+from switchfit.uncertainty.profiles import Profile
+from switchfit.uncertainty.residuals import ResidualDiagnostics, correct_errors, correct_intervals
+
+ERROR, LOW, HIGH = "{} std. error", "{} low", "{} high"
+"""Names of the columns beside an unknown: its standard error, and the ends of its 95 % interval."""
+
+
+@describe_frame.register(Estimate)
+def describe_estimate(estimate: Estimate, *, what: str = "unknowns") -> Frame:
+    """Return one of the tables of an estimate.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    what : {"unknowns", "trajectories", "residuals", "history"}
+    """
+    tables = {
+        "unknowns": _describe_unknowns,
+        "trajectories": _describe_trajectories,
+        "residuals": _describe_residuals,
+        "history": _describe_history,
+    }
+    return tables[what](estimate)
+
+
+def _describe_unknowns(estimate: Estimate) -> Frame:
+    """Return a row for each unknown; standard errors and intervals allow for correlated residuals, as in the report."""
+    names, rows = estimate.theta_names, ("unknown",)
+    held = [np.array_equal(row, np.zeros(len(names))) for row in estimate.covariance]
+    errors, naive = (np.where(held, np.nan, e) for e in (correct_errors(estimate), estimate.standard_errors))
+    low, high = correct_intervals(estimate).T
+    joins = {transition.index: f"{transition.before} -> {transition.after}" for transition in estimate.transitions}
+    columns: dict[str, Any] = {
+        "value": estimate.theta,
+        "std_error": errors,
+        "low": low,
+        "high": high,
+        "unit": np.array(list(map(format_unit, estimate.theta_units)), dtype=str),
+        "naive_std_error": naive,
+        "guess": estimate.initial_theta,
+        "lower": estimate.lower,
+        "upper": estimate.upper,
+        "transition": np.array([joins.get(i, "") for i in range(len(names))], dtype=str),
+        "held": np.array(["; ".join(list_holds(estimate, name)) for name in names], dtype=str),
+    }
+    dated = list_dated(estimate)
+    if any(run is not None for run in dated):
+        ends = zip(dated, estimate.theta, strict=True)
+        dates = [
+            None if run is None or run.origin is None else run.origin.find_date(t, run.time_unit) for run, t in ends
+        ]
+        columns["date"] = np.array(["" if date is None else date.isoformat() for date in dates], dtype=str)
+    variables = [Variable(name, values, rows) for name, values in columns.items()]
+    square = ("unknown", "unknown_2")
+    variables += [
+        Variable("covariance", estimate.covariance, square, column=""),
+        Variable("correlation", estimate.correlation, square, column=""),
+        Variable("hessian", estimate.hessian, square, column=""),
+    ]
+    labels = {"unknown_2": Labels(names)}
+    return Frame("unknown", (_name_rows("unknown", names),), tuple(variables), labels, _summarize(estimate))
+
+
+def _summarize(estimate: Estimate) -> dict[str, str | float]:
+    """Return how the fit ended."""
+    return {
+        "verdict": estimate.verdict.level,
+        "status": estimate.status.name,
+        "cost": float(estimate.cost),
+        "seconds": float(estimate.seconds),
+    }
+
+
+def _name_rows(dimension: str, names: Sequence[str]) -> Variable:
+    return Variable(dimension, np.array(names, dtype=str), (dimension,))
+
+
+def list_holds(fit: Fit, name: str) -> Iterator[str]:
+    """Yield what holds an unknown: a bound, a kink, or that the cost does not depend on it.
+
+    Parameters
+    ----------
+    fit : Fit
+    name : str
+    """
+    if name in fit.idle:
+        yield "idle"
+    yield from (f"at {c.kind}" for c in fit.active if c.unknown == name and c.position is None)
+    if name in [kink.unknown for kink in fit.kinks]:
+        yield "at a kink"
+
+
+def _describe_trajectories(fit: Fit) -> Frame:
+    """Return a row for each node of each run."""
+    rows, each = ("node",), fit.trajectories
+    runs = np.repeat(np.array(fit.run_names, dtype=str), [len(trajectory.times) for trajectory in each])
+    times = np.concatenate([trajectory.times for trajectory in each])
+    modes = np.concatenate([trajectory.modes for trajectory in each])
+    index = Variable("run", runs, rows), Variable("time", times, rows, _get_time_unit(fit))
+    states = np.concatenate([trajectory.states for trajectory in each])
+    variables = [Variable("mode", modes, rows)]
+    variables += _split(states, rows, each[0].state_names, each[0].state_units)
+    return Frame("node", index, tuple(variables))
+
+
+def _get_time_unit(fit: Fit) -> str:
+    """Return the unit of all times; "" where runs differ in it."""
+    units = {trajectory.time_unit for trajectory in fit.trajectories}
+    return units.pop() if len(units) == 1 else ""
+
+
+def _split(values: FloatArray, rows: tuple[str], names: Sequence[str], units: Sequence[str]) -> list[Variable]:
+    """Return the columns of values (K, n) as variables of their own."""
+    named = zip(names, units, values.T, strict=True)
+    return [Variable(name, column, rows, format_unit(unit)) for name, unit, column in named]
+
+
+def _describe_residuals(estimate: Estimate) -> Frame:
+    """Return a row for each value that was measured, in the order of runs, data and channels."""
+    parts: dict[str, list[NDArray[Any]]] = {}
+    for e, comparisons in enumerate(estimate.comparisons):
+        for comparison, units in zip(comparisons, _list_channel_units(estimate, e), strict=True):
+            for k, channel in enumerate(comparison.names):
+                there = np.isfinite(comparison.measured[:, k])
+                count = int(there.sum())
+                sigma = np.full(count, np.nan) if comparison.sigma is None else comparison.sigma[there, k]
+                residual = comparison.residuals[there, k]
+                columns: dict[str, NDArray[Any]] = {
+                    "run": np.full(count, estimate.run_names[e]),
+                    "channel": np.full(count, channel),
+                    "time": comparison.times[there],
+                    "measured": comparison.measured[there, k],
+                    "fitted": comparison.fitted[there, k],
+                    "residual": residual,
+                    "sigma": sigma,
+                    "standardized": residual / sigma,
+                    "unit": np.full(count, format_unit(units[k])),
+                }
+                for name, values in columns.items():
+                    parts.setdefault(name, []).append(values)
+    rows = ("sample",)
+    whole = {name: np.concatenate(columns) for name, columns in parts.items()}
+    variables = [Variable(name, values, rows) for name, values in whole.items()]
+    index = tuple(v._replace(unit=_get_time_unit(estimate)) if v.name == "time" else v for v in variables[:3])
+    return Frame("sample", index, tuple(variables[3:]))
+
+
+def _list_channel_units(estimate: Estimate, e: int) -> Iterator[tuple[str, ...]]:
+    """Yield the units of the channels of each comparison of a run; those of states that channels are called like."""
+    trajectory, given = estimate.trajectories[e], []
+    if estimate.problem is not None:
+        data = estimate.problem.experiments[e].data
+        given = [item.units for item in data if isinstance(item, Measurements)]
+    states = dict(zip(trajectory.state_names, trajectory.state_units, strict=True))
+    for comparison in estimate.comparisons[e]:
+        stated = given.pop(0) if given and comparison.kind == "measurements" else None
+        named = tuple(states.get(name, "") for name in comparison.names)
+        yield tuple(own or other for own, other in zip(stated or named, named, strict=True))
+
+
+def _describe_history(fit: Fit) -> Frame:
+    """Return a row for each iteration."""
+    rows, history = ("iteration",), fit.history
+    index = (Variable("iteration", np.array([record.iteration for record in history], dtype=np.int64), rows),)
+    columns = {name: np.array([getattr(record, name) for record in history]) for name in ("cost", "optimality", "step")}
+    columns["evaluations"] = np.array([record.evaluations for record in history], dtype=np.int64)
+    theta = np.array([record.theta for record in history]).reshape(-1, len(fit.theta_names))
+    variables = [Variable(name, values, rows) for name, values in columns.items()]
+    return Frame("iteration", index, (*variables, *_split(theta, rows, fit.theta_names, fit.theta_units)))
+
+
+def _list_dates(result: Trajectory | Prediction, rows: tuple[str]) -> list[Variable]:
+    """Return a column with the dates, in UTC if they have a zone; none where times are no dates."""
+    if result.origin is None:
+        return []
+    return [Variable(*_make_dates(result.times, result.origin, result.time_unit), rows)]
+
+
+def _make_dates(times: FloatArray, origin: Origin, time_unit: str) -> tuple[str, NDArray[Any]]:
+    """Return the name of a column of dates, and the dates as datetime64, which have no zone of their own."""
+    dates = [origin.find_date(time, time_unit) for time in times.tolist()]
+    bare = [
+        date if date is None or date.tzinfo is None else date.astimezone(UTC).replace(tzinfo=None) for date in dates
+    ]
+    name = "date (UTC)" if origin.time_zone else "date"
+    return name, np.array(bare, dtype="datetime64[us]").astype("datetime64[ns]")
+
+
+@describe_frame.register(Trajectory)
+def describe_trajectory(trajectory: Trajectory) -> Frame:
+    """Return a row for each time.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+    """
+    rows = ("time",)
+    variables = _list_dates(trajectory, rows)
+    variables.append(Variable("mode", trajectory.modes, rows))
+    variables += _split(trajectory.states, rows, trajectory.state_names, trajectory.state_units)
+    return Frame("time", (Variable("time", trajectory.times, rows, trajectory.time_unit),), tuple(variables))
+
+
+@describe_frame.register(Comparison)
+def describe_comparison(comparison: Comparison) -> Frame:
+    """Return a row for each sample, with four columns for each channel.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    """
+    both = ("time", "channel")
+    variables = [
+        Variable("measured", comparison.measured, both),
+        Variable("fitted", comparison.fitted, both, column="{} fitted"),
+        Variable("residual", comparison.residuals, both, column="{} residual"),
+    ]
+    if comparison.sigma is not None:
+        variables.append(Variable("sigma", comparison.sigma, both, column="{} sigma"))
+    index = (Variable("time", comparison.times, ("time",)),)
+    return Frame("time", index, tuple(variables), {"channel": Labels(comparison.names)})
+
+
+@describe_frame.register(ResidualDiagnostics)
+def describe_diagnostics(diagnostics: ResidualDiagnostics) -> Frame:
+    """Return a row for each channel: its size, and the tests of its residuals.
+
+    Parameters
+    ----------
+    diagnostics : ResidualDiagnostics
+    """
+    rows, channels = ("channel",), diagnostics.channels
+    names = ("mean", "rms", "correlation", "whiteness", "normality", "skewness", "kurtosis", "effective", "outliers")
+    variables = [Variable("samples", np.array([len(channel.values) for channel in channels], dtype=np.int64), rows)]
+    variables += [Variable(name, np.array([getattr(channel, name) for channel in channels]), rows) for name in names]
+    return Frame("channel", (_name_rows("channel", diagnostics.labels),), tuple(variables))
+
+
+@describe_frame.register(Prediction)
+def describe_prediction(prediction: Prediction) -> Frame:
+    """Return a row for each time: states and outputs with standard errors and 95 % confidence bands, sigma of a sample.
+
+    Parameters
+    ----------
+    prediction : Prediction
+    """
+    state, output = ("time", "state"), ("time", "output")
+    low, high = np.moveaxis(prediction.state_band(), -1, 0)
+    output_low, output_high = np.moveaxis(prediction.output_band(), -1, 0)
+    variables = (
+        *_list_dates(prediction, ("time",)),
+        Variable("states", prediction.states, state),
+        Variable("state_errors", prediction.state_errors, state, column=ERROR),
+        Variable("states_low", low, state, column=LOW),
+        Variable("states_high", high, state, column=HIGH),
+        Variable("outputs", prediction.outputs, output, column="{} output"),
+        Variable("output_errors", prediction.output_errors, output, column=ERROR.format("{} output")),
+        Variable("outputs_low", output_low, output, column=LOW.format("{} output")),
+        Variable("outputs_high", output_high, output, column=HIGH.format("{} output")),
+        Variable("noise", prediction.noise, output, column="{} output noise"),
+        Variable("near_transition", prediction.near_transition, ("time",)),
+    )
+    labels = {
+        "state": Labels(prediction.state_names, tuple(map(format_unit, prediction.state_units))),
+        "output": Labels(prediction.output_names),
+    }
+    return Frame("time", (Variable("time", prediction.times, ("time",), prediction.time_unit),), variables, labels)
+
+
+@describe_frame.register(Profile)
+def describe_profile(profile: Profile) -> Frame:
+    """Return a row for each value at which the unknown was held.
+
+    Parameters
+    ----------
+    profile : Profile
+    """
+    rows, fit = (profile.name,), profile.fit
+    low, high = profile.interval()
+    variables = [
+        Variable("cost", profile.costs, rows),
+        Variable("zeta", profile.zeta, rows),
+        Variable("converged", profile.converged, rows),
+        *_split(profile.thetas, rows, fit.theta_names, fit.theta_units),
+    ]
+    others = tuple(variable for variable in variables if variable.name != profile.name)
+    attributes = {"estimate": profile.value, "std_error": profile.standard_error, "level": profile.level}
+    attributes |= {"low": float(low), "high": float(high)}
+    index = (Variable(profile.name, profile.values, rows, format_unit(profile.unit)),)
+    return Frame(profile.name, index, others, attributes=attributes)
+
+
+@describe_frame.register(Fits)
+def describe_fits(fits: Fits) -> Frame:
+    """Return a row for each fit.
+
+    Parameters
+    ----------
+    fits : Fits
+    """
+    rows, both = ("run",), ("run", "unknown")
+    low, high = np.moveaxis(fits.confidence_intervals(), -1, 0)
+    variables = [
+        Variable("level", fits.levels, rows),
+        Variable("status", fits.status, rows),
+        Variable("theta", fits.theta, both),
+        Variable("std_error", np.where(fits.standard_errors > 0, fits.standard_errors, np.nan), both, column=ERROR),
+        Variable("low", low, both, column=LOW),
+        Variable("high", high, both, column=HIGH),
+        Variable("start", fits.start, both, column="{} start"),
+    ]
+    names = ("cost", "explained", "samples", "optimality", "iterations", "evaluations", "collapsed", "at_bounds")
+    variables += [Variable(name, getattr(fits, name), rows) for name in names]
+    variables.append(Variable("message", fits.message, rows))
+    variables.append(Variable("covariance", fits.covariance, (*both, "unknown_2")))
+    attributes: dict[str, str | float] = {"requested": fits.requested, "seconds": float(fits.seconds)}
+    if isinstance(fits, Multistart):
+        variables.insert(2, Variable("cluster", fits.clusters, rows))
+    elif isinstance(fits, MonteCarlo):
+        variables.append(Variable("truth", fits.truth, ("unknown",)))
+    elif isinstance(fits, Bootstrap):
+        variables.append(Variable("estimate", fits.estimate, ("unknown",)))
+        attributes["resample"] = fits.resample
+    units = tuple(map(format_unit, fits.theta_units))
+    labels = {"unknown": Labels(fits.theta_names, units), "unknown_2": Labels(fits.theta_names)}
+    return Frame("run", (Variable("run", fits.runs, rows),), tuple(variables), labels, attributes)

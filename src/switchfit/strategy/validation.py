@@ -1,0 +1,722 @@
+"""Validation: how well the fitted parameters predict another run, with all that is uncertain counted.
+
+With residuals and derivatives in units of sigma, e the noise of the new run, dp the error of the fitted parameters
+(covariance C) and G the derivative of the new run's own unknowns, which were fitted to it, the residuals are
+
+    r = M (e - X dp),      M = I - G G^+,      cov r = M + (M X) C (M X)'.
+
+In a linear model ``z = (I + M X C X' M)^(-1/2) r`` has the covariance M: chi-square is ``z . z``, with as many degrees
+of freedom as values less own unknowns ([1]_, section 3.9, prediction of several new observations). Tests of whiteness
+are made of z, since the error of the parameters, which is common to all samples, correlates the residuals r.
+
+With sigma unknown both in the fit and here, ``z . z / (n s^2)`` is compared with F of (n, degrees of freedom of the
+fit).
+
+References
+----------
+.. [1] G. A. F. Seber, A. J. Lee, Linear Regression Analysis, 2nd ed., Wiley 2003, chapters 3 and 5.
+.. [2] T. Soderstrom, P. Stoica, System Identification, Prentice Hall 1989, section 11.2 (tests of cross-correlation).
+.. [3] L. Ljung, System Identification: Theory for the User, 2nd ed., Prentice Hall 1999, chapter 16 (fit in per cent).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import scipy.special
+from numpy.typing import NDArray
+
+from switchfit.estimation.estimator import Estimate
+from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.result import Fit, inverse_on
+from switchfit.fit.solution import is_least_squares, is_sigma_known
+from switchfit.fit.trajectory import Comparison, SimulatedProblem, Trajectory
+from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.experiment import Experiment, name_runs
+from switchfit.problem.problem import GIVEN, Problem
+from switchfit.problem.tables import list_columns
+from switchfit.problem.validation import as_names, join_names, shorten
+from switchfit.runtime.dispatch import validate_on
+from switchfit.runtime.issue import Issue
+from switchfit.runtime.presentation import draw_figure, format_text
+from switchfit.strategy.choice import estimate as fit_problem
+from switchfit.uncertainty.prediction import Prediction, build_prediction
+from switchfit.uncertainty.quality import explain_all, explain_channel
+from switchfit.uncertainty.residuals import FEWEST, ResidualDiagnostics, diagnose_runs
+from switchfit.uncertainty.sensitivity import Sensitivity, collect_sample_derivatives, compute_sensitivity
+from switchfit.uncertainty.verdict import (
+    CLEARLY_OFF,
+    EXPLAINED,
+    EXPLAINED_UNKNOWN,
+    HALF,
+    LEVELS,
+    UNLIKELY,
+    Finding,
+    Verdict,
+)
+
+NEGLIGIBLE = 1e-10
+"""Singular value of the derivative of the own unknowns, relative to the largest, of a direction that does nothing."""
+
+
+class InputCorrelation(NamedTuple):
+    """Whether the residuals of one channel depend on one input.
+
+    Attributes
+    ----------
+    channel, input : str
+    probability : float
+        Of so large a correlation at lags 0 to `lags`, in samples, if there is none; NaN for fewer than 20 values or an
+        input that is constant.
+    lags : int
+
+    See Also
+    --------
+    Validation
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> sf.InputCorrelation("speed", "torque", probability=0.4, lags=5).input
+    'torque'
+    """
+
+    channel: str
+    input: str
+    probability: float
+    lags: int
+
+
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """How well the parameters of a fit predict another run; print it for the report.
+
+    Attributes
+    ----------
+    fit : Fit
+        The fit whose parameters these are.
+    problem : Problem
+        The other run, with the parameters of the fit.
+    theta_names : tuple of str
+        Its unknowns: its own, and the parameters that were kept.
+    theta : (d,)
+    kept : tuple of str
+        Unknowns that come from the fit.
+    covariance : (d, d)
+        Of theta: for parameters that of the fit, for own unknowns what follows from it and from the new data. NaN if
+        the fit has none.
+    refit : Estimate or None
+        The estimation of the own unknowns; None if nothing was estimated.
+    run_names : tuple of str
+    trajectories : tuple of Trajectory, one for each experiment
+    comparisons : tuple of tuples of Comparison, one tuple for each experiment
+    chi_square : float
+        Sum of the squared residuals over what is expected of them, the error of the parameters included; NaN if the
+        noise or the covariance of the fit is unknown, a loss is robust, a delay is a parameter, or with reference
+        signals.
+    freedom : int
+        Its degrees of freedom: values less own unknowns that were estimated.
+    sigma_known : bool or None
+        Whether the noise is known; None with other data than Measurements.
+    residual_variance : float
+        Variance of the noise by which residuals are divided where sigma is unknown: that of the fit.
+    residuals : ResidualDiagnostics
+        Tests of the residuals, those of `chi_square` where there is one.
+    inputs : tuple of InputCorrelation
+        Tests of the residuals of each channel with each input.
+
+    See Also
+    --------
+    Estimate.validate : returns it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    Fit every other reading, and predict the rest with the parameter and the transition time of its own:
+
+    >>> log = problem.experiments[0].data[0]
+    >>> halves = [sf.Measurements(log.times[k::2], log.values[k::2], sigma=0.2) for k in (0, 1)]
+    >>> runs = [sf.Experiment(half, ("on", "off"), (2.0,), 0.0, 6.0) for half in halves]
+    >>> found = sf.estimate(sf.Problem(problem.system, runs[0], problem.parameters)).validate(runs[1])
+    >>> round(found.percent), round(found.explained, 3)
+    (96, 0.999)
+    >>> print(found.verdict)
+    Good: the fitted parameters predict 99.87 % of the variance (fit 96.4 %; chi² 3.94 for 11 degrees of freedom).
+    """
+
+    fit: Fit = field(repr=False)
+    problem: Problem = field(repr=False)
+    theta_names: tuple[str, ...]
+    theta: FloatArray
+    kept: tuple[str, ...]
+    covariance: FloatArray = field(repr=False)
+    refit: Estimate | None = field(repr=False)
+    run_names: tuple[str, ...]
+    trajectories: tuple[Trajectory, ...] = field(repr=False)
+    comparisons: tuple[tuple[Comparison, ...], ...] = field(repr=False)
+    chi_square: float
+    freedom: int
+    sigma_known: bool | None
+    residual_variance: float
+    residuals: ResidualDiagnostics = field(repr=False)
+    inputs: tuple[InputCorrelation, ...] = ()
+
+    @property
+    def explained(self) -> float:
+        """R²: share of the variance of all channels that is predicted, each in units of its sigma."""
+        return explain_all(self.comparisons)
+
+    @property
+    def percent(self) -> float:
+        """Fit in per cent, ``100 (1 - |y - predicted| / |y - mean|)`` over all channels; 100 at best."""
+        return convert_to_percent(self.explained)
+
+    @property
+    def channels(self) -> dict[str, float]:
+        """Fit in per cent of each channel, by its name, and that of its run if there are several."""
+        single, found = len(self.comparisons) == 1, {}
+        for run, comparisons in zip(self.run_names, self.comparisons, strict=True):
+            for comparison in comparisons:
+                for k, name in enumerate(comparison.names):
+                    if np.isfinite(comparison.measured[:, k]).any():
+                        label = name if single else f"{run} {name}"
+                        found[label] = convert_to_percent(explain_channel(comparison, k))
+        return found
+
+    @property
+    def standard_errors(self) -> FloatArray:
+        """Standard errors of theta: (d,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def probability(self) -> float:
+        """Probability of such a chi-square, or a larger one, if model and noise are right; NaN without."""
+        if not np.isfinite(self.chi_square) or self.freedom <= 0:
+            return np.nan
+        if self.sigma_known:
+            return float(scipy.special.chdtrc(self.freedom, self.chi_square))
+        return float(scipy.special.fdtrc(self.freedom, self.fit.freedom, self.chi_square / self.freedom))
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Whether the parameters hold for the other run: good, doubtful or bad, and why. Print it for one line."""
+        return judge_validation(self)
+
+    @cached_property
+    def predictions(self) -> tuple[Prediction, ...]:
+        """The predicted curves with their bands, one for each experiment; empty if the fit has no covariance."""
+        if not np.isfinite(self.covariance).all():
+            return ()
+        evaluator = Evaluator(self.problem, theta=self.theta)
+        return tuple(
+            build_prediction(self, self.problem, e, compute_sensitivity(self.problem, e, self.theta, mesh).nodes)
+            for e, mesh in enumerate(evaluator.meshes)
+        )
+
+    def quantile(self, level: float) -> float:
+        """Return the two-sided quantile of bands, that of the fit.
+
+        See Also
+        --------
+        Prediction.prediction_band
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> round(fit.validate(fit.problem).quantile(0.95), 2)
+        1.96
+        """
+        return self.fit.quantile(level)
+
+    def plot(self, *, level: float = 0.95) -> Any:
+        """Draw measured against predicted with bands, and the residuals, as a matplotlib Figure.
+
+        Parameters
+        ----------
+        level : float, between 0 and 1
+            Level of the bands.
+
+        See Also
+        --------
+        Estimate.plot
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> len(fit.validate(fit.problem).plot().axes)
+        2
+        """
+        return draw_figure(self, level=level)
+
+    def __str__(self) -> str:
+        return format_text(self)
+
+
+def convert_to_percent(explained: float) -> float:
+    """Return the fit in per cent, ``100 (1 - sqrt(1 - R²))``.
+
+    Parameters
+    ----------
+    explained : float
+        R².
+    """
+    return float(100 * (1 - np.sqrt(1 - explained)))
+
+
+@validate_on.register(Estimate)
+def validate(estimate: Estimate, other: Any, *, refit: Sequence[str] | None = None) -> Validation:
+    """Return how well the parameters of an estimate predict another run, see `Estimate.validate`.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    other : Experiment, list of Experiment, Problem, Measurements or Log
+    refit : sequence of str, optional
+    """
+    return validate_problem(estimate, build_other_problem(estimate, other), refit, "auto")
+
+
+def validate_problem(
+    estimate: Estimate, problem: Problem, refit: Sequence[str] | None, strategy: Literal["auto", "local"]
+) -> Validation:
+    """Return how well the parameters of an estimate predict the runs of a problem, which has their values.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    problem : Problem
+        As from `build_other_problem`.
+    refit : sequence of str or None
+    strategy : {"auto", "local"}
+        Of the estimation of the own unknowns.
+    """
+    spans = problem.unknowns.parameters
+    kept = {
+        problem.theta_names[i]: i
+        for name, span in spans.items()
+        if name in estimate.parameters
+        for i in range(span.start, span.stop)
+    }
+    own = [name for name in problem.theta_names if name not in kept]
+    asked = own if refit is None else list(as_names(refit, "refit", "a sequence of names of unknowns"))
+    unknown = [name for name in asked if name not in own]
+    if unknown:
+        raise ValueError(
+            f"refit names {shorten(unknown[0])}, which is no unknown of the other run's own; these are "
+            f"{join_names(own)}. Parameters of the fit are kept."
+        )
+    theta, found = problem.initial_theta, None
+    if asked:
+        held = [name for name in problem.theta_names if name not in asked]
+        found = fit_problem(fix_unknowns(problem, held), strategy=strategy)
+        places = [problem.theta_names.index(name) for name in found.theta_names]
+        theta[places] = found.theta
+    return measure_validation(estimate, problem, theta, kept, found)
+
+
+def build_other_problem(estimate: Estimate, other: Any) -> Problem:
+    """Return the problem of another run, in which the parameters of a fit begin at their fitted values, without priors.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    other : Experiment, list of Experiment, Problem, Measurements or Log
+    """
+    if isinstance(other, Problem):
+        given, runs = other, list(other.experiments)
+    else:
+        given = estimate.evaluator_at_solution().problem
+        several = list(other) if isinstance(other, (list, tuple)) else [other]
+        if all(isinstance(item, Experiment) for item in several) and several:
+            runs = several
+        else:
+            runs = [_build_experiment(estimate, given, other)]
+    parameters = {}
+    for name, parameter in given.parameters.items():
+        if name in estimate.parameters:
+            value = estimate.parameters[name]
+            bounds = {"lower": np.minimum(parameter.lower, value), "upper": np.maximum(parameter.upper, value)}
+            held = parameter.fixed or name in estimate.fixed
+            parameter = replace(parameter, value=value, **bounds, prior=None, fixed=held)
+        parameters[name] = parameter
+    return Problem(**{name: getattr(given, name) for name in GIVEN} | {"experiments": runs, "parameters": parameters})
+
+
+def _build_experiment(estimate: Estimate, problem: Problem, other: Any) -> Experiment:
+    """Return the only experiment of a fit with the data of another log."""
+    items = [item for item in problem.experiments[0].data if isinstance(item, Measurements)]
+    given = list(other) if isinstance(other, (list, tuple)) else [other]
+    is_log = list_columns(other) is not None and hasattr(other, "times")
+    if not is_log and not (given and all(isinstance(item, Measurements) for item in given)):
+        raise TypeError(
+            "validate needs another run: an sf.Experiment or a list of them, an sf.Problem, sf.Measurements or a log; "
+            f"got {shorten(other)}."
+        )
+    if len(problem.experiments) > 1:
+        raise ValueError(
+            f"the fit has {len(problem.experiments)} experiments: give validate an sf.Experiment, which says what the "
+            "other log is."
+        )
+    run = problem.experiments[0]
+    if run.inputs is not None:
+        raise ValueError(
+            "the fit has an input, and another run has its own: give validate an sf.Experiment with inputs=..."
+        )
+    if is_log:
+        given = [_read_channels(other, item) for item in items]
+    if len(given) != len(items) or len(items) != len(run.data):
+        raise ValueError(
+            f"the fit has {len(run.data)} data in its experiment, {len(items)} of them Measurements; got {len(given)} "
+            "Measurements for the other run. Give validate an sf.Experiment with all data of it."
+        )
+    data = [_complete(new, item) for new, item in zip(given, items, strict=True)]
+    first, last = min(item.seen_times[0] for item in data), max(item.times[-1] for item in data)
+    t0 = first if "t0" in run.taken_from_data else run.t0
+    times = estimate.transition_times[0]
+    if np.any(np.diff([t0, *times, last]) <= 0):
+        times = np.linspace(t0, last, len(run.mode_sequence) + 1)[1:-1]
+    guesses = tuple(
+        replace(tau, value=np.clip(time, tau.lower, tau.upper), prior=None)
+        for tau, time in zip(run.transition_times, times, strict=True)
+    )
+    return replace(run, data=data, t0=t0, tf=run.tf if run.has_free_tf else last, transition_times=guesses)
+
+
+def _read_channels(log: Any, like: Measurements) -> Measurements:
+    """Return the Measurements of a log's columns that are called like the channels of others."""
+    if like.names is None:
+        raise ValueError(
+            "the channels of the fit have no names by which to find the columns of the log: give its Measurements "
+            "names, or give validate sf.Measurements."
+        )
+    missing = [name for name in like.names if name not in log]
+    if missing:
+        raise ValueError(f"the log has no column {join_names(missing)}; it has {join_names(list(log.columns))}.")
+    values = np.stack([np.asarray(log[name], dtype=np.float64) for name in like.names], axis=1)
+    return Measurements(log.times, values, names=like.names)
+
+
+def _complete(new: Measurements, like: Measurements) -> Measurements:
+    """Return Measurements with what is left out in them taken from others, where the channels are as many."""
+    if new.values.shape[1] != like.values.shape[1]:
+        raise ValueError(
+            f"the Measurements of the fit have {like.values.shape[1]} channels, those of the other run "
+            f"{new.values.shape[1]}."
+        )
+    left_out: dict[str, Any] = {}
+    if new.sigma is None and like.sigma is not None:
+        if isinstance(like.sigma, np.ndarray) and like.sigma.ndim == 2:
+            raise ValueError(
+                "sigma differs from sample to sample in the fit: give the Measurements of the other run their "
+                "own sigma."
+            )
+        left_out["sigma"] = like.sigma
+        left_out |= {"loss": like.loss, "loss_scale": like.loss_scale}
+    if new.observe is None:
+        left_out["observe"] = like.observe
+    if new.delay == 0.0:
+        left_out["delay"] = like.delay
+    left_out |= {name: getattr(like, name) for name in ("names", "units") if getattr(new, name) is None}
+    return replace(new, **left_out)
+
+
+def fix_unknowns(problem: Problem, names: Sequence[str], theta: FloatArray | None = None) -> Problem:
+    """Return a problem with some of its unknowns fixed at theta (d,), by default at the guess.
+
+    Parameters
+    ----------
+    problem : Problem
+    names : sequence of str
+        Of all entries of a parameter, or of none.
+    theta : (d,), optional
+    """
+    at = problem.initial_theta if theta is None else theta
+    fixed = {problem.theta_names.index(name) for name in names}
+    unknowns = problem.unknowns
+
+    def fix(parameter: Any, place: int) -> Any:
+        return replace(parameter, value=at[place], fixed=True) if place in fixed else parameter
+
+    runs = []
+    for e, run in enumerate(problem.experiments):
+        times = tuple(fix(tau, i) for tau, i in zip(run.times, unknowns.times[e].tolist(), strict=True))
+        count = len(run.transition_times)
+        changes: dict[str, Any] = {"transition_times": times[:count]}
+        if len(times) > count:
+            changes["tf"] = times[count] if not times[count].fixed else float(times[count].value)
+        states = unknowns.initial_states[e]
+        if (states >= 0).any():
+            initial = problem.system.initial_state if run.initial_state is None else run.initial_state
+            changes["initial_state"] = [
+                fix(x, i) if i >= 0 else x for x, i in zip(initial, states.tolist(), strict=True)
+            ]
+        runs.append(replace(run, **changes))
+    parameters = {}
+    for name, parameter in problem.parameters.items():
+        span = unknowns.parameters.get(name)
+        places = set() if span is None else set(range(span.start, span.stop))
+        if places & fixed and not places <= fixed:
+            raise ValueError(f"the entries of {name!r} are estimated all together, or none of them.")
+        held = bool(places) and places <= fixed
+        parameters[name] = (
+            replace(parameter, value=at[span].reshape(parameter.shape), fixed=True) if held else parameter
+        )
+    return Problem(**{name: getattr(problem, name) for name in GIVEN} | {"experiments": runs, "parameters": parameters})
+
+
+def measure_validation(
+    estimate: Estimate, problem: Problem, theta: FloatArray, kept: Mapping[str, int], refit: Estimate | None
+) -> Validation:
+    """Return the validation of an estimate on a problem at theta.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    problem : Problem
+    theta : (d,)
+        With the parameters of the fit and the own unknowns of the problem.
+    kept : mapping of str to int
+        Unknowns that come from the fit, and where they are in theta.
+    refit : Estimate or None
+        Estimation of the others.
+    """
+    evaluator = Evaluator(problem, theta=theta)
+    trajectories, comparisons = SimulatedProblem(evaluator, theta).compare()
+    sensitivities = [compute_sensitivity(problem, e, theta, mesh) for e, mesh in enumerate(evaluator.meshes)]
+    noise = _choose_noise(estimate, problem)
+    whitened = _whiten(estimate, problem, sensitivities, comparisons, kept, refit, noise)
+    judged = [
+        [replace(c, measured=c.fitted + z, downweighted=None) for c, z in zip(run, shown, strict=True)]
+        for run, shown in zip(comparisons, whitened.residuals, strict=True)
+    ]
+    names = name_runs(problem.experiments)
+    diagnostics = diagnose_runs(judged, names, trajectories)
+    return Validation(
+        fit=estimate,
+        problem=problem,
+        theta_names=problem.theta_names,
+        theta=theta,
+        kept=tuple(kept),
+        covariance=whitened.covariance,
+        refit=refit,
+        run_names=names,
+        trajectories=trajectories,
+        comparisons=comparisons,
+        chi_square=whitened.chi_square,
+        freedom=whitened.freedom,
+        sigma_known=is_sigma_known(problem),
+        residual_variance=noise**2,
+        residuals=diagnostics,
+        inputs=tuple(_correlate_inputs(problem, diagnostics)),
+    )
+
+
+def _choose_noise(estimate: Estimate, problem: Problem) -> float:
+    """Return what residuals are divided by where sigma is unknown: 1 where it is known, NaN where nothing says it."""
+    if is_sigma_known(problem):
+        return 1.0
+    return float(np.sqrt(estimate.residual_variance)) if estimate.sigma_known is False else np.nan
+
+
+class _Whitened(NamedTuple):
+    """Residuals in the units of the data, decorrelated, as lists like the comparisons; and what follows from them."""
+
+    residuals: list[list[FloatArray]]
+    chi_square: float
+    freedom: int
+    covariance: FloatArray
+
+
+def _whiten(
+    estimate: Estimate,
+    problem: Problem,
+    sensitivities: Sequence[Sensitivity],
+    comparisons: Sequence[Sequence[Comparison]],
+    kept: Mapping[str, int],
+    refit: Estimate | None,
+    noise: float,
+) -> _Whitened:
+    """Return the residuals with the correlation removed that the error of the parameters makes."""
+    d = len(problem.theta_names)
+    found = [[c.residuals.copy() for c in run] for run in comparisons]
+    freedom = sum(int(np.isfinite(c.measured).sum()) for run in comparisons for c in run if c.kind == "measurements")
+    Z = np.zeros((d, 0))
+    if refit is not None:
+        where = [problem.theta_names.index(name) for name in refit.theta_names]
+        Z = np.zeros((d, refit.free_basis.shape[1]))
+        Z[where] = refit.free_basis
+        freedom += len(refit.priors) - Z.shape[1]
+    C = _expand_covariance(estimate, kept, d)
+    items = [item for run in problem.experiments for item in run.data]
+    delayed = any(isinstance(item, Measurements) and isinstance(item.delay, str) for item in items)
+    usable = is_sigma_known(problem) is not None and is_least_squares_or_scaled(problem) and not delayed
+    if not (usable and np.isfinite(C).all() and np.isfinite(noise)):
+        return _Whitened(found, np.nan, freedom, np.full((d, d), np.nan))
+    samples = collect_sample_derivatives(problem, sensitivities)
+    sigma = _collect_sigma(comparisons) * noise
+    X, r = samples.derivative / sigma[:, None], -samples.residual / sigma
+    priors = problem.unknowns.priors
+    if refit is not None and refit.priors:
+        rows = [i for i in where if priors.precision[i] > 0]
+        values = refit.theta[[where.index(i) for i in rows]]
+        log, root = priors.log[rows], np.sqrt(priors.precision[rows])
+        e = np.where(log, np.log(np.where(log, values, 1.0)), values) - priors.center[rows]
+        unit = np.zeros((len(rows), d))
+        unit[np.arange(len(rows)), rows] = root * np.where(log, 1.0 / np.where(log, values, 1.0), 1.0)
+        X, r = np.vstack([X, unit]), np.append(r, -root * e)
+    left, size, right = np.linalg.svd(X @ Z, full_matrices=False)
+    does = size > NEGLIGIBLE * size.max(initial=0.0)
+    Q, root = left[:, does], Z @ (right[does].T / size[does])  # Z G^+ = root Q'
+    values, vectors = np.linalg.eigh(C)
+    half = vectors * np.sqrt(np.maximum(values, 0.0))
+    U = X @ half
+    across = U - Q @ (Q.T @ U)
+    W, s, _ = np.linalg.svd(across, full_matrices=False)
+    r = r - Q @ (Q.T @ r)  # a fit that ended at a kink or a bound leaves a part
+    z = r + W @ ((1 / np.sqrt(1 + s**2) - 1) * (W.T @ r))
+    for e, run in enumerate(comparisons):
+        measured = [k for k, c in enumerate(run) if c.kind == "measurements"]
+        for k, item in enumerate(measured):
+            there = np.isfinite(run[item].residuals)
+            here = (samples.experiment == e) & (samples.item == k)
+            found[e][item][there] = (z[: len(sigma)] * sigma)[here]
+    own = half - root @ (Q.T @ U)  # how own unknowns follow the error of the parameters
+    alone = root @ root.T
+    if refit is not None:
+        # The exact Hessian, as of any fit: a transition time at which the vector field does not jump has no first
+        # derivative, and would have no error.
+        exact = inverse_on(refit.free_basis, refit.hessian) * noise**2
+        if np.isfinite(exact).all():
+            alone = np.zeros((d, d))
+            alone[np.ix_(where, where)] = exact
+    return _Whitened(found, float(z @ z), freedom, own @ own.T + alone)
+
+
+def is_least_squares_or_scaled(problem: Problem) -> bool:
+    """Return whether residuals over sigma are normal: no loss is robust. A sigma may be a parameter.
+
+    Parameters
+    ----------
+    problem : Problem
+    """
+    if is_least_squares(problem):
+        return True
+    items = [item for run in problem.experiments for item in run.data if isinstance(item, Measurements)]
+    return all(item.loss == "linear" for item in items)
+
+
+def _expand_covariance(estimate: Estimate, kept: Mapping[str, int], d: int) -> FloatArray:
+    """Return the covariance of the parameters of a fit at their places in another theta: (d, d)."""
+    shared = [(estimate.theta_names.index(name), i) for name, i in kept.items() if name in estimate.theta_names]
+    C = np.zeros((d, d))
+    if shared:
+        there, here = (np.array(column) for column in zip(*shared, strict=True))
+        C[np.ix_(here, here)] = estimate.covariance[np.ix_(there, there)]
+    return C
+
+
+def _collect_sigma(comparisons: Sequence[Sequence[Comparison]]) -> FloatArray:
+    """Return the sigma of all samples that are not missing, in the order of their derivatives; 1 where unknown."""
+    parts = [np.zeros(0)]
+    for comparison in (c for run in comparisons for c in run if c.kind == "measurements"):
+        there = np.isfinite(comparison.measured)
+        parts.append(np.ones(int(there.sum())) if comparison.sigma is None else comparison.sigma[there])
+    return np.concatenate(parts)
+
+
+def _correlate_inputs(problem: Problem, diagnostics: ResidualDiagnostics) -> list[InputCorrelation]:
+    """Test the residuals of each channel with each input of its run."""
+    found = []
+    for label, channel in zip(diagnostics.labels, diagnostics.channels, strict=True):
+        run = problem.experiments[channel.experiment]
+        if run.inputs is None:
+            continue
+        values = run.inputs.signal(run.t0, run.end)(channel.times)
+        width = values.shape[1]
+        names = run.inputs.names or (("u",) if width == 1 else tuple(f"u{k + 1}" for k in range(width)))
+        for name, u in zip(names, values.T, strict=True):
+            found.append(InputCorrelation(label, name, correlate(channel.values, u, channel.lags), channel.lags))
+    return found
+
+
+def correlate(z: FloatArray, u: FloatArray, lags: int) -> float:
+    """Return the probability of the correlation of residuals z (n,) with an input u (n,) at lags 0 to `lags`, or of a
+    larger one, if z is white and independent of u; NaN for fewer than 20 values, or if u does not vary.
+
+    With Phi the input at these lags, each less its mean, ``z' Phi (Phi' Phi)^+ Phi' z / (z' z / n)`` is chi-square with
+    the rank of Phi degrees of freedom.
+
+    Parameters
+    ----------
+    z, u : (n,)
+    lags : int
+    """
+    if len(z) < FEWEST:
+        return np.nan
+    Phi = np.stack([u[lags - k : len(u) - k] for k in range(lags + 1)], axis=1)
+    Phi = Phi - Phi.mean(axis=0)
+    left, size, _ = np.linalg.svd(Phi, full_matrices=False)
+    kept: NDArray[np.bool_] = size > 1e-8 * max(float(np.abs(u).max(initial=0.0)), 1e-300) * np.sqrt(len(u))
+    if not kept.any():
+        return np.nan
+    inner = z[lags:]
+    square = float(inner @ inner) / len(inner)
+    statistic = float(np.sum((left[:, kept].T @ inner) ** 2)) / square if square > 0 else 0.0
+    return float(scipy.special.chdtrc(int(kept.sum()), statistic))
+
+
+def judge_validation(found: Validation) -> Verdict:
+    """Return the verdict on a validation.
+
+    Parameters
+    ----------
+    found : Validation
+    """
+    explained = found.explained
+    figures: dict[str, float | tuple[float, ...]] = {
+        "explained": explained,
+        "percent": found.percent,
+        "chi-square": found.chi_square,
+        "freedom": float(found.freedom),
+        "probability": found.probability,
+    }
+    against: list[Finding] = []
+    if found.refit is not None and not found.refit.status.successful:
+        names = tuple(name for name in found.theta_names if name not in found.kept)
+        against.append(Finding("bad", Issue("own unknowns not converged", names), ("give a better guess",)))
+    correlated = any(found.residuals.correlated)
+    if np.isfinite(found.probability):
+        ratio = found.chi_square / found.freedom
+        if found.probability < UNLIKELY and ratio > 1 + CLEARLY_OFF:
+            level = "doubtful" if explained >= EXPLAINED else "bad"
+            against.append(Finding(level, Issue("predicts badly", (), figures), ("look at plot",)))  # type: ignore[arg-type]
+    elif not explained >= (EXPLAINED_UNKNOWN if correlated else HALF):
+        against.append(Finding("bad", Issue("predicts badly", (), figures), ("look at plot",)))
+    if correlated:
+        labels = [label for label, own in zip(found.residuals.labels, found.residuals.correlated, strict=True) if own]
+        against.append(Finding("doubtful", Issue("prediction errors correlated", tuple(labels))))
+    tested = [test for test in found.inputs if test.probability < UNLIKELY / len(found.inputs)]
+    if tested:
+        against.append(Finding("doubtful", Issue("input not explained", tuple(t.input for t in tested))))
+    if not against:
+        return Verdict("good", (Issue("predicts", (), figures),))
+    against.sort(key=lambda finding: -LEVELS.index(finding.level))
+    reasons = [finding.reason for finding in against]
+    if all(reason.kind != "predicts badly" for reason in reasons):
+        reasons.append(Issue("predicts", (), figures))
+    steps = dict.fromkeys(step for finding in against for step in finding.steps)
+    return Verdict(against[0].level, tuple(reasons), tuple(Issue(f"next: {step}") for step in steps))

@@ -1,0 +1,910 @@
+"""Dates on the way in and out: against pandas, zoneinfo and exact arithmetic."""
+
+import csv
+import datetime as dt
+import json
+import re
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from zoneinfo import ZoneInfo
+
+import matplotlib
+import numpy as np
+import pandas as pd
+import polars as pl
+import pytest
+import xarray as xr
+from browser import Browser, find_browser
+from hypothesis import given
+from hypothesis import strategies as st
+from models import charge, decay, first_state
+from typer.testing import CliRunner
+
+import switchfit as sf
+from switchfit.cli import app
+from switchfit.io.problem_file import load_problem
+from switchfit.io.result_tables import write_runs, write_unknowns
+from switchfit.io.summary import describe
+from switchfit.problem.dates import NANOSECONDS, Dates, Origin, as_dates, from_epoch, make_origin
+from switchfit.report.date_axis import DateLocator
+from switchfit.report.dates import add_dates, format_date, format_time
+from switchfit.runtime.errors import InputError
+
+matplotlib.use("agg")
+
+BERLIN = ZoneInfo("Europe/Berlin")
+EXAMPLES = Path(__file__).parent.parent / "examples"
+DAYS = ["2020-03-28", "2020-03-29", "2020-03-30", "2020-03-31"]
+VALUES = [1.0, 2.0, 1.5, 1.0]
+ROOM = sf.HybridSystem({"on": charge, "off": decay}, [0.0])
+
+
+def log(times, **more):
+    return sf.Measurements(times, VALUES[: len(times)], sigma=0.1, **more)
+
+
+def run_of(times, transition=None, **more):
+    return sf.Experiment(log(times), ("on", "off"), transition, **{"time_unit": "h"} | more)
+
+
+# --- what is a date ---------------------------------------------------------------------------------------------------
+
+NAIVE = {
+    "text": DAYS,
+    "an array of text": np.array(DAYS),
+    "datetime64[D]": np.array(DAYS, dtype="datetime64[D]"),
+    "datetime64[us]": np.array(DAYS, dtype="datetime64[us]"),
+    "a list of datetime64": [np.datetime64(day) for day in DAYS],
+    "datetime": [dt.datetime.fromisoformat(day) for day in DAYS],
+    "date": [dt.date.fromisoformat(day) for day in DAYS],
+    "an array of objects": np.array([dt.date.fromisoformat(day) for day in DAYS], dtype=object),
+    "an index": pd.DatetimeIndex(DAYS),
+    "a column of pandas": pd.Series(pd.to_datetime(DAYS)),
+    "a column of text": pd.Series(DAYS),
+    "timestamps": list(pd.DatetimeIndex(DAYS)),
+    "a column of polars": pl.Series([dt.datetime.fromisoformat(day) for day in DAYS]),
+    "days of polars": pl.Series([dt.date.fromisoformat(day) for day in DAYS]),
+    "text of polars": pl.Series(DAYS),
+    "an array of xarray": xr.DataArray(np.array(DAYS, dtype="datetime64[ns]")),
+}
+AWARE = {
+    "text": [
+        f"{day}T00:00{offset}" for day, offset in zip(DAYS, ("+01:00", "+01:00", "+02:00", "+02:00"), strict=True)
+    ],
+    "datetime": [dt.datetime.fromisoformat(day).replace(tzinfo=BERLIN) for day in DAYS],
+    "an index": pd.DatetimeIndex(DAYS, tz="Europe/Berlin"),
+    "a column of pandas": pd.Series(pd.DatetimeIndex(DAYS, tz="Europe/Berlin")),
+    "timestamps": list(pd.DatetimeIndex(DAYS, tz="Europe/Berlin")),
+    "a column of polars": pl.Series(pd.DatetimeIndex(DAYS, tz="Europe/Berlin")),
+    "numbers since 1970": from_epoch([1585350000, 1585436400, 1585519200, 1585605600]),
+    "in UTC": pd.DatetimeIndex(DAYS, tz="Europe/Berlin").tz_convert("UTC"),
+}
+
+
+@pytest.mark.parametrize("kind", NAIVE)
+def test_dates_without_a_zone_have_days_of_24_hours(kind):
+    run = run_of(NAIVE[kind])
+    np.testing.assert_array_equal(run.data[0].times, [0.0, 24.0, 48.0, 72.0])
+    assert (run.origin, run.time_zone) == (Origin("2020-03-28T00:00:00", ""), None)
+    assert run.tf == 72.0
+    np.testing.assert_array_equal(run_of(NAIVE[kind], time_zone="Europe/Berlin").data[0].times, [0.0, 24.0, 47.0, 71.0])
+
+
+@pytest.mark.parametrize("kind", AWARE)
+def test_dates_with_a_zone_are_moments(kind):
+    run = run_of(AWARE[kind], time_unit="d")
+    np.testing.assert_array_equal(run.data[0].times, np.array([0.0, 24.0, 47.0, 71.0]) / 24)
+    zoned = run_of(AWARE[kind], time_zone="Europe/Berlin")
+    assert zoned.origin == Origin("2020-03-28T00:00:00+01:00", "Europe/Berlin")
+    assert run.origin.instant == zoned.origin.instant
+
+
+def test_the_zone_of_the_dates_is_that_in_which_they_are_shown():
+    assert run_of(AWARE["an index"]).time_zone == run_of(AWARE["timestamps"]).time_zone == "Europe/Berlin"
+    assert run_of(AWARE["text"]).time_zone == "UTC", "two offsets"
+    assert run_of([f"{day}T00:00+01:00" for day in DAYS]).time_zone == "+01:00"
+
+
+def test_numbers_are_numbers_as_ever():
+    run = run_of([0.0, 1.0, 2.0], [1.5], time_unit="fortnight")
+    assert (run.origin, run.time_zone) == (None, None)
+    assert run_of([1.7e12, 1.8e12, 1.9e12]).origin is None, "never told by their size"
+
+
+def test_every_unit():
+    times = ["2024-05-01T00:00:00", "2024-05-02T12:00:00"]
+    for unit, length in NANOSECONDS.items():
+        run = sf.Experiment(log(times), ("on",), (), time_unit=unit)
+        assert run.tf == Fraction(36 * NANOSECONDS["h"], length)
+    assert sf.Experiment(log(times), ("on",), (), time_unit="hours").tf == 36.0
+
+
+def test_nanoseconds_are_kept():
+    """As numbers since 1970, all of these would be one float64."""
+    instants = np.datetime64("2024-05-01T12:00:00", "ns") + np.array([0, 1, 2, 500])
+    run = sf.Experiment(log(instants), ("on",), (), time_unit="ns")
+    np.testing.assert_array_equal(run.data[0].times, [0.0, 1.0, 2.0, 500.0])
+    text = ["2024-05-01T12:00:00.000000001", "2024-05-01T12:00:00.0000005"]
+    np.testing.assert_array_equal(as_dates(text, "times").instants, instants.astype(np.int64)[[1, 3]])
+    np.testing.assert_array_equal(
+        as_dates(list(pd.DatetimeIndex(instants)), "times").instants, instants.astype(np.int64)
+    )
+
+
+# --- round trips ------------------------------------------------------------------------------------------------------
+
+MICROSECONDS = st.integers(-6 * 10**15, 8 * 10**15)
+ZONES = st.sampled_from(["UTC", "Europe/Berlin", "Asia/Kathmandu", "America/St_Johns", "Australia/Lord_Howe", "-03:30"])
+
+
+@given(MICROSECONDS, MICROSECONDS, ZONES, st.sampled_from(list(NANOSECONDS)))
+def test_a_number_is_the_exact_difference_rounded_once(start, instant, zone, unit):
+    origin = make_origin(1000 * start, zone)
+    assert origin.instant == 1000 * start
+    assert Origin(origin.date, origin.time_zone) == origin
+    number = origin.to_numbers(Dates(np.array(1000 * instant), "UTC"), unit)
+    exact = Fraction(1000 * (instant - start), NANOSECONDS[unit])
+    assert abs(Fraction(float(number)) - exact) <= abs(exact) * Fraction(2, 2**53)
+
+
+@given(st.integers(-4 * 10**15, 4 * 10**15), st.integers(-(10**9), 10**9), ZONES)
+def test_dates_come_back(start, seconds, zone):
+    origin = make_origin(1000 * start, zone)
+    (date,) = origin.to_dates([seconds], "s")
+    moment = dt.datetime(1970, 1, 1, tzinfo=dt.UTC) + dt.timedelta(microseconds=start + 10**6 * seconds)
+    assert date == moment
+    assert date.utcoffset() == moment.astimezone(origin.zone).utcoffset()
+    assert origin.to_numbers(as_dates(date, "date"), "s") == seconds
+
+
+@given(
+    st.datetimes(dt.datetime(1985, 1, 1), dt.datetime(2037, 1, 1)),
+    st.sampled_from(["Europe/Berlin", "America/New_York"]),
+)
+def test_wall_clocks_agree_with_pandas(reading, zone):
+    given = as_dates(reading, "times")
+    try:
+        expected = pd.Timestamp(reading).tz_localize(zone)
+    except ValueError:
+        with pytest.raises(ValueError, match=r"times: .* (is skipped|occurs twice)"):
+            given.localize(zone, "times")
+    else:
+        found = given.localize(zone, "times")
+        assert int(found.instants) == expected.as_unit("ns").value
+        assert make_origin(int(found.instants), zone).zone == ZoneInfo(zone)
+
+
+@given(st.lists(st.integers(0, 4 * 10**12), min_size=1, max_size=20), st.sampled_from(["ms", "us", "ns"]))
+def test_numbers_since_1970_agree_with_pandas(numbers, unit):
+    expected = pd.to_datetime(numbers, unit=unit, utc=True).as_unit("ns").asi8
+    np.testing.assert_array_equal(from_epoch(numbers, unit).instants, expected)
+    np.testing.assert_array_equal(from_epoch(np.array(numbers, dtype=float), unit).instants, expected)
+
+
+def test_fractions_of_seconds_since_1970():
+    assert int(from_epoch(1585000800.25).instants) == 1585000800250000000
+
+
+# --- clocks that are set ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("reading", "message"),
+    [
+        ("2020-03-29 02:30", "times of Measurements: 2020-03-29 02:30 is skipped as clocks are set forward in Europe/"),
+        (
+            "2020-10-25 02:30",
+            "2020-10-25 02:30 occurs twice as clocks are set back in Europe/Berlin. Write these dates",
+        ),
+    ],
+)
+def test_a_reading_that_is_skipped_or_occurs_twice(reading, message):
+    times = ["2020-01-01", reading, "2021-01-01"]
+    assert run_of(times).origin.time_zone == ""
+    with pytest.raises(ValueError, match=message):
+        run_of(times, time_zone="Europe/Berlin")
+
+
+def test_sources_in_different_zones_meet_as_moments():
+    berlin, tokyo = (
+        pd.date_range("2020-03-28", periods=3, tz="Europe/Berlin"),
+        pd.date_range("2020-03-28 08:00", periods=3, tz="Asia/Tokyo"),
+    )
+    data = [log(berlin), log(tokyo)]
+    run = sf.Experiment(data, ("on", "off"), ["2020-03-28 09:00+09:00"], time_unit="h")
+    np.testing.assert_array_equal(run.data[0].times, [0.0, 24.0, 47.0])
+    np.testing.assert_array_equal(run.data[1].times, [0.0, 24.0, 48.0])
+    assert (run.initial_times, run.time_zone) == ([1.0], "UTC")
+    here = sf.Experiment(data, ("on", "off"), ["2020-03-28 01:00"], time_unit="h", time_zone="Europe/Berlin")
+    assert (here.initial_times, here.origin.date) == ([1.0], "2020-03-28T00:00:00+01:00")
+
+
+# --- origin, horizon, guesses and bounds ------------------------------------------------------------------------------
+
+
+def test_the_origin_is_the_first_sample_or_t0_or_what_is_stated():
+    assert run_of(DAYS).origin.date == "2020-03-28T00:00:00"
+    early = run_of(DAYS, t0="2020-03-27 18:00")
+    assert (early.origin.date, early.t0, early.data[0].times[0]) == ("2020-03-27T18:00:00", 0.0, 6.0)
+    stated = run_of(DAYS, origin="2020-03-01", time_unit="d")
+    assert (stated.t0, stated.tf, stated.initial_times) == (27.0, 30.0, [28.5])
+    numbers = run_of([0.0, 1.0, 2.0], [1.0], origin="2020-03-28", time_unit="d", tf="2020-03-31")
+    assert (numbers.t0, numbers.tf, numbers.origin.date) == (0.0, 3.0, "2020-03-28T00:00:00")
+    beside = run_of(DAYS, [30.0])
+    assert beside.initial_times == [30.0], "numbers beside dates count from the origin"
+
+
+def test_two_runs_have_origins_of_their_own_unless_one_is_stated():
+    later = [f"2020-04-{day}" for day in (10, 11, 12)]
+    own = sf.Problem(ROOM, [run_of(DAYS), run_of(later)], {"k": 1.0})
+    assert [run.t0 for run in own.experiments] == [0.0, 0.0]
+    shared = sf.Problem(ROOM, [run_of(times, origin=DAYS[0]) for times in (DAYS, later)], {"k": 1.0})
+    assert [run.t0 for run in shared.experiments] == [0.0, 13 * 24.0]
+
+
+def test_guesses_bounds_and_priors_are_dates():
+    tau = sf.Parameter(
+        "2020-03-29T12:00Z", lower="2020-03-29", upper="2020-03-30", prior=sf.Normal("2020-03-29 10:00Z", 2.0)
+    )
+    end = sf.Parameter("2020-03-31", lower="2020-03-31", upper="2020-04-02")
+    run = sf.Experiment(log(DAYS), ("on", "off"), [tau], tf=end, time_unit="h", time_zone="Europe/Berlin")
+    (found, tf) = run.times
+    assert (found.value, found.lower, found.upper, found.prior.mean, found.prior.sd) == (37.0, 24.0, 47.0, 35.0, 2.0)
+    assert (tf.value, tf.lower, tf.upper) == (71.0, 71.0, 119.0)
+
+
+@pytest.mark.parametrize("times", [("2020-03-29", "2020-03-30"), pd.DatetimeIndex(DAYS[1:3]), np.array(DAYS[1:3])])
+def test_transition_times_in_any_form(times):
+    run = sf.Experiment(log(DAYS), ("on", "off", "on"), times, time_unit="d")
+    np.testing.assert_array_equal(run.initial_times, [1.0, 2.0])
+
+
+def test_a_copy_keeps_its_origin():
+    run = run_of(DAYS, time_zone="Europe/Berlin")
+    copy = replace(run, data=log(["2020-03-29 12:00", "2020-03-30"]))
+    assert copy.origin == run.origin
+    np.testing.assert_array_equal(copy.data[0].times, [35.0, 47.0])
+    assert replace(copy, name="again").time_zone == "Europe/Berlin"
+
+
+def test_signals_and_inputs():
+    numbers = np.arange(24.0)
+    dates = np.datetime64("2020-03-28", "h") + numbers.astype(int)
+    values = np.sin(numbers)
+    given = sf.ReferenceSignal.from_samples(dates, values, lowpass_hz=0.1, names=("x",))
+    inputs = sf.Input(dates, {"u": values}, kind="cubic")
+    run = sf.Experiment(given, ("on",), (), time_unit="h", inputs=inputs)
+    expected = sf.ReferenceSignal.from_samples(numbers, values, lowpass_hz=0.1)
+    np.testing.assert_array_equal(run.data[0].signal.knots, expected.signal.knots)
+    np.testing.assert_array_equal(run.data[0].signal.coefficients, expected.signal.coefficients)
+    assert (run.data[0].names, run.data[0].lowpass_hz) == (("x",), 0.1)
+    # A cut-off is in cycles per time unit: in Hz, this one would need ten million points.
+    days = np.datetime64("2020-03-01") + np.arange(30)
+    slow = sf.ReferenceSignal.from_samples(days, np.sin(np.arange(30.0)), lowpass_hz=0.45)
+    assert sf.Experiment(slow, ("on",), (), time_unit="d").data[0].signal.knots[-1] == 29.0
+    np.testing.assert_array_equal(run.inputs.times, numbers)
+    assert run.t0 == 0.0
+
+
+MIXED = (
+    "t0 has a time zone .2020-03-28T00:00:00\\+00:00., but times of Measurements has none .4 dates from .*time_zone="
+)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: log(["2020-03-28", "soon"]), ValueError, "Measurements times must be numbers or dates; got 'soon' at"),
+        (lambda: log(["2020-03-28", 3.0]), TypeError, "Measurements times must be numbers or dates, not both; got 3.0"),
+        (
+            lambda: log(["2020-03-28", None]),
+            ValueError,
+            "times must not be missing; the date at index 1 is. Leave such",
+        ),
+        (lambda: log([pd.Timestamp("2020"), pd.NaT]), ValueError, "must not be missing; the date at index 1"),
+        (lambda: log(pd.DatetimeIndex(["2020", None])), ValueError, "must not be missing; the date at index 1"),
+        (
+            lambda: log(["2020-03-28", "2020-03-29T00:00Z"]),
+            ValueError,
+            "has dates with a time zone and dates without one",
+        ),
+        (lambda: log(DAYS[::-1]), ValueError, "must increase strictly; got 2020-03-31T00:00:00 followed by 2020-03-30"),
+        (
+            lambda: log(["1500-01-01", "1500-01-02"]),
+            ValueError,
+            "must lie between 1678-01-01 and 2262-01-01; got '1500",
+        ),
+        (lambda: log(np.array(["1500-01-01"], dtype="datetime64[D]")), ValueError, "must lie between 1678-01-01 and"),
+        (lambda: log(pd.to_timedelta([0, 1], "h")), TypeError, "dates and time differences are not supported"),
+        (lambda: run_of(DAYS, t0="2020-03-28T00:00Z"), ValueError, MIXED),
+        (lambda: run_of(DAYS, time_zone="Europe/Berln"), ValueError, "time_zone 'Europe/Berln' is not known; give a"),
+        (lambda: run_of(DAYS, time_zone=2), TypeError, "time_zone must be the name of a time zone"),
+        (lambda: run_of(DAYS, time_unit="week"), ValueError, "time_unit must be one of ns, us, ms, s, min, h, d where"),
+        (lambda: run_of(DAYS, origin=3.0), TypeError, "origin must be a date, such as .*; got 3.0"),
+        (lambda: run_of(DAYS, origin=DAYS), ValueError, "origin must be one date; got 4 dates from"),
+        (lambda: run_of(DAYS, t0=pd.DatetimeIndex(DAYS)), ValueError, "t0 must be one date; got 4 dates from"),
+        (lambda: run_of(DAYS, tf=DAYS), ValueError, "tf must be one date; got 4 dates from"),
+        (lambda: run_of([0.0, 1.0], time_zone="UTC"), ValueError, "time_zone is 'UTC', but no time is a date: give"),
+        (
+            lambda: run_of([0.0, 9.0], ["2020-03-29"]),
+            ValueError,
+            "a transition time is a date, but the Measurements has",
+        ),
+        (
+            lambda: sf.Experiment([log(DAYS), log([0.0, 1.0])], ("on",), ()),
+            ValueError,
+            "times of Measurements is a date, but a Measurements beside it has numbers for times: give origin",
+        ),
+        (
+            lambda: run_of(DAYS, ["2020-04-02"]),
+            ValueError,
+            r"inside .t0, tf. = .2020-03-28 00:00:00, 2020-03-31 00:00:00",
+        ),
+        (
+            lambda: run_of(DAYS, tf="2020-03-30"),
+            ValueError,
+            "= .2020-03-28 .*; 1 of 4 do not, the first is 2020-03-31 00",
+        ),
+        (lambda: run_of(DAYS, t0="2020-04-01"), ValueError, "t0 < tf"),
+        (lambda: sf.Parameter("soon"), ValueError, "Parameter value must be a number or a date; got 'soon'"),
+        (lambda: sf.Parameter(DAYS), ValueError, "Parameter value must be one date"),
+        (
+            lambda: sf.Parameter("2020-03-29", lower=3.0),
+            ValueError,
+            "is a date, and its lower bound a number: give dates",
+        ),
+        (
+            lambda: sf.Parameter(3.0, upper="2020-03-29"),
+            ValueError,
+            "Parameter upper is a date, and its value a number",
+        ),
+        (
+            lambda: sf.Parameter("2020-03-29", prior=sf.Normal(3.0, 1.0)),
+            ValueError,
+            "its prior must be an sf.Normal whose",
+        ),
+        (lambda: sf.Parameter(3.0, prior=sf.Normal("2020-03-29", 1.0)), ValueError, "prior is a date, and its value a"),
+        (
+            lambda: run_of(DAYS, [sf.Parameter("2020-03-29", lower="2020-03-30")]),
+            ValueError,
+            "a transition time 2020-03-29T00:00:00 lies outside its bounds .2020-03-30T00:00:00, inf.",
+        ),
+        (
+            lambda: run_of(DAYS, initial_state=[sf.Parameter("2020-03-29")]),
+            ValueError,
+            "must be a number; got the date",
+        ),
+        (lambda: from_epoch([1e30]), ValueError, "numbers since 1970 in s must be finite, and lie between"),
+        (lambda: from_epoch([1.0], "weeks"), ValueError, "unit must be one of ns, us"),
+        (lambda: from_epoch(["2020"]), ValueError, "numbers since 1970 must be"),
+        (
+            lambda: make_origin(0, "UTC").to_dates([np.nan], "s"),
+            ValueError,
+            "nan s since 1970-01-01T00:00:00.00:00 is no",
+        ),
+        (
+            lambda: make_origin(0, "").to_numbers(as_dates("2020-01-01T00Z", "t"), "s"),
+            ValueError,
+            "has a time",
+        ),
+        (lambda: Origin("2020-01-01", "UTC"), ValueError, "does not fit the time zone"),
+    ],
+)
+def test_what_is_wrong_is_said(call, error, message):
+    with pytest.raises(error, match=message):
+        call()
+
+
+def test_a_parameter_of_the_model_is_no_date():
+    said = "parameter 'k' must be a number; got the date 2020-03-29T00:00:00. Only transition times and tf may be dates"
+    with pytest.raises(ValueError, match=re.escape(said)):
+        sf.Problem(ROOM, run_of(DAYS), {"k": sf.Parameter("2020-03-29")})
+
+
+# --- a fit ------------------------------------------------------------------------------------------------------------
+
+START = dt.datetime(2020, 3, 20, tzinfo=BERLIN)
+
+
+def room(dated, **more):
+    """A room that is heated for 9.3 days, with samples every 12 hours; over the night in which clocks are set."""
+    t = np.arange(40) / 2
+    truth = np.where(t < 9.3, 1 - np.exp(-t), (1 - np.exp(-9.3)) * np.exp(-(t - 9.3)))
+    values = truth + 0.02 * np.random.default_rng(1).normal(size=40)
+    dates = pd.DatetimeIndex([START.astimezone(dt.UTC) + dt.timedelta(days=float(x)) for x in t])
+    data = sf.Measurements(dates if dated else t, values, observe=first_state, sigma=0.02, names=("x",))
+    guess = sf.Parameter("2020-03-28T00:00", lower="2020-03-22") if dated else sf.Parameter(8.0, lower=2.0)
+    zone = {"time_zone": "Europe/Berlin"} if dated else {}
+    run = sf.Experiment(data, ("on", "off"), [guess], time_unit="d", **zone | more)
+    return sf.Problem(ROOM, run, {"k": 0.9})
+
+
+@pytest.fixture(scope="module")
+def fits():
+    return sf.estimate(room(dated=True)), sf.estimate(room(dated=False))
+
+
+def test_the_numbers_are_those_of_a_fit_to_numbers(fits):
+    dated, plain = fits
+    assert dated.theta_names == plain.theta_names == ("tau_1", "k")
+    np.testing.assert_array_equal(dated.theta, plain.theta)
+    np.testing.assert_array_equal(dated.covariance, plain.covariance)
+    np.testing.assert_array_equal(dated.trajectory.times, plain.trajectory.times)
+    assert (plain.transition_dates, plain.trajectory.dates) == ((None,), None)
+
+
+def test_transition_times_as_dates(fits):
+    dated, _ = fits
+    ((date,),) = dated.transition_dates
+    moment = START.astimezone(dt.UTC) + dt.timedelta(days=float(dated.transition_times[0][0]))
+    assert abs(date - moment) <= dt.timedelta(microseconds=1)
+    assert date.tzinfo == BERLIN
+    assert date.utcoffset() == dt.timedelta(hours=2), "summer time by then"
+    assert dated.trajectory.dates[0] == START
+
+
+def test_the_report_shows_dates(fits):
+    dated, plain = fits
+    text = str(dated)
+    assert "on -> off, 2020-03-20 to 2020-04-08 13:00" in text
+    assert re.search(r"times +d since 2020-03-20, Europe/Berlin", text)
+    (line,) = (line for line in text.splitlines() if line.strip().startswith("tau_1 "))
+    shown = re.search(r"tau_1 +(2020-03-\d\d \d\d:\d\d) +± (\S+) +d +2020-03-28 +t = (\S+), on -> off", line)
+    date = dated.transition_dates[0][0]
+    assert abs(dt.datetime.fromisoformat(shown[1]).replace(tzinfo=BERLIN) - date) <= dt.timedelta(seconds=30)
+    assert float(shown[3]) == pytest.approx(dated.theta[0], abs=0.01)
+    assert "2020" not in str(plain)
+    assert "2020-03-29" in dated.report(full=True)
+
+
+def test_sentences_have_dates_beside_numbers(fits):
+    dated, plain = fits
+    text = "Kinks: tau_1 = 9.5, where; tau_1 is at its lower bound 2. run.tau_1 = 3, tau_1 later, k = 3."
+    assert add_dates(text, dated) == (
+        "Kinks: tau_1 = 9.5 (2020-03-29 13:00), where; tau_1 is at its lower bound 2 (2020-03-22). run.tau_1 = 3, "
+        "tau_1 later, k = 3."
+    )
+    assert add_dates(text, plain) == text
+
+
+def test_a_bound_is_a_date():
+    problem = room(dated=True)
+    (run,) = problem.experiments
+    late = replace(run, transition_times=[sf.Parameter("2020-03-31", lower="2020-03-30T12:00")])
+    text = " ".join(sf.estimate(replace(problem, experiments=[late]), strategy="local").report(full=True).split())
+    assert "tau_1 is at its lower bound 10.4583 (2020-03-30 12:00): it has no standard error" in text
+    assert re.search(r"tau_1 +2020-03-30 12:00 .*AT LOWER BOUND", text)
+
+
+def test_tables_and_notebooks(fits):
+    dated, plain = fits
+    row, *_ = csv.DictReader(write_unknowns(dated).splitlines())
+    assert dt.datetime.fromisoformat(row["date"]) == dated.transition_dates[0][0]
+    low, high = (dt.datetime.fromisoformat(row[f"date {side} 95 %"]) for side in ("low", "high"))
+    assert low < dated.transition_dates[0][0] < high
+    assert "date" not in write_unknowns(plain)
+    assert next(csv.DictReader(write_runs(dated).splitlines()))["origin"] == "2020-03-20T00:00:00+01:00"
+    assert "2020-03-28" in dated.problem._repr_html_()
+    assert "2020-03-29" in dated._repr_html_()
+    text = describe(dated.problem)
+    assert "on -> off on [2020-03-20, 2020-04-08 13:00] (t0 and tf from the data), at 2020-03-28" in text
+    assert "times in d since 2020-03-20, Europe/Berlin" in text
+    assert "typically 0.5 d apart" in text
+    assert "tau_1  2020-03-28  in [2020-03-22, inf]" in text
+
+
+def test_a_saved_fit_has_the_dates(fits, tmp_path):
+    dated, _ = fits
+    dated.save(tmp_path / "fit.json")
+    content = json.loads((tmp_path / "fit.json").read_text())
+    assert content["transition_dates"] == {"tau_1": dated.transition_dates[0][0].isoformat()}
+    origin = {"date": "2020-03-20T00:00:00+01:00", "time_zone": "Europe/Berlin"}
+    assert content["fit"]["trajectories"][0]["origin"] == origin
+    loaded = sf.Estimate.load(tmp_path / "fit.json", problem=dated.problem)
+    assert loaded.transition_dates == dated.transition_dates
+    assert str(loaded) == str(dated)
+    assert loaded.trajectory.origin == dated.trajectory.origin
+    for problem in (room(dated=True, origin="2020-03-19"), room(dated=False)):
+        with pytest.raises(
+            ValueError, match=r"holds times since 2020-03-20T00:00:00\+01:00, the problem has (num|times s)"
+        ):
+            sf.Estimate.load(tmp_path / "fit.json", problem=problem)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"origin": {"date": "soon", "time_zone": ""}}, "must be a number or a date; got 'soon'"),
+        ({"origin": {"date": "2020-03-20", "time_zone": "Mars"}}, "time_zone 'Mars' is not known"),
+        ({"origin": "2020-03-20"}, "must be an object"),
+        ({"time_unit": "week"}, "time_unit must be one of"),
+    ],
+)
+def test_a_damaged_origin_is_found(change, message, fits, tmp_path):
+    fits[0].save(tmp_path / "fit.json")
+    content = json.loads((tmp_path / "fit.json").read_text())
+    content["fit"]["trajectories"][0] |= change
+    (tmp_path / "fit.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=message):
+        sf.Estimate.load(tmp_path / "fit.json")
+
+
+def test_a_file_of_version_5_has_no_dates(fits, tmp_path):
+    fits[1].save(tmp_path / "fit.json")
+    content = json.loads((tmp_path / "fit.json").read_text())
+    assert "transition_dates" not in content
+    assert content["fit"]["trajectories"][0].pop("origin") is None
+    (tmp_path / "fit.json").write_text(json.dumps(content | {"version": 5}))
+    loaded = sf.Estimate.load(tmp_path / "fit.json")
+    assert loaded.trajectory.origin is None
+    np.testing.assert_array_equal(loaded.theta, fits[1].theta)
+
+
+def test_predictions_at_dates(fits):
+    dated, plain = fits
+    found = dated.predict(["2020-03-21", "2020-03-29T12:00"])
+    expected = plain.predict([1.0, 9.5 - 1 / 24])
+    np.testing.assert_allclose(found.outputs, expected.outputs, rtol=1e-9)
+    assert [str(date) for date in found.dates] == ["2020-03-21 00:00:00+01:00", "2020-03-29 12:00:00+02:00"]
+    with pytest.raises(
+        ValueError, match=r"inside \[t0, tf\] = \[2020-03-20 00:00:00\+01:00, .*; got 2021-01-01 00:00:00"
+    ):
+        dated.predict(["2021-01-01"])
+    with pytest.raises(ValueError, match=r"times are dates .*, but the times of the experiment are numbers"):
+        plain.predict(["2020-03-21"])
+    assert plain.predict([1.0]).dates is None
+
+
+def test_simulations_at_dates(fits):
+    dated, plain = fits
+    problem, theta = dated.problem, dated.theta
+    found = sf.simulate(problem, theta, times=["2020-03-21", "2020-03-29T12:00"])
+    np.testing.assert_array_equal(found.states, sf.simulate(plain.problem, theta, times=[1.0, 9.5 - 1 / 24]).states)
+    assert [str(date) for date in found.dates] == ["2020-03-21 00:00:00+01:00", "2020-03-29 12:00:00+02:00"]
+    with pytest.raises(
+        ValueError, match=r"must lie inside \[t0, tf\] = \[2020-03-20 00:00:00\+01:00, .*; got 2019-01-01"
+    ):
+        sf.simulate(problem, theta, times="2019-01-01")
+    with pytest.raises(ValueError, match=r"times must be .*samples"):
+        sf.simulate(problem, theta, times="sampels")
+
+
+def test_frames_have_dates(fits):
+    dated, plain = fits
+    table = sf.simulate(dated.problem, dated.theta, times=["2020-03-21", "2020-03-29T12:00"]).to_pandas()
+    assert list(table["date (UTC)"]) == [pd.Timestamp("2020-03-20T23:00"), pd.Timestamp("2020-03-29T10:00")]
+    prediction = dated.predict(["2020-03-21"])
+    assert list(prediction.to_pandas()["date (UTC)"]) == [pd.Timestamp("2020-03-20T23:00")]
+    assert prediction.to_xarray()["date (UTC)"].dtype.kind == "M"
+    assert list(dated.to_pandas()["date"]) == [dated.transition_dates[0][0].isoformat(), ""]
+    assert "date" not in plain.to_pandas()
+    assert not [name for name in plain.predict([1.0]).to_pandas() if "date" in str(name)]
+
+
+# --- figures ----------------------------------------------------------------------------------------------------------
+
+
+def labels_of(ax):
+    ax.get_figure(root=True).draw_without_rendering()
+    return [label.get_text() for label in ax.get_xticklabels()]
+
+
+def test_ticks_are_at_midnight_of_the_zone(fits):
+    dated, plain = fits
+    figure = dated.plot()
+    ax = figure.axes[-1]
+    labels = labels_of(ax)
+    assert len(labels) >= 3
+    assert all(re.fullmatch(r"\d\d (Mar|Apr)", label) for label in labels), labels
+    assert ax.xaxis.get_offset_text().get_text() == "2020"
+    assert not figure.axes[0].xaxis.get_offset_text().get_visible()
+    for tick, label in zip(ax.get_xticks(), labels, strict=True):
+        (date,) = dated.trajectory.origin.to_dates([tick], "d")
+        nearest = (date + dt.timedelta(seconds=1)).replace(microsecond=0)
+        assert (nearest.hour, nearest.minute, f"{nearest:%d %b}") == (0, 0, label)
+    assert ax.get_xlabel() == "time (Europe/Berlin)"
+    assert plain.plot().axes[-1].get_xlabel() == "time (d)"
+
+
+@pytest.mark.parametrize("span", [1e-3, 1.0, 30.0, 1e4, 1e5, 1e7, 3e9])
+def test_ticks_of_any_span(span):
+    from matplotlib.figure import Figure
+
+    from switchfit.report.date_axis import label_axis
+
+    run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0]), ("on",), (), 0.0, span, origin="2020-03-28T12:00Z")
+    ax = Figure(figsize=(6, 2)).subplots()
+    ax.set_xlim(0.0, span)
+    label_axis(ax, run)
+    assert isinstance(ax.xaxis.get_major_locator(), DateLocator)
+    ticks = np.array([tick for tick in ax.get_xticks() if 0 <= tick <= span])
+    assert 2 <= len(ticks) <= 10
+    assert len(set(labels_of(ax))) > 1
+    assert ax.format_coord(0.0, 0.0).count("2020-03-28 12:00:00") == 1
+
+
+def test_profiles_residuals_and_many_fits_show_dates(fits):
+    dated, _ = fits
+    profile = dated.profile("tau_1")
+    assert re.search(r"date +2020-03-29 \d\d:\d\d, 95 % from 2020-03-29 \d\d:\d\d to 2020-03-29", str(profile))
+    assert "d since 2020-03-20, Europe/Berlin" in str(profile)
+    ax = profile.plot().axes[0]
+    assert ax.get_xlabel() == "tau_1 (Europe/Berlin)"
+    assert all(":" in label or "Mar" in label for label in labels_of(ax))
+    assert dated.plot_residuals().axes[0].get_xlabel() == "time (Europe/Berlin)"
+    study = sf.bootstrap(dated, 40)
+    assert study.date_origins == (dated.trajectory.origin, None)
+    assert re.search(r"tau_1 \(d\) +2020-03-29 \d\d:\d\d", str(study))
+    assert study.plot().axes[0].get_xlabel() == "tau_1 (Europe/Berlin)"
+
+
+def test_many_logs_with_origins_of_their_own_are_not_shown_as_dates():
+    same = sf.estimate_many([room(dated=True), room(dated=True)])
+    assert same.date_origins[0].time_zone == "Europe/Berlin"
+    other = sf.estimate_many([room(dated=True), room(dated=True, origin="2020-03-19")])
+    assert other.date_origins == (None, None)
+    np.testing.assert_allclose(other.theta[1, 0] - other.theta[0, 0], 1.0, rtol=1e-6)
+
+
+def test_the_page_shows_dates(fits, tmp_path):
+    dated, _ = fits
+    dated.save_report(tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
+    assert "2020-03-20 to 2020-03-29" in text
+    assert "CustomJSTicker" in text
+
+
+@pytest.mark.skipif(find_browser() is None, reason="needs Chromium")
+def test_the_browser_agrees_with_zoneinfo(fits, tmp_path):
+    dated, _ = fits
+    dated.save_report(tmp_path / "report.html")
+    browser = Browser(tmp_path / "profile")
+    try:
+        browser.open(tmp_path / "report.html")
+        (shown,) = browser.evaluate(
+            "[...document.querySelectorAll('[data-slider=\"0\"] output')].map((o) => o.textContent)"
+        )
+        assert shown == format_date(dated.transition_dates[0][0], 600)
+        start = dated.trajectory.origin.instant / 1e6
+        for low, high in ((0, 19), (8.5, 10), (9, 9.01), (0, 900), (-3000, 3000)):
+            ticks = browser.evaluate(f"switchfitDates.findTicks({low}, {high}, {start}, 864e5, 'Europe/Berlin')")
+            assert 3 <= len(ticks) <= 10
+            dates = [dated.trajectory.origin.find_date(round(tick * 864e5) / 864e5, "d") for tick in ticks]
+            finest = 0 if high - low < 0.1 else date_parts(dates)
+            assert finest == 0, dates
+        assert browser.errors == []
+    finally:
+        browser.close()
+
+
+def date_parts(dates):
+    """Seconds and smaller parts of dates, which ticks of hours and more have none of."""
+    return sum(date.second + date.microsecond for date in dates)
+
+
+# --- texts ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (30 * 86400, "2020-03-23"),
+        (2 * 86400, "2020-03-23 18h"),
+        (5 * 3600, "2020-03-23 18h"),
+        (3600, "2020-03-23 17:41"),
+        (60, "2020-03-23 17:41:12"),
+        (5, "2020-03-23 17:41:12"),
+        (0.5, "2020-03-23 17:41:12.4"),
+        (0.004, "2020-03-23 17:41:12.3567"),
+        (1e-9, "2020-03-23 17:41:12.356700"),
+    ],
+)
+def test_a_date_has_the_places_that_its_error_allows(error, text):
+    assert format_date(dt.datetime(2020, 3, 23, 17, 41, 12, 356700), error) == text
+
+
+def test_a_date_is_rounded_to_the_next_day():
+    assert format_date(dt.datetime(2020, 2, 29, 23, 59, 58), 60) == "2020-02-29 23:59:58"
+    assert format_date(dt.datetime(2020, 2, 29, 23, 59, 58), 3600) == "2020-03-01 00:00"
+    assert format_date(dt.datetime(2020, 2, 29, 23, 59, 58), 3600, short=True) == "2020-03-01"
+
+
+def test_a_date_that_clocks_show_twice_has_its_offset():
+    first = dt.datetime(2020, 10, 25, 0, 30, tzinfo=dt.UTC).astimezone(BERLIN)
+    second = dt.datetime(2020, 10, 25, 1, 30, tzinfo=dt.UTC).astimezone(BERLIN)
+    assert [format_date(date, 600) for date in (first, second)] == ["2020-10-25 02:30+0200", "2020-10-25 02:30+0100"]
+
+
+def test_a_time_beyond_all_calendars_is_a_number():
+    run = run_of(DAYS)
+    assert format_time(1e9, run) == "1e+09"
+    assert format_time(np.inf, run) == "inf"
+    assert format_time(12.0, run) == "2020-03-28 12:00"
+    assert format_time(12.0, run_of([0.0, 20.0])) == "12"
+
+
+# --- logs and problem files -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("cells", "zone", "first"),
+    [
+        (["2020-03-28T00:00:00.000001", "2020-03-28T12:00"], "", "2020-03-28T00:00:00.000001"),
+        (["28.03.2020 00:00", "28.03.2020 12:00"], "", "2020-03-28T00:00:00"),
+        (["2020-03-28T00:00Z", "2020-03-28T12:00Z"], "UTC", "2020-03-28T00:00:00+00:00"),
+        (["2020-03-28T00:00+02:00", "2020-03-28T12:00+02:00"], "+02:00", "2020-03-28T00:00:00+02:00"),
+        (["2020-03-28T00:00+01:00", "2020-03-28T13:00+02:00"], "UTC", "2020-03-27T23:00:00+00:00"),
+    ],
+)
+def test_a_log_hands_over_its_dates(cells, zone, first, tmp_path):
+    (tmp_path / "a.csv").write_text("time;x\n" + "".join(f"{cell};1\n" for cell in cells))
+    found = sf.read_log(tmp_path / "a.csv", time_unit="h")
+    assert found.dates.time_zone == found.time_zone == zone
+    assert repr(found.dates[0]) == first
+    assert (found.dates.instants[1] - found.dates.instants[0]) / NANOSECONDS["h"] == pytest.approx(12.0)
+    run = sf.Experiment(sf.Measurements(found.dates, found[["x"]]), ("on",), (), time_unit="h")
+    np.testing.assert_allclose(run.data[0].times, found.times, atol=1e-9)
+
+
+def test_a_log_without_dates_has_none(tmp_path):
+    (tmp_path / "a.csv").write_text("time;x\n0;1\n1;1\n")
+    assert sf.read_log(tmp_path / "a.csv").dates is None
+
+
+def test_columns_of_dates_of_parquet(tmp_path):
+    for zone in (None, "Europe/Berlin"):
+        table = pd.DataFrame({"time": pd.DatetimeIndex(DAYS, tz=zone), "x": VALUES})
+        table.to_parquet(tmp_path / "a.parquet")
+        found = sf.read_log(tmp_path / "a.parquet")
+        assert found.time_zone == (zone or "")
+        assert repr(found.dates[0]) == ("2020-03-28T00:00:00+01:00" if zone else "2020-03-28T00:00:00")
+
+
+FILE = """
+model = "{model}"
+
+[parameters]
+power = 1.5
+loss = 0.1
+
+[[experiments]]
+mode_sequence = ["on", "off"]
+time_unit = "d"
+{experiment}
+
+[[experiments.data]]
+file = "{log}"
+columns = ["warmth"]
+sigma = 0.3
+{data}
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    (tmp_path / "heater.py").write_text((EXAMPLES / "dates" / "heater.py").read_text())
+    rows = [f"2020-03-{day:02d}T12:00,{day % 7}" for day in range(10, 28)]
+    (tmp_path / "naive.csv").write_text("time,warmth\n" + "\n".join(rows))
+    (tmp_path / "utc.csv").write_text("time,warmth\n" + "\n".join(row.replace(",", "Z,") for row in rows))
+    stamps = [
+        f"{dt.datetime(2020, 3, day, 12, tzinfo=dt.UTC).timestamp() * 1000:.0f},{day % 7}" for day in range(10, 28)
+    ]
+    (tmp_path / "stamps.csv").write_text("time_ms,warmth\n" + "\n".join(stamps))
+
+    def write(experiment, log="naive.csv", data=""):
+        text = FILE.format(model="heater.py:HEATER", experiment=experiment, log=log, data=data)
+        (tmp_path / "problem.toml").write_text(text)
+        return tmp_path / "problem.toml"
+
+    return write
+
+
+def load(path):
+    (run,) = load_problem(path).problem.experiments
+    return run
+
+
+@pytest.mark.parametrize("date", ["2020-03-20", '"2020-03-20"', "2020-03-20T00:00:00", "{ value = 2020-03-20 }"])
+def test_dates_of_toml(date, write):
+    run = load(write(f"transition_times = [{date}]\nt0 = 2020-03-10"))
+    assert (run.t0, run.initial_times, run.data[0].times[0]) == (0.0, [10.0], 0.5)
+    assert run.origin.date == "2020-03-10T00:00:00"
+
+
+def test_zones_of_toml(write):
+    text = "transition_times = [{ value = 2020-03-20T01:00:00+01:00, lower = 2020-03-15 }]\ntime_zone = 'Europe/Berlin'"
+    run = load(write(f"{text}\norigin = 2020-03-01", "utc.csv"))
+    assert run.origin.date == "2020-03-01T00:00:00+01:00"
+    assert run.initial_times == pytest.approx([19 + 1 / 24], rel=1e-15)
+    assert (run.times[0].lower, run.data[0].times[0]) == (14.0, pytest.approx(9 + 13 / 24, rel=1e-15))
+
+
+def test_without_a_date_in_the_file_numbers_count_from_the_first_of_the_log(write):
+    run = load(write("transition_times = [3.0]"))
+    assert (run.t0, run.tf, run.initial_times, run.origin.date) == (0.0, 17.0, [3.0], "2020-03-10T12:00:00")
+
+
+def test_numbers_since_1970_are_dates_if_the_file_says_so(write):
+    data = 'epoch = "ms"\nwindow = [1583841600000, 1584532800000]'
+    run = load(write("transition_times = [2020-03-13T00:00:00Z]", "stamps.csv", data))
+    np.testing.assert_array_equal(run.data[0].times, np.arange(9.0))
+    assert (run.initial_times, run.origin.date) == ([2.5], "2020-03-10T12:00:00+00:00")
+    with pytest.raises(InputError, match="the times are in ms, but time_unit"):
+        load(write("transition_times = [3.0]", "stamps.csv"))
+
+
+@pytest.mark.parametrize("log", ["naive.csv", "utc.csv"])
+def test_a_window_of_dates(log, write):
+    zone = "" if log == "naive.csv" else "\ntime_zone = 'UTC'"
+    run = load(write(f"transition_times = [2020-03-14]{zone}", log, "window = [2020-03-12, 2020-03-16T12:00:00]"))
+    assert (len(run.data[0].times), run.tf - run.t0) == (5, 4.0)
+
+
+@pytest.mark.parametrize(
+    ("experiment", "log", "data", "message"),
+    [
+        ("transition_times = ['soon']", "naive.csv", "", r"transition_times\[1\]' must be a table; got 'soon'"),
+        (
+            "t0 = true",
+            "naive.csv",
+            "",
+            r"'experiments\[1\]\.t0' must be a number or a date such as 2024-05-01, .*; got True",
+        ),
+        ("t0 = 07:30:00", "naive.csv", "", r"t0' must be a number or a date such as"),
+        ("origin = 3.0", "naive.csv", "", r"'experiments\[1\]\.origin' must be a date such as .*; got 3.0"),
+        ("time_zone = 'Mars'", "naive.csv", "", "time_zone 'Mars' is not known"),
+        ("t0 = 2020-03-10T00:00:00Z", "naive.csv", "", "t0 has a time zone .*time_zone='Europe/Berlin'"),
+        (
+            "t0 = 2020-03-10",
+            "naive.csv",
+            "time_scale = 2.0",
+            r"naive\.csv has dates, which are converted to time_unit by",
+        ),
+        ("", "naive.csv", 'epoch = "ms"', r"naive\.csv has dates already: leave out epoch = 'ms'"),
+        ("", "stamps.csv", 'epoch = "s"', r"stamps\.csv: the times are in ms, but epoch is 's'"),
+        (
+            "",
+            "stamps.csv",
+            "time_scale = 1\nwindow = [2020-03-12, 2020-03-16]",
+            "has dates, and .*stamps.csv has numbers",
+        ),
+        (
+            "",
+            "naive.csv",
+            "window = [2020-03-12, 3.0]",
+            "has dates, and .*naive.csv has dates, of which the window has one",
+        ),
+        ("", "naive.csv", "window = [2021-03-12, 2022-01-01]", "they reach from 2020-03-10T12:00:00 to 2020-03-27T12"),
+        (
+            "",
+            "naive.csv",
+            "window = [2020-03-12T00:00:00Z, 2022-01-01]",
+            "window: 2020-03-12T00:00:00.00:00 has a time zone",
+        ),
+    ],
+)
+def test_mistakes_in_a_problem_file(experiment, log, data, message, write):
+    with pytest.raises(InputError, match=message):
+        load(write(experiment, log, data))
+
+
+def test_the_command_line(tmp_path):
+    problem = EXAMPLES / "dates" / "problem.toml"
+    done = CliRunner().invoke(app, ["check", str(problem)])
+    assert done.exit_code == 0, done.output
+    assert "on -> off on [2020-03-10, 2020-04-04 13:00] (tf from the data), at 2020-03-20" in done.output
+    done = CliRunner().invoke(app, ["simulate", str(problem), "--out", str(tmp_path / "out.csv")])
+    assert done.exit_code == 0, done.output
+    rows = list(csv.DictReader((tmp_path / "out.csv").read_text().splitlines()))
+    assert rows[0]["date"] == "2020-03-10T00:00:00+01:00"
+    for row in (rows[0], rows[-1]):
+        moment = dt.datetime(2020, 3, 9, 23, tzinfo=dt.UTC) + dt.timedelta(days=float(row["t (d)"]))
+        assert abs(dt.datetime.fromisoformat(row["date"]) - moment) <= dt.timedelta(microseconds=1)
+    one = ["fit", str(EXAMPLES / "dates" / "warmth.csv"), "--problem", str(problem), "--table", str(tmp_path / "t.csv")]
+    done = CliRunner().invoke(app, one)
+    assert done.exit_code == 0, done.output
+    (row,) = csv.DictReader((tmp_path / "t.csv").read_text().splitlines())
+    assert row["tau_1 (date)"].startswith("2020-03-2")
+    off = dt.datetime.fromisoformat(row["tau_1 (date)"]) - dt.datetime(2020, 3, 22, 6, tzinfo=dt.UTC)
+    assert abs(off) < 3 * dt.timedelta(days=float(row["tau_1 (d) std. error"]))

@@ -1,0 +1,111 @@
+"""docs/first-ten-minutes.md, run: its commands print what the page shows, up to times and last digits."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PAGE = ROOT / "docs" / "first-ten-minutes.md"
+
+NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+VARYING = re.compile(r"effort|optimality|integration error|tried")
+"""Lines with numbers that differ between machines: times, what is left by rounding."""
+CLOSE = 0.02
+"""Largest relative difference of the other numbers: a unit of the second digit that is printed, or a little more."""
+
+
+def read_steps(text):
+    """Return the steps of the page in order: ("file", name, content) or ("command", line, printed)."""
+    steps = []
+    for match in re.finditer(r"^```(\w+)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
+        kind, block = match.groups()
+        if kind in ("python", "toml"):
+            name = re.search(r"Save this as `([\w./]+)`:\s*$", text[: match.start()])[1]
+            steps.append(("file", name, block))
+        elif kind == "console":
+            commands = re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]
+            steps += [("command", *command.split("\n", 1)) for command in commands]
+    return steps
+
+
+def follows(printed, shown):
+    """Whether lines that were printed are those of the page, in which ``...`` stands for any lines."""
+    if not shown:
+        return not printed
+    if shown[0] == "...":
+        return any(follows(printed[k:], shown[1:]) for k in range(len(printed) + 1))
+    return bool(printed) and agree(printed[0], shown[0]) and follows(printed[1:], shown[1:])
+
+
+def agree(printed, shown):
+    """Whether two lines are the same but for last digits, and for numbers that differ between machines."""
+    if words_of(printed) != words_of(shown):
+        return False
+    numbers = [[float(number) for number in NUMBER.findall(line)] for line in (printed, shown)]
+    return bool(VARYING.search(shown)) or all(
+        abs(a - b) <= CLOSE * max(abs(a), abs(b)) for a, b in zip(*numbers, strict=True)
+    )
+
+
+def words_of(line):
+    """Return a line without its numbers and the widths of its columns."""
+    return NUMBER.sub("#", line).split()
+
+
+def run(command, folder):
+    """Run a line of the shell with this environment's commands; return what it prints."""
+    places = [str(Path(sys.executable).parent), os.environ.get("PATH", "")]
+    sources = [str(ROOT / "src"), os.environ.get("PYTHONPATH", "")]
+    kept = os.environ | {"PATH": os.pathsep.join(places), "PYTHONPATH": os.pathsep.join(filter(None, sources))}
+    kept |= {"COLUMNS": "100", "LC_ALL": "C.UTF-8"}
+    done = subprocess.run(
+        ["sh", "-c", command], cwd=folder, env=kept, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    return done.stdout
+
+
+def test_the_commands_print_what_the_page_shows(tmp_path):
+    shutil.copytree(ROOT / "examples", tmp_path / "examples", ignore=shutil.ignore_patterns("__pycache__"))
+    folder, commands = tmp_path, 0
+    for kind, line, text in read_steps(PAGE.read_text(encoding="utf-8")):
+        if kind == "file":
+            (folder / line).write_text(text, encoding="utf-8")
+        elif line.startswith("cd "):
+            folder = folder / shlex.split(line)[1]
+        else:
+            printed = run(line, folder)
+            if not follows(printed.splitlines(), text.splitlines()):
+                pytest.fail(f"$ {line}\n{printed}\nThe page has:\n{text}")
+            commands += 1
+    assert commands > 8
+    assert "<html" in (folder / "room" / "out" / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_log_is_what_its_script_writes(tmp_path):
+    script = ROOT / "examples" / "room" / "make_log.py"
+    (tmp_path / script.name).write_text(script.read_text())
+    subprocess.run([sys.executable, tmp_path / script.name], check=True)
+    assert (tmp_path / "room.csv").read_bytes() == script.with_name("room.csv").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("printed", "shown", "same"),
+    [
+        ("mu 0.2162 ± 0.0011", "mu  0.2163 ± 0.0011", True),
+        ("mu 0.2162 ± 0.0011", "mu 0.2262 ± 0.0011", False),
+        ("mu 0.2162", "nu 0.2162", False),
+        ("effort 7 iterations, 2.3 s", "effort 9 iterations, 0.1 s", True),
+        ("a\nb\nc", "a\n...\nc", True),
+        ("a\nb\nd", "a\n...\nc", False),
+        ("a\nb", "a", False),
+        ("", "...", True),
+    ],
+)
+def test_outputs_are_compared_up_to_last_digits(printed, shown, same):
+    assert follows(printed.splitlines(), shown.splitlines()) is same

@@ -1,0 +1,233 @@
+"""Problems to begin with: `switchfit init` and `switchfit examples`."""
+
+import ast
+import os
+import re
+import shutil
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import switchfit as sf
+from switchfit import cli
+from switchfit.cli.starting import find_examples
+from switchfit.io import first_problem
+from switchfit.io.first_problem import plan_problem, write_first_problem
+from switchfit.io.problem_file import load_problem
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def run(*arguments):
+    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+
+
+def write_log(path, header="t,level,idle,count", times=None, rows=None):
+    """A tank that fills to 2 until t = 6 and then drains to -1, each with a time constant of 1.5; noise of 0.01."""
+    times = np.arange(0.0, 15.0, 0.1) if times is None else times
+    filled = 2 - 2 * np.exp(-np.minimum(times, 6.0) / 1.5)
+    values = -1 + (filled + 1) * np.exp(-np.maximum(times - 6.0, 0) / 1.5)
+    values += 0.01 * np.random.default_rng(2).standard_normal(len(times))
+    found = [f"{t:.3f},{v:.5f},7.0,{k}\n" for k, (t, v) in enumerate(zip(times.tolist(), values.tolist(), strict=True))]
+    path.write_text(header + "\n" + "".join(rows(found) if rows else found))
+    return path
+
+
+def test_without_a_log_an_example_is_written_that_can_be_fitted(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = run("init", "room")
+    assert result.exit_code == 0, result.output
+    assert sorted(path.name for path in Path("room").iterdir()) == ["log.csv", "model.py", "problem.toml"]
+    assert "switchfit fit room/problem.toml --out room/out" in result.stdout
+    assert run("check", "room/problem.toml").exit_code == 0
+    fit = sf.estimate(load_problem("room/problem.toml").problem)
+    assert fit.verdict.level == "good"
+    np.testing.assert_allclose(fit.theta, [5.3, 5.0, 0.2, 15.0], rtol=0.02)
+
+
+def test_commands_that_are_printed_work(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    printed = run("init", "room").stdout
+    commands = re.findall(r"^  switchfit (.*)$", printed, re.MULTILINE)
+    assert [command.split()[0] for command in commands] == ["check", "fit"]
+    for command in commands:
+        result = run(*command.split())
+        assert result.exit_code == 0, result.output
+    assert (tmp_path / "room" / "out" / "report.txt").is_file()
+
+
+def test_from_a_log(tmp_path):
+    log = write_log(tmp_path / "tank.csv")
+    result = run("init", tmp_path / "tank", "--from", log)
+    assert result.exit_code == 0, result.output
+    folder = tmp_path / "tank"
+    assert (folder / "tank.csv").read_bytes() == log.read_bytes()
+    contents = tomllib.loads((folder / "problem.toml").read_text())
+    (data,) = contents["experiments"][0]["data"]
+    assert (data["file"], data["time"], data["columns"]) == ("tank.csv", "t", ["level"])  # idle: constant; count: rows
+    ast.parse((folder / "model.py").read_text())
+    loaded = load_problem(folder / "problem.toml")
+    fit = sf.estimate(loaded.problem, **loaded.options)
+    assert fit.verdict.level == "good"
+    found = dict(zip(fit.theta_names, fit.theta, strict=True))
+    assert found["tau_1"] == pytest.approx(6.0, abs=0.02)
+    assert found["T"] == pytest.approx(1.5, rel=0.02)
+    assert found["level_before"] == pytest.approx(2.0, abs=0.02)
+    assert found["level_after"] == pytest.approx(-1.0, abs=0.02)
+
+
+def test_several_channels_of_different_sizes_have_a_sigma_each(tmp_path):
+    """With one sigma for all, the largest channel alone would count."""
+    times = np.arange(0.0, 10.0, 0.05)
+    rng, step = np.random.default_rng(0), np.where(times < 4.0, 0.0, 1.0)
+    big, small = 1e4 * step + 100 * rng.standard_normal(200), 1e-3 * step + 1e-5 * rng.standard_normal(200)
+    rows = "".join(f"{t},{a},{b}\n" for t, a, b in zip(times.tolist(), big.tolist(), small.tolist(), strict=True))
+    (tmp_path / "log.csv").write_text("time (min),big,small\n" + rows)
+    write_first_problem(tmp_path / "new", tmp_path / "log.csv")
+    loaded = load_problem(tmp_path / "new" / "problem.toml")
+    assert loaded.problem.experiments[0].time_unit == "min"
+    fit = sf.estimate(loaded.problem, strategy="local")
+    found = dict(zip(fit.theta_names, fit.theta, strict=True))
+    assert found["sigma_1"] == pytest.approx(100, rel=0.2)
+    assert found["sigma_2"] == pytest.approx(1e-5, rel=0.2)
+    assert found["tau_1"] == pytest.approx(4.0, abs=0.1)
+
+
+def test_times_in_milliseconds_become_seconds(tmp_path):
+    log = write_log(tmp_path / "log.csv", header="t (ms),level,idle,count", times=np.arange(0.0, 15.0, 0.1))
+    write_first_problem(tmp_path / "new", log)
+    assert "time_scale = 0.001" in (tmp_path / "new" / "problem.toml").read_text()
+    problem = load_problem(tmp_path / "new" / "problem.toml").problem
+    assert problem.experiments[0].tf == pytest.approx(14.9e-3)
+
+
+def test_a_log_that_is_out_of_order_is_repaired_as_the_file_says(tmp_path):
+    log = write_log(tmp_path / "log.csv", rows=lambda rows: [*rows[5:], *rows[:6]])
+    write_first_problem(tmp_path / "new", log)
+    text = (tmp_path / "new" / "problem.toml").read_text()
+    assert 'repair = ["sort", "drop-duplicates"]' in text
+    assert str(tmp_path) not in text
+    assert len(load_problem(tmp_path / "new" / "problem.toml").problem.experiments[0].data[0].times) == 150
+
+
+def test_a_large_log_is_referred_to(tmp_path, monkeypatch):
+    log = write_log(tmp_path / "log.csv")
+    monkeypatch.setattr(first_problem, "LARGEST_COPY", 100)
+    written = write_first_problem(tmp_path / "new", log)
+    assert [path.name for path in written] == ["problem.toml", "model.py"]
+    assert 'file = "../log.csv"' in (tmp_path / "new" / "problem.toml").read_text()
+    assert load_problem(tmp_path / "new" / "problem.toml").problem
+
+
+def test_names_with_quotes_and_braces(tmp_path):
+    log = write_log(tmp_path / "log.csv", header='t,"a ""b"" {c} \\d",idle,count')
+    write_first_problem(tmp_path / "new", log)
+    problem = load_problem(tmp_path / "new" / "problem.toml").problem
+    assert problem.system.state_names == ('a "b" {c} \\d',)
+
+
+def test_positions_are_east_and_north(tmp_path):
+    pytest.importorskip("gpxpy")
+    points = "".join(
+        f'<trkpt lat="{48 + 1e-5 * max(k - 20, 0)}" lon="{11 + 1e-5 * min(k, 20)}"><ele>500</ele>'
+        f"<time>2024-05-01T10:00:{k:02d}Z</time></trkpt>"
+        for k in range(50)
+    )
+    (tmp_path / "track.gpx").write_text(
+        f'<gpx version="1.1" creator="t" xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>{points}</trkseg></trk></gpx>'
+    )
+    plan = plan_problem(sf.read_log(tmp_path / "track.gpx"))
+    assert plan.channels == ["east", "north"]
+    write_first_problem(tmp_path / "new", tmp_path / "track.gpx")
+    assert load_problem(tmp_path / "new" / "problem.toml").problem
+
+
+# --- nothing is overwritten -------------------------------------------------------------------------------------------
+
+
+def test_nothing_is_overwritten(tmp_path):
+    (tmp_path / "room").mkdir()
+    (tmp_path / "room" / "notes.txt").write_text("mine")
+    for command in (("init", tmp_path / "room"), ("examples", "toss", tmp_path / "room")):
+        result = run(*command)
+        assert result.exit_code == 2
+        assert "exists already, and nothing is overwritten" in result.stderr
+    assert [path.name for path in (tmp_path / "room").iterdir()] == ["notes.txt"]
+    (tmp_path / "file").write_text("mine")
+    assert run("init", tmp_path / "file").exit_code == 2
+    (tmp_path / "empty").mkdir()
+    assert run("init", tmp_path / "empty").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("t,a\n" + "".join(f"{k},1.0\n" for k in range(20)), "has no channel with 8 samples or more that changes"),
+        ("t,a\n0,1\n1,2\n", "has no channel"),
+        (None, "missing.csv"),
+    ],
+)
+def test_logs_that_cannot_be_used(content, message, tmp_path):
+    log = tmp_path / "missing.csv"
+    if content is not None:
+        log.write_text(content)
+    result = run("init", tmp_path / "new", "--from", log)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_that_cannot_be_written(tmp_path):
+    tmp_path.chmod(0o500)
+    result = run("init", tmp_path / "new")
+    assert result.exit_code == 2
+    assert "cannot be written" in result.stderr
+
+
+# --- examples ---------------------------------------------------------------------------------------------------------
+
+
+def test_examples_are_listed_with_what_they_are_about():
+    result = run("examples")
+    assert result.exit_code == 0
+    listed = [line.split(maxsplit=1) for line in result.stdout.splitlines()]
+    assert {name for name, _ in listed} == {path.stem for path in EXAMPLES.iterdir() if not path.name.startswith("_")}
+    assert all(len(about) > 10 for _, about in listed)
+
+
+def test_an_example_is_copied_and_can_be_fitted(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = run("examples", "toss")
+    assert result.exit_code == 0, result.output
+    assert "switchfit fit toss/problem.toml" in result.stdout
+    names = {path.name for path in EXAMPLES.joinpath("toss").iterdir()} - {"__pycache__"}
+    assert {path.name for path in Path("toss").iterdir()} == names
+    assert run("check", "toss/problem.toml").exit_code == 0
+    result = run("examples", "own_model", "mine")
+    assert "python mine/own_model.py" in result.stdout
+    assert Path("mine", "own_model.py").is_file()
+
+
+def test_an_unknown_example():
+    result = run("examples", "moon")
+    assert result.exit_code == 2
+    assert "there is no example 'moon'; there are ball, covid" in result.stderr
+
+
+def test_installed_examples_come_first(tmp_path, monkeypatch):
+    """In a wheel they are inside the package; in a clone, beside it."""
+    assert find_examples() == EXAMPLES
+    package = tmp_path / "switchfit"
+    shutil.copytree(EXAMPLES / "toss", package / "examples" / "toss")
+    monkeypatch.setattr(sf, "__file__", str(package / "__init__.py"))
+    assert find_examples() == package / "examples"
+
+
+def test_the_wheel_has_the_examples():
+    project = tomllib.loads((EXAMPLES.parent / "pyproject.toml").read_text())
+    included = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
+    assert included == {"examples": "switchfit/examples"}

@@ -1,0 +1,480 @@
+"""Jumps of the state at known times: doses into one compartment, against closed forms and copies of the mode."""
+
+import dataclasses
+from itertools import pairwise
+
+import cloudpickle
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import switchfit as sf
+from switchfit.engine.native.foreign import foreign_derivatives
+from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.io.problem_file import load_problem, read_experiments
+from switchfit.io.summary import describe_experiments
+from switchfit.problem.functions import use_float64
+
+DOSES = np.array([0.0, 8.0, 16.0, 24.0])
+AMOUNT = 100.0
+TIMES = np.arange(0.0, 37.0)
+"""Four of the samples are at the times of doses: they are of the state before."""
+
+TRUE = {"k": 0.13, "V": 11.0}
+GUESS = {"k": 0.2, "V": sf.Parameter(8.0, lower=1.0)}
+
+
+def eliminate(t, x, p):
+    return -p["k"] * x
+
+
+def dose(t, x, p):
+    return x + AMOUNT / p["V"]
+
+
+BODY = sf.HybridSystem({"eliminate": eliminate}, [0.0], state_names=("c",))
+
+
+def concentration(k, V):
+    """c (K,), its slopes (K, 2) and curvatures (K, 2, 2) in k and V: a sum of decaying doses."""
+    since = TIMES[:, None] - DOSES
+    each = np.where(since > 0, AMOUNT / V * np.exp(-k * since), 0.0)
+    c, ck, ckk = each.sum(1), -(since * each).sum(1), (since**2 * each).sum(1)
+    slopes = np.stack([ck, -c / V], axis=1)
+    curvatures = np.stack([np.stack([ckk, -ck / V], 1), np.stack([-ck / V, 2 * c / V**2], 1)], 1)
+    return c, slopes, curvatures
+
+
+def make_log(values):
+    return sf.Measurements(TIMES, values, sigma=0.1)
+
+
+ALL = sf.Jump(DOSES, dose)
+
+
+def make_problem(values, jumps=ALL, **options):
+    run = sf.Experiment(make_log(values), ["eliminate"], [], t0=0.0, time_unit="h", jumps=jumps)
+    return sf.Problem(BODY, run, GUESS, **options)
+
+
+@pytest.fixture(scope="module")
+def values():
+    return concentration(**TRUE)[0] + 0.1 * np.random.default_rng(3).standard_normal(len(TIMES))
+
+
+@pytest.mark.parametrize("engine", ["native", "jax"])
+def test_cost_and_derivatives_are_those_of_the_closed_form(values, engine):
+    problem = make_problem(values, engine=engine, rtol=1e-11, atol=1e-13)
+    found = sf.evaluate(problem)
+    c, slopes, curvatures = concentration(0.2, 8.0)
+    r = (c - values) / 0.01
+    np.testing.assert_allclose(found.cost, 0.5 * r @ (c - values), rtol=1e-10)
+    np.testing.assert_allclose(found.gradient, r @ slopes, rtol=1e-9)
+    expected = slopes.T @ slopes / 0.01 + np.tensordot(r, curvatures, 1)
+    np.testing.assert_allclose(found.hessian, expected, rtol=1e-9)
+    assert evaluator_of(problem).engine.name == engine
+
+
+def test_fit_ends_where_least_squares_of_the_closed_form_ends(values):
+    from scipy.optimize import least_squares
+
+    fit = sf.estimate(make_problem(values))
+    other = least_squares(lambda at: (concentration(*at)[0] - values) / 0.1, [0.2, 8.0], xtol=1e-14, gtol=1e-14)
+    np.testing.assert_allclose(fit.theta, other.x, rtol=1e-6)
+    assert fit.verdict.level == "good"
+    assert fit.transition_times[0].shape == (0,)
+    assert fit.trajectory.mode_spans == [("eliminate", 0.0, 36.0)]
+    np.testing.assert_array_equal(fit.trajectory.jump_times, DOSES)
+    assert fit.initial_state[0] == 0.0  # before the dose at t0
+    assert "eliminate, 0 to 36 h, 4 jumps at 0, 8, 16, 24 h" in str(fit)
+    assert sf.check_derivatives(make_problem(values)).passed  # the paper's equations, too
+
+
+@pytest.mark.parametrize("engine", ["native", "jax"])
+def test_the_same_as_a_copy_of_the_mode_for_each_dose(values, engine):
+    """From the second dose on: a transition at t0 is not allowed."""
+    names = ["m0", "m1", "m2", "m3"]
+    copies = sf.HybridSystem(
+        dict.fromkeys(names, eliminate),
+        lambda p: jnp.array([AMOUNT / p["V"]]),
+        reset_maps=dict.fromkeys(pairwise(names), dose),
+    )
+    known = [sf.Parameter(time, fixed=True) for time in DOSES[1:]]
+    run = sf.Experiment(make_log(np.append(np.nan, values[1:])), names, known, t0=0.0)
+    one = sf.evaluate(sf.Problem(copies, run, GUESS, engine=engine))
+    other = sf.evaluate(make_problem(np.append(np.nan, values[1:]), engine=engine))
+    np.testing.assert_allclose(other.cost, one.cost, rtol=1e-9)
+    np.testing.assert_allclose(other.gradient, one.gradient, rtol=1e-8)
+    np.testing.assert_allclose(other.hessian, one.hessian, rtol=1e-8)
+
+
+# --- with transitions -------------------------------------------------------------------------------------------------
+
+
+def speed_up(t, x, p):
+    return -3 * p["k"] * x
+
+
+CHANGING = sf.HybridSystem({"slow": eliminate, "fast": speed_up}, [0.0])
+
+
+def make_changing(values, guess=10.5, **options):
+    """Elimination becomes three times as fast at an unknown time."""
+    log = sf.Measurements(TIMES, values, sigma=0.05)
+    run = sf.Experiment(log, ["slow", "fast"], [guess], t0=0.0, time_unit="h", jumps=[ALL])
+    return sf.Problem(CHANGING, run, GUESS, **options)
+
+
+def simulate_changing(tau):
+    """The exact concentrations at the true parameters."""
+    rest = np.where(TIMES[:, None] <= tau, TIMES[:, None], tau + 3 * (TIMES[:, None] - tau))
+    given = np.where(tau >= DOSES, DOSES, tau + 3 * (DOSES - tau))
+    since = rest - given
+    return np.where(TIMES[:, None] > DOSES, AMOUNT / TRUE["V"] * np.exp(-TRUE["k"] * since), 0.0).sum(1)
+
+
+@pytest.mark.parametrize("engine", ["native", "jax"])
+def test_a_transition_between_jumps_is_found(engine):
+    problem = make_changing(simulate_changing(13.3), engine=engine)
+    assert problem.theta_names == ("tau_1", "k", "V")
+    np.testing.assert_array_equal(problem.unknowns.lower[:1], [8.0])
+    np.testing.assert_array_equal(problem.unknowns.upper[:1], [16.0])
+    fit = sf.estimate(problem)
+    np.testing.assert_allclose(fit.theta, [13.3, 0.13, 11.0], rtol=1e-6)
+    np.testing.assert_allclose(fit.transition_times[0], [13.3], rtol=1e-6)
+    assert [mode for mode, _, _ in fit.trajectory.mode_spans] == ["slow", "fast"]
+    np.testing.assert_array_equal(fit.trajectory.jump_times, DOSES)
+    assert [(t.before, t.after) for t in fit.transitions] == [("slow", "fast")]
+
+
+@pytest.mark.parametrize("engine", ["native", "jax"])
+def test_the_sample_at_a_jump_is_of_the_state_before_on_both_sides_of_a_kink(engine):
+    """The derivative to the left of a kink must not put the jumps before the samples at the same times."""
+    problem = make_changing(simulate_changing(13.3), guess=13.0, engine=engine)
+    evaluator, theta = Evaluator(problem), problem.initial_theta  # tau_1 = 13 is a sample, too
+    left, right = evaluator(theta, -1), evaluator(theta, 1)
+    assert left.cost == pytest.approx(right.cost, rel=1e-12)
+    for side, found in ((-1, left), (1, right)):
+        moved = theta.copy()
+        moved[0] += side * 1e-6
+        slope = (evaluator.cost(moved) - found.cost) / (side * 1e-6)
+        assert found.gradient[0] == pytest.approx(slope, rel=1e-4)
+    for matrix in ("adjoint", "forward"):
+        np.testing.assert_allclose(evaluator(theta, -1, matrix).gradient, left.gradient, rtol=1e-6)
+
+
+def test_the_same_inside_the_programs_of_batches():
+    problem = make_changing(simulate_changing(13.3), guess=13.0)
+    evaluator, theta = Evaluator(problem), problem.initial_theta
+    (structure,), (arguments,), own = problem.structures, evaluator.arguments, problem.own_places[0][0]
+    with use_float64():
+        program = jax.jit(lambda tau, p, side: foreign_derivatives(structure, arguments, tau, p, side))
+        for side in (-1.0, 1.0):
+            J, g, _ = map(np.asarray, program(*problem.vectors(theta, 0), side))
+            expected = evaluator(theta, int(side))
+            assert float(J) == pytest.approx(expected.cost, rel=1e-12)
+            np.testing.assert_allclose(g[own], expected.gradient, rtol=1e-10)
+
+
+def test_a_transition_that_wants_past_a_jump_stops_there_and_says_so():
+    """The guess says between which jumps it lies."""
+    fit = sf.estimate(make_changing(simulate_changing(18.0), guess=12.0), strategy="local")
+    assert fit.theta[0] == 16.0
+    assert [str(active) for active in fit.active] == ["tau_1 at its upper bound 16"]
+    after = sf.estimate(make_changing(simulate_changing(18.0), guess=17.0))
+    np.testing.assert_allclose(after.theta, [18.0, 0.13, 11.0], rtol=1e-6)
+
+
+def test_a_transition_at_the_lower_bound_that_is_a_jump():
+    """Both are at one node, a sample, and the derivatives are asked for on either side."""
+    problem = make_changing(simulate_changing(13.3), guess=9.0)
+    evaluator, theta = Evaluator(problem), np.array([8.0, 0.2, 8.0])
+    for method in ("auto", "forward"):
+        left, right = evaluator(theta, -1, method), evaluator(theta, 1, method)
+        assert left.cost == right.cost == pytest.approx(evaluator.cost(np.array([8.0 + 1e-9, 0.2, 8.0])), rel=1e-7)
+        np.testing.assert_allclose(left.gradient[1:], right.gradient[1:], rtol=1e-12)
+
+
+def test_guesses_that_are_proposed_keep_away_from_jumps():
+    run = sf.Experiment(make_log(TIMES), ["slow", "fast"], None, t0=0.0, tf=36.0, jumps=sf.Jump(18.0, dose))
+    assert 18.0 < run.initial_times[0] < 36.0
+
+
+def test_a_collapsed_mode_with_a_jump_inside_is_not_idle():
+    """Its two transition times cannot move together: one is before the jump, the other after it."""
+    from switchfit.fit.collapsed import idle_unknowns
+
+    def make(jumps):
+        run = sf.Experiment(make_log(TIMES), ["slow", "fast", "slow"], [7.5, 8.5], t0=0.0, jumps=jumps)
+        return Evaluator(sf.Problem(CHANGING, run, GUESS))
+
+    theta = np.array([8.0, 8.0, 0.2, 8.0])
+    assert idle_unknowns(make([]), theta, False).any()
+    assert not idle_unknowns(make(sf.Jump(8.0, dose)), theta, False).any()
+
+
+def test_the_horizon_grows_over_jumps(values):
+    from switchfit.strategy.horizon import grow_horizon
+
+    problem = make_changing(simulate_changing(13.3), guess=9.0)
+    end = grow_horizon(problem, problem.initial_theta)
+    np.testing.assert_allclose(end.theta, [13.3, 0.13, 11.0], rtol=1e-4)
+
+
+def test_with_a_free_final_time():
+    """The time at which the state, refilled twice, has fallen to 1."""
+    system = sf.HybridSystem({"run": lambda t, x, p: -x}, [1.0])
+    data = [sf.RunningCost(lambda t, x, p: 1.0), sf.TerminalConstraint(lambda x, p: x[0] - 1.0)]
+    refill = sf.Jump([0.0, 1.0], lambda t, x, p: x + 2.0)
+    run = sf.Experiment(data, ["run"], [], t0=0.0, tf=sf.Parameter(1.5, upper=6.0), jumps=[refill])
+    fit = sf.estimate(sf.Problem(system, run))
+    assert fit.theta[0] == pytest.approx(1.0 + np.log(3 * np.exp(-1.0) + 2.0), rel=1e-6)
+    np.testing.assert_array_equal(fit.trajectory.jump_times, [0.0, 1.0])
+
+
+def concentration_after(time):
+    """Just after a dose, at the true parameters."""
+    given = DOSES[time >= DOSES]
+    return (AMOUNT / TRUE["V"] * np.exp(-TRUE["k"] * (time - given))).sum()
+
+
+def test_names_of_guards_count_transitions_alone():
+    system = dataclasses.replace(CHANGING, guards={("slow", "fast"): lambda t, x, p: x[0] - 6.0})
+    tau = 8.0 + np.log(concentration_after(8.0) / 6.0) / TRUE["k"]
+    run = sf.Experiment(make_log(simulate_changing(tau)), ["slow", "fast"], [12.0], t0=0.0, jumps=sf.Jump(DOSES, dose))
+    problem = sf.Problem(system, run, GUESS)
+    assert problem.constraint_names == ("guard of tau_1 (slow -> fast)",)
+    np.testing.assert_allclose(sf.estimate(problem).theta, [tau, 0.13, 11.0], rtol=1e-6)
+
+
+# --- maps, several jumps ----------------------------------------------------------------------------------------------
+
+
+def test_an_amount_that_is_estimated():
+    k, amounts = 0.1, (100.0, 60.0)
+    times = np.arange(0.5, 20.0)
+    past = times[:, None] - np.array([0.0, 9.0])
+    exact = (np.where(past > 0, np.exp(-k * past), 0.0) * np.array(amounts)).sum(1)
+    first = sf.Jump(0.0, lambda t, x, p: x + 100.0)
+    second = sf.Jump(9.0, lambda t, x, p: x + p["amount"])
+    run = sf.Experiment(sf.Measurements(times, exact, sigma=1.0), ["eliminate"], [], t0=0.0, jumps=[second, first])
+    fit = sf.estimate(sf.Problem(BODY, run, {"k": 0.2, "amount": 30.0}))
+    np.testing.assert_allclose(fit.theta, [0.1, 60.0], rtol=1e-6)
+
+
+def test_jumps_at_one_time_act_in_order():
+    add, double = sf.Jump(1.0, lambda t, x, p: x + 1.0), sf.Jump(1.0, lambda t, x, p: 2.0 * x)
+    system = sf.HybridSystem({"rest": lambda t, x, p: 0.0 * p["k"] * x}, [3.0])
+    for jumps, expected in (([add, double], 8.0), ([double, add], 7.0)):
+        log = sf.Measurements([1.0, 2.0], [3.0, expected], sigma=1.0)
+        run = sf.Experiment(log, ["rest"], [], t0=0.0, jumps=jumps)
+        for engine in ("native", "jax"):
+            problem = sf.Problem(system, run, {"k": 1.0}, engine=engine)
+            assert sf.evaluate(problem).cost == pytest.approx(0.0, abs=1e-18)
+            assert sf.simulate(problem).states[-1] == expected
+
+
+def test_at_the_time_of_a_fixed_transition_the_jump_comes_first():
+    system = sf.HybridSystem(
+        {"a": lambda t, x, p: 0.0 * p["k"] * x, "b": lambda t, x, p: 0.0 * x},
+        [3.0],
+        reset_maps={("a", "b"): lambda t, x, p: 2.0 * x},
+    )
+    log = sf.Measurements([1.0, 2.0], [3.0, 8.0], sigma=1.0)
+    known = sf.Parameter(1.0, fixed=True)
+    run = sf.Experiment(log, ["a", "b"], [known], t0=0.0, jumps=sf.Jump(1.0, lambda t, x, p: x + 1.0))
+    problem = sf.Problem(system, run, {"k": 1.0})
+    for side in (-1, 1):
+        assert Evaluator(problem)(problem.initial_theta, side).cost == pytest.approx(0.0, abs=1e-18)
+
+
+# --- many fits, files, reports ----------------------------------------------------------------------------------------
+
+
+def test_many_logs_in_one_program(values):
+    rng = np.random.default_rng(5)
+    problems = [
+        make_changing(simulate_changing(13.3) + 0.05 * rng.standard_normal(len(TIMES)), guess=10.0) for _ in range(3)
+    ]
+    fits = sf.estimate_many(problems)
+    for k, problem in enumerate(problems):
+        np.testing.assert_allclose(fits.theta[k], sf.estimate(problem).theta, rtol=1e-5)
+
+
+def test_logs_with_other_times_of_doses_are_not_confused():
+    """The times of jumps are no unknowns: problems that differ in them alone cost differently."""
+    early = make_problem(concentration(**TRUE)[0])
+    late = make_problem(concentration(**TRUE)[0], jumps=sf.Jump([0.0, 9.0, 16.0, 24.0], dose))
+    fits = sf.estimate_many([early, late])
+    for k, problem in enumerate((early, late)):
+        np.testing.assert_allclose(fits.theta[k], sf.estimate(problem).theta, rtol=1e-6)
+    assert fits.cost[0] < 1e-8 < fits.cost[1]
+
+
+def test_bootstrap_and_workers_take_jumps(values):
+    problem = make_problem(values)
+    assert cloudpickle.loads(cloudpickle.dumps(problem)).theta_names == problem.theta_names
+    found = sf.bootstrap(sf.estimate(problem), 8, seed=1)
+    assert np.isfinite(found.theta).all()
+
+
+def test_a_copy_with_other_jumps_has_other_bounds():
+    run = make_changing(simulate_changing(13.3)).experiments[0]
+    other = dataclasses.replace(run, jumps=())
+    assert other.jumps == ()
+    assert np.isneginf(other.times[0].lower)
+    assert run.times[0].lower == 8.0
+
+
+MODEL = """
+import switchfit as sf
+
+def eliminate(t, x, p):
+    return -p["k"] * x
+
+def dose(t, x, p):
+    return x + 100.0 / p["V"]
+
+def give(amount):
+    return lambda t, x, p: x + amount / p["V"]
+
+body = sf.HybridSystem({"eliminate": eliminate}, [0.0], state_names=("c",))
+"""
+
+FILE = """
+model = "model.py:body"
+
+[parameters]
+k = 0.2
+V = { value = 8.0, lower = 1.0 }
+
+[[experiments]]
+mode_sequence = ["eliminate"]
+time_unit = "h"
+t0 = 0.0
+
+[[experiments.jumps]]
+time = [0.0, 8.0, 16.0]
+map = "model.py:dose"
+
+[[experiments.jumps]]
+time = 24
+map = { name = "model.py:give", arguments = { amount = 100.0 } }
+
+[[experiments.data]]
+file = "log.csv"
+columns = ["c"]
+sigma = 0.1
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, values):
+    rows = [f"{t},{c!r}\n" for t, c in zip(TIMES.tolist(), values.tolist(), strict=True)]
+    (tmp_path / "log.csv").write_text("t,c\n" + "".join(rows))
+    (tmp_path / "model.py").write_text(MODEL)
+    (tmp_path / "problem.toml").write_text(FILE)
+    return tmp_path
+
+
+def test_problem_file(folder, values):
+    problem = load_problem(folder / "problem.toml").problem
+    assert sf.evaluate(problem).cost == pytest.approx(sf.evaluate(make_problem(values)).cost, rel=1e-9)
+    runs = read_experiments(folder / "problem.toml")
+    assert "4 jumps at 0, 8, 16, 24 h" in describe_experiments(runs.experiments)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"model.py:dose"', '"model.py:doze"', "jumps\\[1\\].map .*defines no 'doze'"),
+        ('"model.py:dose"', '"dose"', "jumps\\[1\\]: map must name a function of a Python file"),
+        ("amount = 100.0", "size = 100.0", "jumps\\[2\\].map .*amount"),
+        ("time = 24", "time = 48", "A Jump must lie in \\[t0, tf\\)"),
+        ("[0.0, 8.0, 16.0]", "[8.0, 0.0]", "jumps\\[1\\]: The times of a Jump must increase strictly"),
+        ("time = 24", "tim = 24", "tim"),
+    ],
+)
+def test_problem_file_with_a_wrong_jump(folder, old, new, message):
+    (folder / "problem.toml").write_text(FILE.replace(old, new))
+    with pytest.raises(ValueError, match=message):
+        load_problem(folder / "problem.toml")
+
+
+def test_report_and_figure_show_the_jumps(values, tmp_path):
+    fit = sf.estimate(make_problem(values))
+    line = next(line for line in fit.plot().axes[0].lines if line.get_label() == "fitted")
+    times, curve = line.get_data()
+    edges = np.flatnonzero(np.diff(times) == 0)
+    np.testing.assert_array_equal(times[edges], DOSES)  # vertical, without a gap
+    np.testing.assert_allclose(curve[edges + 1] - curve[edges], AMOUNT / fit.parameters["V"])
+    fit.save(tmp_path / "fit.json")
+    loaded = sf.Estimate.load(tmp_path / "fit.json")
+    np.testing.assert_array_equal(loaded.trajectory.jump_times, DOSES)
+
+
+def test_the_page_has_curves_that_sliders_can_move(values):
+    """Divided at the jumps, with derivatives: those of the nodes, not of a trajectory without them."""
+    from switchfit.report.html.curves import collect_curves
+    from switchfit.report.html.sliders import measure_gap
+
+    fit = sf.estimate(make_problem(values))
+    (curves, *_) = collect_curves(fit, 0, [0, 1], 2000)
+    breaks = np.flatnonzero(np.isnan(curves.times))
+    np.testing.assert_array_equal(curves.times[breaks - 1], DOSES)
+    np.testing.assert_array_equal(curves.times[breaks + 1], DOSES)
+    assert set(curves.tangents) == {0, 1}
+    assert set(curves.modes) == {"eliminate", ""}  # "" at the gaps
+    near = fit.theta[0] + 0.1 * fit.standard_errors[0]
+    assert measure_gap(fit, {0: [curves]}, 0, (near,)) < 1e-4  # and no jump's size
+
+
+def test_prediction_and_profile_know_the_jumps(values):
+    fit = sf.estimate(make_problem(values))
+    bands = sf.predict(fit, times=[7.999, 8.001])
+    assert np.diff(bands.outputs[:, 0]) == pytest.approx(AMOUNT / fit.parameters["V"], rel=1e-3)
+    low, high = fit.profile("k").interval()
+    assert low < fit.parameters["k"] < high
+
+
+# --- what is wrong ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: sf.Jump(np.nan, dose), ValueError, "Jump time must be a finite number or several; got nan"),
+        (lambda: sf.Jump([], dose), ValueError, "Jump time must be a finite number or several"),
+        (lambda: sf.Jump([2.0, 1.0], dose), ValueError, "times of a Jump must increase strictly; got \\[2.0, 1.0\\]"),
+        (lambda: sf.Jump(1.0, 5.0), TypeError, "Jump map must be a function map\\(t, x, p\\); got float"),
+        (lambda: sf.Jump(1.0, lambda x: x), TypeError, "cannot be called with 3 argument"),
+        (
+            lambda: make_problem(TIMES, [sf.Jump(36.0, dose)]),
+            ValueError,
+            "lie in \\[t0, tf\\) = \\[0.0, 36.0\\) h",
+        ),
+        (lambda: make_problem(TIMES, [sf.Jump(-1.0, dose)]), ValueError, "got \\[-1.0\\]"),
+        (lambda: make_problem(TIMES, [dose]), TypeError, "each of jumps must be an sf.Jump; got function"),
+        (lambda: make_problem(TIMES, 3.0), TypeError, "jumps must be an sf.Jump or a sequence"),
+        (
+            lambda: make_changing(TIMES, guess=8.0),
+            ValueError,
+            "time 1 is guessed at 8.0 h, the time of a jump",
+        ),
+        (
+            lambda: make_problem(TIMES, [sf.Jump(1.0, lambda t, x, p: jnp.zeros(2))]),
+            ValueError,
+            "the map of a Jump.*\\(2,\\)",
+        ),
+        (lambda: make_changing(TIMES, max_transitions=4), ValueError, "has 5 transitions and jumps"),
+        (
+            lambda: sf.simulate(make_problem(TIMES, [sf.Jump(1.0, lambda t, x, p: x / 0.0)])),
+            ValueError,
+            "the map of a Jump at t = 1 h",
+        ),
+    ],
+)
+def test_what_is_wrong_is_said(make, error, message):
+    with pytest.raises(error, match=message):
+        make()

@@ -1,0 +1,535 @@
+"""Results as DataFrames, Datasets and draws, read back by their own readers; many fits saved, printed, drawn."""
+
+import csv
+import io
+import json
+import sys
+import warnings
+from dataclasses import fields, replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from models import RAMP
+from test_many_logs import folder, log_of, run  # noqa: F401  # a fixture
+from test_report import made, several, trajectory_of
+from test_save import CERTIFICATE, assert_same
+
+import switchfit as sf
+from switchfit.batch import saved
+from switchfit.batch.chunks import compute_seal
+from switchfit.fit.result import Fit
+from switchfit.models import heater_problem
+from switchfit.problem.constraints import ActiveConstraint
+from switchfit.runtime.errors import MissingExtraError
+from switchfit.runtime.frames import describe_frame
+
+
+def as_estimate(fit):
+    return sf.Estimate(**{f.name: getattr(fit, f.name) for f in fields(Fit)}, saved_certificate=CERTIFICATE)
+
+
+@pytest.fixture(scope="module")
+def heater():
+    return sf.estimate(heater_problem(), strategy="local")
+
+
+@pytest.fixture(scope="module")
+def studies(heater):
+    """One of each kind of fits."""
+    problem = heater_problem()
+    return {
+        "Fits": sf.estimate_many([problem, problem]),
+        "MonteCarlo": sf.monte_carlo(problem, 6, theta=[2.5, 0.4]),
+        "Bootstrap": sf.bootstrap(heater, 6),
+        "Multistart": sf.multistart(problem, 4),
+    }
+
+
+def through_csv(table):
+    levels = list(range(table.index.nlevels))
+    return pd.read_csv(io.StringIO(table.to_csv()), index_col=levels)
+
+
+def through_netcdf(dataset):
+    """Written and read in memory by SciPy's netCDF, which xarray takes where there is no other."""
+    return xr.load_dataset(io.BytesIO(dataset.to_netcdf(engine="scipy")), engine="scipy")
+
+
+# --- single fits ------------------------------------------------------------------------------------------------------
+
+
+def test_the_table_of_the_unknowns(heater):
+    table = heater.to_pandas()
+    assert list(table.index) == ["tau_1", "k"]
+    assert table["value"].tolist() == heater.theta.tolist()
+    assert table["std_error"].tolist() == heater.corrected_standard_errors.tolist()
+    np.testing.assert_array_equal(table[["low", "high"]], heater.confidence_intervals())
+    assert table["unit"].tolist() == ["h", "1/h"]
+    assert table["guess"].tolist() == [2.0, 0.5]
+    assert table["transition"].tolist() == ["on -> off", ""]
+    assert table.attrs["verdict"] == "good"
+    assert table.attrs["cost"] == heater.cost
+
+
+def test_an_unknown_that_is_held_has_no_error():
+    active = (ActiveConstraint("lower bound", 0.05, "mu", multiplier=3.0),)
+    fit = as_estimate(made(active=active, free_basis=np.eye(3)[:, :2], idle=("tau_2",)))
+    table = fit.to_pandas()
+    assert table["held"].tolist() == ["", "idle", "at lower bound"]
+    assert np.isfinite(table["std_error"]).tolist() == [True, True, False]
+    assert np.isnan(table.loc["mu", ["low", "high"]].astype(float)).all()
+
+
+def test_covariance_and_hessian_are_in_the_dataset(heater):
+    found = heater.to_xarray()
+    np.testing.assert_array_equal(found["covariance"], heater.covariance)
+    assert found["hessian"].sel(unknown="tau_1", unknown_2="k").item() == heater.hessian[0, 1]
+
+
+def test_trajectories_of_all_runs_are_in_one_table():
+    fit = as_estimate(several(3))
+    table = fit.to_pandas("trajectories")
+    assert table.index.names == ["run", "time"]
+    assert table.attrs["units"] == {"time": "s", "X": "m", "dX": "m/s"}
+    second = table.loc["run2"]
+    np.testing.assert_array_equal(second[["X", "dX"]], fit.trajectories[1].states)
+    assert second["mode"].tolist() == fit.trajectories[1].modes.tolist()
+    found = fit.to_xarray("trajectories")
+    assert found["X"].attrs == {"units": "m"}
+    assert found.sizes["node"] == len(table)
+
+
+def test_residuals_of_all_runs_are_in_one_table_without_missing_samples(heater):
+    fit = as_estimate(several(2))
+    table = fit.to_pandas("residuals")
+    assert table.index.names == ["run", "channel", "time"]
+    assert len(table) == 2 * (29 + 30)  # the third sample of X is missing
+    np.testing.assert_allclose(table["residual"], table["measured"] - table["fitted"], atol=1e-15)
+    np.testing.assert_allclose(table["standardized"], table["residual"] / 0.1)
+    assert table.loc["run1"].groupby(level="channel")["unit"].first().to_dict() == {"X": "m", "dX": "m/s"}
+    assert (
+        heater.to_pandas("residuals")["measured"].tolist()
+        == heater.problem.experiments[0].data[0].values.ravel().tolist()
+    )
+
+
+def test_units_of_channels_are_those_of_the_data():
+    times = np.linspace(0.0, 2.0, 9)
+    given = {"names": ("v", "w"), "units": ("km/h", ""), "sigma": 0.1}
+    data = sf.Measurements(times, np.stack([times, times], 1), observe=lambda t, x, p: x[np.array([0, 0])], **given)
+    problem = sf.Problem(RAMP, sf.Experiment(data, ("up", "rest"), (1.0,), 0.0, 2.0), {"v": 2.0})
+    table = sf.estimate(problem, strategy="local", max_iterations=0).to_pandas("residuals")
+    assert table["unit"].groupby(level="channel").first().to_dict() == {"v": "km/h", "w": ""}
+
+
+def test_the_history_has_a_row_for_each_iteration(heater):
+    table = heater.to_pandas("history")
+    assert table.index.tolist() == [record.iteration for record in heater.history]
+    assert table["cost"].tolist() == [record.cost for record in heater.history]
+    np.testing.assert_array_equal(table[["tau_1", "k"]], [record.theta for record in heater.history])
+    assert table.attrs["units"] == {"tau_1": "h", "k": "1/h"}
+
+
+@pytest.mark.parametrize("what", ["unknowns", "trajectories", "residuals", "history"])
+def test_tables_of_a_fit_come_back_from_their_files(heater, what, tmp_path):
+    table, found = heater.to_pandas(what), heater.to_xarray(what)
+    again = through_csv(table)
+    assert list(again.columns) == list(table.columns)
+    for name in table.select_dtypes("number"):
+        np.testing.assert_allclose(again[name], table[name], rtol=1e-15, err_msg=name)
+    table.to_parquet(tmp_path / "table.parquet")
+    stored = pd.read_parquet(tmp_path / "table.parquet")
+    pd.testing.assert_frame_equal(stored, table)
+    assert stored.attrs == table.attrs
+    xr.testing.assert_identical(through_netcdf(found), found)
+
+
+def test_a_table_that_does_not_exist(heater):
+    with pytest.raises(ValueError, match="what must be one of unknowns, trajectories, residuals, history; got 'theta'"):
+        heater.to_pandas("theta")
+    with pytest.raises(ValueError, match="what must be one of"):
+        heater.to_xarray("theta")
+    with pytest.raises(TypeError, match=r"no module of switchfit\.report makes a table of a int"):
+        describe_frame(3)
+
+
+@pytest.mark.parametrize("library", ["pandas", "xarray"])
+def test_a_library_that_is_not_installed(heater, library, monkeypatch):
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(MissingExtraError, match=f"needs {library}, which cannot be imported .*: pip install {library}"):
+        getattr(heater, f"to_{library}")()
+
+
+def test_states_that_are_called_like_other_columns():
+    path = replace(trajectory_of(), state_names=("mode", "time"))
+    table = path.to_pandas()
+    assert list(table.columns) == ["mode", "mode (mode)", "time (time)"]
+    np.testing.assert_array_equal(table["mode (mode)"], path.states[:, 0])
+    np.testing.assert_array_equal(path.to_xarray()["mode (value)"], path.states[:, 0])
+    several_alike = replace(trajectory_of(), state_names=("x", "x"))
+    assert list(several_alike.to_pandas().columns) == ["mode", "x", "x (x)"]
+
+
+def test_a_trajectory_goes_back_in_as_data_with_its_names_and_units():
+    path = sf.simulate(heater_problem(), times=[1.0, 2.0, 3.0])
+    table, found = path.to_pandas(), path.to_xarray()
+    for times, values in ((table.index, table[["T"]]), (found["time"], found[["T"]])):
+        data = sf.Measurements(times, values, sigma=0.1)
+        assert (data.names, data.units) == (("T",), ("K",))
+        np.testing.assert_array_equal(data.values, path.states)
+
+
+def test_a_comparison_has_four_columns_a_channel():
+    comparison = made().comparisons[0][0]
+    table = comparison.to_pandas()
+    assert list(table.columns)[:4] == ["X", "h", "X fitted", "h fitted"]
+    np.testing.assert_array_equal(table["h residual"], comparison.residuals[:, 1])
+    assert np.isnan(table["X"].iloc[2])
+    assert comparison.to_xarray()["measured"].sel(channel="h").dims == ("time",)
+    assert "sigma" not in replace(comparison, sigma=None).to_xarray()
+
+
+def test_tests_of_residuals_have_a_row_a_channel(heater):
+    table = heater.residuals.to_pandas()
+    assert table.loc["thermometer", "samples"] == 24
+    assert table.loc["thermometer", "rms"] == heater.residuals.channels[0].rms
+
+
+def test_predictions_have_their_bands(heater):
+    prediction = heater.predict([1.0, 4.0])
+    table, found = prediction.to_pandas(), prediction.to_xarray()
+    np.testing.assert_array_equal(table[["T low", "T high"]], prediction.state_band()[:, 0])
+    np.testing.assert_array_equal(
+        table[["thermometer output low", "thermometer output high"]], prediction.output_band()[:, 0]
+    )
+    assert table.attrs["units"]["T std. error"] == "K"
+    assert found["state_unit"].item() == "K"
+    xr.testing.assert_identical(through_netcdf(found), found)
+
+
+def test_profiles_have_the_other_unknowns(heater):
+    profile = heater.profile("k")
+    table, found = profile.to_pandas(), profile.to_xarray()
+    assert table.index.name == "k"
+    assert list(table.columns) == ["cost", "zeta", "converged", "tau_1"]
+    assert (table.attrs["low"], table.attrs["high"]) == profile.interval()
+    assert found["tau_1"].dims == ("k",)
+    assert found["k"].attrs == {"units": "1/h"}
+
+
+# --- many fits --------------------------------------------------------------------------------------------------------
+
+KINDS = ["Fits", "MonteCarlo", "Bootstrap", "Multistart"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_many_fits_have_a_row_each(studies, kind, tmp_path):
+    fits = studies[kind]
+    table, found = fits.to_pandas(), fits.to_xarray()
+    np.testing.assert_array_equal(table[["tau_1", "k"]], fits.theta)
+    np.testing.assert_array_equal(table["k std. error"], fits.standard_errors[:, 1])
+    np.testing.assert_array_equal(table[["k low", "k high"]], fits.confidence_intervals()[:, 1])
+    assert table["level"].tolist() == fits.levels.tolist()
+    assert table.attrs["units"]["k std. error"] == "1/h"
+    np.testing.assert_array_equal(found["covariance"], fits.covariance)
+    assert found["unknown_unit"].values.tolist() == ["h", "1/h"]
+    assert ("cluster" in table) == (kind == "Multistart")
+    assert ("truth" in found, "estimate" in found) == (kind == "MonteCarlo", kind == "Bootstrap")
+    table.to_parquet(tmp_path / "fits.parquet")
+    pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "fits.parquet"), table)
+    np.testing.assert_allclose(through_csv(table)["k"], table["k"], rtol=1e-15)
+    xr.testing.assert_identical(through_netcdf(found), found)
+
+
+@pytest.mark.parametrize("kind", ["MonteCarlo", "Bootstrap"])
+def test_draws_for_arviz(studies, kind, monkeypatch, tmp_path):
+    study = studies[kind]
+    status = study.status.copy()
+    status[1] = "MAX_ITERATIONS"  # which is left out
+    study = replace(study, status=status)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # ArviZ 0.23 warns of its next version
+        import arviz
+
+        draws = study.to_arviz()
+        summary = arviz.summary(draws, kind="stats", round_to="none")
+    good = np.delete(study.theta, 1, axis=0)
+    np.testing.assert_array_equal(draws.posterior["k"], good[None, :, 1])
+    assert draws.posterior["tau_1"].attrs == {"units": "h"}
+    np.testing.assert_allclose(summary.loc[["tau_1", "k"], "mean"].astype(float), good.mean(0))
+    name = "truth" if kind == "MonteCarlo" else "estimate"
+    assert draws.constant_data[f"k {name}"].item() == getattr(study, name)[1]
+    monkeypatch.setattr(arviz, "InferenceData", None)
+    monkeypatch.delattr(arviz, "InferenceData")  # as in ArviZ 1.0
+    tree = study.to_arviz()
+    assert isinstance(tree, xr.DataTree)
+    xr.testing.assert_identical(tree["posterior"].to_dataset(), draws.posterior)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_many_fits_come_back_to_the_bit(studies, kind, tmp_path):
+    fits, path = studies[kind], tmp_path / "fits.npz"
+    fits.save(str(path))
+    again = sf.Fits.load(path)
+    assert type(again) is type(fits)
+    for f in fields(fits):
+        if f.name == "best":
+            for g in fields(Fit):
+                assert_same(getattr(fits.best.complete(), g.name), getattr(again.best, g.name), g.name)
+        else:
+            assert_same(getattr(fits, f.name), getattr(again, f.name), f.name)
+    assert str(again) == str(fits)
+    assert type(fits).load(path).verdict.level == fits.verdict.level
+    assert again.plot().axes
+
+
+def test_a_multistart_without_a_best_end_comes_back(studies, tmp_path):
+    replace(studies["Multistart"], best=None).save(tmp_path / "fits.npz")
+    assert sf.Multistart.load(tmp_path / "fits.npz").best is None
+
+
+def rewrite(path, **changes):
+    """The file with some arrays changed, and sealed again; `header` is a function of its JSON."""
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files if name != "seal"}
+    header = changes.pop("header", None)
+    if header is not None:
+        content = json.loads(arrays["header"].tobytes())
+        header(content)
+        changes["header"] = np.frombuffer(json.dumps(content).encode(), dtype=np.uint8)
+    arrays |= changes
+    arrays = {name: array for name, array in arrays.items() if array is not None}
+    np.savez(path, **arrays, seal=np.array(compute_seal(arrays)))
+
+
+DAMAGES = [
+    ({"theta": np.zeros((2, 3))}, r"theta must have the shape \(2, 2\) for 2 fits of 2 unknowns; got \(2, 3\)"),
+    ({"pieces": np.zeros((2, 1, 3, 6, 5))}, r"pieces must have the shape \(2, 1, 2, any, 5\)"),
+    ({"cost": np.array([1, 2])}, "cost must be an array of float64; got one of int64"),
+    ({"status": np.array(["CONVERGED", "FINE"])}, "status has 'FINE', which is no status"),
+    ({"piece_places": np.array([2])}, "piece_places must lie between 0 and 1"),
+    ({"covariance": None}, "it must have the arrays of Fits, covariance among them or not"),
+    ({"header": lambda c: c["fits"].pop("priors")}, "fits.priors is missing"),
+    ({"header": lambda c: c["fits"].update(theta_units=["h"])}, "theta_units must have 2 entries; got 1"),
+    ({"header": lambda c: c["fits"].update(log_scaled=["m"])}, "log_scaled has the name 'm'"),
+    ({"header": lambda c: c["fits"].update(seconds="long")}, "fits.seconds must be a number"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), DAMAGES, ids=[message[:30] for _, message in DAMAGES])
+def test_fits_that_are_damaged(studies, change, message, tmp_path):
+    path = tmp_path / "fits.npz"
+    studies["Fits"].save(path)
+    rewrite(path, **change)
+    with pytest.raises(ValueError, match=f"fits.npz is damaged: {message}"):
+        sf.Fits.load(path)
+
+
+def test_files_that_hold_no_fits(studies, heater, tmp_path):
+    path = tmp_path / "fits.npz"
+    studies["Fits"].save(path)
+    whole = path.read_bytes()
+    for content in (b"", b"no archive", whole[: len(whole) // 2], np.lib.format.magic(1, 0)):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"fits\.npz does not hold saved fits \("):
+            sf.Fits.load(path)
+    np.savez(path, header=np.array([{}], dtype=object))  # a pickle
+    with pytest.raises(ValueError, match="does not hold saved fits"):
+        sf.Fits.load(path)
+    heater.save(path)
+    with pytest.raises(ValueError, match="does not hold saved fits"):
+        sf.Fits.load(path)
+    with pytest.raises(FileNotFoundError):
+        sf.Fits.load(tmp_path / "none.npz")
+    studies["Fits"].save(path)
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    np.savez(path, **(arrays | {"cost": arrays["cost"] + 1}))
+    with pytest.raises(ValueError, match=r"fits\.npz is damaged: its content is not what was written"):
+        sf.Fits.load(path)
+
+
+def test_fits_of_another_version_or_kind(studies, tmp_path, monkeypatch):
+    path = tmp_path / "fits.npz"
+    studies["MonteCarlo"].save(path)
+    with pytest.raises(ValueError, match=r"holds the kind of fits 'MonteCarlo', not Bootstrap: sf\.Fits\.load reads"):
+        sf.Bootstrap.load(path)
+    monkeypatch.setattr(saved, "VERSION", 2)
+    with pytest.raises(ValueError, match="holds fits in version 1 of their format; this switchfit reads version 2"):
+        sf.Fits.load(path)
+
+
+def test_a_failed_save_leaves_the_file(studies, tmp_path, monkeypatch):
+    path = tmp_path / "fits.npz"
+    studies["Fits"].save(path)
+    before = path.read_bytes()
+
+    def fail(*arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("switchfit.runtime.files.os.fsync", fail)
+    with pytest.raises(OSError, match="No space left"):
+        studies["Fits"].save(path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def many(fits, count):
+    """`count` copies of the first fit; the fifth costs most, the third has not converged."""
+    arrays = {
+        f.name: np.repeat(getattr(fits, f.name)[:1], count, axis=0)
+        for f in fields(fits)
+        if isinstance(getattr(fits, f.name), np.ndarray) and f.name not in ("piece_places", "log_origins")
+    }
+    cost, status = arrays["cost"].copy(), arrays["status"].astype("U20")
+    explained, runs = arrays["explained"].copy(), np.arange(count)
+    cost[4], explained[4], status[2] = 1e4, 0.3, "MAX_ITERATIONS"
+    return replace(fits, **(arrays | {"cost": cost, "status": status, "explained": explained, "runs": runs}))
+
+
+def test_fits_print_as_a_table(studies):
+    lines = str(studies["Fits"]).splitlines()
+    rows = lines[lines.index("") + 2 :]
+    assert lines[lines.index("") + 1].split() == ["run", "J", "tau_1", "(h)", "k", "(1/h)"]
+    assert [row.split()[:3] for row in rows] == [["0", "good", "6.03062"], ["1", "good", "6.03062"]]
+    assert "2.462  ± 0.018" in rows[0]
+
+
+def test_of_many_fits_the_worst_are_printed_and_drawn_first(studies):
+    fits = many(studies["Fits"], 60)
+    assert fits.worst_first[:3].tolist() == [2, 4, 0]
+    text = str(fits)
+    rows = [line for line in text.splitlines() if line.lstrip()[:1].isdigit() and "±" in line]
+    assert len(rows) == 12
+    assert [row.split()[:2] for row in rows[:2]] == [["2", "bad"], ["4", "bad"]]
+    assert "the worst 12 of 60 fits; .to_pandas() has all of them" in text
+    figure = fits.plot()
+    labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    assert len(labels) == 40
+    assert labels[:2] == ["2", "4"]
+    first, last = (figure.axes[0].transData.transform((2.4, row))[1] for row in (0, 39))
+    assert first > last, "the worst fit is not on top"
+    assert figure.legends[0].get_title().get_text() == "the worst 40 of 60 fits"
+
+
+# --- simulation at given times ----------------------------------------------------------------------------------------
+
+
+def test_a_simulation_at_given_times_is_that_of_the_nodes():
+    problem = heater_problem()
+    times = np.array([0.0, 1.0, 2.0, 2.5, 4.1, 6.0])
+    path = sf.simulate(problem, [2.5, 0.4], times=times)
+    rising = np.minimum(times, 2.5)
+    exact = 25.0 * (1.0 - np.exp(-0.4 * rising)) * np.exp(-0.4 * (times - rising))
+    np.testing.assert_allclose(path.states[:, 0], exact, rtol=1e-8, atol=1e-8)
+    assert path.modes.tolist() == ["on", "on", "on", "on", "off", "off"]  # at the transition that before it
+    assert path.segments.tolist() == [0, 4, 6]
+    assert path.mode_spans == [("on", 0.0, 2.5), ("off", 4.1, 6.0)]
+    late = sf.simulate(problem, [2.5, 0.4], times=[5.0])
+    assert late.segments.tolist() == [0, 0, 1]
+    assert late.mode_spans == [("off", 5.0, 5.0)]
+
+
+def test_a_simulation_at_the_samples(heater):
+    path = sf.simulate(heater.problem, heater.theta, times="samples")
+    np.testing.assert_array_equal(path.times, heater.comparisons[0][0].times)
+    np.testing.assert_allclose(path.states, heater.comparisons[0][0].fitted, rtol=1e-8)
+
+
+def test_a_simulation_at_the_samples_of_several_data():
+    first = sf.Measurements([0.5, 1.0], [0.5, 1.0], sigma=0.1)
+    other = sf.ReferenceSignal.from_samples(np.array([0.0, 1.0, 1.5, 2.0]), np.zeros((4, 1)))
+    problem = sf.Problem(RAMP, sf.Experiment([first, other], ("up", "rest"), (1.2,), 0.0, 2.0), {"v": 2.0})
+    assert sf.simulate(problem, times="samples").times.tolist() == [0.0, 0.5, 1.0, 1.5, 2.0]
+
+
+def test_a_simulation_up_to_a_free_tf():
+    data = sf.TerminalCost(lambda x, p: (x[0] - 3.0) ** 2)
+    end = sf.Parameter(1.7, lower=1.0, upper=5.0)
+    problem = sf.Problem(RAMP, sf.Experiment(data, ("up",), (), 0.0, end), {"v": sf.Parameter(2.0, fixed=True)})
+    path = sf.simulate(problem, times=[0.0, 1.0, 1.7])
+    np.testing.assert_allclose(path.states[:, 0], [0.0, 2.0, 3.4], rtol=1e-9)
+    with pytest.raises(ValueError, match=r"times must lie inside \[t0, tf\] = \[0.0, 1.7\] s; got 2.0"):
+        sf.simulate(problem, times=[2.0])
+    with pytest.raises(ValueError, match="times='samples' needs data with samples, and experiment 0 has none"):
+        sf.simulate(problem, times="samples")
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        ([1.0, 1.0], "times must increase strictly; got 1.0 after 1.0"),
+        ([-1.0], r"times must lie inside \[t0, tf\] = \[0.0, 6.0\] h; got -1.0"),
+        ([], r"times must be finite numbers of shape \(K,\), or 'samples'; got shape \(0,\)"),
+        ([np.nan], "times must be finite numbers"),
+        ("sample", "times must be 'samples'; got 'sample'|times must be .*samples"),
+    ],
+)
+def test_times_that_cannot_be_simulated(times, message):
+    with pytest.raises(ValueError, match=message):
+        sf.simulate(heater_problem(), times=times)
+
+
+# --- command line -----------------------------------------------------------------------------------------------------
+
+
+def test_simulate_writes_the_times_that_are_asked_for(folder):  # noqa: F811
+    (folder / "problem.toml").write_text((folder / "problem.toml").read_text().replace("log.csv", "logs/monday.csv"))
+    out = folder / "path.csv"
+
+    def times_of(*arguments):
+        result = run("simulate", folder / "problem.toml", "--out", out, *arguments)
+        assert result.exit_code == 0, result.stderr
+        with out.open(newline="") as file:
+            return [float(row["t"]) for row in csv.DictReader(file)]
+
+    np.testing.assert_allclose(times_of("--times", "0.5"), np.arange(0.0, 6.25, 0.5))
+    np.testing.assert_allclose(times_of("--times", "4"), [0.0, 4.0])
+    np.testing.assert_allclose(times_of("--times", "samples"), np.arange(0.25, 6.0, 0.5))
+    assert len(times_of()) > 2
+    for wrong in ("often", "0", "-1", "nan", "1e-9"):
+        result = run("simulate", folder / "problem.toml", "--out", out, f"--times={wrong}")
+        assert result.exit_code == 2
+        assert "--times must be " in result.stderr
+
+
+def test_the_table_of_logs_is_complete_and_may_be_parquet(folder, monkeypatch):  # noqa: F811
+    (folder / "logs" / "sunday.csv").write_text("t;T\n0;1\n1;cold\n")
+    tables = {}
+    for name in ("table.csv", "table.parquet"):
+        result = run("fit", folder / "logs", "--problem", folder / "problem.toml", "--table", folder / name)
+        assert result.exit_code == 2
+        tables[name] = pd.read_csv(folder / name) if name.endswith("csv") else pd.read_parquet(folder / name)
+    written, parquet = tables.values()
+    assert list(parquet.columns) == list(written.columns)
+    assert parquet["verdict"].tolist() == ["good", "refused", "good"]
+    assert parquet["values"].tolist()[::2] == [12, 12]
+    for name in ("chi2", "degrees of freedom", "t0", "tf", "seconds", "tau_1 (s)", "tau_1 (s) std. error", "heating"):
+        assert np.isfinite(parquet[name]).tolist() == [True, False, True], name
+        assert np.isfinite(written[name]).tolist() == [True, False, True], name
+    assert written["degrees of freedom"].dropna().tolist() == [10, 10]
+    np.testing.assert_allclose(written["chi2"].dropna(), 2 * written["cost"].dropna(), rtol=1e-12)
+    assert "cold" in parquet["message"][1]
+    import pyarrow.parquet
+
+    schema = pyarrow.parquet.read_schema(folder / "table.parquet")
+    assert schema.field("tau_1 (s) std. error").metadata == {b"unit": b"s"}
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
+    result = run("fit", folder / "logs", "--problem", folder / "problem.toml", "--table", folder / "new.parquet")
+    assert result.exit_code == 2
+    assert "pip install 'switchfit[parquet]', or give the table a name that ends in .csv" in result.stderr
+    assert not (folder / "new.parquet").exists()
+
+
+@pytest.mark.parametrize(("form", "start"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")])
+def test_the_figure_is_written_in_the_format_that_is_asked_for(folder, form, start):  # noqa: F811
+    (folder / "problem.toml").write_text((folder / "problem.toml").read_text().replace("log.csv", "logs/monday.csv"))
+    one, logs = folder / "one", folder / "many"
+    assert run("fit", folder / "problem.toml", "--out", one, "--figures", form).exit_code == 0
+    monday = folder / "logs" / "monday.csv"
+    assert run("fit", monday, "--problem", folder / "problem.toml", "--out", logs, "--figures", form).exit_code == 0
+    for out in (one, logs / "monday"):
+        assert (out / f"fit.{form}").read_bytes().startswith(start)
+        assert len(list(out.glob("fit.*"))) == 1

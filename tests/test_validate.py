@@ -1,0 +1,298 @@
+"""Validation on another run: closed forms of linear regression, the error of the parameters counted."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+import switchfit as sf
+from switchfit.models import heater_problem
+from switchfit.strategy.validation import correlate
+
+SIGMA = 0.3
+TRAIN, TEST = np.array([0.5, 1.0, 1.7, 2.2, 3.0, 3.9]), np.linspace(0.2, 4.5, 31)
+PARABOLA = sf.HybridSystem({"m": lambda t, x, p: p["a"] + p["b"] * t + 0.0 * x}, [0.0], state_names=("x",))
+
+
+def design(times):
+    """x = a t + b t^2 / 2."""
+    return np.stack([times, times**2 / 2], axis=1)
+
+
+def values(times, seed, shift=0.0):
+    return shift + design(times) @ [1.2, -0.4] + SIGMA * np.random.default_rng(seed).standard_normal(len(times))
+
+
+def run(times, y, sigma=SIGMA, **settings):
+    return sf.Experiment(sf.Measurements(times, y, sigma=sigma, names=("x",)), ("m",), (), 0.0, 5.0, **settings)
+
+
+def fit_line(sigma=SIGMA, seed=0):
+    return sf.estimate(sf.Problem(PARABOLA, run(TRAIN, values(TRAIN, seed), sigma), {"a": 1.0, "b": 0.0}))
+
+
+def by_hand(seed=0):
+    """Estimates of the parameters and their covariance over sigma^2."""
+    X = design(TRAIN)
+    return np.linalg.lstsq(X, values(TRAIN, seed), rcond=None)[0], np.linalg.inv(X.T @ X)
+
+
+def test_chi_square_in_closed_form_with_sigma_known():
+    fit, y = fit_line(seed=5), values(TEST, 1)
+    found = fit.validate(run(TEST, y))
+    p, C = by_hand(seed=5)
+    r, X = y - design(TEST) @ p, design(TEST)
+    expected = r @ np.linalg.solve(SIGMA**2 * (np.eye(len(TEST)) + X @ C @ X.T), r)
+    assert found.chi_square == pytest.approx(expected, rel=1e-6)
+    assert found.freedom == len(TEST)
+    assert found.probability == pytest.approx(scipy.stats.chi2.sf(expected, len(TEST)), rel=1e-5)
+    naive = r @ r / SIGMA**2
+    assert naive > 1.2 * expected, "otherwise the error of the parameters would not matter in this test"
+    np.testing.assert_allclose(found.covariance, SIGMA**2 * C, rtol=1e-6)
+    assert found.refit is None
+    assert found.kept == ("a", "b")
+    mean = y.mean()
+    assert found.percent == pytest.approx(100 * (1 - np.linalg.norm(r) / np.linalg.norm(y - mean)), rel=1e-6)
+    assert found.explained == pytest.approx(1 - r @ r / np.sum((y - mean) ** 2), rel=1e-6)
+    assert found.channels == {"x": pytest.approx(found.percent)}
+
+
+def test_f_test_in_closed_form_with_sigma_unknown():
+    fit, y = fit_line(sigma=None), values(TEST, 1)
+    found = fit.validate(run(TEST, y, None))
+    p, C = by_hand()
+    s2 = np.sum((values(TRAIN, 0) - design(TRAIN) @ p) ** 2) / (len(TRAIN) - 2)
+    r, X = y - design(TEST) @ p, design(TEST)
+    expected = r @ np.linalg.solve(np.eye(len(TEST)) + X @ C @ X.T, r) / s2
+    assert found.chi_square == pytest.approx(expected, rel=1e-6)
+    probability = scipy.stats.f.sf(expected / len(TEST), len(TEST), len(TRAIN) - 2)
+    assert found.probability == pytest.approx(probability, rel=1e-5)
+
+
+def test_own_unknowns_are_estimated_and_cost_a_degree_of_freedom():
+    """The initial state of the other run: chi-square is that of generalized least squares, which does not use M."""
+    fit, y = fit_line(), values(TEST, 2, shift=0.8)
+    found = fit.validate(run(TEST, y, initial_state=[sf.Parameter(0.0)]))
+    p, C = by_hand()
+    r, X, G = y - design(TEST) @ p, design(TEST), np.ones((len(TEST), 1))
+    W = np.linalg.inv(SIGMA**2 * (np.eye(len(TEST)) + X @ C @ X.T))
+    expected = r @ (W - W @ G @ np.linalg.inv(G.T @ W @ G) @ G.T @ W) @ r
+    assert found.chi_square == pytest.approx(expected, rel=1e-6)
+    assert found.freedom == len(TEST) - 1
+    assert found.theta_names == ("a", "b", "x(t0)")
+    assert found.theta[2] == pytest.approx(r.mean(), rel=1e-6)
+    np.testing.assert_allclose(found.theta[:2], p, rtol=1e-6)
+    u = X.mean(axis=0)  # x(t0) = mean (y - X p), so that it follows dp by -u
+    variance = SIGMA**2 * (1 / len(TEST) + u @ C @ u)
+    assert found.covariance[2, 2] == pytest.approx(variance, rel=1e-6)
+    np.testing.assert_allclose(found.covariance[2, :2], -(SIGMA**2) * u @ C, rtol=1e-6)
+
+
+def test_a_prior_of_an_own_unknown_counts_as_a_measurement():
+    fit, y = fit_line(), values(TEST, 2, shift=0.8)
+    start = sf.Parameter(0.0, prior=sf.Normal(0.5, 0.1))
+    found = fit.validate(run(TEST, y, initial_state=[start]))
+    p, C = by_hand()
+    X = np.vstack([design(TEST) / SIGMA, np.zeros(2)])
+    r, G = np.append((y - design(TEST) @ p) / SIGMA, 5.0), np.append(np.full(len(TEST), 1 / SIGMA), 10.0)[:, None]
+    W = np.linalg.inv(np.eye(len(r)) + X @ (SIGMA**2 * C) @ X.T)
+    expected = r @ (W - W @ G @ np.linalg.inv(G.T @ W @ G) @ G.T @ W) @ r
+    assert found.chi_square == pytest.approx(expected, rel=1e-6)
+    assert found.freedom == len(TEST)
+
+
+def test_bands_of_another_run():
+    fit = fit_line()
+    found = fit.validate(run(TEST, values(TEST, 1)))
+    (prediction,) = found.predictions
+    X = design(prediction.times)
+    expected = np.sqrt(np.einsum("ki,ij,kj->k", X, SIGMA**2 * by_hand()[1], X))
+    np.testing.assert_allclose(prediction.output_errors[:, 0], expected, rtol=1e-5, atol=1e-12)
+
+
+def test_residuals_are_tested_without_the_error_of_the_parameters_that_they_share():
+    fit = fit_line(seed=5)
+    times = np.linspace(0.1, 5.0, 200)
+    found = fit.validate(run(times, values(times, 7)))
+    raw = found.comparisons[0][0].residuals[:, 0]
+    alike = raw[1:] @ raw[:-1] / (raw @ raw)
+    assert alike > 0.3
+    assert abs(found.residuals.channels[0].correlation) < 0.2
+    assert found.residuals.channels[0].whiteness > 0.01
+    assert found.verdict.level == "good"
+
+
+def test_the_transition_time_of_another_day_is_estimated_and_the_parameters_stay():
+    fit = sf.estimate(heater_problem())
+    times = np.linspace(0.25, 5.0, 20)
+    exact = 25 * (1 - np.exp(-0.4 * np.minimum(times, 1.4))) * np.exp(-0.4 * np.maximum(times - 1.4, 0))
+    y = exact + 0.2 * np.random.default_rng(4).normal(size=20)
+    found = fit.validate(sf.Measurements(times, y))
+    assert found.theta_names == ("tau_1", "k")
+    assert found.theta[1] == fit.theta[1]
+    assert abs(found.theta[0] - 1.4) < 4 * found.standard_errors[0]
+    assert found.standard_errors[0] > found.refit.standard_errors[0]  # it contains the error of k
+    assert found.comparisons[0][0].names == ("thermometer",)
+    np.testing.assert_array_equal(found.comparisons[0][0].sigma, 0.2)
+    assert found.freedom == 19
+    same = fit.validate(sf.Experiment(sf.Measurements(times, y, sigma=0.2), ("on", "off"), (2.0,), 0.0, 5.0))
+    assert same.chi_square == pytest.approx(found.chi_square, rel=1e-6)
+    assert "Kept from the fit" in str(found)
+    assert "Estimated from this run\n  tau_1" in str(found)
+    held = fit.validate(sf.Measurements(times, y), refit=())
+    assert held.theta[0] == fit.theta[0]
+    assert held.refit is None
+    assert held.verdict.level == "bad"
+    assert held.freedom == 20
+    found.plot().draw_without_rendering()
+
+
+def test_a_problem_brings_parameters_of_its_own():
+    """Another offset of the sensor, which the fit has not."""
+    fit = fit_line()
+
+    def observe(t, x, p):
+        return x + p["offset"]
+
+    data = sf.Measurements(TEST, values(TEST, 3, shift=0.5), observe=observe, sigma=SIGMA)
+    parameters = {"a": 0.0, "b": 0.0, "offset": 0.0}
+    other = sf.Problem(PARABOLA, sf.Experiment(data, ("m",), (), 0.0, 5.0), parameters)
+    found = fit.validate(other)
+    np.testing.assert_allclose(found.theta[:2], fit.theta, rtol=1e-12)
+    r = values(TEST, 3, shift=0.5) - design(TEST) @ by_hand()[0]
+    assert found.theta[2] == pytest.approx(r.mean(), rel=1e-5)
+    assert fit.validate(other, refit=()).theta[2] == 0.0
+    assert fit.validate(other, refit=("offset",)).theta[2] == found.theta[2]
+
+
+def test_a_log_is_read_by_the_names_of_the_channels(tmp_path):
+    fit, y = fit_line(), values(TEST, 1)
+    lines = ["t [s],x [m],other", *(f"{t},{v},0" for t, v in zip(TEST.tolist(), y.tolist(), strict=True))]
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    found = fit.validate(sf.read_log(tmp_path / "log.csv"))
+    assert found.chi_square == pytest.approx(fit.validate(run(TEST, y)).chi_square, rel=1e-6)
+    (tmp_path / "wrong.csv").write_text("\n".join(["t [s],y [m]", *lines[1:][:0], "0,1", "1,2"]))
+    with pytest.raises(ValueError, match="the log has no column x; it has y"):
+        fit.validate(sf.read_log(tmp_path / "wrong.csv"))
+
+
+def driven(missing):
+    """A fit and another run of a system with an input, which the model may miss in part."""
+
+    def mode(t, x, p, u):
+        return p["a"] * u - x
+
+    times = np.linspace(0.1, 20.0, 200)
+    rng = np.random.default_rng(0)
+    problems = []
+    for seed in (1, 2):
+        knots = np.arange(0.0, 20.0, 0.5)
+        u = np.random.default_rng(seed).standard_normal(len(knots))
+        inputs = sf.Input(knots, u)
+        system = sf.HybridSystem({"m": mode}, [0.0])
+        data = sf.Measurements(times, np.zeros(200), sigma=0.05)
+        path = sf.simulate(
+            sf.Problem(system, sf.Experiment(data, ("m",), (), 0.0, 20.0, inputs=inputs), {"a": 1.0}), [1.0]
+        )
+        y = np.interp(times, path.times, path.states[:, 0]) + 0.05 * rng.standard_normal(200)
+        y += missing * u[np.clip((times / 0.5).astype(int), 0, len(u) - 1)]
+        data = sf.Measurements(times, y, sigma=0.05)
+        problems.append(sf.Problem(system, sf.Experiment(data, ("m",), (), 0.0, 20.0, inputs=inputs), {"a": 0.8}))
+    return sf.estimate(problems[0]), problems[1]
+
+
+def test_residuals_that_depend_on_the_input_are_found():
+    fit, other = driven(0.0)
+    found = fit.validate(other)
+    assert found.verdict.level == "good"
+    assert [(test.channel, test.input) for test in found.inputs] == [("x1", "u")]
+    assert found.inputs[0].probability > 1e-3
+    fit, other = driven(0.06)
+    found = fit.validate(other)
+    assert found.inputs[0].probability < 1e-6
+    assert any(reason.kind == "input not explained" for reason in found.verdict.reasons)
+    assert "Correlation with inputs" in str(found)
+    with pytest.raises(ValueError, match="the fit has an input, and another run has its own: give validate an"):
+        fit.validate(other.experiments[0].data[0])
+
+
+def test_the_test_of_inputs_is_that_of_a_regression():
+    rng = np.random.default_rng(0)
+    z, u, lags = rng.standard_normal(60), rng.standard_normal(60), 4
+    Phi = np.stack([u[lags - k : 60 - k] for k in range(lags + 1)], axis=1)
+    Phi -= Phi.mean(axis=0)
+    inner = z[lags:]
+    explained = inner @ Phi @ np.linalg.lstsq(Phi, inner, rcond=None)[0] / (inner @ inner)
+    assert correlate(z, u, lags) == pytest.approx(scipy.stats.chi2.sf(56 * explained, lags + 1), rel=1e-9)
+    assert np.isnan(correlate(z, np.ones(60), lags))
+    assert np.isnan(correlate(z[:10], u[:10], lags))
+    shares = [correlate(*rng.standard_normal((2, 100)), 5) < 0.1 for _ in range(1000)]
+    assert 0.07 < np.mean(shares) < 0.13
+
+
+def test_without_a_noise_level_there_is_no_chi_square():
+    fit = fit_line()
+    found = fit.validate(sf.Problem(PARABOLA, run(TEST, values(TEST, 1), None), {"a": 1.0, "b": 0.0}))
+    assert np.isnan(found.chi_square)
+    assert found.predictions == ()
+    r = values(TEST, 1) - design(TEST) @ by_hand()[0]
+    assert found.explained == pytest.approx(1 - r @ r / len(r) / values(TEST, 1).var(), rel=1e-6)
+    assert "chi²" not in str(found)
+    found.plot().draw_without_rendering()
+
+
+def test_what_cannot_be_validated():
+    fit = fit_line()
+    with pytest.raises(TypeError, match=r"validate needs another run: an sf.Experiment.*got 3"):
+        fit.validate(3)
+    with pytest.raises(ValueError, match=r"refit names 'b', which is no unknown of the other run's own; these are"):
+        fit.validate(run(TEST, values(TEST, 1), initial_state=[sf.Parameter(0.0)]), refit=("b",))
+    two = sf.Measurements(TEST, np.zeros((len(TEST), 2)), observe=lambda t, x, p: jnp.stack([x[0], x[0]]))
+    with pytest.raises(ValueError, match="of the fit have 1 channels, those of the other run 2"):
+        fit.validate(two)
+    with pytest.raises(ValueError, match="the fit has 1 data in its experiment, 1 of them Measurements; got 2"):
+        fit.validate([sf.Measurements(TEST, values(TEST, 1))] * 2)
+    both = sf.Problem(PARABOLA, [run(TRAIN, values(TRAIN, s)) for s in (0, 1)], {"a": 1.0, "b": 0.0})
+    with pytest.raises(ValueError, match=r"the fit has 2 experiments: give validate an sf.Experiment"):
+        sf.estimate(both).validate(sf.Measurements(TEST, values(TEST, 1)))
+    sigma = np.full((len(TRAIN), 1), SIGMA)
+    each = sf.estimate(sf.Problem(PARABOLA, run(TRAIN, values(TRAIN, 0), sigma), {"a": 1.0, "b": 0.0}))
+    with pytest.raises(ValueError, match="sigma differs from sample to sample in the fit"):
+        each.validate(sf.Measurements(TEST, values(TEST, 1)))
+    unnamed = sf.Measurements(TRAIN, values(TRAIN, 0), sigma=SIGMA)
+    problem = sf.Problem(PARABOLA, sf.Experiment(unnamed, ("m",), (), 0.0, 5.0), {"a": 1.0, "b": 0.0})
+    log = sf.Log(TEST, {"x": values(TEST, 1)}, {}, "s", "log")
+    with pytest.raises(ValueError, match="the channels of the fit have no names"):
+        sf.estimate(problem).validate(log)
+
+
+def test_an_array_parameter_is_refitted_as_a_whole():
+    fit = fit_line()
+
+    def observe(t, x, p):
+        return p["c"][0] * x + p["c"][1]
+
+    data = sf.Measurements(TEST, values(TEST, 3), observe=observe, sigma=SIGMA)
+    parameters = {"a": 0.0, "b": 0.0, "c": [1.0, 0.0]}
+    other = sf.Problem(PARABOLA, sf.Experiment(data, ("m",), (), 0.0, 5.0), parameters)
+    assert fit.validate(other).freedom == len(TEST) - 2
+    with pytest.raises(ValueError, match="the entries of 'c' are estimated all together, or none of them"):
+        fit.validate(other, refit=("c[0]",))
+
+
+def test_a_transition_at_which_the_vector_field_does_not_jump_has_the_error_of_the_exact_hessian():
+    """A block that slides until its speed is zero: to first order, the data do not depend on when it rests."""
+    system = sf.HybridSystem({"slide": lambda t, x, p: p["v"] - t + 0.0 * x, "rest": lambda t, x, p: 0.0 * x}, [0.0])
+    times = np.linspace(0.03, 2.0, 40)
+    exact = np.minimum(times, 1.0) - np.minimum(times, 1.0) ** 2 / 2
+    logs = [exact + 0.003 * np.random.default_rng(seed).standard_normal(40) for seed in (1, 2)]
+    runs = [
+        sf.Experiment(sf.Measurements(times, log, sigma=0.003), ("slide", "rest"), (0.95,), 0.0, 2.0) for log in logs
+    ]
+    found = sf.estimate(sf.Problem(system, runs[0], {"v": 1.1})).validate(runs[1])
+    assert found.theta_names == ("tau_1", "v")
+    assert not found.refit.kinks
+    assert found.standard_errors[0] >= found.refit.standard_errors[0] * (1 - 1e-9)
+    assert found.refit.standard_errors[0] > 0.005
